@@ -1,0 +1,182 @@
+//! One small error enum an operation. Each message says what is wrong and, where it can be said, what to try.
+//!
+//! Errors about a file carry its path (added in `io`); the command line joins context with `anyhow`.
+
+use std::path::PathBuf;
+use thiserror::Error;
+
+/// Geometry: affines, grids, lengths.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum SpaceError {
+    /// NaN or infinity in an affine.
+    #[error("the voxel-to-world affine holds a value that is not finite")]
+    NotFinite,
+    /// The affine cannot be inverted.
+    #[error("the voxel-to-world affine is singular (determinant {determinant:.3e}); set a valid sform or qform")]
+    Singular {
+        /// Its determinant (mm^3).
+        determinant: f64,
+    },
+    /// A side of zero voxels.
+    #[error("the grid {shape:?} has no voxels")]
+    Empty {
+        /// Voxels along each axis.
+        shape: [usize; 3],
+    },
+    /// More voxels than can be handled.
+    #[error("the grid {shape:?} has more than 2^31 voxels; crop or resample it first")]
+    TooLarge {
+        /// Voxels along each axis.
+        shape: [usize; 3],
+    },
+    /// As many values as the grid has voxels were expected.
+    #[error("{found} values for a grid of {expected}")]
+    Length {
+        /// What the grid needs.
+        expected: usize,
+        /// What was given.
+        found: usize,
+    },
+}
+
+/// Meshing: Delaunay in 2D and 3D.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum MeshError {
+    /// NaN or infinity in a coordinate.
+    #[error("node {node} has a coordinate that is not finite")]
+    NotFinite {
+        /// Its number.
+        node: usize,
+    },
+    /// An element names a node that is not there.
+    #[error("an element names node {index}, but there are {nodes}")]
+    Index {
+        /// The number found.
+        index: u32,
+        /// How many nodes there are.
+        nodes: usize,
+    },
+    /// Too few points for one simplex.
+    #[error("{found} distinct points cannot be triangulated; at least {needed} are needed")]
+    TooFew {
+        /// Distinct points given.
+        found: usize,
+        /// Needed.
+        needed: usize,
+    },
+    /// All points lie on one line.
+    #[error("all points lie on one line, so there is no triangle among them")]
+    Collinear,
+    /// All points lie in one plane (use the 2D Delaunay).
+    #[error("all points lie in one plane, so there is no tetrahedron among them")]
+    Coplanar,
+}
+
+/// A parameter out of range.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[error("{name} is {value}, but must be {range}")]
+pub struct ParamError {
+    /// The flag's name.
+    pub name: &'static str,
+    /// What was given.
+    pub value: f64,
+    /// What is allowed.
+    pub range: &'static str,
+}
+
+/// Reading and writing files.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum IoError {
+    /// The operating system refused.
+    #[error("{path}: cannot {action}: {source}", path = path.display())]
+    Os {
+        /// The file.
+        path: PathBuf,
+        /// read, write, create ...
+        action: &'static str,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is not what it should be.
+    #[error("{path}: {what}; {hint}", path = path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+        /// What to try.
+        hint: String,
+    },
+}
+
+/// The field pipeline.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum FieldError {
+    /// A parameter out of range.
+    #[error(transparent)]
+    Param(#[from] ParamError),
+    /// Geometry.
+    #[error(transparent)]
+    Space(#[from] SpaceError),
+    /// Meshing.
+    #[error(transparent)]
+    Mesh(#[from] MeshError),
+    /// A volume that cannot be used; `volume` is "initial", "deformed" or "mask".
+    #[error("the {volume} volume {what}; {hint}")]
+    Volume {
+        /// Which one.
+        volume: &'static str,
+        /// What is wrong.
+        what: String,
+        /// What to try.
+        hint: String,
+    },
+    /// Too little to work with.
+    #[error("{found} {what}, {needed} are needed; {hint}")]
+    TooFew {
+        /// Found.
+        found: usize,
+        /// Of what.
+        what: &'static str,
+        /// Needed.
+        needed: usize,
+        /// What to try.
+        hint: String,
+    },
+    /// The two volumes do not show the same place.
+    #[error("the two volumes do not overlap in world space; {hint}")]
+    NoOverlap {
+        /// What to try.
+        hint: String,
+    },
+    /// Two grids that had to be the same are not.
+    #[error(
+        "{what} is on another grid ({found:?}) than {reference} ({expected:?}); resample it with `palpate warp --reference`"
+    )]
+    GridMismatch {
+        /// What.
+        what: String,
+        /// Its shape.
+        found: [usize; 3],
+        /// Of what the grid should be.
+        reference: String,
+        /// The shape it should have.
+        expected: [usize; 3],
+    },
+}
+
+/// Phantoms.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum SynthError {
+    /// A parameter out of range.
+    #[error(transparent)]
+    Param(#[from] ParamError),
+    /// Geometry.
+    #[error(transparent)]
+    Space(#[from] SpaceError),
+}

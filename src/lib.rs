@@ -1,0 +1,29 @@
+//! `palpate` measures how soft tissue deforms inside from a pair of MR volumes.
+//!
+//! The modules stand in the order of the pipeline.
+
+pub mod error;
+
+pub mod types;
+
+pub mod numerics;
+
+pub mod io;
+
+pub mod features;
+
+pub mod matching;
+
+pub mod consistency;
+
+pub mod mesh;
+
+pub mod field;
+
+pub mod synth;
+
+pub mod evaluate;
+
+pub mod report;
+
+pub mod pipeline;

@@ -1,0 +1,3 @@
+//! The chains of stages that a library user calls.
+
+pub mod field;

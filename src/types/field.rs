@@ -1,0 +1,93 @@
+//! A dense displacement field.
+
+use crate::error::SpaceError;
+use crate::types::space::{Grid, WorldPoint};
+use ndarray::{Array4, ShapeBuilder};
+
+/// Displacements on the initial volume's grid, in world mm, RAS components, initial to deformed.
+///
+/// The array has shape (nx, ny, nz, 3) with x fastest, so each component is one contiguous volume. (On disk the
+/// components are LPS; `io` converts.)
+#[derive(Debug, Clone, PartialEq)]
+pub struct DenseField {
+    grid: Grid,
+    data: Array4<f32>,
+}
+
+impl DenseField {
+    /// No motion.
+    pub fn zeros(grid: Grid) -> Self {
+        let s = grid.shape();
+        Self { grid, data: Array4::zeros((s[0], s[1], s[2], 3).f()) }
+    }
+
+    /// From the three components one after the other, each x fastest (mm, RAS).
+    ///
+    /// # Errors
+    /// [`SpaceError::Length`] when the length is not three times the grid's.
+    pub fn from_vec(grid: Grid, values: Vec<f32>) -> Result<Self, SpaceError> {
+        let (expected, found) = (3 * grid.len(), values.len());
+        let s = grid.shape();
+        let data = Array4::from_shape_vec((s[0], s[1], s[2], 3).f(), values)
+            .map_err(|_| SpaceError::Length { expected, found })?;
+        Ok(Self { grid, data })
+    }
+
+    /// The displacement (mm) that `f` gives for each voxel centre.
+    pub fn from_fn(grid: Grid, mut f: impl FnMut(WorldPoint) -> [f64; 3]) -> Self {
+        let mut out = Self::zeros(grid);
+        let s = grid.shape();
+        let n = grid.len();
+        let values = out.as_mut_slice();
+        for k in 0..s[2] {
+            for j in 0..s[1] {
+                for i in 0..s[0] {
+                    let d = f(grid.world(i, j, k));
+                    let at = grid.index(i, j, k);
+                    for c in 0..3 {
+                        values[c * n + at] = d[c] as f32;
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    /// The lattice (the initial volume's).
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// The (nx, ny, nz, 3) array.
+    pub fn array(&self) -> &Array4<f32> {
+        &self.data
+    }
+
+    /// All three components, one after the other, x fastest.
+    pub fn as_slice(&self) -> &[f32] {
+        self.data.as_slice_memory_order().unwrap_or_default()
+    }
+
+    /// The same, to be changed in place.
+    pub fn as_mut_slice(&mut self) -> &mut [f32] {
+        self.data.as_slice_memory_order_mut().unwrap_or_default()
+    }
+
+    /// Component `c` (0 = right, 1 = front, 2 = up), x fastest.
+    pub fn component(&self, c: usize) -> &[f32] {
+        let n = self.grid.len();
+        &self.as_slice()[c * n..(c + 1) * n]
+    }
+
+    /// The displacement at one voxel, by its x-fastest offset (mm).
+    #[inline]
+    pub fn at(&self, index: usize) -> [f32; 3] {
+        let (v, n) = (self.as_slice(), self.grid.len());
+        [v[index], v[n + index], v[2 * n + index]]
+    }
+
+    /// The three components, x fastest.
+    pub fn into_vec(self) -> Vec<f32> {
+        self.data.into_raw_vec_and_offset().0
+    }
+}

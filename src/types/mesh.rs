@@ -1,0 +1,70 @@
+//! Simplicial meshes: triangles in the plane, tetrahedra in space.
+
+use crate::error::MeshError;
+use crate::types::space::WorldPoint;
+
+/// A tetrahedral mesh. Each tetrahedron `[a, b, c, d]` is positively oriented: `det(b - a, c - a, d - a) > 0`.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TetMesh {
+    nodes: Vec<WorldPoint>,
+    tetrahedra: Vec<[u32; 4]>,
+}
+
+impl TetMesh {
+    /// From nodes (mm, RAS) and tetrahedra.
+    ///
+    /// # Errors
+    /// [`MeshError`] when an index is out of range or a coordinate is not finite. Orientation is the maker's duty.
+    pub fn new(nodes: Vec<WorldPoint>, tetrahedra: Vec<[u32; 4]>) -> Result<Self, MeshError> {
+        check(&nodes, tetrahedra.iter().flatten())?;
+        Ok(Self { nodes, tetrahedra })
+    }
+
+    /// Node positions (mm, RAS).
+    pub fn nodes(&self) -> &[WorldPoint] {
+        &self.nodes
+    }
+
+    /// Node numbers of each tetrahedron.
+    pub fn tetrahedra(&self) -> &[[u32; 4]] {
+        &self.tetrahedra
+    }
+}
+
+/// A triangle mesh of a plane that lies anywhere in space.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TriMesh {
+    nodes: Vec<WorldPoint>,
+    triangles: Vec<[u32; 3]>,
+}
+
+impl TriMesh {
+    /// From nodes (mm, RAS) and triangles.
+    ///
+    /// # Errors
+    /// As [`TetMesh::new`].
+    pub fn new(nodes: Vec<WorldPoint>, triangles: Vec<[u32; 3]>) -> Result<Self, MeshError> {
+        check(&nodes, triangles.iter().flatten())?;
+        Ok(Self { nodes, triangles })
+    }
+
+    /// Node positions (mm, RAS).
+    pub fn nodes(&self) -> &[WorldPoint] {
+        &self.nodes
+    }
+
+    /// Node numbers of each triangle.
+    pub fn triangles(&self) -> &[[u32; 3]] {
+        &self.triangles
+    }
+}
+
+fn check<'a>(nodes: &[WorldPoint], mut indices: impl Iterator<Item = &'a u32>) -> Result<(), MeshError> {
+    if let Some(node) = nodes.iter().position(|p| p.0.iter().any(|v| !v.is_finite())) {
+        return Err(MeshError::NotFinite { node });
+    }
+    match indices.find(|&&i| i as usize >= nodes.len()) {
+        Some(&index) => Err(MeshError::Index { index, nodes: nodes.len() }),
+        None => Ok(()),
+    }
+}

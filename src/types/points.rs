@@ -1,0 +1,59 @@
+//! Feature points, matches and sparse displacement fields.
+
+use crate::types::space::{VoxelPoint, WorldPoint};
+
+/// A corner-like place of a volume (3D Harris).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FeaturePoint {
+    /// Sub-voxel position in the volume it was found in.
+    pub voxel: VoxelPoint,
+    /// The same in world mm (RAS).
+    pub world: WorldPoint,
+    /// Corner response; larger is more distinct. Its unit is intensity^2 / mm^2 (Foerstner) or as the measure says.
+    pub response: f32,
+}
+
+/// One correspondence: the tissue at `initial` is found at `initial + displacement` in the deformed volume.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// Place in the initial volume, world mm (RAS).
+    pub initial: WorldPoint,
+    /// Initial to deformed, world mm.
+    pub displacement: [f64; 3],
+    /// Normalised cross-correlation of the two patches, -1 to 1.
+    pub ncc: f32,
+    /// Covariance of the displacement (mm^2): xx, yy, zz, xy, xz, yz.
+    pub covariance: [f64; 6],
+    /// Whether the consistency stage kept it.
+    pub kept: bool,
+}
+
+impl Match {
+    /// One number for the precision: the root of a third of the covariance's trace (mm).
+    pub fn sigma(&self) -> f64 {
+        ((self.covariance[0] + self.covariance[1] + self.covariance[2]) / 3.0).max(0.0).sqrt()
+    }
+}
+
+/// Matches of one pair of volumes.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SparseField {
+    /// Kept and rejected ones, in a fixed order.
+    pub matches: Vec<Match>,
+}
+
+impl SparseField {
+    /// The matches that consistency kept.
+    pub fn kept(&self) -> impl Iterator<Item = &Match> {
+        self.matches.iter().filter(|m| m.kept)
+    }
+}
+
+/// A place known in both volumes, from an expert or from exact truth (world mm, RAS).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Landmark {
+    /// Place in the initial volume.
+    pub initial: WorldPoint,
+    /// The same tissue in the deformed volume.
+    pub deformed: WorldPoint,
+}

@@ -1,0 +1,107 @@
+//! What the field pipeline gives back.
+
+use crate::types::{DenseField, SparseField, TetMesh, TriMesh, Volume};
+use serde::Serialize;
+
+/// The mesh through the kept matches: tetrahedra, or triangles for one slice.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Mesh {
+    /// In space.
+    Tetrahedra(TetMesh),
+    /// In the plane of a slice.
+    Triangles(TriMesh),
+}
+
+/// The smallest motion that explains the matches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MotionModel {
+    /// Nothing moves.
+    Identity,
+    /// One rotation and one translation.
+    Rigid,
+    /// One affine map.
+    Affine,
+    /// A free field.
+    Free,
+}
+
+/// How many of what (at full resolution).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Counts {
+    /// Features in the initial volume.
+    pub features_initial: usize,
+    /// Features in the deformed volume.
+    pub features_deformed: usize,
+    /// Candidate matches, many to many.
+    pub candidates: usize,
+    /// Matches kept by consistency.
+    pub kept: usize,
+    /// Mesh nodes.
+    pub nodes: usize,
+    /// Tetrahedra (triangles for one slice).
+    pub tetrahedra: usize,
+}
+
+/// One level of the coarse-to-fine pyramid.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct LevelReport {
+    /// Voxel size on this level (mm).
+    pub spacing_mm: [f64; 3],
+    /// Counts on this level.
+    pub counts: Counts,
+    /// Consistency energy of the best-correlation assignment, before relaxation (1).
+    pub energy_before: f64,
+    /// The same energy after relaxation (1).
+    pub energy_after: f64,
+    /// Median distance of the kept matches to the coupled field (mm).
+    pub residual_mm: f64,
+}
+
+/// Everything but the volumes.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FieldSummary {
+    /// Counts at full resolution.
+    pub counts: Counts,
+    /// The model that was chosen.
+    pub model: MotionModel,
+    /// Why: the evidence for each model tried, in words with numbers.
+    pub evidence: Vec<String>,
+    /// Coarse to fine.
+    pub levels: Vec<LevelReport>,
+    /// Voxels of the mask with a Jacobian determinant at or below zero.
+    pub folds: usize,
+    /// Voxels of the mask.
+    pub mask_voxels: usize,
+    /// Mean and largest length of the displacement over the mask (mm).
+    pub mean_mm: f64,
+    /// Largest length over the mask (mm).
+    pub max_mm: f64,
+    /// Median of the uncertainty over the mask (mm, 1 sigma).
+    pub uncertainty_median_mm: f64,
+    /// Stage names and wall seconds, in order.
+    pub seconds: Vec<(String, f64)>,
+    /// What the user should know before trusting the result.
+    pub warnings: Vec<String>,
+}
+
+/// The result of `palpate field`. All volumes lie on the initial volume's grid.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FieldResult {
+    /// Displacement, initial to deformed (mm, RAS).
+    pub displacement: DenseField,
+    /// The deformed volume resampled at x + u(x): looks like the initial one.
+    pub warped: Volume,
+    /// Jacobian determinant of x + u(x) (1).
+    pub jacobian: Volume,
+    /// One standard deviation of the displacement (mm).
+    pub uncertainty: Volume,
+    /// All matches with covariance.
+    pub matches: SparseField,
+    /// The mesh through the kept matches (initial positions).
+    pub mesh: Mesh,
+    /// Displacement at the mesh's nodes (mm, RAS).
+    pub node_displacement: Vec<[f64; 3]>,
+    /// The rest.
+    pub summary: FieldSummary,
+}

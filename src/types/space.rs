@@ -1,0 +1,204 @@
+//! Frames: voxel indices, world millimetres (RAS), and the affine between them.
+//!
+//! The two kinds of point are different types, so that one cannot be used for the other. A *displacement* is a plain
+//! `[f64; 3]` in world millimetres, pointing from the initial to the deformed place of the same tissue.
+
+use crate::error::SpaceError;
+
+/// A position in voxels: the centre of voxel `(i, j, k)` is `[i, j, k]`; fractions lie between centres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VoxelPoint(pub [f64; 3]);
+
+/// A position in world millimetres, RAS: x grows to the patient's right, y to the front, z to the head.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WorldPoint(pub [f64; 3]);
+
+impl WorldPoint {
+    /// This point moved by `d` (mm).
+    pub fn moved(self, d: [f64; 3]) -> WorldPoint {
+        WorldPoint([self.0[0] + d[0], self.0[1] + d[1], self.0[2] + d[2]])
+    }
+
+    /// The vector from `other` to this point (mm).
+    pub fn minus(self, other: WorldPoint) -> [f64; 3] {
+        [self.0[0] - other.0[0], self.0[1] - other.0[1], self.0[2] - other.0[2]]
+    }
+}
+
+/// A 3 x 3 matrix, row by row.
+pub type Matrix3 = [[f64; 3]; 3];
+
+/// The invertible affine map from voxels to world millimetres: `world = linear * voxel + origin`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Affine {
+    linear: Matrix3,
+    origin: [f64; 3],
+    inverse: Matrix3,
+}
+
+/// `a b`.
+fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])
+}
+
+impl Affine {
+    /// From the upper three rows of the homogeneous 4 x 4 matrix (mm a voxel, mm).
+    ///
+    /// # Errors
+    /// [`SpaceError`] when an entry is not finite or the linear part is singular (relative determinant under 1e-9).
+    pub fn new(rows: [[f64; 4]; 3]) -> Result<Self, SpaceError> {
+        if rows.iter().flatten().any(|v| !v.is_finite()) {
+            return Err(SpaceError::NotFinite);
+        }
+        let m: Matrix3 = std::array::from_fn(|r| [rows[r][0], rows[r][1], rows[r][2]]);
+        let det = m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+            + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
+        let scale: f64 = (0..3).map(|c| (0..3).map(|r| m[r][c] * m[r][c]).sum::<f64>().sqrt()).product();
+        // `<=` also catches a zero column, where both sides are zero.
+        if !det.is_finite() || det.abs() <= 1e-9 * scale || scale == 0.0 {
+            return Err(SpaceError::Singular { determinant: det });
+        }
+        let inverse: Matrix3 = std::array::from_fn(|r| {
+            std::array::from_fn(|c| {
+                let (a, b) = ((c + 1) % 3, (c + 2) % 3);
+                let (p, q) = ((r + 1) % 3, (r + 2) % 3);
+                (m[a][p] * m[b][q] - m[a][q] * m[b][p]) / det
+            })
+        });
+        Ok(Self { linear: m, origin: std::array::from_fn(|r| rows[r][3]), inverse })
+    }
+
+    /// Axis-aligned: `spacing` mm a voxel, the first voxel's centre at `origin` (mm).
+    ///
+    /// # Errors
+    /// As [`Affine::new`].
+    pub fn scaled(spacing: [f64; 3], origin: [f64; 3]) -> Result<Self, SpaceError> {
+        let mut rows = [[0.0; 4]; 3];
+        for a in 0..3 {
+            rows[a][a] = spacing[a];
+            rows[a][3] = origin[a];
+        }
+        Self::new(rows)
+    }
+
+    /// The upper three rows of the homogeneous matrix.
+    pub fn rows(&self) -> [[f64; 4]; 3] {
+        std::array::from_fn(|r| [self.linear[r][0], self.linear[r][1], self.linear[r][2], self.origin[r]])
+    }
+
+    /// The linear part (mm a voxel).
+    pub fn linear(&self) -> &Matrix3 {
+        &self.linear
+    }
+
+    /// The inverse of the linear part (voxels a mm).
+    pub fn inverse_linear(&self) -> &Matrix3 {
+        &self.inverse
+    }
+
+    /// World position of the centre of voxel `(0, 0, 0)` (mm).
+    pub fn origin(&self) -> WorldPoint {
+        WorldPoint(self.origin)
+    }
+
+    /// Lengths of the voxel's edges (mm).
+    pub fn spacing(&self) -> [f64; 3] {
+        std::array::from_fn(|c| (0..3).map(|r| self.linear[r][c] * self.linear[r][c]).sum::<f64>().sqrt())
+    }
+
+    /// Voxel to world (mm).
+    pub fn to_world(&self, p: VoxelPoint) -> WorldPoint {
+        WorldPoint(matvec(&self.linear, p.0)).moved(self.origin)
+    }
+
+    /// World (mm) to voxel.
+    pub fn to_voxel(&self, p: WorldPoint) -> VoxelPoint {
+        VoxelPoint(matvec(&self.inverse, p.minus(self.origin())))
+    }
+
+    /// A displacement in voxels as one in world mm (the origin plays no part).
+    pub fn vector_to_world(&self, d: [f64; 3]) -> [f64; 3] {
+        matvec(&self.linear, d)
+    }
+
+    /// A displacement in world mm as one in voxels.
+    pub fn vector_to_voxel(&self, d: [f64; 3]) -> [f64; 3] {
+        matvec(&self.inverse, d)
+    }
+}
+
+/// The lattice of a volume: how many voxels along each axis, and where they are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grid {
+    shape: [usize; 3],
+    affine: Affine,
+}
+
+impl Grid {
+    /// A lattice of `shape` voxels placed by `affine`.
+    ///
+    /// # Errors
+    /// [`SpaceError::Empty`] when a side is zero, [`SpaceError::TooLarge`] past 2^31 voxels.
+    pub fn new(shape: [usize; 3], affine: Affine) -> Result<Self, SpaceError> {
+        if shape.contains(&0) {
+            return Err(SpaceError::Empty { shape });
+        }
+        match shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s)) {
+            Some(n) if n <= 1 << 31 => Ok(Self { shape, affine }),
+            _ => Err(SpaceError::TooLarge { shape }),
+        }
+    }
+
+    /// Voxels along x, y, z.
+    pub fn shape(&self) -> [usize; 3] {
+        self.shape
+    }
+
+    /// Voxel-to-world affine.
+    pub fn affine(&self) -> &Affine {
+        &self.affine
+    }
+
+    /// Edge lengths of a voxel (mm).
+    pub fn spacing(&self) -> [f64; 3] {
+        self.affine.spacing()
+    }
+
+    /// Number of voxels.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Never true: a grid has at least one voxel.
+    pub fn is_empty(&self) -> bool {
+        false
+    }
+
+    /// Whether the volume is one slice, that is one voxel thick along some axis.
+    pub fn is_single_slice(&self) -> bool {
+        self.shape.contains(&1)
+    }
+
+    /// Offset of voxel `(i, j, k)` in x-fastest order (NIfTI's order on disk).
+    #[inline]
+    pub fn index(&self, i: usize, j: usize, k: usize) -> usize {
+        i + self.shape[0] * (j + self.shape[1] * k)
+    }
+
+    /// World position of a voxel's centre (mm).
+    pub fn world(&self, i: usize, j: usize, k: usize) -> WorldPoint {
+        self.affine.to_world(VoxelPoint([i as f64, j as f64, k as f64]))
+    }
+
+    /// Whether the two grids have the same shape and their corners coincide to 1e-3 of a voxel (NIfTI stores float32).
+    pub fn same_as(&self, other: &Grid) -> bool {
+        let far = |g: &Grid, c: usize| {
+            let s = self.shape;
+            let at = |a: usize| if c >> a & 1 == 1 { (s[a] - 1) as f64 } else { 0.0 };
+            g.affine.to_world(VoxelPoint([at(0), at(1), at(2)]))
+        };
+        let tolerance = 1e-3 * self.spacing().iter().fold(f64::INFINITY, |m, &v| m.min(v));
+        self.shape == other.shape
+            && (0..8).all(|c| far(self, c).minus(far(other, c)).iter().all(|d| d.abs() <= tolerance))
+    }
+}
