@@ -1,1 +1,21 @@
-//! numerics.
+//! Numerical tools that every stage may use: filters, sampling, splines, small dense algebra, sparse solves.
+//!
+//! Everything here works on plain slices with x fastest and gives the same bits for any number of threads: work is cut
+//! into pieces by the data's shape alone, and sums are taken in a fixed order. Inner loops are plain multiplies and
+//! adds that the compiler vectorises for the machine at hand ([`simd::dispatch`]).
+
+pub mod simd;
+
+pub mod filters;
+
+pub mod pyramid;
+
+pub mod small;
+
+pub mod bspline;
+
+pub mod bending;
+
+pub mod statistics;
+
+pub mod random;

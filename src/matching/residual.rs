@@ -1,0 +1,105 @@
+//! What is left of the difference between two volumes, as normal equations for a spline field.
+//!
+//! With `r = f - (a w + b)` (initial, gain, warped, offset) and `g` the mean of both images' gradients (the symmetric
+//! Gauss-Newton step of Benhimane & Malis 2004), every node of the lattice gets the information
+//! `A = sum_x B(x) rho(x) g g^T / sigma^2` and the right-hand side `sum_x B(x) rho(x) g r / sigma^2`. The sum of the
+//! basis functions is one, so the block diagonal `A` bounds the true Gauss-Newton matrix from above (each step cannot
+//! overshoot) and no pair of nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`.
+
+use crate::matching::gain::GainField;
+use crate::matching::pair::Pair;
+use crate::numerics::bspline::Lattice;
+use crate::numerics::filters::gradient_rows;
+use crate::numerics::simd::dispatch;
+use crate::numerics::statistics::median;
+
+/// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
+const CAUCHY: f32 = 2.385;
+
+/// Normal equations of one pass.
+#[derive(Debug, Clone)]
+pub struct NormalEquations {
+    /// Information of each node (1/mm^2): xx, yy, zz, xy, xz, yz.
+    pub blocks: Vec<[f32; 6]>,
+    /// Right-hand side (1/mm), planar.
+    pub rhs: Vec<f32>,
+    /// Robust standard deviation of the residual (intensity).
+    pub sigma: f32,
+    /// Mean weighted squared residual over sigma^2.
+    pub misfit: f64,
+}
+
+/// Robust spread of `f - (a w + b)` over the mask (1.4826 MAD), from at most about 200,000 voxels.
+pub fn residual_sigma(pair: &Pair, warped: &[f32], gain: &GainField) -> f32 {
+    let [nx, ny, nz] = pair.shape;
+    let rows = ny * nz;
+    let stride = (pair.fixed.len() / 200_000).max(1);
+    let (mut a, mut b) = (vec![0.0; nx], vec![0.0; nx]);
+    let mut r = Vec::new();
+    for row in (0..rows).step_by(stride) {
+        let (j, k) = (row % ny, row / ny);
+        if !pair.row_in_mask(j, k) {
+            continue;
+        }
+        gain.row(j, k, &mut a, &mut b);
+        let from = row * nx;
+        for i in 0..nx {
+            let v = pair.fixed_smooth[from + i] - (a[i] * warped[from + i] + b[i]);
+            if pair.mask[from + i] != 0 && v.is_finite() {
+                r.push(v.abs());
+            }
+        }
+    }
+    if r.is_empty() { 0.0 } else { 1.4826 * median(&mut r) }
+}
+
+/// Accumulates the normal equations of `lattice` for the present warp. `floor` bounds sigma from below (intensity).
+pub fn normal_equations(
+    pair: &Pair,
+    warped: &[f32],
+    gain: &GainField,
+    lattice: &Lattice,
+    floor: f32,
+) -> NormalEquations {
+    let nx = pair.shape[0];
+    let sigma = residual_sigma(pair, warped, gain).max(floor).max(f32::MIN_POSITIVE);
+    let (inverse, cut) = (1.0 / sigma, 1.0 / (CAUCHY * sigma));
+    let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
+    let sums = lattice.accumulate::<11>(|j, k, rows| {
+        if !pair.row_in_mask(j, k) {
+            return false;
+        }
+        let mut g: [Vec<f32>; 8] = std::array::from_fn(|_| vec![0.0; nx]);
+        let [fx, fy, fz, wx, wy, wz, a, b] = &mut g;
+        dispatch(|| {
+            gradient_rows(&pair.fixed_smooth, pair.shape, j, k, [fx, fy, fz]);
+            gradient_rows(warped, pair.shape, j, k, [wx, wy, wz]);
+            gain.row(j, k, a, b);
+            let from = nx * (j + pair.shape[1] * k);
+            let (f, w, m) = (&pair.fixed_smooth[from..][..nx], &warped[from..][..nx], &pair.mask[from..][..nx]);
+            let [xx, yy, zz, xy, xz, yz, rx, ry, rz, rr, count] = rows;
+            for i in 0..nx {
+                let r = f[i] - (a[i] * w[i] + b[i]);
+                let gx = (fx[i] + a[i] * wx[i]) * per_mm[0];
+                let gy = (fy[i] + a[i] * wy[i]) * per_mm[1];
+                let gz = (fz[i] + a[i] * wz[i]) * per_mm[2];
+                let good = m[i] != 0 && (r + gx + gy + gz).is_finite();
+                let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
+                let t = r * cut;
+                let weight = inverse * inverse / (1.0 + t * t);
+                let (hx, hy, hz) = (weight * gx, weight * gy, weight * gz);
+                (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
+                (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);
+                (rx[i], ry[i], rz[i]) = (hx * r, hy * r, hz * r);
+                rr[i] = weight * r * r;
+                count[i] = if good { 1.0 } else { 0.0 };
+            }
+        });
+        true
+    });
+    let n = lattice.len();
+    let blocks = (0..n).map(|i| std::array::from_fn(|q| sums[q * n + i])).collect();
+    let total = |q: usize| sums[q * n..(q + 1) * n].iter().map(|v| f64::from(*v)).sum::<f64>();
+    let misfit = total(9) / total(10).max(1.0);
+    NormalEquations { blocks, rhs: sums[6 * n..9 * n].to_vec(), sigma, misfit }
+}

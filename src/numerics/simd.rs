@@ -1,0 +1,26 @@
+//! Run-time choice of the vector instructions.
+
+/// Runs `work` compiled for the widest vector instructions of this machine (AVX-512, AVX2, NEON ... or plain).
+///
+/// The code inside must be inlined to profit. No fused multiply-add is used, so the result is the same for each.
+#[inline(always)]
+pub fn dispatch<R>(work: impl FnOnce() -> R) -> R {
+    pulp::Arch::new().dispatch(work)
+}
+
+/// Sum of products of two equally long slices, in 16 interleaved partial sums (a fixed order on every machine).
+#[inline(always)]
+pub fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0.0f32; 16];
+    let (a16, b16) = (a.chunks_exact(16), b.chunks_exact(16));
+    let mut tail = 0.0;
+    for (x, y) in a16.remainder().iter().zip(b16.remainder()) {
+        tail += x * y;
+    }
+    for (x, y) in a16.zip(b16) {
+        for l in 0..16 {
+            lanes[l] += x[l] * y[l];
+        }
+    }
+    lanes.iter().sum::<f32>() + tail
+}

@@ -1,0 +1,76 @@
+//! Symmetric 3 x 3 algebra. A symmetric matrix is `[xx, yy, zz, xy, xz, yz]`.
+
+/// A symmetric 3 x 3 matrix as `[xx, yy, zz, xy, xz, yz]`.
+pub type Symmetric3 = [f64; 6];
+
+/// Determinant.
+#[inline(always)]
+pub fn determinant(m: &Symmetric3) -> f64 {
+    let [a, b, c, d, e, f] = *m;
+    a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+}
+
+/// Adjugate (the inverse times the determinant).
+#[inline(always)]
+pub fn adjugate(m: &Symmetric3) -> Symmetric3 {
+    let [a, b, c, d, e, f] = *m;
+    [b * c - f * f, a * c - e * e, a * b - d * d, e * f - d * c, d * f - b * e, d * e - a * f]
+}
+
+/// Inverse; none when the determinant is not positive beyond rounding (so: positive definite only).
+#[inline(always)]
+pub fn inverse(m: &Symmetric3) -> Option<Symmetric3> {
+    let det = determinant(m);
+    let scale = (m[0].abs() + m[1].abs() + m[2].abs()).powi(3);
+    (det > 1e-14 * scale && det.is_finite()).then(|| adjugate(m).map(|v| v / det))
+}
+
+/// Matrix times vector.
+#[inline(always)]
+pub fn multiply(m: &Symmetric3, v: [f64; 3]) -> [f64; 3] {
+    [
+        m[0] * v[0] + m[3] * v[1] + m[4] * v[2],
+        m[3] * v[0] + m[1] * v[1] + m[5] * v[2],
+        m[4] * v[0] + m[5] * v[1] + m[2] * v[2],
+    ]
+}
+
+/// `v . m v`.
+#[inline(always)]
+pub fn quadratic(m: &Symmetric3, v: [f64; 3]) -> f64 {
+    let w = multiply(m, v);
+    v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+}
+
+/// Solves a dense symmetric positive definite system in place by Cholesky; none when it is not.
+pub fn cholesky_solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
+    for i in 0..N {
+        for j in 0..=i {
+            let mut s = a[i][j];
+            for k in 0..j {
+                s -= a[i][k] * a[j][k];
+            }
+            if i == j {
+                if s.is_nan() || s <= 1e-12 * a[i][i].abs() || s <= 0.0 {
+                    return None;
+                }
+                a[i][i] = s.sqrt();
+            } else {
+                a[i][j] = s / a[j][j];
+            }
+        }
+    }
+    for i in 0..N {
+        for k in 0..i {
+            b[i] -= a[i][k] * b[k];
+        }
+        b[i] /= a[i][i];
+    }
+    for i in (0..N).rev() {
+        for k in i + 1..N {
+            b[i] -= a[k][i] * b[k];
+        }
+        b[i] /= a[i][i];
+    }
+    Some(b)
+}
