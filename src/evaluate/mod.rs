@@ -83,8 +83,7 @@ struct VoxelError {
 
 impl VoxelError {
     fn new(field: &DenseField, truth: &DenseField, at: usize) -> Self {
-        let [nx, ny, _] = truth.grid().shape();
-        let voxel = [at % nx, at / nx % ny, at / (nx * ny)];
+        let voxel = truth.grid().voxel(at);
         let (u, t) = (field.at(at).map(f64::from), truth.at(at).map(f64::from));
         let (gu, gt) = (displacement_gradient(field, voxel), displacement_gradient(truth, voxel));
         let difference = gu.as_flattened().iter().zip(gt.as_flattened()).map(|(a, b)| (a - b).powi(2));

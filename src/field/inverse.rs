@@ -26,13 +26,12 @@ pub struct Inverse {
 pub fn invert(field: &DenseField, grid: Option<&Grid>) -> Inverse {
     let target = *grid.unwrap_or(field.grid());
     let inverse = DenseField::from_voxels(target, |_, y| solve(field, y));
-    let [nx, ny, nz] = target.shape();
-    let (max_residual_mm, outside) = (0..ny * nz)
+    let (max_residual_mm, outside) = (0..target.len())
         .into_par_iter()
-        .flat_map_iter(|row| (0..nx).map(move |i| (i, row)))
-        .map(|(i, row)| {
-            let y = target.world(i, row % ny, row / ny);
-            let x = y.moved(inverse.at(row * nx + i).map(f64::from));
+        .map(|at| {
+            let [i, j, k] = target.voxel(at);
+            let y = target.world(i, j, k);
+            let x = y.moved(inverse.at(at).map(f64::from));
             match inside(field.grid().shape(), field.grid().affine().to_voxel(x)) {
                 true => (length(residual(field, x, y)), 0),
                 false => (0.0, 1),

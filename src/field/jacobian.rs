@@ -7,19 +7,13 @@ use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::types::space::determinant;
 use crate::types::{DenseField, Mask, Volume};
-use rayon::prelude::*;
 
 /// The Jacobian determinant of x + u(x) with respect to world mm (1): 1 = volume kept, at or below 0 = folded.
 pub fn jacobian_determinant(field: &DenseField) -> Volume {
-    let [nx, ny, _] = field.grid().shape();
-    let mut out = Volume::filled(*field.grid(), 1.0);
-    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, line)| {
-        for (i, v) in line.iter_mut().enumerate() {
-            let g = displacement_gradient(field, [i, row % ny, row / ny]);
-            *v = determinant(&deformation_gradient(g)) as f32;
-        }
-    });
-    out
+    let grid = *field.grid();
+    Volume::from_voxels(grid, |at, _| {
+        determinant(&deformation_gradient(displacement_gradient(field, grid.voxel(at)))) as f32
+    })
 }
 
 /// How many voxels have a determinant at or below zero, within `mask` (everywhere when `None`).

@@ -6,7 +6,6 @@
 
 use crate::numerics::sampling::{Interpolation, Sampler, displacement, inside, nearest};
 use crate::types::{DenseField, Grid, Volume, WorldPoint};
-use rayon::prelude::*;
 
 /// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background` outside the image.
 pub fn warp_image(
@@ -22,7 +21,7 @@ pub fn warp_image(
 }
 
 /// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not there.
-pub fn warp_labels<T: Copy + Send + Sync>(
+pub fn warp_labels<T: Copy + Default + Send + Sync>(
     labels: &Volume<T>,
     field: &DenseField,
     reference: Option<&Grid>,
@@ -45,22 +44,16 @@ fn warp_point(p: WorldPoint, field: &DenseField) -> Option<WorldPoint> {
 }
 
 /// `value` at x + u(x) for each x of the output grid.
-fn warp_with<T: Copy + Send + Sync>(
+fn warp_with<T: Copy + Default + Send + Sync>(
     field: &DenseField,
     reference: Option<&Grid>,
     background: T,
     value: impl Fn(WorldPoint) -> T + Sync,
 ) -> Volume<T> {
-    let own = reference.is_none_or(|r| r == field.grid());
     let grid = *reference.unwrap_or(field.grid());
-    let [nx, ny, _] = grid.shape();
-    let mut out = Volume::filled(grid, background);
-    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, line)| {
-        for (i, v) in line.iter_mut().enumerate() {
-            let x = grid.world(i, row % ny, row / ny);
-            let target = if own { Some(x.moved(field.at(row * nx + i).map(f64::from))) } else { warp_point(x, field) };
-            *v = target.map_or(background, &value);
-        }
-    });
-    out
+    let own = grid == *field.grid();
+    Volume::from_voxels(grid, |at, x| {
+        let target = if own { Some(x.moved(field.at(at).map(f64::from))) } else { warp_point(x, field) };
+        target.map_or(background, &value)
+    })
 }

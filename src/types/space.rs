@@ -190,6 +190,13 @@ impl Grid {
         i + self.shape[0] * (j + self.shape[1] * k)
     }
 
+    /// The voxel `[i, j, k]` at an x-fastest offset.
+    #[inline]
+    pub fn voxel(&self, index: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.shape;
+        [index % nx, index / nx % ny, index / (nx * ny)]
+    }
+
     /// World position of a voxel's centre (mm).
     pub fn world(&self, i: usize, j: usize, k: usize) -> WorldPoint {
         self.affine.to_world(VoxelPoint([i as f64, j as f64, k as f64]))
