@@ -8,6 +8,10 @@ pub mod simd;
 
 pub mod filters;
 
+pub mod differences;
+
+pub mod sampling;
+
 pub mod pyramid;
 
 pub mod small;

@@ -1,4 +1,4 @@
-//! Robust statistics.
+//! Order statistics and robust spread.
 
 /// The value at fraction `q` (0 to 1) of the sorted order (nearest rank); NaN for no values. Reorders its input.
 pub fn quantile(values: &mut [f32], q: f64) -> f32 {
@@ -12,6 +12,22 @@ pub fn quantile(values: &mut [f32], q: f64) -> f32 {
 /// Median; NaN for no values. Reorders its input.
 pub fn median(values: &mut [f32]) -> f32 {
     quantile(values, 0.5)
+}
+
+/// The `q`-th percentile (0 to 100) with linear interpolation between order statistics, as numpy does by default.
+///
+/// Reorders `values`; NaN sorts last. An empty slice gives NaN.
+pub fn percentile(values: &mut [f64], q: f64) -> f64 {
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let rank = (q / 100.0).clamp(0.0, 1.0) * (values.len() - 1) as f64;
+    let (low, t) = (rank.floor() as usize, rank.fract());
+    let (_, &mut a, above) = values.select_nth_unstable_by(low, f64::total_cmp);
+    match above.iter().copied().min_by(f64::total_cmp) {
+        Some(b) if t > 0.0 => a + t * (b - a),
+        _ => a,
+    }
 }
 
 /// Standard deviation of white noise in a volume, from second differences along each row (voxels).
