@@ -1,4 +1,5 @@
-//! NIfTI files, byte by byte: each is built here, so that what must come out is known exactly.
+//! NIfTI files, byte by byte: each is built here, so that what must come out is known exactly (one file, as all tests
+//! share the header builder).
 #![allow(clippy::unwrap_used)]
 
 use palpate::io::{
