@@ -5,6 +5,7 @@ use crate::synth::noise::SmoothNoise;
 use crate::synth::random::Random;
 use crate::types::space::Matrix3;
 use crate::types::{Grid, WorldPoint};
+use rayon::prelude::*;
 
 /// The shape of a displacement, before [`Motion`] centres and scales it.
 #[derive(Debug, Clone)]
@@ -122,11 +123,12 @@ impl Motion {
 
     /// Takes the mean over `tissue` off (a smooth law only) and makes `amplitude` mm the largest displacement there.
     pub fn scaled(mut self, amplitude: f64, tissue: &[WorldPoint]) -> Self {
+        let raw: Vec<[f64; 3]> = tissue.par_iter().map(|p| self.planar(p.0)).collect();
         if matches!(self.law, Law::Smooth { .. }) {
-            let sums = tissue.iter().map(|p| self.planar(p.0)).fold([0.0; 3], |s, u| add(s, u, 1.0));
+            let sums = raw.iter().fold([0.0; 3], |s, &u| add(s, u, 1.0));
             self.offset = sums.map(|s| s / tissue.len().max(1) as f64);
         }
-        let largest = tissue.iter().map(|&p| length(self.at(p))).fold(0.0, f64::max);
+        let largest = raw.iter().map(|&u| length(add(u, self.offset, -1.0))).fold(0.0, f64::max);
         self.scale *= if largest > 0.0 { amplitude / largest } else { 0.0 };
         self
     }
@@ -135,6 +137,19 @@ impl Motion {
     pub fn at(&self, p: WorldPoint) -> [f64; 3] {
         let u = self.planar(p.0);
         std::array::from_fn(|a| (u[a] - self.offset[a]) * self.scale)
+    }
+
+    /// The x with x + u(x) = y, by fixed point to 1e-9 mm; for motions whose gradient stays under 1, as a press has.
+    pub fn origin_of(&self, y: WorldPoint) -> WorldPoint {
+        let mut x = y;
+        for _ in 0..200 {
+            let r = y.minus(x.moved(self.at(x)));
+            x = x.moved(r);
+            if length(r) < 1e-9 {
+                break;
+            }
+        }
+        x
     }
 
     /// Whether neighbouring places may part (a jump, so that difference quotients are not the Jacobian).

@@ -43,10 +43,15 @@ impl<const N: usize> SmoothNoise<N> {
         for (&k, wz) in index[2].iter().zip(weights[2]) {
             for (&j, wy) in index[1].iter().zip(weights[1]) {
                 let row = &self.coefficients[SIDE * (j + SIDE * k)..][..SIDE];
+                let mut line = [0.0; N];
                 for (&i, wx) in index[0].iter().zip(weights[0]) {
-                    for (s, c) in sum.iter_mut().zip(row[i]) {
-                        *s += wz * wy * wx * f64::from(c);
+                    for (s, c) in line.iter_mut().zip(row[i]) {
+                        *s += wx * f64::from(c);
                     }
+                }
+                let weight = wz * wy;
+                for (s, l) in sum.iter_mut().zip(line) {
+                    *s += weight * l;
                 }
             }
         }
