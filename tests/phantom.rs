@@ -5,12 +5,10 @@ use palpate::field::jacobian::jacobian_determinant;
 use palpate::field::warp::warp_image;
 use palpate::numerics::sampling::{Interpolation, displacement};
 use palpate::synth::{MIN_JACOBIAN, MotionKind, Phantom, PhantomKind, PhantomParams, phantom, phantom_on};
-use palpate::types::{Affine, Grid, WorldPoint};
+use palpate::types::{Affine, DenseField, Grid};
 
 fn small(kind: PhantomKind) -> PhantomParams {
-    let mut params = PhantomParams::new(kind).sized(if kind == PhantomKind::Slice { 96 } else { 40 });
-    params.amplitude = params.amplitude.min(4.0);
-    params
+    PhantomParams::new(kind).sized(if kind == PhantomKind::Slice { 96 } else { 40 })
 }
 
 fn clean(mut params: PhantomParams) -> Phantom {
@@ -18,28 +16,29 @@ fn clean(mut params: PhantomParams) -> Phantom {
     phantom(&params).unwrap()
 }
 
-/// Over the mask: root-mean-square difference of deformed(x + u) and initial(x), as a share of that of deformed(x).
-fn unexplained(p: &Phantom, skip: impl Fn(WorldPoint) -> bool) -> f64 {
-    let warped = warp_image(&p.deformed, &p.truth, None, Interpolation::Cubic, 0.0);
-    let grid = p.initial.grid();
-    let (mut left, mut before) = (0.0, 0.0);
-    for at in (0..grid.len()).filter(|&at| p.mask.as_slice()[at] != 0) {
-        let [i, j, k] = grid.voxel(at);
-        if skip(grid.world(i, j, k)) {
-            continue;
-        }
-        left += f64::from(warped.as_slice()[at] - p.initial.as_slice()[at]).powi(2);
-        before += f64::from(p.deformed.as_slice()[at] - p.initial.as_slice()[at]).powi(2);
-    }
-    (left / before).sqrt()
+/// Over the mask: root-mean-square difference of deformed(x + f u) and initial(x), as a share of that for f = 0.
+fn unexplained(p: &Phantom, factor: f32) -> f64 {
+    let difference = |factor: f32| {
+        let scaled = p.truth.as_slice().iter().map(|u| factor * u).collect();
+        let field = DenseField::from_vec(*p.truth.grid(), scaled).unwrap();
+        let warped = warp_image(&p.deformed, &field, None, Interpolation::Cubic, 0.0);
+        let pairs = warped.as_slice().iter().zip(p.initial.as_slice()).zip(p.mask.as_slice());
+        pairs.filter(|v| *v.1 != 0).map(|((w, i), _)| f64::from(w - i).powi(2)).sum::<f64>().sqrt()
+    };
+    difference(factor) / difference(0.0)
+}
+
+/// What is left is the interpolation of thin layers; a motion a tenth too small or too large leaves more.
+fn assert_explains(p: &Phantom, name: &str) {
+    let shares = [0.9, 1.0, 1.1].map(|factor| unexplained(p, factor));
+    assert!(shares[1] < 0.15 && shares[1] < 0.8 * shares[0].min(shares[2]), "{name}: {shares:.3?}");
 }
 
 #[test]
 fn the_truth_explains_every_kind_to_interpolation_error() {
     for (name, kind) in PhantomKind::KNOWN {
         let p = clean(small(kind));
-        let share = unexplained(&p, |_| false);
-        assert!(share < 0.12, "{name}: {share:.3} of the difference is left");
+        assert_explains(&p, name);
         assert!(p.description.mask_voxels > p.initial.grid().len() / 5, "{name}: {}", p.description.mask_voxels);
     }
 }
@@ -47,12 +46,10 @@ fn the_truth_explains_every_kind_to_interpolation_error() {
 #[test]
 fn the_truth_explains_every_motion() {
     for (name, motion) in MotionKind::KNOWN {
-        let params = PhantomParams { motion, ..small(PhantomKind::Block) };
-        let p = clean(params);
+        let p = clean(PhantomParams { motion, ..small(PhantomKind::Block) });
         match motion {
             MotionKind::None => assert_eq!(p.initial, p.deformed),
-            // Where the tissue parts, interpolation of the deformed volume reads across the plane.
-            _ => assert!(unexplained(&p, |_| false) < 0.12, "{name}: {}", unexplained(&p, |_| false)),
+            _ => assert_explains(&p, name),
         }
         let jacobian = jacobian_determinant(&p.truth);
         if motion != MotionKind::Slide {
@@ -174,15 +171,21 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
 
 #[test]
 fn landmarks_agree_with_the_truth_between_voxels_and_lie_in_the_mask() {
-    for kind in [PhantomKind::Calf, PhantomKind::Slice, PhantomKind::Head] {
-        let p = phantom(&small(kind)).unwrap();
-        assert!(p.landmarks.len() >= 20, "{kind:?}: {}", p.landmarks.len());
-        let g = p.mask.grid();
-        for l in &p.landmarks {
-            let v = g.affine().to_voxel(l.initial).0.map(|c| c.round() as usize);
-            assert_eq!(p.mask.as_slice()[g.index(v[0], v[1], v[2])], 1);
-            let error = l.initial.moved(displacement(&p.truth, l.initial)).minus(l.deformed);
-            assert!(error.iter().all(|e| e.abs() < 0.3), "{kind:?}: {error:?}");
+    // Trilinear interpolation of a rotation is exact; of a smooth motion on voxels of 12 mm it is not.
+    for (motion, tolerance) in [(MotionKind::Rotate, 1e-4), (MotionKind::Smooth, 0.15)] {
+        for kind in [PhantomKind::Calf, PhantomKind::Slice, PhantomKind::Head] {
+            let p = phantom(&PhantomParams { motion, ..small(kind) }).unwrap();
+            assert!(p.landmarks.len() >= 20, "{kind:?}: {}", p.landmarks.len());
+            let g = p.mask.grid();
+            let mut sum = 0.0;
+            for l in &p.landmarks {
+                let v = g.affine().to_voxel(l.initial).0.map(|c| c.round() as usize);
+                assert_eq!(p.mask.as_slice()[g.index(v[0], v[1], v[2])], 1);
+                let error = l.initial.moved(displacement(&p.truth, l.initial)).minus(l.deformed);
+                sum += error.iter().map(|e| e * e).sum::<f64>().sqrt();
+            }
+            let mean = sum / p.landmarks.len() as f64;
+            assert!(mean < tolerance, "{kind:?} {motion:?}: {mean} mm");
         }
     }
 }

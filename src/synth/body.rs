@@ -5,7 +5,7 @@
 //! coarse smooth displacement, so that nothing is symmetric. Texture cells are at least two voxels along each axis:
 //! the function can be sampled and interpolated without much aliasing.
 
-use crate::synth::noise::SmoothNoise;
+use crate::synth::noise::{COARSE, FINE, SmoothNoise};
 use crate::synth::random::Random;
 use crate::types::space::Matrix3;
 use crate::types::{Grid, WorldPoint};
@@ -48,7 +48,7 @@ pub struct Body {
     edge: f64,
     edge_in_plane: f64,
     texture: [SmoothNoise<1>; 3],
-    bend: SmoothNoise<3>,
+    bend: SmoothNoise<4>,
     bend_mm: f64,
     taper: f64,
 }
@@ -71,7 +71,7 @@ impl Body {
         let linear = grid.affine().linear();
         let cell: [f64; 3] = std::array::from_fn(|a| 2.0 * linear[a].iter().map(|v| v * v).sum::<f64>().sqrt());
         let extent = extent(grid);
-        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0));
+        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0), FINE);
         let longest = |axes: usize| {
             let squares = |a: usize| (0..axes).map(|w| linear[w][a] * linear[w][a]).sum::<f64>();
             (0..3).map(squares).fold(0.0, f64::max).sqrt()
@@ -84,7 +84,7 @@ impl Body {
             centre: shifted,
             edges: std::array::from_fn(|a| std::array::from_fn(|w| linear[w][a])),
             texture: std::array::from_fn(noise),
-            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3]),
+            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3], COARSE),
             bend_mm,
             taper,
         }
@@ -117,7 +117,7 @@ impl Body {
 
     /// World position to the body's frame: turned, bent, with the taper undone.
     fn own_frame(&self, p: WorldPoint) -> [f64; 3] {
-        let bend = self.bend.at(p.0);
+        let bend = self.bend.vector(p.0);
         let d: [f64; 3] = std::array::from_fn(|a| p.0[a] - self.centre[a] + self.bend_mm * bend[a]);
         let q: [f64; 3] = std::array::from_fn(|r| (0..3).map(|c| self.rotation[r][c] * d[c]).sum());
         let scale = (1.0 + self.taper * q[2]).max(0.2);
