@@ -1,1 +1,3 @@
-//! consistency.
+//! Which matches agree with each other.
+
+pub mod coupling;

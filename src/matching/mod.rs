@@ -10,6 +10,8 @@
 
 pub mod pair;
 
+pub mod levels;
+
 pub mod correlation;
 
 pub mod candidates;

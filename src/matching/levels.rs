@@ -1,0 +1,186 @@
+//! The coarse-to-fine pyramid: both volumes on one lattice at several voxel sizes.
+
+use crate::error::{FieldError, SpaceError};
+use crate::matching::pair::Pair;
+use crate::numerics::sampling::{Interpolation, Sampler};
+use crate::numerics::statistics::quantile;
+use crate::numerics::{filters, pyramid};
+use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint};
+use rayon::prelude::*;
+
+/// Both volumes at full resolution on lattices with the same axes and voxel size.
+#[derive(Debug, Clone)]
+pub struct Aligned {
+    shape: [usize; 3],
+    spacing: [f64; 3],
+    fixed: Vec<f32>,
+    mask: Vec<u8>,
+    moving_shape: [usize; 3],
+    moving_origin: [f64; 3],
+    moving: Vec<f32>,
+}
+
+impl Aligned {
+    /// Puts the deformed volume on the initial volume's axes. Where its axes and voxel size are the same already
+    /// (whatever its origin and shape) its values are taken as they are, else it is resampled once (cubic) over its
+    /// own extent, cut to the initial volume's box widened by `reach_mm`.
+    ///
+    /// # Errors
+    /// [`FieldError::NoOverlap`] when the two boxes, widened by `reach_mm`, do not meet.
+    pub fn new(initial: &Volume, deformed: &Volume, mask: &Mask, reach_mm: f64) -> Result<Self, FieldError> {
+        let (g, m) = (initial.grid(), deformed.grid());
+        let spacing = g.spacing();
+        let corners = corners(m).map(|c| g.affine().to_voxel(m.affine().to_world(c)).0);
+        let (mut lo, mut hi) = ([0.0; 3], [0.0; 3]);
+        for a in 0..3 {
+            let reach = if g.shape()[a] == 1 { 0.5 } else { reach_mm / spacing[a] };
+            lo[a] = corners.iter().map(|c| c[a]).fold(f64::INFINITY, f64::min).max(-reach);
+            hi[a] =
+                corners.iter().map(|c| c[a]).fold(f64::NEG_INFINITY, f64::max).min((g.shape()[a] - 1) as f64 + reach);
+        }
+        if (0..3).any(|a| lo[a] > hi[a]) {
+            let hint = "check the affines (sform, qform) of both files, or align their origins first".into();
+            return Err(FieldError::NoOverlap { hint });
+        }
+        let same_axes = (0..3)
+            .all(|r| (0..3).all(|c| (g.affine().linear()[r][c] - m.affine().linear()[r][c]).abs() < 1e-4 * spacing[c]));
+        let base = Self {
+            shape: g.shape(),
+            spacing,
+            fixed: initial.as_slice().to_vec(),
+            mask: mask.as_slice().to_vec(),
+            moving_shape: m.shape(),
+            moving_origin: g.affine().to_voxel(m.affine().origin()).0,
+            moving: Vec::new(),
+        };
+        if same_axes {
+            return Ok(Self { moving: deformed.as_slice().to_vec(), ..base });
+        }
+        let origin = lo.map(f64::floor);
+        let shape = std::array::from_fn(|a| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1);
+        let moving = resample(deformed, g, origin, shape)?;
+        Ok(Self { moving_shape: shape, moving_origin: origin, moving, ..base })
+    }
+
+    /// The pair with blocks of `factor` voxels averaged.
+    pub fn level(&self, factor: [usize; 3]) -> Pair {
+        let shape = pyramid::reduced_shape(self.shape, factor);
+        let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
+        let mask = if factor == [1; 3] {
+            self.mask.clone()
+        } else {
+            let inside: Vec<f32> = self.mask.iter().map(|&m| f32::from(m != 0)).collect();
+            pyramid::reduce(&inside, self.shape, factor).iter().map(|&v| u8::from(v >= 0.5)).collect()
+        };
+        Pair {
+            shape,
+            spacing: std::array::from_fn(|a| self.spacing[a] * factor[a] as f64),
+            fixed_smooth: filters::bspline(&fixed, shape),
+            fixed,
+            mask,
+            moving_shape: pyramid::reduced_shape(self.moving_shape, factor),
+            moving_origin: std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64),
+            moving: pyramid::reduce(&self.moving, self.moving_shape, factor),
+        }
+    }
+}
+
+/// Position on a level of `factor` of a full-resolution voxel position.
+#[inline(always)]
+pub fn to_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
+    std::array::from_fn(|a| (p[a] + 0.5) / factor[a] as f64 - 0.5)
+}
+
+/// Full-resolution voxel position of a position on a level of `factor`.
+#[inline(always)]
+pub fn from_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
+    std::array::from_fn(|a| (p[a] + 0.5) * factor[a] as f64 - 0.5)
+}
+
+/// Reduction factors from coarse to fine. The finest is `finest` times the smallest voxel edge, each coarser one about
+/// twice as coarse, up to voxels of about `coarsest_mm`; a coarse axis (thick slices) is left alone until the others
+/// have caught up, and no axis is reduced below 12 voxels.
+pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm: f64) -> Vec<[usize; 3]> {
+    let smallest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let mut out: Vec<[usize; 3]> = Vec::new();
+    let mut scale = finest.max(1) as f64;
+    loop {
+        let target = smallest * scale;
+        let f = std::array::from_fn(|a| {
+            let most = (shape[a] / 12).max(1);
+            ((target / spacing[a]).round() as usize).clamp(1, most)
+        });
+        if out.last() != Some(&f) {
+            out.push(f);
+        }
+        if target * 1.5 > coarsest_mm || scale > 64.0 {
+            break;
+        }
+        scale *= 2.0;
+    }
+    out.reverse();
+    out
+}
+
+/// A mask of tissue where none is given: brighter than a tenth of the way from the dark to the bright end (2nd and
+/// 98th percentile) after smoothing; everything when that leaves less than 2 % of the volume.
+pub fn foreground(volume: &Volume) -> Mask {
+    let shape = volume.grid().shape();
+    let smooth = filters::gaussian(volume.as_slice(), shape, [1.0; 3]);
+    let stride = (smooth.len() / 400_000).max(1);
+    let mut sample: Vec<f32> = smooth.iter().copied().step_by(stride).collect();
+    let (lo, hi) = (quantile(&mut sample, 0.02), quantile(&mut sample, 0.98));
+    let threshold = lo + 0.1 * (hi - lo);
+    let mut inside: Vec<u8> = smooth.iter().map(|&v| u8::from(v > threshold)).collect();
+    if inside.iter().filter(|&&m| m != 0).count() * 50 < inside.len() {
+        inside.fill(1);
+    }
+    let mut out = Mask::filled(*volume.grid(), 0);
+    out.as_mut_slice().copy_from_slice(&crate::matching::pair::dilate(&inside, shape, 1));
+    out
+}
+
+fn corners(g: &Grid) -> [VoxelPoint; 8] {
+    let s = g.shape();
+    std::array::from_fn(|c| VoxelPoint(std::array::from_fn(|a| if c >> a & 1 == 1 { (s[a] - 1) as f64 } else { 0.0 })))
+}
+
+/// `volume` on a lattice with `grid`'s axes that starts at `origin` (voxels of `grid`); smoothed first along its axes
+/// where its voxels are finer, so that nothing aliases. Outside it the edge value continues.
+fn resample(volume: &Volume, grid: &Grid, origin: [f64; 3], shape: [usize; 3]) -> Result<Vec<f32>, FieldError> {
+    let affine = {
+        let mut rows = grid.affine().rows();
+        let start = grid.affine().to_world(VoxelPoint(origin)).0;
+        for r in 0..3 {
+            rows[r][3] = start[r];
+        }
+        Affine::new(rows)?
+    };
+    let target = Grid::new(shape, affine).map_err(|_| SpaceError::TooLarge { shape })?;
+    // Voxel edges of the target seen along each axis of the source.
+    let (fine, coarse) = (volume.grid().spacing(), grid.affine().linear());
+    let sigma = std::array::from_fn(|a| {
+        let axis: [f64; 3] = std::array::from_fn(|r| volume.grid().affine().linear()[r][a] / fine[a]);
+        let seen = (0..3).map(|c| (0..3).map(|r| coarse[r][c] * axis[r]).sum::<f64>().powi(2)).sum::<f64>().sqrt();
+        0.425 * ((seen / fine[a]).powi(2) - 1.0).max(0.0).sqrt()
+    });
+    let smooth = if sigma.iter().all(|&s| s < 0.2) {
+        volume.clone()
+    } else {
+        Volume::from_vec(*volume.grid(), filters::gaussian(volume.as_slice(), volume.grid().shape(), sigma))?
+    };
+    let sampler = Sampler::new(&smooth, Interpolation::Cubic, 0.0);
+    let limit: [f64; 3] = volume.grid().shape().map(|n| (n - 1) as f64);
+    let mut out = vec![0.0f32; target.len()];
+    out.par_chunks_mut(shape[0] * shape[1]).enumerate().for_each(|(k, plane)| {
+        for (at, o) in plane.iter_mut().enumerate() {
+            let p = volume.grid().affine().to_voxel(target.world(at % shape[0], at / shape[0], k)).0;
+            *o = if (0..3).all(|a| p[a] >= -0.5 && p[a] <= limit[a] + 0.5) {
+                sampler.at(VoxelPoint(std::array::from_fn(|a| p[a].clamp(0.0, limit[a]))))
+            } else {
+                f32::NAN
+            };
+        }
+    });
+    Ok(out)
+}
