@@ -2,7 +2,10 @@
 //! energy of a spline lattice holds the places together.
 
 use crate::numerics::bending::{Smoothness, SolveReport, apply_blocks, solve};
+use crate::numerics::bspline::Lattice;
 use crate::numerics::random::Random;
+use crate::numerics::small::{Symmetric3, multiply, quadratic};
+use rayon::prelude::*;
 
 /// One Gauss-Newton step: adds to `coefficients` the `d` that minimises
 /// `1/2 d.A d - b.d + lambda/2 (c + d).L (c + d)`.
@@ -52,4 +55,74 @@ pub fn determined(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], see
         trace += lx.iter().zip(z).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
     }
     3.0 * n as f64 - f64::from(lambda) * trace
+}
+
+/// A measured displacement with its information, at a place of the lattice's grid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Evidence {
+    /// Where (voxels of the lattice's grid).
+    pub at: [f64; 3],
+    /// Displacement (mm).
+    pub displacement: [f64; 3],
+    /// Information, the inverse covariance (1/mm^2).
+    pub information: Symmetric3,
+}
+
+/// The smooth field nearest to scattered evidence, robustly.
+///
+/// Minimises `sum_i rho(e_i . A_i e_i) + lambda c . L c` with `e_i = u(x_i) - d_i` by reweighted conjugate gradients:
+/// every place pulls only along the directions that its patch determines, so a match that slid along an edge does no
+/// harm (aperture). `rho` is Geman & McClure's, its scale falling from `start` to 3 standard deviations.
+/// `lambda` (per mm^3 of lattice cell) is set in each round from the evidence as in [`determined`].
+pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], rounds: usize) -> (Vec<f32>, f32) {
+    let n = lattice.len();
+    let mut c = vec![0.0f32; 3 * n];
+    // A first guess of lambda: second derivatives of 0.01 / mm.
+    let mut lambda = 1e4f32;
+    let mut scale = 400.0;
+    for round in 0..rounds {
+        let mut blocks = vec![[0.0f32; 6]; n];
+        let mut rhs = vec![0.0f32; 3 * n];
+        let weights: Vec<f64> = evidence
+            .par_iter()
+            .map(|e| {
+                let u = lattice.at(&c, e.at);
+                let q = quadratic(&e.information, std::array::from_fn(|a| u[a] - e.displacement[a]));
+                if round == 0 { 1.0 } else { (scale / (scale + q)).powi(2) }
+            })
+            .collect();
+        for (e, w) in evidence.iter().zip(&weights) {
+            let pull = multiply(&e.information, e.displacement).map(|v| (w * v) as f32);
+            let info = e.information.map(|v| (w * v) as f32);
+            lattice.for_each_tap(e.at, |node, b| {
+                for q in 0..6 {
+                    blocks[node][q] += b * info[q];
+                }
+                for a in 0..3 {
+                    rhs[a * n + node] += b * pull[a];
+                }
+            });
+        }
+        let operator = |x: &[f32], out: &mut [f32]| {
+            out.fill(0.0);
+            let pulls: Vec<[f64; 3]> = evidence
+                .par_iter()
+                .zip(&weights)
+                .map(|(e, w)| multiply(&e.information, lattice.at(x, e.at)).map(|v| w * v))
+                .collect();
+            for (e, p) in evidence.iter().zip(&pulls) {
+                lattice.for_each_tap(e.at, |node, b| {
+                    for a in 0..3 {
+                        out[a * n + node] += b * p[a] as f32;
+                    }
+                });
+            }
+        };
+        solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, 1e-3, 80);
+        let gamma = determined(smoothness, lambda, &blocks, round as u64, 60);
+        let energy = smoothness.energy(&c).max(1e-9);
+        lambda = ((0.5 * gamma / energy) as f32).clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
+        scale = (scale * 0.5f64).max(9.0);
+    }
+    (c, lambda)
 }

@@ -23,3 +23,5 @@ pub mod bending;
 pub mod statistics;
 
 pub mod random;
+
+pub mod neighbours;

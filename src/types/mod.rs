@@ -26,7 +26,7 @@ pub use field::DenseField;
 pub use mesh::{TetMesh, TriMesh};
 pub use metrics::Metrics;
 pub use params::FieldParams;
-pub use points::{FeaturePoint, Landmark, Match, SparseField};
+pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
 pub use result::{Counts, FieldResult, FieldSummary, LevelReport, Mesh, MotionModel};
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use volume::{Mask, Volume};

@@ -13,6 +13,15 @@ pub struct FeaturePoint {
     pub response: f32,
 }
 
+/// One of several places where the tissue of an initial feature may have gone.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Candidate {
+    /// Displacement (mm along the initial grid's axes).
+    pub displacement: [f64; 3],
+    /// Normalised cross-correlation of the two patches, -1 to 1.
+    pub ncc: f32,
+}
+
 /// One correspondence: the tissue at `initial` is found at `initial + displacement` in the deformed volume.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Match {
