@@ -1,1 +1,43 @@
-//! io.
+//! Files in and out: the only stage that opens one.
+//!
+//! Promises: every error names the file, what is wrong and what to try; no header can make it allocate more than the
+//! file could hold; nothing half-written ever stands under a final name (each file is written under a temporary name
+//! in the same folder, then renamed; [`OutputFolder`] does the same for a whole folder). Nothing here prints.
+
+pub mod nifti;
+
+pub mod csv;
+
+pub mod vtu;
+
+pub mod text;
+
+pub mod output;
+
+mod atomic;
+
+mod deflate;
+
+mod gzip;
+
+pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
+pub use nifti::{
+    count_non_finite, read_field, read_labels, read_mask, read_volume, write_field, write_integers, write_labels,
+    write_volume,
+};
+pub use output::OutputFolder;
+pub use text::{write_bytes, write_json, write_text};
+pub use vtu::{write_tet_mesh, write_tri_mesh};
+
+use crate::error::IoError;
+use std::path::Path;
+
+/// For `map_err`: what the operating system refused to do to `path`.
+fn os(path: &Path, action: &'static str) -> impl FnOnce(std::io::Error) -> IoError {
+    move |source| IoError::Os { path: path.into(), action, source }
+}
+
+/// What is wrong with a file's content, and what to try.
+fn format(path: &Path, what: impl Into<String>, hint: impl Into<String>) -> IoError {
+    IoError::Format { path: path.into(), what: what.into(), hint: hint.into() }
+}

@@ -1,0 +1,179 @@
+//! Tables of matches, landmarks and points: comma-separated, one header line, world mm RAS.
+//!
+//! Columns are found by name, in any order and case. Every error names the file and the line.
+
+use super::atomic::write_atomic;
+use super::{format, os};
+use crate::error::IoError;
+use crate::types::{Landmark, Match, SparseField, WorldPoint};
+use csv::{ReaderBuilder, StringRecord, Trim, Writer};
+use std::fs::File;
+use std::path::Path;
+
+const MATCH_COLUMNS: [&str; 9] = ["x", "y", "z", "dx", "dy", "dz", "ncc", "sigma", "kept"];
+const LANDMARK_COLUMNS: [&str; 6] = ["fx", "fy", "fz", "mx", "my", "mz"];
+const POINT_COLUMNS: [&str; 3] = ["x", "y", "z"];
+
+/// Points with the table's other columns, which are carried along as text.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PointTable {
+    /// World mm, RAS.
+    pub points: Vec<WorldPoint>,
+    /// Names of the columns other than x, y, z.
+    pub other_columns: Vec<String>,
+    /// Their text, a row for each point.
+    pub others: Vec<Vec<String>>,
+}
+
+/// Writes x,y,z,dx,dy,dz (mm), ncc, sigma (mm) and kept (1 or 0), all matches in order, with six decimals.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_matches(path: impl AsRef<Path>, field: &SparseField) -> Result<(), IoError> {
+    let rows = field.matches.iter().map(|m| {
+        let numbers = [&m.initial.0[..], &m.displacement, &[f64::from(m.ncc), m.sigma()]].concat();
+        let mut row: Vec<String> = numbers.into_iter().map(decimal).collect();
+        row.push(u8::from(m.kept).to_string());
+        row
+    });
+    write_table(path.as_ref(), &MATCH_COLUMNS, rows)
+}
+
+/// Reads what [`write_matches`] writes; the covariance becomes sigma squared along each axis.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read, a column is missing or a value is not a finite number.
+pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
+    let matches = read_table(path.as_ref(), MATCH_COLUMNS)?.numbers.into_iter();
+    let matches = matches.map(|[x, y, z, dx, dy, dz, ncc, sigma, kept]| Match {
+        initial: WorldPoint([x, y, z]),
+        displacement: [dx, dy, dz],
+        ncc: ncc as f32,
+        covariance: [sigma * sigma, sigma * sigma, sigma * sigma, 0.0, 0.0, 0.0],
+        kept: kept != 0.0,
+    });
+    Ok(SparseField { matches: matches.collect() })
+}
+
+/// Reads landmarks: fx,fy,fz in the initial (fixed) volume, mx,my,mz in the deformed (moving) one.
+///
+/// # Errors
+/// As [`read_matches`]; also when there is no row.
+pub fn read_landmarks(path: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> {
+    let rows = read_table(path.as_ref(), LANDMARK_COLUMNS)?.numbers;
+    some_rows(path.as_ref(), rows.len())?;
+    let landmark =
+        |[a, b, c, d, e, f]: [f64; 6]| Landmark { initial: WorldPoint([a, b, c]), deformed: WorldPoint([d, e, f]) };
+    Ok(rows.into_iter().map(landmark).collect())
+}
+
+/// Writes what [`read_landmarks`] reads.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_landmarks(path: impl AsRef<Path>, landmarks: &[Landmark]) -> Result<(), IoError> {
+    let rows = landmarks.iter().map(|l| [l.initial.0, l.deformed.0].concat().into_iter().map(decimal).collect());
+    write_table(path.as_ref(), &LANDMARK_COLUMNS, rows)
+}
+
+/// Reads points: columns x,y,z and any others.
+///
+/// # Errors
+/// As [`read_landmarks`].
+pub fn read_points(path: impl AsRef<Path>) -> Result<PointTable, IoError> {
+    let table = read_table(path.as_ref(), POINT_COLUMNS)?;
+    some_rows(path.as_ref(), table.numbers.len())?;
+    let points = table.numbers.into_iter().map(WorldPoint).collect();
+    Ok(PointTable { points, other_columns: table.other_columns, others: table.others })
+}
+
+/// Writes x,y,z and the other columns.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_points(path: impl AsRef<Path>, table: &PointTable) -> Result<(), IoError> {
+    let columns: Vec<&str> = POINT_COLUMNS.into_iter().chain(table.other_columns.iter().map(String::as_str)).collect();
+    let rows = table.points.iter().enumerate().map(|(i, p)| {
+        let others = table.others.get(i).into_iter().flatten().cloned();
+        let mut row: Vec<String> = p.0.into_iter().map(decimal).chain(others).collect();
+        row.resize(columns.len(), String::new());
+        row
+    });
+    write_table(path.as_ref(), &columns, rows)
+}
+
+fn decimal(v: f64) -> String {
+    format!("{v:.6}")
+}
+
+fn some_rows(path: &Path, rows: usize) -> Result<(), IoError> {
+    match rows {
+        0 => Err(format(path, "there is no row after the header line", "give at least one point")),
+        _ => Ok(()),
+    }
+}
+
+fn write_table(path: &Path, columns: &[&str], rows: impl Iterator<Item = Vec<String>>) -> Result<(), IoError> {
+    write_atomic(path, |w| {
+        let mut table = Writer::from_writer(w);
+        table.write_record(columns)?;
+        rows.into_iter().try_for_each(|row| table.write_record(row))?;
+        table.flush()
+    })
+}
+
+struct Table<const N: usize> {
+    numbers: Vec<[f64; N]>,
+    other_columns: Vec<String>,
+    others: Vec<Vec<String>>,
+}
+
+/// All rows: the named columns as finite numbers, the others as text.
+fn read_table<const N: usize>(path: &Path, names: [&str; N]) -> Result<Table<N>, IoError> {
+    let file = File::open(path).map_err(os(path, "read"))?;
+    let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(file);
+    let header = reader.headers().map_err(|e| damaged(path, e))?.clone();
+    let mut columns = [0; N];
+    for (column, name) in columns.iter_mut().zip(names) {
+        *column = header.iter().position(|h| h.eq_ignore_ascii_case(name)).ok_or_else(|| {
+            let found = header.iter().take(20).collect::<Vec<_>>().join(",");
+            let hint = format!("the first line must name {}, separated by commas", names.join(","));
+            format(path, format!("line 1: there is no column {name:?} among {found:?}"), hint)
+        })?;
+    }
+    let rest: Vec<usize> = (0..header.len()).filter(|c| !columns.contains(c)).collect();
+    let text = |record: &StringRecord| rest.iter().map(|&c| record[c].to_string()).collect();
+    let mut table = Table { numbers: Vec::new(), other_columns: text(&header), others: Vec::new() };
+    for record in reader.records() {
+        let record = record.map_err(|e| damaged(path, e))?;
+        let mut row = [0.0; N];
+        for (value, (&column, name)) in row.iter_mut().zip(columns.iter().zip(names)) {
+            let found = &record[column];
+            *value = found.parse().ok().filter(|v: &f64| v.is_finite()).ok_or_else(|| {
+                let line = record.position().map_or(0, csv::Position::line);
+                let what = format!("line {line}: {name} is {found:?}, not a finite number");
+                format(path, what, "correct or remove that line")
+            })?;
+        }
+        table.numbers.push(row);
+        table.others.push(text(&record));
+    }
+    Ok(table)
+}
+
+/// The `csv` crate's messages name the line themselves.
+fn damaged(path: &Path, error: csv::Error) -> IoError {
+    match error.into_kind() {
+        csv::ErrorKind::Io(source) => os(path, "read")(source),
+        csv::ErrorKind::UnequalLengths { pos, expected_len, len } => {
+            let line = pos.map_or(0, |p| p.line());
+            let what = format!("line {line}: {len} values, but the header line has {expected_len}");
+            format(path, what, "give each line the same number of commas")
+        }
+        csv::ErrorKind::Utf8 { pos, .. } => {
+            let what = format!("line {}: is not UTF-8 text", pos.map_or(0, |p| p.line()));
+            format(path, what, "save it as plain CSV")
+        }
+        _ => format(path, "is not a table of comma-separated values", "save it as plain CSV"),
+    }
+}

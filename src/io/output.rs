@@ -1,0 +1,110 @@
+//! A folder of results that appears as a whole or not at all.
+
+use super::atomic::TEMPORARY;
+use super::{format, os};
+use crate::error::IoError;
+use std::fs;
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+/// Where a command puts its results.
+///
+/// Files are first written into a hidden folder inside the target (same file system, so that moving them is a rename)
+/// and moved by [`OutputFolder::commit`]. Dropped without a commit, it leaves the target as it was; folders that it
+/// had created are removed again. A killed process may leave the hidden folder; it is ignored next time.
+#[derive(Debug)]
+pub struct OutputFolder {
+    path: PathBuf,
+    staging: Option<TempDir>,
+    names: Vec<String>,
+    /// Folders made here, outermost first.
+    created: Vec<PathBuf>,
+}
+
+impl OutputFolder {
+    /// Checks that results can be written to `path`, and creates the folder (and those above it) where needed.
+    ///
+    /// # Errors
+    /// [`IoError`] when `path` is a file, cannot be created or written, or holds files and `force` is not set.
+    pub fn create(path: impl AsRef<Path>, force: bool) -> Result<Self, IoError> {
+        let path = path.as_ref();
+        if path.exists() && !path.is_dir() {
+            return Err(format(path, "is a file, but a folder is needed for the results", "choose another --output"));
+        }
+        if path.is_dir() && !force {
+            let ours = |e: &fs::DirEntry| e.file_name().to_string_lossy().starts_with(TEMPORARY);
+            let mut entries = fs::read_dir(path).map_err(os(path, "read the folder"))?;
+            if entries.any(|e| !e.is_ok_and(|e| ours(&e))) {
+                return Err(format(path, "the folder is not empty", "choose another --output, or add --force"));
+            }
+        }
+        let missing = |p: &&Path| !p.as_os_str().is_empty() && !p.exists();
+        let mut folder = Self { path: path.into(), staging: None, names: Vec::new(), created: Vec::new() };
+        let mut to_create: Vec<&Path> = path.ancestors().take_while(missing).collect();
+        while let Some(next) = to_create.pop() {
+            fs::create_dir(next).map_err(os(next, "create the folder"))?;
+            folder.created.push(next.into());
+        }
+        let staging = tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(path);
+        folder.staging = Some(staging.map_err(os(path, "write into the folder"))?);
+        Ok(folder)
+    }
+
+    /// The target folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Stages the file `name` (no folders in it): `write` gets the path to write to, which ends in `name`.
+    ///
+    /// # Errors
+    /// Those of `write`, with the file's final path.
+    pub fn write(&mut self, name: &str, write: impl FnOnce(&Path) -> Result<(), IoError>) -> Result<(), IoError> {
+        let target = self.path.join(name);
+        if target.is_dir() {
+            return Err(format(
+                &target,
+                "is a folder, but a file is to be written",
+                "remove it or choose another --output",
+            ));
+        }
+        let Some(staging) = &self.staging else { return Ok(()) };
+        write(&staging.path().join(name)).map_err(|error| match error {
+            IoError::Os { action, source, .. } => IoError::Os { path: target, action, source },
+            IoError::Format { what, hint, .. } => IoError::Format { path: target, what, hint },
+        })?;
+        if !self.names.iter().any(|n| n == name) {
+            self.names.push(name.into());
+        }
+        Ok(())
+    }
+
+    /// Moves all files to their final names, and returns these in the order of writing.
+    ///
+    /// # Errors
+    /// [`IoError`] when a rename is refused; files moved before that are removed.
+    pub fn commit(mut self) -> Result<Vec<PathBuf>, IoError> {
+        let mut done = Vec::with_capacity(self.names.len());
+        if let Some(staging) = &self.staging {
+            for name in &self.names {
+                let target = self.path.join(name);
+                if let Err(error) = fs::rename(staging.path().join(name), &target) {
+                    done.iter().for_each(|moved| drop(fs::remove_file(moved)));
+                    return Err(os(&target, "create")(error));
+                }
+                done.push(target);
+            }
+        }
+        self.created.clear();
+        Ok(done)
+    }
+}
+
+impl Drop for OutputFolder {
+    fn drop(&mut self) {
+        self.staging = None; // removes the hidden folder
+        for folder in self.created.iter().rev() {
+            let _ = fs::remove_dir(folder); // refused when someone else has put something there
+        }
+    }
+}

@@ -1,0 +1,34 @@
+//! JSON, text (HTML, SVG) and bytes (PNG).
+
+use super::atomic::write_atomic;
+use crate::error::IoError;
+use serde::Serialize;
+use std::io::Write;
+use std::path::Path;
+
+/// Writes `value` as indented JSON with a newline at the end. Numbers that are not finite become `null`.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written or the value cannot be put in JSON (a map with keys that are not text).
+pub fn write_json(path: impl AsRef<Path>, value: &impl Serialize) -> Result<(), IoError> {
+    write_atomic(path.as_ref(), |w| {
+        serde_json::to_writer_pretty(&mut *w, value)?;
+        w.write_all(b"\n")
+    })
+}
+
+/// Writes text as UTF-8.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_text(path: impl AsRef<Path>, text: &str) -> Result<(), IoError> {
+    write_bytes(path, text.as_bytes())
+}
+
+/// Writes bytes as they are.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<(), IoError> {
+    write_atomic(path.as_ref(), |w| w.write_all(bytes))
+}

@@ -1,0 +1,145 @@
+//! Meshes as VTK XML unstructured grids (`.vtu`), for ParaView, PyVista, meshio and Slicer.
+//!
+//! Arrays are appended in base64, compressed with zlib; positions in world mm (RAS), float32. The form is that of the
+//! VTK file formats guide, section "XML file formats": each array is a header (number of blocks, block size, size of
+//! the last block where it is smaller, compressed sizes; all u64) and then its blocks, each part in base64 by itself.
+
+use super::atomic::write_atomic;
+use super::{format, os};
+use crate::error::IoError;
+use crate::types::{TetMesh, TriMesh, WorldPoint};
+use base64::{Engine, engine::general_purpose::STANDARD};
+use libdeflater::{CompressionLvl, Compressor};
+use std::fmt::Write as _;
+use std::io::{self, Write as _};
+use std::path::Path;
+
+/// Bytes compressed together.
+const BLOCK: usize = 1 << 20;
+/// VTK's numbers for the two cells.
+const VTK_TRIANGLE: u8 = 5;
+const VTK_TETRA: u8 = 10;
+
+/// Writes tetrahedra with `displacement` (mm, RAS) and its `magnitude` at the nodes, and one number a cell for each
+/// `(name, values)` of `cell_data`.
+///
+/// # Errors
+/// [`IoError`] when a length does not fit the mesh or the file cannot be written.
+pub fn write_tet_mesh(
+    path: impl AsRef<Path>,
+    mesh: &TetMesh,
+    displacement: &[[f64; 3]],
+    cell_data: &[(&str, &[f32])],
+) -> Result<(), IoError> {
+    write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_TETRA, displacement, cell_data)
+}
+
+/// Writes triangles, as [`write_tet_mesh`] does tetrahedra.
+///
+/// # Errors
+/// As [`write_tet_mesh`].
+pub fn write_tri_mesh(
+    path: impl AsRef<Path>,
+    mesh: &TriMesh,
+    displacement: &[[f64; 3]],
+    cell_data: &[(&str, &[f32])],
+) -> Result<(), IoError> {
+    write(path.as_ref(), mesh.nodes(), mesh.triangles(), VTK_TRIANGLE, displacement, cell_data)
+}
+
+fn write<const N: usize>(
+    path: &Path,
+    nodes: &[WorldPoint],
+    cells: &[[u32; N]],
+    cell_type: u8,
+    displacement: &[[f64; 3]],
+    cell_data: &[(&str, &[f32])],
+) -> Result<(), IoError> {
+    let fits = |name: &str, found: usize, needed: usize| match found == needed {
+        true => Ok(()),
+        false => Err(format(path, format!("{found} values of {name} for {needed}"), "give one for each")),
+    };
+    fits("displacement", displacement.len(), nodes.len())?;
+    cell_data.iter().try_for_each(|(name, values)| fits(name, values.len(), cells.len()))?;
+
+    let mut file = Appended { xml: String::new(), data: String::new() };
+    let packed = file.describe(nodes, cells, cell_type, displacement, cell_data);
+    packed.map_err(|e| os(path, "compress")(io::Error::other(e)))?;
+    write_atomic(path, |w| {
+        write!(
+            w,
+            "<?xml version=\"1.0\"?>\n<VTKFile type=\"UnstructuredGrid\" version=\"1.0\" byte_order=\"LittleEndian\" \
+             header_type=\"UInt64\" compressor=\"vtkZLibDataCompressor\">\n<UnstructuredGrid>\n\
+             <Piece NumberOfPoints=\"{}\" NumberOfCells=\"{}\">\n{}</Piece>\n</UnstructuredGrid>\n\
+             <AppendedData encoding=\"base64\">\n_{}\n</AppendedData>\n</VTKFile>\n",
+            nodes.len(),
+            cells.len(),
+            file.xml,
+            file.data
+        )
+    })
+}
+
+/// The description of the arrays, and their data.
+struct Appended {
+    xml: String,
+    data: String,
+}
+
+type Packed = Result<(), Box<dyn std::error::Error + Send + Sync>>;
+
+impl Appended {
+    fn describe<const N: usize>(
+        &mut self,
+        nodes: &[WorldPoint],
+        cells: &[[u32; N]],
+        cell_type: u8,
+        displacement: &[[f64; 3]],
+        cell_data: &[(&str, &[f32])],
+    ) -> Packed {
+        let vectors = |v: &mut dyn Iterator<Item = [f64; 3]>| bytes(v.flatten().map(|x| (x as f32).to_le_bytes()));
+        let length = |d: &[f64; 3]| (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt() as f32;
+
+        self.xml += "<PointData Vectors=\"displacement\" Scalars=\"magnitude\">\n";
+        self.array("displacement", "Float32", 3, &vectors(&mut displacement.iter().copied()))?;
+        self.array("magnitude", "Float32", 1, &bytes(displacement.iter().map(|d| length(d).to_le_bytes())))?;
+        self.xml += "</PointData>\n<CellData>\n";
+        for (name, values) in cell_data {
+            self.array(name, "Float32", 1, &bytes(values.iter().map(|v| v.to_le_bytes())))?;
+        }
+        self.xml += "</CellData>\n<Points>\n";
+        self.array("Points", "Float32", 3, &vectors(&mut nodes.iter().map(|p| p.0)))?;
+        self.xml += "</Points>\n<Cells>\n";
+        let connectivity = cells.iter().flatten().map(|&node| i64::from(node).to_le_bytes());
+        self.array("connectivity", "Int64", 1, &bytes(connectivity))?;
+        self.array("offsets", "Int64", 1, &bytes((1..=cells.len()).map(|i| ((N * i) as i64).to_le_bytes())))?;
+        self.array("types", "UInt8", 1, &vec![cell_type; cells.len()])?;
+        self.xml += "</Cells>\n";
+        Ok(())
+    }
+
+    fn array(&mut self, name: &str, number: &str, components: usize, raw: &[u8]) -> Packed {
+        let offset = self.data.len();
+        writeln!(
+            self.xml,
+            "<DataArray type=\"{number}\" Name=\"{name}\" NumberOfComponents=\"{components}\" format=\"appended\" \
+             offset=\"{offset}\"/>"
+        )?;
+        let mut compressor = Compressor::new(CompressionLvl::default());
+        let mut header = vec![raw.len().div_ceil(BLOCK), BLOCK, raw.len() % BLOCK];
+        let mut blocks = Vec::new();
+        for block in raw.chunks(BLOCK) {
+            let mut packed = vec![0; compressor.zlib_compress_bound(block.len())];
+            let size = compressor.zlib_compress(block, &mut packed)?;
+            header.push(size);
+            blocks.extend_from_slice(&packed[..size]);
+        }
+        STANDARD.encode_string(bytes(header.iter().map(|&v| (v as u64).to_le_bytes())), &mut self.data);
+        STANDARD.encode_string(blocks, &mut self.data);
+        Ok(())
+    }
+}
+
+fn bytes<const N: usize>(values: impl Iterator<Item = [u8; N]>) -> Vec<u8> {
+    values.flatten().collect()
+}
