@@ -86,6 +86,20 @@ pub struct ParamError {
     pub range: &'static str,
 }
 
+/// A name that is not among the known ones.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("unknown {what} '{found}'{}; known: {}", .nearest.map(|n| format!(", did you mean '{n}'?")).unwrap_or_default(), .known.join(", "))]
+pub struct UnknownName {
+    /// What was to be chosen.
+    pub what: &'static str,
+    /// What was given.
+    pub found: String,
+    /// All names that are known.
+    pub known: Vec<&'static str>,
+    /// The nearest of them, when it is near.
+    pub nearest: Option<&'static str>,
+}
+
 /// Reading and writing files.
 #[derive(Debug, Error)]
 #[non_exhaustive]

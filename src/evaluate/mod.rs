@@ -1,1 +1,117 @@
-//! evaluate.
+//! A displacement field against exact truth.
+//!
+//! Both fields lie on one grid; gradients are those of [`crate::numerics::differences`], percentiles interpolate
+//! linearly, landmarks are read off trilinearly with the edge value beyond the grid. Nothing is compared where the
+//! mask is zero. Fails when grids differ or the mask is empty.
+
+use crate::error::FieldError;
+use crate::numerics::differences::{deformation_gradient, displacement_gradient};
+use crate::numerics::sampling::displacement;
+use crate::numerics::statistics::percentile;
+use crate::types::space::determinant;
+use crate::types::{DenseField, Grid, Landmark, Mask, Metrics};
+use rayon::prelude::*;
+
+/// Truth moves less than this in still tissue (mm).
+const STILL_MM: f64 = 0.1;
+
+/// More still voxels than this are needed for [`Metrics::still_mm`].
+const STILL_VOXELS: usize = 1000;
+
+/// Scores `field` against `truth` over `mask` (everywhere when `None`) and at `landmarks` (none when empty).
+///
+/// # Errors
+/// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when the mask is empty.
+pub fn metrics(
+    field: &DenseField,
+    truth: &DenseField,
+    mask: Option<&Mask>,
+    landmarks: &[Landmark],
+) -> Result<Metrics, FieldError> {
+    let grid = truth.grid();
+    check("the field", field.grid(), grid)?;
+    if let Some(mask) = mask {
+        check("the mask", mask.grid(), grid)?;
+    }
+    let used = |at: &usize| mask.is_none_or(|m| m.as_slice()[*at] != 0);
+    let voxels: Vec<VoxelError> =
+        (0..grid.len()).into_par_iter().filter(used).map(|at| VoxelError::new(field, truth, at)).collect();
+    if voxels.is_empty() {
+        return Err(FieldError::Volume {
+            volume: "mask",
+            what: "has no voxel set".into(),
+            hint: "give one that covers the tissue".into(),
+        });
+    }
+    let mut error: Vec<f64> = voxels.iter().map(|v| v.error).collect();
+    let mut gradient: Vec<f64> = voxels.iter().map(|v| v.gradient).collect();
+    let still: Vec<f64> = voxels.iter().filter(|v| v.motion < STILL_MM).map(|v| v.error).collect();
+    let truths: Vec<f64> = voxels.iter().map(|v| v.motion).collect();
+    let at_landmarks = self::landmarks(field, landmarks);
+    Ok(Metrics {
+        voxels: voxels.len(),
+        mean_mm: mean(&error),
+        median_mm: percentile(&mut error, 50.0),
+        p95_mm: percentile(&mut error, 95.0),
+        max_mm: percentile(&mut error, 100.0),
+        identity_mm: mean(&truths),
+        still_mm: (still.len() > STILL_VOXELS).then(|| mean(&still)),
+        grad_err: percentile(&mut gradient, 50.0),
+        grad_err_p95: percentile(&mut gradient, 95.0),
+        folds: voxels.iter().filter(|v| v.folded).count() as f64 / voxels.len() as f64,
+        landmarks_mm: (!at_landmarks.is_empty()).then(|| mean(&at_landmarks)),
+    })
+}
+
+/// The error at each landmark: |initial + u(initial) - deformed| (mm), in the order given.
+pub fn landmarks(field: &DenseField, landmarks: &[Landmark]) -> Vec<f64> {
+    let error = |l: &Landmark| length(l.initial.moved(displacement(field, l.initial)).minus(l.deformed));
+    landmarks.iter().map(error).collect()
+}
+
+/// What is measured at one voxel.
+struct VoxelError {
+    /// |u - truth| (mm).
+    error: f64,
+    /// |truth| (mm).
+    motion: f64,
+    /// Frobenius norm of the difference of the displacement gradients (1).
+    gradient: f64,
+    /// Whether the determinant of I + grad u is at or below zero.
+    folded: bool,
+}
+
+impl VoxelError {
+    fn new(field: &DenseField, truth: &DenseField, at: usize) -> Self {
+        let voxel = truth.grid().voxel(at);
+        let (u, t) = (field.at(at).map(f64::from), truth.at(at).map(f64::from));
+        let (gu, gt) = (displacement_gradient(field, voxel), displacement_gradient(truth, voxel));
+        let difference = gu.as_flattened().iter().zip(gt.as_flattened()).map(|(a, b)| (a - b).powi(2));
+        Self {
+            error: length([u[0] - t[0], u[1] - t[1], u[2] - t[2]]),
+            motion: length(t),
+            gradient: difference.sum::<f64>().sqrt(),
+            folded: determinant(&deformation_gradient(gu)) <= 0.0,
+        }
+    }
+}
+
+fn check(what: &str, found: &Grid, expected: &Grid) -> Result<(), FieldError> {
+    match expected.same_as(found) {
+        true => Ok(()),
+        false => Err(FieldError::GridMismatch {
+            what: what.into(),
+            found: found.shape(),
+            reference: "the truth".into(),
+            expected: expected.shape(),
+        }),
+    }
+}
+
+fn length(v: [f64; 3]) -> f64 {
+    v.iter().map(|c| c * c).sum::<f64>().sqrt()
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}

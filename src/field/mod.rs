@@ -1,1 +1,9 @@
 //! field.
+
+pub mod composition;
+
+pub mod inverse;
+
+pub mod jacobian;
+
+pub mod warp;

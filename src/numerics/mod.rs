@@ -1,1 +1,7 @@
 //! numerics.
+
+pub mod differences;
+
+pub mod sampling;
+
+pub mod statistics;

@@ -1,1 +1,24 @@
-//! synth.
+//! Phantoms: pairs of volumes whose displacement is known exactly.
+//!
+//! A body is an intensity B(p) at every world position, a motion a displacement u(x) in closed form, so neither volume
+//! is interpolated. The same settings give the same bytes for any number of threads. Fails when a setting is out of
+//! range or the motion folds.
+
+mod anatomy;
+
+mod body;
+
+mod landmarks;
+
+mod motion;
+
+mod noise;
+
+pub mod params;
+
+pub mod phantom;
+
+mod random;
+
+pub use params::{MotionKind, PhantomKind, PhantomParams};
+pub use phantom::{Description, MIN_JACOBIAN, Phantom, phantom, phantom_on};

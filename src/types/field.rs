@@ -3,6 +3,7 @@
 use crate::error::SpaceError;
 use crate::types::space::{Grid, WorldPoint};
 use ndarray::{Array4, ShapeBuilder};
+use rayon::prelude::*;
 
 /// Displacements on the initial volume's grid, in world mm, RAS components, initial to deformed.
 ///
@@ -50,6 +51,22 @@ impl DenseField {
                 }
             }
         }
+        out
+    }
+
+    /// The same in parallel; `f` also gets the voxel's x-fastest offset, and must not depend on the order of calls.
+    pub fn from_voxels(grid: Grid, f: impl Fn(usize, WorldPoint) -> [f64; 3] + Sync) -> Self {
+        let mut out = Self::zeros(grid);
+        let [nx, ny, _] = grid.shape();
+        let (x, rest) = out.as_mut_slice().split_at_mut(grid.len());
+        let (y, z) = rest.split_at_mut(grid.len());
+        let rows = x.par_chunks_mut(nx).zip(y.par_chunks_mut(nx)).zip(z.par_chunks_mut(nx));
+        rows.enumerate().for_each(|(row, ((x, y), z))| {
+            for i in 0..nx {
+                let d = f(row * nx + i, grid.world(i, row % ny, row / ny));
+                (x[i], y[i], z[i]) = (d[0] as f32, d[1] as f32, d[2] as f32);
+            }
+        });
         out
     }
 

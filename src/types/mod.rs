@@ -20,6 +20,8 @@ pub mod metrics;
 
 pub mod result;
 
+pub mod names;
+
 pub use field::DenseField;
 pub use mesh::{TetMesh, TriMesh};
 pub use metrics::Metrics;

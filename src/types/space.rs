@@ -36,6 +36,12 @@ pub struct Affine {
     inverse: Matrix3,
 }
 
+/// The determinant of `m`.
+pub fn determinant(m: &Matrix3) -> f64 {
+    m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
+}
+
 /// `a b`.
 fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])
@@ -51,8 +57,7 @@ impl Affine {
             return Err(SpaceError::NotFinite);
         }
         let m: Matrix3 = std::array::from_fn(|r| [rows[r][0], rows[r][1], rows[r][2]]);
-        let det = m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
-            + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
+        let det = determinant(&m);
         let scale: f64 = (0..3).map(|c| (0..3).map(|r| m[r][c] * m[r][c]).sum::<f64>().sqrt()).product();
         // `<=` also catches a zero column, where both sides are zero.
         if !det.is_finite() || det.abs() <= 1e-9 * scale || scale == 0.0 {
@@ -183,6 +188,13 @@ impl Grid {
     #[inline]
     pub fn index(&self, i: usize, j: usize, k: usize) -> usize {
         i + self.shape[0] * (j + self.shape[1] * k)
+    }
+
+    /// The voxel `[i, j, k]` at an x-fastest offset.
+    #[inline]
+    pub fn voxel(&self, index: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.shape;
+        [index % nx, index / nx % ny, index / (nx * ny)]
     }
 
     /// World position of a voxel's centre (mm).

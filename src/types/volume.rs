@@ -1,8 +1,9 @@
 //! A scalar volume on a grid, and masks and label maps of the same form.
 
 use crate::error::SpaceError;
-use crate::types::space::Grid;
+use crate::types::space::{Grid, WorldPoint};
 use ndarray::{Array3, ShapeBuilder};
+use rayon::prelude::*;
 
 /// Values on a [`Grid`]; the array has shape (nx, ny, nz) and lies in memory with x fastest (NIfTI's order).
 #[derive(Debug, Clone, PartialEq)]
@@ -38,6 +39,22 @@ impl<T: Clone> Volume<T> {
         }
         let values = array.t().iter().cloned().collect();
         Self::from_vec(grid, values)
+    }
+
+    /// The value that `f` gives for each voxel's x-fastest offset and centre, in parallel: `f` must not depend on the
+    /// order of calls.
+    pub fn from_voxels(grid: Grid, f: impl Fn(usize, WorldPoint) -> T + Sync) -> Self
+    where
+        T: Send + Sync + Default,
+    {
+        let mut out = Self::filled(grid, T::default());
+        let [nx, ny, _] = grid.shape();
+        out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, line)| {
+            for (i, v) in line.iter_mut().enumerate() {
+                *v = f(row * nx + i, grid.world(i, row % ny, row / ny));
+            }
+        });
+        out
     }
 
     /// The same value everywhere.

@@ -1,0 +1,216 @@
+//! Values of a volume or field between voxel centres.
+//!
+//! **Inside** means within half a voxel of the outermost centres, that is in a voxel of the grid; there the position
+//! is clamped to the centres' box, so an axis of one voxel is constant over that voxel. Elsewhere a volume has the
+//! background value the caller gives. Positions that are NaN are outside.
+//!
+//! Cubic interpolation is the cubic B-spline with its prefilter (Unser, Aldroubi, Eden 1993; mirror boundaries). It
+//! passes through the samples and was chosen over Catmull-Rom by measurement: on noise band-limited to 0.2, 0.3 and
+//! 0.4 cycles a voxel its root-mean-square error between samples is 0.2, 1.5 and 7.0 % of the signal's, against 1.4,
+//! 5.9 and 15.1 % (linear: 6.3, 13.7 and 23.8 %). It overshoots at sharp edges. A NaN spreads along its lines in the prefilter: replace such voxels first.
+
+use crate::error::UnknownName;
+use crate::types::names::choose;
+use crate::types::{DenseField, Volume, VoxelPoint, WorldPoint};
+use rayon::prelude::*;
+use std::borrow::Cow;
+
+/// How values between voxel centres are made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Interpolation {
+    /// The value of the voxel that holds the position.
+    Nearest,
+    /// Trilinear.
+    #[default]
+    Linear,
+    /// Cubic B-spline with prefilter.
+    Cubic,
+}
+
+impl std::str::FromStr for Interpolation {
+    type Err = UnknownName;
+
+    fn from_str(name: &str) -> Result<Self, UnknownName> {
+        let known = [("nearest", Self::Nearest), ("linear", Self::Linear), ("cubic", Self::Cubic)];
+        choose("interpolation", name, &known)
+    }
+}
+
+/// Slack (voxels) for positions that rounding puts just past the grid's face.
+const SLACK: f64 = 1e-6;
+
+/// Whether `p` lies in a voxel of a grid of `shape`.
+#[inline]
+pub fn inside(shape: [usize; 3], p: VoxelPoint) -> bool {
+    (0..3).all(|a| p.0[a] >= -0.5 - SLACK && p.0[a] <= shape[a] as f64 - 0.5 + SLACK)
+}
+
+/// The offset (x fastest) of the voxel that holds `p`, or `None` outside.
+#[inline]
+pub fn nearest(shape: [usize; 3], p: VoxelPoint) -> Option<usize> {
+    inside(shape, p).then(|| {
+        let at = |a: usize| ((p.0[a] + 0.5).max(0.0) as usize).min(shape[a] - 1);
+        at(0) + shape[0] * (at(1) + shape[1] * at(2))
+    })
+}
+
+/// The cell of a position along one axis: lower index, upper index, fraction; clamped to the outermost centres.
+#[inline]
+fn cell(n: usize, p: f64) -> (usize, usize, f64) {
+    let q = p.clamp(0.0, (n - 1) as f64);
+    let low = q as usize;
+    (low, (low + 1).min(n - 1), q - low as f64)
+}
+
+/// The eight voxels around a position and their trilinear weights.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stencil {
+    /// Offsets, x fastest.
+    pub index: [usize; 8],
+    /// Weights; they sum to 1.
+    pub weight: [f64; 8],
+}
+
+impl Stencil {
+    /// For any position; one outside takes the nearest position on the box of voxel centres.
+    #[inline]
+    pub fn new(shape: [usize; 3], p: VoxelPoint) -> Self {
+        let c: [(usize, usize, f64); 3] = std::array::from_fn(|a| cell(shape[a], p.0[a]));
+        let pick = |a: usize, up: bool| if up { (c[a].1, c[a].2) } else { (c[a].0, 1.0 - c[a].2) };
+        let corner = |n: usize| [pick(0, n & 1 > 0), pick(1, n & 2 > 0), pick(2, n & 4 > 0)];
+        Self {
+            index: std::array::from_fn(|n| {
+                let [x, y, z] = corner(n);
+                x.0 + shape[0] * (y.0 + shape[1] * z.0)
+            }),
+            weight: std::array::from_fn(|n| corner(n).iter().map(|v| v.1).product()),
+        }
+    }
+
+    /// The interpolated value.
+    #[inline]
+    pub fn of(&self, values: &[f32]) -> f64 {
+        self.index.iter().zip(&self.weight).map(|(&i, w)| w * f64::from(values[i])).sum()
+    }
+}
+
+/// The displacement (mm) at a world position, trilinear; outside the grid the value of its nearest edge.
+#[inline]
+pub fn displacement(field: &DenseField, p: WorldPoint) -> [f64; 3] {
+    let grid = field.grid();
+    let stencil = Stencil::new(grid.shape(), grid.affine().to_voxel(p));
+    std::array::from_fn(|c| stencil.of(field.component(c)))
+}
+
+/// The four weights of the cubic B-spline at fraction `t` of a cell, for the samples at -1, 0, 1, 2.
+#[inline]
+pub fn cubic_bspline(t: f64) -> [f64; 4] {
+    let s = 1.0 - t;
+    [s * s * s / 6.0, 2.0 / 3.0 - t * t * (2.0 - t) / 2.0, 2.0 / 3.0 - s * s * (2.0 - s) / 2.0, t * t * t / 6.0]
+}
+
+/// A volume ready to be sampled anywhere.
+#[derive(Debug, Clone)]
+pub struct Sampler<'a> {
+    shape: [usize; 3],
+    /// The volume's values, or its B-spline coefficients for [`Interpolation::Cubic`].
+    values: Cow<'a, [f32]>,
+    interpolation: Interpolation,
+    background: f32,
+}
+
+impl<'a> Sampler<'a> {
+    /// Prepares `volume`; `background` is the value outside. Cubic filters a copy of the volume, the others borrow it.
+    pub fn new(volume: &'a Volume, interpolation: Interpolation, background: f32) -> Self {
+        let shape = volume.grid().shape();
+        let values = match interpolation {
+            Interpolation::Cubic => Cow::Owned(bspline_coefficients(volume.as_slice().to_vec(), shape)),
+            _ => Cow::Borrowed(volume.as_slice()),
+        };
+        Self { shape, values, interpolation, background }
+    }
+
+    /// The value at a position in voxels.
+    #[inline]
+    pub fn at(&self, p: VoxelPoint) -> f32 {
+        let Some(voxel) = nearest(self.shape, p) else { return self.background };
+        match self.interpolation {
+            Interpolation::Nearest => self.values[voxel],
+            Interpolation::Linear => Stencil::new(self.shape, p).of(&self.values) as f32,
+            Interpolation::Cubic => self.cubic(p),
+        }
+    }
+
+    fn cubic(&self, p: VoxelPoint) -> f32 {
+        let mut weights = [[0.0; 4]; 3];
+        let mut index = [[0; 4]; 3];
+        for a in 0..3 {
+            let (low, _, t) = cell(self.shape[a], p.0[a]);
+            weights[a] = cubic_bspline(t);
+            index[a] = std::array::from_fn(|n| mirror(low as isize + n as isize - 1, self.shape[a]));
+        }
+        let mut sum = 0.0;
+        for (&k, wz) in index[2].iter().zip(weights[2]) {
+            for (&j, wy) in index[1].iter().zip(weights[1]) {
+                let row = self.shape[0] * (j + self.shape[1] * k);
+                let line: f64 =
+                    index[0].iter().zip(weights[0]).map(|(&i, w)| w * f64::from(self.values[row + i])).sum();
+                sum += wz * wy * line;
+            }
+        }
+        sum as f32
+    }
+}
+
+/// Index `i` reflected about the first and last of `n` samples.
+#[inline]
+fn mirror(i: isize, n: usize) -> usize {
+    if (0..n as isize).contains(&i) {
+        return i as usize;
+    }
+    let period = (2 * n as isize - 2).max(1);
+    let j = i.rem_euclid(period);
+    j.min(period - j) as usize
+}
+
+/// Coefficients of the cubic B-spline that passes through `values` (x fastest).
+fn bspline_coefficients(mut values: Vec<f32>, [nx, ny, nz]: [usize; 3]) -> Vec<f32> {
+    values.par_chunks_mut(nx).for_each(|row| filter(row.chunks_mut(1).collect()));
+    values.par_chunks_mut(nx * ny).for_each(|slice| filter(slice.chunks_mut(nx).collect()));
+    let mut planes: Vec<Vec<&mut [f32]>> = (0..ny).map(|_| Vec::with_capacity(nz)).collect();
+    for (n, row) in values.chunks_mut(nx).enumerate() {
+        planes[n % ny].push(row);
+    }
+    planes.into_par_iter().for_each(filter);
+    values
+}
+
+/// The recursive prefilter along a sequence of rows, each entry of a row on its own (Unser 1999, box 2).
+fn filter(mut rows: Vec<&mut [f32]>) {
+    /// The filter's pole, sqrt(3) - 2; its 16th power is below f32's precision.
+    const POLE: f32 = -0.267_949_2;
+    let n = rows.len();
+    if n == 1 {
+        return;
+    }
+    for e in 0..rows[0].len() {
+        let start = (0..16).rev().fold(0.0, |sum, k| sum * POLE + rows[mirror(k, n)][e]);
+        rows[0][e] = 6.0 * start;
+    }
+    for i in 1..n {
+        let (before, now) = rows.split_at_mut(i);
+        for (v, p) in now[0].iter_mut().zip(before[i - 1].iter()) {
+            *v = 6.0 * *v + POLE * p;
+        }
+    }
+    let (before, last) = rows.split_at_mut(n - 1);
+    for (v, p) in last[0].iter_mut().zip(before[n - 2].iter()) {
+        *v = POLE / (POLE * POLE - 1.0) * (*v + POLE * p);
+    }
+    for i in (0..n - 1).rev() {
+        let (now, after) = rows.split_at_mut(i + 1);
+        for (v, next) in now[i].iter_mut().zip(after[0].iter()) {
+            *v = POLE * (next - *v);
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! A body as an intensity that is defined at every world position.
+//!
+//! Regions are painted one over the other. Each is a tapered superellipsoid with an edge two voxels wide (10 to 90 %),
+//! a mean intensity, and a share of one fine texture that runs through the whole body. The outlines are bent by a
+//! coarse smooth displacement, so that nothing is symmetric. Texture cells are at least two voxels along each axis:
+//! the function can be sampled and interpolated without much aliasing.
+
+use crate::synth::noise::SmoothNoise;
+use crate::synth::random::Random;
+use crate::types::space::Matrix3;
+use crate::types::{Grid, WorldPoint};
+
+/// (|x/a|^n + |y/b|^n + |z/c|^n)^(1/n) <= 1 in its own axes. A radius may be infinite: a tube.
+#[derive(Debug, Clone)]
+pub struct Superellipsoid {
+    /// Centre (mm, in the body's frame).
+    pub centre: [f64; 3],
+    /// Semi-axes (mm).
+    pub radii: [f64; 3],
+    /// Turn about the third axis (radians).
+    pub turn: f64,
+    /// The exponent n: 2 is an ellipsoid, 8 nearly a box.
+    pub power: i32,
+}
+
+/// A region and what it looks like.
+#[derive(Debug, Clone)]
+pub struct Region {
+    /// Its outline.
+    pub shape: Superellipsoid,
+    /// Mean intensity.
+    pub mean: f64,
+    /// Standard deviation of its texture, relative to the mean (1).
+    pub texture: f64,
+}
+
+/// A whole body.
+#[derive(Debug, Clone)]
+pub struct Body {
+    /// Painted in this order; the first one is the body's outline.
+    regions: Vec<Region>,
+    /// Rotation (rows) and centre (mm) of the body's frame in the world.
+    rotation: Matrix3,
+    centre: [f64; 3],
+    /// Voxel edges as rows of the transposed linear part: how far (mm) the world axes run in one voxel step.
+    edges: Matrix3,
+    texture: [SmoothNoise<1>; 3],
+    bend: SmoothNoise<3>,
+    bend_mm: f64,
+    taper: f64,
+}
+
+/// Weights of the coarser texture cells, and how many times the finest they are.
+const OCTAVES: [(f64, f64); 3] = [(1.0, 1.0), (2.3, 0.8), (5.1, 0.6)];
+
+impl Body {
+    /// The body of `regions` in the middle of `grid`, turned by up to 3 degrees and shifted by 0.3 to 0.7 mm or
+    /// voxels, whichever is less, so that no lattice is symmetric to it.
+    ///
+    /// `taper` is the relative growth of all radii and offsets across the axis a mm upwards; `bend_mm` the standard
+    /// deviation of the outlines' bending.
+    pub fn new(regions: Vec<Region>, grid: &Grid, taper: f64, bend_mm: f64, seed: u64) -> Self {
+        let mut random = Random::new(seed, 1);
+        let angles: [f64; 3] = std::array::from_fn(|_| random.uniform(-3.0, 3.0).to_radians());
+        let small = grid.spacing().iter().fold(1.0, |m: f64, &s| m.min(s));
+        let middle = centre(grid);
+        let shifted = std::array::from_fn(|a| middle[a] + small * random.uniform(0.3, 0.7));
+        let linear = grid.affine().linear();
+        let cell: [f64; 3] = std::array::from_fn(|a| 2.0 * linear[a].iter().map(|v| v * v).sum::<f64>().sqrt());
+        let extent = extent(grid);
+        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0));
+        Self {
+            regions,
+            rotation: rotation(angles),
+            centre: shifted,
+            edges: std::array::from_fn(|a| std::array::from_fn(|w| linear[w][a])),
+            texture: std::array::from_fn(noise),
+            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3]),
+            bend_mm,
+            taper,
+        }
+    }
+
+    /// Intensity at a world position.
+    pub fn intensity(&self, p: WorldPoint) -> f64 {
+        let q = self.own_frame(p);
+        let norm = OCTAVES.iter().map(|o| o.1 * o.1).sum::<f64>().sqrt();
+        let texture: f64 = self.texture.iter().zip(OCTAVES).map(|(t, o)| t.at(p.0)[0] * o.1 / norm).sum();
+        let painted = self.regions.iter().fold(0.0, |below, region| {
+            let cover = self.cover(&region.shape, q);
+            below + cover * (region.mean * (1.0 + region.texture * texture) - below)
+        });
+        painted.max(0.0)
+    }
+
+    /// Whether a world position lies in the body's outline.
+    pub fn contains(&self, p: WorldPoint) -> bool {
+        self.regions.first().is_some_and(|r| self.cover(&r.shape, self.own_frame(p)) > 0.5)
+    }
+
+    /// World position to the body's frame: turned, bent, with the taper undone.
+    fn own_frame(&self, p: WorldPoint) -> [f64; 3] {
+        let bend = self.bend.at(p.0);
+        let d: [f64; 3] = std::array::from_fn(|a| p.0[a] - self.centre[a] + self.bend_mm * bend[a]);
+        let q: [f64; 3] = std::array::from_fn(|r| (0..3).map(|c| self.rotation[r][c] * d[c]).sum());
+        let scale = (1.0 + self.taper * q[2]).max(0.2);
+        [q[0] / scale, q[1] / scale, q[2]]
+    }
+
+    /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1.
+    fn cover(&self, shape: &Superellipsoid, q: [f64; 3]) -> f64 {
+        /// Width of the logistic edge, in voxels: 10 to 90 % in two.
+        const WIDTH: f64 = 0.45;
+        let (value, gradient) = shape.level(q);
+        // Rate of change a voxel step; the body's turn of a few degrees is left out, as it hardly changes the width.
+        let rate = self.edges.iter().map(|e| (0..3).map(|w| e[w] * gradient[w]).sum::<f64>().powi(2)).sum::<f64>();
+        let voxels = (1.0 - value) / rate.sqrt().max(1e-12);
+        1.0 / (1.0 + (-voxels / WIDTH).exp())
+    }
+}
+
+impl Superellipsoid {
+    /// The level function (1 on the outline, less inside) and its gradient (a mm) at `q`.
+    fn level(&self, q: [f64; 3]) -> (f64, [f64; 3]) {
+        let (sin, cos) = self.turn.sin_cos();
+        let d: [f64; 3] = std::array::from_fn(|a| q[a] - self.centre[a]);
+        let own = [cos * d[0] + sin * d[1], cos * d[1] - sin * d[0], d[2]];
+        let s: [f64; 3] = std::array::from_fn(|a| own[a] / self.radii[a]);
+        let level = s.iter().map(|v| v.abs().powi(self.power)).sum::<f64>().powf(1.0 / f64::from(self.power)).max(1e-6);
+        let slope: [f64; 3] =
+            std::array::from_fn(|a| s[a].signum() * (s[a].abs() / level).powi(self.power - 1) / self.radii[a]);
+        (level, [cos * slope[0] - sin * slope[1], sin * slope[0] + cos * slope[1], slope[2]])
+    }
+}
+
+/// The middle of a grid (mm).
+pub fn centre(grid: &Grid) -> [f64; 3] {
+    grid.affine().to_world(crate::types::VoxelPoint(grid.shape().map(|n| (n - 1) as f64 / 2.0))).0
+}
+
+/// Sides (mm) of the axis-aligned box around a grid's voxels.
+pub fn extent(grid: &Grid) -> [f64; 3] {
+    let (linear, shape) = (grid.affine().linear(), grid.shape());
+    std::array::from_fn(|w| (0..3).map(|a| linear[w][a].abs() * shape[a] as f64).sum())
+}
+
+/// Rotation about x, then y, then z (radians).
+pub fn rotation([x, y, z]: [f64; 3]) -> Matrix3 {
+    let ((sx, cx), (sy, cy), (sz, cz)) = (x.sin_cos(), y.sin_cos(), z.sin_cos());
+    [
+        [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+        [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+        [-sy, cy * sx, cy * cx],
+    ]
+}
