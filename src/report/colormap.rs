@@ -39,9 +39,10 @@ const DIVERGING: [[f64; 3]; 5] =
 impl ColorMap {
     /// The sRGB colour at `t`; outside 0 to 1 it is that of the nearer end, and NaN gives the lower end.
     pub fn rgb(self, t: f64) -> [u8; 3] {
-        let t = t.max(0.0).min(1.0);
+        let t = if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) };
         let byte = |v: f64| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
-        let polynomial = |c: &[[f64; 3]; 7]| std::array::from_fn(|k| byte(c.iter().rfold(0.0, |v, row| v * t + row[k])));
+        let polynomial =
+            |c: &[[f64; 3]; 7]| std::array::from_fn(|k| byte(c.iter().rfold(0.0, |v, row| v * t + row[k])));
         match self {
             ColorMap::Gray => [byte(t); 3],
             ColorMap::Viridis => polynomial(&VIRIDIS),

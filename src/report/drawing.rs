@@ -29,15 +29,15 @@ pub fn arrows(
     scale: &Scale,
 ) -> String {
     let (nodes, step) = section.lattice(28);
-    let shape = field.grid().shape();
     let width = step / 9.0;
-    let mut svg = format!(r#"<g fill="none" stroke-width="{width:.2}" stroke-linecap="round" stroke-linejoin="round">"#);
+    let mut svg =
+        format!(r#"<g fill="none" stroke-width="{width:.2}" stroke-linecap="round" stroke-linejoin="round">"#);
     for offset in nodes {
         if mask.is_some_and(|m| m.as_slice()[offset] == 0) {
             continue;
         }
         let d = field.at(offset).map(f64::from);
-        let (i, j, k) = (offset % shape[0], offset / shape[0] % shape[1], offset / (shape[0] * shape[1]));
+        let [i, j, k] = field.grid().voxel(offset);
         let ([x, y], _) = section.place(field.grid().world(i, j, k));
         let [dx, dy] = section.direct(d).map(|v| v * factor);
         let colour = scale.hex(d.iter().map(|v| v * v).sum::<f64>().sqrt());
@@ -75,11 +75,8 @@ pub fn arrow_factor(sections: &[Section], length: f64) -> f64 {
 /// Matches within `slab` mm of the section: the kept ones as dots coloured by their precision, the rejected ones as
 /// crosses. At most 1,200 are drawn, evenly thinned.
 pub fn matches(section: &Section, background: &Picture, matches: &[Match], slab: f64, scale: &Scale) -> String {
-    let near: Vec<_> = matches
-        .iter()
-        .map(|m| (m, section.place(m.initial)))
-        .filter(|(_, (_, behind))| behind.abs() <= slab)
-        .collect();
+    let near: Vec<_> =
+        matches.iter().map(|m| (m, section.place(m.initial))).filter(|(_, (_, behind))| behind.abs() <= slab).collect();
     let r = background.size_mm[0].max(background.size_mm[1]) / 160.0;
     let (mut kept, mut rejected) = (String::new(), String::new());
     for (m, ([x, y], _)) in near.iter().step_by(near.len().div_ceil(MATCHES).max(1)) {

@@ -30,7 +30,8 @@ pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::types::{
-        Affine, Counts, DenseField, FieldSummary, LevelReport, Match, Mesh, MotionModel, SparseField, TetMesh, WorldPoint,
+        Affine, Counts, DenseField, FieldSummary, LevelReport, Match, Mesh, MotionModel, SparseField, TetMesh,
+        WorldPoint,
     };
 
     /// A made-up result with known numbers.

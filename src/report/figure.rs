@@ -35,8 +35,7 @@ pub fn figure(title: &str, panels: &[Panel]) -> String {
             );
             let [l, r, t, b] = picture.plane.labels();
             let (cx, cy) = (x + w / 2.0, top + h / 2.0 + 4.0);
-            for (tx, ty, name) in
-                [(x + 9.0, cy, l), (x + w - 9.0, cy, r), (cx, top + 13.0, t), (cx, top + h - 5.0, b)]
+            for (tx, ty, name) in [(x + 9.0, cy, l), (x + w - 9.0, cy, r), (cx, top + 13.0, t), (cx, top + h - 5.0, b)]
             {
                 let _ = write!(body, r#"<text x="{tx:.1}" y="{ty:.1}" class="side">{name}</text>"#);
             }

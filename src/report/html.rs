@@ -66,7 +66,11 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
         short2(*slab)
     );
     body.push_str(&drawn("Matches", &note, &planes, dots, Some(precision)));
-    let _ = write!(body, "<article class=\"wide\"><h3>Distributions</h3><div class=\"charts\">{}</div></article>", histograms(report, &views));
+    let _ = write!(
+        body,
+        "<article class=\"wide\"><h3>Distributions</h3><div class=\"charts\">{}</div></article>",
+        histograms(report, &views)
+    );
     let _ = write!(
         body,
         "</div></section><section><h2>Numbers</h2><div class=\"grid\"><article><h3>Counts</h3>{}</article><article><h3>Inputs</h3>{}</article>",
@@ -156,7 +160,8 @@ fn legend(scale: Option<&Scale>) -> String {
 }
 
 fn card(panel: &Panel) -> String {
-    let figures: String = panel.pictures.iter().map(|p| figure(p.plane, p.size_mm, &image(p, "", &panel.title))).collect();
+    let figures: String =
+        panel.pictures.iter().map(|p| figure(p.plane, p.size_mm, &image(p, "", &panel.title))).collect();
     let note = if panel.note.is_empty() { String::new() } else { format!("<p>{}</p>", escape(&panel.note)) };
     format!(
         "<article><h3>{}</h3>{note}<div class=\"planes\">{figures}</div>{}</article>",

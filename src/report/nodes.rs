@@ -33,7 +33,9 @@ pub fn scatter(nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -
     let screen =
         |q: [f64; 3]| [WIDTH / 2.0 + zoom * (q[0] - (x0 + x1) / 2.0), HEIGHT / 2.0 - zoom * (q[1] - (y0 + y1) / 2.0)];
 
-    let mut svg = format!(r#"<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="displacement at the mesh nodes"><g class="frame">"#);
+    let mut svg = format!(
+        r#"<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="displacement at the mesh nodes"><g class="frame">"#
+    );
     for (a, &p) in corners.iter().enumerate() {
         for axis in (0..3).map(|k| 1 << k).filter(|k| a & k == 0) {
             let ([px, py], [qx, qy]) = (screen(p), screen(corners[a | axis]));
@@ -77,13 +79,17 @@ mod tests {
 
     #[test]
     fn every_node_is_drawn_once_and_inside_the_picture() {
-        let nodes: Vec<_> = (0..60).map(|i| WorldPoint([f64::from(i % 5) * 9.0, f64::from(i / 5 % 4), f64::from(i / 20)])).collect();
+        let nodes: Vec<_> =
+            (0..60).map(|i| WorldPoint([f64::from(i % 5) * 9.0, f64::from(i / 5 % 4), f64::from(i / 20)])).collect();
         let d: Vec<_> = (0..60).map(|i| [f64::from(i), 0.0, 0.0]).collect();
         let svg = scatter(&nodes, &d, &Scale::from_zero(60.0, "mm", ColorMap::Viridis));
         assert_eq!(svg.matches("<circle").count(), 60);
         assert_eq!(svg.matches("<path").count(), 12);
         let inside = |key: &str, limit: f64| {
-            svg.split(key).skip(1).filter_map(|s| s.split('"').next()?.parse::<f64>().ok()).all(|v| v > 0.0 && v < limit)
+            svg.split(key)
+                .skip(1)
+                .filter_map(|s| s.split('"').next()?.parse::<f64>().ok())
+                .all(|v| v > 0.0 && v < limit)
         };
         assert!(inside("cx=\"", WIDTH) && inside("cy=\"", HEIGHT));
         assert!(!scatter(&[], &[], &Scale::from_zero(1.0, "mm", ColorMap::Viridis)).contains("NaN"));

@@ -76,17 +76,16 @@ pub fn length(field: &DenseField, offset: usize) -> f32 {
 /// nothing moves.
 pub fn centre_of_motion(field: &DenseField, mask: Option<&Mask>) -> WorldPoint {
     let grid = field.grid();
-    let s = grid.shape();
     let (mut sum, mut weight) = ([0.0; 3], 0.0);
     for o in sample(grid.len(), mask) {
         let w = f64::from(length(field, o)).powi(2);
         if w.is_finite() {
-            let at = [o % s[0], o / s[0] % s[1], o / (s[0] * s[1])];
+            let at = grid.voxel(o);
             (0..3).for_each(|a| sum[a] += w * at[a] as f64);
             weight += w;
         }
     }
-    let middle = s.map(|n| (n - 1) as f64 / 2.0);
+    let middle = grid.shape().map(|n| (n - 1) as f64 / 2.0);
     let voxel = if weight > 1e-12 { sum.map(|v| v / weight) } else { middle };
     grid.affine().to_world(VoxelPoint(voxel))
 }
@@ -122,7 +121,8 @@ mod tests {
     fn the_cut_goes_where_the_motion_is() {
         let grid = Grid::new([21, 21, 21], Affine::scaled([2.0; 3], [-20.0; 3]).unwrap()).unwrap();
         assert_eq!(centre_of_motion(&DenseField::zeros(grid), None), WorldPoint([0.0; 3]));
-        let press = DenseField::from_fn(grid, |p| [if p == WorldPoint([10.0, -4.0, 6.0]) { 5.0 } else { 0.0 }, 0.0, 0.0]);
+        let press =
+            DenseField::from_fn(grid, |p| [if p == WorldPoint([10.0, -4.0, 6.0]) { 5.0 } else { 0.0 }, 0.0, 0.0]);
         assert_eq!(centre_of_motion(&press, None), WorldPoint([10.0, -4.0, 6.0]));
         let elsewhere = Mask::filled(grid, 0);
         assert_eq!(centre_of_motion(&press, Some(&elsewhere)), WorldPoint([0.0; 3]));

@@ -91,8 +91,7 @@ mod tests {
         let grid = Grid::new([3, 2, 1], Affine::scaled([1.0, 1.0, 1.0], [0.0; 3]).unwrap()).unwrap();
         let section = &Section::through(&grid, WorldPoint([0.0; 3]))[0];
         let scale = Scale::from_zero(1.0, "mm", ColorMap::Viridis);
-        let picture =
-            Picture::overlay(section, |o| o as f32, [0.0, 5.0], |o| (o == 5).then_some(1.0), &scale).unwrap();
+        let picture = Picture::overlay(section, |o| o as f32, [0.0, 5.0], |o| (o == 5).then_some(1.0), &scale).unwrap();
         let mut decoder = png::Decoder::new(std::io::Cursor::new(&picture.png));
         decoder.set_transformations(png::Transformations::EXPAND);
         let mut reader = decoder.read_info().unwrap();

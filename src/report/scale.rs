@@ -69,7 +69,7 @@ pub fn thousands(n: usize) -> String {
     let digits = n.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);
     for (i, c) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i) % 3 == 0 {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
             out.push(',');
         }
         out.push(c);
@@ -83,7 +83,10 @@ mod tests {
 
     #[test]
     fn round_numbers_are_at_or_above() {
-        assert_eq!([0.07, 1.0, 7.3, 8.1, 123.0, 0.0].map(|v| short(round_up(v))), ["0.08", "1", "8", "10", "150", "0.001"]);
+        assert_eq!(
+            [0.07, 1.0, 7.3, 8.1, 123.0, 0.0].map(|v| short(round_up(v))),
+            ["0.08", "1", "8", "10", "150", "0.001"]
+        );
         assert_eq!(round_up(f64::NAN), 1.0);
     }
 

@@ -71,7 +71,8 @@ fn canonical_axes(grid: &Grid) -> [Axis; 3] {
     const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
     let (linear, spacing, shape) = (grid.affine().linear(), grid.spacing(), grid.shape());
     let alignment = |o: &[usize; 3]| (0..3).map(|w| linear[w][o[w]].abs() / spacing[o[w]]).sum::<f64>();
-    let best = ORDERS.into_iter().fold(ORDERS[0], |best, o| if alignment(&o) > alignment(&best) + 1e-9 { o } else { best });
+    let best =
+        ORDERS.into_iter().fold(ORDERS[0], |best, o| if alignment(&o) > alignment(&best) + 1e-9 { o } else { best });
     std::array::from_fn(|w| {
         let voxel = best[w];
         Axis { voxel, reversed: linear[w][voxel] < 0.0, len: shape[voxel], spacing: spacing[voxel] }

@@ -74,7 +74,9 @@ pub fn levels(report: &FieldReport<'_>) -> String {
 /// The two volumes and what was asked for.
 pub fn inputs(report: &FieldReport<'_>) -> String {
     let [initial, deformed, mask] = report.names.map(escape);
-    let grid = |g: &crate::types::Grid| format!("{} voxels of {} mm", g.shape().map(|n| n.to_string()).join(" × "), triple(g.spacing()));
+    let grid = |g: &crate::types::Grid| {
+        format!("{} voxels of {} mm", g.shape().map(|n| n.to_string()).join(" × "), triple(g.spacing()))
+    };
     let automatic = |v: f64, unit: &str| if v == 0.0 { "automatic".into() } else { format!("{}{unit}", short(v)) };
     let p = report.params;
     let rows = [

@@ -26,7 +26,13 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
             first.energy_before, first.energy_after, last.energy_before, last.energy_after
         );
     }
-    let _ = writeln!(out, "  motion       mean {:.2} mm, largest {:.2} mm over {} voxels", s.mean_mm, s.max_mm, thousands(s.mask_voxels));
+    let _ = writeln!(
+        out,
+        "  motion       mean {:.2} mm, largest {:.2} mm over {} voxels",
+        s.mean_mm,
+        s.max_mm,
+        thousands(s.mask_voxels)
+    );
     let _ = writeln!(out, "  mesh         {} nodes, {} elements", thousands(c.nodes), thousands(c.tetrahedra));
     let _ = writeln!(out, "  folds        {}", thousands(s.folds));
     let _ = writeln!(out, "  trust        {}: {}", v.trust.name(), v.reasons.join("; "));
@@ -36,8 +42,17 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
 
 /// A score against truth, a few lines.
 pub fn metrics(m: &Metrics) -> String {
-    let mut out = format!("Mean error {:.3} mm over {} voxels, where doing nothing gives {:.3} mm.\n", m.mean_mm, thousands(m.voxels), m.identity_mm);
-    let _ = writeln!(out, "  error        median {:.3} mm, 95th percentile {:.3} mm, largest {:.3} mm", m.median_mm, m.p95_mm, m.max_mm);
+    let mut out = format!(
+        "Mean error {:.3} mm over {} voxels, where doing nothing gives {:.3} mm.\n",
+        m.mean_mm,
+        thousands(m.voxels),
+        m.identity_mm
+    );
+    let _ = writeln!(
+        out,
+        "  error        median {:.3} mm, 95th percentile {:.3} mm, largest {:.3} mm",
+        m.median_mm, m.p95_mm, m.max_mm
+    );
     if let Some(v) = m.landmarks_mm {
         let _ = writeln!(out, "  landmarks    {v:.3} mm");
     }

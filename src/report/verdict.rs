@@ -45,7 +45,8 @@ pub struct Verdict {
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     let s = &report.result.summary;
     let spacing = report.initial.grid().spacing();
-    let (edge, fine) = (spacing.iter().fold(0.0, |m: f64, v| m.max(*v)), spacing.iter().fold(f64::INFINITY, |m, v| m.min(*v)));
+    let (edge, fine) =
+        (spacing.iter().fold(0.0, |m: f64, v| m.max(*v)), spacing.iter().fold(f64::INFINITY, |m, v| m.min(*v)));
     let motion = match s.model {
         MotionModel::Identity => "Nothing moved beyond the noise".to_string(),
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
@@ -54,7 +55,8 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
             format!("Tissue moved {} mm on average and {} mm at most", short2(s.mean_mm), short2(s.max_mm))
         }
     };
-    let residual = s.levels.last().map(|l| format!(", median residual {} mm", short2(l.residual_mm))).unwrap_or_default();
+    let residual =
+        s.levels.last().map(|l| format!(", median residual {} mm", short2(l.residual_mm))).unwrap_or_default();
     let headline = format!("{motion}: {} matches{residual}.", thousands(s.counts.kept));
 
     let (share, side) = uncertain(report, edge);
@@ -70,7 +72,11 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     } else if s.model == MotionModel::Free && s.uncertainty_median_mm > s.mean_mm {
         low.push("the motion is smaller than its uncertainty".into());
     }
-    let weak = format!("{} % of the voxels are uncertain by more than a voxel ({} mm){side}", short1(100.0 * share), short2(edge));
+    let weak = format!(
+        "{} % of the voxels are uncertain by more than a voxel ({} mm){side}",
+        short1(100.0 * share),
+        short2(edge)
+    );
     let precise = s.uncertainty_median_mm <= fine / 2.0 && share < 0.1;
     let median = format!("median uncertainty {} mm (1 sigma)", short2(s.uncertainty_median_mm));
     let (trust, mut reasons) = match (low.is_empty(), precise && s.folds == 0) {
@@ -91,9 +97,11 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
 fn uncertain(report: &FieldReport<'_>, limit: f64) -> (f64, String) {
     let sigma = report.result.uncertainty.as_slice();
     let grid = report.initial.grid();
-    let s = grid.shape();
     let picked = sample(grid.len(), report.mask);
-    let world = |&o: &usize| grid.world(o % s[0], o / s[0] % s[1], o / (s[0] * s[1])).0;
+    let world = |&o: &usize| {
+        let [i, j, k] = grid.voxel(o);
+        grid.world(i, j, k).0
+    };
     let weak: Vec<usize> = picked.iter().copied().filter(|&o| f64::from(sigma[o]) > limit).collect();
     if weak.is_empty() {
         return (0.0, String::new());
@@ -156,6 +164,10 @@ mod tests {
         case.result.uncertainty.as_mut_slice()[20 * 20 * 16..].fill(3.0);
         let v = verdict(&case.report());
         assert_eq!(v.trust, Trust::Moderate);
-        assert!(v.reasons[1].starts_with("20 % of the voxels") && v.reasons[1].ends_with("upper side"), "{:?}", v.reasons);
+        assert!(
+            v.reasons[1].starts_with("20 % of the voxels") && v.reasons[1].ends_with("upper side"),
+            "{:?}",
+            v.reasons
+        );
     }
 }

@@ -99,7 +99,10 @@ impl Views {
             jacobian: Panel::coloured("Jacobian determinant", &sections, base, mask, change, jacobian)?
                 .with_note("Blue: the tissue shrinks. Red: it grows. White: its volume stays."),
             uncertainty: Panel::coloured("Uncertainty of the displacement", &sections, base, mask, vague, sigma)?
-                .with_note(format!("One standard deviation. Half of the voxels lie under {} mm.", short(spread(0.5, &sigma)))),
+                .with_note(format!(
+                    "One standard deviation. Half of the voxels lie under {} mm.",
+                    short(spread(0.5, &sigma))
+                )),
             arrows: (arrows, factor),
             matches: (dots, slab, precision),
         })
