@@ -47,7 +47,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         deformed: &pair.deformed,
         mask,
         params: &params,
-        metrics: Some(&metrics),
+        truth: Some((&pair.truth, &metrics)),
     };
     let summary = write_field(&mut folder, &measured, &mut result)?;
     folder.commit()?;

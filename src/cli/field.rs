@@ -98,7 +98,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         deformed: &moving,
         mask: inside.as_ref(),
         params: &params,
-        metrics: None,
+        truth: None,
     };
     let summary = write_field(&mut folder, &measured, &mut result)?;
     folder.commit()?;

@@ -28,7 +28,7 @@ pub struct Measured<'a> {
     pub deformed: &'a Volume,
     pub mask: Option<&'a Mask>,
     pub params: &'a FieldParams,
-    pub metrics: Option<&'a Metrics>,
+    pub truth: Option<(&'a DenseField, &'a Metrics)>,
 }
 
 /// Stages all files, adds the time of writing to the summary, and gives the short summary for stdout back.
@@ -45,7 +45,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &
     })?;
     result.summary.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
 
-    let Measured { command, names, initial, deformed, mask, params, metrics } = *measured;
+    let Measured { command, names, initial, deformed, mask, params, truth } = *measured;
     let still = warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0);
     let report = FieldReport {
         command,
@@ -56,7 +56,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &
         mask,
         params,
         result,
-        metrics,
+        truth,
     };
     folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
     let page = html::page(&report)?;

@@ -6,6 +6,8 @@ use crate::report::section::Section;
 use crate::types::{DenseField, Mask, Match};
 use std::fmt::Write;
 
+/// Arrows along the longer side of a picture.
+const ACROSS: usize = 16;
 /// Matches drawn at most in one picture.
 const MATCHES: usize = 1200;
 
@@ -28,8 +30,8 @@ pub fn arrows(
     factor: f64,
     scale: &Scale,
 ) -> String {
-    let (nodes, step) = section.lattice(28);
-    let width = step / 9.0;
+    let (nodes, step) = section.lattice(ACROSS);
+    let width = step / 8.0;
     let mut svg =
         format!(r#"<g fill="none" stroke-width="{width:.2}" stroke-linecap="round" stroke-linejoin="round">"#);
     for offset in nodes {
@@ -65,10 +67,10 @@ pub fn arrows(
     over(background, &format!("displacement arrows, {} plane", section.plane.name()), &svg)
 }
 
-/// How many times longer than in truth arrows should be, so that one of `length` mm fills about a lattice step and a half.
+/// How many times longer than in truth arrows should be, so that one of `length` mm fills about two lattice steps.
 pub fn arrow_factor(sections: &[Section], length: f64) -> f64 {
-    let step = sections.iter().map(|s| s.lattice(28).1).fold(f64::INFINITY, f64::min);
-    let wanted = 1.5 * step / length.max(1e-6);
+    let step = sections.iter().map(|s| s.lattice(ACROSS).1).fold(f64::INFINITY, f64::min);
+    let wanted = 2.0 * step / length.max(1e-6);
     [1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0].into_iter().rfind(|f| *f <= wanted).unwrap_or(1.0)
 }
 
@@ -113,7 +115,7 @@ mod tests {
         let (grid, section, picture, scale) = scene();
         let field = DenseField::from_fn(grid, |_| [0.0, 3.0, 0.0]);
         let svg = arrows(&section, &picture, &field, None, 1.0, &scale);
-        assert_eq!(svg.matches("<path").count(), 28 * 28);
+        assert_eq!(svg.matches("<path").count(), 14 * 14);
         assert!(svg.contains("l0.0 -3.0l"), "down is positive in SVG");
         let mask = Mask::filled(grid, 0);
         assert!(!arrows(&section, &picture, &field, Some(&mask), 1.0, &scale).contains("<path"));

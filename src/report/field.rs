@@ -1,6 +1,6 @@
 //! What the report of `palpate field` is made from.
 
-use crate::types::{FieldParams, FieldResult, Grid, Mask, Metrics, Volume};
+use crate::types::{DenseField, FieldParams, FieldResult, Grid, Mask, Metrics, Volume};
 
 /// A result with the volumes it came from.
 #[derive(Debug, Clone, Copy)]
@@ -21,8 +21,8 @@ pub struct FieldReport<'a> {
     pub params: &'a FieldParams,
     /// What was found.
     pub result: &'a FieldResult,
-    /// Its score, where the truth is known.
-    pub metrics: Option<&'a Metrics>,
+    /// The true displacement on the initial grid and the score against it, where the truth is known.
+    pub truth: Option<(&'a DenseField, &'a Metrics)>,
 }
 
 #[cfg(test)]
@@ -30,8 +30,7 @@ pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::types::{
-        Affine, Counts, DenseField, FieldSummary, LevelReport, Match, Mesh, MotionModel, SparseField, TetMesh,
-        WorldPoint,
+        Affine, Counts, FieldSummary, LevelReport, Match, Mesh, MotionModel, SparseField, TetMesh, WorldPoint,
     };
 
     /// A made-up result with known numbers.
@@ -106,7 +105,7 @@ pub(crate) mod tests {
                 mask: None,
                 params: &self.params,
                 result: &self.result,
-                metrics: None,
+                truth: None,
             }
         }
     }

@@ -29,6 +29,7 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let views = Views::of(report)?;
     let result = report.result;
     let mut body = head(report);
+    body.push_str(&score(report, &views));
 
     let [x, y, z] = views.centre.0.map(|v| short((v * 10.0).round() / 10.0));
     let _ = write!(
@@ -36,8 +37,9 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
         "<section><h2>Alignment</h2><p class=\"lead\">Planes through the centre of motion, x {x}, y {y}, z {z} mm. \
          The right of a picture is the patient's right, or front.</p><div class=\"grid\">"
     );
-    views.volumes.iter().chain(&views.differences).for_each(|p| body.push_str(&card(p)));
+    views.volumes.iter().for_each(|p| body.push_str(&card(p)));
     body.push_str(&blink(&views.volumes));
+    views.differences.iter().for_each(|p| body.push_str(&card(p)));
     body.push_str("</div></section><section><h2>Displacement</h2><div class=\"grid\">");
     body.push_str(&card(&views.magnitude));
     let planes: Vec<(Plane, [f64; 2])> = views.magnitude.pictures.iter().map(|p| (p.plane, p.size_mm)).collect();
@@ -91,7 +93,7 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     ))
 }
 
-/// Verdict, key numbers, score, warnings.
+/// Verdict, key numbers, warnings.
 fn head(report: &FieldReport<'_>) -> String {
     let (s, v) = (&report.result.summary, verdict(report));
     let [initial, deformed, _] = report.names.map(escape);
@@ -117,16 +119,20 @@ fn head(report: &FieldReport<'_>) -> String {
         let items: String = s.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
         let _ = write!(out, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
     }
-    if let Some(m) = report.metrics {
-        let _ = write!(
-            out,
-            "<article class=\"score\"><h3>Against exact truth</h3><p>Mean error <b>{:.3} mm</b>; doing nothing would give {:.3} mm.</p>{}</article>",
-            m.mean_mm,
-            m.identity_mm,
-            tables::metrics(m)
-        );
-    }
     out
+}
+
+/// The score against exact truth and where the error lies.
+fn score(report: &FieldReport<'_>, views: &Views) -> String {
+    let (Some((_, m)), Some(error)) = (report.truth, &views.error) else { return String::new() };
+    format!(
+        "<div class=\"grid\"><article class=\"score\"><h3>Against exact truth</h3><p>Mean error <b>{:.3} mm</b>; doing nothing \
+         would give {:.3} mm.</p>{}</article>{}</div>",
+        m.mean_mm,
+        m.identity_mm,
+        tables::metrics(m),
+        card(error)
+    )
 }
 
 /// A picture or drawing with its sides named.
@@ -232,7 +238,7 @@ mod tests {
     fn the_page_stands_alone_and_closes_what_it_opens() {
         let case = Case::new([24, 20, 9], [1.0, 1.0, 4.0]);
         let metrics = Metrics { mean_mm: 0.25, ..Metrics::default() };
-        let html = page(&FieldReport { metrics: Some(&metrics), ..case.report() }).unwrap();
+        let html = page(&FieldReport { truth: Some((&case.result.displacement, &metrics)), ..case.report() }).unwrap();
         for tag in ["article", "section", "figure", "div", "table", "svg", "p", "ul", "li", "b", "span", "i"] {
             let opened = html.matches(&format!("<{tag}>")).count() + html.matches(&format!("<{tag} ")).count();
             assert_eq!(opened, html.matches(&format!("</{tag}>")).count(), "<{tag}>");

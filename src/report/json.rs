@@ -33,7 +33,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
         "warnings": s.warnings,
         "params": report.params,
     });
-    if let Some(metrics) = report.metrics {
+    if let Some((_, metrics)) = report.truth {
         out["metrics"] = json!(metrics);
     }
     out

@@ -9,7 +9,7 @@ const NODES: usize = 4000;
 const WIDTH: f64 = 560.0;
 const HEIGHT: f64 = 440.0;
 
-/// Parallel projection: seen from the left front, a little from above. Right, up, and away from the eye.
+/// Parallel projection: seen from behind and the left, a little from above. Right, up, and away from the eye.
 fn project(p: [f64; 3]) -> [f64; 3] {
     let (turn, tilt) = (35f64.to_radians(), 22f64.to_radians());
     let (right, away) = (p[0] * turn.cos() - p[1] * turn.sin(), p[0] * turn.sin() + p[1] * turn.cos());
@@ -29,7 +29,7 @@ pub fn scatter(nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -
         [range(f64::min, f64::INFINITY), range(f64::max, f64::NEG_INFINITY)]
     };
     let ([x0, x1], [y0, y1]) = (extent(0), extent(1));
-    let zoom = ((WIDTH - 90.0) / (x1 - x0).max(1e-9)).min((HEIGHT - 70.0) / (y1 - y0).max(1e-9));
+    let zoom = ((WIDTH - 200.0) / (x1 - x0).max(1e-9)).min((HEIGHT - 60.0) / (y1 - y0).max(1e-9));
     let screen =
         |q: [f64; 3]| [WIDTH / 2.0 + zoom * (q[0] - (x0 + x1) / 2.0), HEIGHT / 2.0 - zoom * (q[1] - (y0 + y1) / 2.0)];
 
@@ -56,11 +56,11 @@ pub fn scatter(nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -
         let [x, y] = screen(q);
         let _ = write!(svg, r#"<circle cx="{x:.1}" cy="{y:.1}" r="{r:.1}" fill="{}"/>"#, scale.hex(length));
     }
-    // Each axis is named at the middle of the edge from the lower front left corner, and measured.
+    // Each axis is named at the middle of an edge of the outline, and measured.
     for (axis, name) in ["L to R", "P to A", "I to S"].iter().enumerate().filter(|_| !corners.is_empty()) {
-        let from = [0b000, 0b001, 0b000][axis];
+        let from = [0b000, 0b000, 0b001][axis];
         let ([px, py], [qx, qy]) = (screen(corners[from]), screen(corners[from | 1 << axis]));
-        let (dx, dy, anchor) = [(0.0, 20.0, "middle"), (8.0, 14.0, "start"), (-8.0, 0.0, "end")][axis];
+        let (dx, dy, anchor) = [(6.0, 18.0, "start"), (-6.0, 18.0, "end"), (10.0, 4.0, "start")][axis];
         let (x, y) = ((px + qx) / 2.0 + dx, (py + qy) / 2.0 + dy);
         let _ = write!(
             svg,

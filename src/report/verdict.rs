@@ -38,15 +38,13 @@ pub struct Verdict {
     pub reasons: Vec<String>,
 }
 
-/// Judges a result. Trust is low with under 100 matches, folds in more than one voxel of a thousand, a median
-/// uncertainty above the longest voxel edge, or one above the mean motion of a free field; high when none of these holds,
-/// nothing folds, the median uncertainty is under half the shortest voxel edge, and under a tenth of the voxels are uncertain
-/// by more than the longest voxel edge.
+/// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under 100 matches, folds in
+/// more than one voxel of a thousand, a median uncertainty above that edge, or one above the mean motion of a free field;
+/// high when nothing folds, the median uncertainty is under half an edge, and under a tenth of the voxels are uncertain by
+/// more than an edge.
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     let s = &report.result.summary;
-    let spacing = report.initial.grid().spacing();
-    let (edge, fine) =
-        (spacing.iter().fold(0.0, |m: f64, v| m.max(*v)), spacing.iter().fold(f64::INFINITY, |m, v| m.min(*v)));
+    let edge = report.initial.grid().spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
         MotionModel::Identity => "Nothing moved beyond the noise".to_string(),
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
@@ -77,7 +75,7 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
         short1(100.0 * share),
         short2(edge)
     );
-    let precise = s.uncertainty_median_mm <= fine / 2.0 && share < 0.1;
+    let precise = s.uncertainty_median_mm <= edge / 2.0 && share < 0.1;
     let median = format!("median uncertainty {} mm (1 sigma)", short2(s.uncertainty_median_mm));
     let (trust, mut reasons) = match (low.is_empty(), precise && s.folds == 0) {
         (false, _) => (Trust::Low, low),

@@ -26,6 +26,8 @@ pub struct Views {
     pub jacobian: Panel,
     /// Uncertainty.
     pub uncertainty: Panel,
+    /// Distance to the true displacement, where that is known.
+    pub error: Option<Panel>,
     /// One SVG a plane, and how many times longer than in truth the arrows are.
     pub arrows: (Vec<String>, f64),
     /// One SVG a plane, how thick a slab is shown (mm), and the scale of the dots.
@@ -70,6 +72,15 @@ impl Views {
         let sigma = |o: usize| result.uncertainty.as_slice()[o];
         let vague = Scale::from_zero(spread(0.98, &sigma), "mm", ColorMap::Magma);
 
+        let error = report.truth.map(|(truth, _)| {
+            let gap = |o: usize| {
+                let (u, t) = (result.displacement.at(o), truth.at(o));
+                (0..3).map(|c| (u[c] - t[c]).powi(2)).sum::<f32>().sqrt()
+            };
+            let scale = Scale::from_zero(spread(0.99, &gap), "mm", ColorMap::Magma);
+            Panel::coloured("Error of the displacement", &sections, base, mask, scale, gap)
+        });
+
         let backgrounds = sections
             .iter()
             .map(|s| Picture::gray(s, |o| initial.as_slice()[o], range))
@@ -103,6 +114,7 @@ impl Views {
                     "One standard deviation. Half of the voxels lie under {} mm.",
                     short(spread(0.5, &sigma))
                 )),
+            error: error.transpose()?,
             arrows: (arrows, factor),
             matches: (dots, slab, precision),
         })
