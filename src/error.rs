@@ -105,7 +105,7 @@ pub struct UnknownName {
 #[non_exhaustive]
 pub enum IoError {
     /// The operating system refused.
-    #[error("{path}: cannot {action}: {source}", path = path.display())]
+    #[error("{path}: cannot {action}: {source}; {hint}", path = path.display(), hint = os_hint(source))]
     Os {
         /// The file.
         path: PathBuf,
@@ -124,6 +124,19 @@ pub enum IoError {
         /// What to try.
         hint: String,
     },
+}
+
+/// What to try when the operating system refuses.
+fn os_hint(error: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind;
+    match error.kind() {
+        ErrorKind::NotFound => "check the spelling, and that the folder exists",
+        ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => "check its permissions or choose another folder",
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
+            "free some space or choose another folder"
+        }
+        _ => "check the path and the disk",
+    }
 }
 
 /// The field pipeline.

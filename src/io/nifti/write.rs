@@ -19,7 +19,7 @@ const STEPS_PER_MM: f32 = 4096.0;
 
 /// Writes a scalar volume as float32; `description` (up to 79 bytes) goes into the header.
 ///
-/// Values are rounded to 16 significant bits (relative error at most 2^-17; whole numbers up to 65,536 are exact), so
+/// Values are rounded to 16 significant bits (relative error at most 2^-16; whole numbers up to 65,536 are exact), so
 /// that they pack.
 ///
 /// # Errors
