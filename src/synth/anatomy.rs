@@ -26,8 +26,8 @@ pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Body {
 /// A region with centre and radii in units of `unit`.
 fn region(unit: [f64; 3], centre: [f64; 3], radii: [f64; 3], turn_degrees: f64, mean: f64, texture: f64) -> Region {
     let scaled = |v: [f64; 3]| std::array::from_fn(|a| v[a] * unit[a]);
-    let shape =
-        Superellipsoid { centre: scaled(centre), radii: scaled(radii), turn: turn_degrees.to_radians(), power: 2 };
+    let (sin, cos) = turn_degrees.to_radians().sin_cos();
+    let shape = Superellipsoid { centre: scaled(centre), radii: scaled(radii), turn: [cos, sin], power: 2 };
     Region { shape, mean, texture }
 }
 

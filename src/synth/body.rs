@@ -5,7 +5,7 @@
 //! coarse smooth displacement, so that nothing is symmetric. Texture cells are at least two voxels along each axis:
 //! the function can be sampled and interpolated without much aliasing.
 
-use crate::synth::noise::SmoothNoise;
+use crate::synth::noise::{COARSE, FINE, SmoothNoise};
 use crate::synth::random::Random;
 use crate::types::space::Matrix3;
 use crate::types::{Grid, WorldPoint};
@@ -17,8 +17,8 @@ pub struct Superellipsoid {
     pub centre: [f64; 3],
     /// Semi-axes (mm).
     pub radii: [f64; 3],
-    /// Turn about the third axis (radians).
-    pub turn: f64,
+    /// Cosine and sine of the turn about the third axis.
+    pub turn: [f64; 2],
     /// The exponent n: 2 is an ellipsoid, 8 nearly a box.
     pub power: i32,
 }
@@ -44,8 +44,11 @@ pub struct Body {
     centre: [f64; 3],
     /// Voxel edges as rows of the transposed linear part: how far (mm) the world axes run in one voxel step.
     edges: Matrix3,
+    /// Longest voxel edge, in space and seen along z (mm).
+    edge: f64,
+    edge_in_plane: f64,
     texture: [SmoothNoise<1>; 3],
-    bend: SmoothNoise<3>,
+    bend: SmoothNoise<4>,
     bend_mm: f64,
     taper: f64,
 }
@@ -68,67 +71,95 @@ impl Body {
         let linear = grid.affine().linear();
         let cell: [f64; 3] = std::array::from_fn(|a| 2.0 * linear[a].iter().map(|v| v * v).sum::<f64>().sqrt());
         let extent = extent(grid);
-        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0));
+        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0), FINE);
+        let longest = |axes: usize| {
+            let squares = |a: usize| (0..axes).map(|w| linear[w][a] * linear[w][a]).sum::<f64>();
+            (0..3).map(squares).fold(0.0, f64::max).sqrt()
+        };
         Self {
+            edge: longest(3),
+            edge_in_plane: longest(2),
             regions,
             rotation: rotation(angles),
             centre: shifted,
             edges: std::array::from_fn(|a| std::array::from_fn(|w| linear[w][a])),
             texture: std::array::from_fn(noise),
-            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3]),
+            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3], COARSE),
             bend_mm,
             taper,
         }
     }
 
-    /// Intensity at a world position.
-    pub fn intensity(&self, p: WorldPoint) -> f64 {
+    /// Intensity at a world position, and whether it lies in the body's outline.
+    pub fn sample(&self, p: WorldPoint) -> (f64, bool) {
         let q = self.own_frame(p);
+        let outline = self.outline(q);
+        if outline == 0.0 {
+            return (0.0, false);
+        }
         let norm = OCTAVES.iter().map(|o| o.1 * o.1).sum::<f64>().sqrt();
         let texture: f64 = self.texture.iter().zip(OCTAVES).map(|(t, o)| t.at(p.0)[0] * o.1 / norm).sum();
         let painted = self.regions.iter().fold(0.0, |below, region| {
             let cover = self.cover(&region.shape, q);
             below + cover * (region.mean * (1.0 + region.texture * texture) - below)
         });
-        painted.max(0.0)
+        (painted.max(0.0), outline > 0.5)
     }
 
     /// Whether a world position lies in the body's outline.
     pub fn contains(&self, p: WorldPoint) -> bool {
-        self.regions.first().is_some_and(|r| self.cover(&r.shape, self.own_frame(p)) > 0.5)
+        self.outline(self.own_frame(p)) > 0.5
+    }
+
+    fn outline(&self, q: [f64; 3]) -> f64 {
+        self.regions.first().map_or(0.0, |r| self.cover(&r.shape, q))
     }
 
     /// World position to the body's frame: turned, bent, with the taper undone.
     fn own_frame(&self, p: WorldPoint) -> [f64; 3] {
-        let bend = self.bend.at(p.0);
+        let bend = self.bend.vector(p.0);
         let d: [f64; 3] = std::array::from_fn(|a| p.0[a] - self.centre[a] + self.bend_mm * bend[a]);
         let q: [f64; 3] = std::array::from_fn(|r| (0..3).map(|c| self.rotation[r][c] * d[c]).sum());
         let scale = (1.0 + self.taper * q[2]).max(0.2);
         [q[0] / scale, q[1] / scale, q[2]]
     }
 
-    /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1.
+    /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1; exactly 0 far outside.
     fn cover(&self, shape: &Superellipsoid, q: [f64; 3]) -> f64 {
         /// Width of the logistic edge, in voxels: 10 to 90 % in two.
         const WIDTH: f64 = 0.45;
-        let (value, gradient) = shape.level(q);
+        /// Beyond so many voxels outside, the logistic is under 1e-9.
+        const FAR: f64 = 9.5;
+        let d: [f64; 3] = std::array::from_fn(|a| q[a] - shape.centre[a]);
+        // The voxel's extent in the plane is all that counts for a tube.
+        let reach = shape.radii[0].max(shape.radii[1])
+            + FAR * if shape.radii[2].is_finite() { self.edge } else { self.edge_in_plane };
+        if d[0] * d[0] + d[1] * d[1] > reach * reach {
+            return 0.0;
+        }
+        let (value, gradient) = shape.level(d);
         // Rate of change a voxel step; the body's turn of a few degrees is left out, as it hardly changes the width.
         let rate = self.edges.iter().map(|e| (0..3).map(|w| e[w] * gradient[w]).sum::<f64>().powi(2)).sum::<f64>();
         let voxels = (1.0 - value) / rate.sqrt().max(1e-12);
-        1.0 / (1.0 + (-voxels / WIDTH).exp())
+        if voxels < -FAR { 0.0 } else { 1.0 / (1.0 + (-voxels / WIDTH).exp()) }
     }
 }
 
 impl Superellipsoid {
-    /// The level function (1 on the outline, less inside) and its gradient (a mm) at `q`.
-    fn level(&self, q: [f64; 3]) -> (f64, [f64; 3]) {
-        let (sin, cos) = self.turn.sin_cos();
-        let d: [f64; 3] = std::array::from_fn(|a| q[a] - self.centre[a]);
+    /// The level function (1 on the outline, less inside) and its gradient (a mm) at `d` mm from the centre.
+    fn level(&self, d: [f64; 3]) -> (f64, [f64; 3]) {
+        let [cos, sin] = self.turn;
         let own = [cos * d[0] + sin * d[1], cos * d[1] - sin * d[0], d[2]];
         let s: [f64; 3] = std::array::from_fn(|a| own[a] / self.radii[a]);
-        let level = s.iter().map(|v| v.abs().powi(self.power)).sum::<f64>().powf(1.0 / f64::from(self.power)).max(1e-6);
-        let slope: [f64; 3] =
-            std::array::from_fn(|a| s[a].signum() * (s[a].abs() / level).powi(self.power - 1) / self.radii[a]);
+        let (level, shares) = if self.power == 2 {
+            let level = (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]).sqrt().max(1e-6);
+            (level, s.map(|v| v / level))
+        } else {
+            let sum: f64 = s.iter().map(|v| v.abs().powi(self.power)).sum();
+            let level = sum.powf(1.0 / f64::from(self.power)).max(1e-6);
+            (level, s.map(|v| v.signum() * (v.abs() / level).powi(self.power - 1)))
+        };
+        let slope: [f64; 3] = std::array::from_fn(|a| shares[a] / self.radii[a]);
         (level, [cos * slope[0] - sin * slope[1], sin * slope[0] + cos * slope[1], slope[2]])
     }
 }

@@ -1,10 +1,11 @@
 //! Displacements known in closed form at every world position.
 
 use crate::synth::body::{centre, extent, rotation};
-use crate::synth::noise::SmoothNoise;
+use crate::synth::noise::{COARSE, SmoothNoise};
 use crate::synth::random::Random;
 use crate::types::space::Matrix3;
 use crate::types::{Grid, WorldPoint};
+use rayon::prelude::*;
 
 /// The shape of a displacement, before [`Motion`] centres and scales it.
 #[derive(Debug, Clone)]
@@ -12,14 +13,14 @@ enum Law {
     /// m (p - centre) + shift.
     Linear { m: Matrix3, shift: [f64; 3] },
     /// Coarse plus a share of fine.
-    Smooth { coarse: SmoothNoise<3>, fine: SmoothNoise<3> },
+    Smooth { coarse: SmoothNoise<4>, fine: SmoothNoise<4> },
     /// A Gaussian of `radius` around the axis through `contact` along `inward`, decaying over `depth`.
     Press { contact: [f64; 3], inward: [f64; 3], radius: f64, depth: f64 },
     /// A flat plate moving up (+z) by `travel` into a body whose lowest point is `contact` and whose outline there
     /// rises by half `curvature` (a mm) times the squared offset along x and y.
     Plate { contact: [f64; 3], curvature: [f64; 2], travel: f64, depth: f64 },
     /// Half a jump along `along` on each side of the plane with `normal`, fading over `radius` across both.
-    Slide { normal: [f64; 3], along: [f64; 3], across: [f64; 3], offset: f64, radius: f64, smooth: SmoothNoise<3> },
+    Slide { normal: [f64; 3], along: [f64; 3], across: [f64; 3], offset: f64, radius: f64, smooth: SmoothNoise<4> },
 }
 
 /// A displacement u(p) (mm), initial to deformed.
@@ -76,7 +77,7 @@ impl Motion {
 
     /// Random cubic B-splines with control points every `spacing` and, at 35 %, every half `spacing` mm; to be scaled.
     pub fn smooth(grid: &Grid, spacing: f64, seed: u64) -> Self {
-        let noise = |stream, h| SmoothNoise::new(Random::new(seed, stream), [h; 3]);
+        let noise = |stream, h| SmoothNoise::new(Random::new(seed, stream), [h; 3], COARSE);
         Self::new(Law::Smooth { coarse: noise(40, spacing), fine: noise(41, spacing / 2.0) }, grid)
     }
 
@@ -115,18 +116,19 @@ impl Motion {
             across: cross(normal, along),
             offset: 0.05 * e[0].min(e[1]) * random.uniform(-1.0, 1.0),
             radius: 0.45 * length(e),
-            smooth: SmoothNoise::new(Random::new(seed, 31), [0.25 * e[0].max(e[1]); 3]),
+            smooth: SmoothNoise::new(Random::new(seed, 31), [0.25 * e[0].max(e[1]); 3], COARSE),
         };
         Self::new(law, grid)
     }
 
     /// Takes the mean over `tissue` off (a smooth law only) and makes `amplitude` mm the largest displacement there.
     pub fn scaled(mut self, amplitude: f64, tissue: &[WorldPoint]) -> Self {
+        let raw: Vec<[f64; 3]> = tissue.par_iter().map(|p| self.planar(p.0)).collect();
         if matches!(self.law, Law::Smooth { .. }) {
-            let sums = tissue.iter().map(|p| self.planar(p.0)).fold([0.0; 3], |s, u| add(s, u, 1.0));
+            let sums = raw.iter().fold([0.0; 3], |s, &u| add(s, u, 1.0));
             self.offset = sums.map(|s| s / tissue.len().max(1) as f64);
         }
-        let largest = tissue.iter().map(|&p| length(self.at(p))).fold(0.0, f64::max);
+        let largest = raw.iter().map(|&u| length(add(u, self.offset, -1.0))).fold(0.0, f64::max);
         self.scale *= if largest > 0.0 { amplitude / largest } else { 0.0 };
         self
     }
@@ -135,6 +137,19 @@ impl Motion {
     pub fn at(&self, p: WorldPoint) -> [f64; 3] {
         let u = self.planar(p.0);
         std::array::from_fn(|a| (u[a] - self.offset[a]) * self.scale)
+    }
+
+    /// The x with x + u(x) = y, by fixed point to 1e-9 mm; for motions whose gradient stays under 1, as a press has.
+    pub fn origin_of(&self, y: WorldPoint) -> WorldPoint {
+        let mut x = y;
+        for _ in 0..200 {
+            let r = y.minus(x.moved(self.at(x)));
+            x = x.moved(r);
+            if length(r) < 1e-9 {
+                break;
+            }
+        }
+        x
     }
 
     /// Whether neighbouring places may part (a jump, so that difference quotients are not the Jacobian).
@@ -158,7 +173,7 @@ impl Law {
                 let d = add(p, centre, -1.0);
                 std::array::from_fn(|r| dot(m[r], d) + shift[r])
             }
-            Law::Smooth { coarse, fine } => add(coarse.at(p), fine.at(p), 0.35),
+            Law::Smooth { coarse, fine } => add(coarse.vector(p), fine.vector(p), 0.35),
             Law::Press { contact, inward, radius, depth } => {
                 let d = add(p, *contact, -1.0);
                 let inside = dot(d, *inward);
@@ -180,7 +195,7 @@ impl Law {
                 let d = add(p, centre, -1.0);
                 let side = if dot(d, *normal) > *offset { 0.5 } else { -0.5 };
                 let jump = side * (-(dot(d, *across) / radius).powi(2)).exp();
-                add(along.map(|v| v * jump), smooth.at(p), 0.08)
+                add(along.map(|v| v * jump), smooth.vector(p), 0.08)
             }
         }
     }

@@ -89,7 +89,7 @@ pub struct PhantomParams {
     pub kind: PhantomKind,
     /// How it moves.
     pub motion: MotionKind,
-    /// Largest displacement in the tissue (mm); for a rotation its angle (degrees).
+    /// Largest displacement over the body's outline at rest (mm); for a rotation its angle (degrees).
     pub amplitude: f64,
     /// Voxels along x, y, z; each 1 or at least 8, at most one of them 1.
     pub size: [usize; 3],

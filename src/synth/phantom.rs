@@ -1,7 +1,8 @@
 //! A pair of volumes and the exact displacement between them.
 //!
 //! With B the body's intensity and u the motion, the initial volume is B(x + u(x)) and the deformed one B(y) times a
-//! slow bias, so deformed(x + u(x)) = initial(x) without any interpolation; both get independent Rician noise. The
+//! slow bias, so deformed(x + u(x)) = initial(x) without any interpolation; both get independent Rician noise. A press
+//! shows the body at rest in the initial volume, B(x), and dented in the deformed one, B(x(y)) with y = x + u(x). The
 //! true Jacobian determinant, by differences on the initial grid, stays above [`MIN_JACOBIAN`] everywhere (a slide
 //! excepted, which shears along its plane); a motion that would break this is made coarser if smooth, else refused.
 
@@ -12,7 +13,7 @@ use crate::synth::anatomy::{FINGERTIP_RADII, body};
 use crate::synth::body::{Body, extent};
 use crate::synth::landmarks::landmarks;
 use crate::synth::motion::Motion;
-use crate::synth::noise::SmoothNoise;
+use crate::synth::noise::{COARSE, SmoothNoise};
 use crate::synth::params::{MotionKind, PhantomKind, PhantomParams};
 use crate::synth::random::Random;
 use crate::types::space::determinant;
@@ -82,12 +83,16 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
     params.check()?;
     let body = body(params.kind, &initial, params.seed);
     let (motion, truth, control_spacing_mm) = motion(params, &body, initial)?;
-    let before = Volume::from_voxels(initial, |_, x| body.intensity(x.moved(motion.at(x))) as f32);
-    let after = Volume::from_voxels(deformed, |_, y| body.intensity(y) as f32);
-    let mut values: Vec<f64> = after.as_slice().iter().map(|&v| f64::from(v)).collect();
+    let rest_first = params.motion == MotionKind::Press;
+    let before = Volume::from_voxels(initial, |at, x| {
+        body.sample(if rest_first { x } else { x.moved(truth.at(at).map(f64::from)) })
+    });
+    let after = Volume::from_voxels(deformed, |_, y| body.sample(if rest_first { motion.origin_of(y) } else { y }));
+    let clean = intensities(&before);
+    let mut values: Vec<f64> = after.as_slice().iter().map(|v| v.0).collect();
     let noise_sigma = params.noise * percentile(&mut values, 99.0);
-    let mask = mask(&body, &truth, &deformed);
-    let landmarks = landmarks(&before, &mask, &motion, params.landmarks, Random::new(params.seed, 50));
+    let mask = mask(&before, &truth, &deformed);
+    let landmarks = landmarks(&clean, &mask, &motion, params.landmarks, Random::new(params.seed, 50));
     let inside = || (0..initial.len()).filter(|&at| mask.as_slice()[at] != 0);
     let lengths: Vec<f64> = inside().map(|at| length(truth.at(at))).collect();
     let (jacobian_min, jacobian_max) = jacobian_range(&truth, |at| mask.as_slice()[at] != 0);
@@ -102,9 +107,9 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
         mask_voxels: lengths.len(),
         landmarks: landmarks.len(),
     };
-    let biased = biased(&body, after, params);
+    let biased = biased(&after, params);
     Ok(Phantom {
-        initial: rician(&before, noise_sigma, params.seed, 60),
+        initial: rician(&clean, noise_sigma, params.seed, 60),
         deformed: rician(&biased, noise_sigma, params.seed, 61),
         truth,
         mask,
@@ -174,32 +179,38 @@ fn jacobian_range(truth: &DenseField, used: impl Fn(usize) -> bool + Sync) -> (f
         .reduce(|| (f64::INFINITY, f64::NEG_INFINITY), |a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
+/// Intensity and whether it is tissue, at each voxel.
+type Imaged = Volume<(f64, bool)>;
+
+fn intensities(imaged: &Imaged) -> Volume {
+    Volume::from_voxels(*imaged.grid(), |at, _| imaged.as_slice()[at].0 as f32)
+}
+
 /// Tissue off the initial grid's border whose deformed place lies a voxel or more inside the deformed grid.
-fn mask(body: &Body, truth: &DenseField, deformed: &Grid) -> Mask {
+fn mask(before: &Imaged, truth: &DenseField, deformed: &Grid) -> Mask {
     let grid = *truth.grid();
     let clear = |shape: [usize; 3], p: [f64; 3]| {
         (0..3).all(|a| shape[a] == 1 || (p[a] >= 1.0 && p[a] <= shape[a] as f64 - 2.0))
     };
     Volume::from_voxels(grid, |at, x| {
-        let y = x.moved(truth.at(at).map(f64::from));
-        let VoxelPoint(there) = deformed.affine().to_voxel(y);
+        let VoxelPoint(there) = deformed.affine().to_voxel(x.moved(truth.at(at).map(f64::from)));
         let here = grid.voxel(at).map(|v| v as f64);
-        u8::from(clear(grid.shape(), here) && clear(deformed.shape(), there) && body.contains(y))
+        u8::from(before.as_slice()[at].1 && clear(grid.shape(), here) && clear(deformed.shape(), there))
     })
 }
 
-/// `clean` times exp(bias b), where b is smooth with mean 0 and largest magnitude 1 in the tissue.
-fn biased(body: &Body, clean: Volume, params: &PhantomParams) -> Volume {
+/// The clean image times exp(bias b), where b is smooth with mean 0 and largest magnitude 1 in the tissue.
+fn biased(clean: &Imaged, params: &PhantomParams) -> Volume {
     let grid = *clean.grid();
     let cell = extent(&grid).iter().fold(0.0, |m: f64, &e| m.max(e)) / 2.0;
-    let noise = SmoothNoise::<1>::new(Random::new(params.seed, 70), [cell; 3]);
-    let slow = Volume::from_voxels(grid, |_, y| (noise.at(y.0)[0], body.contains(y)));
-    let tissue: Vec<f64> = slow.as_slice().iter().filter(|v| v.1).map(|v| v.0).collect();
+    let noise = SmoothNoise::<1>::new(Random::new(params.seed, 70), [cell; 3], COARSE);
+    let slow = Volume::from_voxels(grid, |_, y| noise.at(y.0)[0]);
+    let tissue: Vec<f64> = slow.as_slice().iter().zip(clean.as_slice()).filter(|v| v.1.1).map(|v| *v.0).collect();
     let mean = tissue.iter().sum::<f64>() / tissue.len().max(1) as f64;
     let largest = tissue.iter().map(|v| (v - mean).abs()).fold(1e-12, f64::max);
     Volume::from_voxels(grid, |at, _| {
-        let b = (slow.as_slice()[at].0 - mean) / largest;
-        (f64::from(clean.as_slice()[at]) * (params.bias * b).exp()) as f32
+        let b = (slow.as_slice()[at] - mean) / largest;
+        (clean.as_slice()[at].0 * (params.bias * b).exp()) as f32
     })
 }
 
