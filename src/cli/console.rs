@@ -35,9 +35,15 @@ impl Console {
         }
     }
 
-    /// Why it ends here.
+    /// Why it ends here, each cause once.
     pub fn error(&self, error: &anyhow::Error) {
-        let _ = writeln!(stderr(), "error: {error:#}");
+        let mut said = error.to_string();
+        for cause in error.chain().skip(1).map(ToString::to_string) {
+            if !said.contains(&cause) {
+                said = format!("{said}: {cause}");
+            }
+        }
+        let _ = writeln!(stderr(), "error: {said}");
     }
 
     /// A bar on stderr: hidden when that is no terminal, or with --quiet.
