@@ -51,7 +51,7 @@ pub struct Description {
     pub control_spacing_mm: Option<f64>,
     /// Standard deviation of the noise (intensity).
     pub noise_sigma: f64,
-    /// Mean and largest displacement over the mask (mm).
+    /// Mean displacement over the mask (mm).
     pub mean_mm: f64,
     /// Largest displacement over the mask (mm).
     pub max_mm: f64,
@@ -62,7 +62,7 @@ pub struct Description {
     /// Voxels of the mask.
     pub mask_voxels: usize,
     /// Landmarks found.
-    pub landmarks: usize,
+    pub landmarks_found: usize,
 }
 
 /// The phantom that `params` ask for, both volumes on [`PhantomParams::grid`].
@@ -105,7 +105,7 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
         jacobian_min,
         jacobian_max,
         mask_voxels: lengths.len(),
-        landmarks: landmarks.len(),
+        landmarks_found: landmarks.len(),
     };
     let biased = biased(&after, params);
     Ok(Phantom {
