@@ -77,7 +77,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         d.mean_mm,
         d.max_mm,
         d.mask_voxels,
-        d.landmarks,
+        phantom.landmarks.len(),
         options.output.join("phantom.svg").display()
     ))
 }
