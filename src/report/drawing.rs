@@ -124,7 +124,8 @@ mod tests {
     #[test]
     fn arrows_are_never_shortened_and_grow_by_round_factors() {
         let (_, section, ..) = scene();
-        assert_eq!([0.0, 0.5, 100.0].map(|l| arrow_factor(std::slice::from_ref(&section), l)), [50.0, 5.0, 1.0]);
+        // Two lattice steps are 7 mm: 14 times half a millimetre.
+        assert_eq!([0.0, 0.5, 100.0].map(|l| arrow_factor(std::slice::from_ref(&section), l)), [50.0, 10.0, 1.0]);
     }
 
     #[test]
