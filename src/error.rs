@@ -207,3 +207,15 @@ pub enum SynthError {
     #[error(transparent)]
     Space(#[from] SpaceError),
 }
+
+/// Pictures and pages.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// A picture could not be encoded.
+    #[error("a picture of the report could not be encoded: {what}")]
+    Picture {
+        /// What the encoder said.
+        what: String,
+    },
+}

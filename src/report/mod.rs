@@ -1,1 +1,41 @@
-//! report.
+//! Results as text, JSON, SVG and HTML: pure functions from data to strings and bytes.
+//!
+//! Pictures show the grid in the nearest canonical orientation (right of the picture = right or front of the patient,
+//! top = front or head), with true proportions in mm. Nothing here opens a file or prints. Volumes given together must
+//! lie on one grid; where they do not, pictures are of what lies at the same offsets.
+
+pub mod colormap;
+
+pub mod scale;
+
+pub mod statistics;
+
+pub mod section;
+
+pub mod picture;
+
+pub mod drawing;
+
+pub mod nodes;
+
+pub mod chart;
+
+pub mod figure;
+
+pub mod verdict;
+
+pub mod panels;
+
+pub mod views;
+
+pub mod field;
+
+pub mod tables;
+
+pub mod html;
+
+pub mod text;
+
+pub mod json;
+
+pub use field::FieldReport;

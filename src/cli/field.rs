@@ -1,0 +1,121 @@
+//! `palpate field`: two volumes to a dense displacement field.
+
+use super::console::Console;
+use super::inputs::{check_distinct, name, read_mask, read_volume, same_file, warn_all};
+use super::outputs::{FIELD_FILES, Measured, write_field};
+use anyhow::{Context, Result};
+use clap::Args;
+use palpate::error::UnknownName;
+use palpate::io::OutputFolder;
+use palpate::pipeline;
+use palpate::types::params::Preset;
+use palpate::types::{FieldParams, FieldSummary, names};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Volume before the deformation (.nii, .nii.gz)
+    initial: PathBuf,
+    /// Volume after it, on any grid
+    deformed: PathBuf,
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Write into a folder that is not empty
+    #[arg(long)]
+    force: bool,
+    /// Where to measure: a mask on the initial volume's grid, 0 outside
+    #[arg(long, value_name = "M")]
+    mask: Option<PathBuf>,
+    #[command(flatten)]
+    tuning: Tuning,
+}
+
+/// What `field` and `demo` share.
+#[derive(Debug, Args)]
+pub struct Tuning {
+    /// Time against error: fast, balanced or accurate
+    #[arg(long, default_value = "balanced", value_parser = preset)]
+    preset: Preset,
+    /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
+    #[arg(long, value_name = "N")]
+    points: Option<usize>,
+    /// Largest motion to look for, up to 200 mm [default: by size]
+    #[arg(long, value_name = "MM")]
+    search: Option<f64>,
+    /// Seed of whatever is drawn at random
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    pub seed: u64,
+}
+
+impl Tuning {
+    /// Parameters in range.
+    pub fn params(&self) -> Result<FieldParams> {
+        let mut params = FieldParams { seed: self.seed, ..FieldParams::preset(self.preset) };
+        params.points = self.points.unwrap_or(params.points);
+        params.search_mm = self.search.unwrap_or(params.search_mm);
+        params.check()?;
+        Ok(params)
+    }
+}
+
+fn preset(name: &str) -> Result<Preset, UnknownName> {
+    let known = [("fast", Preset::Fast), ("balanced", Preset::Balanced), ("accurate", Preset::Accurate)];
+    names::choose("preset", name, &known)
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let Options { initial, deformed, output, force, mask, tuning } = options;
+    let params = tuning.params()?;
+    let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).map(PathBuf::as_path).collect();
+    check_distinct(&given, &FIELD_FILES.map(|f| output.join(f)))?;
+
+    let started = Instant::now();
+    let mut warnings = Vec::new();
+    if same_file(initial, deformed) {
+        warnings.push("the initial and the deformed volume are the same file".into());
+    }
+    let progress = console.progress();
+    progress.set("read", 0.0);
+    let fixed = read_volume(initial, &mut warnings)?;
+    let moving = read_volume(deformed, &mut warnings)?;
+    let inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
+    let mut folder = OutputFolder::create(output, *force)?;
+    let read = started.elapsed().as_secs_f64();
+
+    let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
+    let mut result = pipeline::field::run(&fixed, &moving, inside.as_ref(), &params, &|s, f| progress.set(s, f))
+        .with_context(|| format!("{} to {}", names[0], names[1]))?;
+    result.summary.seconds.insert(0, ("read".into(), read));
+    result.summary.warnings.splice(0..0, warnings);
+
+    progress.set("write", 1.0);
+    let measured = Measured {
+        command: "field",
+        names: [&names[0], &names[1], &names[2]],
+        initial: &fixed,
+        deformed: &moving,
+        mask: inside.as_ref(),
+        params: &params,
+        truth: None,
+    };
+    let summary = write_field(&mut folder, &measured, &mut result)?;
+    folder.commit()?;
+    drop(progress);
+    explain(console, &result.summary);
+    warn_all(console, &result.summary.warnings);
+    console.say(&format!("{summary}  results      {}", output.join("report.html").display()))
+}
+
+/// Levels, reasons and stages, for -v.
+pub fn explain(console: &Console, summary: &FieldSummary) {
+    for l in &summary.levels {
+        console.detail(&format!(
+            "level {:.2?} mm: {} candidates, {} kept, energy {:.4} -> {:.4}, residual {:.3} mm",
+            l.spacing_mm, l.counts.candidates, l.counts.kept, l.energy_before, l.energy_after, l.residual_mm
+        ));
+    }
+    summary.evidence.iter().for_each(|e| console.detail(&format!("model: {e}")));
+    summary.seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.2} s")));
+}

@@ -1,0 +1,89 @@
+//! Reading inputs, and the checks that can be made before any work.
+
+use super::Usage;
+use super::console::Console;
+use anyhow::{Result, bail};
+use palpate::error::FieldError;
+use palpate::io;
+use palpate::types::{Grid, Mask, Volume};
+use std::path::{Path, PathBuf};
+
+/// The last part of a path, for messages and reports.
+pub fn name(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Whether two paths name one existing file.
+pub fn same_file(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
+/// An output must not replace an input.
+pub fn check_distinct(inputs: &[&Path], outputs: &[PathBuf]) -> Result<()> {
+    for output in outputs {
+        if let Some(input) = inputs.iter().find(|input| same_file(input, output)) {
+            bail!(Usage(format!("{} is an input and would be overwritten; choose another --output", input.display())));
+        }
+    }
+    Ok(())
+}
+
+/// One output file: its folder must be there, and its name end in one of `endings`.
+pub fn check_output_file(path: &Path, endings: &[&str]) -> Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if !folder.is_dir() {
+        let what = if folder.exists() { "is not a folder" } else { "does not exist" };
+        bail!(
+            "{}: cannot be written, because {} {what}; create it or choose another --output",
+            path.display(),
+            folder.display()
+        );
+    }
+    if path.is_dir() {
+        bail!(Usage(format!("{} is a folder; give --output the name of a file", path.display())));
+    }
+    if !endings.iter().any(|e| name(path).to_lowercase().ends_with(e)) {
+        bail!(Usage(format!("{}: the name must end in {}", path.display(), endings.join(" or "))));
+    }
+    Ok(())
+}
+
+/// A volume to measure on; warns about single voxels without a number and refuses a volume without any.
+pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
+    let volume = io::read_volume(path)?;
+    let (bad, all) = (io::count_non_finite(&volume), volume.grid().len());
+    if bad == all {
+        bail!("{}: every voxel is NaN or infinite; export it again", path.display());
+    }
+    if bad > 0 {
+        warnings.push(format!("{}: {bad} of {all} voxels are NaN or infinite and are not used", name(path)));
+    }
+    let mut finite = volume.as_slice().iter().filter(|v| v.is_finite());
+    let first = finite.next();
+    if finite.all(|v| Some(v) == first) {
+        bail!("{}: every voxel has the same value, so nothing can be found in it; check the file", path.display());
+    }
+    Ok(volume)
+}
+
+/// A mask on `grid`, which is that of `reference`.
+pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
+    let mask = io::read_mask(path)?;
+    if !grid.same_as(mask.grid()) {
+        bail!(FieldError::GridMismatch {
+            what: path.display().to_string(),
+            found: mask.grid().shape(),
+            reference: reference.display().to_string(),
+            expected: grid.shape(),
+        });
+    }
+    if mask.as_slice().iter().all(|v| *v == 0) {
+        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
+    }
+    Ok(mask)
+}
+
+/// All warnings, once.
+pub fn warn_all(console: &Console, warnings: &[String]) {
+    warnings.iter().for_each(|w| console.warn(w));
+}

@@ -1,0 +1,38 @@
+//! `palpate invert`: the field from the deformed to the initial place.
+
+use super::console::Console;
+use super::inputs::{check_distinct, check_output_file};
+use anyhow::Result;
+use clap::Args;
+use palpate::field::inverse::invert;
+use palpate::io;
+use std::path::PathBuf;
+
+/// An inverse that is off by more than this somewhere is worth a warning (mm).
+const RESIDUAL_MM: f64 = 0.1;
+
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Displacement field (5-D NIfTI, LPS mm)
+    field: PathBuf,
+    /// File to write (.nii, .nii.gz)
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let Options { field, output } = options;
+    check_distinct(&[field], std::slice::from_ref(output))?;
+    check_output_file(output, &[".nii", ".nii.gz"])?;
+    let inverse = invert(&io::read_field(field)?, None);
+    io::write_field(output, &inverse.field)?;
+    if inverse.max_residual_mm > RESIDUAL_MM {
+        console.warn("the field folds somewhere, so it has no exact inverse there; look at its Jacobian determinant");
+    }
+    console.say(&format!(
+        "Wrote {}: undoes the field to {:.4} mm; {} voxels come from outside its grid.",
+        output.display(),
+        inverse.max_residual_mm,
+        inverse.outside
+    ))
+}

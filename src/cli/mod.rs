@@ -1,0 +1,104 @@
+//! Raw arguments to a checked plan to the pipeline; one file a subcommand.
+//!
+//! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0 done, 1 failed on
+//! this input, 2 wrong usage. A closed pipe ends the program quietly.
+
+mod console;
+
+mod demo;
+
+mod evaluate;
+
+mod field;
+
+mod inputs;
+
+mod invert;
+
+mod outputs;
+
+mod phantom;
+
+mod warp;
+
+use clap::{Args, Parser, Subcommand};
+use console::Console;
+use std::process::ExitCode;
+
+/// Measures how soft tissue deforms inside, from a pair of MR volumes.
+#[derive(Debug, Parser)]
+#[command(
+    name = "palpate",
+    version,
+    max_term_width = 100,
+    after_help = "Try `palpate demo` first. Positions are world mm (RAS); a displacement points from the initial to the \
+                  deformed place of the same tissue."
+)]
+struct Cli {
+    #[command(flatten)]
+    common: Common,
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// Flags of every subcommand.
+#[derive(Debug, Args)]
+struct Common {
+    /// Threads to use [default: all cores]
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    /// No progress and no warnings on stderr
+    #[arg(long, global = true)]
+    quiet: bool,
+    /// More on stderr: stages, levels, reasons
+    #[arg(short, long, global = true, conflicts_with = "quiet")]
+    verbose: bool,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Measure the displacement from an initial to a deformed volume
+    Field(field::Options),
+    /// Carry an image, a label map or points along a displacement field
+    Warp(warp::Options),
+    /// Turn a displacement field around: deformed to initial
+    Invert(invert::Options),
+    /// Make a synthetic pair of volumes with exactly known displacement
+    Phantom(phantom::Options),
+    /// Score a displacement field against exact truth
+    Evaluate(evaluate::Options),
+    /// Make a synthetic calf, measure it, and score the result against the truth
+    Demo(demo::Options),
+}
+
+/// The arguments do not make sense together.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+struct Usage(String);
+
+/// The whole program.
+pub fn run() -> ExitCode {
+    let Cli { common, command } = Cli::parse();
+    let console = Console::new(common.quiet, common.verbose);
+    if let Some(n) = common.threads {
+        // Fails only when a pool is there already, which cannot be: nothing has run yet.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global();
+    }
+    let done = match command {
+        Command::Field(options) => field::run(&options, &console),
+        Command::Warp(options) => warp::run(&options, &console),
+        Command::Invert(options) => invert::run(&options, &console),
+        Command::Phantom(options) => phantom::run(&options, &console),
+        Command::Evaluate(options) => evaluate::run(&options, &console),
+        Command::Demo(options) => demo::run(&options, &console),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) if console::is_closed_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            console.error(&error);
+            let usage = error.is::<Usage>() || error.is::<palpate::error::ParamError>();
+            ExitCode::from(if usage { 2 } else { 1 })
+        }
+    }
+}

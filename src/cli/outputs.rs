@@ -1,0 +1,65 @@
+//! The files of a field run.
+
+use anyhow::Result;
+use palpate::field::warp::warp_image;
+use palpate::io::{self, OutputFolder};
+use palpate::numerics::sampling::Interpolation;
+use palpate::report::{FieldReport, html, json};
+use palpate::types::{DenseField, FieldParams, FieldResult, Mask, Mesh, Metrics, Volume};
+use std::time::Instant;
+
+/// Names of what [`write_field`] writes.
+pub const FIELD_FILES: [&str; 8] = [
+    "displacement.nii.gz",
+    "warped.nii.gz",
+    "jacobian.nii.gz",
+    "uncertainty.nii.gz",
+    "matches.csv",
+    "mesh.vtu",
+    "summary.json",
+    "report.html",
+];
+
+/// A measured pair, as the outputs need it.
+pub struct Measured<'a> {
+    pub command: &'a str,
+    pub names: [&'a str; 3],
+    pub initial: &'a Volume,
+    pub deformed: &'a Volume,
+    pub mask: Option<&'a Mask>,
+    pub params: &'a FieldParams,
+    pub truth: Option<(&'a DenseField, &'a Metrics)>,
+}
+
+/// Stages all files, adds the time of writing to the summary, and gives the short summary for stdout back.
+pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &mut FieldResult) -> Result<String> {
+    let started = Instant::now();
+    folder.write("displacement.nii.gz", |p| io::write_field(p, &result.displacement))?;
+    folder.write("warped.nii.gz", |p| io::write_volume(p, &result.warped, "palpate: deformed at x + u(x)"))?;
+    folder.write("jacobian.nii.gz", |p| io::write_volume(p, &result.jacobian, "palpate: Jacobian determinant"))?;
+    folder.write("uncertainty.nii.gz", |p| io::write_volume(p, &result.uncertainty, "palpate: 1 sigma of u, mm"))?;
+    folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
+    folder.write("mesh.vtu", |p| match &result.mesh {
+        Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
+        Mesh::Triangles(mesh) => io::write_tri_mesh(p, mesh, &result.node_displacement, &[]),
+    })?;
+    result.summary.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
+
+    let Measured { command, names, initial, deformed, mask, params, truth } = *measured;
+    let still = warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0);
+    let report = FieldReport {
+        command,
+        names,
+        initial,
+        deformed: &still,
+        deformed_grid: deformed.grid(),
+        mask,
+        params,
+        result,
+        truth,
+    };
+    folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
+    let page = html::page(&report)?;
+    folder.write("report.html", |p| io::write_text(p, &page))?;
+    Ok(palpate::report::text::field_summary(&report))
+}

@@ -1,0 +1,99 @@
+//! `palpate phantom`: a synthetic pair with exactly known displacement.
+
+use super::Usage;
+use super::console::Console;
+use anyhow::{Result, bail};
+use clap::Args;
+use palpate::io::{self, OutputFolder};
+use palpate::report::{figure, panels};
+use palpate::synth::{self, MotionKind, Phantom, PhantomKind, PhantomParams};
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub struct Options {
+    /// calf, slice, head, block or fingertip
+    kind: PhantomKind,
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Write into a folder that is not empty
+    #[arg(long)]
+    force: bool,
+    /// Voxels along x; the field of view stays [default: by kind]
+    #[arg(long, value_name = "N")]
+    size: Option<usize>,
+    /// Voxel edges in mm, one number or x,y,z; the number of voxels stays [default: by kind]
+    #[arg(long, value_name = "MM", value_delimiter = ',')]
+    spacing: Vec<f64>,
+    /// Seed of anatomy, motion and noise
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    seed: u64,
+    /// none, translate, rotate, affine, smooth, press or slide [default: by kind]
+    #[arg(long)]
+    motion: Option<MotionKind>,
+    /// Largest displacement in mm, or degrees for rotate [default: by kind]
+    #[arg(long, value_name = "MM")]
+    amplitude: Option<f64>,
+    /// Standard deviation of the Rician noise, as a part of the brightest tissue
+    #[arg(long, value_name = "PART", default_value_t = 0.03)]
+    noise: f64,
+    /// Largest change of brightness across the deformed volume, as a part
+    #[arg(long, value_name = "PART", default_value_t = 0.15)]
+    bias: f64,
+}
+
+impl Options {
+    /// Parameters in range.
+    fn params(&self) -> Result<PhantomParams> {
+        let mut p =
+            PhantomParams { seed: self.seed, noise: self.noise, bias: self.bias, ..PhantomParams::new(self.kind) };
+        if let Some(n) = self.size {
+            p = p.sized(n);
+        }
+        match self.spacing[..] {
+            [] => {}
+            [v] => p.spacing = [v; 3],
+            [x, y, z] => p.spacing = [x, y, z],
+            _ => bail!(Usage("--spacing takes one number or three, as 1.5,1.5,5".into())),
+        }
+        p.motion = self.motion.unwrap_or(p.motion);
+        p.amplitude = self.amplitude.unwrap_or(p.amplitude);
+        p.check()?;
+        Ok(p)
+    }
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let params = options.params()?;
+    let mut folder = OutputFolder::create(&options.output, options.force)?;
+    let phantom = synth::phantom(&params)?;
+    write(&mut folder, &phantom)?;
+    folder.commit()?;
+    let d = &phantom.description;
+    console.say(&format!(
+        "{:?}, {:?} motion: mean {:.2} mm, largest {:.2} mm over {} voxels; {} landmarks.\n  results      {}",
+        d.params.kind,
+        d.params.motion,
+        d.mean_mm,
+        d.max_mm,
+        d.mask_voxels,
+        phantom.landmarks.len(),
+        options.output.join("phantom.svg").display()
+    ))
+}
+
+/// Stages both volumes, truth, mask, landmarks, description and picture.
+pub fn write(folder: &mut OutputFolder, phantom: &Phantom) -> Result<()> {
+    let Phantom { initial, deformed, truth, mask, landmarks, description } = phantom;
+    folder.write("initial.nii.gz", |p| io::write_integers(p, initial, "palpate phantom: initial"))?;
+    folder.write("deformed.nii.gz", |p| io::write_integers(p, deformed, "palpate phantom: deformed"))?;
+    folder.write("truth.nii.gz", |p| io::write_field(p, truth))?;
+    folder.write("mask.nii.gz", |p| io::write_labels(p, mask, "palpate phantom: tissue"))?;
+    folder.write("landmarks.csv", |p| io::write_landmarks(p, landmarks))?;
+    folder.write("phantom.json", |p| io::write_json(p, description))?;
+    let params = &description.params;
+    let title = format!("{:?}, {:?} motion, seed {}", params.kind, params.motion, params.seed);
+    let picture = figure::figure(&title, &panels::synthetic_pair(initial, deformed, truth, Some(mask))?);
+    folder.write("phantom.svg", |p| io::write_text(p, &picture))?;
+    Ok(())
+}

@@ -1,0 +1,87 @@
+//! `palpate warp`: images, labels and points carried along a field.
+
+use super::console::Console;
+use super::inputs::{check_distinct, check_output_file};
+use anyhow::Result;
+use clap::Args;
+use palpate::error::IoError;
+use palpate::field::warp::{warp_image, warp_labels, warp_points};
+use palpate::io;
+use palpate::numerics::sampling::Interpolation;
+use palpate::types::{DenseField, WorldPoint};
+use std::path::{Path, PathBuf};
+
+#[derive(Debug, Args)]
+#[command(
+    after_help = "An image is read at x + u(x), so the deformed volume comes to look like the initial one. A point \
+                        moves to p + u(p), from its initial to its deformed place. Use --interpolation nearest for \
+                        labels and masks."
+)]
+pub struct Options {
+    /// Image, label map or mask (.nii, .nii.gz)
+    #[arg(required_unless_present = "points")]
+    image: Option<PathBuf>,
+    /// Points to move instead: CSV with columns x,y,z (world mm, RAS); other columns are kept
+    #[arg(long, value_name = "P", conflicts_with_all = ["image", "reference", "interpolation"])]
+    points: Option<PathBuf>,
+    /// Displacement field (5-D NIfTI, LPS mm, as `palpate field` writes it)
+    #[arg(long, value_name = "F")]
+    field: PathBuf,
+    /// File to write
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Take the grid of this image instead of the field's
+    #[arg(long, value_name = "R")]
+    reference: Option<PathBuf>,
+    /// nearest, linear or cubic
+    #[arg(long, default_value = "linear")]
+    interpolation: Interpolation,
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let Options { image, points, field, output, reference, interpolation } = options;
+    let given = [image, points, reference].into_iter().flatten().chain([field]).map(PathBuf::as_path);
+    check_distinct(&given.collect::<Vec<_>>(), std::slice::from_ref(output))?;
+    match (image, points) {
+        (_, Some(points)) => {
+            check_output_file(output, &[".csv"])?;
+            move_points(points, &io::read_field(field)?, output, console)
+        }
+        (Some(image), None) => {
+            check_output_file(output, &[".nii", ".nii.gz"])?;
+            let grid = reference.as_ref().map(io::read_volume).transpose()?.map(|r| *r.grid());
+            let field = io::read_field(field)?;
+            let integers = (*interpolation == Interpolation::Nearest).then(|| io::read_labels(image));
+            match integers {
+                Some(Ok(labels)) => {
+                    io::write_labels(
+                        output,
+                        &warp_labels(&labels, &field, grid.as_ref(), 0),
+                        "palpate: labels, warped",
+                    )?;
+                }
+                Some(Err(error @ IoError::Os { .. })) => return Err(error.into()),
+                _ => {
+                    let image = io::read_volume(image)?;
+                    let warped = warp_image(&image, &field, grid.as_ref(), *interpolation, 0.0);
+                    io::write_volume(output, &warped, "palpate: warped")?;
+                }
+            }
+            console.say(&format!("Wrote {}.", output.display()))
+        }
+        (None, None) => Ok(()),
+    }
+}
+
+/// Points outside the field's grid keep their line, with NaN for a place.
+fn move_points(points: &Path, field: &DenseField, output: &Path, console: &Console) -> Result<()> {
+    let mut table = io::read_points(points)?;
+    let moved = warp_points(&table.points, field);
+    let lost = moved.iter().filter(|p| p.is_none()).count();
+    if lost > 0 {
+        console.warn(&format!("{lost} of {} points lie outside the field's grid and became NaN", moved.len()));
+    }
+    table.points = moved.into_iter().map(|p| p.unwrap_or(WorldPoint([f64::NAN; 3]))).collect();
+    io::write_points(output, &table)?;
+    console.say(&format!("Wrote {}: {} points.", output.display(), table.points.len()))
+}

@@ -1,0 +1,59 @@
+//! summary.json of `palpate field`.
+
+use crate::report::field::FieldReport;
+use crate::types::Grid;
+use serde_json::{Map, Value, json};
+
+/// Shape, spacing (mm) and affine (rows of the 4 x 4 voxel-to-world matrix without the last, mm, RAS) of a grid.
+pub fn grid(g: &Grid) -> Value {
+    json!({ "shape": g.shape(), "spacing_mm": g.spacing(), "affine_ras": g.affine().rows() })
+}
+
+/// The keys are those of docs/file-formats.md.
+pub fn field_summary(report: &FieldReport<'_>) -> Value {
+    let s = &report.result.summary;
+    let seconds: Map<String, Value> = s.seconds.iter().map(|(stage, t)| (stage.clone(), json!(t))).collect();
+    let [initial, deformed, mask] = report.names;
+    let mut out = json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": report.command,
+        "inputs": { "initial": initial, "deformed": deformed, "mask": report.mask.map(|_| mask) },
+        "grid": grid(report.initial.grid()),
+        "deformed_grid": grid(report.deformed_grid),
+        "counts": s.counts,
+        "model": s.model,
+        "evidence": s.evidence,
+        "levels": s.levels,
+        "mask_voxels": s.mask_voxels,
+        "folds": s.folds,
+        "displacement_mean_mm": s.mean_mm,
+        "displacement_max_mm": s.max_mm,
+        "uncertainty_median_mm": s.uncertainty_median_mm,
+        "seconds": seconds,
+        "warnings": s.warnings,
+        "params": report.params,
+    });
+    if let Some((_, metrics)) = report.truth {
+        out["metrics"] = json!(metrics);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::field::tests::Case;
+
+    #[test]
+    fn the_promised_keys_are_there() {
+        let value = field_summary(&Case::new([4, 5, 6], [1.0, 1.0, 3.0]).report());
+        assert_eq!(value["grid"]["shape"], json!([4, 5, 6]));
+        assert_eq!(value["counts"]["kept"], 13_020);
+        assert_eq!(value["model"], "free");
+        assert_eq!(value["seconds"]["matching"], 2.0);
+        assert_eq!(value["inputs"]["mask"], Value::Null);
+        for key in ["version", "command", "folds", "levels", "evidence", "warnings", "params"] {
+            assert!(!value[key].is_null(), "{key}");
+        }
+    }
+}

@@ -1,0 +1,105 @@
+//! Which value has which colour, and the bar that says so.
+
+use crate::report::colormap::ColorMap;
+
+/// A linear map from values to colours.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scale {
+    /// Value of the table's lower end.
+    pub low: f64,
+    /// Value of its upper end.
+    pub high: f64,
+    /// Unit, "mm" say; empty for plain numbers.
+    pub unit: &'static str,
+    /// The table.
+    pub map: ColorMap,
+}
+
+impl Scale {
+    /// 0 to a round number at or above `high`.
+    pub fn from_zero(high: f64, unit: &'static str, map: ColorMap) -> Self {
+        Self { low: 0.0, high: round_up(high), unit, map }
+    }
+
+    /// Symmetric about `middle`, with a round half-width of at least `half`.
+    pub fn about(middle: f64, half: f64, unit: &'static str) -> Self {
+        let half = round_up(half);
+        Self { low: middle - half, high: middle + half, unit, map: ColorMap::Diverging }
+    }
+
+    /// Where `value` lies, 0 to 1 and beyond.
+    pub fn position(&self, value: f64) -> f64 {
+        (value - self.low) / (self.high - self.low)
+    }
+
+    /// The colour of `value` as `#rrggbb`.
+    pub fn hex(&self, value: f64) -> String {
+        self.map.hex(self.position(value))
+    }
+
+    /// Lower end, middle and upper end in words.
+    pub fn ticks(&self) -> [String; 3] {
+        [self.low, (self.low + self.high) / 2.0, self.high].map(short)
+    }
+
+    /// Nine colours from the lower to the upper end.
+    pub fn stops(&self) -> [String; 9] {
+        std::array::from_fn(|i| self.map.hex(i as f64 / 8.0))
+    }
+}
+
+/// The smallest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is at or above `v` (1e-3 at least).
+pub fn round_up(v: f64) -> f64 {
+    let v = if v.is_finite() { v.max(1e-3) } else { 1.0 };
+    let power = 10f64.powf(v.log10().floor());
+    let step = [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0].into_iter().find(|s| s * power >= v * (1.0 - 1e-9));
+    step.unwrap_or(10.0) * power
+}
+
+/// A number with three digits at most after the point and no trailing zeros.
+pub fn short(v: f64) -> String {
+    let digits = if v.abs() >= 100.0 { 0 } else { 3 };
+    let s = format!("{v:.digits$}");
+    let s = if s.contains('.') { s.trim_end_matches('0').trim_end_matches('.') } else { &s };
+    if s == "-0" { "0".into() } else { s.into() }
+}
+
+/// 1234567 as 1,234,567.
+pub fn thousands(n: usize) -> String {
+    let digits = n.to_string();
+    let mut out = String::with_capacity(digits.len() + digits.len() / 3);
+    for (i, c) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(c);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn round_numbers_are_at_or_above() {
+        assert_eq!(
+            [0.07, 1.0, 7.3, 8.1, 123.0, 0.0].map(|v| short(round_up(v))),
+            ["0.08", "1", "8", "10", "150", "0.001"]
+        );
+        assert_eq!(round_up(f64::NAN), 1.0);
+    }
+
+    #[test]
+    fn numbers_in_words() {
+        assert_eq!([0.25, -0.0, 2.0, 1234.5].map(short), ["0.25", "0", "2", "1234"]);
+        assert_eq!([7, 1000, 13020, 1234567].map(thousands), ["7", "1,000", "13,020", "1,234,567"]);
+    }
+
+    #[test]
+    fn the_neutral_colour_is_the_middle_value() {
+        let s = Scale::about(1.0, 0.13, "");
+        assert_eq!((s.low, s.high), (0.85, 1.15));
+        assert_eq!(s.hex(1.0), "#f7f7f7");
+    }
+}

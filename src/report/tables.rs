@@ -1,0 +1,108 @@
+//! Tables of the page.
+
+use crate::report::field::FieldReport;
+use crate::report::html::escape;
+use crate::report::scale::{short, thousands};
+use crate::types::{Metrics, MotionModel};
+use std::fmt::Write;
+
+/// A table from a head (may be empty) and rows; the first column is text, the others are numbers.
+fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+    let mut out = String::from("<div class=\"scroll\"><table>");
+    if !head.is_empty() {
+        let cells: String = head.iter().map(|h| format!("<th>{h}</th>")).collect();
+        let _ = write!(out, "<thead><tr>{cells}</tr></thead>");
+    }
+    out.push_str("<tbody>");
+    for row in rows {
+        let cells: String = row.iter().map(|c| format!("<td>{c}</td>")).collect();
+        let _ = write!(out, "<tr>{cells}</tr>");
+    }
+    out.push_str("</tbody></table></div>");
+    out
+}
+
+fn triple(v: [f64; 3]) -> String {
+    v.map(short).join(" × ")
+}
+
+/// What was counted.
+pub fn counts(report: &FieldReport<'_>) -> String {
+    let (s, c) = (&report.result.summary, report.result.summary.counts);
+    let model = match s.model {
+        MotionModel::Identity => "none",
+        MotionModel::Rigid => "rigid",
+        MotionModel::Affine => "affine",
+        MotionModel::Free => "free",
+    };
+    let rows = [
+        ("Features in the initial volume", thousands(c.features_initial)),
+        ("Features in the deformed volume", thousands(c.features_deformed)),
+        ("Candidate matches", thousands(c.candidates)),
+        ("Matches kept", thousands(c.kept)),
+        ("Mesh nodes", thousands(c.nodes)),
+        ("Mesh elements", thousands(c.tetrahedra)),
+        ("Voxels measured", thousands(s.mask_voxels)),
+        ("Voxels folded", thousands(s.folds)),
+        ("Motion model", model.into()),
+    ];
+    table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+}
+
+/// The levels, coarse to fine.
+pub fn levels(report: &FieldReport<'_>) -> String {
+    let rows: Vec<_> = report
+        .result
+        .summary
+        .levels
+        .iter()
+        .map(|l| {
+            vec![
+                triple(l.spacing_mm),
+                thousands(l.counts.features_initial),
+                thousands(l.counts.candidates),
+                thousands(l.counts.kept),
+                format!("{:.4}", l.energy_before),
+                format!("{:.4}", l.energy_after),
+                format!("{:.3}", l.residual_mm),
+            ]
+        })
+        .collect();
+    table(&["Voxel, mm", "Features", "Candidates", "Kept", "Energy before", "after", "Residual, mm"], &rows)
+}
+
+/// The two volumes and what was asked for.
+pub fn inputs(report: &FieldReport<'_>) -> String {
+    let [initial, deformed, mask] = report.names.map(escape);
+    let grid = |g: &crate::types::Grid| {
+        format!("{} voxels of {} mm", g.shape().map(|n| n.to_string()).join(" × "), triple(g.spacing()))
+    };
+    let automatic = |v: f64, unit: &str| if v == 0.0 { "automatic".into() } else { format!("{}{unit}", short(v)) };
+    let p = report.params;
+    let rows = [
+        ("Initial volume", format!("{initial}<br>{}", grid(report.initial.grid()))),
+        ("Deformed volume", format!("{deformed}<br>{}", grid(report.deformed_grid))),
+        ("Mask", if report.mask.is_some() { mask } else { "none given".into() }),
+        ("Preset", format!("{:?}", p.preset).to_lowercase()),
+        ("Points", automatic(p.points as f64, "")),
+        ("Search", automatic(p.search_mm, " mm")),
+        ("Seed", p.seed.to_string()),
+    ];
+    table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+}
+
+/// The score against exact truth.
+pub fn metrics(m: &Metrics) -> String {
+    let mm = |v: f64| format!("{v:.3} mm");
+    let mut rows = vec![
+        ("Mean error", mm(m.mean_mm)),
+        ("Mean error of doing nothing", mm(m.identity_mm)),
+        ("Median error", mm(m.median_mm)),
+        ("95th percentile", mm(m.p95_mm)),
+        ("Largest error", mm(m.max_mm)),
+        ("Median error of the gradient", format!("{:.4}", m.grad_err)),
+    ];
+    rows.extend(m.still_mm.map(|v| ("Mean error where nothing moves", mm(v))));
+    rows.extend(m.landmarks_mm.map(|v| ("Mean error at the landmarks", mm(v))));
+    table(&[], &rows.into_iter().map(|(name, value)| vec![name.into(), value]).collect::<Vec<_>>())
+}

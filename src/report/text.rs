@@ -1,0 +1,87 @@
+//! The short summary for a terminal.
+
+use crate::report::field::FieldReport;
+use crate::report::scale::thousands;
+use crate::report::verdict::verdict;
+use crate::types::Metrics;
+use std::fmt::Write;
+
+/// What a field run found, a few lines.
+pub fn field_summary(report: &FieldReport<'_>) -> String {
+    let (s, v) = (&report.result.summary, verdict(report));
+    let c = s.counts;
+    let mut out = format!("{}\n", v.headline);
+    let _ = writeln!(
+        out,
+        "  matches      {} kept of {} candidates, from {} and {} features",
+        thousands(c.kept),
+        thousands(c.candidates),
+        thousands(c.features_initial),
+        thousands(c.features_deformed)
+    );
+    if let [first, .., last] | [first @ last] = s.levels.as_slice() {
+        let _ = writeln!(
+            out,
+            "  energy       {:.4} -> {:.4} at the coarsest level, {:.4} -> {:.4} at the finest",
+            first.energy_before, first.energy_after, last.energy_before, last.energy_after
+        );
+    }
+    let _ = writeln!(
+        out,
+        "  motion       mean {:.2} mm, largest {:.2} mm over {} voxels",
+        s.mean_mm,
+        s.max_mm,
+        thousands(s.mask_voxels)
+    );
+    let _ = writeln!(out, "  mesh         {} nodes, {} elements", thousands(c.nodes), thousands(c.tetrahedra));
+    let _ = writeln!(out, "  folds        {}", thousands(s.folds));
+    let _ = writeln!(out, "  trust        {}: {}", v.trust.name(), v.reasons.join("; "));
+    let _ = writeln!(out, "  time         {:.1} s", s.seconds.iter().map(|t| t.1).sum::<f64>());
+    out
+}
+
+/// A score against truth, a few lines.
+pub fn metrics(m: &Metrics) -> String {
+    let mut out = format!(
+        "Mean error {:.3} mm over {} voxels, where doing nothing gives {:.3} mm.\n",
+        m.mean_mm,
+        thousands(m.voxels),
+        m.identity_mm
+    );
+    let _ = writeln!(
+        out,
+        "  error        median {:.3} mm, 95th percentile {:.3} mm, largest {:.3} mm",
+        m.median_mm, m.p95_mm, m.max_mm
+    );
+    if let Some(v) = m.landmarks_mm {
+        let _ = writeln!(out, "  landmarks    {v:.3} mm");
+    }
+    if let Some(v) = m.still_mm {
+        let _ = writeln!(out, "  still tissue {v:.3} mm");
+    }
+    let _ = writeln!(out, "  gradient     median error {:.4}, 95th percentile {:.4}", m.grad_err, m.grad_err_p95);
+    let _ = writeln!(out, "  folds        {:.2e} of the voxels", m.folds);
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::field::tests::Case;
+
+    #[test]
+    fn the_summary_is_short_and_holds_the_counts() {
+        let text = field_summary(&Case::new([8, 8, 8], [1.0; 3]).report());
+        assert!(text.lines().count() <= 9, "{text}");
+        for part in ["13,020 kept of 160,000", "900.0000 -> 300.0000", "mean 1.50 mm", "trust        high"] {
+            assert!(text.contains(part), "{part} is missing in\n{text}");
+        }
+    }
+
+    #[test]
+    fn a_score_names_what_doing_nothing_gives() {
+        let text = metrics(&Metrics { mean_mm: 0.25, identity_mm: 2.0, voxels: 1000, ..Metrics::default() });
+        assert!(text.starts_with("Mean error 0.250 mm over 1,000 voxels, where doing nothing gives 2.000 mm."));
+        assert!(!text.contains("landmarks"));
+    }
+}

@@ -1,0 +1,481 @@
+//! The program as a user meets it: exit codes, help, outputs, and what it says to bad input.
+#![allow(clippy::unwrap_used)]
+
+mod fixtures;
+
+use assert_cmd::Command;
+use fixtures::{Nifti, palpate, small_pair, text};
+use std::fs;
+use std::path::Path;
+use tempfile::TempDir;
+
+/// Runs, and checks the exit code; stdout and stderr come back.
+fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
+    let output = palpate(folder).args(arguments).output().unwrap();
+    let (out, err) = (text(&output.stdout), text(&output.stderr));
+    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
+    assert!(!err.contains("panicked"), "{err}");
+    (out, err)
+}
+
+#[test]
+fn help_names_every_subcommand_and_exits_with_0() {
+    let folder = TempDir::new().unwrap();
+    let (out, _) = run(folder.path(), &["--help"], 0);
+    let commands = ["field", "warp", "invert", "phantom", "evaluate", "demo"];
+    for command in commands {
+        assert!(out.contains(&format!("\n  {command}")), "{command} is missing in\n{out}");
+        let (own, _) = run(folder.path(), &[command, "--help"], 0);
+        for flag in ["--threads", "--quiet", "--verbose"] {
+            assert!(own.contains(flag), "{command} --help does not name {flag}");
+        }
+    }
+    let (version, _) = run(folder.path(), &["--version"], 0);
+    assert_eq!(version.trim(), format!("palpate {}", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn wrong_usage_exits_with_2_and_writes_nothing() {
+    let folder = small_pair();
+    let cases: [(&[&str], &str); 14] = [
+        (&[], "Usage"),
+        (&["fiedl"], "field"),
+        (&["field", "initial.nii.gz", "deformed.nii.gz"], "--output"),
+        (&["field", "initial.nii.gz", "-o", "x"], "DEFORMED"),
+        (&["field", "initial.nii.gz", "deformed.nii.gz", "-o", "x", "--preset", "acurate"], "did you mean 'accurate'"),
+        (&["field", "initial.nii.gz", "deformed.nii.gz", "-o", "x", "--points", "5"], "points is 5"),
+        (&["field", "initial.nii.gz", "deformed.nii.gz", "-o", "x", "--search", "500"], "200 mm"),
+        (&["field", "initial.nii.gz", "deformed.nii.gz", "-o", "x", "--threads", "0"], "threads"),
+        (&["warp", "--field", "truth.nii.gz", "-o", "x.nii"], "IMAGE"),
+        (&["warp", "initial.nii.gz", "--points", "p.csv", "--field", "truth.nii.gz", "-o", "x.csv"], "cannot be used"),
+        (&["warp", "initial.nii.gz", "--field", "truth.nii.gz", "-o", "x.png"], ".nii.gz"),
+        (&["invert", "truth.nii.gz", "-o", "truth.nii.gz"], "would be overwritten"),
+        (&["phantom", "fingertips", "-o", "x"], "did you mean 'fingertip'"),
+        (&["phantom", "block", "-o", "x", "--size", "3"], "size is 3"),
+    ];
+    for (arguments, message) in cases {
+        let before = fs::read_dir(folder.path()).unwrap().count();
+        let (_, err) = run(folder.path(), arguments, 2);
+        assert!(err.contains(message), "{arguments:?} should say {message:?}:\n{err}");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), before, "{arguments:?} left something");
+    }
+}
+
+/// Runs `palpate field` on a bad initial volume: it must fail, name the file and say `message`, and leave nothing.
+fn refused(name: &str, bytes: &[u8], message: &str) {
+    let folder = small_pair();
+    fs::write(folder.path().join(name), bytes).unwrap();
+    let (out, err) = run(folder.path(), &["field", name, "deformed.nii.gz", "-o", "results"], 1);
+    assert!(out.is_empty(), "{out}");
+    assert!(err.starts_with("error: ") && err.contains(name), "{err}");
+    assert!(err.to_lowercase().contains(&message.to_lowercase()), "should say {message:?}: {err}");
+    assert!(!folder.path().join("results").exists());
+}
+
+#[test]
+fn a_missing_file() {
+    let folder = small_pair();
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "absent.nii.gz", "-o", "results"], 1);
+    assert!(err.contains("absent.nii.gz: cannot read"), "{err}");
+    assert!(!folder.path().join("results").exists());
+}
+
+#[test]
+fn a_folder_as_input() {
+    let folder = small_pair();
+    fs::create_dir(folder.path().join("volume.nii")).unwrap();
+    let (_, err) = run(folder.path(), &["field", "volume.nii", "deformed.nii.gz", "-o", "results"], 1);
+    assert!(err.contains("volume.nii"), "{err}");
+}
+
+#[test]
+fn an_empty_file() {
+    refused("bad.nii", &[], "bad.nii");
+}
+
+#[test]
+fn a_truncated_file() {
+    let whole = Nifti::ramp([12, 12, 12]).bytes();
+    refused("bad.nii", &whole[..whole.len() - 100], "bad.nii");
+}
+
+#[test]
+fn a_truncated_header() {
+    refused("bad.nii", &Nifti::ramp([12, 12, 12]).bytes()[..200], "bad.nii");
+}
+
+#[test]
+fn a_truncated_gzip_stream() {
+    let folder = small_pair();
+    let whole = fs::read(folder.path().join("initial.nii.gz")).unwrap();
+    refused("bad.nii.gz", &whole[..whole.len() / 2], "bad.nii.gz");
+}
+
+#[test]
+fn a_damaged_gzip_stream() {
+    let folder = small_pair();
+    let mut whole = fs::read(folder.path().join("initial.nii.gz")).unwrap();
+    let middle = whole.len() / 2;
+    whole[middle..middle + 20].fill(0x55);
+    refused("bad.nii.gz", &whole, "bad.nii.gz");
+}
+
+#[test]
+fn a_wrong_magic() {
+    let mut bytes = Nifti::ramp([12, 12, 12]).bytes();
+    bytes[344..348].copy_from_slice(b"abcd");
+    refused("bad.nii", &bytes, "bad.nii");
+}
+
+#[test]
+fn a_text_file_called_nii() {
+    refused("bad.nii", "This is not a volume. ".repeat(40).as_bytes(), "bad.nii");
+}
+
+#[test]
+fn another_ending() {
+    refused("bad.mha", &Nifti::ramp([12, 12, 12]).bytes(), ".nii");
+}
+
+#[test]
+fn dimensions_larger_than_the_file() {
+    let mut forged = Nifti::ramp([12, 12, 12]);
+    forged.dims = [30_000, 30_000, 30_000];
+    refused("bad.nii", &forged.bytes(), "bad.nii");
+}
+
+#[test]
+fn negative_dimensions() {
+    let mut forged = Nifti::ramp([12, 12, 12]);
+    forged.dims[1] = -12;
+    refused("bad.nii", &forged.bytes(), "bad.nii");
+}
+
+#[test]
+fn zero_dimensions() {
+    let mut forged = Nifti::ramp([12, 12, 12]);
+    forged.dims[2] = 0;
+    refused("bad.nii", &forged.bytes(), "bad.nii");
+}
+
+#[test]
+fn several_time_points() {
+    let mut series = Nifti::ramp([12, 12, 12]);
+    series.times = 3;
+    series.values = series.values.repeat(3);
+    refused("bad.nii", &series.bytes(), "bad.nii");
+}
+
+#[test]
+fn rgb_voxels() {
+    let mut rgb = Nifti::ramp([12, 12, 12]);
+    rgb.datatype = 128;
+    refused("bad.nii", &rgb.bytes(), "rgb");
+}
+
+#[test]
+fn complex_voxels() {
+    let mut complex = Nifti::ramp([12, 12, 12]);
+    complex.datatype = 32;
+    refused("bad.nii", &complex.bytes(), "complex");
+}
+
+#[test]
+fn an_unknown_data_type() {
+    let mut unknown = Nifti::ramp([12, 12, 12]);
+    unknown.datatype = 9999;
+    refused("bad.nii", &unknown.bytes(), "bad.nii");
+}
+
+#[test]
+fn a_singular_affine() {
+    let mut flat = Nifti::ramp([12, 12, 12]);
+    flat.sform[1] = flat.sform[0];
+    refused("bad.nii", &flat.bytes(), "singular");
+}
+
+#[test]
+fn an_affine_that_is_not_finite() {
+    let mut broken = Nifti::ramp([12, 12, 12]);
+    broken.sform[0][0] = f32::NAN;
+    refused("bad.nii", &broken.bytes(), "finite");
+}
+
+#[test]
+fn nan_everywhere() {
+    let mut nan = Nifti::ramp([12, 12, 12]);
+    nan.values.fill(f32::NAN);
+    refused("bad.nii", &nan.bytes(), "every voxel is NaN");
+}
+
+#[test]
+fn a_constant_volume() {
+    let mut constant = Nifti::ramp([12, 12, 12]);
+    constant.values.fill(7.0);
+    refused("bad.nii", &constant.bytes(), "same value");
+}
+
+#[test]
+fn a_line_of_voxels() {
+    refused("bad.nii", &Nifti::ramp([1, 1, 64]).bytes(), "");
+}
+
+#[test]
+fn too_few_features() {
+    let folder = small_pair();
+    let ramp = Nifti::ramp([20, 20, 20]).bytes();
+    fs::write(folder.path().join("plain.nii"), ramp).unwrap();
+    let (_, err) = run(folder.path(), &["field", "plain.nii", "plain.nii", "-o", "results", "--quiet"], 1);
+    assert!(err.starts_with("error: ") && !err.contains("under construction"), "{err}");
+    assert!(!folder.path().join("results").exists());
+}
+
+#[test]
+fn volumes_that_do_not_overlap() {
+    let folder = small_pair();
+    let mut far = Nifti::ramp([20, 20, 20]);
+    far.sform[0][3] = 5000.0;
+    fs::write(folder.path().join("far.nii"), far.bytes()).unwrap();
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "far.nii", "-o", "results"], 1);
+    assert!(err.contains("overlap"), "{err}");
+    assert!(!folder.path().join("results").exists());
+}
+
+/// Runs `palpate field` with a mask that must be refused.
+fn mask_refused(mask: &Nifti, message: &str) {
+    let folder = small_pair();
+    fs::write(folder.path().join("m.nii"), mask.bytes()).unwrap();
+    let arguments = ["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "m.nii", "-o", "results"];
+    let (_, err) = run(folder.path(), &arguments, 1);
+    assert!(err.contains("m.nii") && err.contains(message), "{err}");
+    assert!(!folder.path().join("results").exists());
+}
+
+#[test]
+fn a_mask_on_another_grid() {
+    mask_refused(&Nifti::filled([9, 9, 9], 1.0), "another grid");
+}
+
+#[test]
+fn an_empty_mask() {
+    mask_refused(&Nifti { sform: fixtures::block_sform(), ..Nifti::filled(fixtures::BLOCK, 0.0) }, "empty");
+}
+
+#[test]
+fn a_mask_with_fractions() {
+    mask_refused(&Nifti { sform: fixtures::block_sform(), ..Nifti::filled(fixtures::BLOCK, 0.5) }, "whole");
+}
+
+#[test]
+fn an_output_that_is_a_file() {
+    let folder = small_pair();
+    fs::write(folder.path().join("results"), "mine").unwrap();
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "deformed.nii.gz", "-o", "results"], 1);
+    assert!(err.contains("results") && err.contains("file"), "{err}");
+    assert_eq!(fs::read_to_string(folder.path().join("results")).unwrap(), "mine");
+}
+
+#[test]
+fn an_output_inside_a_file() {
+    let folder = small_pair();
+    fs::write(folder.path().join("file"), "mine").unwrap();
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "deformed.nii.gz", "-o", "file/results"], 1);
+    assert!(err.contains("file"), "{err}");
+    let (_, err) = run(folder.path(), &["invert", "truth.nii.gz", "-o", "file/inverse.nii.gz"], 1);
+    assert!(err.contains("is not a folder"), "{err}");
+}
+
+#[test]
+fn an_output_folder_that_is_not_empty() {
+    let folder = small_pair();
+    fs::create_dir(folder.path().join("results")).unwrap();
+    fs::write(folder.path().join("results/mine.txt"), "mine").unwrap();
+    let (_, err) = run(folder.path(), &["phantom", "block", "--size", "16", "-o", "results"], 1);
+    assert!(err.contains("--force"), "{err}");
+    assert_eq!(fs::read_dir(folder.path().join("results")).unwrap().count(), 1);
+    run(folder.path(), &["phantom", "block", "--size", "16", "-o", "results", "--force"], 0);
+    assert_eq!(fs::read_to_string(folder.path().join("results/mine.txt")).unwrap(), "mine");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn an_output_folder_that_cannot_be_written() {
+    let folder = small_pair();
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "deformed.nii.gz", "-o", "/proc/results"], 1);
+    assert!(err.contains("/proc/results"), "{err}");
+}
+
+/// A file size limit stands for a full disk: each write past it fails.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_failed_write_leaves_nothing() {
+    let folder = small_pair();
+    let program = assert_cmd::cargo::cargo_bin!("palpate");
+    let script = format!("trap '' XFSZ; ulimit -f 1; exec '{}' phantom block --size 16 -o results", program.display());
+    let output = Command::new("sh").current_dir(&folder).args(["-c", &script]).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
+    assert!(text(&output.stderr).contains("results/"), "{}", text(&output.stderr));
+    assert!(!folder.path().join("results").exists());
+}
+
+#[test]
+fn an_input_that_would_be_overwritten() {
+    let folder = small_pair();
+    fs::copy(folder.path().join("deformed.nii.gz"), folder.path().join("warped.nii.gz")).unwrap();
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "warped.nii.gz", "-o", ".", "--force"], 2);
+    assert!(err.contains("would be overwritten"), "{err}");
+}
+
+#[test]
+fn a_volume_in_place_of_a_field() {
+    let folder = small_pair();
+    let (_, err) = run(folder.path(), &["invert", "initial.nii.gz", "-o", "x.nii.gz"], 1);
+    assert!(err.contains("initial.nii.gz") && err.contains("field"), "{err}");
+    assert!(!folder.path().join("x.nii.gz").exists());
+}
+
+#[test]
+fn a_truth_on_another_grid() {
+    let folder = small_pair();
+    run(folder.path(), &["phantom", "block", "--size", "16", "-o", "other"], 0);
+    let (_, err) = run(folder.path(), &["evaluate", "truth.nii.gz", "--truth", "other/truth.nii.gz"], 1);
+    assert!(err.contains("another grid"), "{err}");
+}
+
+#[test]
+fn tables_with_flaws() {
+    let folder = small_pair();
+    let cases = [
+        ("a,b,c\n1,2,3\n", "no column"),
+        ("x,y,z\n1,two,3\n", "two"),
+        ("x,y,z\n1,2\n", "line 2"),
+        ("x,y,z\n", "no row"),
+    ];
+    for (table, message) in cases {
+        fs::write(folder.path().join("p.csv"), table).unwrap();
+        let arguments = ["warp", "--points", "p.csv", "--field", "truth.nii.gz", "-o", "moved.csv"];
+        let (_, err) = run(folder.path(), &arguments, 1);
+        assert!(err.contains("p.csv") && err.contains(message), "{table:?}: {err}");
+        assert!(!folder.path().join("moved.csv").exists());
+    }
+}
+
+#[test]
+fn a_phantom_scores_zero_against_its_own_truth() {
+    let folder = small_pair();
+    let arguments = ["evaluate", "truth.nii.gz", "--truth", "truth.nii.gz", "--mask", "mask.nii.gz"];
+    let (out, _) = run(folder.path(), &[&arguments[..], &["--landmarks", "landmarks.csv", "--json"]].concat(), 0);
+    let score: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(score["max_mm"], 0.0);
+    assert!(score["identity_mm"].as_f64().unwrap() > 0.1);
+    let (words, _) = run(folder.path(), &arguments, 0);
+    assert!(words.starts_with("Mean error 0.000 mm"), "{words}");
+}
+
+#[test]
+fn warping_with_the_truth_brings_the_deformed_volume_back() {
+    let folder = TempDir::new().unwrap();
+    run(folder.path(), &["phantom", "block", "--size", "32", "--noise", "0", "--bias", "0", "-o", "."], 0);
+    let arguments = ["deformed.nii.gz", "--field", "truth.nii.gz", "--interpolation", "cubic", "-o", "back.nii.gz"];
+    run(folder.path(), &[&["warp"][..], &arguments].concat(), 0);
+    let volume = |name: &str| palpate::io::read_volume(folder.path().join(name)).unwrap();
+    let mask = palpate::io::read_mask(folder.path().join("mask.nii.gz")).unwrap();
+    let (initial, deformed, back) = (volume("initial.nii.gz"), volume("deformed.nii.gz"), volume("back.nii.gz"));
+    let difference = |v: &palpate::types::Volume| -> f64 {
+        let all = initial.as_slice().iter().zip(v.as_slice()).zip(mask.as_slice());
+        all.filter(|(_, m)| **m > 0).map(|((a, b), _)| f64::from((a - b).abs())).sum()
+    };
+    let (after, before) = (difference(&back), difference(&deformed));
+    assert!(after < 0.35 * before, "{after} against {before}");
+}
+
+#[test]
+fn labels_keep_their_values_and_points_their_columns() {
+    let folder = small_pair();
+    let arguments = ["warp", "mask.nii.gz", "--field", "truth.nii.gz", "--interpolation", "nearest", "-o", "m.nii.gz"];
+    run(folder.path(), &arguments, 0);
+    let labels = palpate::io::read_labels(folder.path().join("m.nii.gz")).unwrap();
+    assert!(labels.as_slice().iter().all(|v| *v <= 1));
+
+    let table = "name,x,y,z\ninside,0,0,0\noutside,900,0,0\n";
+    fs::write(folder.path().join("p.csv"), table).unwrap();
+    let arguments = ["warp", "--points", "p.csv", "--field", "truth.nii.gz", "-o", "moved.csv"];
+    let (_, err) = run(folder.path(), &arguments, 0);
+    assert!(err.starts_with("warning: 1 of 2 points") && err.contains("--quiet"), "{err}");
+    let moved = fs::read_to_string(folder.path().join("moved.csv")).unwrap();
+    assert!(moved.contains("inside") && moved.contains("NaN,NaN,NaN,outside"), "{moved}");
+    let (_, err) = run(folder.path(), &[&arguments[..], &["--quiet"]].concat(), 0);
+    assert!(err.is_empty(), "{err}");
+}
+
+#[test]
+fn the_inverse_undoes_the_field() {
+    let folder = small_pair();
+    let (out, _) = run(folder.path(), &["invert", "truth.nii.gz", "-o", "inverse.nii.gz"], 0);
+    assert!(out.contains("undoes the field"), "{out}");
+    // At a voxel centre of the inverse nothing is interpolated on the way there, and the way back is the field's own.
+    let start = palpate::io::read_volume(folder.path().join("deformed.nii.gz")).unwrap().grid().world(14, 17, 19).0;
+    fs::write(folder.path().join("p.csv"), format!("x,y,z\n{},{},{}\n", start[0], start[1], start[2])).unwrap();
+    run(folder.path(), &["warp", "--points", "p.csv", "--field", "inverse.nii.gz", "-o", "q.csv"], 0);
+    run(folder.path(), &["warp", "--points", "q.csv", "--field", "truth.nii.gz", "-o", "r.csv"], 0);
+    let point = |name: &str| palpate::io::read_points(folder.path().join(name)).unwrap().points[0];
+    let apart = |d: [f64; 3]| d.iter().map(|v| v * v).sum::<f64>().sqrt();
+    assert!(apart(point("q.csv").minus(point("p.csv"))) > 0.05);
+    assert!(apart(point("r.csv").minus(point("p.csv"))) < 1e-3);
+}
+
+#[test]
+fn a_reader_that_leaves_early_is_no_error() {
+    let folder = small_pair();
+    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin!("palpate"))
+        .current_dir(&folder)
+        .args(["evaluate", "truth.nii.gz", "--truth", "truth.nii.gz"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert!(output.stderr.is_empty(), "{}", text(&output.stderr));
+}
+
+#[test]
+fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
+    let folder = small_pair();
+    let field = |output: &str, threads: &str| {
+        let files = ["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--preset", "fast"];
+        run(folder.path(), &[&files[..], &["--quiet", "--threads", threads, "-o", output]].concat(), 0)
+    };
+    let (out, err) = field("one", "1");
+    field("two", "2");
+    assert!(out.contains("matches") && out.contains("one/report.html"), "{out}");
+    assert!(err.is_empty(), "{err}");
+    let volumes = ["displacement.nii.gz", "warped.nii.gz", "jacobian.nii.gz", "uncertainty.nii.gz"];
+    for name in volumes.into_iter().chain(["matches.csv", "mesh.vtu"]) {
+        let read = |run: &str| fs::read(folder.path().join(run).join(name)).unwrap();
+        assert!(read("one") == read("two"), "{name} depends on the number of threads");
+    }
+    let summary = fs::read_to_string(folder.path().join("one/summary.json")).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+    for key in ["version", "command", "inputs", "grid", "model", "folds", "evidence", "levels", "warnings", "params"] {
+        assert!(!summary[key].is_null(), "{key}");
+    }
+    for key in ["features_initial", "features_deformed", "candidates", "kept", "nodes", "tetrahedra"] {
+        assert!(summary["counts"][key].as_u64().unwrap() > 0, "{key}");
+    }
+    assert!(summary["seconds"]["read"].as_f64().unwrap() >= 0.0);
+    let page = fs::read_to_string(folder.path().join("one/report.html")).unwrap();
+    assert!(page.contains("Trust is") && !page.contains("http"));
+    assert_eq!(fs::read_dir(folder.path().join("one")).unwrap().count(), 8);
+}
+
+#[test]
+fn the_demo_can_be_run_again() {
+    let folder = TempDir::new().unwrap();
+    for _ in 0..2 {
+        let (out, _) = run(folder.path(), &["demo", "--preset", "fast", "--quiet"], 0);
+        assert!(out.contains("Mean error") && out.contains("palpate-demo"), "{out}");
+    }
+    assert!(folder.path().join("palpate-demo/report.html").is_file());
+}
