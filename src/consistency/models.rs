@@ -1,1 +1,203 @@
+//! The smallest motion that explains the matches: identity, rigid, affine, or a free field.
+//!
+//! Each is fitted to all kept matches with their own covariances, robustly, and judged by the Bayesian information
+//! criterion (Schwarz 1978) `n_eff * mean cost + k ln n_eff`, with `k` = 0, 6 (3 in a plane), 12 (6), or the number of
+//! degrees of freedom that the data determine in the free field. Patches overlap, so `n_eff` counts independent
+//! measurements. The smallest criterion wins.
 
+use crate::consistency::pruning::Measured;
+use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
+use crate::types::MotionModel;
+use crate::types::space::Matrix3;
+
+/// An affine map `x -> linear x + shift` (mm along the lattice's axes).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AffineMotion {
+    /// Linear part (1).
+    pub linear: Matrix3,
+    /// Shift (mm).
+    pub shift: [f64; 3],
+}
+
+impl AffineMotion {
+    /// Nothing moves.
+    pub const IDENTITY: Self = Self { linear: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], shift: [0.0; 3] };
+
+    /// Displacement at `x` (mm).
+    pub fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
+        let y = product(&self.linear, x);
+        std::array::from_fn(|a| y[a] + self.shift[a] - x[a])
+    }
+}
+
+/// The choice and its evidence.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Choice {
+    /// The model that won.
+    pub model: MotionModel,
+    /// Its map; none for a free field.
+    pub motion: Option<AffineMotion>,
+    /// One line a model: cost, parameters, criterion.
+    pub evidence: Vec<String>,
+}
+
+/// Chooses a model. `independent` is the fraction of matches that count as independent (0 to 1), `determined` the
+/// free field's degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm), `flat` whether the
+/// matches lie in one slice.
+pub fn choose(matches: &[Measured], independent: f64, determined: f64, model_mm: f64, flat: bool) -> Choice {
+    let information: Vec<Symmetric3> = matches
+        .iter()
+        .map(|m| {
+            let mut c = m.covariance;
+            for v in &mut c[..3] {
+                *v += model_mm * model_mm;
+            }
+            inverse(&c).unwrap_or([0.0; 6])
+        })
+        .collect();
+    let n_eff = (matches.len() as f64 * independent).max(1.0);
+    let cost = |residual: &dyn Fn(&Measured) -> [f64; 3]| {
+        let sum: f64 = matches.iter().zip(&information).map(|(m, i)| robust(quadratic(i, residual(m)))).sum();
+        sum / matches.len().max(1) as f64
+    };
+    let left = |motion: AffineMotion| move |m: &Measured| apart(m.displacement, motion.displacement(m.place));
+    let rigid = fit_rigid(matches, &information);
+    let affine = fit_affine(matches, &information, rigid);
+    let dof = if flat { [0.0, 3.0, 6.0] } else { [0.0, 6.0, 12.0] };
+    let free = cost(&|m: &Measured| apart(m.displacement, m.field));
+    let tried = [
+        (MotionModel::Identity, Some(AffineMotion::IDENTITY), cost(&left(AffineMotion::IDENTITY)), dof[0]),
+        (MotionModel::Rigid, Some(rigid), cost(&left(rigid)), dof[1]),
+        (MotionModel::Affine, Some(affine), cost(&left(affine)), dof[2]),
+        (MotionModel::Free, None, free, determined.max(dof[2])),
+    ];
+    let criterion = |c: f64, k: f64| n_eff * c + k * n_eff.ln();
+    let best = (0..4).min_by(|&a, &b| criterion(tried[a].2, tried[a].3).total_cmp(&criterion(tried[b].2, tried[b].3))).unwrap_or(3);
+    let evidence = tried
+        .iter()
+        .map(|(model, _, c, k)| {
+            let name = format!("{model:?}").to_lowercase();
+            format!("{name}: mean cost {c:.3}, {k:.0} parameters, criterion {:.1}", criterion(*c, *k))
+        })
+        .collect();
+    Choice { model: tried[best].0, motion: tried[best].1, evidence }
+}
+
+/// Squared Mahalanobis distance at which the robust cost reaches half of its bound.
+const SCALE: f64 = 16.0;
+
+/// Geman & McClure's bounded cost of a squared distance.
+fn robust(q: f64) -> f64 {
+    SCALE * q / (SCALE + q)
+}
+
+fn apart(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|c| a[c] - b[c])
+}
+
+fn product(m: &Matrix3, v: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|r| m[r][0] * v[0] + m[r][1] * v[1] + m[r][2] * v[2])
+}
+
+/// One reweighted Gauss-Newton step for `N` parameters; `jacobian(m)` has a column of three a parameter.
+fn step<const N: usize>(
+    matches: &[Measured],
+    information: &[Symmetric3],
+    motion: &AffineMotion,
+    jacobian: impl Fn(&Measured) -> [[f64; 3]; N],
+    first: bool,
+) -> [f64; N] {
+    let (mut h, mut b) = ([[0.0; N]; N], [0.0; N]);
+    for (m, i) in matches.iter().zip(information) {
+        let e = apart(m.displacement, motion.displacement(m.place));
+        let w = if first { 1.0 } else { (SCALE / (SCALE + quadratic(i, e))).powi(2) };
+        let (pull, j) = (multiply(i, e), jacobian(m));
+        let ij = j.map(|column| multiply(i, column));
+        for r in 0..N {
+            b[r] += w * (0..3).map(|a| j[r][a] * pull[a]).sum::<f64>();
+            for c in 0..N {
+                h[r][c] += w * (0..3).map(|a| j[r][a] * ij[c][a]).sum::<f64>();
+            }
+        }
+    }
+    for r in 0..N {
+        // Directions that nothing measures (out of a slice's plane) stay where they are.
+        h[r][r] += 1e-9 * h[r][r] + 1e-9;
+    }
+    cholesky_solve(h, b).unwrap_or([0.0; N])
+}
+
+/// Robust information-weighted rigid fit: ten Gauss-Newton steps on (rotation vector, shift).
+fn fit_rigid(matches: &[Measured], information: &[Symmetric3]) -> AffineMotion {
+    let mut motion = AffineMotion::IDENTITY;
+    for round in 0..12 {
+        let now = motion;
+        let d = step::<6>(
+            matches,
+            information,
+            &now,
+            |m| {
+                let y = product(&now.linear, m.place);
+                [
+                    [0.0, -y[2], y[1]],
+                    [y[2], 0.0, -y[0]],
+                    [-y[1], y[0], 0.0],
+                    [1.0, 0.0, 0.0],
+                    [0.0, 1.0, 0.0],
+                    [0.0, 0.0, 1.0],
+                ]
+            },
+            round < 3,
+        );
+        let turn = rotation([d[0], d[1], d[2]]);
+        motion.linear = std::array::from_fn(|r| {
+            std::array::from_fn(|c| (0..3).map(|k| turn[r][k] * motion.linear[k][c]).sum::<f64>())
+        });
+        for a in 0..3 {
+            motion.shift[a] += d[3 + a];
+        }
+    }
+    motion
+}
+
+/// Robust information-weighted affine fit from `start`.
+fn fit_affine(matches: &[Measured], information: &[Symmetric3], start: AffineMotion) -> AffineMotion {
+    let mut motion = start;
+    for _ in 0..8 {
+        let d = step::<12>(
+            matches,
+            information,
+            &motion,
+            |m| {
+                let x = [m.place[0], m.place[1], m.place[2], 1.0];
+                std::array::from_fn(|p| {
+                    let mut column = [0.0; 3];
+                    column[p / 4] = x[p % 4];
+                    column
+                })
+            },
+            false,
+        );
+        for r in 0..3 {
+            for c in 0..3 {
+                motion.linear[r][c] += d[4 * r + c];
+            }
+            motion.shift[r] += d[4 * r + 3];
+        }
+    }
+    motion
+}
+
+/// Rotation matrix of a rotation vector (Rodrigues).
+fn rotation(v: [f64; 3]) -> Matrix3 {
+    let angle = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+    if angle < 1e-15 {
+        return AffineMotion::IDENTITY.linear;
+    }
+    let k = v.map(|x| x / angle);
+    let (s, c) = angle.sin_cos();
+    let cross = [[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]];
+    std::array::from_fn(|i| {
+        std::array::from_fn(|j| f64::from(u8::from(i == j)) * c + (1.0 - c) * k[i] * k[j] + s * cross[i][j])
+    })
+}
