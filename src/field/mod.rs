@@ -1,1 +1,3 @@
 //! field.
+
+pub mod interpolation;

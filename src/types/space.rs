@@ -36,6 +36,18 @@ pub struct Affine {
     inverse: Matrix3,
 }
 
+/// The scalar product of two vectors.
+#[inline]
+pub fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// The vector product of two vectors.
+#[inline]
+pub fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
 /// `a b`.
 fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])
