@@ -31,19 +31,22 @@ pub struct Located<const N: usize> {
 pub struct TetrahedronLocator<'a> {
     mesh: &'a TetMesh,
     neighbours: &'a [[u32; 4]],
-    tolerance: f64,
+    bounds: Bounds,
 }
 
 impl<'a> TetrahedronLocator<'a> {
     /// Over a Delaunay mesh.
     pub fn new(delaunay: &'a Delaunay<TetMesh, 4>) -> Self {
-        let tolerance = TOLERANCE * extent(delaunay.mesh.nodes());
-        Self { mesh: &delaunay.mesh, neighbours: &delaunay.neighbours, tolerance }
+        let bounds = Bounds::around(delaunay.mesh.nodes().iter().map(|p| p.0));
+        Self { mesh: &delaunay.mesh, neighbours: &delaunay.neighbours, bounds }
     }
 
     /// The tetrahedron that holds `p` (world mm, RAS), walking from tetrahedron `hint` (any; a near one is faster).
     /// None outside the hull or where `p` is not finite.
     pub fn locate(&self, p: WorldPoint, hint: u32) -> Option<Located<4>> {
+        if !self.bounds.hold(p.0) {
+            return None;
+        }
         let nodes = self.mesh.nodes();
         let corners = |e: usize| self.mesh.tetrahedra()[e].map(|v| &nodes[v as usize].0);
         // Six times the volume of the element with corner `i` moved to `p`.
@@ -58,11 +61,11 @@ impl<'a> TetrahedronLocator<'a> {
             let normal = cross(b.minus(a), c.minus(a));
             dot(normal, normal).sqrt()
         };
-        let far = |e: usize, i: usize, part: f64| part < -self.tolerance * facet(e, i);
-        let element = if p.0.iter().all(|v| v.is_finite()) { walk(self.neighbours, hint, part, far) } else { None }?;
+        let far = |e: usize, i: usize, part: f64| part < -self.bounds.tolerance * facet(e, i);
+        let element = walk(self.neighbours, hint, part, far)?;
         let e = element as usize;
         let parts = std::array::from_fn(|i| part(e, i));
-        Some(Located { element, weights: weights(corners(e).map(|q| *q), p.0, parts, 1e-3 * self.tolerance) })
+        Some(Located { element, weights: weights(corners(e).map(|q| *q), p.0, parts, 1e-3 * self.bounds.tolerance) })
     }
 }
 
@@ -73,7 +76,7 @@ pub struct TriangleLocator<'a> {
     neighbours: &'a [[u32; 3]],
     plane: Plane,
     feet: Vec<[f64; 2]>,
-    tolerance: f64,
+    bounds: Bounds,
 }
 
 impl<'a> TriangleLocator<'a> {
@@ -84,16 +87,18 @@ impl<'a> TriangleLocator<'a> {
     pub fn new(delaunay: &'a Delaunay<TriMesh, 3>) -> Result<Self, MeshError> {
         let nodes = delaunay.mesh.nodes();
         let plane = Plane::through(nodes)?;
-        let feet = nodes.iter().map(|&p| plane.project(p)).collect();
-        let tolerance = TOLERANCE * extent(nodes);
-        Ok(Self { mesh: &delaunay.mesh, neighbours: &delaunay.neighbours, plane, feet, tolerance })
+        let feet: Vec<[f64; 2]> = nodes.iter().map(|&p| plane.project(p)).collect();
+        let bounds = Bounds::around(feet.iter().copied().map(lift));
+        Ok(Self { mesh: &delaunay.mesh, neighbours: &delaunay.neighbours, plane, feet, bounds })
     }
 
     /// The triangle that holds the foot of `p` (world mm, RAS), walking from triangle `hint`.
     /// None outside the hull or where `p` is not finite.
     pub fn locate(&self, p: WorldPoint, hint: u32) -> Option<Located<3>> {
         let foot = self.plane.project(p);
-        let lift = |q: [f64; 2]| [q[0], q[1], 0.0];
+        if !self.bounds.hold(lift(foot)) {
+            return None;
+        }
         let corners = |e: usize| self.mesh.triangles()[e].map(|v| self.feet[v as usize]);
         let part = |e: usize, i: usize| {
             let mut q = corners(e);
@@ -102,13 +107,21 @@ impl<'a> TriangleLocator<'a> {
         };
         let far = |e: usize, i: usize, part: f64| {
             let (a, b) = (corners(e)[(i + 1) % 3], corners(e)[(i + 2) % 3]);
-            part < -self.tolerance * (b[0] - a[0]).hypot(b[1] - a[1])
+            part < -self.bounds.tolerance * (b[0] - a[0]).hypot(b[1] - a[1])
         };
-        let element = if foot.iter().all(|v| v.is_finite()) { walk(self.neighbours, hint, part, far) } else { None }?;
+        let element = walk(self.neighbours, hint, part, far)?;
         let e = element as usize;
         let parts = std::array::from_fn(|i| part(e, i));
-        Some(Located { element, weights: weights(corners(e).map(lift), lift(foot), parts, 1e-3 * self.tolerance) })
+        Some(Located {
+            element,
+            weights: weights(corners(e).map(lift), lift(foot), parts, 1e-3 * self.bounds.tolerance),
+        })
     }
+}
+
+/// A point of the plane as one in space.
+fn lift([x, y]: [f64; 2]) -> [f64; 3] {
+    [x, y, 0.0]
 }
 
 /// Walks through facets that separate the element from the point (`part` negative) until there is none; through the
@@ -141,12 +154,29 @@ fn walk<const N: usize>(
     }
 }
 
-/// The longest side of the box around the points (mm).
-fn extent(points: &[WorldPoint]) -> f64 {
-    let side = |a: usize| {
-        let [low, high] =
-            points.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], p| [l.min(p.0[a]), h.max(p.0[a])]);
-        high - low
-    };
-    side(0).max(side(1)).max(side(2))
+/// An axis-aligned box, and the tolerance that goes with its size.
+#[derive(Debug, Clone)]
+struct Bounds {
+    low: [f64; 3],
+    high: [f64; 3],
+    tolerance: f64,
+}
+
+impl Bounds {
+    fn around(points: impl Iterator<Item = [f64; 3]>) -> Self {
+        let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+        for p in points {
+            for a in 0..3 {
+                low[a] = low[a].min(p[a]);
+                high[a] = high[a].max(p[a]);
+            }
+        }
+        let size = (0..3).map(|a| high[a] - low[a]).fold(0.0, f64::max);
+        Self { low, high, tolerance: TOLERANCE * size }
+    }
+
+    /// Whether a point is in the box; not so where a coordinate is NaN.
+    fn hold(&self, p: [f64; 3]) -> bool {
+        (0..3).all(|a| p[a] >= self.low[a] - self.tolerance && p[a] <= self.high[a] + self.tolerance)
+    }
 }
