@@ -8,7 +8,7 @@
 //! cells again, whatever points lie on one sphere or plane.
 
 use super::edge_map::EdgeMap;
-use super::predicates::{insphere, orient3d};
+use super::predicates::{StaticBounds, insphere_bounded, orient3d_bounded};
 
 /// The vertex at infinity; always the last of its cell.
 pub(super) const GHOST: u32 = u32::MAX;
@@ -17,12 +17,12 @@ pub(super) const GHOST: u32 = u32::MAX;
 /// the neighbour's number times four plus the facet's number there.
 pub(super) type Cell = [[u32; 4]; 2];
 
-/// The vertices of the facet's edge that is across from a third one: `EDGE[i][j]` completes `i` and `j` to 0, 1, 2, 3.
-const EDGE: [[[usize; 2]; 4]; 4] = [
-    [[0, 0], [2, 3], [1, 3], [1, 2]],
-    [[2, 3], [0, 0], [0, 3], [0, 2]],
-    [[1, 3], [0, 3], [0, 0], [0, 1]],
-    [[1, 2], [0, 2], [0, 1], [0, 0]],
+/// For each apex, the other three facets, each with the two vertices of its edge across from the apex.
+const SIDES: [[[usize; 3]; 3]; 4] = [
+    [[1, 2, 3], [2, 1, 3], [3, 1, 2]],
+    [[0, 2, 3], [2, 0, 3], [3, 0, 2]],
+    [[0, 1, 3], [1, 0, 3], [3, 0, 1]],
+    [[0, 1, 2], [1, 0, 2], [2, 0, 1]],
 ];
 
 /// A facet of the cavity's surface joined to the new point: the new cell's vertices, which of them is the new point,
@@ -36,6 +36,7 @@ struct Spoke {
 /// A Delaunay tetrahedralisation of the points inserted so far.
 pub(super) struct Cells {
     points: Vec<[f64; 3]>,
+    bounds: StaticBounds,
     cells: Vec<Cell>,
     dead: Vec<bool>,
     free: Vec<u32>,
@@ -78,8 +79,15 @@ impl Cells {
         }
         let mut dead = Vec::with_capacity(capacity);
         dead.resize(cells.len(), false);
+        let size = [0, 1, 2].map(|k| {
+            let [low, high] =
+                points.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], p| [l.min(p[k]), h.max(p[k])]);
+            high - low
+        });
         Self {
             points,
+            // Differences may round up.
+            bounds: StaticBounds::new(size.map(|v| v * 1.01)),
             cells,
             dead,
             free: Vec::new(),
@@ -109,20 +117,21 @@ impl Cells {
     /// Walks through any facet that separates, the first one drawn by chance: on points of one sphere a fixed choice
     /// could go round for ever (Devillers, Pion, Teillaud, "Walking in a triangulation", 2002).
     fn locate(&mut self, p: &[f64; 3]) -> u32 {
+        let (points, cells) = (self.points.as_slice(), self.cells.as_slice());
         let mut at = self.last;
-        if self.cells[at as usize][0][3] == GHOST {
-            at = self.cells[at as usize][1][3] >> 2;
+        if cells[at as usize][0][3] == GHOST {
+            at = cells[at as usize][1][3] >> 2;
         }
         let mut came = 4;
         'walk: loop {
-            let [v, links] = self.cells[at as usize];
+            let [v, links] = &cells[at as usize];
             if v[3] == GHOST {
                 return at;
             }
             self.chance ^= self.chance << 13;
             self.chance ^= self.chance >> 17;
             self.chance ^= self.chance << 5;
-            let corners = v.map(|i| &self.points[i as usize]);
+            let corners = corners(points, v);
             for turn in 0..4 {
                 let i = (self.chance + turn) as usize & 3;
                 if i == came {
@@ -130,7 +139,7 @@ impl Cells {
                 }
                 let mut q = corners;
                 q[i] = p;
-                if orient3d(q[0], q[1], q[2], q[3]) < 0.0 {
+                if orient3d_bounded(&self.bounds, q) < 0.0 {
                     at = links[i] >> 2;
                     came = links[i] as usize & 3;
                     continue 'walk;
@@ -140,39 +149,27 @@ impl Cells {
         }
     }
 
-    /// Whether `p` may not stay outside of the cell's sphere.
-    #[inline]
-    fn conflicts(&self, cell: u32, p: &[f64; 3]) -> bool {
-        let [v, links] = &self.cells[cell as usize];
-        let corner = |i: u32| &self.points[i as usize];
-        if v[3] != GHOST {
-            return insphere(corner(v[0]), corner(v[1]), corner(v[2]), corner(v[3]), p) > 0.0;
-        }
-        let side = orient3d(corner(v[0]), corner(v[1]), corner(v[2]), p);
-        // In the facet's plane, the circle of the facet is where the inner cell's sphere cuts the plane.
-        if side == 0.0 { self.conflicts(links[3] >> 2, p) } else { side > 0.0 }
-    }
-
     /// Collects the cells in conflict with `p`, and the facets around them joined to it.
     fn dig(&mut self, start: u32, vertex: u32, p: &[f64; 3]) {
+        let (points, cells, dead) = (self.points.as_slice(), self.cells.as_slice(), self.dead.as_mut_slice());
         self.cavity.clear();
         self.spokes.clear();
         self.cavity.push(start);
-        self.dead[start as usize] = true;
+        dead[start as usize] = true;
         let mut next = 0;
         while let Some(&cell) = self.cavity.get(next) {
             next += 1;
-            let [v, links] = self.cells[cell as usize];
+            let [v, links] = &cells[cell as usize];
             for (i, &link) in links.iter().enumerate() {
                 let beyond = link >> 2;
-                if self.dead[beyond as usize] {
+                if dead[beyond as usize] {
                     continue;
                 }
-                if self.conflicts(beyond, p) {
-                    self.dead[beyond as usize] = true;
+                if conflicts(points, cells, &self.bounds, beyond, p) {
+                    dead[beyond as usize] = true;
                     self.cavity.push(beyond);
                 } else {
-                    let mut vertices = v;
+                    let mut vertices = *v;
                     vertices[i] = vertex;
                     self.spokes.push(Spoke { vertices, apex: i, outward: link });
                 }
@@ -195,14 +192,10 @@ impl Cells {
             };
             self.dead[slot as usize] = false;
             let mut links = [0; 4];
-            for j in 0..4 {
+            links[spoke.apex] = spoke.outward;
+            self.cells[(spoke.outward >> 2) as usize][1][spoke.outward as usize & 3] = slot << 2 | spoke.apex as u32;
+            for &[j, k, l] in &SIDES[spoke.apex] {
                 let here = slot << 2 | j as u32;
-                if j == spoke.apex {
-                    links[j] = spoke.outward;
-                    self.cells[(spoke.outward >> 2) as usize][1][spoke.outward as usize & 3] = here;
-                    continue;
-                }
-                let [k, l] = EDGE[spoke.apex][j];
                 if let Some(there) = self.edges.pair(spoke.vertices[k], spoke.vertices[l], here) {
                     links[j] = there;
                     self.cells[(there >> 2) as usize][1][there as usize & 3] = here;
@@ -245,4 +238,24 @@ impl Cells {
         neighbours.shrink_to_fit();
         (vertices, neighbours)
     }
+}
+
+/// The corners of a finite cell.
+#[inline(always)]
+fn corners<'a>(points: &'a [[f64; 3]], v: &[u32; 4]) -> [&'a [f64; 3]; 4] {
+    [&points[v[0] as usize], &points[v[1] as usize], &points[v[2] as usize], &points[v[3] as usize]]
+}
+
+/// Whether a cell may not stay once `p` is inserted.
+#[inline]
+fn conflicts(points: &[[f64; 3]], cells: &[Cell], bounds: &StaticBounds, cell: u32, p: &[f64; 3]) -> bool {
+    let [v, links] = &cells[cell as usize];
+    if v[3] != GHOST {
+        return insphere_bounded(bounds, corners(points, v), p) > 0.0;
+    }
+    let facet = [v[0], v[1], v[2]].map(|i| &points[i as usize]);
+    let side = orient3d_bounded(bounds, [facet[0], facet[1], facet[2], p]);
+    // In the facet's plane, the circle of the facet is where the inner cell's sphere cuts the plane.
+    let inner = &cells[(links[3] >> 2) as usize][0];
+    side > 0.0 || side == 0.0 && insphere_bounded(bounds, corners(points, inner), p) > 0.0
 }

@@ -42,26 +42,57 @@ pub fn orient2d(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     robust::orient2d(a, b, c)
 }
 
-/// The sign of `det(b - a, c - a, d - a)`: positive for a positively oriented tetrahedron, zero where coplanar.
+/// Bounds on the rounding error of the determinants of all points within a box, so that most signs need no other.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct StaticBounds {
+    orient3d: f64,
+    insphere: f64,
+}
+
+impl StaticBounds {
+    /// For points of which no two differ by more than `size` along each axis.
+    pub(super) fn new(size: [f64; 3]) -> Self {
+        let (orient3d, insphere) = bounds(size);
+        Self { orient3d, insphere }
+    }
+}
+
+/// Bounds for differences of the given sizes along each axis; infinite where they could underflow or overflow.
 #[inline]
+fn bounds([x, y, z]: [f64; 3]) -> (f64, f64) {
+    let (least, most) = (smaller(smaller(x, y), z), larger(larger(x, y), z));
+    if least > 1e-58 && most < 1e61 {
+        let volume = x * y * z;
+        (ORIENT3D_BOUND * volume, INSPHERE_BOUND * volume * (most * most))
+    } else {
+        (f64::INFINITY, f64::INFINITY)
+    }
+}
+
+/// The sign of `det(b - a, c - a, d - a)`: positive for a positively oriented tetrahedron, zero where coplanar.
 pub fn orient3d(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3]) -> f64 {
+    orient3d_bounded(&StaticBounds { orient3d: f64::INFINITY, insphere: f64::INFINITY }, [a, b, c, d])
+}
+
+/// [`orient3d`], faster for points within the box that `bounds` are for.
+#[inline(always)]
+pub(super) fn orient3d_bounded(bounds: &StaticBounds, [a, b, c, d]: [&[f64; 3]; 4]) -> f64 {
     let [u, v, w] = [minus(b, a), minus(c, a), minus(d, a)];
     let det =
         u[2] * (v[0] * w[1] - w[0] * v[1]) + v[2] * (w[0] * u[1] - u[0] * w[1]) + w[2] * (u[0] * v[1] - v[0] * u[1]);
-    let size = |k: usize| larger(larger(u[k].abs(), v[k].abs()), w[k].abs());
-    let (x, y, z) = (size(0), size(1), size(2));
-    let (least, most) = (smaller(smaller(x, y), z), larger(larger(x, y), z));
-    // Inside this range neither the determinant nor the bound can underflow or overflow.
-    if least > 1e-97 && most < 1e102 && det.abs() > ORIENT3D_BOUND * x * y * z {
-        return det;
-    }
-    exact_orient3d(a, b, c, d, least)
+    if det.abs() > bounds.orient3d { det } else { close_orient3d(det, [a, b, c, d]) }
 }
 
-#[cold]
-fn exact_orient3d(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3], least: f64) -> f64 {
-    if least == 0.0 {
+/// A determinant near zero: bounded by its own differences, or exactly.
+#[inline(never)]
+fn close_orient3d(det: f64, [a, b, c, d]: [&[f64; 3]; 4]) -> f64 {
+    let size = |k: usize| larger(larger((b[k] - a[k]).abs(), (c[k] - a[k]).abs()), (d[k] - a[k]).abs());
+    let size = [size(0), size(1), size(2)];
+    if size.contains(&0.0) {
         return 0.0;
+    }
+    if det.abs() > bounds(size).0 {
+        return det;
     }
     // Shewchuk's sign is the opposite one, hence the exchange.
     robust::orient3d(coord(b), coord(a), coord(c), coord(d))
@@ -69,28 +100,35 @@ fn exact_orient3d(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3], least:
 
 /// Positive where `e` lies strictly inside the sphere through the positively oriented tetrahedron `a b c d`, zero where
 /// on it.
-#[inline]
 pub fn insphere(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3], e: &[f64; 3]) -> f64 {
-    let [p, q, r, s] = [minus(a, e), minus(b, e), minus(c, e), minus(d, e)];
-    let minor = |u: &[f64; 3], v: &[f64; 3]| u[0] * v[1] - v[0] * u[1];
-    let (pq, qr, rs, sp, pr, qs) =
-        (minor(&p, &q), minor(&q, &r), minor(&r, &s), minor(&s, &p), minor(&p, &r), minor(&q, &s));
-    let pqr = p[2] * qr - q[2] * pr + r[2] * pq;
-    let qrs = q[2] * rs - r[2] * qs + s[2] * qr;
-    let rsp = r[2] * sp + s[2] * pr + p[2] * rs;
-    let spq = s[2] * pq + p[2] * qs + q[2] * sp;
-    let lift = |u: &[f64; 3]| u[0] * u[0] + u[1] * u[1] + u[2] * u[2];
-    let det = (lift(&p) * qrs - lift(&q) * rsp) + (lift(&r) * spq - lift(&s) * pqr);
-    let size = |k: usize| larger(larger(p[k].abs(), q[k].abs()), larger(r[k].abs(), s[k].abs()));
-    let (x, y, z) = (size(0), size(1), size(2));
-    let (least, most) = (smaller(smaller(x, y), z), larger(larger(x, y), z));
-    if least > 1e-58 && most < 1e61 && det.abs() > INSPHERE_BOUND * x * y * z * (most * most) {
-        return det;
-    }
-    exact_insphere(a, b, c, d, e)
+    insphere_bounded(&StaticBounds { orient3d: f64::INFINITY, insphere: f64::INFINITY }, [a, b, c, d], e)
 }
 
-#[cold]
-fn exact_insphere(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3], e: &[f64; 3]) -> f64 {
-    robust::insphere(coord(b), coord(a), coord(c), coord(d), coord(e))
+/// [`insphere`], faster for points within the box that `bounds` are for.
+#[inline(always)]
+pub(super) fn insphere_bounded(bounds: &StaticBounds, corners: [&[f64; 3]; 4], e: &[f64; 3]) -> f64 {
+    // One lane a corner, for vector instructions; lane i of `minor` and `volume` begins with corner i.
+    let [a, b, c, d] = corners;
+    let x = [a[0] - e[0], b[0] - e[0], c[0] - e[0], d[0] - e[0]];
+    let y = [a[1] - e[1], b[1] - e[1], c[1] - e[1], d[1] - e[1]];
+    let z = [a[2] - e[2], b[2] - e[2], c[2] - e[2], d[2] - e[2]];
+    let minor = |i: usize, j: usize| x[i] * y[j] - x[j] * y[i];
+    let side = [minor(0, 1), minor(1, 2), minor(2, 3), minor(3, 0)];
+    let (ac, bd) = (minor(0, 2), minor(1, 3));
+    let skip = [-ac, -bd, ac, bd];
+    let volume = |i: usize, j: usize, k: usize| z[i] * side[j] + z[j] * skip[i] + z[k] * side[i];
+    let lift = |i: usize| x[i] * x[i] + y[i] * y[i] + z[i] * z[i];
+    let det = (lift(0) * volume(1, 2, 3) - lift(1) * volume(2, 3, 0))
+        + (lift(2) * volume(3, 0, 1) - lift(3) * volume(0, 1, 2));
+    if det.abs() > bounds.insphere { det } else { close_insphere(det, corners, e) }
+}
+
+#[inline(never)]
+fn close_insphere(det: f64, corners: [&[f64; 3]; 4], e: &[f64; 3]) -> f64 {
+    let size = [0, 1, 2].map(|k| corners.iter().fold(0.0, |m, p| larger(m, (p[k] - e[k]).abs())));
+    if det.abs() > bounds(size).1 {
+        return det;
+    }
+    let [a, b, c, d] = corners.map(coord);
+    robust::insphere(b, a, c, d, coord(e))
 }
