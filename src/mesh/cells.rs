@@ -177,34 +177,35 @@ impl Cells {
         }
     }
 
-    /// Puts the new cells into the cavity's slots and links them.
+    /// Puts the new cells into the cavity's slots, and more as needed, and links them.
     fn fill(&mut self) {
+        while self.cavity.len() < self.spokes.len() {
+            let slot = self.free.pop().unwrap_or_else(|| {
+                self.cells.push([[0; 4]; 2]);
+                self.dead.push(true);
+                self.cells.len() as u32 - 1
+            });
+            self.cavity.push(slot);
+        }
+        self.free.extend(self.cavity.drain(self.spokes.len()..));
+        self.last = self.cavity[0];
+        let (cells, dead) = (self.cells.as_mut_slice(), self.dead.as_mut_slice());
         // A surface of f triangles has 3 f / 2 edges.
-        self.edges.clear(self.spokes.len() * 3 / 2);
-        for spoke in &self.spokes {
-            let slot = match self.cavity.pop().or_else(|| self.free.pop()) {
-                Some(slot) => slot,
-                None => {
-                    self.cells.push([[0; 4]; 2]);
-                    self.dead.push(true);
-                    self.cells.len() as u32 - 1
-                }
-            };
-            self.dead[slot as usize] = false;
+        let mut edges = self.edges.start(self.spokes.len() * 3 / 2);
+        for (spoke, &slot) in self.spokes.iter().zip(&self.cavity) {
             let mut links = [0; 4];
             links[spoke.apex] = spoke.outward;
-            self.cells[(spoke.outward >> 2) as usize][1][spoke.outward as usize & 3] = slot << 2 | spoke.apex as u32;
+            cells[(spoke.outward >> 2) as usize][1][spoke.outward as usize & 3] = slot << 2 | spoke.apex as u32;
             for &[j, k, l] in &SIDES[spoke.apex] {
                 let here = slot << 2 | j as u32;
-                if let Some(there) = self.edges.pair(spoke.vertices[k], spoke.vertices[l], here) {
+                if let Some(there) = edges.pair(spoke.vertices[k], spoke.vertices[l], here) {
                     links[j] = there;
-                    self.cells[(there >> 2) as usize][1][there as usize & 3] = here;
+                    cells[(there >> 2) as usize][1][there as usize & 3] = here;
                 }
             }
-            self.cells[slot as usize] = [spoke.vertices, links];
-            self.last = slot;
+            cells[slot as usize] = [spoke.vertices, links];
+            dead[slot as usize] = false;
         }
-        self.free.append(&mut self.cavity);
     }
 
     /// Vertices and neighbours of the finite cells; `none` stands for no neighbour.

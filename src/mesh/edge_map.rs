@@ -21,17 +21,27 @@ impl EdgeMap {
     }
 
     /// Forgets everything and makes room for `edges` edges at a load of at most a half.
-    pub(super) fn clear(&mut self, edges: usize) {
+    pub(super) fn start(&mut self, edges: usize) -> Pairs<'_> {
         let wanted = (2 * edges).next_power_of_two();
         if wanted > self.slots.len() || self.stamp == u32::MAX {
             let size = wanted.max(self.slots.len());
             *self = Self { slots: vec![Slot::default(); size], shift: 64 - size.trailing_zeros(), stamp: 0 };
         }
         self.stamp += 1;
+        Pairs { slots: &mut self.slots, shift: self.shift, stamp: self.stamp }
     }
+}
 
+/// The map while one cavity is filled.
+pub(super) struct Pairs<'a> {
+    slots: &'a mut [Slot],
+    shift: u32,
+    stamp: u32,
+}
+
+impl Pairs<'_> {
     /// The value stored for the edge between `a` and `b`, or none on its first visit, when `value` is stored.
-    #[inline]
+    #[inline(always)]
     pub(super) fn pair(&mut self, a: u32, b: u32, value: u32) -> Option<u32> {
         let edge = u64::from(a.min(b)) << 32 | u64::from(a.max(b));
         let mask = self.slots.len() - 1;

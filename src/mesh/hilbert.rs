@@ -4,7 +4,7 @@
 //! the Hilbert curve", AIP Conf. Proc. 707 (2004).
 
 /// Bits an axis on the curve.
-const BITS: u32 = 20;
+const BITS: u32 = 16;
 
 /// The order in which to insert the points: a permutation of their numbers, the same every time.
 ///
@@ -38,7 +38,7 @@ fn round(i: u64) -> u32 {
     ((h ^ (h >> 31)).trailing_zeros() / 3).min(15)
 }
 
-/// Position of a cell of the 2^20-cube along the Hilbert curve (Skilling's `AxestoTranspose`, then interleaved).
+/// Position of a cell of the 2^16-cube along the Hilbert curve (Skilling's `AxestoTranspose`, then interleaved).
 fn hilbert_index(mut x: [u32; 3]) -> u64 {
     for bit in (1..BITS).rev() {
         let (q, mask) = (1 << bit, (1 << bit) - 1);
