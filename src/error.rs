@@ -66,6 +66,20 @@ pub enum MeshError {
         /// Needed.
         needed: usize,
     },
+    /// As many displacements as the mesh has nodes were expected.
+    #[error("{found} displacements for a mesh of {expected} nodes")]
+    Length {
+        /// What the mesh needs.
+        expected: usize,
+        /// What was given.
+        found: usize,
+    },
+    /// A triangle mesh can only fill a grid of one slice.
+    #[error("triangles can only be interpolated on a grid of one slice, not on {shape:?}")]
+    NotOneSlice {
+        /// Voxels along each axis.
+        shape: [usize; 3],
+    },
     /// All points lie on one line.
     #[error("all points lie on one line, so there is no triangle among them")]
     Collinear,

@@ -3,6 +3,7 @@
 
 use crate::numerics::bending::{Smoothness, SolveReport, apply_blocks, solve};
 use crate::numerics::bspline::Lattice;
+use crate::numerics::filters;
 use crate::numerics::random::Random;
 use crate::numerics::small::{Symmetric3, multiply, quadratic};
 use rayon::prelude::*;
@@ -125,4 +126,58 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         scale = (scale * 0.5f64).max(9.0);
     }
     (c, lambda)
+}
+
+/// Standard deviation of the coupled field at each node (mm, root of a third of the covariance's trace).
+///
+/// The covariance is `(A + lambda L)^-1`; random vectors with just that covariance are drawn by solving for
+/// right-hand sides with covariance `A + lambda L` (perturb and optimise, Papandreou & Yuille 2010), and their squares
+/// averaged over `draws` and over neighbouring nodes.
+pub fn deviation(
+    smoothness: &Smoothness,
+    lambda: f32,
+    blocks: &[[f32; 6]],
+    nodes: [usize; 3],
+    draws: usize,
+    seed: u64,
+) -> Vec<f32> {
+    let n = blocks.len();
+    let mut squares = vec![0.0f32; n];
+    for draw in 0..draws {
+        let mut random = Random::new(seed, 1000 + draw as u64);
+        let mut b = vec![0.0f32; 3 * n];
+        for component in b.chunks_exact_mut(n) {
+            let l = smoothness.sample(&mut random);
+            for (b, l) in component.iter_mut().zip(l) {
+                *b = lambda.sqrt() * l;
+            }
+        }
+        for (i, a) in blocks.iter().enumerate() {
+            let (e, f) = (random.normals(), random.normals());
+            let v = cholesky_times(a, [e[0], e[1], f[0]]);
+            for c in 0..3 {
+                b[c * n + i] += v[c] as f32;
+            }
+        }
+        let mut x = vec![0.0f32; 3 * n];
+        solve(smoothness, lambda, |x, out| apply_blocks(blocks, x, out), blocks, &b, &mut x, 1e-2, 200);
+        for (i, s) in squares.iter_mut().enumerate() {
+            *s += (x[i] * x[i] + x[n + i] * x[n + i] + x[2 * n + i] * x[2 * n + i]) / (3 * draws) as f32;
+        }
+    }
+    let smooth = filters::gaussian(&squares, nodes, [1.0; 3]);
+    smooth.iter().map(|v| v.sqrt()).collect()
+}
+
+/// `C e` with `C C^T` the symmetric matrix `a` (zero pivots count as no information).
+fn cholesky_times(a: &[f32; 6], e: [f64; 3]) -> [f64; 3] {
+    let [xx, yy, zz, xy, xz, yz] = a.map(f64::from);
+    let root = |v: f64| v.max(0.0).sqrt();
+    let over = |v: f64, d: f64| if d > 0.0 { v / d } else { 0.0 };
+    let c00 = root(xx);
+    let (c10, c20) = (over(xy, c00), over(xz, c00));
+    let c11 = root(yy - c10 * c10);
+    let c21 = over(yz - c20 * c10, c11);
+    let c22 = root(zz - c20 * c20 - c21 * c21);
+    [c00 * e[0], c10 * e[0] + c11 * e[1], c20 * e[0] + c21 * e[1] + c22 * e[2]]
 }

@@ -1,9 +1,13 @@
-//! field.
+//! Dense displacement fields: interpolation from a mesh, Jacobian, inverse, composition, warping.
 
-pub mod composition;
+pub mod interpolation;
+
+pub mod spline;
+
+pub mod jacobian;
 
 pub mod inverse;
 
-pub mod jacobian;
+pub mod composition;
 
 pub mod warp;

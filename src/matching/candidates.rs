@@ -46,8 +46,10 @@ pub fn candidates(
     spacing: [f64; 3],
     params: CandidateParams,
 ) -> Vec<Vec<Candidate>> {
-    let from_initial = one_way(initial, deformed, spacing, params);
-    let from_deformed = one_way(deformed, initial, spacing, params);
+    let from_initial = one_way(initial, deformed, initial.features, spacing, params);
+    // The strongest of the deformed features, as many as there are initial ones.
+    let strongest = &deformed.features[..deformed.features.len().min(initial.features.len())];
+    let from_deformed = one_way(deformed, initial, strongest, spacing, params);
     let starts: Vec<[f64; 3]> = initial.features.iter().map(|&p| initial.mm(p, spacing)).collect();
     let tree = Neighbours::new(&starts);
     let near = 2.0 * spacing.iter().fold(0.0f64, |m, &s| m.max(s));
@@ -61,7 +63,7 @@ pub fn candidates(
         })
         .collect();
     // A deformed feature found back at `p` in the initial volume speaks for the initial feature nearest to `p`.
-    for (found, &q) in from_deformed.iter().zip(deformed.features) {
+    for (found, &q) in from_deformed.iter().zip(strongest) {
         let q = deformed.mm(q, spacing);
         for &(p, ncc) in found {
             if let Some(&i) = tree.within(p, near, 1).first() {
@@ -85,12 +87,12 @@ pub fn candidates(
     all
 }
 
-/// For each feature of `from`: the best places in `to` by search, then the best features of `to` (common mm, ncc).
-fn one_way(from: &Side<'_>, to: &Side<'_>, spacing: [f64; 3], params: CandidateParams) -> Vec<Vec<([f64; 3], f32)>> {
+/// For each of `features` (of `from`): the best places in `to` by search, then the best features of `to` (common mm, ncc).
+fn one_way(from: &Side<'_>, to: &Side<'_>, features: &[[f64; 3]], spacing: [f64; 3], params: CandidateParams) -> Vec<Vec<([f64; 3], f32)>> {
     let targets: Vec<[f64; 3]> = to.features.iter().map(|&p| to.mm(p, spacing)).collect();
     let tree = Neighbours::new(&targets);
     let reach = spacing.map(|s| (params.reach_mm / s).ceil() as usize);
-    from.features
+    features
         .par_iter()
         .map(|&p| {
             let centre = p.map(|v| v.round().max(0.0) as usize);

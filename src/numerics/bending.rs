@@ -4,6 +4,7 @@
 //! penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999), plus `membrane` times the squared first
 //! differences / mm^2. An affine field costs no bending.
 
+use crate::numerics::random::Random;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse, multiply};
 use rayon::prelude::*;
@@ -114,6 +115,36 @@ impl Smoothness {
                         let anchor = i + nx * (j + ny * k);
                         for &(o, s) in &t.taps {
                             out[anchor + o] += t.weight * s * s;
+                        }
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    /// A random vector with covariance `L` (one planar component): the transpose of the differences applied to
+    /// independent standard normal numbers.
+    pub fn sample(&self, random: &mut Random) -> Vec<f32> {
+        let [nx, ny, nz] = self.nodes;
+        let mut out = vec![0.0f32; nx * ny * nz];
+        for t in self.terms() {
+            let scale = t.weight.sqrt();
+            let mut spare = None;
+            for k in 0..nz - t.reach[2] {
+                for j in 0..ny - t.reach[1] {
+                    for i in 0..nx - t.reach[0] {
+                        let anchor = i + nx * (j + ny * k);
+                        let e = match spare.take() {
+                            Some(e) => e,
+                            None => {
+                                let [a, b] = random.normals();
+                                spare = Some(b);
+                                a
+                            }
+                        };
+                        for &(o, s) in &t.taps {
+                            out[anchor + o] += scale * s * e as f32;
                         }
                     }
                 }

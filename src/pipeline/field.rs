@@ -1,25 +1,338 @@
-//! Two volumes to a dense displacement field.
+//! Two volumes to a dense displacement field: the main chain, in order.
 
-use crate::error::FieldError;
-use crate::types::{FieldParams, FieldResult, Mask, Volume};
+use crate::consistency::coupling;
+use crate::consistency::models::{AffineMotion, Choice, choose};
+use crate::error::{FieldError, MeshError};
+use crate::field::{interpolation, jacobian, spline, warp};
+use crate::matching::levels::{Aligned, factors, from_level, to_level};
+use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
+use crate::numerics::bending;
+use crate::numerics::bspline::Lattice;
+use crate::numerics::sampling;
+use crate::numerics::statistics::median;
+use crate::pipeline::check;
+use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::types::params::Interpolation;
+use crate::types::*;
+use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
+/// Fewest matches that a result may rest on.
+const FEWEST: usize = 20;
+
+/// Stage names and their wall seconds.
+struct Clock(Vec<(String, f64)>, Instant);
+
+impl Clock {
+    /// Books the time since the last call to `stage`.
+    fn book(&mut self, stage: &str) {
+        let seconds = self.1.elapsed().as_secs_f64();
+        self.1 = Instant::now();
+        match self.0.iter_mut().find(|s| s.0 == stage) {
+            Some(s) => s.1 += seconds,
+            None => self.0.push((stage.into(), seconds)),
+        }
+    }
+}
+
 /// Measures the displacement from `initial` to `deformed`.
 ///
-/// `mask` lies on the initial grid: features are taken and statistics are made inside it.
+/// `mask` lies on the initial grid: features are taken, residuals weighed and statistics made inside it. The volumes
+/// may lie on different grids. Results lie on the initial grid.
 ///
 /// # Errors
-/// [`FieldError`] when a volume has no texture, the two do not overlap, or too few matches survive.
+/// [`FieldError`] when a volume is constant or not finite, the mask is empty or on another grid, the two volumes do not
+/// overlap, or fewer than 20 matches survive.
 pub fn run(
-    _initial: &Volume,
-    _deformed: &Volume,
-    _mask: Option<&Mask>,
+    initial: &Volume,
+    deformed: &Volume,
+    mask: Option<&Mask>,
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
     params.check()?;
-    progress("features", 0.0);
-    Err(FieldError::TooFew { found: 0, what: "stages are built", needed: 1, hint: "under construction".into() })
+    progress("pyramid", 0.0);
+    let mut clock = Clock(Vec::new(), Instant::now());
+    let (mask, clean, not_finite) = check::inputs(initial, deformed, mask)?;
+    let grid = *initial.grid();
+    let search = search_mm(&grid, params.search_mm);
+    let aligned = Aligned::new(&clean, deformed, &mask, search)?;
+    let factors = factors(grid.shape(), grid.spacing(), params.finest, search / 6.0);
+    clock.book("pyramid");
+
+    // Coarse to fine.
+    let mut reports = Vec::new();
+    let mut state: Option<(SplineField, [usize; 3])> = None;
+    let mut fine = None;
+    for (l, &factor) in factors.iter().enumerate() {
+        let (first, last) = (l == 0, l + 1 == factors.len());
+        let pair = aligned.level(factor);
+        clock.book("pyramid");
+        let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
+        let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
+        let mut field = match &state {
+            Some((coarse, from)) => level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from)),
+            None => {
+                progress("matching", done(0.0));
+                let points = pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(COARSE_SHARE).clamp(40, COARSE_POINTS);
+                let wide = MatchParams { points, reach_mm: search, patch: 2, strain: 0.3 };
+                let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
+                clock.book("matching");
+                let enough = report.counts.kept >= FEWEST;
+                reports.push(report);
+                fitted.filter(|_| enough).unwrap_or_else(|| SplineField {
+                    coefficients: vec![0.0; 3 * lattice.len()],
+                    lattice,
+                    lambda: 30.0,
+                    blocks: Vec::new(),
+                    determined: 0.0,
+                })
+            }
+        };
+        let passes = if last { params.passes } else { params.coarse_passes };
+        level::refine(&pair, &mut field, passes, params.seed, |p| {
+            progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
+        });
+        clock.book("residual");
+        if last {
+            progress("matching", done(0.9));
+            let inside = pair.mask.iter().filter(|&&m| m != 0).count();
+            let points = if params.points > 0 { params.points } else { (inside / params.voxels_per_point).max(200) };
+            let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
+            let near = MatchParams { points, reach_mm: 2.0 * finest, patch: 3, strain: 0.05 };
+            let (matches, _, report) = level::matches(&pair, Some(&field), field.lattice.clone(), near);
+            if !first || reports.is_empty() {
+                reports.push(report);
+            } else {
+                reports = vec![report];
+            }
+            clock.book("matching");
+            fine = Some((matches, pair.spacing));
+        }
+        state = Some((field, factor));
+    }
+    let (Some((field, factor)), Some((matches, spacing))) = (state, fine) else {
+        return Err(too_few(0, search));
+    };
+    let kept = matches.iter().filter(|m| m.kept).count();
+    if kept < FEWEST {
+        return Err(too_few(kept, search));
+    }
+
+    // The smallest motion that explains the matches.
+    progress("model", 0.9);
+    let flat = grid.is_single_slice();
+    let choice = smallest(&matches, &field, spacing);
+    let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
+    clock.book("model");
+
+    // Mesh and dense field.
+    progress("mesh", 0.92);
+    let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
+    let (mesh, source) = triangulate(&sparse, flat)?;
+    clock.book("mesh");
+    let smooth = spline::dense(&grid, &lattice, &coefficients);
+    let kept_matches: Vec<&Match> = sparse.kept().collect();
+    let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
+    let displacement = match params.interpolation {
+        Interpolation::Spline => smooth,
+        Interpolation::Barycentric => barycentric(&mesh, &node_displacement, smooth)?,
+    };
+    clock.book("interpolation");
+
+    progress("jacobian", 0.94);
+    let jacobian = jacobian::jacobian_determinant(&displacement);
+    let folds = jacobian::count_folds(&jacobian, Some(&mask))?;
+    clock.book("jacobian");
+    progress("uncertainty", 0.95);
+    let uncertainty = uncertainty(&grid, &field, spacing, params.seed);
+    clock.book("uncertainty");
+    progress("warp", 0.98);
+    let warped = warp::warp_image(deformed, &displacement, None, sampling::Interpolation::Cubic, 0.0);
+    clock.book("warp");
+
+    let last = reports.last_mut();
+    let mut counts = last.as_ref().map(|r| r.counts).unwrap_or_default();
+    (counts.nodes, counts.tetrahedra) = match &mesh {
+        Mesh::Tetrahedra(m) => (m.nodes().len(), m.tetrahedra().len()),
+        Mesh::Triangles(m) => (m.nodes().len(), m.triangles().len()),
+    };
+    if let Some(r) = last {
+        r.counts = counts;
+    }
+    let length = lengths(&displacement, &mask);
+    let mut sigma: Vec<f32> =
+        uncertainty.as_slice().iter().zip(mask.as_slice()).filter(|(_, m)| **m != 0).map(|(u, _)| *u).collect();
+    let summary = FieldSummary {
+        counts,
+        model: choice.model,
+        evidence: choice.evidence,
+        levels: reports,
+        folds,
+        mask_voxels: sigma.len(),
+        mean_mm: length.0,
+        max_mm: length.1,
+        uncertainty_median_mm: f64::from(median(&mut sigma)),
+        seconds: clock.0,
+        warnings: warnings(counts, folds, not_finite, length.1, search),
+    };
+    progress("done", 1.0);
+    Ok(FieldResult { displacement, warped, jacobian, uncertainty, matches: sparse, mesh, node_displacement, summary })
+}
+
+/// Voxels of the coarsest mask for each feature there, and the most features.
+const COARSE_SHARE: usize = 12;
+/// See [`COARSE_SHARE`].
+const COARSE_POINTS: usize = 4000;
+
+/// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30 mm.
+fn search_mm(grid: &Grid, asked: f64) -> f64 {
+    let (shape, spacing) = (grid.shape(), grid.spacing());
+    let thick = || (0..3).filter(|&a| shape[a] > 1);
+    let side = thick().map(|a| shape[a] as f64 * spacing[a]).fold(f64::INFINITY, f64::min);
+    let voxel = thick().map(|a| spacing[a]).fold(0.0, f64::max);
+    if asked > 0.0 { asked } else { (0.15 * side).min(30.0).max(2.0 * voxel) }
+}
+
+fn too_few(found: usize, search: f64) -> FieldError {
+    let hint = format!("widen --search (now {search:.0} mm), check the mask, or check that both show the same tissue");
+    FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
+}
+
+/// Chooses the model from the kept matches and the free field.
+fn smallest(matches: &[LevelMatch], field: &SplineField, spacing: [f64; 3]) -> Choice {
+    let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
+    let finest = spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
+    let excess = |motion: &AffineMotion| {
+        let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * spacing[a])));
+        let apart: Vec<f32> = field.coefficients.iter().zip(&map).map(|(c, m)| c - m).collect();
+        let mut weighed = vec![0.0; apart.len()];
+        bending::apply_blocks(&field.blocks, &apart, &mut weighed);
+        apart.iter().zip(&weighed).map(|(a, w)| f64::from(*a) * f64::from(*w)).sum()
+    };
+    choose(&measured, excess, field.determined, 0.02 * finest)
+}
+
+/// The chosen motion on a lattice over the full-resolution grid.
+fn full_lattice(grid: &Grid, field: &SplineField, factor: [usize; 3], choice: &Choice) -> (Lattice, Vec<f32>) {
+    let step = std::array::from_fn(|a| field.lattice.step[a] * factor[a]);
+    let lattice = Lattice::new(grid.shape(), step);
+    let spacing = grid.spacing();
+    let coefficients = match &choice.motion {
+        Some(motion) => lattice.fit(|p| motion.displacement(std::array::from_fn(|a| to_level(p, factor)[a] * spacing[a] * factor[a] as f64))),
+        None if factor == [1; 3] => field.coefficients.clone(),
+        None => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
+    };
+    (lattice, coefficients)
+}
+
+/// A level's match in world mm (RAS).
+fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
+    let (spacing, linear) = (grid.spacing(), grid.affine().linear());
+    let axes: [[f64; 3]; 3] = std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]));
+    let [xx, yy, zz, xy, xz, yz] = m.measured.covariance;
+    let c = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+    let turned = |r: usize, s: usize| -> f64 {
+        (0..3).map(|a| (0..3).map(|b| axes[r][a] * c[a][b] * axes[s][b]).sum::<f64>()).sum()
+    };
+    Match {
+        initial: grid.affine().to_world(VoxelPoint(from_level(m.voxel, factor))),
+        displacement: std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * m.measured.displacement[a]).sum()),
+        ncc: m.ncc,
+        covariance: [turned(0, 0), turned(1, 1), turned(2, 2), turned(0, 1), turned(0, 2), turned(1, 2)],
+        kept: m.kept,
+    }
+}
+
+/// The Delaunay mesh of the kept matches, and the kept match of each node.
+fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
+    let places: Vec<WorldPoint> = sparse.kept().map(|m| m.initial).collect();
+    if !flat {
+        match delaunay3(&places) {
+            Ok(d) => return Ok((Mesh::Tetrahedra(d.mesh), d.source)),
+            Err(MeshError::Coplanar) => {}
+            Err(e) => return Err(e.into()),
+        }
+    }
+    let d = delaunay2(&places)?;
+    Ok((Mesh::Triangles(d.mesh), d.source))
+}
+
+/// Piecewise linear inside the mesh, `outside` elsewhere.
+fn barycentric(mesh: &Mesh, nodes: &[[f64; 3]], mut outside: DenseField) -> Result<DenseField, FieldError> {
+    let filled = match mesh {
+        Mesh::Tetrahedra(m) => interpolation::interpolate_tetrahedra(m, nodes, outside.grid())?,
+        Mesh::Triangles(m) => interpolation::interpolate_triangles(m, nodes, outside.grid())?,
+    };
+    let inside = filled.inside.as_slice();
+    let (n, values) = (inside.len(), filled.displacement.as_slice());
+    for (i, v) in outside.as_mut_slice().iter_mut().enumerate() {
+        if inside[i % n] != 0 {
+            *v = values[i];
+        }
+    }
+    Ok(outside)
+}
+
+/// Posterior standard deviation of the coupled field (mm), from a lattice twice as coarse as the field's own.
+fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -> Volume {
+    let fine = &field.lattice;
+    let coarse = Lattice::new(fine.shape, fine.step.map(|s| 2 * s));
+    let mut blocks = vec![[0.0f32; 6]; coarse.len()];
+    for (m, block) in field.blocks.iter().enumerate() {
+        let index = [m % fine.nodes[0], m / fine.nodes[0] % fine.nodes[1], m / (fine.nodes[0] * fine.nodes[1])];
+        let at = std::array::from_fn(|a| (index[a] as f64 - 1.0) * fine.step[a] as f64);
+        coarse.for_each_tap(at, |node, w| {
+            for q in 0..6 {
+                blocks[node][q] += w * block[q];
+            }
+        });
+    }
+    let energy = level::smoothness(&coarse, spacing);
+    let cell: f64 = (0..3).filter(|&a| coarse.shape[a] > 1).map(|a| coarse.step[a] as f64 * spacing[a]).product();
+    let deviation = coupling::deviation(&energy, (field.lambda * cell) as f32, &blocks, coarse.nodes, 6, seed);
+    let factor: [usize; 3] = std::array::from_fn(|a| (spacing[a] / grid.spacing()[a]).round() as usize);
+    let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));
+    if full.nodes == coarse.nodes {
+        return spline::scalar(grid, &full, &deviation);
+    }
+    let three: Vec<f32> = deviation.iter().chain(&deviation).chain(&deviation).copied().collect();
+    let values = full.fit(|p| coarse.at(&three, to_level(p, factor)));
+    spline::scalar(grid, &full, &values[..full.len()])
+}
+
+/// Mean and largest length over the mask (mm).
+fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64) {
+    let (mut sum, mut top, mut n) = (0.0, 0.0f64, 0usize);
+    for (i, &m) in mask.as_slice().iter().enumerate() {
+        if m != 0 {
+            let d = field.at(i).map(f64::from);
+            let length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
+            sum += length;
+            top = top.max(length);
+            n += 1;
+        }
+    }
+    (sum / n.max(1) as f64, top)
+}
+
+/// What a user should know.
+fn warnings(counts: Counts, folds: usize, not_finite: usize, max_mm: f64, search: f64) -> Vec<String> {
+    let mut out = Vec::new();
+    if not_finite > 0 {
+        out.push(format!("{not_finite} voxels of the initial volume are not finite; they were left out"));
+    }
+    if folds > 0 {
+        out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));
+    }
+    if max_mm > 0.9 * search {
+        out.push(format!("the motion reaches {max_mm:.1} mm, near the search range of {search:.1} mm; try a wider --search"));
+    }
+    if counts.features_initial > 0 && counts.kept * 4 < counts.features_initial {
+        let (kept, all) = (counts.kept, counts.features_initial);
+        out.push(format!("only {kept} of {all} features found a consistent match; look at uncertainty.nii.gz"));
+    }
+    out
 }

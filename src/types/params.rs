@@ -16,6 +16,16 @@ pub enum Preset {
     Accurate,
 }
 
+/// How the dense field is made from the measured places.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Interpolation {
+    /// The coupled spline field, brought to the last residual of the two volumes.
+    Spline,
+    /// Piecewise linear in the tetrahedra (triangles) of the kept matches, as in the source; the spline outside.
+    Barycentric,
+}
+
 /// Parameters of [`crate::pipeline::field`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -23,10 +33,23 @@ pub struct FieldParams {
     /// Preset that the other values came from.
     pub preset: Preset,
     /// Feature points wanted in the initial volume at full resolution (the deformed one gets up to five times as
-    /// many, as in the source); 0 = as many as the volume's texture and size ask for.
+    /// many, as in the source); 0 = one for each `voxels_per_point` voxels of the mask.
     pub points: usize,
-    /// Largest motion looked for (mm); 0 = a fifth of the volume's smallest side, at most 40 mm.
+    /// Voxels of the mask for each automatic point (1); 27 to 1000. Measured: more points than one in 64 voxels gain
+    /// nothing, since their patches overlap.
+    pub voxels_per_point: usize,
+    /// Largest motion looked for (mm); 0 = 15 % of the volume's smallest side, 2 voxels to 30 mm.
     pub search_mm: f64,
+    /// Finest level worked on: 1 = full resolution, 2 = half.
+    pub finest: usize,
+    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 8.
+    pub node_spacing: usize,
+    /// Residual passes on the finest level; 1 to 40.
+    pub passes: usize,
+    /// Residual passes on each coarser level; 1 to 60.
+    pub coarse_passes: usize,
+    /// How the dense field is made.
+    pub interpolation: Interpolation,
     /// Seed of whatever is drawn at random.
     pub seed: u64,
 }
@@ -38,9 +61,25 @@ impl Default for FieldParams {
 }
 
 impl FieldParams {
-    /// The values of a preset.
+    /// The values of a preset (docs/accuracy.md has the measurements behind them).
     pub fn preset(preset: Preset) -> Self {
-        Self { preset, points: 0, search_mm: 0.0, seed: 1 }
+        let balanced = Self {
+            preset,
+            points: 0,
+            voxels_per_point: 125,
+            search_mm: 0.0,
+            finest: 1,
+            node_spacing: 4,
+            passes: 4,
+            coarse_passes: 10,
+            interpolation: Interpolation::Spline,
+            seed: 1,
+        };
+        match preset {
+            Preset::Fast => Self { finest: 2, passes: 6, coarse_passes: 8, voxels_per_point: 1000, ..balanced },
+            Preset::Balanced => balanced,
+            Preset::Accurate => Self { node_spacing: 3, passes: 10, coarse_passes: 14, voxels_per_point: 64, ..balanced },
+        }
     }
 
     /// Checks every range.
@@ -57,6 +96,18 @@ impl FieldParams {
                 value: self.points as f64,
                 range: "0 (automatic), or 20 to 2,000,000",
             });
+        }
+        let whole = [
+            ("voxels_per_point", self.voxels_per_point, 8, 100_000, "8 to 100,000"),
+            ("finest", self.finest, 1, 8, "1 (full resolution) to 8"),
+            ("node_spacing", self.node_spacing, 2, 16, "2 to 16 voxels"),
+            ("passes", self.passes, 1, 100, "1 to 100"),
+            ("coarse_passes", self.coarse_passes, 1, 100, "1 to 100"),
+        ];
+        for (name, value, low, high, range) in whole {
+            if !(low..=high).contains(&value) {
+                return Err(ParamError { name, value: value as f64, range });
+            }
         }
         Ok(())
     }

@@ -1,0 +1,56 @@
+//! A spline lattice as a dense field.
+
+use crate::numerics::bspline::Lattice;
+use crate::numerics::simd::dispatch;
+use crate::types::{DenseField, Grid, Volume};
+use rayon::prelude::*;
+
+/// Evaluates `coefficients` (mm along `grid`'s axes, planar) at every voxel and turns them into world mm (RAS).
+///
+/// The lattice must lie over `grid`'s shape.
+pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField {
+    let [nx, ny, _] = grid.shape();
+    let (spacing, linear) = (grid.spacing(), grid.affine().linear());
+    let axes: [[f32; 3]; 3] = std::array::from_fn(|r| std::array::from_fn(|a| (linear[r][a] / spacing[a]) as f32));
+    let mut out = DenseField::zeros(*grid);
+    let n = grid.len();
+    let (x, rest) = out.as_mut_slice().split_at_mut(n);
+    let (y, z) = rest.split_at_mut(n);
+    let plane = nx * ny;
+    let planes = (x.par_chunks_mut(plane), y.par_chunks_mut(plane), z.par_chunks_mut(plane));
+    planes.into_par_iter().enumerate().for_each(|(k, (x, y, z))| {
+        let slice = lattice.slice(coefficients, k);
+        let mut nodes = vec![0.0; lattice.nodes[0]];
+        let mut d: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
+        dispatch(|| {
+            for j in 0..ny {
+                for (c, d) in d.iter_mut().enumerate() {
+                    lattice.row(&slice, c, j, &mut nodes, d);
+                }
+                for i in 0..nx {
+                    let v = [d[0][i], d[1][i], d[2][i]];
+                    let world = |r: usize| axes[r][0] * v[0] + axes[r][1] * v[1] + axes[r][2] * v[2];
+                    (x[j * nx + i], y[j * nx + i], z[j * nx + i]) = (world(0), world(1), world(2));
+                }
+            }
+        });
+    });
+    out
+}
+
+/// A scalar on the nodes (repeated as three components) as a volume.
+pub fn scalar(grid: &Grid, lattice: &Lattice, values: &[f32]) -> Volume {
+    let [nx, ny, _] = grid.shape();
+    let three: Vec<f32> = values.iter().chain(values).chain(values).copied().collect();
+    let mut out = Volume::filled(*grid, 0.0);
+    out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
+        let slice = lattice.slice(&three, k);
+        let mut nodes = vec![0.0; lattice.nodes[0]];
+        dispatch(|| {
+            for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
+                lattice.row(&slice, 0, j, &mut nodes, row);
+            }
+        });
+    });
+    out
+}

@@ -1,0 +1,57 @@
+//! What cannot be measured is refused before any work.
+
+use crate::error::FieldError;
+use crate::matching::levels::foreground;
+use crate::types::{Mask, Volume};
+
+/// The mask to work in: the given one or the foreground, less the voxels that are not finite.
+///
+/// Returns the mask, the initial volume with those voxels set to zero, and how many there were.
+///
+/// # Errors
+/// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
+pub fn inputs(initial: &Volume, deformed: &Volume, mask: Option<&Mask>) -> Result<(Mask, Volume, usize), FieldError> {
+    for (volume, v) in [("initial", initial), ("deformed", deformed)] {
+        let refuse = |what: &str, hint: &str| Err(FieldError::Volume { volume, what: what.into(), hint: hint.into() });
+        if v.grid().shape().iter().filter(|&&n| n < 2).count() > 1 {
+            return refuse("is a line of voxels", "give a volume or one slice");
+        }
+        let finite = || v.as_slice().iter().copied().filter(|x| x.is_finite());
+        let (lo, hi) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), x| (lo.min(x), hi.max(x)));
+        if lo > hi {
+            return refuse("has no finite voxel", "check how it was exported");
+        }
+        if lo == hi {
+            return refuse("is constant, so nothing can be matched", "check that it is the right file");
+        }
+    }
+    if let Some(m) = mask {
+        if !m.grid().same_as(initial.grid()) {
+            return Err(FieldError::GridMismatch {
+                what: "the mask".into(),
+                found: m.grid().shape(),
+                reference: "the initial volume".into(),
+                expected: initial.grid().shape(),
+            });
+        }
+        if m.as_slice().iter().all(|&v| v == 0) {
+            let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
+            return Err(FieldError::Volume { volume: "mask", what, hint });
+        }
+    }
+    let mut clean = initial.clone();
+    let mut bad = 0;
+    for v in clean.as_mut_slice().iter_mut().filter(|v| !v.is_finite()) {
+        *v = 0.0;
+        bad += 1;
+    }
+    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&clean));
+    if bad > 0 {
+        for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
+            if !v.is_finite() {
+                *m = 0;
+            }
+        }
+    }
+    Ok((mask, clean, bad))
+}

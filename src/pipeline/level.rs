@@ -1,0 +1,351 @@
+//! One level of the pyramid: matches by features, and the passes that bring the spline field to the residual.
+
+use crate::consistency::coupling::{self, Evidence};
+use crate::consistency::energy::{EnergyParams, Graph};
+use crate::consistency::pruning::{Measured, prune};
+use crate::consistency::relaxation::relax;
+use crate::features::{Corner, HarrisParams, response, spread};
+use crate::matching::candidates::{CandidateParams, Side, candidates};
+use crate::matching::correlation::Searchable;
+use crate::matching::gain::GainField;
+use crate::matching::lsm::{self, Refined, Template};
+use crate::matching::pair::{Pair, dilate};
+use crate::matching::residual::normal_equations;
+use crate::numerics::bending::Smoothness;
+use crate::numerics::bspline::Lattice;
+use crate::numerics::small::{Symmetric3, inverse};
+use crate::numerics::statistics::{median, noise_sigma};
+use crate::types::{Counts, LevelReport};
+use rayon::prelude::*;
+
+/// A spline field on one level, with the state of its coupling.
+#[derive(Debug, Clone)]
+pub struct SplineField {
+    /// Nodes over the level's initial lattice.
+    pub lattice: Lattice,
+    /// Displacement (mm along the lattice's axes), planar.
+    pub coefficients: Vec<f32>,
+    /// Weight of the bending energy, per mm^3 of lattice cell.
+    pub lambda: f64,
+    /// Information of the last pass (1/mm^2), one block a node.
+    pub blocks: Vec<[f32; 6]>,
+    /// Degrees of freedom that the data determine.
+    pub determined: f64,
+}
+
+/// Volume of a lattice cell (mm^3), flat axes counting 1.
+fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
+    (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] as f64 * spacing[a]).product()
+}
+
+/// The bending energy over a lattice.
+pub fn smoothness(lattice: &Lattice, spacing: [f64; 3]) -> Smoothness {
+    Smoothness::new(lattice.nodes, std::array::from_fn(|a| lattice.step[a] as f64 * spacing[a]), 0.0)
+}
+
+/// A lattice whose nodes are `step` of the finest axis' voxels apart along every axis (in mm).
+pub fn lattice(pair: &Pair, step: usize) -> Lattice {
+    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
+    Lattice::new(pair.shape, pair.spacing.map(|s| ((step as f64 * finest / s).round() as usize).max(1)))
+}
+
+/// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
+fn independent(pair: &Pair) -> f32 {
+    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
+}
+
+/// How much of the last step is carried into the next: the block diagonal is an upper bound, so plain steps are short.
+const MOMENTUM: f32 = 0.5;
+
+/// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
+const SETTLED: f64 = 0.004;
+
+/// Conjugate gradient iterations a pass: each pass needs only a fair step.
+const ITERATIONS: usize = 15;
+
+/// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence (MacKay 1992):
+/// `lambda = determined / (2 energy)`. Calls `tick` after each pass.
+pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
+    let energy = smoothness(&field.lattice, pair.spacing);
+    let cell = cell_volume(&field.lattice, pair.spacing);
+    let active = dilate(&pair.mask, pair.shape, 1);
+    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
+    let weight = independent(pair);
+    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
+    let mut before = field.coefficients.clone();
+    for pass in 0..passes {
+        let warped = pair.warp(&field.lattice, &field.coefficients, &active);
+        let gain = GainField::measure(pair, &warped, noise);
+        let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * noise);
+        for v in equations.blocks.iter_mut().flatten().chain(&mut equations.rhs) {
+            *v *= weight;
+        }
+        let lambda = (field.lambda * cell) as f32;
+        let base = field.coefficients.clone();
+        let (_, moved) =
+            coupling::step(&energy, lambda, &equations.blocks, &equations.rhs, &mut field.coefficients, 0.02, ITERATIONS);
+        for ((c, b), before) in field.coefficients.iter_mut().zip(&base).zip(&before) {
+            *c += MOMENTUM * (b - before);
+        }
+        before = base;
+        field.blocks = equations.blocks;
+        if pass % 2 == 1 || pass + 1 == passes {
+            field.determined = coupling::determined(&energy, lambda, &field.blocks, seed + pass as u64, 60);
+            let bent = energy.energy(&field.coefficients).max(1e-12);
+            let target = 0.5 * field.determined.max(1.0) / bent / cell;
+            field.lambda = target.clamp(field.lambda / 5.0, field.lambda * 5.0).clamp(1e-6, 1e9);
+        }
+        tick(pass);
+        if f64::from(moved) < SETTLED * finest && pass >= 3 {
+            break;
+        }
+    }
+}
+
+/// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
+pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> SplineField {
+    let coefficients = lattice.fit(|p| coarse.lattice.at(&coarse.coefficients, from_here(p)));
+    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Vec::new(), determined: 0.0 }
+}
+
+/// What the feature stages need to know.
+#[derive(Debug, Clone, Copy)]
+pub struct MatchParams {
+    /// Features wanted in the initial volume; up to five times as many in the deformed one.
+    pub points: usize,
+    /// Reach of the search about the known field (mm).
+    pub reach_mm: f64,
+    /// Patch radius (voxels of the finest axis).
+    pub patch: usize,
+    /// Strain that neighbours may show against the known field.
+    pub strain: f64,
+}
+
+/// One feature's match on a level.
+#[derive(Debug, Clone, Copy)]
+pub struct LevelMatch {
+    /// Place (voxels of the level's initial lattice).
+    pub voxel: [f64; 3],
+    /// Displacement, covariance and the coupled field's displacement (mm along the lattice's axes).
+    pub measured: Measured,
+    /// Correlation.
+    pub ncc: f32,
+    /// Survived consistency.
+    pub kept: bool,
+}
+
+/// Features of both volumes, many-to-many candidates, relaxation, least-squares matching, coupling, pruning.
+///
+/// With `known`, the deformed volume is first warped by that field and only the rest is sought; the field itself then
+/// serves as the coupled one. Without, the search is over the deformed volume as it is, and a coupled field is fitted:
+/// it is returned on `lattice`.
+pub fn matches(
+    pair: &Pair,
+    known: Option<&SplineField>,
+    lattice: Lattice,
+    params: MatchParams,
+) -> (Vec<LevelMatch>, Option<SplineField>, LevelReport) {
+    let spacing = pair.spacing;
+    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let radius: [usize; 3] = spacing.map(|s| ((params.patch as f64 * finest / s).round() as usize).max(1));
+    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
+    let corners = |data: &[f32], shape, mask: Option<&[u8]>, wanted| {
+        let r = response(data, shape, spacing, HarrisParams::default());
+        // Noise alone answers with about a hundredth of its variance per squared voxel.
+        spread(&r, shape, spacing, mask, wanted, 0.02 * (f64::from(noise) / finest).powi(2) as f32)
+    };
+    let initial = corners(&pair.fixed, pair.shape, Some(&pair.mask), params.points);
+    let moving: Vec<f32> = pair.moving.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
+    let deformed = corners(&moving, pair.moving_shape, None, 5 * params.points);
+
+    // The deformed side: as it is, or warped by the known field with its features taken back through it.
+    let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &dilate(&pair.mask, pair.shape, radius[0] + 3)));
+    let (data, shape, origin) = match &warped {
+        Some(w) => (w.as_slice(), pair.shape, [0.0; 3]),
+        None => (pair.moving.as_slice(), pair.moving_shape, pair.moving_origin),
+    };
+    let places: Vec<[f64; 3]> = deformed.iter().filter_map(|c| back(pair, known, c)).collect();
+    let fixed = if known.is_some() { &pair.fixed_smooth } else { &pair.fixed };
+    let (here, there) = (Searchable::new(fixed, pair.shape, radius), Searchable::new(data, shape, radius));
+    let starts: Vec<[f64; 3]> = initial.iter().map(|c| c.voxel).collect();
+    let list = candidates(
+        &Side { volume: &here, origin: [0.0; 3], features: &starts },
+        &Side { volume: &there, origin, features: &places },
+        spacing,
+        CandidateParams { reach_mm: params.reach_mm, keep: if known.is_some() { 3 } else { 8 }, partners: 16, min_ncc: 0.3 },
+    );
+    let count = list.iter().map(Vec::len).sum();
+    let mm: Vec<[f64; 3]> = starts.iter().map(|p| std::array::from_fn(|a| p[a] * spacing[a])).collect();
+    let energy = EnergyParams { lambda: 1.5, precision_mm: finest, strain: params.strain, neighbours: 16 };
+    let relaxed = relax(&Graph::new(&mm, energy), &list);
+
+    // Sub-voxel position and covariance of each choice.
+    let template = Template {
+        data: &pair.fixed_smooth,
+        shape: pair.shape,
+        spacing,
+        radius,
+        noise: f64::from(noise) * f64::from(independent(pair)).sqrt(),
+    };
+    let refined: Vec<Option<(usize, [f64; 3], Refined)>> = (0..initial.len())
+        .into_par_iter()
+        .map(|i| {
+            let start = list[i].get(relaxed.chosen[i])?.displacement;
+            let voxels: [f64; 3] = std::array::from_fn(|a| start[a] / spacing[a]);
+            let at: [f64; 3] = std::array::from_fn(|a| initial[i].centre[a] as f64 + voxels[a] - origin[a]);
+            let place = |o: [f32; 3]| -> [f32; 3] { std::array::from_fn(|a| at[a] as f32 + o[a]) };
+            let found = match &warped {
+                Some(w) => lsm::refine(&template, initial[i].centre, |o| trilinear(w, shape, place(o)), 3, 2.0),
+                None => lsm::refine(&template, initial[i].centre, |o| pair.sampler().at(place(o)), 6, 2.0),
+            }?;
+            Some((i, start, found))
+        })
+        .collect();
+    let refined: Vec<_> = refined.into_iter().flatten().collect();
+    let own = |d: [f64; 3], r: &Refined| -> [f64; 3] { std::array::from_fn(|a| d[a] + r.shift[a]) };
+
+    // The coupled field: the known one, or one fitted to all matches with their information.
+    let fitted = known.is_none().then(|| fit(pair, lattice, &starts, &refined, &radius));
+    let field = known.or(fitted.as_ref());
+    let mut measured: Vec<Measured> = refined
+        .iter()
+        .map(|(i, start, r)| {
+            let u = field.map_or([0.0; 3], |f| f.lattice.at(&f.coefficients, starts[*i]));
+            let base = if known.is_some() { u } else { [0.0; 3] };
+            let d = own(*start, r);
+            Measured {
+                place: mm[*i],
+                displacement: std::array::from_fn(|a| base[a] + d[a]),
+                covariance: r.covariance,
+                field: u,
+            }
+        })
+        .collect();
+    let kept = prune(&measured, 0.2 * finest, GATE);
+    calibrate(&mut measured, &kept);
+    let mut residual: Vec<f32> = measured
+        .iter()
+        .zip(&kept)
+        .filter(|(_, k)| **k)
+        .map(|(m, _)| crate::consistency::energy::distance(m.displacement, m.field) as f32)
+        .collect();
+    let report = LevelReport {
+        spacing_mm: spacing,
+        counts: Counts {
+            features_initial: initial.len(),
+            features_deformed: deformed.len(),
+            candidates: count,
+            kept: residual.len(),
+            ..Counts::default()
+        },
+        energy_before: relaxed.energy_before,
+        energy_after: relaxed.energy_after,
+        residual_mm: if residual.is_empty() { 0.0 } else { f64::from(median(&mut residual)) },
+    };
+    let matches = refined
+        .iter()
+        .zip(measured)
+        .zip(kept)
+        .map(|(((i, _, r), measured), kept)| LevelMatch { voxel: starts[*i], measured, ncc: r.ncc, kept })
+        .collect();
+    (matches, fitted, report)
+}
+
+/// 99.9 % point of chi-square with 3 degrees of freedom.
+const GATE: f64 = 16.27;
+
+/// Scales all covariances so that the kept matches scatter about the coupled field as they say: by the median squared
+/// Mahalanobis distance over chi-square's median, 2.366. Noise alone does not tell what interpolation, strain inside
+/// a patch and contrast changes add.
+fn calibrate(measured: &mut [Measured], kept: &[bool]) {
+    let mut q: Vec<f32> = measured
+        .iter()
+        .zip(kept)
+        .filter(|(_, k)| **k)
+        .filter_map(|(m, _)| {
+            let e = std::array::from_fn(|a| m.displacement[a] - m.field[a]);
+            Some(crate::numerics::small::quadratic(&in_plane(&m.covariance)?, e) as f32)
+        })
+        .collect();
+    if q.len() < 20 {
+        return;
+    }
+    let factor = f64::from(median(&mut q)) / 2.366;
+    for m in measured {
+        m.covariance = m.covariance.map(|v| v * factor.max(0.05));
+    }
+}
+
+/// Inverse of a covariance that may be flat along an axis (one slice).
+fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
+    let mut c = *c;
+    let top = c[0] + c[1] + c[2];
+    for v in &mut c[..3] {
+        *v += 1e-6 * top + 1e-12;
+    }
+    inverse(&c)
+}
+
+/// A deformed feature's place in the frame that is searched: its own voxel, or the initial-lattice place that the known
+/// field takes there (fixed point of `x = q - u(x)`).
+fn back(pair: &Pair, known: Option<&SplineField>, corner: &Corner) -> Option<[f64; 3]> {
+    let Some(k) = known else { return Some(corner.voxel) };
+    let q: [f64; 3] = std::array::from_fn(|a| corner.voxel[a] + pair.moving_origin[a]);
+    let mut x = q;
+    for _ in 0..6 {
+        let u = k.lattice.at(&k.coefficients, x);
+        x = std::array::from_fn(|a| q[a] - u[a] / pair.spacing[a]);
+    }
+    (0..3).all(|a| x[a] >= 0.0 && x[a] <= (pair.shape[a] - 1) as f64).then_some(x)
+}
+
+/// Couples the matches of a level into a spline field.
+fn fit(
+    pair: &Pair,
+    lattice: Lattice,
+    starts: &[[f64; 3]],
+    refined: &[(usize, [f64; 3], Refined)],
+    radius: &[usize; 3],
+) -> SplineField {
+    // Patches overlap: each match counts for the share of voxels that is its own.
+    let inside = pair.mask.iter().filter(|&&m| m != 0).count().max(1) as f64;
+    let patch: f64 = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| (2 * radius[a] + 1) as f64).product();
+    let share = (inside / (refined.len().max(1) as f64 * patch)).min(1.0);
+    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
+    let evidence: Vec<Evidence> = refined
+        .iter()
+        .filter_map(|(i, start, r)| {
+            let mut c = r.covariance;
+            for v in &mut c[..3] {
+                *v += (0.3 * finest).powi(2);
+            }
+            let information = inverse(&c)?.map(|v| v * share);
+            let displacement = std::array::from_fn(|a| start[a] + r.shift[a]);
+            Some(Evidence { at: starts[*i], displacement, information })
+        })
+        .collect();
+    let energy = smoothness(&lattice, pair.spacing);
+    let (coefficients, lambda) = coupling::fit(&lattice, &energy, &evidence, 10);
+    let lambda = f64::from(lambda) / cell_volume(&lattice, pair.spacing);
+    SplineField { lattice, coefficients, lambda, blocks: Vec::new(), determined: 0.0 }
+}
+
+/// Trilinear sample; NaN outside.
+#[inline(always)]
+fn trilinear(data: &[f32], shape: [usize; 3], p: [f32; 3]) -> f32 {
+    let mut corner = [0usize; 3];
+    let mut t = [0.0f32; 3];
+    for a in 0..3 {
+        let last = (shape[a] - 1) as f32;
+        if !(p[a] >= 0.0 && p[a] <= last) {
+            return f32::NAN;
+        }
+        corner[a] = (p[a] as usize).min(shape[a].saturating_sub(2));
+        t[a] = p[a] - corner[a] as f32;
+    }
+    let step = [usize::from(shape[0] > 1), if shape[1] > 1 { shape[0] } else { 0 }, if shape[2] > 1 { shape[0] * shape[1] } else { 0 }];
+    let base = corner[0] + shape[0] * (corner[1] + shape[1] * corner[2]);
+    let line = |o: usize| data[o] + t[0] * (data[o + step[0]] - data[o]);
+    let face = |o: usize| line(o) + t[1] * (line(o + step[1]) - line(o));
+    face(base) + t[2] * (face(base + step[2]) - face(base))
+}
