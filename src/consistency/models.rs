@@ -49,12 +49,7 @@ pub const CHANCE: f64 = 3.0;
 
 /// Chooses a model. `excess(m)` gives the excess misfit `Q` of a map against the free field, `determined` the field's
 /// degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm).
-pub fn choose(
-    matches: &[Measured],
-    excess: impl Fn(&AffineMotion) -> f64,
-    determined: f64,
-    model_mm: f64,
-) -> Choice {
+pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, determined: f64, model_mm: f64) -> Choice {
     let information: Vec<Symmetric3> = matches
         .iter()
         .map(|m| {

@@ -88,7 +88,13 @@ pub fn candidates(
 }
 
 /// For each of `features` (of `from`): the best places in `to` by search, then the best features of `to` (common mm, ncc).
-fn one_way(from: &Side<'_>, to: &Side<'_>, features: &[[f64; 3]], spacing: [f64; 3], params: CandidateParams) -> Vec<Vec<([f64; 3], f32)>> {
+fn one_way(
+    from: &Side<'_>,
+    to: &Side<'_>,
+    features: &[[f64; 3]],
+    spacing: [f64; 3],
+    params: CandidateParams,
+) -> Vec<Vec<([f64; 3], f32)>> {
     let targets: Vec<[f64; 3]> = to.features.iter().map(|&p| to.mm(p, spacing)).collect();
     let tree = Neighbours::new(&targets);
     let reach = spacing.map(|s| (params.reach_mm / s).ceil() as usize);

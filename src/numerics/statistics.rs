@@ -30,18 +30,30 @@ pub fn percentile(values: &mut [f64], q: f64) -> f64 {
     }
 }
 
-/// Standard deviation of white noise in a volume, from second differences along each row (voxels).
+/// Standard deviation of white noise in a volume, from second differences along every thick axis at once.
 ///
-/// The median absolute value of `v[i-1] - 2 v[i] + v[i+1]` over 0.6745 sqrt(6): smooth structure drops out, edges are
-/// a minority that the median ignores. At most about a million places are read.
+/// The median absolute value of the `(1, -2, 1)` products over 0.6745 times their norm (Immerkaer 1996, with the median
+/// for robustness): smooth structure and straight edges drop out. At most about 300,000 places are read.
 pub fn noise_sigma(data: &[f32], shape: [usize; 3], keep: impl Fn(usize) -> bool) -> f32 {
-    let nx = shape[0];
-    let stride = (data.len() / 1_000_000).max(1) | 1;
-    let mut d: Vec<f32> = (1..data.len().saturating_sub(1))
-        .step_by(stride)
-        .filter(|&i| i % nx != 0 && (i + 1) % nx != 0 && keep(i))
-        .map(|i| (data[i - 1] - 2.0 * data[i] + data[i + 1]).abs())
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let thick: Vec<usize> = (0..3).filter(|&a| shape[a] > 2).collect();
+    let every = (data.len() / 300_000).max(1) | 1;
+    let mut d: Vec<f32> = (0..data.len())
+        .step_by(every)
+        .filter(|&i| keep(i) && thick.iter().all(|&a| (1..shape[a] - 1).contains(&(i / stride[a] % shape[a]))))
+        .map(|i| second_differences(data, i, &thick, &stride).abs())
         .filter(|v| v.is_finite())
         .collect();
-    if d.is_empty() { 0.0 } else { median(&mut d) / (0.6745 * 6f32.sqrt()) }
+    if d.is_empty() { 0.0 } else { median(&mut d) / (0.6745 * 6f32.sqrt().powi(thick.len() as i32)) }
+}
+
+/// `(1, -2, 1)` along each of `axes` about value `at`.
+fn second_differences(data: &[f32], at: usize, axes: &[usize], stride: &[usize; 3]) -> f32 {
+    match axes.split_first() {
+        None => data[at],
+        Some((&a, rest)) => {
+            let v = |i| second_differences(data, i, rest, stride);
+            v(at - stride[a]) - 2.0 * v(at) + v(at + stride[a])
+        }
+    }
 }

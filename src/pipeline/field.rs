@@ -76,7 +76,8 @@ pub fn run(
             Some((coarse, from)) => level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from)),
             None => {
                 progress("matching", done(0.0));
-                let points = pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(COARSE_SHARE).clamp(40, COARSE_POINTS);
+                let points =
+                    pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(COARSE_SHARE).clamp(40, COARSE_POINTS);
                 let wide = MatchParams { points, reach_mm: search, patch: 2, strain: 0.3 };
                 let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
                 clock.book("matching");
@@ -221,7 +222,9 @@ fn full_lattice(grid: &Grid, field: &SplineField, factor: [usize; 3], choice: &C
     let lattice = Lattice::new(grid.shape(), step);
     let spacing = grid.spacing();
     let coefficients = match &choice.motion {
-        Some(motion) => lattice.fit(|p| motion.displacement(std::array::from_fn(|a| to_level(p, factor)[a] * spacing[a] * factor[a] as f64))),
+        Some(motion) => lattice.fit(|p| {
+            motion.displacement(std::array::from_fn(|a| to_level(p, factor)[a] * spacing[a] * factor[a] as f64))
+        }),
         None if factor == [1; 3] => field.coefficients.clone(),
         None => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
     };
@@ -328,7 +331,9 @@ fn warnings(counts: Counts, folds: usize, not_finite: usize, max_mm: f64, search
         out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));
     }
     if max_mm > 0.9 * search {
-        out.push(format!("the motion reaches {max_mm:.1} mm, near the search range of {search:.1} mm; try a wider --search"));
+        out.push(format!(
+            "the motion reaches {max_mm:.1} mm, near the search range of {search:.1} mm; try a wider --search"
+        ));
     }
     if counts.features_initial > 0 && counts.kept * 4 < counts.features_initial {
         let (kept, all) = (counts.kept, counts.features_initial);

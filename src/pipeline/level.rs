@@ -82,8 +82,15 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
         }
         let lambda = (field.lambda * cell) as f32;
         let base = field.coefficients.clone();
-        let (_, moved) =
-            coupling::step(&energy, lambda, &equations.blocks, &equations.rhs, &mut field.coefficients, 0.02, ITERATIONS);
+        let (_, moved) = coupling::step(
+            &energy,
+            lambda,
+            &equations.blocks,
+            &equations.rhs,
+            &mut field.coefficients,
+            0.02,
+            ITERATIONS,
+        );
         for ((c, b), before) in field.coefficients.iter_mut().zip(&base).zip(&before) {
             *c += MOMENTUM * (b - before);
         }
@@ -149,8 +156,12 @@ pub fn matches(
     let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
     let radius: [usize; 3] = spacing.map(|s| ((params.patch as f64 * finest / s).round() as usize).max(1));
     let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
-    let corners = |data: &[f32], shape, mask: Option<&[u8]>, wanted| {
-        let r = response(data, shape, spacing, HarrisParams::default());
+    let corners = |data: &[f32], shape: [usize; 3], mask: Option<&[u8]>, wanted: usize| {
+        // Many points wanted: a narrower window has more maxima.
+        let room = mask.map_or(data.len(), |m| m.iter().filter(|&&v| v != 0).count()) as f64 / wanted as f64;
+        let defaults = HarrisParams::default();
+        let integration_sigma = (room.cbrt() / 4.0).clamp(0.7, defaults.integration_sigma);
+        let r = response(data, shape, spacing, HarrisParams { integration_sigma, ..defaults });
         // Noise alone answers with about a hundredth of its variance per squared voxel.
         spread(&r, shape, spacing, mask, wanted, 0.02 * (f64::from(noise) / finest).powi(2) as f32)
     };
@@ -172,7 +183,12 @@ pub fn matches(
         &Side { volume: &here, origin: [0.0; 3], features: &starts },
         &Side { volume: &there, origin, features: &places },
         spacing,
-        CandidateParams { reach_mm: params.reach_mm, keep: if known.is_some() { 3 } else { 8 }, partners: 16, min_ncc: 0.3 },
+        CandidateParams {
+            reach_mm: params.reach_mm,
+            keep: if known.is_some() { 3 } else { 8 },
+            partners: 16,
+            min_ncc: 0.3,
+        },
     );
     let count = list.iter().map(Vec::len).sum();
     let mm: Vec<[f64; 3]> = starts.iter().map(|p| std::array::from_fn(|a| p[a] * spacing[a])).collect();
@@ -343,7 +359,11 @@ fn trilinear(data: &[f32], shape: [usize; 3], p: [f32; 3]) -> f32 {
         corner[a] = (p[a] as usize).min(shape[a].saturating_sub(2));
         t[a] = p[a] - corner[a] as f32;
     }
-    let step = [usize::from(shape[0] > 1), if shape[1] > 1 { shape[0] } else { 0 }, if shape[2] > 1 { shape[0] * shape[1] } else { 0 }];
+    let step = [
+        usize::from(shape[0] > 1),
+        if shape[1] > 1 { shape[0] } else { 0 },
+        if shape[2] > 1 { shape[0] * shape[1] } else { 0 },
+    ];
     let base = corner[0] + shape[0] * (corner[1] + shape[1] * corner[2]);
     let line = |o: usize| data[o] + t[0] * (data[o + step[0]] - data[o]);
     let face = |o: usize| line(o) + t[1] * (line(o + step[1]) - line(o));

@@ -78,7 +78,9 @@ impl FieldParams {
         match preset {
             Preset::Fast => Self { finest: 2, passes: 6, coarse_passes: 8, voxels_per_point: 1000, ..balanced },
             Preset::Balanced => balanced,
-            Preset::Accurate => Self { node_spacing: 3, passes: 10, coarse_passes: 14, voxels_per_point: 64, ..balanced },
+            Preset::Accurate => {
+                Self { node_spacing: 3, passes: 10, coarse_passes: 14, voxels_per_point: 64, ..balanced }
+            }
         }
     }
 
