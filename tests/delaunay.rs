@@ -210,9 +210,9 @@ proptest! {
     /// The signs against integer arithmetic, on integers small enough for 128 bits and any scale.
     #[test]
     fn predicates_against_integers(
-        p in prop::array::uniform5(prop::array::uniform3(-12i64..12)),
+        p in prop::array::uniform5(prop::array::uniform3(-2i64..=2)),
         shift in prop::array::uniform3(-200_000i64..200_000),
-        factor in 1i64..4000,
+        factor in 1i64..30_000,
         exponent in -100i32..100,
     ) {
         let p = p.map(|q| [0, 1, 2].map(|k| q[k] * factor + shift[k]));
