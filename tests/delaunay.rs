@@ -76,7 +76,7 @@ fn family(kind: usize, n: usize, seed: u64) -> Vec<P> {
         }
         // Each point about three times.
         6 => {
-            let some = points[..n.div_ceil(3).max(6)].to_vec();
+            let some = points[..n.div_ceil(3).max(6).min(n)].to_vec();
             points.iter_mut().skip(6).for_each(|p| *p = some[(p[0] * some.len() as f64) as usize]);
         }
         // Nearly coplanar.
