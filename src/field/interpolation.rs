@@ -6,7 +6,7 @@
 //! elements and the voxels they hold.
 //!
 //! Elements are filled in voxel coordinates, where any affine grid is the unit lattice and barycentric weights are what
-//! they were. An element thinner than [`THIN`] yields to the others at voxels that both hold, since its gradient is all
+//! they were. An element thinner than one in 1e6 yields to the others at voxels that both hold, since its gradient is all
 //! rounding.
 
 use crate::error::MeshError;
