@@ -6,7 +6,7 @@
 //! elements and the voxels they hold.
 //!
 //! Elements are filled in voxel coordinates, where any affine grid is the unit lattice and barycentric weights are what
-//! they were. An element thinner than [`THIN`] yields to the others at voxels that both hold, since its gradient is all
+//! they were. An element thinner than one in 1e6 yields to the others at voxels that both hold, since its gradient is all
 //! rounding.
 
 use crate::error::MeshError;
@@ -20,8 +20,11 @@ const TOLERANCE: f64 = 1e-9;
 /// Least height over length of an element that is not a sliver.
 const THIN: f64 = 1e-6;
 
+/// Up to so many rows, cutting each with the faces costs less than finding those that an element reaches in a slice.
+const FEW_ROWS: usize = 6;
+
 /// Slices filled by one task.
-const SLAB: usize = 8;
+const SLAB: usize = 16;
 
 /// A field inside of a mesh.
 #[derive(Debug, Clone, PartialEq)]
@@ -109,7 +112,7 @@ fn fill_elements<const N: usize>(
         let (_, determinant) = gradients(&x);
         let edges: [f64; 3] = std::array::from_fn(|k| extent(&x, k)[1] - extent(&x, k)[0]);
         let bound = THIN * dot(edges, edges).sqrt().powi(N as i32 - 1);
-        (voxel_range(&x, 2, shape[2]), determinant.abs() <= bound)
+        (voxel_range(extent(&x, 2), shape[2]), determinant.abs() <= bound)
     });
     let mut displacements = DenseField::zeros(*grid);
     let mut inside = Volume::filled(*grid, 0u8);
@@ -120,12 +123,14 @@ fn fill_elements<const N: usize>(
     parts.zip(inside.as_mut_slice().par_chunks_mut(plane)).zip(&queues).enumerate().for_each(
         |(s, ((((right, front), up), inside), queue))| {
             let mut slab = Slab { components: [right, front, up], inside, first: s * SLAB, shape };
-            for &e in queue {
-                let values = elements[e as usize].map(|v| displacement[v as usize]);
-                let x = corners(e);
-                let (weights, determinant) = gradients(&x);
-                if determinant != 0.0 {
-                    slab.fill(&x, &values, &weights.map(|g| g.map(|v| v / determinant)));
+            for (list, thin) in queue.iter().zip([true, false]) {
+                for &e in list {
+                    let values = elements[e as usize].map(|v| displacement[v as usize]);
+                    let x = corners(e);
+                    let (weights, determinant) = gradients(&x);
+                    if determinant != 0.0 {
+                        slab.fill(&x, &values, &weights.map(|g| g.map(|v| v / determinant)), thin);
+                    }
                 }
             }
         },
@@ -135,8 +140,8 @@ fn fill_elements<const N: usize>(
 
 /// The elements that touch each slab: first the thin ones, then the others, each in the mesh's order. `place` gives an
 /// element's slices and whether it is thin.
-fn queues(elements: usize, slices: usize, place: impl Fn(u32) -> (std::ops::Range<usize>, bool)) -> Vec<Vec<u32>> {
-    let mut queues = vec![[Vec::new(), Vec::new()]; slices.div_ceil(SLAB)];
+fn queues(elements: usize, slices: usize, place: impl Fn(u32) -> (std::ops::Range<usize>, bool)) -> Vec<[Vec<u32>; 2]> {
+    let mut queues = vec![<[Vec<u32>; 2]>::default(); slices.div_ceil(SLAB)];
     for e in 0..elements as u32 {
         let (range, thin) = place(e);
         if !range.is_empty() {
@@ -145,62 +150,116 @@ fn queues(elements: usize, slices: usize, place: impl Fn(u32) -> (std::ops::Rang
             }
         }
     }
-    queues.into_iter().map(|[thin, others]| [thin, others].concat()).collect()
+    queues
 }
 
 impl Slab<'_> {
-    /// Fills one element with corners `x` (voxels), `values` (mm) there, and the `gradients` of its weights.
-    fn fill<const N: usize>(&mut self, x: &[[f64; 3]; N], values: &[[f64; 3]; N], gradients: &[[f64; 3]; N]) {
-        // Inside is where each signed distance `offset + normal . p` is at least minus the tolerance.
-        let faces: [([f64; 3], f64); N] = std::array::from_fn(|i| {
-            let length = dot(gradients[i], gradients[i]).sqrt();
-            let normal = gradients[i].map(|v| v / length);
-            (normal, TOLERANCE - dot(normal, x[(i + 1) % N]))
+    /// Fills one element with corners `x` (voxels), `values` (mm) there, and the `gradients` of its weights. In a `thin`
+    /// one, rounding is kept from leaving the range of the corners' values.
+    fn fill<const N: usize>(
+        &mut self,
+        x: &[[f64; 3]; N],
+        values: &[[f64; 3]; N],
+        gradients: &[[f64; 3]; N],
+        thin: bool,
+    ) {
+        // A voxel is inside where each distance from a face, `offset + normal . p`, is at least minus the tolerance. Along
+        // a row that is where x is above (normal to the right) or below `limit[0] + limit[1] y + limit[2] z`.
+        let faces: [(bool, [f64; 3]); N] = std::array::from_fn(|i| {
+            let [right, front, up] = gradients[i].map(|v| v / dot(gradients[i], gradients[i]).sqrt());
+            // A face along the row is turned by less than the tolerance, to cut far away.
+            let right = if right.abs() < 1e-12 { 1e-12 } else { right };
+            let offset = TOLERANCE - dot([right, front, up], x[(i + 1) % N]);
+            (right > 0.0, [-offset / right, -front / right, -up / right])
         });
-        if faces.iter().any(|(normal, _)| !dot(*normal, *normal).is_finite()) {
+        if faces.iter().any(|(_, limit)| !dot(*limit, *limit).is_finite()) {
             return;
         }
         let slope: [[f64; 3]; 3] = std::array::from_fn(|c| {
             std::array::from_fn(|k| (1..N).map(|i| (values[i][c] - values[0][c]) * gradients[i][k]).sum())
         });
         let range: [[f64; 2]; 3] = std::array::from_fn(|c| extent(values, c));
-        let rows = voxel_range(x, 1, self.shape[1]);
-        let columns = voxel_range(x, 0, self.shape[0]);
-        let slices = voxel_range(x, 2, self.first + self.inside.len() / (self.shape[0] * self.shape[1]));
+        let [width, depth, _] = self.shape;
+        let columns = voxel_range(extent(x, 0), width);
+        let rows = voxel_range(extent(x, 1), depth);
+        let slices = voxel_range(extent(x, 2), self.first + self.inside.len() / (width * depth));
         for k in slices.start.max(self.first)..slices.end {
-            for j in rows.clone() {
+            let z = k as f64;
+            let cuts = faces.map(|(above, limit)| (above, limit[0] + limit[2] * z, limit[1]));
+            let rows = if rows.len() > FEW_ROWS { voxel_range(section(x, z), depth) } else { rows.clone() };
+            for j in rows {
+                let y = j as f64;
                 let (mut low, mut high) = (columns.start as f64, columns.end as f64 - 1.0);
-                for (normal, offset) in &faces {
-                    let at = offset + normal[1] * j as f64 + normal[2] * k as f64;
-                    // A face along the row cuts all of it or nothing.
-                    if normal[0] > 1e-12 {
-                        low = low.max(-at / normal[0]);
-                    } else if normal[0] < -1e-12 {
-                        high = high.min(-at / normal[0]);
-                    } else if at < 0.0 {
-                        high = -1.0;
+                for (above, offset, slope) in cuts {
+                    let at = offset + slope * y;
+                    if above {
+                        low = if at > low { at } else { low };
+                    } else {
+                        high = if at < high { at } else { high };
                     }
                 }
                 if high < low {
                     continue;
                 }
-                let (from, to) = (low.ceil() as usize, high as usize + 1);
+                let (from, to) = (round_up(low), high as u32 as usize + 1);
                 if from >= to {
                     continue;
                 }
-                let row = self.shape[0] * (j + self.shape[1] * (k - self.first));
-                self.inside[row + from..row + to].fill(1);
-                for c in 0..3 {
-                    let start = values[0][c] + dot(slope[c], minus([from as f64, j as f64, k as f64], x[0]));
-                    let [least, most] = range[c];
-                    for (i, out) in self.components[c][row + from..row + to].iter_mut().enumerate() {
-                        // Between the corners' values, where rounding would leave that range in a thin element.
-                        *out = (start + slope[c][0] * i as f64).max(least).min(most) as f32;
+                let offset = minus([from as f64, y, z], x[0]);
+                let mut start: [f64; 3] = std::array::from_fn(|c| values[0][c] + dot(slope[c], offset));
+                let mut step = slope.map(|s| s[0]);
+                if thin {
+                    let last = (to - from - 1) as f64;
+                    for c in 0..3 {
+                        let end = (start[c] + step[c] * last).max(range[c][0]).min(range[c][1]);
+                        start[c] = start[c].max(range[c][0]).min(range[c][1]);
+                        step[c] = (end - start[c]) / last.max(1.0);
                     }
                 }
+                self.fill_row(width * (j + depth * (k - self.first)) + from, to - from, start, step);
             }
         }
     }
+
+    /// Fills `count` voxels of a row from offset `at`: `start` in the first and `step` (mm) more in each that follows.
+    #[inline(always)]
+    fn fill_row(&mut self, at: usize, count: usize, start: [f64; 3], step: [f64; 3]) {
+        let [right, front, up] = self.components.each_mut().map(|c| &mut c[at..at + count]);
+        let inside = &mut self.inside[at..at + count];
+        let mut along = 0.0;
+        for (((right, front), up), inside) in right.iter_mut().zip(front).zip(up).zip(inside) {
+            *right = (start[0] + step[0] * along) as f32;
+            *front = (start[1] + step[1] * along) as f32;
+            *up = (start[2] + step[2] * along) as f32;
+            *inside = 1;
+            along += 1.0;
+        }
+    }
+}
+
+/// The extent along y of an element's cut with the plane at `z`, or a little more.
+fn section<const N: usize>(x: &[[f64; 3]; N], z: f64) -> [f64; 2] {
+    // An edge this close to level counts from end to end.
+    const LEVEL: f64 = 1e-6;
+    let mut range = [f64::INFINITY, f64::NEG_INFINITY];
+    let mut reach = |y: f64| range = [range[0].min(y - LEVEL), range[1].max(y + LEVEL)];
+    for i in 1..N {
+        for j in 0..i {
+            let (p, q) = if x[i][2] < x[j][2] { (x[i], x[j]) } else { (x[j], x[i]) };
+            let (below, above) = (z - p[2], q[2] - z);
+            if below < -LEVEL || above < -LEVEL {
+                continue;
+            }
+            let rise = q[2] - p[2];
+            if rise < LEVEL {
+                reach(p[1]);
+                reach(q[1]);
+            } else {
+                reach(p[1] + (q[1] - p[1]) * (below / rise).clamp(0.0, 1.0));
+            }
+        }
+    }
+    range
 }
 
 fn minus(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
@@ -212,11 +271,16 @@ fn extent(vectors: &[[f64; 3]], k: usize) -> [f64; 2] {
     vectors.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], v| [l.min(v[k]), h.max(v[k])])
 }
 
-/// The voxels along axis `k`, of `count`, whose centres lie within the corners' extent.
-fn voxel_range(x: &[[f64; 3]], k: usize, count: usize) -> std::ops::Range<usize> {
-    let [low, high] = extent(x, k);
-    // Conversions saturate, so far values stay ordered; what is below the first voxel becomes an empty range.
-    let from = (low - TOLERANCE).ceil().max(0.0) as usize;
-    let to = ((high + TOLERANCE).floor() + 1.0).max(0.0) as usize;
-    from.min(count)..to.min(count).max(from.min(count))
+/// The voxels of an axis with `count` of them whose centres lie within an extent.
+fn voxel_range([low, high]: [f64; 2], count: usize) -> std::ops::Range<usize> {
+    let from = round_up(low - TOLERANCE).min(count);
+    let to = if high + TOLERANCE < 0.0 { 0 } else { (high + TOLERANCE) as u32 as usize + 1 };
+    from..to.min(count).max(from)
+}
+
+/// The least number of voxels not below `v` (conversions saturate; faster than `ceil` where that is a call).
+#[inline(always)]
+fn round_up(v: f64) -> usize {
+    let n = v as u32;
+    n as usize + usize::from(f64::from(n) < v)
 }

@@ -79,15 +79,10 @@ impl Cells {
         }
         let mut dead = Vec::with_capacity(capacity);
         dead.resize(cells.len(), false);
-        let size = [0, 1, 2].map(|k| {
-            let [low, high] =
-                points.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[l, h], p| [l.min(p[k]), h.max(p[k])]);
-            high - low
-        });
+        let bounds = StaticBounds::new(&points);
         Self {
             points,
-            // Differences may round up.
-            bounds: StaticBounds::new(size.map(|v| v * 1.01)),
+            bounds,
             cells,
             dead,
             free: Vec::new(),

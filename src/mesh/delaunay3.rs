@@ -3,7 +3,7 @@
 //! Promises: the tetrahedra tile the convex hull, none is flat, each is positively oriented, and no point lies strictly
 //! inside the sphere through any (where more than four lie on one sphere, it is one of the valid choices, always the
 //! same). Needs finite points that do not all lie in one plane; points that coincide become one node. Time grows as
-//! n log n on points of bounded density. Fails on fewer than four points, and on points in one plane or on one line.
+//! n log n on points of bounded density; up to about 150 million points fit. Fails on fewer than four points, and on points in one plane or on one line.
 
 use super::cells::Cells;
 use super::hilbert::insertion_order;

@@ -1,7 +1,7 @@
 //! Which element of a Delaunay mesh holds a point, and with which weights.
 //!
-//! Promises: exact signs choose the way, so the element found is right up to the rounding of its corners; a point
-//! farther than 1e-9 of the mesh's size outside the hull is in none. Needs the mesh of a convex hull with its
+//! Promises: exact signs choose the way, and the element found holds the point or lies within 1e-9 of the mesh's size of
+//! it; a point farther than twice that outside the hull is in none. Needs the mesh of a convex hull with its
 //! neighbour table, as the Delaunay functions give it.
 //!
 //! Source: O. Devillers, S. Pion, M. Teillaud, "Walking in a triangulation", Int. J. Found. Comput. Sci. 13 (2002).
@@ -50,9 +50,9 @@ impl<'a> TetrahedronLocator<'a> {
         let nodes = self.mesh.nodes();
         let corners = |e: usize| self.mesh.tetrahedra()[e].map(|v| &nodes[v as usize].0);
         // Six times the volume of the element with corner `i` moved to `p`.
-        let part = |e: usize, i: usize| {
+        let part = |p: &[f64; 3], e: usize, i: usize| {
             let mut q = corners(e);
-            q[i] = &p.0;
+            q[i] = p;
             orient3d(q[0], q[1], q[2], q[3])
         };
         let facet = |e: usize, i: usize| {
@@ -62,9 +62,10 @@ impl<'a> TetrahedronLocator<'a> {
             dot(normal, normal).sqrt()
         };
         let far = |e: usize, i: usize, part: f64| part < -self.bounds.tolerance * facet(e, i);
-        let element = walk(self.neighbours, hint, part, far)?;
+        let inner = self.bounds.inwards(p.0);
+        let element = walk(self.neighbours, hint, |e, i| part(&inner, e, i), far)?;
         let e = element as usize;
-        let parts = std::array::from_fn(|i| part(e, i));
+        let parts = std::array::from_fn(|i| part(&p.0, e, i));
         Some(Located { element, weights: weights(corners(e).map(|q| *q), p.0, parts, 1e-3 * self.bounds.tolerance) })
     }
 }
@@ -100,7 +101,7 @@ impl<'a> TriangleLocator<'a> {
             return None;
         }
         let corners = |e: usize| self.mesh.triangles()[e].map(|v| self.feet[v as usize]);
-        let part = |e: usize, i: usize| {
+        let part = |foot: [f64; 2], e: usize, i: usize| {
             let mut q = corners(e);
             q[i] = foot;
             orient2d(q[0], q[1], q[2])
@@ -109,9 +110,10 @@ impl<'a> TriangleLocator<'a> {
             let (a, b) = (corners(e)[(i + 1) % 3], corners(e)[(i + 2) % 3]);
             part < -self.bounds.tolerance * (b[0] - a[0]).hypot(b[1] - a[1])
         };
-        let element = walk(self.neighbours, hint, part, far)?;
+        let [x, y, _] = self.bounds.inwards(lift(foot));
+        let element = walk(self.neighbours, hint, |e, i| part([x, y], e, i), far)?;
         let e = element as usize;
-        let parts = std::array::from_fn(|i| part(e, i));
+        let parts = std::array::from_fn(|i| part(foot, e, i));
         Some(Located {
             element,
             weights: weights(corners(e).map(lift), lift(foot), parts, 1e-3 * self.bounds.tolerance),
@@ -154,25 +156,35 @@ fn walk<const N: usize>(
     }
 }
 
-/// An axis-aligned box, and the tolerance that goes with its size.
+/// An axis-aligned box, the mean of the points in it, and the tolerance that goes with its size.
 #[derive(Debug, Clone)]
 struct Bounds {
     low: [f64; 3],
     high: [f64; 3],
+    mean: [f64; 3],
     tolerance: f64,
 }
 
 impl Bounds {
-    fn around(points: impl Iterator<Item = [f64; 3]>) -> Self {
+    fn around(points: impl ExactSizeIterator<Item = [f64; 3]>) -> Self {
+        let part = 1.0 / points.len() as f64;
+        let mut mean = [0.0; 3];
         let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         for p in points {
             for a in 0..3 {
                 low[a] = low[a].min(p[a]);
                 high[a] = high[a].max(p[a]);
+                mean[a] += part * p[a];
             }
         }
         let size = (0..3).map(|a| high[a] - low[a]).fold(0.0, f64::max);
-        Self { low, high, tolerance: TOLERANCE * size }
+        Self { low, high, mean, tolerance: TOLERANCE * size }
+    }
+
+    /// The point moved towards the mean by up to the tolerance: off the hull, where rounding makes slivers so thin that
+    /// a point beside them seems to be in one far from it.
+    fn inwards(&self, p: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|a| p[a] + TOLERANCE * (self.mean[a] - p[a]))
     }
 
     /// Whether a point is in the box; not so where a coordinate is NaN.

@@ -6,6 +6,8 @@
 
 pub mod predicates;
 
+mod double_double;
+
 mod normalise;
 
 mod hilbert;
