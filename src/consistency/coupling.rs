@@ -119,8 +119,8 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
                 });
             }
         };
-        solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, 1e-3, 80);
-        let gamma = determined(smoothness, lambda, &blocks, round as u64, 60);
+        solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, 1e-2, 30);
+        let gamma = determined(smoothness, lambda, &blocks, round as u64, 30);
         let energy = smoothness.energy(&c).max(1e-9);
         lambda = ((0.5 * gamma / energy) as f32).clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
         scale = (scale * 0.5f64).max(9.0);

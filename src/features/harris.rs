@@ -2,7 +2,6 @@
 
 use crate::numerics::filters::{gaussian, gaussian_kernel, gradient_rows, separable};
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::{adjugate, determinant};
 use rayon::prelude::*;
 
 /// Scales of the structure tensor.
@@ -37,7 +36,7 @@ pub fn response(data: &[f32], shape: [usize; 3], spacing: [f64; 3], params: Harr
     let (ds, is) = (sigma(params.derivative_sigma), sigma(params.integration_sigma));
     let kernels = is.map(gaussian_kernel);
     let halo = (3.0 * ds[2]).ceil() as usize + kernels[2].len() + 1;
-    let flat: Vec<usize> = (0..3).filter(|&a| shape[a] == 1).collect();
+    let flat = shape.contains(&1);
     let per_mm: [f32; 3] = std::array::from_fn(|a| (1.0 / spacing[a]) as f32);
     let mut out = vec![0.0f32; data.len()];
     for start in (0..nz).step_by(SLAB) {
@@ -66,21 +65,26 @@ pub fn response(data: &[f32], shape: [usize; 3], spacing: [f64; 3], params: Harr
         let m = products.map(|p| separable(&p, part, [&kernels[0], &kernels[1], &kernels[2]]));
         let skip = (start - lo) * plane;
         out[start * plane..end * plane].par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
-            for (o, out) in out.iter_mut().enumerate() {
-                let at = skip + k * plane + o;
-                *out = foerstner(std::array::from_fn(|q| f64::from(m[q][at])), &flat) as f32;
-            }
+            let at = skip + k * plane;
+            let [xx, yy, zz, xy, xz, yz] = std::array::from_fn(|q| &m[q][at..at + plane]);
+            dispatch(|| {
+                for (o, out) in out.iter_mut().enumerate() {
+                    *out = foerstner([xx[o], yy[o], zz[o], xy[o], xz[o], yz[o]], flat);
+                }
+            });
         });
     }
     out
 }
 
-/// `det / trace(adj)`; along a flat axis (all zeros) a large constant takes part, which leaves the 2 x 2 measure.
-fn foerstner(mut m: [f64; 6], flat: &[usize]) -> f64 {
-    for &a in flat {
-        m[a] = 1e6 * (m[0] + m[1] + m[2]) + f64::MIN_POSITIVE;
-    }
-    let adj = adjugate(&m);
-    let trace = adj[0] + adj[1] + adj[2];
-    if trace > 0.0 { (determinant(&m) / trace).max(0.0) } else { 0.0 }
+/// `det / trace(adj)` of `[xx, yy, zz, xy, xz, yz]`; with a flat axis (all its entries are zero) the 2 x 2 form.
+#[inline(always)]
+fn foerstner(m: [f32; 6], flat: bool) -> f32 {
+    let [a, b, c, d, e, f] = m;
+    let (bc, ac, ab) = (b * c - f * f, a * c - e * e, a * b - d * d);
+    let minors = bc + ac + ab;
+    let trace = a + b + c;
+    let det = a * bc - d * (d * c - f * e) + e * (d * f - b * e);
+    let value = if flat { minors / trace } else { det / minors };
+    if value.is_finite() { value.max(0.0) } else { 0.0 }
 }

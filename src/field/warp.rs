@@ -52,8 +52,9 @@ fn warp_with<T: Copy + Default + Send + Sync>(
 ) -> Volume<T> {
     let grid = *reference.unwrap_or(field.grid());
     let own = grid == *field.grid();
+    let [dx, dy, dz] = std::array::from_fn(|c| field.component(c));
     Volume::from_voxels(grid, |at, x| {
-        let target = if own { Some(x.moved(field.at(at).map(f64::from))) } else { warp_point(x, field) };
+        let target = if own { Some(x.moved([dx[at], dy[at], dz[at]].map(f64::from))) } else { warp_point(x, field) };
         target.map_or(background, &value)
     })
 }

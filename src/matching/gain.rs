@@ -66,20 +66,34 @@ impl GainField {
             (lo, (lo + 1).min(n - 1), p - lo as f32)
         };
         let ((j0, j1, tj), (k0, k1, tk)) = (split(j, by), split(k, bz));
-        let mut line = vec![[0.0f32; 2]; bx];
-        for (jj, wj) in [(j0, 1.0 - tj), (j1, tj)] {
-            for (kk, wk) in [(k0, 1.0 - tk), (k1, tk)] {
-                let from = bx * (jj + by * kk);
-                for (l, v) in line.iter_mut().zip(&self.values[from..from + bx]) {
-                    l[0] += wj * wk * v[0];
-                    l[1] += wj * wk * v[1];
-                }
+        let corners = [
+            (j0, k0, (1.0 - tj) * (1.0 - tk)),
+            (j1, k0, tj * (1.0 - tk)),
+            (j0, k1, (1.0 - tj) * tk),
+            (j1, k1, tj * tk),
+        ];
+        let at = |b: usize| {
+            let mut v = [0.0f32; 2];
+            for (jj, kk, w) in corners {
+                let c = self.values[b + bx * (jj + by * kk)];
+                v[0] += w * c[0];
+                v[1] += w * c[1];
             }
-        }
-        for (i, (g, o)) in gain.iter_mut().zip(offset).enumerate() {
-            let (lo, hi, t) = split(i, bx);
-            *g = line[lo][0] + t * (line[hi][0] - line[lo][0]);
-            *o = line[lo][1] + t * (line[hi][1] - line[lo][1]);
+            v
+        };
+        // Half a block before the first centre, whole blocks between centres, half a block after the last.
+        let half = BLOCK / 2;
+        let n = gain.len();
+        let (mut lo, mut from) = (at(0), 0);
+        for b in 0..=bx {
+            let hi = at(b.min(bx - 1));
+            let to = (half + b * BLOCK).min(n);
+            for i in from..to {
+                let t = if b == 0 { 0.0 } else { (i as f32 + 0.5 - (b as f32 - 0.5) * BLOCK as f32) / BLOCK as f32 };
+                gain[i] = lo[0] + t * (hi[0] - lo[0]);
+                offset[i] = lo[1] + t * (hi[1] - lo[1]);
+            }
+            (lo, from) = (hi, to);
         }
     }
 }

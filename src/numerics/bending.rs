@@ -1,28 +1,25 @@
 //! The smoothness energy of a lattice of vectors, and the sparse solve that couples data to it.
 //!
 //! Energy (per component): `sum over nodes of |second differences|^2 / mm^4` over all six second derivatives (a P-spline
-//! penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999), plus `membrane` times the squared first
-//! differences / mm^2. An affine field costs no bending.
+//! penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999). An affine field costs nothing.
 
 use crate::numerics::random::Random;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse, multiply};
 use rayon::prelude::*;
 
-/// Second (and first) difference operators on a lattice of nodes.
+/// Second difference operators on a lattice of nodes.
 #[derive(Debug, Clone)]
 pub struct Smoothness {
     nodes: [usize; 3],
     /// Node distances (mm).
     step_mm: [f64; 3],
-    /// Weight of the first differences against the second (1/mm^2).
-    membrane: f64,
 }
 
 impl Smoothness {
-    /// On `nodes` at distances `step_mm`; `membrane` in 1/mm^2.
-    pub fn new(nodes: [usize; 3], step_mm: [f64; 3], membrane: f64) -> Self {
-        Self { nodes, step_mm, membrane }
+    /// On `nodes` at distances `step_mm`.
+    pub fn new(nodes: [usize; 3], step_mm: [f64; 3]) -> Self {
+        Self { nodes, step_mm }
     }
 
     /// Terms `(offset list, weight)`: the penalised differences, as node strides and signs.
@@ -40,12 +37,6 @@ impl Smoothness {
                     weight: (1.0 / h[a].powi(4)) as f32,
                 });
             }
-            if self.nodes[a] >= 2 && self.membrane > 0.0 {
-                let mut reach = [0; 3];
-                reach[a] = 1;
-                let weight = (self.membrane / h[a].powi(2)) as f32;
-                out.push(Term { reach, taps: vec![(0, -1.0), (stride[a], 1.0)], weight });
-            }
             for b in 0..a {
                 if self.nodes[a] >= 2 && self.nodes[b] >= 2 {
                     let mut reach = [0; 3];
@@ -60,67 +51,101 @@ impl Smoothness {
     }
 
     /// `out = L x` for one planar component; `x . L x` is the energy.
+    ///
+    /// `L` is a sum of products of the one-dimensional operators `B = D2^T D2` and `G = D1^T D1` (second and first
+    /// differences), so a row of the result is a combination of 13 rows of `x` and one more filter along the row.
     pub fn apply(&self, x: &[f32], out: &mut [f32]) {
-        let [nx, ny, nz] = self.nodes;
-        let terms = self.terms();
+        let [nx, ny, _] = self.nodes;
         let plane = nx * ny;
+        let (b, g) = (self.second(), self.first());
+        let [bx, by, bz] = &b;
+        let [gx, gy, gz] = &g;
+        let h = self.step_mm;
+        let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
+        let (xy, xz, yz) = (pair(0, 1), pair(0, 2), pair(1, 2));
         out.par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
-            out.fill(0.0);
-            let mut row = vec![0.0f32; nx];
-            for t in &terms {
-                // Each difference anchored at (i, j, k0) touches the planes k0 .. k0 + reach.
-                for back in 0..=t.reach[2] {
-                    let Some(k0) = k.checked_sub(back) else { continue };
-                    if k0 + t.reach[2] >= nz {
-                        continue;
+            let mut cross = vec![0.0f32; nx];
+            let row = |j: usize, k: usize| &x[nx * (j + ny * k)..][..nx];
+            dispatch(|| {
+                for (j, out) in out.chunks_exact_mut(nx).enumerate() {
+                    let (vy, vz) = (&by[j], &bz[k]);
+                    scale_row(vy[2] + vz[2] + yz * gy[j][1] * gz[k][1], row(j, k), out);
+                    scale_row(xy * gy[j][1] + xz * gz[k][1], row(j, k), &mut cross);
+                    for d in [0, 1, 3, 4] {
+                        if vy[d] != 0.0 {
+                            add_row(vy[d], row(j + d - 2, k), out);
+                        }
+                        if vz[d] != 0.0 {
+                            add_row(vz[d], row(j, k + d - 2), out);
+                        }
                     }
-                    let here: Vec<(usize, f32)> = t
-                        .taps
-                        .iter()
-                        .filter(|(o, _)| o / plane == back)
-                        .map(|&(o, s)| (o % plane, s * t.weight))
-                        .collect();
-                    let width = nx - t.reach[0];
-                    dispatch(|| {
-                        for j in 0..ny - t.reach[1] {
-                            let anchor = nx * (j + ny * k0);
-                            let r = &mut row[..width];
-                            r.fill(0.0);
-                            for &(o, s) in &t.taps {
-                                for (r, v) in r.iter_mut().zip(&x[anchor + o..anchor + o + width]) {
-                                    *r += s * v;
-                                }
-                            }
-                            for &(o, s) in &here {
-                                let at = nx * j + o;
-                                for (o, v) in out[at..at + width].iter_mut().zip(&*r) {
-                                    *o += s * v;
-                                }
+                    for d in [0, 2] {
+                        if gy[j][d] != 0.0 {
+                            add_row(yz * gy[j][d] * gz[k][1], row(j + d - 1, k), out);
+                            add_row(xy * gy[j][d], row(j + d - 1, k), &mut cross);
+                        }
+                        if gz[k][d] != 0.0 {
+                            add_row(yz * gy[j][1] * gz[k][d], row(j, k + d - 1), out);
+                            add_row(xz * gz[k][d], row(j, k + d - 1), &mut cross);
+                        }
+                        for e in [0, 2] {
+                            let w = yz * gy[j][d] * gz[k][e];
+                            if w != 0.0 {
+                                add_row(w, row(j + d - 1, k + e - 1), out);
                             }
                         }
-                    });
+                    }
+                    banded(bx, row(j, k), out);
+                    banded(gx, &cross, out);
+                }
+            });
+        });
+    }
+
+    /// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
+    fn second(&self) -> [Vec<[f32; 5]>; 3] {
+        std::array::from_fn(|a| {
+            let n = self.nodes[a];
+            let scale = (1.0 / self.step_mm[a].powi(4)) as f32;
+            let mut rows = vec![[0.0f32; 5]; n];
+            for s in 0..n.saturating_sub(2) {
+                for (p, v) in [1.0, -2.0, 1.0].into_iter().enumerate() {
+                    for (q, w) in [1.0, -2.0, 1.0].into_iter().enumerate() {
+                        rows[s + p][q + 2 - p] += scale * v * w;
+                    }
                 }
             }
-        });
+            rows
+        })
+    }
+
+    /// Rows of `G = D1^T D1` along each axis: three diagonals.
+    fn first(&self) -> [Vec<[f32; 3]>; 3] {
+        std::array::from_fn(|a| {
+            let n = self.nodes[a];
+            let mut rows = vec![[0.0f32; 3]; n];
+            for s in 0..n.saturating_sub(1) {
+                rows[s][1] += 1.0;
+                rows[s + 1][1] += 1.0;
+                rows[s][2] -= 1.0;
+                rows[s + 1][0] -= 1.0;
+            }
+            rows
+        })
     }
 
     /// Diagonal of `L`.
     pub fn diagonal(&self) -> Vec<f32> {
-        let [nx, ny, nz] = self.nodes;
-        let mut out = vec![0.0f32; nx * ny * nz];
-        for t in self.terms() {
-            for k in 0..nz - t.reach[2] {
-                for j in 0..ny - t.reach[1] {
-                    for i in 0..nx - t.reach[0] {
-                        let anchor = i + nx * (j + ny * k);
-                        for &(o, s) in &t.taps {
-                            out[anchor + o] += t.weight * s * s;
-                        }
-                    }
-                }
-            }
-        }
-        out
+        let [nx, ny, _] = self.nodes;
+        let (b, g, h) = (self.second(), self.first(), self.step_mm);
+        (0..self.nodes.iter().product())
+            .map(|m| {
+                let at = [m % nx, m / nx % ny, m / (nx * ny)];
+                let bending: f32 = (0..3).map(|a| b[a][at[a]][2]).sum();
+                let twist = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32 * g[a][at[a]][1] * g[c][at[c]][1];
+                bending + twist(0, 1) + twist(0, 2) + twist(1, 2)
+            })
+            .collect()
     }
 
     /// A random vector with covariance `L` (one planar component): the transpose of the differences applied to
@@ -163,6 +188,51 @@ impl Smoothness {
                 x.iter().zip(&lx).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>()
             })
             .sum()
+    }
+}
+
+/// `out = w row`.
+#[inline(always)]
+fn scale_row(w: f32, row: &[f32], out: &mut [f32]) {
+    for (o, v) in out.iter_mut().zip(row) {
+        *o = w * v;
+    }
+}
+
+/// `out += w row`.
+#[inline(always)]
+fn add_row(w: f32, row: &[f32], out: &mut [f32]) {
+    for (o, v) in out.iter_mut().zip(row) {
+        *o += w * v;
+    }
+}
+
+/// `out += M row` for a banded matrix of `2 R + 1` diagonals whose inner rows are all alike.
+#[inline(always)]
+fn banded<const W: usize>(matrix: &[[f32; W]], row: &[f32], out: &mut [f32]) {
+    let (n, r) = (row.len(), W / 2);
+    let edge = |i: usize, out: &mut [f32]| {
+        for (d, w) in matrix[i].iter().enumerate() {
+            if *w != 0.0 {
+                out[i] += w * row[i + d - r];
+            }
+        }
+    };
+    // The first and last `W - 1 - r` rows feel the border.
+    let border = W - 1;
+    if n <= 2 * border {
+        (0..n).for_each(|i| edge(i, out));
+        return;
+    }
+    (0..border).chain(n - border..n).for_each(|i| edge(i, out));
+    let m = matrix[border];
+    for (i, o) in out[border..n - border].iter_mut().enumerate() {
+        let window = &row[i + border - r..i + border - r + W];
+        let mut s = 0.0;
+        for d in 0..W {
+            s += m[d] * window[d];
+        }
+        *o += s;
     }
 }
 

@@ -40,7 +40,7 @@ fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
 
 /// The bending energy over a lattice.
 pub fn smoothness(lattice: &Lattice, spacing: [f64; 3]) -> Smoothness {
-    Smoothness::new(lattice.nodes, std::array::from_fn(|a| lattice.step[a] as f64 * spacing[a]), 0.0)
+    Smoothness::new(lattice.nodes, std::array::from_fn(|a| lattice.step[a] as f64 * spacing[a]))
 }
 
 /// A lattice whose nodes are `step` of the finest axis' voxels apart along every axis (in mm).
@@ -97,7 +97,7 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
         before = base;
         field.blocks = equations.blocks;
         if pass % 2 == 1 || pass + 1 == passes {
-            field.determined = coupling::determined(&energy, lambda, &field.blocks, seed + pass as u64, 60);
+            field.determined = coupling::determined(&energy, lambda, &field.blocks, seed + pass as u64, 30);
             let bent = energy.energy(&field.coefficients).max(1e-12);
             let target = 0.5 * field.determined.max(1.0) / bent / cell;
             field.lambda = target.clamp(field.lambda / 5.0, field.lambda * 5.0).clamp(1e-6, 1e9);
