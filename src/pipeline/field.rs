@@ -102,7 +102,7 @@ pub fn run(
             let inside = pair.mask.iter().filter(|&&m| m != 0).count();
             let points = if params.points > 0 { params.points } else { (inside / params.voxels_per_point).max(200) };
             let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
-            let near = MatchParams { points, reach_mm: 2.0 * finest, patch: 3, strain: 0.05 };
+            let near = MatchParams { points, reach_mm: finest, patch: 3, strain: 0.05 };
             let (matches, _, report) = level::matches(&pair, Some(&field), field.lattice.clone(), near);
             if !first || reports.is_empty() {
                 reports.push(report);
