@@ -37,8 +37,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for (run, &points) in counts.iter().enumerate() {
         let params = FieldParams { points, interpolation: Interpolation::Barycentric, ..FieldParams::default() };
         let started = Instant::now();
-        let result =
-            pipeline::field::run(&pair.initial, &pair.deformed, pair.mask.as_ref(), &params, &|_, _| {})?;
+        let result = pipeline::field::run(&pair.initial, &pair.deformed, pair.mask.as_ref(), &params, &|_, _| {})?;
         let seconds = started.elapsed().as_secs_f64();
         let s = &result.summary;
         let energy = s.levels.last().map(|l| format!("{:.3} -> {:.3}", l.energy_before, l.energy_after));

@@ -65,7 +65,8 @@ fn the_commands_of_the_readme_make_the_data_again() {
 #[test]
 fn the_data_can_be_measured() {
     // Folder, largest mean error as a share of doing nothing.
-    for (name, share) in [("calf-press", 0.5), ("slice-smooth", 0.33), ("block-smooth", 0.33), ("fingertip-press", 0.5)] {
+    for (name, share) in [("calf-press", 0.5), ("slice-smooth", 0.33), ("block-smooth", 0.33), ("fingertip-press", 0.5)]
+    {
         let file = |f: &str| data().join(name).join(f);
         let [initial, deformed] = ["initial.nii.gz", "deformed.nii.gz"].map(|f| io::read_volume(file(f)).unwrap());
         let mask = io::read_mask(file("mask.nii.gz")).unwrap();

@@ -109,7 +109,8 @@ mod tests {
     #[test]
     fn the_figure_stands_alone_with_one_colour_bar() {
         let nodes = [WorldPoint([0.0; 3]), WorldPoint([9.0, 4.0, 2.0])];
-        let svg = figure("a < b", &nodes, &[[0.0; 3], [3.0, 4.0, 0.0]], &Scale::from_zero(5.0, "mm", ColorMap::Viridis));
+        let svg =
+            figure("a < b", &nodes, &[[0.0; 3], [3.0, 4.0, 0.0]], &Scale::from_zero(5.0, "mm", ColorMap::Viridis));
         assert!(svg.starts_with(r#"<svg xmlns="http://www.w3.org/2000/svg""#) && svg.contains("a &lt; b"));
         assert_eq!((svg.matches("<circle").count(), svg.matches("<linearGradient").count()), (2, 1));
         assert!(svg.contains(">5 mm<") && svg.matches("<svg").count() == svg.matches("</svg>").count());
