@@ -2,6 +2,7 @@
 
 use crate::report::html::escape;
 use crate::report::panels::Panel;
+use crate::report::scale::Scale;
 use std::fmt::Write;
 
 const WIDTH: f64 = 960.0;
@@ -42,32 +43,42 @@ pub fn figure(title: &str, panels: &[Panel]) -> String {
             x += w + GAP;
         }
         if let Some(scale) = &panel.scale {
-            let tall = (tall(panel) * zoom).min(160.0);
-            let stops: String = (0..9)
-                .zip(scale.stops())
-                .map(|(i, c)| format!(r#"<stop offset="{:.3}" stop-color="{c}"/>"#, f64::from(i) / 8.0))
-                .collect();
-            let _ = write!(
-                body,
-                r#"<linearGradient id="g{row}" x1="0" y1="1" x2="0" y2="0">{stops}</linearGradient><rect x="{x:.1}" y="{top:.1}" width="12" height="{tall:.1}" fill="url(#g{row})"/>"#
-            );
-            for (i, tick) in scale.ticks().into_iter().enumerate() {
-                let y = top + tall * (1.0 - i as f64 / 2.0) + [0.0, 4.0, 9.0][i];
-                let unit = if i == 2 { format!(" {}", scale.unit) } else { String::new() };
-                let _ = write!(body, r#"<text x="{:.1}" y="{y:.1}">{tick}{unit}</text>"#, x + 18.0);
-            }
+            body.push_str(&colour_bar(scale, row, [x, top], (tall(panel) * zoom).min(160.0)));
         }
         top += tall(panel) * zoom + 16.0;
     }
+    stand_alone([WIDTH, height], &body)
+}
+
+/// A scale from `place` (its upper left corner) down, `tall` high, with three ticks; `number` sets it apart from others.
+pub(super) fn colour_bar(scale: &Scale, number: usize, [x, top]: [f64; 2], tall: f64) -> String {
+    let stops: String = (0..9)
+        .zip(scale.stops())
+        .map(|(i, c)| format!(r#"<stop offset="{:.3}" stop-color="{c}"/>"#, f64::from(i) / 8.0))
+        .collect();
+    let mut bar = format!(
+        r#"<linearGradient id="g{number}" x1="0" y1="1" x2="0" y2="0">{stops}</linearGradient><rect x="{x:.1}" y="{top:.1}" width="12" height="{tall:.1}" fill="url(#g{number})"/>"#
+    );
+    for (i, tick) in scale.ticks().into_iter().enumerate() {
+        let y = top + tall * (1.0 - i as f64 / 2.0) + [0.0, 4.0, 9.0][i];
+        let unit = if i == 2 { format!(" {}", scale.unit) } else { String::new() };
+        let _ = write!(bar, r#"<text x="{:.1}" y="{y:.1}">{tick}{unit}</text>"#, x + 18.0);
+    }
+    bar
+}
+
+/// A whole SVG file around `body`, on white.
+pub(super) fn stand_alone([w, h]: [f64; 2], body: &str) -> String {
     format!(
         concat!(
             r#"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {w} {h:.0}" width="{w}" height="{h:.0}">"#,
             "<style>text{{font:12px system-ui,sans-serif;fill:#444}}.title{{font-size:19px;font-weight:600;fill:#111}}",
-            ".head{{font-weight:600;fill:#222}}.side{{fill:#fff;text-anchor:middle;opacity:.85;font-weight:600}}</style>",
+            ".head{{font-weight:600;fill:#222}}.side{{fill:#fff;text-anchor:middle;opacity:.85;font-weight:600}}",
+            ".frame{{fill:none;stroke:#bbb}}</style>",
             r##"<rect width="100%" height="100%" fill="#fff"/>{body}</svg>"##
         ),
-        w = WIDTH,
-        h = height,
+        w = w,
+        h = h,
         body = body
     )
 }

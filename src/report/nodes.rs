@@ -1,5 +1,7 @@
 //! The source's picture: the length of the displacement at every mesh node, in space.
 
+use crate::report::figure::{colour_bar, stand_alone};
+use crate::report::html::escape;
 use crate::report::scale::Scale;
 use crate::types::WorldPoint;
 use std::fmt::Write;
@@ -72,6 +74,15 @@ pub fn scatter(nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -
     svg
 }
 
+/// [`scatter`] with a title and a colour bar, as an SVG file that stands alone.
+pub fn figure(title: &str, nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -> String {
+    let chart = scatter(nodes, displacement, scale);
+    let chart = chart.replacen("<svg", &format!(r#"<svg y="50" width="{WIDTH}" height="{HEIGHT}""#), 1);
+    let bar = colour_bar(scale, 0, [WIDTH + 10.0, 90.0], 160.0);
+    let title = format!(r#"<text x="24" y="34" class="title">{}</text>"#, escape(title));
+    stand_alone([WIDTH + 90.0, HEIGHT + 60.0], &format!("{title}{chart}{bar}"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -93,6 +104,16 @@ mod tests {
         };
         assert!(inside("cx=\"", WIDTH) && inside("cy=\"", HEIGHT));
         assert!(!scatter(&[], &[], &Scale::from_zero(1.0, "mm", ColorMap::Viridis)).contains("NaN"));
+    }
+
+    #[test]
+    fn the_figure_stands_alone_with_one_colour_bar() {
+        let nodes = [WorldPoint([0.0; 3]), WorldPoint([9.0, 4.0, 2.0])];
+        let svg =
+            figure("a < b", &nodes, &[[0.0; 3], [3.0, 4.0, 0.0]], &Scale::from_zero(5.0, "mm", ColorMap::Viridis));
+        assert!(svg.starts_with(r#"<svg xmlns="http://www.w3.org/2000/svg""#) && svg.contains("a &lt; b"));
+        assert_eq!((svg.matches("<circle").count(), svg.matches("<linearGradient").count()), (2, 1));
+        assert!(svg.contains(">5 mm<") && svg.matches("<svg").count() == svg.matches("</svg>").count());
     }
 
     #[test]

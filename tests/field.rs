@@ -1,0 +1,278 @@
+//! The whole field pipeline against phantoms whose displacement is known exactly.
+#![allow(clippy::unwrap_used)]
+
+use palpate::error::FieldError;
+use palpate::evaluate;
+use palpate::numerics::sampling::displacement;
+use palpate::pipeline::field::run;
+use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom, phantom_on};
+use palpate::types::params::{Interpolation, Preset};
+use palpate::types::{Affine, FieldParams, FieldResult, Grid, Mask, Mesh, Metrics, MotionModel, Volume};
+
+/// A block of `n` voxels a side, 1 mm each, with 1 % noise.
+fn block(n: usize, motion: MotionKind, amplitude: f64) -> PhantomParams {
+    let size = [n; 3];
+    PhantomParams { motion, amplitude, size, noise: 0.01, ..PhantomParams::new(PhantomKind::Block) }
+}
+
+fn measure_with(p: &Phantom, params: &FieldParams) -> (FieldResult, Metrics) {
+    let result = run(&p.initial, &p.deformed, Some(&p.mask), params, &|_, _| {}).unwrap();
+    let metrics = evaluate::metrics(&result.displacement, &p.truth, Some(&p.mask), &p.landmarks).unwrap();
+    (result, metrics)
+}
+
+fn measure(params: &PhantomParams) -> (FieldResult, Metrics) {
+    measure_with(&phantom(params).unwrap(), &FieldParams::default())
+}
+
+#[test]
+fn no_motion_gives_no_motion() {
+    for (kind, noise) in [(PhantomKind::Block, 0.03), (PhantomKind::Head, 0.03), (PhantomKind::Calf, 0.03)] {
+        let params = PhantomParams { motion: MotionKind::None, noise, ..PhantomParams::new(kind).sized(48) };
+        let (result, m) = measure(&params);
+        assert_eq!(result.summary.model, MotionModel::Identity, "{kind:?}: {:?}", result.summary.evidence);
+        assert!(m.mean_mm < 0.02, "{kind:?}: {m:?}");
+    }
+}
+
+#[test]
+fn a_translation_and_a_rotation_come_back() {
+    for (motion, amplitude) in [(MotionKind::Translate, 2.7), (MotionKind::Rotate, 10.0)] {
+        let (result, m) = measure(&block(64, motion, amplitude));
+        assert!(m.mean_mm < 0.05, "{motion:?}: {m:?}, {:?}", result.summary.evidence);
+    }
+}
+
+#[test]
+fn an_affine_motion_comes_back() {
+    let (result, m) = measure(&block(48, MotionKind::Affine, 3.0));
+    assert!(m.mean_mm < 0.1, "{m:?}, {:?}", result.summary.evidence);
+}
+
+#[test]
+fn smooth_motions_and_presses_are_measured_without_folds() {
+    let head = PhantomParams::new(PhantomKind::Head).sized(48);
+    let cases = [
+        ("smooth block", block(48, MotionKind::Smooth, 3.0), 1.0 / 3.0),
+        ("pressed block", block(48, MotionKind::Press, 4.0), 1.0 / 3.0),
+        ("smooth head", PhantomParams { amplitude: 6.0, ..head.clone() }, 0.5),
+        ("pressed head", PhantomParams { motion: MotionKind::Press, amplitude: 8.0, ..head }, 0.5),
+        ("pressed fingertip", PhantomParams::new(PhantomKind::Fingertip).sized(48), 0.5),
+    ];
+    for (name, params, share) in cases {
+        let (result, m) = measure(&params);
+        assert!(m.mean_mm < share * m.identity_mm, "{name}: {m:?}");
+        assert!(m.landmarks_mm.unwrap() < share * m.identity_mm, "{name}: {m:?}");
+        assert_eq!((m.folds, result.summary.folds), (0.0, 0), "{name}");
+        assert_eq!(result.summary.model, MotionModel::Free, "{name}");
+    }
+}
+
+#[test]
+fn small_motions_and_slides_are_never_worse_than_nothing() {
+    for (motion, amplitude) in [(MotionKind::Smooth, 0.5), (MotionKind::Press, 0.5), (MotionKind::Slide, 3.0)] {
+        let (_, m) = measure(&PhantomParams { noise: 0.03, ..block(40, motion, amplitude) });
+        assert!(m.mean_mm < 0.9 * m.identity_mm, "{motion:?}: {m:?}");
+    }
+}
+
+#[test]
+fn a_press_leaves_far_tissue_still() {
+    let (_, m) = measure(&PhantomParams::new(PhantomKind::Fingertip));
+    assert!(m.still_mm.unwrap() < 0.05, "{m:?}");
+}
+
+#[test]
+fn one_slice_stays_in_its_plane() {
+    let slice = PhantomParams::new(PhantomKind::Slice).sized(128);
+    let block = PhantomParams { size: [96, 1, 96], ..PhantomParams::new(PhantomKind::Block) };
+    for (name, params, normal) in [("lying", slice, 2), ("standing", block, 1)] {
+        let p = phantom(&params).unwrap();
+        let (result, m) = measure_with(&p, &FieldParams::default());
+        assert!(result.displacement.component(normal).iter().all(|&u| u == 0.0), "{name}");
+        assert!(matches!(&result.mesh, Mesh::Triangles(t) if !t.triangles().is_empty()), "{name}");
+        assert!(result.matches.matches.iter().all(|m| m.displacement[normal] == 0.0), "{name}");
+        assert!(m.mean_mm < 0.3 * m.identity_mm && m.folds == 0.0, "{name}: {m:?}");
+    }
+}
+
+#[test]
+fn thick_slices_are_honoured() {
+    let (_, m) = measure(&PhantomParams::new(PhantomKind::Calf).sized(72));
+    assert!(m.mean_mm < 0.5 * m.identity_mm && m.folds == 0.0, "{m:?}");
+}
+
+/// Mean distance (mm) of two fields in world space, at the first one's mask.
+fn apart(a: &FieldResult, b: &FieldResult, mask: &Mask) -> f64 {
+    let g = a.displacement.grid();
+    let inside: Vec<usize> = (0..g.len()).filter(|&at| mask.as_slice()[at] != 0).collect();
+    let distance = |&at: &usize| {
+        let [i, j, k] = g.voxel(at);
+        let (u, v) = (a.displacement.at(at), displacement(&b.displacement, g.world(i, j, k)));
+        (0..3).map(|c| (f64::from(u[c]) - v[c]).powi(2)).sum::<f64>().sqrt()
+    };
+    inside.iter().map(distance).sum::<f64>() / inside.len() as f64
+}
+
+#[test]
+fn the_grids_do_not_matter() {
+    let params = block(48, MotionKind::Smooth, 3.0);
+    let plain = params.grid().unwrap();
+    let grid = |shape, rows| Grid::new(shape, Affine::new(rows).unwrap()).unwrap();
+    let o = plain.world(0, 0, 0).0;
+    let far = 47.0;
+    let flipped = grid([48; 3], [[-1.0, 0.0, 0.0, o[0] + far], [0.0, 1.0, 0.0, o[1]], [0.0, 0.0, -1.0, o[2] + far]]);
+    let swapped = grid([48; 3], [[0.0, 1.0, 0.0, o[0]], [0.0, 0.0, 1.0, o[1]], [1.0, 0.0, 0.0, o[2]]]);
+    let shifted =
+        grid([52, 50, 54], [[1.0, 0.0, 0.0, o[0] - 2.3], [0.0, 1.0, 0.0, o[1] - 0.6], [0.0, 0.0, 1.0, o[2] - 3.5]]);
+    let (sin, cos) = 12f64.to_radians().sin_cos();
+    let oblique = grid([58, 58, 52], [[cos, -sin, 0.0, -22.0], [sin, cos, 0.0, -34.0], [0.0, 0.0, 1.0, -26.0]]);
+    let finer =
+        grid([64, 60, 60], [[0.8, 0.0, 0.0, o[0] - 1.0], [0.0, 0.85, 0.0, o[1] - 1.0], [0.0, 0.0, 0.85, o[2] - 1.0]]);
+    let base = phantom_on(&params, plain, plain).unwrap();
+    let (first, _) = measure_with(&base, &FieldParams::default());
+    let cases = [
+        ("both flipped", flipped, flipped),
+        ("axes swapped", swapped, swapped),
+        ("deformed flipped", plain, flipped),
+        ("deformed shifted", plain, shifted),
+        ("deformed oblique", plain, oblique),
+        ("deformed finer", plain, finer),
+    ];
+    for (name, initial, deformed) in cases {
+        let p = phantom_on(&params, initial, deformed).unwrap();
+        let (result, m) = measure_with(&p, &FieldParams::default());
+        let distance = apart(&first, &result, &base.mask);
+        assert!(m.mean_mm < 0.3 * m.identity_mm && distance < 0.12, "{name}: {distance} mm apart, {m:?}");
+    }
+}
+
+#[test]
+fn a_mask_restricts() {
+    let p = phantom(&block(40, MotionKind::Smooth, 2.0)).unwrap();
+    let mut half = p.mask.clone();
+    let g = *half.grid();
+    for (at, m) in half.as_mut_slice().iter_mut().enumerate() {
+        *m *= u8::from(g.voxel(at)[0] < 20);
+    }
+    let result = run(&p.initial, &p.deformed, Some(&half), &FieldParams::default(), &|_, _| {}).unwrap();
+    let m = evaluate::metrics(&result.displacement, &p.truth, Some(&half), &[]).unwrap();
+    assert!(m.mean_mm < 0.4 * m.identity_mm, "{m:?}");
+    assert_eq!(result.summary.mask_voxels, half.as_slice().iter().filter(|&&v| v != 0).count());
+    let inside = |m: &palpate::types::Match| g.affine().to_voxel(m.initial).0[0] < 20.5;
+    assert!(result.matches.matches.iter().all(inside));
+}
+
+#[test]
+fn a_block_that_is_not_finite_is_survived_with_a_warning() {
+    let mut p = phantom(&block(40, MotionKind::Smooth, 2.0)).unwrap();
+    let g = *p.initial.grid();
+    let bad = |at: usize| g.voxel(at).iter().all(|v| (14..20).contains(v));
+    let spoil = |v: &mut Volume| {
+        v.as_mut_slice().iter_mut().enumerate().filter(|(at, _)| bad(*at)).for_each(|(_, v)| *v = f32::NAN);
+    };
+    spoil(&mut p.initial);
+    spoil(&mut p.deformed);
+    let (result, _) = measure_with(&p, &FieldParams::default());
+    for values in [result.displacement.as_slice(), result.uncertainty.as_slice(), result.jacobian.as_slice()] {
+        assert!(values.iter().all(|v| v.is_finite()));
+    }
+    for (at, m) in p.mask.as_mut_slice().iter_mut().enumerate() {
+        *m *= u8::from(!bad(at));
+    }
+    let m = evaluate::metrics(&result.displacement, &p.truth, Some(&p.mask), &[]).unwrap();
+    assert!(m.mean_mm < 0.4 * m.identity_mm, "{m:?}");
+    assert!(result.summary.warnings.iter().any(|w| w.contains("216 voxels") && w.contains("not finite")));
+}
+
+#[test]
+fn the_number_of_threads_changes_nothing() {
+    let cases = [block(40, MotionKind::Smooth, 2.0), PhantomParams::new(PhantomKind::Slice).sized(64)];
+    for (params, preset) in cases.iter().zip([Preset::Balanced, Preset::Fast]) {
+        let p = phantom(params).unwrap();
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut result = pool.install(|| measure_with(&p, &FieldParams::preset(preset)).0);
+            result.summary.seconds.clear();
+            result
+        };
+        let one = with(1);
+        for threads in [2, 3] {
+            assert!(with(threads) == one, "{:?} with {threads} threads", params.kind);
+        }
+    }
+}
+
+#[test]
+fn the_uncertainty_is_calibrated_on_smooth_motions() {
+    for (name, params) in [
+        ("block", block(48, MotionKind::Smooth, 3.0)),
+        ("head", PhantomParams { amplitude: 6.0, ..PhantomParams::new(PhantomKind::Head).sized(48) }),
+        ("calf", PhantomParams::new(PhantomKind::Calf).sized(64)),
+    ] {
+        let p = phantom(&params).unwrap();
+        let (result, _) = measure_with(&p, &FieldParams::default());
+        // Shares of the components inside of 1, 2 and 3 sigma; 0.68, 0.95 and 0.997 would be exact.
+        let mut inside = [0usize; 3];
+        let mut all = 0;
+        for at in (0..p.mask.grid().len()).filter(|&at| p.mask.as_slice()[at] != 0) {
+            let (u, t, s) = (result.displacement.at(at), p.truth.at(at), result.uncertainty.as_slice()[at]);
+            for c in 0..3 {
+                all += 1;
+                (1..=3).for_each(|k| inside[k - 1] += usize::from((u[c] - t[c]).abs() <= k as f32 * s));
+            }
+        }
+        let share = inside.map(|n| n as f64 / all as f64);
+        assert!((0.5..0.95).contains(&share[0]) && share[1] > 0.8, "{name}: {share:.3?}");
+    }
+}
+
+#[test]
+fn barycentric_interpolation_is_piecewise_linear_between_the_nodes() {
+    let p = phantom(&block(48, MotionKind::Smooth, 3.0)).unwrap();
+    let (smooth, s) = measure_with(&p, &FieldParams { points: 1000, ..FieldParams::default() });
+    let linear = FieldParams { points: 1000, interpolation: Interpolation::Barycentric, ..FieldParams::default() };
+    let (result, b) = measure_with(&p, &linear);
+    assert!(b.mean_mm < 0.5 * b.identity_mm, "{b:?}");
+    // A line between places measured once is no match for a field brought to the last residual.
+    assert!(s.mean_mm < b.mean_mm, "{} against {} mm", s.mean_mm, b.mean_mm);
+    assert_eq!((&smooth.mesh, &smooth.node_displacement), (&result.mesh, &result.node_displacement));
+}
+
+fn refusal(initial: &Volume, deformed: &Volume, mask: Option<&Mask>, params: &FieldParams) -> FieldError {
+    run(initial, deformed, mask, params, &|_, _| {}).unwrap_err()
+}
+
+#[test]
+fn what_cannot_be_measured_is_refused_with_a_reason() {
+    let p = phantom(&block(32, MotionKind::Smooth, 1.0)).unwrap();
+    let (a, b, g) = (&p.initial, &p.deformed, *p.initial.grid());
+    let params = FieldParams::default();
+    let said = |initial: &Volume, deformed: &Volume, mask: Option<&Mask>| {
+        refusal(initial, deformed, mask, &params).to_string()
+    };
+    let flat = Volume::filled(g, 7.0);
+    assert!(said(&flat, b, None).starts_with("the initial volume is constant"));
+    assert!(said(a, &flat, None).starts_with("the deformed volume is constant"));
+    let lost = Volume::filled(g, f32::NAN);
+    assert!(said(&lost, b, None).starts_with("the initial volume has no finite voxel"));
+    assert!(said(a, b, Some(&Mask::filled(g, 0))).starts_with("the mask volume is empty"));
+
+    let coarse = Grid::new([16; 3], Affine::scaled([2.0; 3], [-16.0; 3]).unwrap()).unwrap();
+    let message = said(a, b, Some(&Mask::filled(coarse, 1)));
+    assert!(message.contains("the mask is on another grid ([16, 16, 16]) than the initial volume ([32, 32, 32])"));
+    let away = Grid::new(g.shape(), Affine::scaled([1.0; 3], [500.0; 3]).unwrap()).unwrap();
+    let message = said(a, &Volume::from_vec(away, b.as_slice().to_vec()).unwrap(), None);
+    assert!(message.contains("do not overlap") && message.contains("sform"), "{message}");
+
+    let line = Grid::new([64, 1, 1], *g.affine()).unwrap();
+    let line = Volume::from_vec(line, (0..64).map(|v| v as f32).collect()).unwrap();
+    assert!(said(&line, b, None).contains("a line of voxels"));
+    // A slope has no corner.
+    let slope = Volume::from_voxels(g, |_, x| x.0[0] as f32 + 100.0);
+    let message = said(&slope, &slope, None);
+    assert!(message.contains("20 are needed") && message.contains("--search"), "{message}");
+
+    let wide = FieldParams { search_mm: 500.0, ..params.clone() };
+    assert!(matches!(refusal(a, b, None, &wide), FieldError::Param(e) if e.name == "search"));
+}
