@@ -254,7 +254,8 @@ impl Lattice {
 
     /// Coefficients whose field takes (nearly) the values of `f` at the nodes.
     ///
-    /// Quasi-interpolation `c = v - (second differences of v) / 6`: exact for cubics, fourth order (de Boor 1978). `f`
+    /// Quasi-interpolation `c = v - (second differences of v) / 6`: exact for cubics, fourth order (de Boor 1978) up to
+    /// the ends, where the second differences are continued in a straight line. `f`
     /// gets a node's voxel position, which may lie up to one step outside the grid.
     pub fn fit(&self, f: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<f32> {
         let [mx, my, _] = self.nodes;
@@ -274,11 +275,16 @@ impl Lattice {
                     continue;
                 }
                 let source = v.clone();
+                let last = self.nodes[a] - 1;
+                let second = |m: usize| source[m - stride] - 2.0 * source[m] + source[m + stride];
                 for (m, v) in v.iter_mut().enumerate() {
-                    let at = m / stride % self.nodes[a];
-                    if at > 0 && at + 1 < self.nodes[a] {
-                        *v -= (source[m - stride] - 2.0 * source[m] + source[m + stride]) / 6.0;
-                    }
+                    // At the ends the second difference goes on in a straight line.
+                    let d = match m / stride % self.nodes[a] {
+                        0 => 2.0 * second(m + stride) - second(m + 2 * stride),
+                        at if at == last => 2.0 * second(m - stride) - second(m - 2 * stride),
+                        _ => second(m),
+                    };
+                    *v -= d / 6.0;
                 }
             }
             for (o, v) in out[c * n..(c + 1) * n].iter_mut().zip(v) {
