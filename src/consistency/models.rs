@@ -1,11 +1,11 @@
 //! The smallest motion that explains the data: identity, rigid, affine, or a free field.
 //!
 //! Rigid and affine maps are fitted to all kept matches with their own covariances, robustly. Each is then compared
-//! with the free field `u`: `Q = sum_nodes (u - m) . A (u - m)` is how much worse, in units of noise, the two volumes
-//! would agree under the map `m` (`A` is the information of the last residual pass). Noise alone makes the free field
-//! differ by about as much as it has degrees of freedom that the data determine, so `Q / determined` near 1 or below
-//! says that the field shows nothing that the map does not. The first model, from the simplest, whose ratio is under
-//! [`CHANCE`] is taken; else the field stays free.
+//! with the free field by the volumes themselves: how much worse they agree under the map, in units of noise (twice the
+//! log-likelihood ratio). Fitting noise alone, a free field agrees better by about as much as it has degrees of freedom
+//! that the data determine, so an excess per degree of freedom near 1 or below says that the field shows nothing that
+//! the map does not. The first model, from the simplest, whose ratio is under [`CHANCE`] is taken; else the field stays
+//! free.
 
 use crate::consistency::pruning::Measured;
 use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
@@ -43,11 +43,10 @@ pub struct Choice {
     pub evidence: Vec<String>,
 }
 
-/// Ratio of excess misfit to determined degrees of freedom up to which a simpler model stands. Measured on still,
-/// shifted and turned phantoms the ratio stays under 1; on motions of a tenth of a voxel it passes 10.
-pub const CHANCE: f64 = 3.0;
+/// Excess misfit per determined degree of freedom up to which a simpler model stands.
+pub const CHANCE: f64 = 2.0;
 
-/// Chooses a model. `excess(m)` gives the excess misfit `Q` of a map against the free field, `determined` the field's
+/// Chooses a model. `excess(m)` gives the excess misfit of a map against the free field, `determined` the field's
 /// degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm).
 pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, determined: f64, model_mm: f64) -> Choice {
     let information: Vec<Symmetric3> = matches

@@ -12,6 +12,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::filters::gradient_rows;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
+use rayon::prelude::*;
 
 /// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
 const CAUCHY: f32 = 2.385;
@@ -102,4 +103,38 @@ pub fn normal_equations(
     let total = |q: usize| sums[q * n..(q + 1) * n].iter().map(|v| f64::from(*v)).sum::<f64>();
     let misfit = total(9) / total(10).max(1.0);
     NormalEquations { blocks, rhs: sums[6 * n..9 * n].to_vec(), sigma, misfit }
+}
+
+/// How much worse, in units of noise, the volumes agree under one warp than under another.
+///
+/// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see, with Cauchy's cost
+/// `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread under the better warp `b`.
+pub fn excess(pair: &Pair, a: &[f32], b: &[f32], noise: f32) -> f64 {
+    let nx = pair.shape[0];
+    let gains = [GainField::measure(pair, a, noise), GainField::measure(pair, b, noise)];
+    let sigma = residual_sigma(pair, b, &gains[1]).max(f32::MIN_POSITIVE);
+    let cut = 1.0 / (CAUCHY * sigma);
+    let rows: Vec<f64> = (0..pair.shape[1] * pair.shape[2])
+        .into_par_iter()
+        .map(|row| {
+            let (j, k) = (row % pair.shape[1], row / pair.shape[1]);
+            if !pair.row_in_mask(j, k) {
+                return 0.0;
+            }
+            let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);
+            let from = row * nx;
+            let mut costs = [vec![0.0f32; nx], vec![0.0f32; nx]];
+            for ((warped, field), cost) in [a, b].iter().zip(&gains).zip(&mut costs) {
+                field.row(j, k, &mut gain, &mut offset);
+                for i in 0..nx {
+                    let t = cut * (pair.fixed_smooth[from + i] - (gain[i] * warped[from + i] + offset[i]));
+                    cost[i] = (t * t).ln_1p();
+                }
+            }
+            let differences =
+                (0..nx).filter(|&i| pair.mask[from + i] != 0).map(|i| f64::from(costs[0][i] - costs[1][i]));
+            differences.filter(|d| d.is_finite()).sum()
+        })
+        .collect();
+    f64::from(CAUCHY * CAUCHY) * rows.iter().sum::<f64>()
 }

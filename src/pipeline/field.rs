@@ -1,12 +1,12 @@
 //! Two volumes to a dense displacement field: the main chain, in order.
 
 use crate::consistency::coupling;
-use crate::consistency::models::{AffineMotion, Choice, choose};
+use crate::consistency::models::{Choice, choose};
 use crate::error::{FieldError, MeshError};
 use crate::field::{interpolation, jacobian, spline, warp};
 use crate::matching::levels::{Aligned, factors, from_level, to_level};
+use crate::matching::pair::Pair;
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
-use crate::numerics::bending;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::sampling;
 use crate::numerics::statistics::median;
@@ -110,11 +110,11 @@ pub fn run(
                 reports = vec![report];
             }
             clock.book("matching");
-            fine = Some((matches, pair.spacing));
+            fine = Some((matches, pair));
         }
         state = Some((field, factor));
     }
-    let (Some((field, factor)), Some((matches, spacing))) = (state, fine) else {
+    let (Some((field, factor)), Some((matches, pair))) = (state, fine) else {
         return Err(too_few(0, search));
     };
     let kept = matches.iter().filter(|m| m.kept).count();
@@ -125,7 +125,8 @@ pub fn run(
     // The smallest motion that explains the matches.
     progress("model", 0.9);
     let flat = grid.is_single_slice();
-    let choice = smallest(&matches, &field, spacing);
+    let choice = smallest(&matches, &pair, &field);
+    let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
     clock.book("model");
 
@@ -203,17 +204,10 @@ fn too_few(found: usize, search: f64) -> FieldError {
 }
 
 /// Chooses the model from the kept matches and the free field.
-fn smallest(matches: &[LevelMatch], field: &SplineField, spacing: [f64; 3]) -> Choice {
+fn smallest(matches: &[LevelMatch], pair: &Pair, field: &SplineField) -> Choice {
     let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
-    let finest = spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
-    let excess = |motion: &AffineMotion| {
-        let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * spacing[a])));
-        let apart: Vec<f32> = field.coefficients.iter().zip(&map).map(|(c, m)| c - m).collect();
-        let mut weighed = vec![0.0; apart.len()];
-        bending::apply_blocks(&field.blocks, &apart, &mut weighed);
-        apart.iter().zip(&weighed).map(|(a, w)| f64::from(*a) * f64::from(*w)).sum()
-    };
-    choose(&measured, excess, field.determined, 0.02 * finest)
+    let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
+    choose(&measured, level::excess(pair, field), field.determined, 0.02 * finest)
 }
 
 /// The chosen motion on a lattice over the full-resolution grid.

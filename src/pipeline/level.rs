@@ -2,6 +2,7 @@
 
 use crate::consistency::coupling::{self, Evidence};
 use crate::consistency::energy::{EnergyParams, Graph};
+use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{Measured, prune};
 use crate::consistency::relaxation::relax;
 use crate::features::{Corner, HarrisParams, response, spread};
@@ -10,7 +11,7 @@ use crate::matching::correlation::Searchable;
 use crate::matching::gain::GainField;
 use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::{Pair, dilate};
-use crate::matching::residual::normal_equations;
+use crate::matching::residual::{self, normal_equations};
 use crate::numerics::bending::Smoothness;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::small::{Symmetric3, inverse};
@@ -106,6 +107,22 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
         if f64::from(moved) < SETTLED * finest && pass >= 3 {
             break;
         }
+    }
+}
+
+/// The excess misfit of a map against the free field, from every fourth slice of a thick volume, with the information
+/// that correlated noise leaves.
+pub fn excess<'a>(pair: &'a Pair, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
+    let plane = pair.shape[0] * pair.shape[1];
+    let every = if pair.shape[2] >= 48 { 4 } else { 1 };
+    let in_sample = |i: usize| i / plane % every == every / 2;
+    let active: Vec<u8> = pair.mask.iter().enumerate().map(|(i, &m)| if in_sample(i) { m } else { 0 }).collect();
+    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
+    let free = pair.warp(&field.lattice, &field.coefficients, &active);
+    move |motion| {
+        let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
+        let warped = pair.warp(&field.lattice, &map, &active);
+        residual::excess(pair, &warped, &free, noise) * every as f64 * f64::from(independent(pair))
     }
 }
 
