@@ -99,8 +99,7 @@ fn lattice_nodes_leave_no_gap() {
 #[test]
 fn nodes_keep_their_values() {
     let grid = Grid::new([16, 16, 16], affines()[2]).unwrap();
-    let voxels: Vec<[f64; 3]> =
-        (0..512).map(|n| [n % 8 * 2, n / 8 % 8 * 2, n / 64 * 2].map(f64::from)).collect();
+    let voxels: Vec<[f64; 3]> = (0..512).map(|n| [n % 8 * 2, n / 8 % 8 * 2, n / 64 * 2].map(f64::from)).collect();
     let d = delaunay3(&world(&grid, &voxels)).unwrap();
     let mut state = 9;
     let u: Vec<[f64; 3]> = voxels.iter().map(|_| [0; 3].map(|_| chance(&mut state))).collect();
