@@ -4,7 +4,7 @@
 //!
 //!     cargo run --release --example seed -- [--quick] [INITIAL DEFORMED [TRUTH [MASK]]]
 //!
-//! Without files a synthetic calf is measured; `--quick` takes a small one and few points.
+//! Without files a synthetic calf is measured; `--quick` takes a small block and few points.
 
 use palpate::report::colormap::ColorMap;
 use palpate::report::nodes;
@@ -62,8 +62,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn synthetic(quick: bool) -> Result<Pair, Box<dyn Error>> {
-    let params = PhantomParams::new(PhantomKind::Calf);
-    let p = phantom(&if quick { params.sized(48) } else { params })?;
+    let calf = PhantomParams::new(PhantomKind::Calf);
+    let p = phantom(&if quick { PhantomParams::new(PhantomKind::Block).sized(48) } else { calf })?;
     Ok(Pair { initial: p.initial, deformed: p.deformed, truth: Some(p.truth), mask: Some(p.mask) })
 }
 

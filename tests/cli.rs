@@ -444,7 +444,7 @@ fn a_reader_that_leaves_early_is_no_error() {
 fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
     let folder = small_pair();
     let field = |output: &str, threads: &str| {
-        let files = ["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--preset", "fast"];
+        let files = ["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz"];
         run(folder.path(), &[&files[..], &["--quiet", "--threads", threads, "-o", output]].concat(), 0)
     };
     let (out, err) = field("one", "1");

@@ -43,7 +43,7 @@ fn seed_meshes_the_matches_and_draws_every_node() {
         let number = |i: usize| row[i].parse::<f64>().unwrap();
         let (nodes, elements) = (number(5), number(6));
         assert!(elements > nodes, "{out}");
-        assert!(number(9) < number(7), "the energy must fall: {out}");
+        assert!(number(9) <= number(7), "the energy must not grow: {out}");
         assert!(number(10) < 0.5 * number(12), "{out}");
     }
     let picture = std::fs::read_to_string(folder.path().join("out/seed.svg")).unwrap();
