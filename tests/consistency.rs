@@ -132,7 +132,7 @@ const SHAPE: [usize; 3] = [25, 25, 25];
 
 fn lattice() -> (Lattice, Smoothness) {
     let lattice = Lattice::new(SHAPE, [6; 3]);
-    let smoothness = Smoothness::new(lattice.nodes, [6.0; 3], 0.0);
+    let smoothness = Smoothness::new(lattice.nodes, [6.0; 3]);
     (lattice, smoothness)
 }
 
@@ -199,7 +199,7 @@ fn coupling_withstands_outliers() {
 /// A small lattice's nodes, smoothness and dense smoothness matrix.
 fn small() -> ([usize; 3], Smoothness, Dense) {
     let nodes = [5, 4, 4];
-    let smoothness = Smoothness::new(nodes, [2.0, 2.0, 3.0], 0.0);
+    let smoothness = Smoothness::new(nodes, [2.0, 2.0, 3.0]);
     let matrix = dense(80, |x| {
         let mut out = vec![0.0; 80];
         smoothness.apply(x, &mut out);

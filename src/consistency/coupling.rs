@@ -119,7 +119,9 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
                 });
             }
         };
-        solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, 1e-2, 30);
+        // Early rounds only sort the evidence; the last two settle the field.
+        let (tolerance, limit) = if round + 2 < rounds { (1e-2, 30) } else { (1e-3, 120) };
+        solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, tolerance, limit);
         let gamma = determined(smoothness, lambda, &blocks, round as u64, 30);
         let energy = smoothness.energy(&c).max(1e-9);
         lambda = ((0.5 * gamma / energy) as f32).clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
