@@ -146,7 +146,7 @@ fn corners(g: &Grid) -> [VoxelPoint; 8] {
 }
 
 /// `volume` on a lattice with `grid`'s axes that starts at `origin` (voxels of `grid`); smoothed first along its axes
-/// where its voxels are finer, so that nothing aliases. Outside it the edge value continues.
+/// where its voxels are finer, so that nothing aliases. NaN beyond half a voxel outside it.
 fn resample(volume: &Volume, grid: &Grid, origin: [f64; 3], shape: [usize; 3]) -> Result<Vec<f32>, FieldError> {
     let affine = {
         let mut rows = grid.affine().rows();

@@ -2,7 +2,7 @@
 //!
 //! Gauss-Newton on the patch with gain and offset (Ackermann 1984; Gruen 1985; Zhang, Hirai & Endo for MR volumes).
 //! The patch's own gradients serve in every step (the compositional form of Baker & Matthews 2004), so the 3 x 3 matrix
-//! is built once. The patch is not warped here: the deformed volume is handed in already warped by the field known so
+//! is built once; what gain and offset explain as well is taken from it, so a mere ramp has no information. The patch is not warped here: the deformed volume is handed in already warped by the field known so
 //! far, so only the rest of the motion is sought.
 
 use crate::numerics::small::{Symmetric3, inverse, multiply};
@@ -58,7 +58,6 @@ pub fn refine(
     let count = radius.iter().map(|r| 2 * r + 1).product::<usize>();
     let (mut f, mut g) = (Vec::with_capacity(count), Vec::with_capacity(count));
     let mut offsets = Vec::with_capacity(count);
-    let mut h: Symmetric3 = [0.0; 6];
     let span = |a: usize| -(radius[a] as i32)..=radius[a] as i32;
     for dz in span(2) {
         for dy in span(1) {
@@ -72,24 +71,19 @@ pub fn refine(
                         f64::from(data[at + stride[a]] - data[at - stride[a]]) / (2.0 * spacing[a])
                     }
                 });
-                for (q, v) in [d[0] * d[0], d[1] * d[1], d[2] * d[2], d[0] * d[1], d[0] * d[2], d[1] * d[2]]
-                    .into_iter()
-                    .enumerate()
-                {
-                    h[q] += v;
-                }
                 f.push(data[at]);
                 g.push(d);
                 offsets.push(o.map(|v| v as f32));
             }
         }
     }
+    let (mf, sf) = moments(&f);
+    let mut h = without_gain_and_offset(&f, &mut g, mf, sf);
     let flat: Vec<usize> = (0..3).filter(|&a| shape[a] == 1).collect();
     for &a in &flat {
         h[a] = h[0] + h[1] + h[2];
     }
     let hi = inverse(&h)?;
-    let (mf, sf) = moments(&f);
     let mut shift = [0.0f64; 3];
     let mut w = vec![0.0f32; count];
     let mut spread = 0.0;
@@ -137,6 +131,28 @@ pub fn refine(
         shift[a] = 0.0;
     }
     (ncc.is_finite() && covariance.iter().all(|v| v.is_finite())).then_some(Refined { shift, covariance, ncc })
+}
+
+/// Takes from the gradients what a change of offset (their mean) or of gain (their part along the patch) explains as
+/// well, and returns the matrix of their products: the information with both unknown (Schur complement).
+fn without_gain_and_offset(f: &[f32], g: &mut [[f64; 3]], mean: f64, deviation: f64) -> Symmetric3 {
+    let n = f.len() as f64;
+    let (mut gm, mut fg) = ([0.0; 3], [0.0; 3]);
+    for (f, g) in f.iter().zip(&*g) {
+        for a in 0..3 {
+            gm[a] += g[a] / n;
+            fg[a] += g[a] * (f64::from(*f) - mean) / (n * deviation * deviation);
+        }
+    }
+    let mut h = [0.0; 6];
+    for (f, g) in f.iter().zip(g) {
+        let [x, y, z] = std::array::from_fn(|a| g[a] - gm[a] - fg[a] * (f64::from(*f) - mean));
+        *g = [x, y, z];
+        for (h, v) in h.iter_mut().zip([x * x, y * y, z * z, x * y, x * z, y * z]) {
+            *h += v;
+        }
+    }
+    h
 }
 
 /// Mean and standard deviation.
