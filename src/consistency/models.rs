@@ -46,6 +46,9 @@ pub struct Choice {
 /// Excess misfit per determined degree of freedom up to which a simpler model stands.
 pub const CHANCE: f64 = 2.0;
 
+/// Degrees of freedom that are counted at least: with fewer, chance and rounding in the noise model weigh too much.
+const FEWEST: f64 = 100.0;
+
 /// Chooses a model. `excess(m)` gives the excess misfit of a map against the free field, `determined` the field's
 /// degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm).
 pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, determined: f64, model_mm: f64) -> Choice {
@@ -66,7 +69,7 @@ pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, deter
     let mut evidence = Vec::new();
     let mut chosen = None;
     for (model, motion) in tried {
-        let ratio = excess(&motion) / determined.max(12.0);
+        let ratio = excess(&motion) / determined.max(FEWEST);
         let name = format!("{model:?}").to_lowercase();
         evidence.push(format!("{name}: excess misfit {ratio:.2} per degree of freedom (chance: at most {CHANCE:.0})"));
         if chosen.is_none() && ratio <= CHANCE {

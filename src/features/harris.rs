@@ -86,5 +86,6 @@ fn foerstner(m: [f32; 6], flat: bool) -> f32 {
     let trace = a + b + c;
     let det = a * bc - d * (d * c - f * e) + e * (d * f - b * e);
     let value = if flat { minors / trace } else { det / minors };
-    if value.is_finite() { value.max(0.0) } else { 0.0 }
+    // A plane's second eigenvalue is rounding: nothing to divide by.
+    if minors > 1e-5 * trace * trace { value.max(0.0) } else { 0.0 }
 }

@@ -33,7 +33,7 @@ pub fn spread(
     let thick: Vec<usize> = (0..3).filter(|&a| shape[a] > 1).collect();
     let volume = area as f64 * thick.iter().map(|&a| spacing[a]).product::<f64>();
     let edge = (volume / wanted.max(1) as f64).powf(1.0 / thick.len().max(1) as f64);
-    let cell: [usize; 3] = std::array::from_fn(|a| (edge / spacing[a]).round().max(1.0) as usize);
+    let cell: [usize; 3] = std::array::from_fn(|a| (edge / spacing[a]).ceil().max(1.0) as usize);
     let cells: [usize; 3] = std::array::from_fn(|a| shape[a].div_ceil(cell[a]));
     let mut maxima: Vec<(usize, Corner)> = (0..shape[2])
         .into_par_iter()

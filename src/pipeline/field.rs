@@ -72,30 +72,32 @@ pub fn run(
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
         let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
-        let mut field = match &state {
-            Some((coarse, from)) => level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from)),
+        let passes = if last { params.passes } else { params.coarse_passes };
+        let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
+        let field = match &state {
+            Some((coarse, from)) => {
+                let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
+                level::refine(&pair, &mut field, passes, params.seed, tick);
+                field
+            }
             None => {
                 progress("matching", done(0.0));
-                let points =
-                    pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(COARSE_SHARE).clamp(40, COARSE_POINTS);
+                let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
+                let points = pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(share).clamp(40, COARSE_POINTS);
                 let wide = MatchParams { points, reach_mm: search, patch: 2, strain: 0.3 };
                 let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
                 clock.book("matching");
                 let enough = report.counts.kept >= FEWEST;
                 reports.push(report);
-                fitted.filter(|_| enough).unwrap_or_else(|| SplineField {
-                    coefficients: vec![0.0; 3 * lattice.len()],
-                    lattice,
-                    lambda: 30.0,
-                    blocks: Vec::new(),
-                    determined: 0.0,
-                })
+                let starts = [fitted.filter(|_| enough), Some(SplineField::still(lattice))];
+                let refined = starts.into_iter().flatten().map(|mut start| {
+                    level::refine(&pair, &mut start, passes, params.seed, tick);
+                    start
+                });
+                // Two starts, the matches' field and stillness: the one that ends at the better agreement goes on.
+                refined.reduce(|a, b| level::better(&pair, a, b)).ok_or_else(|| too_few(0, search))?
             }
         };
-        let passes = if last { params.passes } else { params.coarse_passes };
-        level::refine(&pair, &mut field, passes, params.seed, |p| {
-            progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
-        });
         clock.book("residual");
         if last {
             progress("matching", done(0.9));

@@ -34,6 +34,21 @@ pub struct SplineField {
     pub determined: f64,
 }
 
+impl SplineField {
+    /// No motion, with a bending energy to start from.
+    pub fn still(lattice: Lattice) -> Self {
+        let coefficients = vec![0.0; 3 * lattice.len()];
+        Self { lattice, coefficients, lambda: 30.0, blocks: Vec::new(), determined: 0.0 }
+    }
+}
+
+/// The field under which the two volumes agree better.
+pub fn better(pair: &Pair, a: SplineField, b: SplineField) -> SplineField {
+    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
+    let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.mask);
+    if residual::excess(pair, &warp(&b), &warp(&a), noise) < 0.0 { b } else { a }
+}
+
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
 fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
     (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] as f64 * spacing[a]).product()
@@ -114,7 +129,7 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
 /// that correlated noise leaves.
 pub fn excess<'a>(pair: &'a Pair, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
     let plane = pair.shape[0] * pair.shape[1];
-    let every = if pair.shape[2] >= 48 { 4 } else { 1 };
+    let every = if pair.shape.iter().all(|&n| n >= 48) { 4 } else { 1 };
     let in_sample = |i: usize| i / plane % every == every / 2;
     let active: Vec<u8> = pair.mask.iter().enumerate().map(|(i, &m)| if in_sample(i) { m } else { 0 }).collect();
     let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
