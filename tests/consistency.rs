@@ -421,17 +421,20 @@ fn the_simplest_model_that_explains_is_chosen_and_exact() {
 #[test]
 fn a_free_motion_stays_free_and_the_evidence_says_why() {
     let matches = moved(&general(), 0, false);
-    let choice = choose(&matches, |_| 1000.0, 50.0, 0.05);
+    let choice = choose(&matches, |_| 4000.0, 200.0, 0.05);
     assert_eq!((choice.model, choice.motion), (MotionModel::Free, None));
     assert_eq!(choice.evidence.len(), 4);
     for (line, name) in choice.evidence.iter().zip(["identity: ", "rigid: ", "affine: ", "free: "]) {
         assert!(line.starts_with(name), "{line}");
     }
     assert!(choice.evidence[0].contains("excess misfit 20.00 per degree of freedom"), "{}", choice.evidence[0]);
-    assert!(choice.evidence[3].contains("50 degrees of freedom"), "{}", choice.evidence[3]);
+    assert!(choice.evidence[3].contains("200 degrees of freedom"), "{}", choice.evidence[3]);
     // Just at the limit the simplest stands.
-    let at = |ratio: f64| choose(&matches, |_| 50.0 * ratio, 50.0, 0.05).model;
+    let at = |ratio: f64| choose(&matches, |_| 200.0 * ratio, 200.0, 0.05).model;
     assert_eq!((at(CHANCE), at(CHANCE + 0.01)), (MotionModel::Identity, MotionModel::Free));
+    // Few degrees of freedom count as a hundred.
+    let few = |excess: f64| choose(&matches, |_| excess, 9.0, 0.05).model;
+    assert_eq!((few(100.0 * CHANCE), few(101.0 * CHANCE)), (MotionModel::Identity, MotionModel::Free));
 }
 
 #[test]
