@@ -57,7 +57,6 @@ fn smooth_motions_and_presses_are_measured_without_folds() {
         ("pressed block", block(48, MotionKind::Press, 4.0), 1.0 / 3.0),
         ("smooth head", PhantomParams { amplitude: 6.0, ..head.clone() }, 0.5),
         ("pressed head", PhantomParams { motion: MotionKind::Press, amplitude: 8.0, ..head }, 0.5),
-        ("pressed fingertip", PhantomParams::new(PhantomKind::Fingertip).sized(48), 0.5),
     ];
     for (name, params, share) in cases {
         let (result, m) = measure(&params);
@@ -77,9 +76,10 @@ fn small_motions_and_slides_are_never_worse_than_nothing() {
 }
 
 #[test]
-fn a_press_leaves_far_tissue_still() {
-    let (_, m) = measure(&PhantomParams::new(PhantomKind::Fingertip));
-    assert!(m.still_mm.unwrap() < 0.05, "{m:?}");
+fn a_pressed_fingertip_is_measured_and_its_far_side_stays_still() {
+    let (result, m) = measure(&PhantomParams::new(PhantomKind::Fingertip));
+    assert!(m.mean_mm < m.identity_mm / 3.0 && m.still_mm.unwrap() < 0.05, "{m:?}");
+    assert_eq!((m.folds, result.summary.folds, result.summary.model), (0.0, 0, MotionModel::Free));
 }
 
 #[test]
