@@ -194,8 +194,8 @@ pub fn matches(
         let defaults = HarrisParams::default();
         let integration_sigma = (room.cbrt() / 4.0).clamp(0.7, defaults.integration_sigma);
         let r = response(data, shape, spacing, HarrisParams { integration_sigma, ..defaults });
-        // Noise alone answers with about a hundredth of its variance per squared voxel.
-        spread(&r, shape, spacing, mask, wanted, 0.02 * (f64::from(noise) / finest).powi(2) as f32)
+        // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
+        spread(&r, shape, spacing, mask, wanted, 0.002 * (f64::from(noise) / finest).powi(2) as f32)
     };
     let initial = corners(&pair.fixed, pair.shape, Some(&pair.mask), params.points);
     let moving: Vec<f32> = pair.moving.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
