@@ -192,7 +192,7 @@ pub fn matches(
         // Many points wanted: a narrower window has more maxima.
         let room = mask.map_or(data.len(), |m| m.iter().filter(|&&v| v != 0).count()) as f64 / wanted as f64;
         let defaults = HarrisParams::default();
-        let integration_sigma = (room.cbrt() / 4.0).clamp(0.7, defaults.integration_sigma);
+        let integration_sigma = (room.cbrt() / 8.0).clamp(0.7, defaults.integration_sigma);
         let r = response(data, shape, spacing, HarrisParams { integration_sigma, ..defaults });
         // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
         spread(&r, shape, spacing, mask, wanted, 0.002 * (f64::from(noise) / finest).powi(2) as f32)
