@@ -80,17 +80,19 @@ struct Usage(String);
 pub fn run() -> ExitCode {
     let Cli { common, command } = Cli::parse();
     let console = Console::new(common.quiet, common.verbose);
-    if let Some(n) = common.threads {
-        // Fails only when a pool is there already, which cannot be: nothing has run yet.
-        let _ = rayon::ThreadPoolBuilder::new().num_threads(n.into()).build_global();
-    }
-    let done = match command {
+    // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
+    let work = || match command {
         Command::Field(options) => field::run(&options, &console),
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
         Command::Phantom(options) => phantom::run(&options, &console),
         Command::Evaluate(options) => evaluate::run(&options, &console),
         Command::Demo(options) => demo::run(&options, &console),
+    };
+    let done = match pool {
+        Ok(pool) => pool.install(work),
+        Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

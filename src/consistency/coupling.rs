@@ -1,7 +1,7 @@
 //! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
 //! energy of a spline lattice holds the places together.
 
-use crate::numerics::bending::{Smoothness, SolveReport, apply_blocks, solve};
+use crate::numerics::bending::{Smoothness, SolveReport, solve, solve_blocks};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::filters;
 use crate::numerics::random::Random;
@@ -29,7 +29,7 @@ pub fn step(
         }
     }
     let mut d = vec![0.0f32; 3 * n];
-    let report = solve(smoothness, lambda, |x, out| apply_blocks(blocks, x, out), blocks, &b, &mut d, tolerance, limit);
+    let report = solve_blocks(smoothness, lambda, blocks, &b, &mut d, tolerance, limit);
     let mut moved = 0.0f64;
     for (c, d) in coefficients.iter_mut().zip(&d) {
         *c += d;
@@ -48,7 +48,7 @@ pub fn determined(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], see
     let mut random = Random::new(seed, 77);
     let z: Vec<f32> = (0..3 * n).map(|_| if random.bits() >> 63 == 0 { 1.0 } else { -1.0 }).collect();
     let mut x = vec![0.0f32; 3 * n];
-    solve(smoothness, lambda, |x, out| apply_blocks(blocks, x, out), blocks, &z, &mut x, 1e-2, limit);
+    solve_blocks(smoothness, lambda, blocks, &z, &mut x, 1e-2, limit);
     let mut lx = vec![0.0f32; n];
     let mut trace = 0.0;
     for (x, z) in x.chunks_exact(n).zip(z.chunks_exact(n)) {
@@ -162,7 +162,7 @@ pub fn deviation(
             }
         }
         let mut x = vec![0.0f32; 3 * n];
-        solve(smoothness, lambda, |x, out| apply_blocks(blocks, x, out), blocks, &b, &mut x, 1e-2, 200);
+        solve_blocks(smoothness, lambda, blocks, &b, &mut x, 1e-2, 200);
         for (i, s) in squares.iter_mut().enumerate() {
             *s += (x[i] * x[i] + x[n + i] * x[n + i] + x[2 * n + i] * x[2 * n + i]) / (3 * draws) as f32;
         }

@@ -1,6 +1,7 @@
 //! The 3D corner measure (Harris & Stephens 1988; Foerstner & Guelch 1987; Rohr 1997 for volumes).
 
-use crate::numerics::filters::{gaussian, gaussian_kernel, gradient_rows, separable};
+use crate::numerics::filters::{HalfKernel, gaussian, gaussian_kernel, gradient_rows, separable};
+use crate::numerics::pyramid::reduced_shape;
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 
@@ -29,45 +30,85 @@ const SLAB: usize = 24;
 /// (Foerstner & Guelch 1987), needs no constant `k`, and is low on edges and planes. For one slice the in-plane 2 x 2
 /// form is used.
 pub fn response(data: &[f32], shape: [usize; 3], spacing: [f64; 3], params: HarrisParams) -> Vec<f32> {
-    let [nx, ny, nz] = shape;
-    let plane = nx * ny;
     let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
-    let sigma = |s: f64| -> [f64; 3] { std::array::from_fn(|a| s * finest / spacing[a]) };
-    let (ds, is) = (sigma(params.derivative_sigma), sigma(params.integration_sigma));
-    let kernels = is.map(gaussian_kernel);
-    let halo = (3.0 * ds[2]).ceil() as usize + kernels[2].len() + 1;
+    let smooth = gaussian(data, shape, spacing.map(|s| params.derivative_sigma * finest / s));
+    block_response(&smooth, shape, spacing, params.integration_sigma, [1; 3])
+}
+
+/// As [`response`], of a volume that is smooth already, for blocks of `step` voxels: the products of the gradients are
+/// averaged over each block and the window is applied there. `integration_sigma` is in voxels of the finest axis.
+///
+/// The result has [`reduced_shape`] of `step`; block `b` is centred at `(b + 0.5) * step - 0.5` voxels. Not finite voxels
+/// make their neighbours' response zero.
+pub fn block_response(
+    smooth: &[f32],
+    shape: [usize; 3],
+    spacing: [f64; 3],
+    integration_sigma: f64,
+    step: [usize; 3],
+) -> Vec<f32> {
+    let [nx, ny, nz] = shape;
+    let blocks = reduced_shape(shape, step);
+    let plane = blocks[0] * blocks[1];
+    let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    // A block is a window itself, of variance (step^2 - 1) / 12.
+    let kernels: [HalfKernel; 3] = std::array::from_fn(|a| {
+        let own = ((step[a] * step[a]) as f64 - 1.0) / 12.0;
+        let wanted = (integration_sigma * finest / spacing[a]).powi(2);
+        gaussian_kernel((wanted - own).max(0.0).sqrt() / step[a] as f64)
+    });
+    let halo = kernels[2].len();
     let flat = shape.contains(&1);
     let per_mm: [f32; 3] = std::array::from_fn(|a| (1.0 / spacing[a]) as f32);
-    let mut out = vec![0.0f32; data.len()];
-    for start in (0..nz).step_by(SLAB) {
-        let end = (start + SLAB).min(nz);
-        let (lo, hi) = (start.saturating_sub(halo), (end + halo).min(nz));
-        let part = [nx, ny, hi - lo];
-        let smooth = gaussian(&data[lo * plane..hi * plane], part, ds);
-        let mut products: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; smooth.len()]);
-        let [xx, yy, zz, xy, xz, yz] = &mut products;
-        let chunks = (xx.par_chunks_mut(plane), yy.par_chunks_mut(plane), zz.par_chunks_mut(plane));
-        let cross = (xy.par_chunks_mut(plane), xz.par_chunks_mut(plane), yz.par_chunks_mut(plane));
-        (chunks, cross).into_par_iter().enumerate().for_each(|(k, ((xx, yy, zz), (xy, xz, yz)))| {
-            let (mut gx, mut gy, mut gz) = (vec![0.0; nx], vec![0.0; nx], vec![0.0; nx]);
-            dispatch(|| {
-                for j in 0..ny {
-                    gradient_rows(&smooth, part, j, k, [&mut gx, &mut gy, &mut gz]);
-                    for i in 0..nx {
-                        let (x, y, z) = (gx[i] * per_mm[0], gy[i] * per_mm[1], gz[i] * per_mm[2]);
-                        let at = j * nx + i;
-                        (xx[at], yy[at], zz[at]) = (x * x, y * y, z * z);
-                        (xy[at], xz[at], yz[at]) = (x * y, x * z, y * z);
+    let mut out = vec![0.0f32; blocks.iter().product()];
+    for start in (0..blocks[2]).step_by(SLAB) {
+        let end = (start + SLAB).min(blocks[2]);
+        let (lo, hi) = (start.saturating_sub(halo), (end + halo).min(blocks[2]));
+        let mut products: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; plane * (hi - lo)]);
+        let [xx, yy, zz, xy, xz, yz] = products.each_mut().map(|p| p.par_chunks_mut(plane));
+        ((xx, yy, zz), (xy, xz, yz)).into_par_iter().enumerate().for_each(|(k, ((xx, yy, zz), (xy, xz, yz)))| {
+            let mut out = [xx, yy, zz, xy, xz, yz];
+            let mut g: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
+            let mut sums: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; nx]);
+            let slices = (lo + k) * step[2]..((lo + k + 1) * step[2]).min(nz);
+            for b in 0..blocks[1] {
+                let rows = b * step[1]..((b + 1) * step[1]).min(ny);
+                dispatch(#[inline(always)] || {
+                    sums.iter_mut().for_each(|s| s.fill(0.0));
+                    for (k, j) in slices.clone().flat_map(|k| rows.clone().map(move |j| (k, j))) {
+                        let [gx, gy, gz] = &mut g;
+                        gradient_rows(smooth, shape, j, k, [gx, gy, gz]);
+                        let [xx, yy, zz, xy, xz, yz] = sums.each_mut().map(|s| &mut s[..nx]);
+                        let (gx, gy, gz) = (&gx[..nx], &gy[..nx], &gz[..nx]);
+                        for i in 0..nx {
+                            let (x, y, z) = (gx[i] * per_mm[0], gy[i] * per_mm[1], gz[i] * per_mm[2]);
+                            let good = (x + y + z).is_finite();
+                            let (x, y, z) = if good { (x, y, z) } else { (0.0, 0.0, 0.0) };
+                            xx[i] += x * x;
+                            yy[i] += y * y;
+                            zz[i] += z * z;
+                            xy[i] += x * y;
+                            xz[i] += x * z;
+                            yz[i] += y * z;
+                        }
+                    }
+                });
+                let lines = (slices.len() * rows.len()) as f32;
+                for (out, sums) in out.iter_mut().zip(&sums) {
+                    let out = &mut out[b * blocks[0]..(b + 1) * blocks[0]];
+                    for (o, s) in out.iter_mut().zip(sums.chunks(step[0])) {
+                        *o = s.iter().sum::<f32>() / (lines * s.len() as f32);
                     }
                 }
-            });
+            }
         });
+        let part = [blocks[0], blocks[1], hi - lo];
         let m = products.map(|p| separable(&p, part, [&kernels[0], &kernels[1], &kernels[2]]));
         let skip = (start - lo) * plane;
         out[start * plane..end * plane].par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
             let at = skip + k * plane;
             let [xx, yy, zz, xy, xz, yz] = std::array::from_fn(|q| &m[q][at..at + plane]);
-            dispatch(|| {
+            dispatch(#[inline(always)] || {
                 for (o, out) in out.iter_mut().enumerate() {
                     *out = foerstner([xx[o], yy[o], zz[o], xy[o], xz[o], yz[o]], flat);
                 }

@@ -6,5 +6,5 @@ pub mod harris;
 
 pub mod suppression;
 
-pub use harris::{HarrisParams, response};
+pub use harris::{HarrisParams, block_response, response};
 pub use suppression::{Corner, spread};

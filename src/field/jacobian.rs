@@ -20,7 +20,7 @@ pub fn jacobian_determinant(field: &DenseField) -> Volume {
     out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
         // g[c][a]: derivative of component c by voxel index along axis a.
         let mut g: [[Vec<f32>; 3]; 3] = std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; nx]));
-        dispatch(|| {
+        dispatch(#[inline(always)] || {
             for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
                 for (component, [x, y, z]) in components.iter().zip(&mut g) {
                     gradient_rows(component, shape, j, k, [x, y, z]);

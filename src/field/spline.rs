@@ -22,7 +22,7 @@ pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField
         let slice = lattice.slice(coefficients, k);
         let mut nodes = vec![0.0; lattice.nodes[0]];
         let mut d: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
-        dispatch(|| {
+        dispatch(#[inline(always)] || {
             for j in 0..ny {
                 for (c, d) in d.iter_mut().enumerate() {
                     lattice.row(&slice, c, j, &mut nodes, d);
@@ -46,7 +46,7 @@ pub fn scalar(grid: &Grid, lattice: &Lattice, values: &[f32]) -> Volume {
     out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
         let slice = lattice.slice(&three, k);
         let mut nodes = vec![0.0; lattice.nodes[0]];
-        dispatch(|| {
+        dispatch(#[inline(always)] || {
             for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
                 lattice.row(&slice, 0, j, &mut nodes, row);
             }

@@ -4,8 +4,11 @@
 //! p + u(p), so it goes from the initial to the deformed place. The image may lie on any grid. Where x lies outside
 //! the field's grid the field says nothing: such voxels get the background value, such points `None`.
 
+use crate::numerics::cubic::LANES;
 use crate::numerics::sampling::{Interpolation, Sampler, displacement, inside, nearest};
+use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Volume, WorldPoint};
+use rayon::prelude::*;
 
 /// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background` outside the image.
 pub fn warp_image(
@@ -17,7 +20,41 @@ pub fn warp_image(
 ) -> Volume {
     let sampler = Sampler::new(image, interpolation, background);
     let affine = *image.grid().affine();
+    if reference.is_none_or(|r| r == field.grid()) {
+        return warp_rows(image.grid(), field, &sampler);
+    }
     warp_with(field, reference, background, |target| sampler.at(affine.to_voxel(target)))
+}
+
+/// On the field's own grid: row by row, no field to be interpolated.
+fn warp_rows(image: &Grid, field: &DenseField, sampler: &Sampler<'_>) -> Volume {
+    let grid = field.grid();
+    let [nx, ny, _] = grid.shape();
+    let components: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
+    let inverse = image.affine().inverse_linear();
+    let place = |i, j, k| image.affine().to_voxel(grid.world(i, j, k)).0;
+    let mut out = Volume::filled(*grid, 0.0);
+    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| {
+        let (j, k) = (row % ny, row / ny);
+        let (start, next) = (place(0, j, k), place(1, j, k));
+        dispatch(#[inline(always)] || {
+            for (block, out) in out.chunks_mut(LANES).enumerate() {
+                let from = row * nx + block * LANES;
+                let mut d = [[0.0f64; LANES]; 3];
+                for (d, c) in d.iter_mut().zip(&components) {
+                    d.iter_mut().zip(&c[from..from + out.len()]).for_each(|(d, c)| *d = f64::from(*c));
+                }
+                let p: [[f64; LANES]; 3] = std::array::from_fn(|a| {
+                    std::array::from_fn(|l| {
+                        let moved = inverse[a][0] * d[0][l] + inverse[a][1] * d[1][l] + inverse[a][2] * d[2][l];
+                        start[a] + (block * LANES + l) as f64 * (next[a] - start[a]) + moved
+                    })
+                });
+                sampler.block(&p, out);
+            }
+        });
+    });
+    out
 }
 
 /// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not there.

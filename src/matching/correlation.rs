@@ -9,7 +9,8 @@ pub struct Searchable<'a> {
     data: &'a [f32],
     shape: [usize; 3],
     radius: [usize; 3],
-    /// Square root of the sum of squares about the mean of the patch around each voxel.
+    /// Square root of the sum of squares about the mean of the patch around each voxel; empty where it is worked out for
+    /// each place that is asked for.
     norm: Vec<f32>,
 }
 
@@ -19,6 +20,9 @@ pub struct Template {
     values: Vec<f32>,
     radius: [usize; 3],
 }
+
+/// Widest patch along x whose sums are made on the spot.
+const WIDTH: usize = 8;
 
 /// A place found: offset from the centre of the search in voxels, and the correlation there (-1 to 1).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,6 +54,40 @@ impl<'a> Searchable<'a> {
         let (mean, square) = (box_mean(&centred), box_mean(&squares));
         let norm = mean.iter().zip(&square).map(|(m, s)| (count * (s - m * m)).max(0.0).sqrt()).collect();
         Self { data, shape, radius, norm }
+    }
+
+    /// As [`Searchable::new`] for few places and short searches: nothing is prepared. Patches wider than 8 voxels along x
+    /// are prepared all the same.
+    pub fn near(data: &'a [f32], shape: [usize; 3], radius: [usize; 3]) -> Self {
+        let radius = patch_radius(shape, radius);
+        if 2 * radius[0] + 1 > WIDTH {
+            return Self::new(data, shape, radius);
+        }
+        Self { data, shape, radius, norm: Vec::new() }
+    }
+
+    /// Correlation with the patch around voxel `at`, which lies inside; not finite where there is none.
+    #[inline(always)]
+    fn direct(&self, template: &Template, at: [usize; 3]) -> f32 {
+        let [rx, ry, rz] = self.radius;
+        let width = 2 * rx + 1;
+        let centre = self.data[at[0] + self.shape[0] * (at[1] + self.shape[1] * at[2])];
+        let [mut cross, mut sum, mut square] = [[0.0f32; WIDTH]; 3];
+        for (row, t) in template.values.chunks_exact(width).enumerate() {
+            let (j, k) = (at[1] + row % (2 * ry + 1) - ry, at[2] + row / (2 * ry + 1) - rz);
+            let from = at[0] - rx + self.shape[0] * (j + self.shape[1] * k);
+            let (mut v, mut w) = ([centre; WIDTH], [0.0f32; WIDTH]);
+            v[..width].copy_from_slice(&self.data[from..from + width]);
+            w[..width].copy_from_slice(t);
+            for l in 0..WIDTH {
+                let d = v[l] - centre;
+                cross[l] += w[l] * d;
+                sum[l] += d;
+                square[l] += d * d;
+            }
+        }
+        let [cross, sum, square] = [cross, sum, square].map(|lanes| lanes.iter().sum::<f32>());
+        cross / (square - sum * sum / template.values.len() as f32).sqrt()
     }
 
     /// The patch around a voxel; none where it leaves the volume, holds NaN, or is constant.
@@ -96,8 +134,24 @@ impl<'a> Searchable<'a> {
         let count = (lx - fx + 1) as usize;
         let [rx, ry, rz] = template.radius;
         let width = 2 * rx + 1;
+        if self.norm.is_empty() {
+            dispatch(#[inline(always)] || {
+                for dz in first(2)..=last(2) {
+                    for dy in first(1)..=last(1) {
+                        for dx in fx..=lx {
+                            let d = [dx, dy, dz];
+                            let at = std::array::from_fn(|a| (centre[a] + d[a]) as usize);
+                            let [i, j, k] = std::array::from_fn(|a| (d[a] + reach[a] as i64) as usize);
+                            let v = self.direct(template, at);
+                            scores[i + size[0] * (j + size[1] * k)] = if v.is_finite() { v } else { f32::NEG_INFINITY };
+                        }
+                    }
+                }
+            });
+            return peaks(&scores, size, reach, keep);
+        }
         let mut line = vec![0.0f32; count];
-        dispatch(|| {
+        dispatch(#[inline(always)] || {
             for dz in first(2)..=last(2) {
                 for dy in first(1)..=last(1) {
                     line.fill(0.0);

@@ -5,6 +5,7 @@
 //! block sums are smoothed over their neighbours and interpolated linearly.
 
 use crate::matching::pair::Pair;
+use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 
 /// Edge of a block (voxels).
@@ -18,41 +19,49 @@ pub struct GainField {
     values: Vec<[f32; 2]>,
 }
 
-/// Sums of a block: count, f, w, ff, ww, fw.
+/// Sums of a block: count, f, w, ff, ww, fw, with f and w less the volumes' means so that no precision is lost.
 type Sums = [f64; 6];
 
 impl GainField {
-    /// From the initial volume (smoothed) and the warped one, inside the mask. `noise` is the initial volume's noise.
-    pub fn measure(pair: &Pair, warped: &[f32], noise: f32) -> Self {
+    /// From the initial volume (smoothed) and the warped one, inside the mask. 
+    pub fn measure(pair: &Pair, warped: &[f32]) -> Self {
         let [nx, ny, _] = pair.shape;
         let blocks = pair.shape.map(|n| n.div_ceil(BLOCK));
         let (bx, by) = (blocks[0], blocks[1]);
+        let centre = pair.centres;
         let mut sums = vec![[0.0f64; 6]; blocks.iter().product()];
-        sums.par_chunks_mut(bx * by).enumerate().for_each(|(bz, sums)| {
-            for k in bz * BLOCK..((bz + 1) * BLOCK).min(pair.shape[2]) {
-                for j in 0..ny {
-                    let from = nx * (j + ny * k);
-                    for b in 0..bx {
-                        let mut s = [0.0f32; 6];
-                        for i in from + b * BLOCK..from + ((b + 1) * BLOCK).min(nx) {
-                            let (f, w) = (pair.fixed_smooth[i], warped[i]);
-                            if pair.mask[i] != 0 && w.is_finite() {
-                                for (s, v) in s.iter_mut().zip([1.0, f, w, f * f, w * w, f * w]) {
-                                    *s += v;
-                                }
-                            }
-                        }
-                        for (t, v) in sums[b + bx * (j / BLOCK)].iter_mut().zip(s) {
-                            *t += f64::from(v);
-                        }
+        sums.par_chunks_mut(bx).enumerate().for_each(|(row, sums)| {
+            // One partial sum for each column of a block.
+            let mut lanes = vec![[[0.0f32; BLOCK]; 6]; bx];
+            let (from, to) = ([row % by, row / by].map(|b| b * BLOCK), [ny, pair.shape[2]]);
+            for k in from[1]..(from[1] + BLOCK).min(to[1]) {
+                for j in from[0]..(from[0] + BLOCK).min(to[0]) {
+                    let span = pair.spans.row(j, k);
+                    if span.is_empty() {
+                        continue;
                     }
+                    let at = nx * (j + ny * k);
+                    dispatch(#[inline(always)] || {
+                        for b in span.start / BLOCK..span.end.div_ceil(BLOCK) {
+                            let part = at + b * BLOCK..at + ((b + 1) * BLOCK).min(nx);
+                            let (mut f, mut w, mut m) = ([0.0f32; BLOCK], [f32::NAN; BLOCK], [0u8; BLOCK]);
+                            f[..part.len()].copy_from_slice(&pair.fixed_smooth[part.clone()]);
+                            w[..part.len()].copy_from_slice(&warped[part.clone()]);
+                            m[..part.len()].copy_from_slice(&pair.mask[part]);
+                            add_columns(&mut lanes[b], &f, &w, &m, centre);
+                        }
+                    });
                 }
+            }
+            for (s, lanes) in sums.iter_mut().zip(&lanes) {
+                *s = lanes.map(|l| l.iter().map(|v| f64::from(*v)).sum());
             }
         });
         let total = sums.iter().fold([0.0; 6], add);
-        let global = gain(&total, f64::from(noise), [1.0, 0.0]);
+        let centre = centre.map(f64::from);
+        let global = gain(&total, f64::from(pair.noise), centre, [1.0, 0.0]);
         let smooth = smooth(&sums, blocks);
-        let values = smooth.iter().map(|s| gain(s, f64::from(noise), global).map(|v| v as f32)).collect();
+        let values = smooth.iter().map(|s| gain(s, f64::from(pair.noise), centre, global).map(|v| v as f32)).collect();
         Self { blocks, values }
     }
 
@@ -98,6 +107,21 @@ impl GainField {
     }
 }
 
+/// Adds one row of a block: a voxel counts where the mask is set and the warp saw it.
+#[inline(always)]
+fn add_columns(lanes: &mut [[f32; BLOCK]; 6], f: &[f32; BLOCK], w: &[f32; BLOCK], m: &[u8; BLOCK], centre: [f32; 2]) {
+    for l in 0..BLOCK {
+        let good = m[l] != 0 && (f[l] + w[l]).is_finite();
+        let (one, f, w) = if good { (1.0, f[l] - centre[0], w[l] - centre[1]) } else { (0.0, 0.0, 0.0) };
+        lanes[0][l] += one;
+        lanes[1][l] += f;
+        lanes[2][l] += w;
+        lanes[3][l] += f * f;
+        lanes[4][l] += w * w;
+        lanes[5][l] += f * w;
+    }
+}
+
 fn add(mut a: Sums, b: &Sums) -> Sums {
     for (a, b) in a.iter_mut().zip(b) {
         *a += b;
@@ -127,7 +151,7 @@ fn smooth(sums: &[Sums], blocks: [usize; 3]) -> Vec<Sums> {
 
 /// Gain and offset from sums; where there is too little (few voxels, hardly more spread than noise) the `fallback`
 /// gain with the local mean.
-fn gain(s: &Sums, noise: f64, fallback: [f64; 2]) -> [f64; 2] {
+fn gain(s: &Sums, noise: f64, centre: [f64; 2], fallback: [f64; 2]) -> [f64; 2] {
     let n = s[0];
     if n < 16.0 {
         return fallback;
@@ -139,5 +163,5 @@ fn gain(s: &Sums, noise: f64, fallback: [f64; 2]) -> [f64; 2] {
     // A clear negative correlation means inverted contrast; anything else is taken as the same contrast.
     let sign = if cov < -0.5 * (vf * vw).sqrt() { -1.0 } else { 1.0 };
     let g = if strong { sign * ((vf + floor) / (vw + floor)).sqrt().clamp(0.1, 10.0) } else { fallback[0] };
-    [g, f - g * w]
+    [g, f + centre[0] - g * (w + centre[1])]
 }

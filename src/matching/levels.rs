@@ -1,9 +1,9 @@
 //! The coarse-to-fine pyramid: both volumes on one lattice at several voxel sizes.
 
 use crate::error::{FieldError, SpaceError};
-use crate::matching::pair::Pair;
+use crate::matching::pair::{Pair, Spans};
 use crate::numerics::sampling::{Interpolation, Sampler};
-use crate::numerics::statistics::quantile;
+use crate::numerics::statistics::{noise_sigma, quantile};
 use crate::numerics::{filters, pyramid};
 use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint};
 use rayon::prelude::*;
@@ -66,23 +66,29 @@ impl Aligned {
     pub fn level(&self, factor: [usize; 3]) -> Pair {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
-        let mask = if factor == [1; 3] {
-            self.mask.clone()
-        } else {
-            let inside: Vec<f32> = self.mask.iter().map(|&m| f32::from(m != 0)).collect();
-            pyramid::reduce(&inside, self.shape, factor).iter().map(|&v| u8::from(v >= 0.5)).collect()
-        };
+        let mask = pyramid::reduce_mask(&self.mask, self.shape, factor);
+        let moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
         Pair {
             shape,
+            centres: [mean(&fixed), mean(&moving)],
+            spans: Spans::new(&mask, shape),
+            noise: noise_sigma(&fixed, shape, |i| mask[i] != 0),
             spacing: std::array::from_fn(|a| self.spacing[a] * factor[a] as f64),
             fixed_smooth: filters::bspline(&fixed, shape),
             fixed,
             mask,
             moving_shape: pyramid::reduced_shape(self.moving_shape, factor),
             moving_origin: std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64),
-            moving: pyramid::reduce(&self.moving, self.moving_shape, factor),
+            moving,
         }
     }
+}
+
+/// Mean of the finite values among at most about 100,000.
+fn mean(values: &[f32]) -> f32 {
+    let sample = values.iter().step_by((values.len() / 100_000).max(1)).filter(|v| v.is_finite());
+    let (sum, n) = sample.fold((0.0, 0usize), |(s, n), v| (s + f64::from(*v), n + 1));
+    (sum / n.max(1) as f64) as f32
 }
 
 /// Position on a level of `factor` of a full-resolution voxel position.

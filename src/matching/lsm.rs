@@ -5,6 +5,7 @@
 //! is built once; what gain and offset explain as well is taken from it, so a mere ramp has no information. The patch is not warped here: the deformed volume is handed in already warped by the field known so
 //! far, so only the rest of the motion is sought.
 
+use crate::numerics::simd::{self, dispatch};
 use crate::numerics::small::{Symmetric3, inverse, multiply};
 
 /// Noise of neighbouring voxels after the cubic B-spline is alike; a patch holds that many times fewer independent
@@ -37,48 +38,44 @@ pub struct Template<'a> {
     pub noise: f64,
 }
 
-/// Refines the match of the patch around voxel `centre`. `sample(offset)` gives the deformed volume at
-/// `centre + offset` (voxels) shifted by the start; it must be smoothed alike and NaN outside.
+impl Template<'_> {
+    /// Patch radius, none along a side of one voxel.
+    fn reach(&self) -> [usize; 3] {
+        std::array::from_fn(|a| if self.shape[a] == 1 { 0 } else { self.radius[a] })
+    }
+}
+
+/// What [`refine`] needs of the deformed volume, from its value at single places: `sample(offset)` with the offset from the
+/// patch's centre (voxels).
+pub fn pointwise(radius: [usize; 3], sample: impl Fn([f32; 3]) -> f32) -> impl Fn([f32; 3], &mut [f32]) {
+    let width = radius.map(|r| 2 * r + 1);
+    move |shift, out| {
+        for (n, o) in out.iter_mut().enumerate() {
+            let at = [n % width[0], n / width[0] % width[1], n / (width[0] * width[1])];
+            *o = sample(std::array::from_fn(|a| at[a] as f32 - radius[a] as f32 + shift[a]));
+        }
+    }
+}
+
+/// Refines the match of the patch around voxel `centre`. `patch(shift, out)` gives the deformed volume over the patch (x
+/// fastest), `shift` voxels beside the start; it must be smoothed alike and NaN outside.
 ///
 /// None where the patch leaves a volume, has no texture in some direction, or the step leaves `limit` voxels.
 pub fn refine(
     template: &Template<'_>,
     centre: [usize; 3],
-    sample: impl Fn([f32; 3]) -> f32,
+    patch: impl Fn([f32; 3], &mut [f32]),
     steps: usize,
     limit: f64,
 ) -> Option<Refined> {
-    let Template { data, shape, spacing, radius, noise } = *template;
-    let margin = |a: usize| if shape[a] == 1 { 0 } else { radius[a] + 1 };
+    let Template { shape, spacing, noise, .. } = *template;
+    let margin = |a: usize| if shape[a] == 1 { 0 } else { template.radius[a] + 1 };
     if (0..3).any(|a| centre[a] < margin(a) || centre[a] + margin(a) >= shape[a]) {
         return None;
     }
-    let radius: [usize; 3] = std::array::from_fn(|a| if shape[a] == 1 { 0 } else { radius[a] });
-    let stride = [1, shape[0], shape[0] * shape[1]];
-    let count = radius.iter().map(|r| 2 * r + 1).product::<usize>();
-    let (mut f, mut g) = (Vec::with_capacity(count), Vec::with_capacity(count));
-    let mut offsets = Vec::with_capacity(count);
-    let span = |a: usize| -(radius[a] as i32)..=radius[a] as i32;
-    for dz in span(2) {
-        for dy in span(1) {
-            for dx in span(0) {
-                let o = [dx, dy, dz];
-                let at = (0..3).fold(0usize, |s, a| s + stride[a] * (centre[a] as i32 + o[a]) as usize);
-                let d: [f64; 3] = std::array::from_fn(|a| {
-                    if shape[a] == 1 {
-                        0.0
-                    } else {
-                        f64::from(data[at + stride[a]] - data[at - stride[a]]) / (2.0 * spacing[a])
-                    }
-                });
-                f.push(data[at]);
-                g.push(d);
-                offsets.push(o.map(|v| v as f32));
-            }
-        }
-    }
-    let (mf, sf) = moments(&f);
-    let mut h = without_gain_and_offset(&f, &mut g, mf, sf);
+    let (f, g, sf) = prepare(template, centre);
+    let count = f.len();
+    let mut h: Symmetric3 = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|(a, b)| dot(&g[a], &g[b]));
     let flat: Vec<usize> = (0..3).filter(|&a| shape[a] == 1).collect();
     for &a in &flat {
         h[a] = h[0] + h[1] + h[2];
@@ -89,31 +86,20 @@ pub fn refine(
     let mut spread = 0.0;
     let mut ncc = 0.0;
     for step in 0..=steps {
-        let voxels: [f32; 3] = std::array::from_fn(|a| (shift[a] / spacing[a]) as f32);
-        for (w, o) in w.iter_mut().zip(&offsets) {
-            *w = sample(std::array::from_fn(|a| o[a] + voxels[a]));
-        }
-        let (mw, sw) = moments(&w);
+        patch(std::array::from_fn(|a| (shift[a] / spacing[a]) as f32), &mut w);
+        let sw = centred(&mut w);
         if !(sw > 0.0 && sf > 0.0 && sw.is_finite()) {
             return None;
         }
-        let gain = sf / sw;
-        let (mut b, mut rr, mut fw) = ([0.0f64; 3], 0.0, 0.0);
-        for ((f, w), g) in f.iter().zip(&w).zip(&g) {
-            let (f, w) = (f64::from(*f) - mf, f64::from(*w) - mw);
-            let r = f - gain * w;
-            rr += r * r;
-            fw += f * w;
-            for a in 0..3 {
-                b[a] += g[a] * r;
-            }
-        }
-        spread = rr / count as f64;
-        ncc = (fw / (count as f64 * sf * sw)) as f32;
+        ncc = (dot(&f, &w) / (count as f64 * sf * sw)) as f32;
+        let gain = (sf / sw) as f32;
+        // From here on the residual.
+        w.iter_mut().zip(&f).for_each(|(w, f)| *w = f - gain * *w);
+        spread = dot(&w, &w) / count as f64;
         if step == steps {
             break;
         }
-        let d = multiply(&hi, b);
+        let d = multiply(&hi, [0, 1, 2].map(|a| dot(&g[a], &w)));
         for a in 0..3 {
             shift[a] += d[a];
             if shape[a] > 1 && shift[a].abs() > limit * spacing[a] {
@@ -133,32 +119,53 @@ pub fn refine(
     (ncc.is_finite() && covariance.iter().all(|v| v.is_finite())).then_some(Refined { shift, covariance, ncc })
 }
 
-/// Takes from the gradients what a change of offset (their mean) or of gain (their part along the patch) explains as
-/// well, and returns the matrix of their products: the information with both unknown (Schur complement).
-fn without_gain_and_offset(f: &[f32], g: &mut [[f64; 3]], mean: f64, deviation: f64) -> Symmetric3 {
-    let n = f.len() as f64;
-    let (mut gm, mut fg) = ([0.0; 3], [0.0; 3]);
-    for (f, g) in f.iter().zip(&*g) {
-        for a in 0..3 {
-            gm[a] += g[a] / n;
-            fg[a] += g[a] * (f64::from(*f) - mean) / (n * deviation * deviation);
+/// The patch less its mean, its gradients (per mm) less what a change of offset (their mean) or of gain (their part along
+/// the patch) explains as well, so that their products are the information with both unknown (Schur complement), and
+/// the patch's standard deviation.
+fn prepare(template: &Template<'_>, centre: [usize; 3]) -> (Vec<f32>, [Vec<f32>; 3], f64) {
+    let Template { data, shape, spacing, .. } = *template;
+    let radius = template.reach();
+    let width = radius.map(|r| 2 * r + 1);
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let count = width.iter().product();
+    let mut f = vec![0.0f32; count];
+    let mut g: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0f32; count]);
+    let first = (0..3).map(|a| stride[a] * (centre[a] - radius[a])).sum::<usize>();
+    for row in 0..width[1] * width[2] {
+        let from = first + stride[1] * (row % width[1]) + stride[2] * (row / width[1]);
+        let to = row * width[0]..(row + 1) * width[0];
+        f[to.clone()].copy_from_slice(&data[from..from + width[0]]);
+        for a in (0..3).filter(|&a| shape[a] > 1) {
+            let scale = (0.5 / spacing[a]) as f32;
+            let (lo, hi) = (&data[from - stride[a]..][..width[0]], &data[from + stride[a]..][..width[0]]);
+            for ((g, l), h) in g[a][to.clone()].iter_mut().zip(lo).zip(hi) {
+                *g = scale * (h - l);
+            }
         }
     }
-    let mut h = [0.0; 6];
-    for (f, g) in f.iter().zip(g) {
-        let [x, y, z] = std::array::from_fn(|a| g[a] - gm[a] - fg[a] * (f64::from(*f) - mean));
-        *g = [x, y, z];
-        for (h, v) in h.iter_mut().zip([x * x, y * y, z * z, x * y, x * z, y * z]) {
-            *h += v;
+    let sf = centred(&mut f);
+    for g in &mut g {
+        centred(g);
+        let along = (dot(g, &f) / (count as f64 * sf * sf)) as f32;
+        if along.is_finite() {
+            g.iter_mut().zip(&f).for_each(|(g, f)| *g -= along * f);
         }
     }
-    h
+    (f, g, sf)
 }
 
-/// Mean and standard deviation.
-fn moments(v: &[f32]) -> (f64, f64) {
-    let n = v.len() as f64;
-    let mean = v.iter().map(|x| f64::from(*x)).sum::<f64>() / n;
-    let variance = v.iter().map(|x| (f64::from(*x) - mean).powi(2)).sum::<f64>() / n;
-    (mean, variance.sqrt())
+/// Takes off the mean and gives the standard deviation back.
+fn centred(v: &mut [f32]) -> f64 {
+    // About the first value, so that a large offset does not cost precision.
+    let (first, n) = (v[0], v.len() as f64);
+    let mean = dispatch(#[inline(always)] || {
+        v.iter_mut().for_each(|x| *x -= first);
+        (f64::from(simd::sum(v)) / n) as f32
+    });
+    dispatch(#[inline(always)] || v.iter_mut().for_each(|x| *x -= mean));
+    (dot(v, v) / n).sqrt()
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    f64::from(dispatch(#[inline(always)] || simd::dot(a, b)))
 }

@@ -3,6 +3,7 @@
 use crate::numerics::bspline::{Lattice, SmoothSampler};
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// An initial and a deformed volume whose voxels have the same axes and size; the second may start elsewhere.
 #[derive(Debug, Clone)]
@@ -17,6 +18,12 @@ pub struct Pair {
     pub fixed_smooth: Vec<f32>,
     /// Where matches are wanted (not 0), on the initial lattice.
     pub mask: Vec<u8>,
+    /// The mask's extent in each row.
+    pub spans: Spans,
+    /// Standard deviation of the initial volume's noise inside the mask (intensity).
+    pub noise: f32,
+    /// About the mean of each volume (intensity), taken off before squares are summed.
+    pub centres: [f32; 2],
     /// Voxels of the deformed volume.
     pub moving_shape: [usize; 3],
     /// Initial-lattice position of the deformed volume's first voxel (voxels).
@@ -37,44 +44,33 @@ impl Pair {
         SmoothSampler { data: &self.moving, shape: self.moving_shape }
     }
 
-    /// Whether any voxel of row `(j, k)` is inside the mask.
-    #[inline(always)]
-    pub fn row_in_mask(&self, j: usize, k: usize) -> bool {
-        let from = self.shape[0] * (j + self.shape[1] * k);
-        self.mask[from..from + self.shape[0]].iter().any(|&m| m != 0)
-    }
-
-    /// The deformed volume sampled at `x + u(x)`: smoothed like `fixed_smooth`, NaN where it was not seen and where
-    /// `active` is 0. `coefficients` are mm along the lattice's axes.
-    pub fn warp(&self, lattice: &Lattice, coefficients: &[f32], active: &[u8]) -> Vec<f32> {
+    /// The deformed volume sampled at `x + u(x)`: smoothed like `fixed_smooth`, NaN where it was not seen and outside
+    /// `spans`. `coefficients` are mm along the lattice's axes.
+    pub fn warp(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans) -> Vec<f32> {
         let [nx, ny, _] = self.shape;
         let mut out = vec![f32::NAN; self.fixed.len()];
         let sampler = self.sampler();
         let scale: [f32; 3] = std::array::from_fn(|a| (1.0 / self.spacing[a]) as f32);
         let origin = self.moving_origin.map(|o| o as f32);
         out.par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
+            if (0..ny).all(|j| spans.row(j, k).is_empty()) {
+                return;
+            }
             let slice = lattice.slice(coefficients, k);
             let mut nodes = vec![0.0; lattice.nodes[0]];
             let mut d: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
             for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                let from = nx * (j + ny * k);
-                let active = &active[from..from + nx];
-                if active.iter().all(|&m| m == 0) {
+                let span = spans.row(j, k);
+                if span.is_empty() {
                     continue;
                 }
-                dispatch(|| {
+                dispatch(#[inline(always)] || {
                     for (c, d) in d.iter_mut().enumerate() {
                         lattice.row(&slice, c, j, &mut nodes, d);
                     }
-                    for i in 0..nx {
-                        if active[i] != 0 {
-                            row[i] = sampler.at([
-                                i as f32 + d[0][i] * scale[0] - origin[0],
-                                j as f32 + d[1][i] * scale[1] - origin[1],
-                                k as f32 + d[2][i] * scale[2] - origin[2],
-                            ]);
-                        }
-                    }
+                    let start = [span.start as f32, j as f32, k as f32];
+                    let d: [&[f32]; 3] = std::array::from_fn(|a| &d[a][span.clone()]);
+                    sampler.row(start, d, scale, origin, &mut row[span.clone()]);
                 });
             }
         });
@@ -82,21 +78,90 @@ impl Pair {
     }
 }
 
+/// One run of voxels along each row of a volume, wide enough for all that matters there.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Spans {
+    rows: Vec<[u32; 2]>,
+    shape: [usize; 3],
+}
+
+impl Spans {
+    /// From the first to the last voxel of each row inside the mask.
+    pub fn new(mask: &[u8], shape: [usize; 3]) -> Self {
+        let span = |row: &[u8]| match row.iter().position(|&m| m != 0) {
+            Some(first) => [first as u32, (row.len() - row.iter().rev().take_while(|&&m| m == 0).count()) as u32],
+            None => [0, 0],
+        };
+        Self { rows: mask.par_chunks(shape[0]).map(span).collect(), shape }
+    }
+
+    /// The voxels of row `(j, k)`.
+    #[inline(always)]
+    pub fn row(&self, j: usize, k: usize) -> Range<usize> {
+        let [from, to] = self.rows[j + self.shape[1] * k];
+        from as usize..to as usize
+    }
+
+    /// Grown by `radius` voxels along each axis (the box around each voxel).
+    pub fn grown(&self, radius: usize) -> Self {
+        let [nx, ny, nz] = self.shape;
+        let join = |from: &[[u32; 2]], rows: &mut dyn Iterator<Item = usize>| {
+            rows.map(|r| from[r]).filter(|r| r[0] < r[1]).reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]).unwrap_or([0, 0])
+        };
+        let near = |at: usize, n: usize| at.saturating_sub(radius)..(at + radius + 1).min(n);
+        let along_y: Vec<[u32; 2]> = (0..ny * nz)
+            .map(|row| {
+                let (j, k) = (row % ny, row / ny);
+                join(&self.rows, &mut near(j, ny).map(|j| j + ny * k))
+            })
+            .collect();
+        let rows = (0..ny * nz)
+            .map(|row| {
+                let (j, k) = (row % ny, row / ny);
+                let [from, to] = join(&along_y, &mut near(k, nz).map(|k| j + ny * k));
+                if from < to { [from.saturating_sub(radius as u32), (to + radius as u32).min(nx as u32)] } else { [0, 0] }
+            })
+            .collect();
+        Self { rows, shape: self.shape }
+    }
+
+    /// Only the slices `k` for which `keep(k)` holds.
+    pub fn slices(&self, keep: impl Fn(usize) -> bool) -> Self {
+        let ny = self.shape[1];
+        let rows = self.rows.iter().enumerate().map(|(row, &r)| if keep(row / ny) { r } else { [0, 0] }).collect();
+        Self { rows, shape: self.shape }
+    }
+}
+
 /// The mask grown by `radius` voxels along each axis in turn (a box).
 pub fn dilate(mask: &[u8], shape: [usize; 3], radius: usize) -> Vec<u8> {
-    let stride = [1, shape[0], shape[0] * shape[1]];
-    let mut out = mask.to_vec();
-    for a in 0..3 {
-        let source = out.clone();
-        let (n, s) = (shape[a], stride[a]);
-        out.par_chunks_mut(stride[2]).enumerate().for_each(|(k, out)| {
-            for (o, out) in out.iter_mut().enumerate() {
-                let index = o + k * stride[2];
-                let at = index / s % n;
-                let (lo, hi) = (at.saturating_sub(radius), (at + radius).min(n - 1));
-                *out = (lo..=hi).map(|p| source[index + p * s - at * s]).max().unwrap_or(0);
+    let [nx, ny, nz] = shape;
+    let plane = nx * ny;
+    let grow = |out: &mut [u8], other: &[u8]| {
+        for (o, v) in out.iter_mut().zip(other) {
+            *o = (*o).max(*v);
+        }
+    };
+    let mut flat = mask.to_vec();
+    flat.par_chunks_mut(plane).zip(mask.par_chunks(plane)).for_each(|(out, mask)| {
+        let mut wide = mask.to_vec();
+        for r in 1..=radius.min(nx - 1) {
+            for (wide, mask) in wide.chunks_exact_mut(nx).zip(mask.chunks_exact(nx)) {
+                grow(&mut wide[r..], mask);
+                grow(wide, &mask[r..]);
             }
-        });
-    }
+        }
+        out.copy_from_slice(&wide);
+        for r in (1..=radius.min(ny - 1)).map(|r| r * nx) {
+            grow(&mut out[r..], &wide);
+            grow(out, &wide[r..]);
+        }
+    });
+    let mut out = flat.clone();
+    out.par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
+        for other in (k.saturating_sub(radius)..(k + radius + 1).min(nz)).filter(|&o| o != k) {
+            grow(out, &flat[other * plane..(other + 1) * plane]);
+        }
+    });
     out
 }

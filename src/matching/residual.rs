@@ -9,7 +9,6 @@
 use crate::matching::gain::GainField;
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
-use crate::numerics::filters::gradient_rows;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
 use rayon::prelude::*;
@@ -26,8 +25,6 @@ pub struct NormalEquations {
     pub rhs: Vec<f32>,
     /// Robust standard deviation of the residual (intensity).
     pub sigma: f32,
-    /// Mean weighted squared residual over sigma^2.
-    pub misfit: f64,
 }
 
 /// Robust spread of `f - (a w + b)` over the mask (1.4826 MAD), from at most about 200,000 voxels.
@@ -39,7 +36,7 @@ pub fn residual_sigma(pair: &Pair, warped: &[f32], gain: &GainField) -> f32 {
     let mut r = Vec::new();
     for row in (0..rows).step_by(stride) {
         let (j, k) = (row % ny, row / ny);
-        if !pair.row_in_mask(j, k) {
+        if pair.spans.row(j, k).is_empty() {
             continue;
         }
         gain.row(j, k, &mut a, &mut b);
@@ -62,29 +59,43 @@ pub fn normal_equations(
     lattice: &Lattice,
     floor: f32,
 ) -> NormalEquations {
-    let nx = pair.shape[0];
+    let [nx, ny, nz] = pair.shape;
     let sigma = residual_sigma(pair, warped, gain).max(floor).max(f32::MIN_POSITIVE);
     let (inverse, cut) = (1.0 / sigma, 1.0 / (CAUCHY * sigma));
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
-    let sums = lattice.accumulate::<11>(|j, k, rows| {
-        if !pair.row_in_mask(j, k) {
-            return false;
+    // Differences over two voxels, over one at the border; none along a side of one voxel.
+    let ends = |at: usize, n: usize| (at.saturating_sub(1), (at + 1).min(n - 1));
+    let sums = lattice.accumulate::<9>(|j, k, rows| {
+        let mut span = pair.spans.row(j, k);
+        if nx > 1 {
+            span = span.start.max(1)..span.end.min(nx - 1);
         }
-        let mut g: [Vec<f32>; 8] = std::array::from_fn(|_| vec![0.0; nx]);
-        let [fx, fy, fz, wx, wy, wz, a, b] = &mut g;
-        dispatch(|| {
-            gradient_rows(&pair.fixed_smooth, pair.shape, j, k, [fx, fy, fz]);
-            gradient_rows(warped, pair.shape, j, k, [wx, wy, wz]);
-            gain.row(j, k, a, b);
-            let from = nx * (j + pair.shape[1] * k);
-            let (f, w, m) = (&pair.fixed_smooth[from..][..nx], &warped[from..][..nx], &pair.mask[from..][..nx]);
-            let [xx, yy, zz, xy, xz, yz, rx, ry, rz, rr, count] = rows;
-            for i in 0..nx {
-                let r = f[i] - (a[i] * w[i] + b[i]);
-                let gx = (fx[i] + a[i] * wx[i]) * per_mm[0];
-                let gy = (fy[i] + a[i] * wy[i]) * per_mm[1];
-                let gz = (fz[i] + a[i] * wz[i]) * per_mm[2];
-                let good = m[i] != 0 && (r + gx + gy + gz).is_finite();
+        if span.start >= span.end {
+            return 0..0;
+        }
+        let at = |j: usize, k: usize| nx * (j + ny * k) + span.start;
+        let (n, here) = (span.len(), at(j, k));
+        let ((j0, j1), (k0, k1)) = (ends(j, ny), ends(k, nz));
+        let x = if nx > 1 { (here - 1, here + 1) } else { (here, here) };
+        let sides = [x, (at(j0, k), at(j1, k)), (at(j, k0), at(j, k1))];
+        let scale = [0.5 * per_mm[0], per_mm[1] / (j1 - j0).max(1) as f32, per_mm[2] / (k1 - k0).max(1) as f32];
+        dispatch(#[inline(always)] || {
+            // The first two rows hold gain and offset until they are overwritten.
+            let [xx, yy, ..] = &mut *rows;
+            gain.row(j, k, xx, yy);
+            let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = rows.each_mut().map(|r| &mut r[span.clone()]);
+            let f = &pair.fixed_smooth[here..][..n];
+            let w = &warped[here..][..n];
+            let mask = &pair.mask[here..][..n];
+            let [[fx0, fx1], [fy0, fy1], [fz0, fz1]] = sides.map(|(l, r)| [l, r].map(|s| &pair.fixed_smooth[s..][..n]));
+            let [[wx0, wx1], [wy0, wy1], [wz0, wz1]] = sides.map(|(l, r)| [l, r].map(|s| &warped[s..][..n]));
+            for i in 0..n {
+                let (a, b) = (xx[i], yy[i]);
+                let r = f[i] - (a * w[i] + b);
+                let gx = scale[0] * (fx1[i] - fx0[i] + a * (wx1[i] - wx0[i]));
+                let gy = scale[1] * (fy1[i] - fy0[i] + a * (wy1[i] - wy0[i]));
+                let gz = scale[2] * (fz1[i] - fz0[i] + a * (wz1[i] - wz0[i]));
+                let good = mask[i] != 0 && (r + gx + gy + gz).is_finite();
                 let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
                 let t = r * cut;
                 let weight = inverse * inverse / (1.0 + t * t);
@@ -92,33 +103,29 @@ pub fn normal_equations(
                 (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
                 (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);
                 (rx[i], ry[i], rz[i]) = (hx * r, hy * r, hz * r);
-                rr[i] = weight * r * r;
-                count[i] = if good { 1.0 } else { 0.0 };
             }
         });
-        true
+        span
     });
     let n = lattice.len();
     let blocks = (0..n).map(|i| std::array::from_fn(|q| sums[q * n + i])).collect();
-    let total = |q: usize| sums[q * n..(q + 1) * n].iter().map(|v| f64::from(*v)).sum::<f64>();
-    let misfit = total(9) / total(10).max(1.0);
-    NormalEquations { blocks, rhs: sums[6 * n..9 * n].to_vec(), sigma, misfit }
+    NormalEquations { blocks, rhs: sums[6 * n..9 * n].to_vec(), sigma }
 }
 
 /// How much worse, in units of noise, the volumes agree under one warp than under another.
 ///
 /// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see, with Cauchy's cost
 /// `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread under the better warp `b`.
-pub fn excess(pair: &Pair, a: &[f32], b: &[f32], noise: f32) -> f64 {
+pub fn excess(pair: &Pair, a: &[f32], b: &[f32]) -> f64 {
     let nx = pair.shape[0];
-    let gains = [GainField::measure(pair, a, noise), GainField::measure(pair, b, noise)];
+    let gains = [GainField::measure(pair, a), GainField::measure(pair, b)];
     let sigma = residual_sigma(pair, b, &gains[1]).max(f32::MIN_POSITIVE);
     let cut = 1.0 / (CAUCHY * sigma);
     let rows: Vec<f64> = (0..pair.shape[1] * pair.shape[2])
         .into_par_iter()
         .map(|row| {
             let (j, k) = (row % pair.shape[1], row / pair.shape[1]);
-            if !pair.row_in_mask(j, k) {
+            if pair.spans.row(j, k).is_empty() {
                 return 0.0;
             }
             let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);

@@ -5,8 +5,9 @@
 
 use crate::numerics::random::Random;
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::{Symmetric3, inverse, multiply};
+use crate::numerics::small::inverse;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Second difference operators on a lattice of nodes.
 #[derive(Debug, Clone)]
@@ -55,53 +56,18 @@ impl Smoothness {
     /// `L` is a sum of products of the one-dimensional operators `B = D2^T D2` and `G = D1^T D1` (second and first
     /// differences), so a row of the result is a combination of 13 rows of `x` and one more filter along the row.
     pub fn apply(&self, x: &[f32], out: &mut [f32]) {
-        let [nx, ny, _] = self.nodes;
-        let plane = nx * ny;
-        let (b, g) = (self.second(), self.first());
-        let [bx, by, bz] = &b;
-        let [gx, gy, gz] = &g;
-        let h = self.step_mm;
-        let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
-        let (xy, xz, yz) = (pair(0, 1), pair(0, 2), pair(1, 2));
-        out.par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
-            let mut cross = vec![0.0f32; nx];
-            let row = |j: usize, k: usize| &x[nx * (j + ny * k)..][..nx];
-            dispatch(|| {
-                for (j, out) in out.chunks_exact_mut(nx).enumerate() {
-                    let (vy, vz) = (&by[j], &bz[k]);
-                    scale_row(vy[2] + vz[2] + yz * gy[j][1] * gz[k][1], row(j, k), out);
-                    scale_row(xy * gy[j][1] + xz * gz[k][1], row(j, k), &mut cross);
-                    for d in [0, 1, 3, 4] {
-                        if vy[d] != 0.0 {
-                            add_row(vy[d], row(j + d - 2, k), out);
-                        }
-                        if vz[d] != 0.0 {
-                            add_row(vz[d], row(j, k + d - 2), out);
-                        }
-                    }
-                    for d in [0, 2] {
-                        if gy[j][d] != 0.0 {
-                            add_row(yz * gy[j][d] * gz[k][1], row(j + d - 1, k), out);
-                            add_row(xy * gy[j][d], row(j + d - 1, k), &mut cross);
-                        }
-                        if gz[k][d] != 0.0 {
-                            add_row(yz * gy[j][1] * gz[k][d], row(j, k + d - 1), out);
-                            add_row(xz * gz[k][d], row(j, k + d - 1), &mut cross);
-                        }
-                        for e in [0, 2] {
-                            let w = yz * gy[j][d] * gz[k][e];
-                            if w != 0.0 {
-                                add_row(w, row(j + d - 1, k + e - 1), out);
-                            }
-                        }
-                    }
-                    banded(bx, row(j, k), out);
-                    banded(gx, &cross, out);
-                }
-            });
+        let bands = self.bands();
+        out.par_chunks_mut(self.nodes[0] * self.nodes[1]).enumerate().for_each(|(k, out)| {
+            let mut cross = vec![0.0f32; self.nodes[0]];
+            dispatch(#[inline(always)] || bands.plane(x, k, out, &mut cross));
         });
     }
 
+    fn bands(&self) -> Bands {
+        let h = self.step_mm;
+        let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
+        Bands { nodes: self.nodes, second: self.second(), first: self.first(), twist: [pair(0, 1), pair(0, 2), pair(1, 2)] }
+    }
     /// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
     fn second(&self) -> [Vec<[f32; 5]>; 3] {
         std::array::from_fn(|a| {
@@ -191,6 +157,56 @@ impl Smoothness {
     }
 }
 
+/// What [`Smoothness::apply`] needs, worked out once.
+struct Bands {
+    nodes: [usize; 3],
+    second: [Vec<[f32; 5]>; 3],
+    first: [Vec<[f32; 3]>; 3],
+    /// Weights of the mixed differences: xy, xz, yz.
+    twist: [f32; 3],
+}
+
+impl Bands {
+    /// Plane `k` of `L x`; `cross` is room for a row.
+    #[inline(always)]
+    fn plane(&self, x: &[f32], k: usize, out: &mut [f32], cross: &mut [f32]) {
+        let [nx, ny, _] = self.nodes;
+        let ([bx, by, bz], [gx, gy, gz], [xy, xz, yz]) = (&self.second, &self.first, self.twist);
+        let row = |j: usize, k: usize| &x[nx * (j + ny * k)..][..nx];
+        for (j, out) in out.chunks_exact_mut(nx).enumerate() {
+            let (vy, vz) = (&by[j], &bz[k]);
+            scale_row(vy[2] + vz[2] + yz * gy[j][1] * gz[k][1], row(j, k), out);
+            scale_row(xy * gy[j][1] + xz * gz[k][1], row(j, k), cross);
+            for d in [0, 1, 3, 4] {
+                if vy[d] != 0.0 {
+                    add_row(vy[d], row(j + d - 2, k), out);
+                }
+                if vz[d] != 0.0 {
+                    add_row(vz[d], row(j, k + d - 2), out);
+                }
+            }
+            for d in [0, 2] {
+                if gy[j][d] != 0.0 {
+                    add_row(yz * gy[j][d] * gz[k][1], row(j + d - 1, k), out);
+                    add_row(xy * gy[j][d], row(j + d - 1, k), cross);
+                }
+                if gz[k][d] != 0.0 {
+                    add_row(yz * gy[j][1] * gz[k][d], row(j, k + d - 1), out);
+                    add_row(xz * gz[k][d], row(j, k + d - 1), cross);
+                }
+                for e in [0, 2] {
+                    let w = yz * gy[j][d] * gz[k][e];
+                    if w != 0.0 {
+                        add_row(w, row(j + d - 1, k + e - 1), out);
+                    }
+                }
+            }
+            banded(bx, row(j, k), out);
+            banded(gx, cross, out);
+        }
+    }
+}
+
 /// `out = w row`.
 #[inline(always)]
 fn scale_row(w: f32, row: &[f32], out: &mut [f32]) {
@@ -267,77 +283,211 @@ pub fn solve(
     tolerance: f64,
     limit: usize,
 ) -> SolveReport {
+    let system = System::new(smoothness, lambda, blocks);
     let n = blocks.len();
-    let diagonal = smoothness.diagonal();
-    let preconditioner: Vec<Symmetric3> = blocks
-        .par_iter()
-        .zip(&diagonal)
-        .map(|(a, &l)| {
-            let mut m = a.map(f64::from);
-            let l = f64::from(lambda * l) + 1e-12;
-            for v in &mut m[..3] {
-                *v += l;
-            }
-            inverse(&m).unwrap_or([1.0 / m[0], 1.0 / m[1], 1.0 / m[2], 0.0, 0.0, 0.0])
-        })
-        .collect();
-    let operator = |x: &[f32], out: &mut [f32]| {
-        data(x, out);
-        let mut lx = vec![0.0f32; n];
-        for (x, out) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)) {
-            smoothness.apply(x, &mut lx);
-            for (o, l) in out.iter_mut().zip(&lx) {
-                *o += lambda * l;
-            }
-        }
-    };
-    let precondition = |r: &[f32], z: &mut [f32]| {
-        let (zx, rest) = z.split_at_mut(n);
-        let (zy, zz) = rest.split_at_mut(n);
-        for (i, m) in preconditioner.iter().enumerate() {
-            let v = multiply(m, [r[i], r[n + i], r[2 * n + i]].map(f64::from));
-            (zx[i], zy[i], zz[i]) = (v[0] as f32, v[1] as f32, v[2] as f32);
-        }
-    };
-    let dot = |a: &[f32], b: &[f32]| -> f64 {
-        // Chunked by length alone: the same sum whatever the number of threads.
-        let parts: Vec<f64> = a
-            .par_chunks(1 << 14)
-            .zip(b.par_chunks(1 << 14))
-            .map(|(a, b)| a.iter().zip(b).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum())
+    let mut values = vec![0.0f32; 3 * n];
+    system.iterate(b, x, tolerance, limit, |p, ap| {
+        data(p, &mut values);
+        system.apply(p, ap, Some(&values))
+    })
+}
+
+/// As [`solve`] for block-diagonal data: `D` is `blocks` itself.
+pub fn solve_blocks(
+    smoothness: &Smoothness,
+    lambda: f32,
+    blocks: &[[f32; 6]],
+    b: &[f32],
+    x: &mut [f32],
+    tolerance: f64,
+    limit: usize,
+) -> SolveReport {
+    let system = System::new(smoothness, lambda, blocks);
+    system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None))
+}
+
+/// The matrix `D + lambda L` with its preconditioner, in slabs of node planes.
+struct System {
+    bands: Bands,
+    lambda: f32,
+    /// Nodes of a plane.
+    plane: usize,
+    /// Diagonal blocks of `D`, planar: xx, yy, zz, xy, xz, yz.
+    blocks: Vec<f32>,
+    /// Inverse 3 x 3 diagonal blocks of the whole matrix, planar.
+    inverse: Vec<f32>,
+}
+
+impl System {
+    fn new(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]]) -> Self {
+        let n = blocks.len();
+        let diagonal = smoothness.diagonal();
+        let inverses: Vec<[f32; 6]> = blocks
+            .par_iter()
+            .zip(&diagonal)
+            .map(|(a, &l)| {
+                let mut m = a.map(f64::from);
+                let l = f64::from(lambda * l) + 1e-12;
+                for v in &mut m[..3] {
+                    *v += l;
+                }
+                inverse(&m).unwrap_or([1.0 / m[0], 1.0 / m[1], 1.0 / m[2], 0.0, 0.0, 0.0]).map(|v| v as f32)
+            })
             .collect();
-        parts.iter().sum()
-    };
-    let mut ap = vec![0.0f32; 3 * n];
-    operator(x, &mut ap);
-    let mut r: Vec<f32> = b.iter().zip(&ap).map(|(b, a)| b - a).collect();
-    let mut z = vec![0.0f32; 3 * n];
-    precondition(&r, &mut z);
-    let mut p = z.clone();
-    let mut rz = dot(&r, &z);
-    let first = rz;
-    let mut iterations = 0;
-    while iterations < limit && rz > tolerance * tolerance * first && rz > 0.0 {
-        operator(&p, &mut ap);
-        let curvature = dot(&p, &ap);
-        if !(curvature > 0.0 && curvature.is_finite()) {
-            break;
+        let planar = |rows: &[[f32; 6]]| -> Vec<f32> {
+            let mut out = vec![0.0; 6 * n];
+            for (q, out) in out.chunks_exact_mut(n).enumerate() {
+                out.iter_mut().zip(rows).for_each(|(o, r)| *o = r[q]);
+            }
+            out
+        };
+        Self {
+            bands: smoothness.bands(),
+            lambda,
+            plane: smoothness.nodes[0] * smoothness.nodes[1],
+            blocks: planar(blocks),
+            inverse: planar(&inverses),
         }
-        let alpha = (rz / curvature) as f32;
-        for ((x, r), (p, a)) in x.iter_mut().zip(&mut r).zip(p.iter().zip(&ap)) {
-            *x += alpha * p;
-            *r -= alpha * a;
-        }
-        precondition(&r, &mut z);
-        let next = dot(&r, &z);
-        let beta = (next / rz) as f32;
-        rz = next;
-        for (p, z) in p.iter_mut().zip(&z) {
-            *p = z + beta * *p;
-        }
-        iterations += 1;
     }
-    SolveReport { iterations, residual: if first > 0.0 { (rz / first).max(0.0).sqrt() } else { 0.0 } }
+
+    /// `out = (D + lambda L) x`, with `D x` given or from the blocks; returns `x . out`. Sums go plane by plane, so that
+    /// they are the same whatever the number of threads.
+    fn apply(&self, x: &[f32], out: &mut [f32], data: Option<&[f32]>) -> f64 {
+        let n = x.len() / 3;
+        let [x0, x1, x2] = thirds(x);
+        let parts = planes(out, self.plane).map(|(k, [o0, o1, o2])| {
+            let at = k * self.plane..(k + 1) * self.plane;
+            let mut cross = vec![0.0f32; self.bands.nodes[0]];
+            dispatch(#[inline(always)] || {
+                self.bands.plane(x0, k, o0, &mut cross);
+                self.bands.plane(x1, k, o1, &mut cross);
+                self.bands.plane(x2, k, o2, &mut cross);
+                let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
+                match data {
+                    Some(d) => {
+                        let [d0, d1, d2] = thirds(d).map(|d| &d[at.clone()]);
+                        for i in 0..x.len() {
+                            o0[i] = self.lambda * o0[i] + d0[i];
+                            o1[i] = self.lambda * o1[i] + d1[i];
+                            o2[i] = self.lambda * o2[i] + d2[i];
+                        }
+                    }
+                    None => {
+                        let [xx, yy, zz, xy, xz, yz] = sixths(&self.blocks, n, &at);
+                        for i in 0..x.len() {
+                            o0[i] = self.lambda * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
+                            o1[i] = self.lambda * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
+                            o2[i] = self.lambda * o2[i] + (xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i]);
+                        }
+                    }
+                }
+                dot(x, o0) + dot(y, o1) + dot(z, o2)
+            })
+        });
+        sum(parts.collect())
+    }
+
+    /// `z = M^-1 r` for one plane, and `r . z`.
+    #[inline(always)]
+    fn precondition(&self, k: usize, r: [&[f32]; 3], z: [&mut [f32]; 3]) -> f64 {
+        let n = self.inverse.len() / 6;
+        let [xx, yy, zz, xy, xz, yz] = sixths(&self.inverse, n, &(k * self.plane..(k + 1) * self.plane));
+        let ([r0, r1, r2], [z0, z1, z2]) = (r, z);
+        for i in 0..self.plane {
+            z0[i] = xx[i] * r0[i] + xy[i] * r1[i] + xz[i] * r2[i];
+            z1[i] = xy[i] * r0[i] + yy[i] * r1[i] + yz[i] * r2[i];
+            z2[i] = xz[i] * r0[i] + yz[i] * r1[i] + zz[i] * r2[i];
+        }
+        dot(r0, z0) + dot(r1, z1) + dot(r2, z2)
+    }
+
+    fn iterate(
+        &self,
+        b: &[f32],
+        x: &mut [f32],
+        tolerance: f64,
+        limit: usize,
+        mut operator: impl FnMut(&[f32], &mut [f32]) -> f64,
+    ) -> SolveReport {
+        let mut ap = vec![0.0f32; x.len()];
+        let mut r = b.to_vec();
+        if x.iter().any(|&v| v != 0.0) {
+            operator(x, &mut ap);
+            r.iter_mut().zip(&ap).for_each(|(r, a)| *r -= a);
+        }
+        let mut z = vec![0.0f32; x.len()];
+        let start = planes(&mut z, self.plane).map(|(k, z)| {
+            let at = k * self.plane..(k + 1) * self.plane;
+            dispatch(#[inline(always)] || self.precondition(k, thirds(&r).map(|r| &r[at.clone()]), z))
+        });
+        let mut rz = sum(start.collect());
+        let mut p = z.clone();
+        let first = rz;
+        let mut iterations = 0;
+        while iterations < limit && rz > tolerance * tolerance * first && rz > 0.0 {
+            let curvature = operator(&p, &mut ap);
+            if !(curvature > 0.0 && curvature.is_finite()) {
+                break;
+            }
+            let alpha = (rz / curvature) as f32;
+            let all = planes(x, self.plane).zip(planes(&mut r, self.plane)).zip(planes(&mut z, self.plane));
+            let parts = all.map(|(((k, x), (_, r)), (_, z))| {
+                let at = k * self.plane..(k + 1) * self.plane;
+                let (p, a) = (thirds(&p).map(|p| &p[at.clone()]), thirds(&ap).map(|a| &a[at.clone()]));
+                dispatch(#[inline(always)] || {
+                    let [r0, r1, r2] = r;
+                    for (((x, r), p), a) in x.into_iter().zip([&mut *r0, &mut *r1, &mut *r2]).zip(p).zip(a) {
+                        for i in 0..self.plane {
+                            x[i] += alpha * p[i];
+                            r[i] -= alpha * a[i];
+                        }
+                    }
+                    self.precondition(k, [r0, r1, r2], z)
+                })
+            });
+            let next = sum(parts.collect());
+            let beta = (next / rz) as f32;
+            rz = next;
+            dispatch(#[inline(always)] || {
+                for (p, z) in p.iter_mut().zip(&z) {
+                    *p = z + beta * *p;
+                }
+            });
+            iterations += 1;
+        }
+        SolveReport { iterations, residual: if first > 0.0 { (rz / first).max(0.0).sqrt() } else { 0.0 } }
+    }
+}
+
+/// The three components of a planar vector.
+fn thirds(v: &[f32]) -> [&[f32]; 3] {
+    let n = v.len() / 3;
+    [&v[..n], &v[n..2 * n], &v[2 * n..]]
+}
+
+/// Part `at` of six planar quantities of `n` values.
+#[inline(always)]
+fn sixths<'a>(v: &'a [f32], n: usize, at: &Range<usize>) -> [&'a [f32]; 6] {
+    std::array::from_fn(|q| &v[q * n + at.start..q * n + at.end])
+}
+
+/// The node planes of a planar vector with their index, to be filled in parallel.
+fn planes(v: &mut [f32], plane: usize) -> impl IndexedParallelIterator<Item = (usize, [&mut [f32]; 3])> {
+    let n = v.len() / 3;
+    let (x, rest) = v.split_at_mut(n);
+    let (y, z) = rest.split_at_mut(n);
+    let chunks = (x.par_chunks_mut(plane), y.par_chunks_mut(plane), z.par_chunks_mut(plane));
+    chunks.into_par_iter().enumerate().map(|(k, (x, y, z))| (k, [x, y, z]))
+}
+
+/// Sum of products in sixteen partial sums.
+#[inline(always)]
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    f64::from(crate::numerics::simd::dot(a, b))
+}
+
+fn sum(parts: Vec<f64>) -> f64 {
+    parts.iter().sum()
 }
 
 /// `D x` for block-diagonal data.

@@ -4,8 +4,10 @@
 //! and a field is evaluated row by row (Rueckert et al. 1999, eq. 3, here separable). A side of one voxel has one node
 //! and no variation. Coefficients are planar: all first components, then all second, then all third.
 
+use crate::numerics::cubic::{self, LANES, Places};
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// The four cubic B-spline weights at fraction `t` (0 to 1) between the second and the third node.
 #[inline(always)]
@@ -151,7 +153,7 @@ impl Lattice {
             volume.par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
                 let slice = self.slice(coefficients, k);
                 let mut nodes = vec![0.0; self.nodes[0]];
-                dispatch(|| {
+                dispatch(#[inline(always)] || {
                     for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
                         self.row(&slice, c, j, &mut nodes, row);
                     }
@@ -163,12 +165,12 @@ impl Lattice {
 
     /// The transpose of evaluation: sums `Q` quantities of every voxel, times each basis function, at the nodes.
     ///
-    /// `fill(j, k, rows)` writes the `Q` rows of row `(j, k)` and says whether any of them is not zero. The result has
-    /// `Q` planar quantities of [`Lattice::len`] values. Cells of the lattice along z run in parallel and are added in
-    /// a fixed order.
+    /// `fill(j, k, rows)` writes the `Q` quantities of row `(j, k)` into `rows` and returns the voxels it wrote; all others
+    /// count as zero. The result has `Q` planar quantities of [`Lattice::len`] values. Cells of the lattice along z run in
+    /// parallel and are added in a fixed order.
     pub fn accumulate<const Q: usize>(
         &self,
-        fill: impl Fn(usize, usize, &mut [Vec<f32>; Q]) -> bool + Sync,
+        fill: impl Fn(usize, usize, &mut [Vec<f32>; Q]) -> Range<usize> + Sync,
     ) -> Vec<f32> {
         let [nx, ny, nz] = self.shape;
         let [mx, my, mz] = self.nodes;
@@ -179,28 +181,32 @@ impl Lattice {
             .map(|cell| {
                 let mut slab = vec![0.0f32; taps_z * Q * plane];
                 let mut rows: [Vec<f32>; Q] = std::array::from_fn(|_| vec![0.0; nx]);
-                let mut nodes = vec![0.0f32; mx + 3];
                 let mut sums = vec![0.0f32; Q * plane];
+                // Voxel rows weighed for the node rows that act on them; each node row is reduced along x only once.
+                let mut ring: Vec<NodeRow> = (0..taps_y).map(|_| NodeRow::new(Q, nx)).collect();
+                let mut nodes = vec![0.0f32; mx + 3];
                 for k in cell * self.step[2]..((cell + 1) * self.step[2]).min(nz) {
                     sums.fill(0.0);
                     let mut any = false;
                     for j in 0..ny {
-                        if !fill(j, k, &mut rows) {
+                        let (first, w) = self.stencil(1, j);
+                        if j > 0 && j % self.step[1] == 0 && taps_y > 1 {
+                            self.flush::<Q>(&mut ring[(first - 1) % taps_y], first - 1, &mut nodes, &mut sums);
+                        }
+                        let span = fill(j, k, &mut rows);
+                        if span.is_empty() {
                             continue;
                         }
                         any = true;
-                        let (first, w) = self.stencil(1, j);
-                        dispatch(|| {
-                            for (q, row) in rows.iter().enumerate() {
-                                self.reduce_row(row, &mut nodes);
-                                for m in 0..taps_y {
-                                    let at = q * plane + (first + m) * mx;
-                                    for (s, v) in sums[at..at + mx].iter_mut().zip(&nodes) {
-                                        *s += w[m] * v;
-                                    }
-                                }
+                        dispatch(#[inline(always)] || {
+                            for m in 0..taps_y {
+                                ring[(first + m) % taps_y].add(w[m], &rows, span.clone());
                             }
                         });
+                    }
+                    for m in 0..taps_y {
+                        let node = self.stencil(1, ny - 1).0 + m;
+                        self.flush::<Q>(&mut ring[node % taps_y], node, &mut nodes, &mut sums);
                     }
                     if any {
                         let (_, w) = self.stencil(2, k);
@@ -231,25 +237,43 @@ impl Lattice {
         out
     }
 
-    /// Transpose of the interpolation along one row.
-    #[inline(always)]
-    fn reduce_row(&self, row: &[f32], nodes: &mut [f32]) {
-        nodes.fill(0.0);
-        if self.nodes[0] == 1 {
-            nodes[0] = row.iter().sum();
+    /// Reduces a node row along x, adds it to row `node` of each quantity's plane, and empties it.
+    fn flush<const Q: usize>(&self, row: &mut NodeRow, node: usize, nodes: &mut [f32], sums: &mut [f32]) {
+        let [mx, my, _] = self.nodes;
+        let span = std::mem::replace(&mut row.span, 0..0);
+        if span.is_empty() {
             return;
         }
-        for (cell, values) in row.chunks(self.step[0]).enumerate() {
-            let mut s = [0.0f32; 4];
-            for (v, w) in values.iter().zip(&self.phases[0]) {
-                for m in 0..4 {
-                    s[m] += w[m] * v;
+        // Whole cells only.
+        let step = self.step[0];
+        let cells = span.start / step..span.end.div_ceil(step);
+        dispatch(#[inline(always)] || {
+            for q in 0..Q {
+                let values = &mut row.values[q * self.shape[0]..(q + 1) * self.shape[0]];
+                let sums = &mut sums[(q * my + node) * mx..][..mx];
+                if self.nodes[0] == 1 {
+                    sums[0] += values[0];
+                } else {
+                    nodes.fill(0.0);
+                    for cell in cells.clone() {
+                        let values = &values[cell * step..((cell + 1) * step).min(self.shape[0])];
+                        let mut s = [0.0f32; 4];
+                        for (v, w) in values.iter().zip(&self.phases[0]) {
+                            for m in 0..4 {
+                                s[m] += w[m] * v;
+                            }
+                        }
+                        for (n, s) in nodes[cell..cell + 4].iter_mut().zip(s) {
+                            *n += s;
+                        }
+                    }
+                    for (s, v) in sums.iter_mut().zip(&*nodes) {
+                        *s += v;
+                    }
                 }
+                values[span.clone()].fill(0.0);
             }
-            for m in 0..4 {
-                nodes[cell + m] += s[m];
-            }
-        }
+        });
     }
 
     /// Coefficients whose field takes (nearly) the values of `f` at the nodes.
@@ -292,6 +316,30 @@ impl Lattice {
             }
         }
         out
+    }
+}
+
+/// `Q` quantities of the voxels of a row, weighed for one row of nodes.
+struct NodeRow {
+    values: Vec<f32>,
+    /// Where they are not zero.
+    span: Range<usize>,
+}
+
+impl NodeRow {
+    fn new(quantities: usize, nx: usize) -> Self {
+        Self { values: vec![0.0; quantities * nx], span: 0..0 }
+    }
+
+    #[inline(always)]
+    fn add<const Q: usize>(&mut self, weight: f32, rows: &[Vec<f32>; Q], span: Range<usize>) {
+        for (values, row) in self.values.chunks_exact_mut(rows[0].len()).zip(rows) {
+            for (v, r) in values[span.clone()].iter_mut().zip(&row[span.clone()]) {
+                *v += weight * r;
+            }
+        }
+        let own = &self.span;
+        self.span = if own.is_empty() { span } else { own.start.min(span.start)..own.end.max(span.end) };
     }
 }
 
@@ -348,6 +396,43 @@ impl SmoothSampler<'_> {
             }
         }
         sum[0] * wx[0] + sum[1] * wx[1] + sum[2] * wx[2] + sum[3] * wx[3]
+    }
+}
+
+impl SmoothSampler<'_> {
+    /// Samples a row of places `start + [l, 0, 0] + scale * d[l] - origin` (voxels), as [`SmoothSampler::at`] does.
+    #[inline(always)]
+    pub fn row(&self, start: [f32; 3], d: [&[f32]; 3], scale: [f32; 3], origin: [f32; 3], out: &mut [f32]) {
+        let mut places = Places::ORIGIN;
+        for (block, out) in out.chunks_mut(LANES).enumerate() {
+            let (from, count) = (block * LANES, out.len());
+            let mut at = [[0.0f32; LANES]; 3];
+            for a in 0..3 {
+                let mut v = [0.0f32; LANES];
+                v[..count].copy_from_slice(&d[a][from..from + count]);
+                for l in 0..LANES {
+                    let base = if a == 0 { start[0] + (from + l) as f32 } else { start[a] };
+                    at[a][l] = base + scale[a] * v[l] - origin[a];
+                }
+                places.set(a, &at[a]);
+            }
+            cubic::sample(self.data, self.shape, &places, count, out, |l| self.at([at[0][l], at[1][l], at[2][l]]));
+        }
+    }
+}
+
+impl SmoothSampler<'_> {
+    /// Samples the patch of `radius` about `centre` (voxels), x fastest, as [`SmoothSampler::at`] does.
+    pub fn patch(&self, centre: [f32; 3], radius: [usize; 3], out: &mut [f32]) {
+        let width: [usize; 3] = std::array::from_fn(|a| if self.shape[a] == 1 { 1 } else { 2 * radius[a] + 1 });
+        let still = vec![0.0; width[0]];
+        dispatch(#[inline(always)] || {
+            for (n, row) in out.chunks_exact_mut(width[0]).enumerate() {
+                let index = [0, n % width[1], n / width[1]];
+                let start = std::array::from_fn(|a| centre[a] + index[a] as f32 - (width[a] / 2) as f32);
+                self.row(start, [&still, &still, &still], [0.0; 3], [0.0; 3], row);
+            }
+        });
     }
 }
 

@@ -63,7 +63,7 @@ pub fn separable(data: &[f32], shape: [usize; 3], kernels: [&HalfKernel; 3]) -> 
     let plane = nx * ny;
     let mut out = vec![0.0f32; data.len()];
     out.par_chunks_mut(plane).zip(data.par_chunks(plane)).for_each(|(out, data)| {
-        dispatch(|| {
+        dispatch(#[inline(always)] || {
             let mut padded = Vec::new();
             let mut along_x = data.to_vec();
             if nx > 1 && kernels[0].len() > 1 {
@@ -86,7 +86,7 @@ pub fn separable(data: &[f32], shape: [usize; 3], kernels: [&HalfKernel; 3]) -> 
     let source = out;
     let mut out = vec![0.0f32; data.len()];
     out.par_chunks_mut(plane).enumerate().for_each(|(k, o)| {
-        dispatch(|| combine_rows(kernels[2], nz, k, |r| &source[r * plane..(r + 1) * plane], o));
+        dispatch(#[inline(always)] || combine_rows(kernels[2], nz, k, |r| &source[r * plane..(r + 1) * plane], o));
     });
     out
 }

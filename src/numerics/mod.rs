@@ -17,6 +17,7 @@ pub mod pyramid;
 pub mod small;
 
 pub mod bspline;
+pub mod cubic;
 
 pub mod bending;
 

@@ -11,6 +11,7 @@
 
 use crate::error::UnknownName;
 use crate::numerics::bspline;
+use crate::numerics::cubic::{self, LANES, Places};
 use crate::types::names::choose;
 use crate::types::{DenseField, Volume, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
@@ -139,6 +140,20 @@ impl<'a> Sampler<'a> {
             Interpolation::Nearest => self.values[voxel],
             Interpolation::Linear => Stencil::new(self.shape, p).of(&self.values) as f32,
             Interpolation::Cubic => self.cubic(p),
+        }
+    }
+
+    /// The values at the first `out.len()` (at most [`LANES`]) of some places (voxels), fast where they follow each other
+    /// along x.
+    #[inline(always)]
+    pub fn block(&self, p: &[[f64; LANES]; 3], out: &mut [f32]) {
+        let at = |l: usize| self.at(VoxelPoint([p[0][l], p[1][l], p[2][l]]));
+        if self.interpolation == Interpolation::Cubic {
+            let mut places = Places::ORIGIN;
+            (0..3).for_each(|a| places.set_f64(a, &p[a]));
+            cubic::sample(&self.values, self.shape, &places, out.len(), out, at);
+        } else {
+            out.iter_mut().enumerate().for_each(|(l, o)| *o = at(l));
         }
     }
 

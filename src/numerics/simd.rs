@@ -24,3 +24,16 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     }
     lanes.iter().sum::<f32>() + tail
 }
+
+/// Sum in 16 interleaved partial sums (a fixed order on every machine).
+#[inline(always)]
+pub fn sum(a: &[f32]) -> f32 {
+    let mut lanes = [0.0f32; 16];
+    let (blocks, rest) = a.as_chunks::<16>();
+    for x in blocks {
+        for l in 0..16 {
+            lanes[l] += x[l];
+        }
+    }
+    lanes.iter().sum::<f32>() + rest.iter().sum::<f32>()
+}

@@ -5,17 +5,20 @@ use crate::consistency::energy::{EnergyParams, Graph};
 use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{Measured, prune};
 use crate::consistency::relaxation::relax;
-use crate::features::{Corner, HarrisParams, response, spread};
+use crate::features::{Corner, HarrisParams, block_response, spread};
+use crate::matching::levels::from_level;
 use crate::matching::candidates::{CandidateParams, Side, candidates};
 use crate::matching::correlation::Searchable;
 use crate::matching::gain::GainField;
 use crate::matching::lsm::{self, Refined, Template};
-use crate::matching::pair::{Pair, dilate};
+use crate::matching::pair::Pair;
 use crate::matching::residual::{self, normal_equations};
 use crate::numerics::bending::Smoothness;
 use crate::numerics::bspline::Lattice;
+use crate::numerics::simd::dispatch;
+use crate::numerics::{filters, pyramid};
 use crate::numerics::small::{Symmetric3, inverse};
-use crate::numerics::statistics::{median, noise_sigma};
+use crate::numerics::statistics::median;
 use crate::types::{Counts, LevelReport};
 use rayon::prelude::*;
 
@@ -44,9 +47,8 @@ impl SplineField {
 
 /// The field under which the two volumes agree better.
 pub fn better(pair: &Pair, a: SplineField, b: SplineField) -> SplineField {
-    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
-    let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.mask);
-    if residual::excess(pair, &warp(&b), &warp(&a), noise) < 0.0 { b } else { a }
+    let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
+    if residual::excess(pair, &warp(&b), &warp(&a)) < 0.0 { b } else { a }
 }
 
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
@@ -84,15 +86,14 @@ const ITERATIONS: usize = 15;
 pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
     let energy = smoothness(&field.lattice, pair.spacing);
     let cell = cell_volume(&field.lattice, pair.spacing);
-    let active = dilate(&pair.mask, pair.shape, 1);
-    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
+    let active = pair.spans.grown(1);
     let weight = independent(pair);
     let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
     let mut before = field.coefficients.clone();
     for pass in 0..passes {
         let warped = pair.warp(&field.lattice, &field.coefficients, &active);
-        let gain = GainField::measure(pair, &warped, noise);
-        let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * noise);
+        let gain = GainField::measure(pair, &warped);
+        let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
         for v in equations.blocks.iter_mut().flatten().chain(&mut equations.rhs) {
             *v *= weight;
         }
@@ -128,16 +129,13 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
 /// The excess misfit of a map against the free field, from every fourth slice of a thick volume, with the information
 /// that correlated noise leaves.
 pub fn excess<'a>(pair: &'a Pair, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
-    let plane = pair.shape[0] * pair.shape[1];
     let every = if pair.shape.iter().all(|&n| n >= 48) { 4 } else { 1 };
-    let in_sample = |i: usize| i / plane % every == every / 2;
-    let active: Vec<u8> = pair.mask.iter().enumerate().map(|(i, &m)| if in_sample(i) { m } else { 0 }).collect();
-    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
+    let active = pair.spans.slices(|k| k % every == every / 2);
     let free = pair.warp(&field.lattice, &field.coefficients, &active);
     move |motion| {
         let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
         let warped = pair.warp(&field.lattice, &map, &active);
-        residual::excess(pair, &warped, &free, noise) * every as f64 * f64::from(independent(pair))
+        residual::excess(pair, &warped, &free) * every as f64 * f64::from(independent(pair))
     }
 }
 
@@ -187,29 +185,29 @@ pub fn matches(
     let spacing = pair.spacing;
     let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
     let radius: [usize; 3] = spacing.map(|s| ((params.patch as f64 * finest / s).round() as usize).max(1));
-    let noise = noise_sigma(&pair.fixed, pair.shape, |i| pair.mask[i] != 0);
-    let corners = |data: &[f32], shape: [usize; 3], mask: Option<&[u8]>, wanted: usize| {
-        // Many points wanted: a narrower window has more maxima.
-        let room = mask.map_or(data.len(), |m| m.iter().filter(|&&v| v != 0).count()) as f64 / wanted as f64;
-        let defaults = HarrisParams::default();
-        let integration_sigma = (room.cbrt() / 8.0).clamp(0.7, defaults.integration_sigma);
-        let r = response(data, shape, spacing, HarrisParams { integration_sigma, ..defaults });
-        // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
-        spread(&r, shape, spacing, mask, wanted, 0.002 * (f64::from(noise) / finest).powi(2) as f32)
-    };
-    let initial = corners(&pair.fixed, pair.shape, Some(&pair.mask), params.points);
-    let moving: Vec<f32> = pair.moving.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect();
-    let deformed = corners(&moving, pair.moving_shape, None, 5 * params.points);
-
-    // The deformed side: as it is, or warped by the known field with its features taken back through it.
-    let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &dilate(&pair.mask, pair.shape, radius[0] + 3)));
+    let noise = pair.noise;
+    let room = pair.mask.iter().filter(|&&m| m != 0).count() as f64 / params.points as f64;
+    // The deformed side: as it is, or warped by the known field, where both volumes' features share one frame.
+    let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &pair.spans.grown(radius[0] + 3)));
+    let smooth;
     let (data, shape, origin) = match &warped {
         Some(w) => (w.as_slice(), pair.shape, [0.0; 3]),
         None => (pair.moving.as_slice(), pair.moving_shape, pair.moving_origin),
     };
-    let places: Vec<[f64; 3]> = deformed.iter().filter_map(|c| back(pair, known, c)).collect();
+    let smooth_data = match &warped {
+        Some(w) => w.as_slice(),
+        None => {
+            smooth = filters::bspline(&pair.moving, pair.moving_shape);
+            smooth.as_slice()
+        }
+    };
+    let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, params.points);
+    let within = known.is_some().then_some(pair.mask.as_slice());
+    let deformed = corners(smooth_data, shape, spacing, within, noise, room, 5 * params.points);
+    let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
     let fixed = if known.is_some() { &pair.fixed_smooth } else { &pair.fixed };
-    let (here, there) = (Searchable::new(fixed, pair.shape, radius), Searchable::new(data, shape, radius));
+    let searchable = if known.is_some() { Searchable::near } else { Searchable::new };
+    let (here, there) = (searchable(fixed, pair.shape, radius), searchable(data, shape, radius));
     let starts: Vec<[f64; 3]> = initial.iter().map(|c| c.voxel).collect();
     let list = candidates(
         &Side { volume: &here, origin: [0.0; 3], features: &starts },
@@ -243,8 +241,14 @@ pub fn matches(
             let at: [f64; 3] = std::array::from_fn(|a| initial[i].centre[a] as f64 + voxels[a] - origin[a]);
             let place = |o: [f32; 3]| -> [f32; 3] { std::array::from_fn(|a| at[a] as f32 + o[a]) };
             let found = match &warped {
-                Some(w) => lsm::refine(&template, initial[i].centre, |o| trilinear(w, shape, place(o)), 3, 2.0),
-                None => lsm::refine(&template, initial[i].centre, |o| pair.sampler().at(place(o)), 6, 2.0),
+                Some(w) => {
+                    let patch = |shift, out: &mut [f32]| trilinear_patch(w, shape, place(shift), radius, out);
+                    lsm::refine(&template, initial[i].centre, patch, 3, 2.0)
+                }
+                None => {
+                    let patch = |shift, out: &mut [f32]| pair.sampler().patch(place(shift), radius, out);
+                    lsm::refine(&template, initial[i].centre, patch, 6, 2.0)
+                }
             }?;
             Some((i, start, found))
         })
@@ -334,17 +338,41 @@ fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
     inverse(&c)
 }
 
-/// A deformed feature's place in the frame that is searched: its own voxel, or the initial-lattice place that the known
-/// field takes there (fixed point of `x = q - u(x)`).
-fn back(pair: &Pair, known: Option<&SplineField>, corner: &Corner) -> Option<[f64; 3]> {
-    let Some(k) = known else { return Some(corner.voxel) };
-    let q: [f64; 3] = std::array::from_fn(|a| corner.voxel[a] + pair.moving_origin[a]);
-    let mut x = q;
-    for _ in 0..6 {
-        let u = k.lattice.at(&k.coefficients, x);
-        x = std::array::from_fn(|a| q[a] - u[a] / pair.spacing[a]);
+/// Voxels a point from which on corners are sought on blocks of two voxels.
+const BLOCKS: f64 = 100.0;
+
+/// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with more of it the structure tensor
+/// is worked out on blocks of two voxels, at an eighth of the cost; with less the window is narrower, which has more maxima.
+fn corners(
+    smooth: &[f32],
+    shape: [usize; 3],
+    spacing: [f64; 3],
+    mask: Option<&[u8]>,
+    noise: f32,
+    room: f64,
+    wanted: usize,
+) -> Vec<Corner> {
+    let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let widest = HarrisParams::default().integration_sigma;
+    let sigma = (room.cbrt() / 8.0).clamp(0.7, widest);
+    // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
+    let least = 0.002 * (f64::from(noise) / finest).powi(2) as f32;
+    let halved = |a: usize| room >= BLOCKS && shape[a] >= 24 && spacing[a] < 1.5 * finest;
+    let step: [usize; 3] = std::array::from_fn(|a| if halved(a) { 2 } else { 1 });
+    if step == [1; 3] {
+        let r = block_response(smooth, shape, spacing, sigma, step);
+        return spread(&r, shape, spacing, mask, wanted, least);
     }
-    (0..3).all(|a| x[a] >= 0.0 && x[a] <= (pair.shape[a] - 1) as f64).then_some(x)
+    let r = block_response(smooth, shape, spacing, sigma, step);
+    let blocks = pyramid::reduced_shape(shape, step);
+    let inside = mask.map(|m| pyramid::reduce_mask(m, shape, step));
+    let coarse = std::array::from_fn(|a| spacing[a] * step[a] as f64);
+    let mut found = spread(&r, blocks, coarse, inside.as_deref(), wanted, least);
+    for corner in &mut found {
+        corner.voxel = from_level(corner.voxel, step);
+        corner.centre = std::array::from_fn(|a| (corner.voxel[a].round().max(0.0) as usize).min(shape[a] - 1));
+    }
+    found
 }
 
 /// Couples the matches of a level into a spline field.
@@ -378,26 +406,36 @@ fn fit(
     SplineField { lattice, coefficients, lambda, blocks: Vec::new(), determined: 0.0 }
 }
 
-/// Trilinear sample; NaN outside.
-#[inline(always)]
-fn trilinear(data: &[f32], shape: [usize; 3], p: [f32; 3]) -> f32 {
-    let mut corner = [0usize; 3];
-    let mut t = [0.0f32; 3];
-    for a in 0..3 {
-        let last = (shape[a] - 1) as f32;
-        if !(p[a] >= 0.0 && p[a] <= last) {
-            return f32::NAN;
+/// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it leaves the volume.
+fn trilinear_patch(data: &[f32], shape: [usize; 3], centre: [f32; 3], radius: [usize; 3], out: &mut [f32]) {
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let (mut base, mut t, mut step) = (0usize, [0.0f32; 3], [0usize; 3]);
+    for a in (0..3).filter(|&a| shape[a] > 1) {
+        let floor = centre[a].floor();
+        let first = floor as i64 - radius[a] as i64;
+        if first < 0 || first + 2 * radius[a] as i64 + 2 > shape[a] as i64 {
+            out.fill(f32::NAN);
+            return;
         }
-        corner[a] = (p[a] as usize).min(shape[a].saturating_sub(2));
-        t[a] = p[a] - corner[a] as f32;
+        (t[a], step[a]) = (centre[a] - floor, stride[a]);
+        base += first as usize * stride[a];
     }
-    let step = [
-        usize::from(shape[0] > 1),
-        if shape[1] > 1 { shape[0] } else { 0 },
-        if shape[2] > 1 { shape[0] * shape[1] } else { 0 },
-    ];
-    let base = corner[0] + shape[0] * (corner[1] + shape[1] * corner[2]);
-    let line = |o: usize| data[o] + t[0] * (data[o + step[0]] - data[o]);
-    let face = |o: usize| line(o) + t[1] * (line(o + step[1]) - line(o));
-    face(base) + t[2] * (face(base + step[2]) - face(base))
+    let width: [usize; 3] = std::array::from_fn(|a| if shape[a] == 1 { 1 } else { 2 * radius[a] + 1 });
+    dispatch(#[inline(always)] || {
+        for (n, row) in out.chunks_exact_mut(width[0]).enumerate() {
+            let from = base + stride[1] * (n % width[1]) + stride[2] * (n / width[1]);
+            let line = |o: usize| &data[from + o..][..width[0]];
+            let corner = |y: usize, z: usize| [line(y + z), line(y + z + step[0])];
+            let [[a0, a1], [b0, b1]] = [corner(0, 0), corner(step[1], 0)];
+            let [[c0, c1], [d0, d1]] = [corner(0, step[2]), corner(step[1], step[2])];
+            for i in 0..width[0] {
+                let a = a0[i] + t[0] * (a1[i] - a0[i]);
+                let b = b0[i] + t[0] * (b1[i] - b0[i]);
+                let c = c0[i] + t[0] * (c1[i] - c0[i]);
+                let d = d0[i] + t[0] * (d1[i] - d0[i]);
+                let (low, high) = (a + t[1] * (b - a), c + t[1] * (d - c));
+                row[i] = low + t[2] * (high - low);
+            }
+        }
+    });
 }

@@ -1,0 +1,131 @@
+#!/usr/bin/env python3
+"""Run one registration tool on one pair and write its field: peers.py METHOD FIXED MOVING FIELD
+
+The field is NIfTI 5-D, intent 1007, LPS mm on the fixed grid. Two threads. Settings are the tools' own defaults or
+those their authors recommend; none was changed after its score was seen. Needs numpy, nibabel and the tool itself
+(pip: picsl_greedy, itk-elastix, SimpleITK, antspyx; Debian: plastimatch).
+"""
+import os
+import subprocess
+import sys
+import tempfile
+
+THREADS = "2"
+for name in ("OMP_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS"):
+    os.environ[name] = THREADS
+
+
+def save(vectors, reference, path):
+    """Writes LPS vectors (nx, ny, nz, 3) on the reference's grid."""
+    import nibabel as nib
+    import numpy as np
+
+    image = nib.Nifti1Image(np.asarray(vectors, np.float32)[:, :, :, None, :], nib.load(reference).affine)
+    image.header.set_intent(1007)
+    nib.save(image, path)
+
+
+def load(path):
+    """Vectors of a file that some tool wrote, as (nx, ny, nz, 3)."""
+    import nibabel as nib
+    import numpy as np
+
+    data = np.asarray(nib.load(path).dataobj, np.float32)
+    return data.reshape(*data.shape[:3], 3)
+
+
+def greedy(iterations, fixed, moving, out):
+    from picsl_greedy import Greedy3D
+
+    with tempfile.TemporaryDirectory() as folder:
+        warp = os.path.join(folder, "warp.nii.gz")
+        Greedy3D().execute(f"-i {fixed} {moving} -m NCC 2x2x2 -n {iterations} -threads {THREADS} -o {warp}")
+        save(load(warp), fixed, out)
+
+
+def elastix(settings, fixed, moving, out):
+    import itk
+    import numpy as np
+
+    parameters = itk.ParameterObject.New()
+    chosen = itk.ParameterObject.GetDefaultParameterMap("bspline", 4, 10.0 if not settings else 8.0)
+    for key, value in settings.items():
+        chosen[key] = value
+    parameters.AddParameterMap(chosen)
+    pair = [itk.imread(p, itk.F) for p in (fixed, moving)]
+    _, result = itk.elastix_registration_method(
+        *pair, parameter_object=parameters, number_of_threads=int(THREADS), log_to_console=False
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        field = itk.transformix_deformation_field(pair[1], result, output_directory=folder)
+    save(np.transpose(itk.array_from_image(field), (2, 1, 0, 3)), fixed, out)
+
+
+def plastimatch(_, fixed, moving, out):
+    stages = "\n".join(
+        "[STAGE]\nxform=bspline\noptim=lbfgsb\nimpl=plastimatch\nthreading=openmp\nmetric=mse\nconvergence_tol=3\n"
+        f"grad_tol=0.1\nregularization_lambda=0.01\nmax_its={its}\ngrid_spac={g} {g} {g}\nres={r} {r} {r}\n"
+        for its, g, r in ((50, 40, 4), (50, 20, 2), (30, 12, 1))
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        recipe, field = (os.path.join(folder, n) for n in ("p.txt", "field.nrrd"))
+        field = os.path.join(folder, "field.nii.gz")
+        with open(recipe, "w") as f:
+            f.write(f"[GLOBAL]\nfixed={fixed}\nmoving={moving}\nvf_out={field}\n{stages}")
+        subprocess.run(["plastimatch", "register", recipe], check=True, stdout=subprocess.DEVNULL)
+        save(load(field), fixed, out)
+
+
+def demons(_, fixed, moving, out):
+    import numpy as np
+    import SimpleITK as sitk
+
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(int(THREADS))
+    f, m = (sitk.ReadImage(p, sitk.sitkFloat32) for p in (fixed, moving))
+    m = sitk.HistogramMatching(m, f, numberOfHistogramLevels=256, numberOfMatchPoints=7, thresholdAtMeanIntensity=True)
+    field = None
+    for shrink in (4, 2, 1):
+        a, b = (sitk.Shrink(sitk.SmoothingRecursiveGaussian(v, 0.5 * shrink) if shrink > 1 else v, [shrink] * 3) for v in (f, m))
+        start = sitk.Resample(field, a) if field is not None else None
+        step = sitk.FastSymmetricForcesDemonsRegistrationFilter()
+        step.SetNumberOfIterations(20)
+        step.SetStandardDeviations(1.0)
+        field = step.Execute(a, b, start) if start is not None else step.Execute(a, b)
+        field = sitk.Cast(field, sitk.sitkVectorFloat64)
+    field = sitk.Resample(field, f)
+    save(np.transpose(sitk.GetArrayFromImage(field), (2, 1, 0, 3)), fixed, out)
+
+
+def ants(kind, fixed, moving, out):
+    import ants as antspy
+
+    os.environ["ANTS_RANDOM_SEED"] = "1"
+    pair = [antspy.image_read(p) for p in (fixed, moving)]
+    result = antspy.registration(*pair, kind)
+    warp = next(p for p in result["fwdtransforms"] if "Warp" in p)
+    save(load(warp), fixed, out)
+
+
+METHODS = {
+    "greedy half": (greedy, "100x50x0"),
+    "greedy full": (greedy, "100x50x10"),
+    "greedy long": (greedy, "100x100x50"),
+    "elastix": (elastix, {}),
+    "elastix finer": (
+        elastix,
+        {
+            "Metric": ["AdvancedNormalizedCorrelation", "TransformBendingEnergyPenalty"],
+            "MaximumNumberOfIterations": ["2000"],
+            "NumberOfSpatialSamples": ["4096"],
+        },
+    ),
+    "plastimatch": (plastimatch, None),
+    "demons": (demons, None),
+    "ANTs SyNQuick": (ants, "antsRegistrationSyNQuick[so]"),
+}
+
+if __name__ == "__main__":
+    if len(sys.argv) != 5 or sys.argv[1] not in METHODS:
+        sys.exit(f"usage: peers.py METHOD FIXED MOVING FIELD\nMETHOD is one of {', '.join(METHODS)}")
+    run, settings = METHODS[sys.argv[1]]
+    run(settings, *sys.argv[2:])
