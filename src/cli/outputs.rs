@@ -6,6 +6,7 @@ use palpate::io::{self, OutputFolder};
 use palpate::numerics::sampling::Interpolation;
 use palpate::report::{FieldReport, html, json};
 use palpate::types::{DenseField, FieldParams, FieldResult, Mask, Mesh, Metrics, Volume};
+use std::borrow::Cow;
 use std::time::Instant;
 
 /// Names of what [`write_field`] writes.
@@ -36,8 +37,8 @@ pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &
     let started = Instant::now();
     folder.write("displacement.nii.gz", |p| io::write_field(p, &result.displacement))?;
     folder.write("warped.nii.gz", |p| io::write_volume(p, &result.warped, "palpate: deformed at x + u(x)"))?;
-    folder.write("jacobian.nii.gz", |p| io::write_volume(p, &result.jacobian, "palpate: Jacobian determinant"))?;
-    folder.write("uncertainty.nii.gz", |p| io::write_volume(p, &result.uncertainty, "palpate: 1 sigma of u, mm"))?;
+    folder.write("jacobian.nii.gz", |p| io::write_steps(p, &result.jacobian, "palpate: Jacobian determinant", 13))?;
+    folder.write("uncertainty.nii.gz", |p| io::write_steps(p, &result.uncertainty, "palpate: 1 sigma of u, mm", 12))?;
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
     folder.write("mesh.vtu", |p| match &result.mesh {
         Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
@@ -46,7 +47,11 @@ pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &
     result.summary.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
 
     let Measured { command, names, initial, deformed, mask, params, truth } = *measured;
-    let still = warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0);
+    let still = if deformed.grid() == initial.grid() {
+        Cow::Borrowed(deformed)
+    } else {
+        Cow::Owned(warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0))
+    };
     let report = FieldReport {
         command,
         names,

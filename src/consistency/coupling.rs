@@ -44,18 +44,37 @@ pub fn step(
 /// The trace is estimated with one random sign vector (Hutchinson 1990), which is exact to about one part in the root
 /// of the number of nodes.
 pub fn determined(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], seed: u64, limit: usize) -> f64 {
-    let n = blocks.len();
-    let mut random = Random::new(seed, 77);
-    let z: Vec<f32> = (0..3 * n).map(|_| if random.bits() >> 63 == 0 { 1.0 } else { -1.0 }).collect();
-    let mut x = vec![0.0f32; 3 * n];
-    solve_blocks(smoothness, lambda, blocks, &z, &mut x, 1e-2, limit);
-    let mut lx = vec![0.0f32; n];
-    let mut trace = 0.0;
-    for (x, z) in x.chunks_exact(n).zip(z.chunks_exact(n)) {
-        smoothness.apply(x, &mut lx);
-        trace += lx.iter().zip(z).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+    Probe::new(blocks.len(), seed).determined(smoothness, lambda, blocks, limit)
+}
+
+/// The random sign vector of [`determined`] and its last solution, from which the next one starts: while a field settles, a
+/// few iterations a time suffice.
+#[derive(Debug, Clone)]
+pub struct Probe {
+    signs: Vec<f32>,
+    solution: Vec<f32>,
+}
+
+impl Probe {
+    /// For `nodes` nodes.
+    pub fn new(nodes: usize, seed: u64) -> Self {
+        let mut random = Random::new(seed, 77);
+        let signs = (0..3 * nodes).map(|_| if random.bits() >> 63 == 0 { 1.0 } else { -1.0 }).collect();
+        Self { signs, solution: vec![0.0; 3 * nodes] }
     }
-    3.0 * n as f64 - f64::from(lambda) * trace
+
+    /// See [`determined`]; at most `limit` more iterations.
+    pub fn determined(&mut self, smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], limit: usize) -> f64 {
+        let n = blocks.len();
+        solve_blocks(smoothness, lambda, blocks, &self.signs, &mut self.solution, 1e-2, limit);
+        let mut lx = vec![0.0f32; n];
+        let mut trace = 0.0;
+        for (x, z) in self.solution.chunks_exact(n).zip(self.signs.chunks_exact(n)) {
+            smoothness.apply(x, &mut lx);
+            trace += lx.iter().zip(z).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+        }
+        3.0 * n as f64 - f64::from(lambda) * trace
+    }
 }
 
 /// A measured displacement with its information, at a place of the lattice's grid.

@@ -73,26 +73,29 @@ pub fn block_response(
             let slices = (lo + k) * step[2]..((lo + k + 1) * step[2]).min(nz);
             for b in 0..blocks[1] {
                 let rows = b * step[1]..((b + 1) * step[1]).min(ny);
-                dispatch(#[inline(always)] || {
-                    sums.iter_mut().for_each(|s| s.fill(0.0));
-                    for (k, j) in slices.clone().flat_map(|k| rows.clone().map(move |j| (k, j))) {
-                        let [gx, gy, gz] = &mut g;
-                        gradient_rows(smooth, shape, j, k, [gx, gy, gz]);
-                        let [xx, yy, zz, xy, xz, yz] = sums.each_mut().map(|s| &mut s[..nx]);
-                        let (gx, gy, gz) = (&gx[..nx], &gy[..nx], &gz[..nx]);
-                        for i in 0..nx {
-                            let (x, y, z) = (gx[i] * per_mm[0], gy[i] * per_mm[1], gz[i] * per_mm[2]);
-                            let good = (x + y + z).is_finite();
-                            let (x, y, z) = if good { (x, y, z) } else { (0.0, 0.0, 0.0) };
-                            xx[i] += x * x;
-                            yy[i] += y * y;
-                            zz[i] += z * z;
-                            xy[i] += x * y;
-                            xz[i] += x * z;
-                            yz[i] += y * z;
+                dispatch(
+                    #[inline(always)]
+                    || {
+                        sums.iter_mut().for_each(|s| s.fill(0.0));
+                        for (k, j) in slices.clone().flat_map(|k| rows.clone().map(move |j| (k, j))) {
+                            let [gx, gy, gz] = &mut g;
+                            gradient_rows(smooth, shape, j, k, [gx, gy, gz]);
+                            let [xx, yy, zz, xy, xz, yz] = sums.each_mut().map(|s| &mut s[..nx]);
+                            let (gx, gy, gz) = (&gx[..nx], &gy[..nx], &gz[..nx]);
+                            for i in 0..nx {
+                                let (x, y, z) = (gx[i] * per_mm[0], gy[i] * per_mm[1], gz[i] * per_mm[2]);
+                                let good = (x + y + z).is_finite();
+                                let (x, y, z) = if good { (x, y, z) } else { (0.0, 0.0, 0.0) };
+                                xx[i] += x * x;
+                                yy[i] += y * y;
+                                zz[i] += z * z;
+                                xy[i] += x * y;
+                                xz[i] += x * z;
+                                yz[i] += y * z;
+                            }
                         }
-                    }
-                });
+                    },
+                );
                 let lines = (slices.len() * rows.len()) as f32;
                 for (out, sums) in out.iter_mut().zip(&sums) {
                     let out = &mut out[b * blocks[0]..(b + 1) * blocks[0]];
@@ -108,11 +111,14 @@ pub fn block_response(
         out[start * plane..end * plane].par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
             let at = skip + k * plane;
             let [xx, yy, zz, xy, xz, yz] = std::array::from_fn(|q| &m[q][at..at + plane]);
-            dispatch(#[inline(always)] || {
-                for (o, out) in out.iter_mut().enumerate() {
-                    *out = foerstner([xx[o], yy[o], zz[o], xy[o], xz[o], yz[o]], flat);
-                }
-            });
+            dispatch(
+                #[inline(always)]
+                || {
+                    for (o, out) in out.iter_mut().enumerate() {
+                        *out = foerstner([xx[o], yy[o], zz[o], xy[o], xz[o], yz[o]], flat);
+                    }
+                },
+            );
         });
     }
     out

@@ -20,22 +20,25 @@ pub fn jacobian_determinant(field: &DenseField) -> Volume {
     out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
         // g[c][a]: derivative of component c by voxel index along axis a.
         let mut g: [[Vec<f32>; 3]; 3] = std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; nx]));
-        dispatch(#[inline(always)] || {
-            for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                for (component, [x, y, z]) in components.iter().zip(&mut g) {
-                    gradient_rows(component, shape, j, k, [x, y, z]);
+        dispatch(
+            #[inline(always)]
+            || {
+                for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
+                    for (component, [x, y, z]) in components.iter().zip(&mut g) {
+                        gradient_rows(component, shape, j, k, [x, y, z]);
+                    }
+                    for (i, out) in row.iter_mut().enumerate() {
+                        let f = |c: usize, d: usize| {
+                            let own = if c == d { 1.0 } else { 0.0 };
+                            own + g[c][0][i] * inverse[0][d] + g[c][1][i] * inverse[1][d] + g[c][2][i] * inverse[2][d]
+                        };
+                        *out = f(0, 0) * (f(1, 1) * f(2, 2) - f(1, 2) * f(2, 1))
+                            - f(0, 1) * (f(1, 0) * f(2, 2) - f(1, 2) * f(2, 0))
+                            + f(0, 2) * (f(1, 0) * f(2, 1) - f(1, 1) * f(2, 0));
+                    }
                 }
-                for (i, out) in row.iter_mut().enumerate() {
-                    let f = |c: usize, d: usize| {
-                        let own = if c == d { 1.0 } else { 0.0 };
-                        own + g[c][0][i] * inverse[0][d] + g[c][1][i] * inverse[1][d] + g[c][2][i] * inverse[2][d]
-                    };
-                    *out = f(0, 0) * (f(1, 1) * f(2, 2) - f(1, 2) * f(2, 1))
-                        - f(0, 1) * (f(1, 0) * f(2, 2) - f(1, 2) * f(2, 0))
-                        + f(0, 2) * (f(1, 0) * f(2, 1) - f(1, 1) * f(2, 0));
-                }
-            }
-        });
+            },
+        );
     });
     out
 }

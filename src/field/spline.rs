@@ -22,18 +22,21 @@ pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField
         let slice = lattice.slice(coefficients, k);
         let mut nodes = vec![0.0; lattice.nodes[0]];
         let mut d: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
-        dispatch(#[inline(always)] || {
-            for j in 0..ny {
-                for (c, d) in d.iter_mut().enumerate() {
-                    lattice.row(&slice, c, j, &mut nodes, d);
+        dispatch(
+            #[inline(always)]
+            || {
+                for j in 0..ny {
+                    for (c, d) in d.iter_mut().enumerate() {
+                        lattice.row(&slice, c, j, &mut nodes, d);
+                    }
+                    for i in 0..nx {
+                        let v = [d[0][i], d[1][i], d[2][i]];
+                        let world = |r: usize| axes[r][0] * v[0] + axes[r][1] * v[1] + axes[r][2] * v[2];
+                        (x[j * nx + i], y[j * nx + i], z[j * nx + i]) = (world(0), world(1), world(2));
+                    }
                 }
-                for i in 0..nx {
-                    let v = [d[0][i], d[1][i], d[2][i]];
-                    let world = |r: usize| axes[r][0] * v[0] + axes[r][1] * v[1] + axes[r][2] * v[2];
-                    (x[j * nx + i], y[j * nx + i], z[j * nx + i]) = (world(0), world(1), world(2));
-                }
-            }
-        });
+            },
+        );
     });
     out
 }
@@ -46,11 +49,14 @@ pub fn scalar(grid: &Grid, lattice: &Lattice, values: &[f32]) -> Volume {
     out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
         let slice = lattice.slice(&three, k);
         let mut nodes = vec![0.0; lattice.nodes[0]];
-        dispatch(#[inline(always)] || {
-            for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                lattice.row(&slice, 0, j, &mut nodes, row);
-            }
-        });
+        dispatch(
+            #[inline(always)]
+            || {
+                for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
+                    lattice.row(&slice, 0, j, &mut nodes, row);
+                }
+            },
+        );
     });
     out
 }

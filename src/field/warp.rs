@@ -37,22 +37,25 @@ fn warp_rows(image: &Grid, field: &DenseField, sampler: &Sampler<'_>) -> Volume 
     out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| {
         let (j, k) = (row % ny, row / ny);
         let (start, next) = (place(0, j, k), place(1, j, k));
-        dispatch(#[inline(always)] || {
-            for (block, out) in out.chunks_mut(LANES).enumerate() {
-                let from = row * nx + block * LANES;
-                let mut d = [[0.0f64; LANES]; 3];
-                for (d, c) in d.iter_mut().zip(&components) {
-                    d.iter_mut().zip(&c[from..from + out.len()]).for_each(|(d, c)| *d = f64::from(*c));
+        dispatch(
+            #[inline(always)]
+            || {
+                for (block, out) in out.chunks_mut(LANES).enumerate() {
+                    let from = row * nx + block * LANES;
+                    let mut d = [[0.0f64; LANES]; 3];
+                    for (d, c) in d.iter_mut().zip(&components) {
+                        d.iter_mut().zip(&c[from..from + out.len()]).for_each(|(d, c)| *d = f64::from(*c));
+                    }
+                    let p: [[f64; LANES]; 3] = std::array::from_fn(|a| {
+                        std::array::from_fn(|l| {
+                            let moved = inverse[a][0] * d[0][l] + inverse[a][1] * d[1][l] + inverse[a][2] * d[2][l];
+                            start[a] + (block * LANES + l) as f64 * (next[a] - start[a]) + moved
+                        })
+                    });
+                    sampler.block(&p, out);
                 }
-                let p: [[f64; LANES]; 3] = std::array::from_fn(|a| {
-                    std::array::from_fn(|l| {
-                        let moved = inverse[a][0] * d[0][l] + inverse[a][1] * d[1][l] + inverse[a][2] * d[2][l];
-                        start[a] + (block * LANES + l) as f64 * (next[a] - start[a]) + moved
-                    })
-                });
-                sampler.block(&p, out);
-            }
-        });
+            },
+        );
     });
     out
 }

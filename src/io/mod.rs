@@ -23,7 +23,7 @@ mod gzip;
 pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
 pub use nifti::{
     count_non_finite, read_field, read_labels, read_mask, read_volume, write_field, write_integers, write_labels,
-    write_volume,
+    write_steps, write_volume,
 };
 pub use output::OutputFolder;
 pub use text::{write_bytes, write_json, write_text};

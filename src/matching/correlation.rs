@@ -21,6 +21,9 @@ pub struct Template {
     radius: [usize; 3],
 }
 
+/// Shifts worked out together.
+const LANES: usize = 16;
+
 /// Widest patch along x whose sums are made on the spot.
 const WIDTH: usize = 8;
 
@@ -135,47 +138,74 @@ impl<'a> Searchable<'a> {
         let [rx, ry, rz] = template.radius;
         let width = 2 * rx + 1;
         if self.norm.is_empty() {
-            dispatch(#[inline(always)] || {
-                for dz in first(2)..=last(2) {
-                    for dy in first(1)..=last(1) {
-                        for dx in fx..=lx {
-                            let d = [dx, dy, dz];
-                            let at = std::array::from_fn(|a| (centre[a] + d[a]) as usize);
-                            let [i, j, k] = std::array::from_fn(|a| (d[a] + reach[a] as i64) as usize);
-                            let v = self.direct(template, at);
-                            scores[i + size[0] * (j + size[1] * k)] = if v.is_finite() { v } else { f32::NEG_INFINITY };
-                        }
-                    }
-                }
-            });
-            return peaks(&scores, size, reach, keep);
-        }
-        let mut line = vec![0.0f32; count];
-        dispatch(#[inline(always)] || {
-            for dz in first(2)..=last(2) {
-                for dy in first(1)..=last(1) {
-                    line.fill(0.0);
-                    let at = [centre[0] + fx, centre[1] + dy, centre[2] + dz].map(|v| v as usize);
-                    for (row, t) in template.values.chunks_exact(width).enumerate() {
-                        let (j, k) = (at[1] + row % (2 * ry + 1) - ry, at[2] + row / (2 * ry + 1) - rz);
-                        let from = at[0] - rx + self.shape[0] * (j + self.shape[1] * k);
-                        let source = &self.data[from..from + count + width - 1];
-                        for (o, &w) in t.iter().enumerate() {
-                            for (l, v) in line.iter_mut().zip(&source[o..]) {
-                                *l += w * v;
+            dispatch(
+                #[inline(always)]
+                || {
+                    for dz in first(2)..=last(2) {
+                        for dy in first(1)..=last(1) {
+                            for dx in fx..=lx {
+                                let d = [dx, dy, dz];
+                                let at = std::array::from_fn(|a| (centre[a] + d[a]) as usize);
+                                let [i, j, k] = std::array::from_fn(|a| (d[a] + reach[a] as i64) as usize);
+                                let v = self.direct(template, at);
+                                scores[i + size[0] * (j + size[1] * k)] =
+                                    if v.is_finite() { v } else { f32::NEG_INFINITY };
                             }
                         }
                     }
-                    let from = at[0] + self.shape[0] * (at[1] + self.shape[1] * at[2]);
-                    let to = size[0] * ((dy + reach[1] as i64) as usize + size[1] * (dz + reach[2] as i64) as usize)
-                        + (fx + reach[0] as i64) as usize;
-                    for ((s, l), n) in scores[to..to + count].iter_mut().zip(&line).zip(&self.norm[from..]) {
-                        let v = l / n;
-                        *s = if v.is_finite() { v } else { f32::NEG_INFINITY };
+                },
+            );
+            return peaks(&scores, size, reach, keep);
+        }
+        // Room for whole blocks of shifts.
+        let mut line = vec![0.0f32; count.next_multiple_of(LANES)];
+        dispatch(
+            #[inline(always)]
+            || {
+                for dz in first(2)..=last(2) {
+                    for dy in first(1)..=last(1) {
+                        line.fill(0.0);
+                        let at = [centre[0] + fx, centre[1] + dy, centre[2] + dz].map(|v| v as usize);
+                        for (row, t) in template.values.chunks_exact(width).enumerate() {
+                            let (j, k) = (at[1] + row % (2 * ry + 1) - ry, at[2] + row / (2 * ry + 1) - rz);
+                            let from = at[0] - rx + self.shape[0] * (j + self.shape[1] * k);
+                            // What lies past the last shift is worked out with it and left alone.
+                            match self.data.get(from..from + line.len() + width - 1) {
+                                Some(source) => {
+                                    for (b, line) in line.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+                                        let source = &source[b * LANES..];
+                                        let mut sum = *line;
+                                        for (o, &w) in t.iter().enumerate() {
+                                            let v = &source[o..o + LANES];
+                                            for l in 0..LANES {
+                                                sum[l] += w * v[l];
+                                            }
+                                        }
+                                        *line = sum;
+                                    }
+                                }
+                                None => {
+                                    let source = &self.data[from..from + count + width - 1];
+                                    for (o, &w) in t.iter().enumerate() {
+                                        for (l, v) in line.iter_mut().zip(&source[o..]) {
+                                            *l += w * v;
+                                        }
+                                    }
+                                }
+                            }
+                        }
+                        let from = at[0] + self.shape[0] * (at[1] + self.shape[1] * at[2]);
+                        let to = size[0]
+                            * ((dy + reach[1] as i64) as usize + size[1] * (dz + reach[2] as i64) as usize)
+                            + (fx + reach[0] as i64) as usize;
+                        for ((s, l), n) in scores[to..to + count].iter_mut().zip(&line).zip(&self.norm[from..]) {
+                            let v = l / n;
+                            *s = if v.is_finite() { v } else { f32::NEG_INFINITY };
+                        }
                     }
                 }
-            }
-        });
+            },
+        );
         peaks(&scores, size, reach, keep)
     }
 }

@@ -23,8 +23,8 @@ pub struct GainField {
 type Sums = [f64; 6];
 
 impl GainField {
-    /// From the initial volume (smoothed) and the warped one, inside the mask. 
-    pub fn measure(pair: &Pair, warped: &[f32]) -> Self {
+    /// From the initial volume (smoothed) and the warped one, inside the mask.
+    pub fn measure(pair: &Pair<'_>, warped: &[f32]) -> Self {
         let [nx, ny, _] = pair.shape;
         let blocks = pair.shape.map(|n| n.div_ceil(BLOCK));
         let (bx, by) = (blocks[0], blocks[1]);
@@ -41,16 +41,19 @@ impl GainField {
                         continue;
                     }
                     let at = nx * (j + ny * k);
-                    dispatch(#[inline(always)] || {
-                        for b in span.start / BLOCK..span.end.div_ceil(BLOCK) {
-                            let part = at + b * BLOCK..at + ((b + 1) * BLOCK).min(nx);
-                            let (mut f, mut w, mut m) = ([0.0f32; BLOCK], [f32::NAN; BLOCK], [0u8; BLOCK]);
-                            f[..part.len()].copy_from_slice(&pair.fixed_smooth[part.clone()]);
-                            w[..part.len()].copy_from_slice(&warped[part.clone()]);
-                            m[..part.len()].copy_from_slice(&pair.mask[part]);
-                            add_columns(&mut lanes[b], &f, &w, &m, centre);
-                        }
-                    });
+                    dispatch(
+                        #[inline(always)]
+                        || {
+                            for b in span.start / BLOCK..span.end.div_ceil(BLOCK) {
+                                let part = at + b * BLOCK..at + ((b + 1) * BLOCK).min(nx);
+                                let (mut f, mut w, mut m) = ([0.0f32; BLOCK], [f32::NAN; BLOCK], [0u8; BLOCK]);
+                                f[..part.len()].copy_from_slice(&pair.fixed_smooth[part.clone()]);
+                                w[..part.len()].copy_from_slice(&warped[part.clone()]);
+                                m[..part.len()].copy_from_slice(&pair.mask[part]);
+                                add_columns(&mut lanes[b], &f, &w, &m, centre);
+                            }
+                        },
+                    );
                 }
             }
             for (s, lanes) in sums.iter_mut().zip(&lanes) {

@@ -7,27 +7,28 @@ use crate::numerics::statistics::{noise_sigma, quantile};
 use crate::numerics::{filters, pyramid};
 use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Both volumes at full resolution on lattices with the same axes and voxel size.
 #[derive(Debug, Clone)]
-pub struct Aligned {
+pub struct Aligned<'a> {
     shape: [usize; 3],
     spacing: [f64; 3],
-    fixed: Vec<f32>,
-    mask: Vec<u8>,
+    fixed: &'a [f32],
+    mask: &'a [u8],
     moving_shape: [usize; 3],
     moving_origin: [f64; 3],
-    moving: Vec<f32>,
+    moving: Cow<'a, [f32]>,
 }
 
-impl Aligned {
+impl<'a> Aligned<'a> {
     /// Puts the deformed volume on the initial volume's axes. Where its axes and voxel size are the same already
     /// (whatever its origin and shape) its values are taken as they are, else it is resampled once (cubic) over its
     /// own extent, cut to the initial volume's box widened by `reach_mm`.
     ///
     /// # Errors
     /// [`FieldError::NoOverlap`] when the two boxes, widened by `reach_mm`, do not meet.
-    pub fn new(initial: &Volume, deformed: &Volume, mask: &Mask, reach_mm: f64) -> Result<Self, FieldError> {
+    pub fn new(initial: &'a Volume, deformed: &'a Volume, mask: &'a Mask, reach_mm: f64) -> Result<Self, FieldError> {
         let (g, m) = (initial.grid(), deformed.grid());
         let spacing = g.spacing();
         let corners = corners(m).map(|c| g.affine().to_voxel(m.affine().to_world(c)).0);
@@ -47,26 +48,26 @@ impl Aligned {
         let base = Self {
             shape: g.shape(),
             spacing,
-            fixed: initial.as_slice().to_vec(),
-            mask: mask.as_slice().to_vec(),
+            fixed: initial.as_slice(),
+            mask: mask.as_slice(),
             moving_shape: m.shape(),
             moving_origin: g.affine().to_voxel(m.affine().origin()).0,
-            moving: Vec::new(),
+            moving: Cow::Borrowed(&[]),
         };
         if same_axes {
-            return Ok(Self { moving: deformed.as_slice().to_vec(), ..base });
+            return Ok(Self { moving: deformed.as_slice().into(), ..base });
         }
         let origin = lo.map(f64::floor);
         let shape = std::array::from_fn(|a| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1);
         let moving = resample(deformed, g, origin, shape)?;
-        Ok(Self { moving_shape: shape, moving_origin: origin, moving, ..base })
+        Ok(Self { moving_shape: shape, moving_origin: origin, moving: moving.into(), ..base })
     }
 
     /// The pair with blocks of `factor` voxels averaged.
-    pub fn level(&self, factor: [usize; 3]) -> Pair {
+    pub fn level(&self, factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
-        let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
-        let mask = pyramid::reduce_mask(&self.mask, self.shape, factor);
+        let fixed = pyramid::reduce(self.fixed, self.shape, factor);
+        let mask = pyramid::reduce_mask(self.mask, self.shape, factor);
         let moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
         Pair {
             shape,

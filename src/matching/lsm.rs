@@ -158,14 +158,23 @@ fn prepare(template: &Template<'_>, centre: [usize; 3]) -> (Vec<f32>, [Vec<f32>;
 fn centred(v: &mut [f32]) -> f64 {
     // About the first value, so that a large offset does not cost precision.
     let (first, n) = (v[0], v.len() as f64);
-    let mean = dispatch(#[inline(always)] || {
-        v.iter_mut().for_each(|x| *x -= first);
-        (f64::from(simd::sum(v)) / n) as f32
-    });
-    dispatch(#[inline(always)] || v.iter_mut().for_each(|x| *x -= mean));
+    let mean = dispatch(
+        #[inline(always)]
+        || {
+            v.iter_mut().for_each(|x| *x -= first);
+            (f64::from(simd::sum(v)) / n) as f32
+        },
+    );
+    dispatch(
+        #[inline(always)]
+        || v.iter_mut().for_each(|x| *x -= mean),
+    );
     (dot(v, v) / n).sqrt()
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f64 {
-    f64::from(dispatch(#[inline(always)] || simd::dot(a, b)))
+    f64::from(dispatch(
+        #[inline(always)]
+        || simd::dot(a, b),
+    ))
 }

@@ -3,17 +3,18 @@
 use crate::numerics::bspline::{Lattice, SmoothSampler};
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::ops::Range;
 
 /// An initial and a deformed volume whose voxels have the same axes and size; the second may start elsewhere.
 #[derive(Debug, Clone)]
-pub struct Pair {
+pub struct Pair<'a> {
     /// Voxels of the initial volume.
     pub shape: [usize; 3],
     /// Voxel edges (mm).
     pub spacing: [f64; 3],
     /// Initial intensities.
-    pub fixed: Vec<f32>,
+    pub fixed: Cow<'a, [f32]>,
     /// The same, smoothed by the cubic B-spline (see [`SmoothSampler`]).
     pub fixed_smooth: Vec<f32>,
     /// Where matches are wanted (not 0), on the initial lattice.
@@ -29,10 +30,15 @@ pub struct Pair {
     /// Initial-lattice position of the deformed volume's first voxel (voxels).
     pub moving_origin: [f64; 3],
     /// Deformed intensities.
-    pub moving: Vec<f32>,
+    pub moving: Cow<'a, [f32]>,
 }
 
-impl Pair {
+impl Pair<'_> {
+    /// The same, with its own copy of the volumes.
+    pub fn into_owned(self) -> Pair<'static> {
+        Pair { fixed: self.fixed.into_owned().into(), moving: self.moving.into_owned().into(), ..self }
+    }
+
     /// Position in the deformed volume's own voxels.
     #[inline(always)]
     pub fn to_moving(&self, p: [f64; 3]) -> [f32; 3] {
@@ -64,14 +70,17 @@ impl Pair {
                 if span.is_empty() {
                     continue;
                 }
-                dispatch(#[inline(always)] || {
-                    for (c, d) in d.iter_mut().enumerate() {
-                        lattice.row(&slice, c, j, &mut nodes, d);
-                    }
-                    let start = [span.start as f32, j as f32, k as f32];
-                    let d: [&[f32]; 3] = std::array::from_fn(|a| &d[a][span.clone()]);
-                    sampler.row(start, d, scale, origin, &mut row[span.clone()]);
-                });
+                dispatch(
+                    #[inline(always)]
+                    || {
+                        for (c, d) in d.iter_mut().enumerate() {
+                            lattice.row(&slice, c, j, &mut nodes, d);
+                        }
+                        let start = [span.start as f32, j as f32, k as f32];
+                        let d: [&[f32]; 3] = std::array::from_fn(|a| &d[a][span.clone()]);
+                        sampler.row(start, d, scale, origin, &mut row[span.clone()]);
+                    },
+                );
             }
         });
         out
@@ -106,7 +115,10 @@ impl Spans {
     pub fn grown(&self, radius: usize) -> Self {
         let [nx, ny, nz] = self.shape;
         let join = |from: &[[u32; 2]], rows: &mut dyn Iterator<Item = usize>| {
-            rows.map(|r| from[r]).filter(|r| r[0] < r[1]).reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])]).unwrap_or([0, 0])
+            rows.map(|r| from[r])
+                .filter(|r| r[0] < r[1])
+                .reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])])
+                .unwrap_or([0, 0])
         };
         let near = |at: usize, n: usize| at.saturating_sub(radius)..(at + radius + 1).min(n);
         let along_y: Vec<[u32; 2]> = (0..ny * nz)
@@ -119,7 +131,11 @@ impl Spans {
             .map(|row| {
                 let (j, k) = (row % ny, row / ny);
                 let [from, to] = join(&along_y, &mut near(k, nz).map(|k| j + ny * k));
-                if from < to { [from.saturating_sub(radius as u32), (to + radius as u32).min(nx as u32)] } else { [0, 0] }
+                if from < to {
+                    [from.saturating_sub(radius as u32), (to + radius as u32).min(nx as u32)]
+                } else {
+                    [0, 0]
+                }
             })
             .collect();
         Self { rows, shape: self.shape }

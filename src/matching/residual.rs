@@ -28,7 +28,7 @@ pub struct NormalEquations {
 }
 
 /// Robust spread of `f - (a w + b)` over the mask (1.4826 MAD), from at most about 200,000 voxels.
-pub fn residual_sigma(pair: &Pair, warped: &[f32], gain: &GainField) -> f32 {
+pub fn residual_sigma(pair: &Pair<'_>, warped: &[f32], gain: &GainField) -> f32 {
     let [nx, ny, nz] = pair.shape;
     let rows = ny * nz;
     let stride = (pair.fixed.len() / 200_000).max(1);
@@ -53,7 +53,7 @@ pub fn residual_sigma(pair: &Pair, warped: &[f32], gain: &GainField) -> f32 {
 
 /// Accumulates the normal equations of `lattice` for the present warp. `floor` bounds sigma from below (intensity).
 pub fn normal_equations(
-    pair: &Pair,
+    pair: &Pair<'_>,
     warped: &[f32],
     gain: &GainField,
     lattice: &Lattice,
@@ -79,32 +79,36 @@ pub fn normal_equations(
         let x = if nx > 1 { (here - 1, here + 1) } else { (here, here) };
         let sides = [x, (at(j0, k), at(j1, k)), (at(j, k0), at(j, k1))];
         let scale = [0.5 * per_mm[0], per_mm[1] / (j1 - j0).max(1) as f32, per_mm[2] / (k1 - k0).max(1) as f32];
-        dispatch(#[inline(always)] || {
-            // The first two rows hold gain and offset until they are overwritten.
-            let [xx, yy, ..] = &mut *rows;
-            gain.row(j, k, xx, yy);
-            let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = rows.each_mut().map(|r| &mut r[span.clone()]);
-            let f = &pair.fixed_smooth[here..][..n];
-            let w = &warped[here..][..n];
-            let mask = &pair.mask[here..][..n];
-            let [[fx0, fx1], [fy0, fy1], [fz0, fz1]] = sides.map(|(l, r)| [l, r].map(|s| &pair.fixed_smooth[s..][..n]));
-            let [[wx0, wx1], [wy0, wy1], [wz0, wz1]] = sides.map(|(l, r)| [l, r].map(|s| &warped[s..][..n]));
-            for i in 0..n {
-                let (a, b) = (xx[i], yy[i]);
-                let r = f[i] - (a * w[i] + b);
-                let gx = scale[0] * (fx1[i] - fx0[i] + a * (wx1[i] - wx0[i]));
-                let gy = scale[1] * (fy1[i] - fy0[i] + a * (wy1[i] - wy0[i]));
-                let gz = scale[2] * (fz1[i] - fz0[i] + a * (wz1[i] - wz0[i]));
-                let good = mask[i] != 0 && (r + gx + gy + gz).is_finite();
-                let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
-                let t = r * cut;
-                let weight = inverse * inverse / (1.0 + t * t);
-                let (hx, hy, hz) = (weight * gx, weight * gy, weight * gz);
-                (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
-                (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);
-                (rx[i], ry[i], rz[i]) = (hx * r, hy * r, hz * r);
-            }
-        });
+        dispatch(
+            #[inline(always)]
+            || {
+                // The first two rows hold gain and offset until they are overwritten.
+                let [xx, yy, ..] = &mut *rows;
+                gain.row(j, k, xx, yy);
+                let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = rows.each_mut().map(|r| &mut r[span.clone()]);
+                let f = &pair.fixed_smooth[here..][..n];
+                let w = &warped[here..][..n];
+                let mask = &pair.mask[here..][..n];
+                let [[fx0, fx1], [fy0, fy1], [fz0, fz1]] =
+                    sides.map(|(l, r)| [l, r].map(|s| &pair.fixed_smooth[s..][..n]));
+                let [[wx0, wx1], [wy0, wy1], [wz0, wz1]] = sides.map(|(l, r)| [l, r].map(|s| &warped[s..][..n]));
+                for i in 0..n {
+                    let (a, b) = (xx[i], yy[i]);
+                    let r = f[i] - (a * w[i] + b);
+                    let gx = scale[0] * (fx1[i] - fx0[i] + a * (wx1[i] - wx0[i]));
+                    let gy = scale[1] * (fy1[i] - fy0[i] + a * (wy1[i] - wy0[i]));
+                    let gz = scale[2] * (fz1[i] - fz0[i] + a * (wz1[i] - wz0[i]));
+                    let good = mask[i] != 0 && (r + gx + gy + gz).is_finite();
+                    let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
+                    let t = r * cut;
+                    let weight = inverse * inverse / (1.0 + t * t);
+                    let (hx, hy, hz) = (weight * gx, weight * gy, weight * gz);
+                    (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
+                    (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);
+                    (rx[i], ry[i], rz[i]) = (hx * r, hy * r, hz * r);
+                }
+            },
+        );
         span
     });
     let n = lattice.len();
@@ -116,7 +120,7 @@ pub fn normal_equations(
 ///
 /// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see, with Cauchy's cost
 /// `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread under the better warp `b`.
-pub fn excess(pair: &Pair, a: &[f32], b: &[f32]) -> f64 {
+pub fn excess(pair: &Pair<'_>, a: &[f32], b: &[f32]) -> f64 {
     let nx = pair.shape[0];
     let gains = [GainField::measure(pair, a), GainField::measure(pair, b)];
     let sigma = residual_sigma(pair, b, &gains[1]).max(f32::MIN_POSITIVE);
@@ -133,14 +137,24 @@ pub fn excess(pair: &Pair, a: &[f32], b: &[f32]) -> f64 {
             let mut costs = [vec![0.0f32; nx], vec![0.0f32; nx]];
             for ((warped, field), cost) in [a, b].iter().zip(&gains).zip(&mut costs) {
                 field.row(j, k, &mut gain, &mut offset);
+                let (f, w) = (&pair.fixed_smooth[from..from + nx], &warped[from..from + nx]);
                 for i in 0..nx {
-                    let t = cut * (pair.fixed_smooth[from + i] - (gain[i] * warped[from + i] + offset[i]));
-                    cost[i] = (t * t).ln_1p();
+                    let t = cut * (f[i] - (gain[i] * w[i] + offset[i]));
+                    cost[i] = 1.0 + t * t;
                 }
             }
-            let differences =
-                (0..nx).filter(|&i| pair.mask[from + i] != 0).map(|i| f64::from(costs[0][i] - costs[1][i]));
-            differences.filter(|d| d.is_finite()).sum()
+            // Logarithms of products of a few voxels, not of each: ln is dear.
+            let mut sum = 0.0;
+            for (at, (a, b)) in costs[0].chunks(8).zip(costs[1].chunks(8)).enumerate() {
+                let mask = &pair.mask[from + 8 * at..];
+                let mut ratio = 1.0f64;
+                for ((a, b), m) in a.iter().zip(b).zip(mask) {
+                    let r = f64::from(*a) / f64::from(*b);
+                    ratio *= if *m != 0 && r.is_finite() { r } else { 1.0 };
+                }
+                sum += ratio.ln();
+            }
+            sum
         })
         .collect();
     f64::from(CAUCHY * CAUCHY) * rows.iter().sum::<f64>()

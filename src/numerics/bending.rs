@@ -58,15 +58,23 @@ impl Smoothness {
     pub fn apply(&self, x: &[f32], out: &mut [f32]) {
         let bands = self.bands();
         out.par_chunks_mut(self.nodes[0] * self.nodes[1]).enumerate().for_each(|(k, out)| {
-            let mut cross = vec![0.0f32; self.nodes[0]];
-            dispatch(#[inline(always)] || bands.plane(x, k, out, &mut cross));
+            let mut cross = vec![0.0f32; self.nodes[0] * self.nodes[1]];
+            dispatch(
+                #[inline(always)]
+                || bands.plane(x, k, out, &mut cross),
+            );
         });
     }
 
     fn bands(&self) -> Bands {
         let h = self.step_mm;
         let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
-        Bands { nodes: self.nodes, second: self.second(), first: self.first(), twist: [pair(0, 1), pair(0, 2), pair(1, 2)] }
+        Bands {
+            nodes: self.nodes,
+            second: self.second(),
+            first: self.first(),
+            twist: [pair(0, 1), pair(0, 2), pair(1, 2)],
+        }
     }
     /// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
     fn second(&self) -> [Vec<[f32; 5]>; 3] {
@@ -167,61 +175,48 @@ struct Bands {
 }
 
 impl Bands {
-    /// Plane `k` of `L x`; `cross` is room for a row.
+    /// Plane `k` of `L x`; `cross` is room for a plane.
     #[inline(always)]
     fn plane(&self, x: &[f32], k: usize, out: &mut [f32], cross: &mut [f32]) {
         let [nx, ny, _] = self.nodes;
         let ([bx, by, bz], [gx, gy, gz], [xy, xz, yz]) = (&self.second, &self.first, self.twist);
-        let row = |j: usize, k: usize| &x[nx * (j + ny * k)..][..nx];
-        for (j, out) in out.chunks_exact_mut(nx).enumerate() {
-            let (vy, vz) = (&by[j], &bz[k]);
-            scale_row(vy[2] + vz[2] + yz * gy[j][1] * gz[k][1], row(j, k), out);
-            scale_row(xy * gy[j][1] + xz * gz[k][1], row(j, k), cross);
-            for d in [0, 1, 3, 4] {
-                if vy[d] != 0.0 {
-                    add_row(vy[d], row(j + d - 2, k), out);
-                }
-                if vz[d] != 0.0 {
-                    add_row(vz[d], row(j, k + d - 2), out);
-                }
+        let nz = self.nodes[2];
+        let first = |g: &[f32; 3], d: usize| if (1..4).contains(&d) { g[d - 1] } else { 0.0 };
+        // Rows two away from the border in y share their weights: they are treated as one long row.
+        let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
+        let borders = (0..low).chain(high..ny).map(|j| (j, j + 1));
+        for (j, end) in borders.chain((low < high).then_some((low, high))) {
+            let (vy, vz, wy, wz) = (&by[j], &bz[k], &gy[j], &gz[k]);
+            let length = nx * (end - j);
+            // A row outside the lattice has weight zero; any other stands in for it.
+            let near = |at: usize, d: usize, n: usize, height: usize| (at + d).saturating_sub(2).min(n - height);
+            let rows = REACH.map(|(dj, dk)| &x[nx * (near(j, dj, ny, end - j) + ny * near(k, dk, nz, 1))..][..length]);
+            let weights = REACH.map(|(dj, dk)| {
+                let bending = if dk == 2 { vy[dj] } else { 0.0 } + if dj == 2 { vz[dk] } else { 0.0 };
+                bending + yz * first(wy, dj) * first(wz, dk)
+            });
+            let twist = REACH.map(|(dj, dk)| {
+                let y = if dk == 2 { xy * first(wy, dj) } else { 0.0 };
+                y + if dj == 2 { xz * first(wz, dk) } else { 0.0 }
+            });
+            let (out, cross) = (&mut out[nx * j..][..length], &mut cross[nx * j..][..length]);
+            for i in 0..length {
+                let v: [f32; 13] = std::array::from_fn(|n| rows[n][i]);
+                out[i] = (0..13).map(|n| weights[n] * v[n]).sum();
+                cross[i] = (0..5).map(|n| twist[n] * v[n]).sum();
             }
-            for d in [0, 2] {
-                if gy[j][d] != 0.0 {
-                    add_row(yz * gy[j][d] * gz[k][1], row(j + d - 1, k), out);
-                    add_row(xy * gy[j][d], row(j + d - 1, k), cross);
-                }
-                if gz[k][d] != 0.0 {
-                    add_row(yz * gy[j][1] * gz[k][d], row(j, k + d - 1), out);
-                    add_row(xz * gz[k][d], row(j, k + d - 1), cross);
-                }
-                for e in [0, 2] {
-                    let w = yz * gy[j][d] * gz[k][e];
-                    if w != 0.0 {
-                        add_row(w, row(j + d - 1, k + e - 1), out);
-                    }
-                }
-            }
-            banded(bx, row(j, k), out);
+        }
+        let x = &x[k * nx * ny..(k + 1) * nx * ny];
+        for ((out, cross), x) in out.chunks_exact_mut(nx).zip(cross.chunks_exact(nx)).zip(x.chunks_exact(nx)) {
+            banded(bx, x, out);
             banded(gx, cross, out);
         }
     }
 }
 
-/// `out = w row`.
-#[inline(always)]
-fn scale_row(w: f32, row: &[f32], out: &mut [f32]) {
-    for (o, v) in out.iter_mut().zip(row) {
-        *o = w * v;
-    }
-}
-
-/// `out += w row`.
-#[inline(always)]
-fn add_row(w: f32, row: &[f32], out: &mut [f32]) {
-    for (o, v) in out.iter_mut().zip(row) {
-        *o += w * v;
-    }
-}
+/// The rows that a row of `L x` is made of, as offsets in y and z plus 2; the first five alone enter the twists with x.
+const REACH: [(usize, usize); 13] =
+    [(2, 2), (1, 2), (3, 2), (2, 1), (2, 3), (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (3, 1), (1, 3), (3, 3)];
 
 /// `out += M row` for a banded matrix of `2 R + 1` diagonals whose inner rows are all alike.
 #[inline(always)]
@@ -234,19 +229,19 @@ fn banded<const W: usize>(matrix: &[[f32; W]], row: &[f32], out: &mut [f32]) {
             }
         }
     };
-    // The first and last `W - 1 - r` rows feel the border.
-    let border = W - 1;
-    if n <= 2 * border {
+    // The first and last `r` rows feel the border.
+    if n <= 2 * r {
         (0..n).for_each(|i| edge(i, out));
         return;
     }
-    (0..border).chain(n - border..n).for_each(|i| edge(i, out));
-    let m = matrix[border];
-    for (i, o) in out[border..n - border].iter_mut().enumerate() {
-        let window = &row[i + border - r..i + border - r + W];
+    (0..r).chain(n - r..n).for_each(|i| edge(i, out));
+    let m = matrix[r];
+    let out = &mut out[r..n - r];
+    let shifted: [&[f32]; W] = std::array::from_fn(|d| &row[d..d + n - 2 * r]);
+    for (i, o) in out.iter_mut().enumerate() {
         let mut s = 0.0;
         for d in 0..W {
-            s += m[d] * window[d];
+            s += m[d] * shifted[d][i];
         }
         *o += s;
     }
@@ -357,32 +352,35 @@ impl System {
         let [x0, x1, x2] = thirds(x);
         let parts = planes(out, self.plane).map(|(k, [o0, o1, o2])| {
             let at = k * self.plane..(k + 1) * self.plane;
-            let mut cross = vec![0.0f32; self.bands.nodes[0]];
-            dispatch(#[inline(always)] || {
-                self.bands.plane(x0, k, o0, &mut cross);
-                self.bands.plane(x1, k, o1, &mut cross);
-                self.bands.plane(x2, k, o2, &mut cross);
-                let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
-                match data {
-                    Some(d) => {
-                        let [d0, d1, d2] = thirds(d).map(|d| &d[at.clone()]);
-                        for i in 0..x.len() {
-                            o0[i] = self.lambda * o0[i] + d0[i];
-                            o1[i] = self.lambda * o1[i] + d1[i];
-                            o2[i] = self.lambda * o2[i] + d2[i];
+            let mut cross = vec![0.0f32; self.plane];
+            dispatch(
+                #[inline(always)]
+                || {
+                    self.bands.plane(x0, k, o0, &mut cross);
+                    self.bands.plane(x1, k, o1, &mut cross);
+                    self.bands.plane(x2, k, o2, &mut cross);
+                    let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
+                    match data {
+                        Some(d) => {
+                            let [d0, d1, d2] = thirds(d).map(|d| &d[at.clone()]);
+                            for i in 0..x.len() {
+                                o0[i] = self.lambda * o0[i] + d0[i];
+                                o1[i] = self.lambda * o1[i] + d1[i];
+                                o2[i] = self.lambda * o2[i] + d2[i];
+                            }
+                        }
+                        None => {
+                            let [xx, yy, zz, xy, xz, yz] = sixths(&self.blocks, n, &at);
+                            for i in 0..x.len() {
+                                o0[i] = self.lambda * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
+                                o1[i] = self.lambda * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
+                                o2[i] = self.lambda * o2[i] + (xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i]);
+                            }
                         }
                     }
-                    None => {
-                        let [xx, yy, zz, xy, xz, yz] = sixths(&self.blocks, n, &at);
-                        for i in 0..x.len() {
-                            o0[i] = self.lambda * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
-                            o1[i] = self.lambda * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
-                            o2[i] = self.lambda * o2[i] + (xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i]);
-                        }
-                    }
-                }
-                dot(x, o0) + dot(y, o1) + dot(z, o2)
-            })
+                    dot(x, o0) + dot(y, o1) + dot(z, o2)
+                },
+            )
         });
         sum(parts.collect())
     }
@@ -418,7 +416,10 @@ impl System {
         let mut z = vec![0.0f32; x.len()];
         let start = planes(&mut z, self.plane).map(|(k, z)| {
             let at = k * self.plane..(k + 1) * self.plane;
-            dispatch(#[inline(always)] || self.precondition(k, thirds(&r).map(|r| &r[at.clone()]), z))
+            dispatch(
+                #[inline(always)]
+                || self.precondition(k, thirds(&r).map(|r| &r[at.clone()]), z),
+            )
         });
         let mut rz = sum(start.collect());
         let mut p = z.clone();
@@ -434,25 +435,31 @@ impl System {
             let parts = all.map(|(((k, x), (_, r)), (_, z))| {
                 let at = k * self.plane..(k + 1) * self.plane;
                 let (p, a) = (thirds(&p).map(|p| &p[at.clone()]), thirds(&ap).map(|a| &a[at.clone()]));
-                dispatch(#[inline(always)] || {
-                    let [r0, r1, r2] = r;
-                    for (((x, r), p), a) in x.into_iter().zip([&mut *r0, &mut *r1, &mut *r2]).zip(p).zip(a) {
-                        for i in 0..self.plane {
-                            x[i] += alpha * p[i];
-                            r[i] -= alpha * a[i];
+                dispatch(
+                    #[inline(always)]
+                    || {
+                        let [r0, r1, r2] = r;
+                        for (((x, r), p), a) in x.into_iter().zip([&mut *r0, &mut *r1, &mut *r2]).zip(p).zip(a) {
+                            for i in 0..self.plane {
+                                x[i] += alpha * p[i];
+                                r[i] -= alpha * a[i];
+                            }
                         }
-                    }
-                    self.precondition(k, [r0, r1, r2], z)
-                })
+                        self.precondition(k, [r0, r1, r2], z)
+                    },
+                )
             });
             let next = sum(parts.collect());
             let beta = (next / rz) as f32;
             rz = next;
-            dispatch(#[inline(always)] || {
-                for (p, z) in p.iter_mut().zip(&z) {
-                    *p = z + beta * *p;
-                }
-            });
+            dispatch(
+                #[inline(always)]
+                || {
+                    for (p, z) in p.iter_mut().zip(&z) {
+                        *p = z + beta * *p;
+                    }
+                },
+            );
             iterations += 1;
         }
         SolveReport { iterations, residual: if first > 0.0 { (rz / first).max(0.0).sqrt() } else { 0.0 } }

@@ -153,11 +153,14 @@ impl Lattice {
             volume.par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
                 let slice = self.slice(coefficients, k);
                 let mut nodes = vec![0.0; self.nodes[0]];
-                dispatch(#[inline(always)] || {
-                    for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                        self.row(&slice, c, j, &mut nodes, row);
-                    }
-                });
+                dispatch(
+                    #[inline(always)]
+                    || {
+                        for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
+                            self.row(&slice, c, j, &mut nodes, row);
+                        }
+                    },
+                );
             });
         }
         out
@@ -198,11 +201,14 @@ impl Lattice {
                             continue;
                         }
                         any = true;
-                        dispatch(#[inline(always)] || {
-                            for m in 0..taps_y {
-                                ring[(first + m) % taps_y].add(w[m], &rows, span.clone());
-                            }
-                        });
+                        dispatch(
+                            #[inline(always)]
+                            || {
+                                for m in 0..taps_y {
+                                    ring[(first + m) % taps_y].add(w[m], &rows, span.clone());
+                                }
+                            },
+                        );
                     }
                     for m in 0..taps_y {
                         let node = self.stencil(1, ny - 1).0 + m;
@@ -247,33 +253,36 @@ impl Lattice {
         // Whole cells only.
         let step = self.step[0];
         let cells = span.start / step..span.end.div_ceil(step);
-        dispatch(#[inline(always)] || {
-            for q in 0..Q {
-                let values = &mut row.values[q * self.shape[0]..(q + 1) * self.shape[0]];
-                let sums = &mut sums[(q * my + node) * mx..][..mx];
-                if self.nodes[0] == 1 {
-                    sums[0] += values[0];
-                } else {
-                    nodes.fill(0.0);
-                    for cell in cells.clone() {
-                        let values = &values[cell * step..((cell + 1) * step).min(self.shape[0])];
-                        let mut s = [0.0f32; 4];
-                        for (v, w) in values.iter().zip(&self.phases[0]) {
-                            for m in 0..4 {
-                                s[m] += w[m] * v;
+        dispatch(
+            #[inline(always)]
+            || {
+                for q in 0..Q {
+                    let values = &mut row.values[q * self.shape[0]..(q + 1) * self.shape[0]];
+                    let sums = &mut sums[(q * my + node) * mx..][..mx];
+                    if self.nodes[0] == 1 {
+                        sums[0] += values[0];
+                    } else {
+                        nodes.fill(0.0);
+                        for cell in cells.clone() {
+                            let values = &values[cell * step..((cell + 1) * step).min(self.shape[0])];
+                            let mut s = [0.0f32; 4];
+                            for (v, w) in values.iter().zip(&self.phases[0]) {
+                                for m in 0..4 {
+                                    s[m] += w[m] * v;
+                                }
+                            }
+                            for (n, s) in nodes[cell..cell + 4].iter_mut().zip(s) {
+                                *n += s;
                             }
                         }
-                        for (n, s) in nodes[cell..cell + 4].iter_mut().zip(s) {
-                            *n += s;
+                        for (s, v) in sums.iter_mut().zip(&*nodes) {
+                            *s += v;
                         }
                     }
-                    for (s, v) in sums.iter_mut().zip(&*nodes) {
-                        *s += v;
-                    }
+                    values[span.clone()].fill(0.0);
                 }
-                values[span.clone()].fill(0.0);
-            }
-        });
+            },
+        );
     }
 
     /// Coefficients whose field takes (nearly) the values of `f` at the nodes.
@@ -426,13 +435,16 @@ impl SmoothSampler<'_> {
     pub fn patch(&self, centre: [f32; 3], radius: [usize; 3], out: &mut [f32]) {
         let width: [usize; 3] = std::array::from_fn(|a| if self.shape[a] == 1 { 1 } else { 2 * radius[a] + 1 });
         let still = vec![0.0; width[0]];
-        dispatch(#[inline(always)] || {
-            for (n, row) in out.chunks_exact_mut(width[0]).enumerate() {
-                let index = [0, n % width[1], n / width[1]];
-                let start = std::array::from_fn(|a| centre[a] + index[a] as f32 - (width[a] / 2) as f32);
-                self.row(start, [&still, &still, &still], [0.0; 3], [0.0; 3], row);
-            }
-        });
+        dispatch(
+            #[inline(always)]
+            || {
+                for (n, row) in out.chunks_exact_mut(width[0]).enumerate() {
+                    let index = [0, n % width[1], n / width[1]];
+                    let start = std::array::from_fn(|a| centre[a] + index[a] as f32 - (width[a] / 2) as f32);
+                    self.row(start, [&still, &still, &still], [0.0; 3], [0.0; 3], row);
+                }
+            },
+        );
     }
 }
 

@@ -63,22 +63,25 @@ pub fn separable(data: &[f32], shape: [usize; 3], kernels: [&HalfKernel; 3]) -> 
     let plane = nx * ny;
     let mut out = vec![0.0f32; data.len()];
     out.par_chunks_mut(plane).zip(data.par_chunks(plane)).for_each(|(out, data)| {
-        dispatch(#[inline(always)] || {
-            let mut padded = Vec::new();
-            let mut along_x = data.to_vec();
-            if nx > 1 && kernels[0].len() > 1 {
-                for (o, row) in along_x.chunks_exact_mut(nx).zip(data.chunks_exact(nx)) {
-                    filter_row(kernels[0], row, &mut padded, o);
+        dispatch(
+            #[inline(always)]
+            || {
+                let mut padded = Vec::new();
+                let mut along_x = data.to_vec();
+                if nx > 1 && kernels[0].len() > 1 {
+                    for (o, row) in along_x.chunks_exact_mut(nx).zip(data.chunks_exact(nx)) {
+                        filter_row(kernels[0], row, &mut padded, o);
+                    }
                 }
-            }
-            if ny > 1 && kernels[1].len() > 1 {
-                for (j, o) in out.chunks_exact_mut(nx).enumerate() {
-                    combine_rows(kernels[1], ny, j, |r| &along_x[r * nx..(r + 1) * nx], o);
+                if ny > 1 && kernels[1].len() > 1 {
+                    for (j, o) in out.chunks_exact_mut(nx).enumerate() {
+                        combine_rows(kernels[1], ny, j, |r| &along_x[r * nx..(r + 1) * nx], o);
+                    }
+                } else {
+                    out.copy_from_slice(&along_x);
                 }
-            } else {
-                out.copy_from_slice(&along_x);
-            }
-        });
+            },
+        );
     });
     if nz == 1 || kernels[2].len() == 1 {
         return out;
@@ -86,7 +89,10 @@ pub fn separable(data: &[f32], shape: [usize; 3], kernels: [&HalfKernel; 3]) -> 
     let source = out;
     let mut out = vec![0.0f32; data.len()];
     out.par_chunks_mut(plane).enumerate().for_each(|(k, o)| {
-        dispatch(#[inline(always)] || combine_rows(kernels[2], nz, k, |r| &source[r * plane..(r + 1) * plane], o));
+        dispatch(
+            #[inline(always)]
+            || combine_rows(kernels[2], nz, k, |r| &source[r * plane..(r + 1) * plane], o),
+        );
     });
     out
 }

@@ -1,6 +1,7 @@
 //! Coarser copies of a volume.
 
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Voxels along each axis after averaging blocks of `factor` voxels (a last, partial block counts).
 pub fn reduced_shape(shape: [usize; 3], factor: [usize; 3]) -> [usize; 3] {
@@ -8,9 +9,9 @@ pub fn reduced_shape(shape: [usize; 3], factor: [usize; 3]) -> [usize; 3] {
 }
 
 /// Block averages. Voxel `i` of the result is centred at `(i + 0.5) * factor - 0.5` of the input.
-pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Vec<f32> {
+pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [f32]> {
     if factor == [1, 1, 1] {
-        return data.to_vec();
+        return Cow::Borrowed(data);
     }
     let [nx, ny, _] = shape;
     let s = reduced_shape(shape, factor);
@@ -36,7 +37,7 @@ pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Vec<f32> {
             }
         }
     });
-    out
+    Cow::Owned(out)
 }
 
 /// Blocks of which at least half the voxels are set.

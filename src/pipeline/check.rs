@@ -3,6 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::types::{Mask, Volume};
+use std::borrow::Cow;
 
 /// The mask to work in: the given one or the foreground, less the voxels that are not finite.
 ///
@@ -10,7 +11,11 @@ use crate::types::{Mask, Volume};
 ///
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
-pub fn inputs(initial: &Volume, deformed: &Volume, mask: Option<&Mask>) -> Result<(Mask, Volume, usize), FieldError> {
+pub fn inputs<'a>(
+    initial: &'a Volume,
+    deformed: &Volume,
+    mask: Option<&Mask>,
+) -> Result<(Mask, Cow<'a, Volume>, usize), FieldError> {
     for (volume, v) in [("initial", initial), ("deformed", deformed)] {
         let refuse = |what: &str, hint: &str| Err(FieldError::Volume { volume, what: what.into(), hint: hint.into() });
         if v.grid().shape().iter().filter(|&&n| n < 2).count() > 1 {
@@ -39,11 +44,10 @@ pub fn inputs(initial: &Volume, deformed: &Volume, mask: Option<&Mask>) -> Resul
             return Err(FieldError::Volume { volume: "mask", what, hint });
         }
     }
-    let mut clean = initial.clone();
-    let mut bad = 0;
-    for v in clean.as_mut_slice().iter_mut().filter(|v| !v.is_finite()) {
-        *v = 0.0;
-        bad += 1;
+    let bad = initial.as_slice().iter().filter(|v| !v.is_finite()).count();
+    let mut clean = Cow::Borrowed(initial);
+    if bad > 0 {
+        clean.to_mut().as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
     }
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&clean));
     if bad > 0 {

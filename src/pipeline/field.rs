@@ -206,7 +206,7 @@ fn too_few(found: usize, search: f64) -> FieldError {
 }
 
 /// Chooses the model from the kept matches and the free field.
-fn smallest(matches: &[LevelMatch], pair: &Pair, field: &SplineField) -> Choice {
+fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField) -> Choice {
     let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
     let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
     choose(&measured, level::excess(pair, field), field.determined, 0.02 * finest)

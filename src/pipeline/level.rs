@@ -6,19 +6,19 @@ use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{Measured, prune};
 use crate::consistency::relaxation::relax;
 use crate::features::{Corner, HarrisParams, block_response, spread};
-use crate::matching::levels::from_level;
 use crate::matching::candidates::{CandidateParams, Side, candidates};
 use crate::matching::correlation::Searchable;
 use crate::matching::gain::GainField;
+use crate::matching::levels::from_level;
 use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::Pair;
 use crate::matching::residual::{self, normal_equations};
 use crate::numerics::bending::Smoothness;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
-use crate::numerics::{filters, pyramid};
 use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
+use crate::numerics::{filters, pyramid};
 use crate::types::{Counts, LevelReport};
 use rayon::prelude::*;
 
@@ -46,7 +46,7 @@ impl SplineField {
 }
 
 /// The field under which the two volumes agree better.
-pub fn better(pair: &Pair, a: SplineField, b: SplineField) -> SplineField {
+pub fn better(pair: &Pair<'_>, a: SplineField, b: SplineField) -> SplineField {
     let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
     if residual::excess(pair, &warp(&b), &warp(&a)) < 0.0 { b } else { a }
 }
@@ -62,13 +62,13 @@ pub fn smoothness(lattice: &Lattice, spacing: [f64; 3]) -> Smoothness {
 }
 
 /// A lattice whose nodes are `step` of the finest axis' voxels apart along every axis (in mm).
-pub fn lattice(pair: &Pair, step: usize) -> Lattice {
+pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
     let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
     Lattice::new(pair.shape, pair.spacing.map(|s| ((step as f64 * finest / s).round() as usize).max(1)))
 }
 
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
-fn independent(pair: &Pair) -> f32 {
+fn independent(pair: &Pair<'_>) -> f32 {
     (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
 }
 
@@ -83,13 +83,14 @@ const ITERATIONS: usize = 15;
 
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence (MacKay 1992):
 /// `lambda = determined / (2 energy)`. Calls `tick` after each pass.
-pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
+pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
     let energy = smoothness(&field.lattice, pair.spacing);
     let cell = cell_volume(&field.lattice, pair.spacing);
     let active = pair.spans.grown(1);
     let weight = independent(pair);
     let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
     let mut before = field.coefficients.clone();
+    let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     for pass in 0..passes {
         let warped = pair.warp(&field.lattice, &field.coefficients, &active);
         let gain = GainField::measure(pair, &warped);
@@ -114,7 +115,8 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
         before = base;
         field.blocks = equations.blocks;
         if pass % 2 == 1 || pass + 1 == passes {
-            field.determined = coupling::determined(&energy, lambda, &field.blocks, seed + pass as u64, 30);
+            let limit = if pass < 2 { 20 } else { 10 };
+            field.determined = probe.determined(&energy, lambda, &field.blocks, limit);
             let bent = energy.energy(&field.coefficients).max(1e-12);
             let target = 0.5 * field.determined.max(1.0) / bent / cell;
             field.lambda = target.clamp(field.lambda / 5.0, field.lambda * 5.0).clamp(1e-6, 1e9);
@@ -128,7 +130,7 @@ pub fn refine(pair: &Pair, field: &mut SplineField, passes: usize, seed: u64, ti
 
 /// The excess misfit of a map against the free field, from every fourth slice of a thick volume, with the information
 /// that correlated noise leaves.
-pub fn excess<'a>(pair: &'a Pair, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
+pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
     let every = if pair.shape.iter().all(|&n| n >= 48) { 4 } else { 1 };
     let active = pair.spans.slices(|k| k % every == every / 2);
     let free = pair.warp(&field.lattice, &field.coefficients, &active);
@@ -177,7 +179,7 @@ pub struct LevelMatch {
 /// serves as the coupled one. Without, the search is over the deformed volume as it is, and a coupled field is fitted:
 /// it is returned on `lattice`.
 pub fn matches(
-    pair: &Pair,
+    pair: &Pair<'_>,
     known: Option<&SplineField>,
     lattice: Lattice,
     params: MatchParams,
@@ -192,7 +194,7 @@ pub fn matches(
     let smooth;
     let (data, shape, origin) = match &warped {
         Some(w) => (w.as_slice(), pair.shape, [0.0; 3]),
-        None => (pair.moving.as_slice(), pair.moving_shape, pair.moving_origin),
+        None => (&pair.moving[..], pair.moving_shape, pair.moving_origin),
     };
     let smooth_data = match &warped {
         Some(w) => w.as_slice(),
@@ -205,7 +207,7 @@ pub fn matches(
     let within = known.is_some().then_some(pair.mask.as_slice());
     let deformed = corners(smooth_data, shape, spacing, within, noise, room, 5 * params.points);
     let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
-    let fixed = if known.is_some() { &pair.fixed_smooth } else { &pair.fixed };
+    let fixed = if known.is_some() { &pair.fixed_smooth[..] } else { &pair.fixed[..] };
     let searchable = if known.is_some() { Searchable::near } else { Searchable::new };
     let (here, there) = (searchable(fixed, pair.shape, radius), searchable(data, shape, radius));
     let starts: Vec<[f64; 3]> = initial.iter().map(|c| c.voxel).collect();
@@ -377,7 +379,7 @@ fn corners(
 
 /// Couples the matches of a level into a spline field.
 fn fit(
-    pair: &Pair,
+    pair: &Pair<'_>,
     lattice: Lattice,
     starts: &[[f64; 3]],
     refined: &[(usize, [f64; 3], Refined)],
@@ -421,21 +423,24 @@ fn trilinear_patch(data: &[f32], shape: [usize; 3], centre: [f32; 3], radius: [u
         base += first as usize * stride[a];
     }
     let width: [usize; 3] = std::array::from_fn(|a| if shape[a] == 1 { 1 } else { 2 * radius[a] + 1 });
-    dispatch(#[inline(always)] || {
-        for (n, row) in out.chunks_exact_mut(width[0]).enumerate() {
-            let from = base + stride[1] * (n % width[1]) + stride[2] * (n / width[1]);
-            let line = |o: usize| &data[from + o..][..width[0]];
-            let corner = |y: usize, z: usize| [line(y + z), line(y + z + step[0])];
-            let [[a0, a1], [b0, b1]] = [corner(0, 0), corner(step[1], 0)];
-            let [[c0, c1], [d0, d1]] = [corner(0, step[2]), corner(step[1], step[2])];
-            for i in 0..width[0] {
-                let a = a0[i] + t[0] * (a1[i] - a0[i]);
-                let b = b0[i] + t[0] * (b1[i] - b0[i]);
-                let c = c0[i] + t[0] * (c1[i] - c0[i]);
-                let d = d0[i] + t[0] * (d1[i] - d0[i]);
-                let (low, high) = (a + t[1] * (b - a), c + t[1] * (d - c));
-                row[i] = low + t[2] * (high - low);
+    dispatch(
+        #[inline(always)]
+        || {
+            for (n, row) in out.chunks_exact_mut(width[0]).enumerate() {
+                let from = base + stride[1] * (n % width[1]) + stride[2] * (n / width[1]);
+                let line = |o: usize| &data[from + o..][..width[0]];
+                let corner = |y: usize, z: usize| [line(y + z), line(y + z + step[0])];
+                let [[a0, a1], [b0, b1]] = [corner(0, 0), corner(step[1], 0)];
+                let [[c0, c1], [d0, d1]] = [corner(0, step[2]), corner(step[1], step[2])];
+                for i in 0..width[0] {
+                    let a = a0[i] + t[0] * (a1[i] - a0[i]);
+                    let b = b0[i] + t[0] * (b1[i] - b0[i]);
+                    let c = c0[i] + t[0] * (c1[i] - c0[i]);
+                    let d = d0[i] + t[0] * (d1[i] - d0[i]);
+                    let (low, high) = (a + t[1] * (b - a), c + t[1] * (d - c));
+                    row[i] = low + t[2] * (high - low);
+                }
             }
-        }
-    });
+        },
+    );
 }

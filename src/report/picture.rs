@@ -73,7 +73,7 @@ fn encode(width: usize, height: usize, palette: Vec<u8>, indices: &[u8]) -> Resu
     encoder.set_color(png::ColorType::Indexed);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_palette(palette);
-    encoder.set_compression(png::Compression::High);
+    encoder.set_compression(png::Compression::Fast);
     let mut writer = encoder.write_header().map_err(failed)?;
     writer.write_image_data(indices).map_err(failed)?;
     writer.finish().map_err(failed)?;

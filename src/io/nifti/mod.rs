@@ -22,4 +22,4 @@ mod read;
 mod write;
 
 pub use read::{count_non_finite, read_field, read_labels, read_mask, read_volume};
-pub use write::{write_field, write_integers, write_labels, write_volume};
+pub use write::{write_field, write_integers, write_labels, write_steps, write_volume};

@@ -30,6 +30,18 @@ pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) 
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| shortened(v).to_le_bytes())
 }
 
+/// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it packs well.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_steps(path: impl AsRef<Path>, volume: &Volume, description: &str, bits: i32) -> Result<(), IoError> {
+    let form = Form { datatype: 16, bits: 32, vector: false, description };
+    let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
+    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| {
+        ((v * up).round_ties_even() * down + 0.0).to_le_bytes()
+    })
+}
+
 /// Writes a volume as int16, each value rounded to the nearest whole number: half the size of [`write_volume`].
 ///
 /// # Errors
