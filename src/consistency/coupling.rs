@@ -2,7 +2,7 @@
 //! energy of a spline lattice holds the places together.
 
 use crate::numerics::bending::{Smoothness, SolveReport, solve, solve_blocks};
-use crate::numerics::bspline::Lattice;
+use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
 use crate::numerics::small::{Symmetric3, multiply, quadratic};
@@ -100,6 +100,8 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
     // A first guess of lambda: second derivatives of 0.01 / mm.
     let mut lambda = 1e4f32;
     let mut scale = 400.0;
+    let stencils: Vec<Stencil> = evidence.iter().map(|e| lattice.stencil_near(e.at)).collect();
+    let mut probe = Probe::new(n, 0);
     for round in 0..rounds {
         let mut blocks = vec![[0.0f32; 6]; n];
         let mut rhs = vec![0.0f32; 3 * n];
@@ -125,23 +127,25 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         }
         let operator = |x: &[f32], out: &mut [f32]| {
             out.fill(0.0);
-            let pulls: Vec<[f64; 3]> = evidence
+            let pulls: Vec<[f32; 3]> = evidence
                 .par_iter()
+                .zip(&stencils)
                 .zip(&weights)
-                .map(|(e, w)| multiply(&e.information, lattice.at(x, e.at)).map(|v| w * v))
+                .map(|((e, s), w)| {
+                    let u = [0, 1, 2].map(|a| f64::from(s.gather(&x[a * n..(a + 1) * n])));
+                    multiply(&e.information, u).map(|v| (w * v) as f32)
+                })
                 .collect();
-            for (e, p) in evidence.iter().zip(&pulls) {
-                lattice.for_each_tap(e.at, |node, b| {
-                    for a in 0..3 {
-                        out[a * n + node] += b * p[a] as f32;
-                    }
-                });
-            }
+            out.par_chunks_mut(n).enumerate().for_each(|(a, out)| {
+                for (s, p) in stencils.iter().zip(&pulls) {
+                    s.scatter(p[a], out);
+                }
+            });
         };
         // Early rounds only sort the evidence; the last two settle the field.
-        let (tolerance, limit) = if round + 2 < rounds { (1e-2, 30) } else { (1e-3, 120) };
+        let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-3, 60) };
         solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, tolerance, limit);
-        let gamma = determined(smoothness, lambda, &blocks, round as u64, 30);
+        let gamma = probe.determined(smoothness, lambda, &blocks, if round < 2 { 30 } else { 15 });
         let energy = smoothness.energy(&c).max(1e-9);
         lambda = ((0.5 * gamma / energy) as f32).clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
         scale = (scale * 0.5f64).max(9.0);

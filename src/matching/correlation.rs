@@ -18,6 +18,8 @@ pub struct Searchable<'a> {
 #[derive(Debug, Clone)]
 pub struct Template {
     values: Vec<f32>,
+    /// The same, each row along x filled up with zeros; empty where rows are wider.
+    padded: Vec<[f32; WIDTH]>,
     radius: [usize; 3],
 }
 
@@ -74,17 +76,21 @@ impl<'a> Searchable<'a> {
     fn direct(&self, template: &Template, at: [usize; 3]) -> f32 {
         let [rx, ry, rz] = self.radius;
         let width = 2 * rx + 1;
-        let centre = self.data[at[0] + self.shape[0] * (at[1] + self.shape[1] * at[2])];
+        let [nx, ny, _] = self.shape;
+        let centre = self.data[at[0] + nx * (at[1] + ny * at[2])];
         let [mut cross, mut sum, mut square] = [[0.0f32; WIDTH]; 3];
-        for (row, t) in template.values.chunks_exact(width).enumerate() {
+        for (row, t) in template.padded.iter().enumerate() {
             let (j, k) = (at[1] + row % (2 * ry + 1) - ry, at[2] + row / (2 * ry + 1) - rz);
-            let from = at[0] - rx + self.shape[0] * (j + self.shape[1] * k);
-            let (mut v, mut w) = ([centre; WIDTH], [0.0f32; WIDTH]);
-            v[..width].copy_from_slice(&self.data[from..from + width]);
-            w[..width].copy_from_slice(t);
+            let rest = &self.data[at[0] - rx + nx * (j + ny * k)..];
+            let mut v = [centre; WIDTH];
+            match rest.first_chunk::<WIDTH>() {
+                // Past the patch stand the next voxels of the row: they do not count.
+                Some(row) => (0..WIDTH).for_each(|l| v[l] = if l < width { row[l] } else { centre }),
+                None => v[..width].copy_from_slice(&rest[..width]),
+            }
             for l in 0..WIDTH {
                 let d = v[l] - centre;
-                cross[l] += w[l] * d;
+                cross[l] += t[l] * d;
                 sum[l] += d;
                 square[l] += d * d;
             }
@@ -113,7 +119,16 @@ impl<'a> Searchable<'a> {
             return None;
         }
         values.iter_mut().for_each(|v| *v /= norm);
-        Some(Template { values, radius: self.radius })
+        let width = 2 * rx + 1;
+        let mut padded = Vec::new();
+        if width <= WIDTH {
+            padded.extend(values.chunks_exact(width).map(|row| {
+                let mut wide = [0.0; WIDTH];
+                wide[..width].copy_from_slice(row);
+                wide
+            }));
+        }
+        Some(Template { values, padded, radius: self.radius })
     }
 
     /// Correlation with the patch around a voxel; none where that leaves the volume or holds NaN.

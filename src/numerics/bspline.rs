@@ -92,6 +92,14 @@ impl Lattice {
         }
     }
 
+    /// The nodes that act at a fractional voxel position (clamped to the grid), to be used many times.
+    pub fn stencil_near(&self, p: [f64; 3]) -> Stencil {
+        let s: [(usize, [f32; 4]); 3] = std::array::from_fn(|a| self.stencil_at(a, p[a]));
+        let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
+        let base = (0..3).map(|a| s[a].0 * stride[a]).sum();
+        Stencil { base, stride, taps: std::array::from_fn(|a| self.taps(a)), weights: s.map(|s| s.1) }
+    }
+
     /// The vector at a fractional voxel position (clamped to the grid).
     pub fn at(&self, coefficients: &[f32], p: [f64; 3]) -> [f64; 3] {
         let n = self.len();
@@ -325,6 +333,44 @@ impl Lattice {
             }
         }
         out
+    }
+}
+
+/// The at most 64 nodes of a lattice that act at one place, with their weights.
+#[derive(Debug, Clone, Copy)]
+pub struct Stencil {
+    base: usize,
+    stride: [usize; 3],
+    taps: [usize; 3],
+    weights: [[f32; 4]; 3],
+}
+
+impl Stencil {
+    /// The value there of one planar component.
+    #[inline(always)]
+    pub fn gather(&self, component: &[f32]) -> f32 {
+        let [wx, wy, wz] = &self.weights;
+        let mut sum = 0.0;
+        for c in 0..self.taps[2] {
+            for b in 0..self.taps[1] {
+                let row = &component[self.base + b * self.stride[1] + c * self.stride[2]..][..self.taps[0]];
+                sum += wz[c] * wy[b] * row.iter().zip(wx).map(|(v, w)| v * w).sum::<f32>();
+            }
+        }
+        sum
+    }
+
+    /// Adds `value` to one planar component, by the weights.
+    #[inline(always)]
+    pub fn scatter(&self, value: f32, component: &mut [f32]) {
+        let [wx, wy, wz] = &self.weights;
+        for c in 0..self.taps[2] {
+            for b in 0..self.taps[1] {
+                let row = &mut component[self.base + b * self.stride[1] + c * self.stride[2]..][..self.taps[0]];
+                let v = value * (wz[c] * wy[b]);
+                row.iter_mut().zip(wx).for_each(|(o, w)| *o += v * w);
+            }
+        }
     }
 }
 
