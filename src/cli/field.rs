@@ -78,8 +78,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let progress = console.progress();
     progress.set("read", 0.0);
-    let fixed = read_volume(initial, &mut warnings)?;
-    let moving = read_volume(deformed, &mut warnings)?;
+    let (mut first, mut second) = (Vec::new(), Vec::new());
+    let (fixed, moving) = rayon::join(|| read_volume(initial, &mut first), || read_volume(deformed, &mut second));
+    let (fixed, moving) = (fixed?, moving?);
+    warnings.extend(first.into_iter().chain(second));
     let inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
     let mut folder = OutputFolder::create(output, *force)?;
     let read = started.elapsed().as_secs_f64();

@@ -35,6 +35,32 @@ pub struct Measured<'a> {
 /// Stages all files, adds the time of writing to the summary, and gives the short summary for stdout back.
 pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &mut FieldResult) -> Result<String> {
     let started = Instant::now();
+    let (initial, deformed) = (measured.initial, measured.deformed);
+    let still = if deformed.grid() == initial.grid() {
+        Cow::Borrowed(deformed)
+    } else {
+        Cow::Owned(warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0))
+    };
+    // The page is made while the volumes are packed and written.
+    let (written, page) =
+        rayon::join(|| write_volumes(folder, result), || html::page(&describe(measured, &still, result)));
+    written?;
+    let page = page?;
+    folder.write("report.html", |p| io::write_text(p, &page))?;
+    result.summary.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
+    let report = describe(measured, &still, result);
+    folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
+    Ok(palpate::report::text::field_summary(&report))
+}
+
+/// `still` is the deformed volume on the initial grid.
+fn describe<'a>(measured: &Measured<'a>, still: &'a Volume, result: &'a FieldResult) -> FieldReport<'a> {
+    let Measured { command, names, initial, deformed, mask, params, truth } = *measured;
+    let deformed_grid = deformed.grid();
+    FieldReport { command, names, initial, deformed: still, deformed_grid, mask, params, result, truth }
+}
+
+fn write_volumes(folder: &mut OutputFolder, result: &FieldResult) -> Result<()> {
     folder.write("displacement.nii.gz", |p| io::write_field(p, &result.displacement))?;
     folder.write("warped.nii.gz", |p| io::write_volume(p, &result.warped, "palpate: deformed at x + u(x)"))?;
     folder.write("jacobian.nii.gz", |p| io::write_steps(p, &result.jacobian, "palpate: Jacobian determinant", 13))?;
@@ -44,27 +70,5 @@ pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &
         Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
         Mesh::Triangles(mesh) => io::write_tri_mesh(p, mesh, &result.node_displacement, &[]),
     })?;
-    result.summary.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
-
-    let Measured { command, names, initial, deformed, mask, params, truth } = *measured;
-    let still = if deformed.grid() == initial.grid() {
-        Cow::Borrowed(deformed)
-    } else {
-        Cow::Owned(warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0))
-    };
-    let report = FieldReport {
-        command,
-        names,
-        initial,
-        deformed: &still,
-        deformed_grid: deformed.grid(),
-        mask,
-        params,
-        result,
-        truth,
-    };
-    folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
-    let page = html::page(&report)?;
-    folder.write("report.html", |p| io::write_text(p, &page))?;
-    Ok(palpate::report::text::field_summary(&report))
+    Ok(())
 }

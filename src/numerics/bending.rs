@@ -57,7 +57,8 @@ impl Smoothness {
     /// differences), so a row of the result is a combination of 13 rows of `x` and one more filter along the row.
     pub fn apply(&self, x: &[f32], out: &mut [f32]) {
         let bands = self.bands();
-        out.par_chunks_mut(self.nodes[0] * self.nodes[1]).enumerate().for_each(|(k, out)| {
+        let plane = self.nodes[0] * self.nodes[1];
+        out.par_chunks_mut(plane).with_min_len(worthwhile(plane)).enumerate().for_each(|(k, out)| {
             let mut cross = vec![0.0f32; self.nodes[0] * self.nodes[1]];
             dispatch(
                 #[inline(always)]
@@ -484,7 +485,12 @@ fn planes(v: &mut [f32], plane: usize) -> impl IndexedParallelIterator<Item = (u
     let (x, rest) = v.split_at_mut(n);
     let (y, z) = rest.split_at_mut(n);
     let chunks = (x.par_chunks_mut(plane), y.par_chunks_mut(plane), z.par_chunks_mut(plane));
-    chunks.into_par_iter().enumerate().map(|(k, (x, y, z))| (k, [x, y, z]))
+    chunks.into_par_iter().with_min_len(worthwhile(plane)).enumerate().map(|(k, (x, y, z))| (k, [x, y, z]))
+}
+
+/// Planes of `plane` nodes that are worth handing to another thread.
+fn worthwhile(plane: usize) -> usize {
+    (1 << 13) / plane.max(1) + 1
 }
 
 /// Sum of products in sixteen partial sums.

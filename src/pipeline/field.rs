@@ -14,6 +14,7 @@ use crate::pipeline::check;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::types::params::Interpolation;
 use crate::types::*;
+use rayon::prelude::*;
 use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -304,17 +305,25 @@ fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -
 
 /// Mean and largest length over the mask (mm).
 fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64) {
-    let (mut sum, mut top, mut n) = (0.0, 0.0f64, 0usize);
-    for (i, &m) in mask.as_slice().iter().enumerate() {
-        if m != 0 {
-            let d = field.at(i).map(f64::from);
-            let length = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
-            sum += length;
-            top = top.max(length);
-            n += 1;
-        }
-    }
-    (sum / n.max(1) as f64, top)
+    let nx = field.grid().shape()[0];
+    let [x, y, z] = [0, 1, 2].map(|c| field.component(c));
+    let rows: Vec<(f64, f32, usize)> = mask
+        .as_slice()
+        .par_chunks(nx)
+        .enumerate()
+        .map(|(row, mask)| {
+            let from = row * nx;
+            let (mut sum, mut top, mut n) = (0.0, 0.0f32, 0);
+            for i in (0..mask.len()).filter(|&i| mask[i] != 0) {
+                let (a, b, c) = (x[from + i], y[from + i], z[from + i]);
+                let length = (a * a + b * b + c * c).sqrt();
+                (sum, top, n) = (sum + f64::from(length), top.max(length), n + 1);
+            }
+            (sum, top, n)
+        })
+        .collect();
+    let (sum, top, n) = rows.iter().fold((0.0, 0.0f32, 0), |a, r| (a.0 + r.0, a.1.max(r.1), a.2 + r.2));
+    (sum / n.max(1) as f64, f64::from(top))
 }
 
 /// What a user should know.

@@ -49,11 +49,12 @@ impl Views {
         let range = gray_range(initial);
         let base = (initial, range);
         let (before, after) = (matched(initial, deformed, &inside), matched(initial, &result.warped, &inside));
-        let aligned = |v: &Volume, gain: f32, o: usize| v.as_slice()[o] * gain;
-        let gap = |v: &Volume, gain: f32, o: usize| (initial.as_slice()[o] - aligned(v, gain, o)).abs();
+        let values = initial.as_slice();
+        let gap = |v: &[f32], gain: f32, o: usize| (values[o] - v[o] * gain).abs();
 
-        let worst = spread(0.99, &|o| gap(deformed, before, o));
+        let worst = spread(0.99, &|o| gap(deformed.as_slice(), before, o));
         let difference = |title: &str, v: &Volume, gain: f32| -> Result<Panel, ReportError> {
+            let v = v.as_slice();
             let scale = Scale { low: 0.0, high: worst.max(1e-6), unit: "", map: ColorMap::Magma };
             let mean = inside.iter().map(|&o| f64::from(gap(v, gain, o))).filter(|g| g.is_finite()).sum::<f64>();
             let mean = mean / inside.len().max(1) as f64 / (range[1] - range[0]) * 100.0;
@@ -67,9 +68,11 @@ impl Views {
 
         let motion = |o| length(&result.displacement, o);
         let lengths = Scale::from_zero(spread(0.998, &motion), "mm", ColorMap::Viridis);
-        let jacobian = |o: usize| result.jacobian.as_slice()[o];
+        let jacobian = result.jacobian.as_slice();
+        let jacobian = |o: usize| jacobian[o];
         let change = Scale::about(1.0, spread(0.99, &|o| (jacobian(o) - 1.0).abs()).clamp(0.05, 1.0), "");
-        let sigma = |o: usize| result.uncertainty.as_slice()[o];
+        let sigma = result.uncertainty.as_slice();
+        let sigma = |o: usize| sigma[o];
         let vague = Scale::from_zero(spread(0.98, &sigma), "mm", ColorMap::Magma);
 
         let error = report.truth.map(|(truth, _)| {
@@ -81,10 +84,8 @@ impl Views {
             Panel::coloured("Error of the displacement", &sections, base, mask, scale, gap)
         });
 
-        let backgrounds = sections
-            .iter()
-            .map(|s| Picture::gray(s, |o| initial.as_slice()[o], range))
-            .collect::<Result<Vec<_>, _>>()?;
+        let backgrounds =
+            sections.iter().map(|s| Picture::gray(s, |o| values[o], range)).collect::<Result<Vec<_>, _>>()?;
         let factor = drawing::arrow_factor(&sections, spread(0.98, &motion));
         let each = |draw: &dyn Fn(&Section, &Picture) -> String| {
             sections.iter().zip(&backgrounds).map(|(s, b)| draw(s, b)).collect::<Vec<_>>()

@@ -5,6 +5,7 @@ use super::flaw::Flaw;
 use crate::error::IoError;
 use crate::io::atomic::write_atomic;
 use crate::io::gzip::{Chunk, write_member};
+use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
 use std::io::Write;
@@ -118,7 +119,10 @@ fn write<T: Copy + Sync, const N: usize>(
         parts.iter().enumerate().flat_map(|(p, values)| values.chunks(CHUNK).map(move |c| (p, c))).collect();
     let bytes = |&(part, values): &(usize, &[T])| -> Vec<u8> {
         let mut bytes = vec![0; N * values.len()];
-        bytes.as_chunks_mut::<N>().0.iter_mut().zip(values).for_each(|(b, &v)| *b = stored(part, v));
+        dispatch(
+            #[inline(always)]
+            || bytes.as_chunks_mut::<N>().0.iter_mut().zip(values).for_each(|(b, &v)| *b = stored(part, v)),
+        );
         bytes
     };
     if !pack {
