@@ -1,7 +1,7 @@
 //! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
 //! energy of a spline lattice holds the places together.
 
-use crate::numerics::bending::{Smoothness, SolveReport, solve, solve_blocks};
+use crate::numerics::bending::{Smoothness, SolveReport, apply_blocks, solve, solve_blocks};
 use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
@@ -44,7 +44,7 @@ pub fn step(
 /// The trace is estimated with one random sign vector (Hutchinson 1990), which is exact to about one part in the root
 /// of the number of nodes.
 pub fn determined(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], seed: u64, limit: usize) -> f64 {
-    Probe::new(blocks.len(), seed).determined(smoothness, lambda, blocks, limit)
+    Probe::new(blocks.len(), seed).determined(smoothness, lambda, blocks, limit, false)
 }
 
 /// The random sign vector of [`determined`] and its last solution, from which the next one starts: while a field settles, a
@@ -63,10 +63,22 @@ impl Probe {
         Self { signs, solution: vec![0.0; 3 * nodes] }
     }
 
-    /// See [`determined`]; at most `limit` more iterations.
-    pub fn determined(&mut self, smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], limit: usize) -> f64 {
+    /// See [`determined`]; at most `limit` more iterations, `multilevel` where the blocks are sparse.
+    pub fn determined(
+        &mut self,
+        smoothness: &Smoothness,
+        lambda: f32,
+        blocks: &[[f32; 6]],
+        limit: usize,
+        multilevel: bool,
+    ) -> f64 {
         let n = blocks.len();
-        solve_blocks(smoothness, lambda, blocks, &self.signs, &mut self.solution, 1e-2, limit);
+        if multilevel {
+            let data = |x: &[f32], out: &mut [f32]| apply_blocks(blocks, x, out);
+            solve(smoothness, lambda, data, blocks, &self.signs, &mut self.solution, 1e-2, limit);
+        } else {
+            solve_blocks(smoothness, lambda, blocks, &self.signs, &mut self.solution, 1e-2, limit);
+        }
         let mut lx = vec![0.0f32; n];
         let mut trace = 0.0;
         for (x, z) in self.solution.chunks_exact(n).zip(self.signs.chunks_exact(n)) {
@@ -145,9 +157,11 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         // Early rounds only sort the evidence; the last two settle the field.
         let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-3, 60) };
         solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, tolerance, limit);
-        let gamma = probe.determined(smoothness, lambda, &blocks, if round < 2 { 30 } else { 15 });
+        let gamma = probe.determined(smoothness, lambda, &blocks, if round < 2 { 30 } else { 15 }, true).max(1.0);
         let energy = smoothness.energy(&c).max(1e-9);
-        lambda = ((0.5 * gamma / energy) as f32).clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
+        // Half way on the logarithm: whole steps swing to and fro.
+        let target = (lambda * (0.5 * gamma / energy) as f32).sqrt();
+        lambda = target.clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
         scale = (scale * 0.5f64).max(9.0);
     }
     (c, lambda)

@@ -3,6 +3,7 @@
 //! Energy (per component): `sum over nodes of |second differences|^2 / mm^4` over all six second derivatives (a P-spline
 //! penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999). An affine field costs nothing.
 
+use crate::numerics::multilevel::Coarse;
 use crate::numerics::random::Random;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::inverse;
@@ -264,7 +265,7 @@ pub struct SolveReport {
     pub residual: f64,
 }
 
-/// Preconditioned conjugate gradients for `(D + lambda L) x = b`, where `D` is any positive semidefinite data operator.
+/// Conjugate gradients with a multilevel preconditioner for `(D + lambda L) x = b`, where `D` is any positive semidefinite data operator.
 ///
 /// `data(x, out)` writes `D x` (planar, three components); `blocks` holds (an upper bound of) its 3 x 3 diagonal blocks
 /// for the preconditioner; `x` holds the start and receives the result. Stops at `tolerance` (relative residual) or
@@ -279,7 +280,7 @@ pub fn solve(
     tolerance: f64,
     limit: usize,
 ) -> SolveReport {
-    let system = System::new(smoothness, lambda, blocks);
+    let system = System::new(smoothness, lambda, blocks, true);
     let n = blocks.len();
     let mut values = vec![0.0f32; 3 * n];
     system.iterate(b, x, tolerance, limit, |p, ap| {
@@ -288,7 +289,8 @@ pub fn solve(
     })
 }
 
-/// As [`solve`] for block-diagonal data: `D` is `blocks` itself.
+/// As [`solve`] for block-diagonal data: `D` is `blocks` itself. Preconditioned by the blocks alone: smooth errors go
+/// slowly, which early stopping makes use of.
 pub fn solve_blocks(
     smoothness: &Smoothness,
     lambda: f32,
@@ -298,7 +300,7 @@ pub fn solve_blocks(
     tolerance: f64,
     limit: usize,
 ) -> SolveReport {
-    let system = System::new(smoothness, lambda, blocks);
+    let system = System::new(smoothness, lambda, blocks, false);
     system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None))
 }
 
@@ -312,10 +314,12 @@ struct System {
     blocks: Vec<f32>,
     /// Inverse 3 x 3 diagonal blocks of the whole matrix, planar.
     inverse: Vec<f32>,
+    /// What is smooth is left to coarser lattices, where that is wanted.
+    coarse: Option<Box<Coarse>>,
 }
 
 impl System {
-    fn new(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]]) -> Self {
+    fn new(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], multilevel: bool) -> Self {
         let n = blocks.len();
         let diagonal = smoothness.diagonal();
         let inverses: Vec<[f32; 6]> = blocks
@@ -337,11 +341,14 @@ impl System {
             }
             out
         };
+        let blocks = planar(blocks);
+        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.into(), &blocks);
         Self {
             bands: smoothness.bands(),
             lambda,
             plane: smoothness.nodes[0] * smoothness.nodes[1],
-            blocks: planar(blocks),
+            coarse: multilevel.then(below).flatten(),
+            blocks,
             inverse: planar(&inverses),
         }
     }
@@ -386,18 +393,34 @@ impl System {
         sum(parts.collect())
     }
 
-    /// `z = M^-1 r` for one plane, and `r . z`.
-    #[inline(always)]
-    fn precondition(&self, k: usize, r: [&[f32]; 3], z: [&mut [f32]; 3]) -> f64 {
-        let n = self.inverse.len() / 6;
-        let [xx, yy, zz, xy, xz, yz] = sixths(&self.inverse, n, &(k * self.plane..(k + 1) * self.plane));
-        let ([r0, r1, r2], [z0, z1, z2]) = (r, z);
-        for i in 0..self.plane {
-            z0[i] = xx[i] * r0[i] + xy[i] * r1[i] + xz[i] * r2[i];
-            z1[i] = xy[i] * r0[i] + yy[i] * r1[i] + yz[i] * r2[i];
-            z2[i] = xz[i] * r0[i] + yz[i] * r1[i] + zz[i] * r2[i];
-        }
-        dot(r0, z0) + dot(r1, z1) + dot(r2, z2)
+    /// `z = M^-1 r`; returns `r . z`.
+    fn precondition(&self, r: &[f32], z: &mut [f32]) -> f64 {
+        let n = r.len() / 3;
+        let below = self.coarse.as_ref().map(|c| (c, c.solve(r)));
+        let parts = planes(z, self.plane).map(|(k, z)| {
+            let at = k * self.plane..(k + 1) * self.plane;
+            let [r0, r1, r2] = thirds(r).map(|r| &r[at.clone()]);
+            let [xx, yy, zz, xy, xz, yz] = sixths(&self.inverse, n, &at);
+            let mut room = Vec::new();
+            dispatch(
+                #[inline(always)]
+                || {
+                    let [z0, z1, z2] = z;
+                    for i in 0..self.plane {
+                        z0[i] = xx[i] * r0[i] + xy[i] * r1[i] + xz[i] * r2[i];
+                        z1[i] = xy[i] * r0[i] + yy[i] * r1[i] + yz[i] * r2[i];
+                        z2[i] = xz[i] * r0[i] + yz[i] * r1[i] + zz[i] * r2[i];
+                    }
+                    if let Some((coarse, below)) = &below {
+                        coarse.add_plane(below, 0, k, z0, &mut room);
+                        coarse.add_plane(below, 1, k, z1, &mut room);
+                        coarse.add_plane(below, 2, k, z2, &mut room);
+                    }
+                    dot(r0, z0) + dot(r1, z1) + dot(r2, z2)
+                },
+            )
+        });
+        sum(parts.collect())
     }
 
     fn iterate(
@@ -415,14 +438,7 @@ impl System {
             r.iter_mut().zip(&ap).for_each(|(r, a)| *r -= a);
         }
         let mut z = vec![0.0f32; x.len()];
-        let start = planes(&mut z, self.plane).map(|(k, z)| {
-            let at = k * self.plane..(k + 1) * self.plane;
-            dispatch(
-                #[inline(always)]
-                || self.precondition(k, thirds(&r).map(|r| &r[at.clone()]), z),
-            )
-        });
-        let mut rz = sum(start.collect());
+        let mut rz = self.precondition(&r, &mut z);
         let mut p = z.clone();
         let first = rz;
         let mut iterations = 0;
@@ -432,25 +448,22 @@ impl System {
                 break;
             }
             let alpha = (rz / curvature) as f32;
-            let all = planes(x, self.plane).zip(planes(&mut r, self.plane)).zip(planes(&mut z, self.plane));
-            let parts = all.map(|(((k, x), (_, r)), (_, z))| {
+            planes(x, self.plane).zip(planes(&mut r, self.plane)).for_each(|((k, x), (_, r))| {
                 let at = k * self.plane..(k + 1) * self.plane;
                 let (p, a) = (thirds(&p).map(|p| &p[at.clone()]), thirds(&ap).map(|a| &a[at.clone()]));
                 dispatch(
                     #[inline(always)]
                     || {
-                        let [r0, r1, r2] = r;
-                        for (((x, r), p), a) in x.into_iter().zip([&mut *r0, &mut *r1, &mut *r2]).zip(p).zip(a) {
+                        for (((x, r), p), a) in x.into_iter().zip(r).zip(p).zip(a) {
                             for i in 0..self.plane {
                                 x[i] += alpha * p[i];
                                 r[i] -= alpha * a[i];
                             }
                         }
-                        self.precondition(k, [r0, r1, r2], z)
                     },
-                )
+                );
             });
-            let next = sum(parts.collect());
+            let next = self.precondition(&r, &mut z);
             let beta = (next / rz) as f32;
             rz = next;
             dispatch(

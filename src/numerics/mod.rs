@@ -18,6 +18,7 @@ pub mod small;
 
 pub mod bspline;
 pub mod cubic;
+mod multilevel;
 
 pub mod bending;
 

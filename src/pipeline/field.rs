@@ -60,7 +60,8 @@ pub fn run(
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, deformed, &mask, search)?;
-    let factors = factors(grid.shape(), grid.spacing(), params.finest, search / 6.0);
+    let finest = finest_level(&grid, &mask, params.finest);
+    let factors = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
     clock.book("pyramid");
 
     // Coarse to fine.
@@ -188,7 +189,7 @@ pub fn run(
 }
 
 /// Voxels of the coarsest mask for each feature there, and the most features.
-const COARSE_SHARE: usize = 12;
+const COARSE_SHARE: usize = 24;
 /// See [`COARSE_SHARE`].
 const COARSE_POINTS: usize = 4000;
 
@@ -199,6 +200,22 @@ fn search_mm(grid: &Grid, asked: f64) -> f64 {
     let side = thick().map(|a| shape[a] as f64 * spacing[a]).fold(f64::INFINITY, f64::min);
     let voxel = thick().map(|a| spacing[a]).fold(0.0, f64::max);
     if asked > 0.0 { asked } else { (0.15 * side).min(30.0).max(2.0 * voxel) }
+}
+
+/// Voxels of the mask that a preset without a fixed finest level works on at most.
+const WORKED_ON: usize = 600_000;
+
+/// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`] voxels of tissue are left.
+fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
+    if asked > 0 {
+        return asked;
+    }
+    let inside = mask.as_slice().iter().filter(|&&m| m != 0).count();
+    let left = |f: usize| {
+        let factor = factors(grid.shape(), grid.spacing(), f, 0.0)[0];
+        inside / factor.iter().product::<usize>()
+    };
+    [1, 2, 4].into_iter().find(|&f| left(f) <= WORKED_ON).unwrap_or(8)
 }
 
 fn too_few(found: usize, search: f64) -> FieldError {

@@ -40,7 +40,7 @@ pub struct FieldParams {
     pub voxels_per_point: usize,
     /// Largest motion looked for (mm); 0 = 15 % of the volume's smallest side, 2 voxels to 30 mm.
     pub search_mm: f64,
-    /// Finest level worked on: 1 = full resolution, 2 = half.
+    /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000 voxels of tissue.
     pub finest: usize,
     /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 8.
     pub node_spacing: usize,
@@ -70,16 +70,16 @@ impl FieldParams {
             search_mm: 0.0,
             finest: 1,
             node_spacing: 4,
-            passes: 4,
-            coarse_passes: 10,
+            passes: 6,
+            coarse_passes: 12,
             interpolation: Interpolation::Spline,
             seed: 1,
         };
         match preset {
-            Preset::Fast => Self { finest: 2, passes: 6, coarse_passes: 8, voxels_per_point: 1000, ..balanced },
+            Preset::Fast => Self { finest: 0, passes: 5, coarse_passes: 6, voxels_per_point: 1000, ..balanced },
             Preset::Balanced => balanced,
             Preset::Accurate => {
-                Self { node_spacing: 3, passes: 10, coarse_passes: 14, voxels_per_point: 64, ..balanced }
+                Self { node_spacing: 3, passes: 12, coarse_passes: 20, voxels_per_point: 64, ..balanced }
             }
         }
     }
@@ -101,7 +101,7 @@ impl FieldParams {
         }
         let whole = [
             ("voxels_per_point", self.voxels_per_point, 8, 100_000, "8 to 100,000"),
-            ("finest", self.finest, 1, 8, "1 (full resolution) to 8"),
+            ("finest", self.finest, 0, 8, "0 (automatic), 1 (full resolution) to 8"),
             ("node_spacing", self.node_spacing, 2, 16, "2 to 16 voxels"),
             ("passes", self.passes, 1, 100, "1 to 100"),
             ("coarse_passes", self.coarse_passes, 1, 100, "1 to 100"),
