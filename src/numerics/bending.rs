@@ -202,10 +202,15 @@ impl Bands {
                 y + if dj == 2 { xz * first(wz, dk) } else { 0.0 }
             });
             let (out, cross) = (&mut out[nx * j..][..length], &mut cross[nx * j..][..length]);
+            // Spelled out, so that it is made of vector instructions.
+            let [r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12] = rows;
+            let [w0, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12] = weights;
+            let [t0, t1, t2, t3, t4, ..] = twist;
             for i in 0..length {
-                let v: [f32; 13] = std::array::from_fn(|n| rows[n][i]);
-                out[i] = (0..13).map(|n| weights[n] * v[n]).sum();
-                cross[i] = (0..5).map(|n| twist[n] * v[n]).sum();
+                let near = w0 * r0[i] + w1 * r1[i] + w2 * r2[i] + w3 * r3[i] + w4 * r4[i];
+                let far = w5 * r5[i] + w6 * r6[i] + w7 * r7[i] + w8 * r8[i];
+                out[i] = near + far + (w9 * r9[i] + w10 * r10[i] + w11 * r11[i] + w12 * r12[i]);
+                cross[i] = t0 * r0[i] + t1 * r1[i] + t2 * r2[i] + t3 * r3[i] + t4 * r4[i];
             }
         }
         let x = &x[k * nx * ny..(k + 1) * nx * ny];
