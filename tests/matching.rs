@@ -23,13 +23,13 @@ use truth::{Waves, entry, normals, sampled, voxels, with_threads};
 fn aligned(
     initial: (Grid, &dyn Fn(WorldPoint) -> f64),
     deformed: (Grid, &dyn Fn(WorldPoint) -> f64),
-) -> Result<Aligned, FieldError> {
+) -> Result<Aligned<'static>, FieldError> {
     let volume = |(grid, f): (Grid, &dyn Fn(WorldPoint) -> f64)| {
         let values = voxels(grid.shape()).map(|[i, j, k]| f(grid.world(i, j, k)) as f32).collect();
         Volume::from_vec(grid, values).unwrap()
     };
     let (i, d) = (volume(initial), volume(deformed));
-    Aligned::new(&i, &d, &Mask::filled(initial.0, 1), 10.0)
+    Ok(Aligned::new(&i, &d, &Mask::filled(initial.0, 1), 10.0)?.into_owned())
 }
 
 fn grid(shape: [usize; 3], rows: [[f64; 4]; 3]) -> Grid {
@@ -50,7 +50,7 @@ fn pair(shape: [usize; 3], spacing: [f64; 3], fixed: &[f32], moving: &[f32]) -> 
 }
 
 /// The deformed volume as the initial lattice sees it, without motion.
-fn unmoved(pair: &Pair) -> Vec<f32> {
+fn unmoved(pair: &Pair<'_>) -> Vec<f32> {
     let lattice = Lattice::new(pair.shape, [4; 3]);
     pair.warp(&lattice, &vec![0.0; 3 * lattice.len()], &Spans::new(&vec![1; pair.fixed.len()], pair.shape))
 }
@@ -494,7 +494,7 @@ fn the_blocks_are_positive_and_bound_the_curvature() {
 // Alignment and levels
 
 /// Whether the deformed volume, seen through the pair, is where the initial one says it is.
-fn agree(pair: &Pair, tolerance: f64) -> usize {
+fn agree(pair: &Pair<'_>, tolerance: f64) -> usize {
     let (mut worst, mut seen) = (0.0f64, 0);
     for (i, p) in voxels(pair.shape).enumerate() {
         let q = pair.to_moving(p.map(|v| v as f64));
@@ -541,7 +541,8 @@ fn volumes_on_any_grids_are_brought_together() {
             ("flipped", grid([34, 30, 30], flipped), 1.0),
             ("turned", grid([40, 40, 32], turned), 2.0),
         ] {
-            let pair = aligned((first, &tissue), (second, &tissue)).unwrap().level([1; 3]);
+            let both = aligned((first, &tissue), (second, &tissue)).unwrap();
+            let pair = both.level([1; 3]);
             let seen = agree(&pair, tolerance);
             assert!(seen > 3000, "{name}: {seen} voxels compared");
         }

@@ -14,8 +14,8 @@ use std::borrow::Cow;
 pub struct Aligned<'a> {
     shape: [usize; 3],
     spacing: [f64; 3],
-    fixed: &'a [f32],
-    mask: &'a [u8],
+    fixed: Cow<'a, [f32]>,
+    mask: Cow<'a, [u8]>,
     moving_shape: [usize; 3],
     moving_origin: [f64; 3],
     moving: Cow<'a, [f32]>,
@@ -48,8 +48,8 @@ impl<'a> Aligned<'a> {
         let base = Self {
             shape: g.shape(),
             spacing,
-            fixed: initial.as_slice(),
-            mask: mask.as_slice(),
+            fixed: initial.as_slice().into(),
+            mask: mask.as_slice().into(),
             moving_shape: m.shape(),
             moving_origin: g.affine().to_voxel(m.affine().origin()).0,
             moving: Cow::Borrowed(&[]),
@@ -63,11 +63,21 @@ impl<'a> Aligned<'a> {
         Ok(Self { moving_shape: shape, moving_origin: origin, moving: moving.into(), ..base })
     }
 
+    /// The same, with its own copy of the volumes.
+    pub fn into_owned(self) -> Aligned<'static> {
+        Aligned {
+            fixed: self.fixed.into_owned().into(),
+            mask: self.mask.into_owned().into(),
+            moving: self.moving.into_owned().into(),
+            ..self
+        }
+    }
+
     /// The pair with blocks of `factor` voxels averaged.
     pub fn level(&self, factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
-        let fixed = pyramid::reduce(self.fixed, self.shape, factor);
-        let mask = pyramid::reduce_mask(self.mask, self.shape, factor);
+        let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
+        let mask = pyramid::reduce_mask(&self.mask, self.shape, factor);
         let moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
         Pair {
             shape,

@@ -114,11 +114,11 @@ pub fn run(
                 reports = vec![report];
             }
             clock.book("matching");
-            fine = Some((matches, pair));
+            fine = Some((matches, pair, points));
         }
         state = Some((field, factor));
     }
-    let (Some((field, factor)), Some((matches, pair))) = (state, fine) else {
+    let (Some((field, factor)), Some((matches, pair, points))) = (state, fine) else {
         return Err(too_few(0, search));
     };
     let kept = matches.iter().filter(|m| m.kept).count();
@@ -129,7 +129,9 @@ pub fn run(
     // The smallest motion that explains the matches.
     progress("model", 0.9);
     let flat = grid.is_single_slice();
-    let choice = smallest(&matches, &pair, &field);
+    let mut choice = smallest(&matches, &pair, &field, params.seed);
+    let found = reports.last().map_or(0, |r| r.counts.features_initial);
+    choice.evidence.push(why_so_many(params, points, found));
     let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
     clock.book("model");
@@ -223,11 +225,21 @@ fn too_few(found: usize, search: f64) -> FieldError {
     FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
 }
 
+/// Where the number of points comes from.
+fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
+    let source = match params.points {
+        0 => format!("one for {} voxels of tissue", params.voxels_per_point),
+        _ => "as asked".into(),
+    };
+    let limit = if found < wanted { "; no more corners stand out of the noise" } else { "" };
+    format!("points: {found} of {wanted} wanted, {source}{limit}")
+}
+
 /// Chooses the model from the kept matches and the free field.
-fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField) -> Choice {
+fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: u64) -> Choice {
     let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
     let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
-    choose(&measured, level::excess(pair, field), field.determined, 0.02 * finest)
+    choose(&measured, level::excess(pair, field), level::determined(pair, field, seed), 0.02 * finest)
 }
 
 /// The chosen motion on a lattice over the full-resolution grid.

@@ -33,15 +33,15 @@ pub struct SplineField {
     pub lambda: f64,
     /// Information of the last pass (1/mm^2), one block a node.
     pub blocks: Vec<[f32; 6]>,
-    /// Degrees of freedom that the data determine.
-    pub determined: f64,
+    /// Weight of the bending energy in the last pass, per lattice cell.
+    pub coupled_at: f32,
 }
 
 impl SplineField {
     /// No motion, with a bending energy to start from.
     pub fn still(lattice: Lattice) -> Self {
         let coefficients = vec![0.0; 3 * lattice.len()];
-        Self { lattice, coefficients, lambda: 30.0, blocks: Vec::new(), determined: 0.0 }
+        Self { lattice, coefficients, lambda: 30.0, blocks: Vec::new(), coupled_at: 0.0 }
     }
 }
 
@@ -116,16 +116,24 @@ pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64
         field.blocks = equations.blocks;
         if pass % 2 == 1 || pass + 1 == passes {
             let limit = if pass < 2 { 20 } else { 10 };
-            field.determined = probe.determined(&energy, lambda, &field.blocks, limit, false);
+            // A warm start saves iterations; where little is determined it can miss by more than there is.
+            let determined = probe.determined(&energy, lambda, &field.blocks, limit, false).max(1.0);
             let bent = energy.energy(&field.coefficients).max(1e-12);
-            let target = 0.5 * field.determined.max(1.0) / bent / cell;
+            let target = 0.5 * determined / bent / cell;
             field.lambda = target.clamp(field.lambda / 5.0, field.lambda * 5.0).clamp(1e-6, 1e9);
         }
+        field.coupled_at = lambda;
         tick(pass);
         if f64::from(moved) < SETTLED * finest && pass >= 3 {
             break;
         }
     }
+}
+
+/// Degrees of freedom that the data of the last pass determine.
+pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
+    let energy = smoothness(&field.lattice, pair.spacing);
+    coupling::determined(&energy, field.coupled_at, &field.blocks, seed, 30).max(12.0)
 }
 
 /// The excess misfit of a map against the free field, from every fourth slice of a thick volume, with the information
@@ -144,7 +152,7 @@ pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&Affine
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
 pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> SplineField {
     let coefficients = lattice.fit(|p| coarse.lattice.at(&coarse.coefficients, from_here(p)));
-    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Vec::new(), determined: 0.0 }
+    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Vec::new(), coupled_at: 0.0 }
 }
 
 /// What the feature stages need to know.
@@ -412,7 +420,7 @@ fn fit(
     let energy = smoothness(&lattice, pair.spacing);
     let (coefficients, lambda) = coupling::fit(&lattice, &energy, &evidence, ROUNDS);
     let lambda = STIFF * f64::from(lambda) / cell_volume(&lattice, pair.spacing);
-    SplineField { lattice, coefficients, lambda, blocks: Vec::new(), determined: 0.0 }
+    SplineField { lattice, coefficients, lambda, blocks: Vec::new(), coupled_at: 0.0 }
 }
 
 /// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it leaves the volume.

@@ -78,9 +78,7 @@ impl FieldParams {
         match preset {
             Preset::Fast => Self { finest: 0, passes: 5, coarse_passes: 6, voxels_per_point: 1000, ..balanced },
             Preset::Balanced => balanced,
-            Preset::Accurate => {
-                Self { node_spacing: 3, passes: 12, coarse_passes: 20, voxels_per_point: 64, ..balanced }
-            }
+            Preset::Accurate => Self { passes: 12, coarse_passes: 16, voxels_per_point: 64, ..balanced },
         }
     }
 
