@@ -260,6 +260,9 @@ pub enum SceneError {
     /// Rigid tips and locked joints.
     #[error("rigid tips and fixed joints leave nothing to move; choose another fingertip.model or set fixed = false")]
     NothingMoves,
+    /// Rigid tips away from joint angles 0.
+    #[error("rigid tips start at joint angles 0; remove initial.theta or choose another fingertip.model")]
+    RigidStart,
     /// More steps or samples than a run may have.
     #[error("{duration} s take more than 2e9 steps or 5e6 samples; lengthen integrator.step or output_every")]
     TooLong {

@@ -39,7 +39,7 @@ impl Phase {
     /// The phase of `scene` around the time `t` (s), which is not at a border of one.
     pub fn at(scene: &Scene, t: f64) -> Self {
         let mut begin = scene.initial.rest;
-        let mut from = [0.0; 2];
+        let mut from = scene.initial.joints;
         let mut phase = Self::hold(from);
         for Motion { target, duration, hold } in &scene.motions {
             if t < begin {

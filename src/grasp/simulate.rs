@@ -44,8 +44,7 @@ pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, Grasp
 
 fn with_tip<T: Tip + Clone>(scene: &Scene, tip: T, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
     let statics = Statics::new(scene, &tip);
-    let start = statics.pinch(scene);
-    check_start(scene, &statics, &start)?;
+    let start = start(scene, &statics)?;
     let plant = Plant::new(scene, tip.clone(), &start);
     let Integrator { formulation, baumgarte, rolling, .. } = scene.integrator;
     match formulation {
@@ -56,8 +55,12 @@ fn with_tip<T: Tip + Clone>(scene: &Scene, tip: T, progress: Progress<'_>) -> Re
     }
 }
 
-/// The pinch must be a stable equilibrium in the model's range.
-fn check_start(scene: &Scene, statics: &Statics<'_>, start: &Equilibrium) -> Result<(), GraspError> {
+/// The equilibrium that a run starts in: the pinch, followed to the first joint angles.
+///
+/// # Errors
+/// [`GraspError::NoStart`] where the pinch is not stable or not in the model's range, or the branch does not reach so far.
+pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspError> {
+    let start = statics.pinch(scene);
     let depth = scene.initial.normal_displacement * 1e3;
     if let Some(lost) = statics.out_of_range(&start.q) {
         let (what, finger) = match lost {
@@ -70,6 +73,7 @@ fn check_start(scene: &Scene, statics: &Statics<'_>, start: &Equilibrium) -> Res
             hint: "change initial.normal_displacement or fingertip.radius".into(),
         });
     }
+    // Not `<=`: an eigenvalue that is no number is not stable either.
     if !(start.smallest_eigenvalue > 0.0) {
         return Err(GraspError::NoStart {
             what: format!(
@@ -80,7 +84,18 @@ fn check_start(scene: &Scene, statics: &Statics<'_>, start: &Equilibrium) -> Res
                 .into(),
         });
     }
-    Ok(())
+    if scene.initial.joints == [0.0; 2] {
+        return Ok(start);
+    }
+    statics.follow(&start, scene.initial.joints, STRIDE).map_err(|(lost, last)| GraspError::NoStart {
+        what: format!(
+            "initial.theta cannot be reached from the pinch: at joint angles {:.2} and {:.2} degrees {}",
+            last.q[3].to_degrees(),
+            last.q[4].to_degrees(),
+            lost.words()
+        ),
+        hint: "choose other angles in initial.theta".into(),
+    })
 }
 
 /// What is looked at in every step.
@@ -183,7 +198,8 @@ impl<const N: usize, S: System<N>> Run<'_, N, S> {
         if growth <= LIMIT {
             return None;
         }
-        let minimal = stepping::growth_at_pinch(self.scene, method, Formulation::Minimal, step, 0.0);
+        let here = Equilibrium { q: std::array::from_fn(|k| state[k]), ..Equilibrium::default() };
+        let minimal = stepping::growth_at(self.scene, method, Formulation::Minimal, step, 0.0, &here);
         let gain = self.scene.integrator.formulation == Formulation::Multipliers && minimal <= LIMIT;
         Some(if gain { EventKind::BadGain } else { EventKind::BadStep })
     }
@@ -246,7 +262,8 @@ fn run<const N: usize, S: System<N>>(
 ) -> Result<GraspRun, GraspError> {
     let Integrator { method, step, output_every, formulation, baumgarte, .. } = scene.integrator;
     let state = system.start(&start);
-    let step_growth = stepping::growth_of(method, system, &Phase::hold([0.0; 2]), step, &state);
+    let at_rest = Phase::hold(scene.initial.joints);
+    let step_growth = stepping::growth_of(method, system, &at_rest, step, &state);
     let watch = Watch {
         radius: scene.fingertip.radius,
         friction: scene.object.friction.unwrap_or(f64::INFINITY),
@@ -265,19 +282,19 @@ fn run<const N: usize, S: System<N>>(
     };
     let mut run = Run { scene, system, watch, state, before: (state, 0.0), result, trial: step };
     if step_growth > LIMIT {
-        let gain_to_blame = run.cause(&Phase::hold([0.0; 2]), &state) == Some(EventKind::BadGain);
+        let gain_to_blame = run.cause(&at_rest, &state) == Some(EventKind::BadGain);
         return Err(if gain_to_blame {
-            let stable = stepping::stable_gain(scene);
+            let stable = stepping::stable_gain(scene, &start);
             GraspError::BadGain { gain: baumgarte, step, growth: step_growth, stable }
         } else {
             let method_name = format!("{}, {}", method.name(), formulation.name());
-            let stable = stepping::stable_step(scene, method, formulation);
+            let stable = stepping::stable_step(scene, method, formulation, &[start]);
             GraspError::BadStep { step, growth: step_growth, method: method_name, stable }
         });
     }
 
     let duration = scene.duration();
-    let mut ends = vec![(scene.initial.rest, 0, [0.0; 2])];
+    let mut ends = vec![(scene.initial.rest, 0, scene.initial.joints)];
     for (i, motion) in scene.motions.iter().enumerate() {
         let last = ends[i].0;
         ends.push((last + motion.duration + motion.hold, i + 1, motion.target));
@@ -292,9 +309,9 @@ fn run<const N: usize, S: System<N>>(
     let mut largest_energy = 0.0f64;
     let mut branch = start;
     let first_eigenvalue = start.smallest_eigenvalue;
-    let (first, reading) = run.sample(&Phase::hold([0.0; 2]), 0.0, &state);
+    let (first, reading) = run.sample(&at_rest, 0.0, &state);
     run.result.samples.push(first);
-    run.goes_on(&Phase::hold([0.0; 2]), 0.0, &reading, &state);
+    run.goes_on(&at_rest, 0.0, &reading, &state);
     let mut next_end = 0;
     let mut next_output = 1;
     if ends[0].0 == 0.0 {
@@ -331,8 +348,7 @@ fn run<const N: usize, S: System<N>>(
             if scene.fingertip.model == FingertipModel::Rigid {
                 return true;
             }
-            let here = statics.smallest_eigenvalue(&q, &reading.forces);
-            if here > 0.1 * first_eigenvalue && !motion_ends {
+            if !motion_ends && statics.stiffer_than(0.1 * first_eigenvalue, &q, &reading.forces) {
                 return true;
             }
             let what = match statics.follow(branch, [q[3], q[4]], STRIDE) {

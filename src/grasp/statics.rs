@@ -60,6 +60,17 @@ pub enum Lost {
     Range(usize),
 }
 
+impl Lost {
+    /// In words, after "at these angles".
+    pub fn words(self) -> String {
+        match self {
+            Self::Fold => "the branch of stable equilibria ends".into(),
+            Self::Contact(i) => format!("finger {} leaves the object", i + 1),
+            Self::Range(i) => format!("finger {} leaves the model's range", i + 1),
+        }
+    }
+}
+
 impl<'a> Statics<'a> {
     /// Of a scene, with tips of the model `tip`.
     pub fn new(scene: &Scene, tip: &'a dyn Tip) -> Self {
@@ -91,6 +102,11 @@ impl<'a> Statics<'a> {
         let d = self.taken(contact);
         let [a, b] = [0, 1].map(|i| self.tip.gradient(d[i], d[2 + i], contact.tilt(i)));
         ([a.normal, b.normal, a.tangential, b.tangential], [a.moment, b.moment])
+    }
+
+    /// Forces of the springs alone (N), without multipliers and damping.
+    pub fn elastic_forces(&self, q: &Coordinates) -> [f64; 4] {
+        self.forces(&self.geometry.contact(q)).0
     }
 
     /// Gradient of the energy in (x, y, a theta) (N), joints fixed, without multipliers.
@@ -149,6 +165,17 @@ impl<'a> Statics<'a> {
         let z = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
         let form: f64 = (0..3).map(|i| (0..3).map(|j| z[i] * h[i][j] * z[j]).sum::<f64>()).sum();
         form / z.iter().map(|v| v * v).sum::<f64>()
+    }
+
+    /// Whether the smallest eigenvalue is above `limit` (N/m), by the leading minors: much quicker than the value.
+    pub fn stiffer_than(&self, limit: f64, q: &Coordinates, f: &[f64; 4]) -> bool {
+        if self.tip.holds_normal() || self.tip.holds_tangent() {
+            return self.smallest_eigenvalue(q, f) > limit;
+        }
+        let h = self.hessian(q, f);
+        let [a, b, c] = [h[0][0] - limit, h[1][1] - limit, h[2][2] - limit];
+        let (d, e, g) = (h[0][1], h[0][2], h[1][2]);
+        a > 0.0 && a * b - d * d > 0.0 && a * (b * c - g * g) - d * (d * c - g * e) + e * (d * g - b * e) > 0.0
     }
 
     /// The closed form at joint angles 0 (docs/grasp.md): x = theta = 0, and for tips that deform along the face
@@ -261,7 +288,7 @@ impl<'a> Statics<'a> {
                 let moved = (0..2).map(|k| (e.q[k] - here.q[k]).abs());
                 let moved = moved.fold(self.geometry.radius * (e.q[2] - here.q[2]).abs(), f64::max);
                 // A branch that is followed moves no faster than some link lengths per radian.
-                moved <= 20.0 * self.geometry.link * part * whole + 1e-9
+                moved <= 5.0 * self.geometry.link * part * whole + 1e-9
             });
             let Some(equilibrium) = near else {
                 part *= 0.5;

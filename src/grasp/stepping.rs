@@ -6,10 +6,10 @@ use crate::grasp::minimal::Minimal;
 use crate::grasp::models::{self, Tip};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::Plant;
-use crate::grasp::statics::Statics;
+use crate::grasp::statics::Equilibrium;
 use crate::numerics::dense::spectral_radius;
 use crate::types::grasp::StableStep;
-use crate::types::scene::{Formulation, Method, Rolling};
+use crate::types::scene::{Formulation, Method};
 use crate::types::{FingertipModel, Scene};
 use std::f64::consts::PI;
 
@@ -72,60 +72,68 @@ pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
     good
 }
 
-/// Largest stable step (s) of a scene at its pinch, to 1 %, with the scene's gains.
-pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation) -> f64 {
-    largest(1e-7, 1.0, |h| growth_at_pinch(scene, method, formulation, h, scene.integrator.baumgarte) <= LIMIT)
+/// Largest stable step (s) at all of the equilibria `at`, to 1 %, with the scene's gains.
+pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: &[Equilibrium]) -> f64 {
+    let gain = scene.integrator.baumgarte;
+    largest(1e-7, 1.0, |h| at.iter().all(|e| growth_at(scene, method, formulation, h, gain, e) <= LIMIT))
 }
 
-/// Largest stable gain of the constraint stabilisation (1/s) at a scene's pinch, for its step, to 1 %.
-pub fn stable_gain(scene: &Scene) -> f64 {
+/// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's step, to 1 %.
+pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
     let (method, step) = (scene.integrator.method, scene.integrator.step);
-    largest(1e-3, 1e9, |g| growth_at_pinch(scene, method, Formulation::Multipliers, step, g) <= LIMIT)
+    largest(1e-3, 1e9, |g| growth_at(scene, method, Formulation::Multipliers, step, g, at) <= LIMIT)
 }
 
-/// Spectral radius of one step about a scene's pinch.
-pub fn growth_at_pinch(scene: &Scene, method: Method, formulation: Formulation, h: f64, gain: f64) -> f64 {
+/// Spectral radius of one step of `h` seconds about an equilibrium, with the gain `gain` (1/s) in the multiplier form.
+pub fn growth_at(
+    scene: &Scene,
+    method: Method,
+    formulation: Formulation,
+    h: f64,
+    gain: f64,
+    at: &Equilibrium,
+) -> f64 {
+    let case = (method, formulation, h, gain);
     let stiffness = PI * scene.fingertip.youngs_modulus;
-    let rolling = scene.integrator.rolling;
-    let phase = Phase::hold([0.0; 2]);
-    fn one<T: Tip + Clone>(
-        scene: &Scene,
-        tip: T,
-        case: (Method, Formulation, f64, f64),
-        rolling: Rolling,
-        phase: &Phase,
-    ) -> f64 {
-        let (method, formulation, h, gain) = case;
-        let start = Statics::new(scene, &tip).pinch(scene);
-        let plant = Plant::new(scene, tip.clone(), &start);
-        match formulation {
-            Formulation::Minimal => {
-                let system = Minimal(plant);
-                growth_of(method, &system, phase, h, &system.start(&start))
-            }
-            Formulation::Multipliers => {
-                let system = Multipliers { plant, gain, rolling };
-                growth_of(method, &system, phase, h, &system.start(&start))
-            }
+    match scene.fingertip.model {
+        FingertipModel::Parallel => growth_with(scene, models::Parallel { stiffness }, case, at),
+        FingertipModel::ParallelNormal => growth_with(scene, models::ParallelNormal { stiffness }, case, at),
+        FingertipModel::Radial => growth_with(scene, models::Radial { stiffness }, case, at),
+        FingertipModel::Rigid => growth_with(scene, models::Rigid, case, at),
+    }
+}
+
+fn growth_with<T: Tip + Clone>(
+    scene: &Scene,
+    tip: T,
+    (method, formulation, h, gain): (Method, Formulation, f64, f64),
+    at: &Equilibrium,
+) -> f64 {
+    let plant = Plant::new(scene, tip, at);
+    let phase = Phase::hold([at.q[3], at.q[4]]);
+    match formulation {
+        Formulation::Minimal => {
+            let system = Minimal(plant);
+            growth_of(method, &system, &phase, h, &system.start(at))
+        }
+        Formulation::Multipliers => {
+            let system = Multipliers { plant, gain, rolling: scene.integrator.rolling };
+            growth_of(method, &system, &phase, h, &system.start(at))
         }
     }
-    let case = (method, formulation, h, gain);
-    match scene.fingertip.model {
-        FingertipModel::Parallel => one(scene, models::Parallel { stiffness }, case, rolling, &phase),
-        FingertipModel::ParallelNormal => one(scene, models::ParallelNormal { stiffness }, case, rolling, &phase),
-        FingertipModel::Radial => one(scene, models::Radial { stiffness }, case, rolling, &phase),
-        FingertipModel::Rigid => one(scene, models::Rigid, case, rolling, &phase),
-    }
 }
 
-/// Largest stable steps of both fixed-step methods in both formulations.
-pub fn stable_steps(scene: &Scene) -> Vec<StableStep> {
+/// Largest stable steps of both fixed-step methods in both formulations, at all of the equilibria `at`.
+pub fn stable_steps(scene: &Scene, at: &[Equilibrium]) -> Vec<StableStep> {
     let cases = [
         (Method::Rk4, Formulation::Minimal),
         (Method::Rk4, Formulation::Multipliers),
         (Method::SemiImplicitEuler, Formulation::Minimal),
         (Method::SemiImplicitEuler, Formulation::Multipliers),
     ];
-    let step = |(method, formulation)| StableStep { method, formulation, step: stable_step(scene, method, formulation) };
+    let step = |(method, formulation)| {
+        let step = stable_step(scene, method, formulation, at);
+        StableStep { method, formulation, step }
+    };
     cases.map(step).to_vec()
 }

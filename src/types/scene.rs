@@ -61,11 +61,13 @@ pub struct Object {
     pub friction: Option<f64>,
 }
 
-/// The start: at rest in the equilibrium at joint angles 0.
+/// The start: at rest in an equilibrium.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Initial {
-    /// Normal displacement d_0 of both tips (m); equals radius + width / 2 - half_span.
+    /// Normal displacement d_0 of both tips at joint angles 0 (m); equals radius + width / 2 - half_span.
     pub normal_displacement: f64,
+    /// Joint angles at the start (rad), usually 0.
+    pub joints: [f64; 2],
     /// Time before the first motion (s).
     pub rest: f64,
 }
@@ -255,14 +257,14 @@ impl Scene {
                 inertia: rectangle_inertia(0.10, 0.060, 0.060),
                 friction: Some(1.0),
             },
-            initial: Initial { normal_displacement: 0.0015, rest: 0.5 },
+            initial: Initial { normal_displacement: 0.0015, joints: [0.0; 2], rest: 0.5 },
             gravity: -9.81,
             integrator: Integrator {
                 method: Method::Rk4,
                 step: 1.0e-3,
                 output_every: 0.01,
                 formulation: Formulation::Minimal,
-                baumgarte: 1000.0,
+                baumgarte: 100.0,
                 rolling: Rolling::Integrated,
                 tolerance: 1e-10,
             },
@@ -322,14 +324,14 @@ impl Scene {
         }
         positive("integrator.baumgarte", integrator.baumgarte, 1e9, "above 0 1/s")?;
         positive("integrator.tolerance", integrator.tolerance, 1e-2, "above 0 and at most 0.01")?;
+        for angle in initial.joints {
+            small_angle("initial.theta", angle)?;
+        }
         for motion in &self.motions {
             positive("motion.move", motion.duration, 1e6, "above 0 s")?;
             at_least_zero("motion.hold", motion.hold, "0 or more s")?;
             for angle in motion.target {
-                if !(angle.abs() < std::f64::consts::FRAC_PI_2) {
-                    let value = angle.to_degrees();
-                    return Err(ParamError { name: "motion.theta", value, range: "-90 to 90 degrees" }.into());
-                }
+                small_angle("motion.theta", angle)?;
             }
         }
         for push in &self.pushes {
@@ -349,8 +351,13 @@ impl Scene {
         if self.finger.fixed && !self.motions.is_empty() {
             return Err(SceneError::FixedMotion);
         }
-        if self.finger.fixed && fingertip.model == FingertipModel::Rigid {
-            return Err(SceneError::NothingMoves);
+        if fingertip.model == FingertipModel::Rigid {
+            if self.finger.fixed {
+                return Err(SceneError::NothingMoves);
+            }
+            if initial.joints != [0.0; 2] {
+                return Err(SceneError::RigidStart);
+            }
         }
         let duration = self.duration();
         if duration / integrator.step > MOST_STEPS || duration / integrator.output_every > MOST_SAMPLES {
@@ -358,6 +365,14 @@ impl Scene {
         }
         Ok(())
     }
+}
+
+/// A joint angle (rad) must lie within a right angle.
+fn small_angle(name: &'static str, angle: f64) -> Result<(), ParamError> {
+    if angle.abs() < std::f64::consts::FRAC_PI_2 {
+        return Ok(());
+    }
+    Err(ParamError { name, value: angle.to_degrees(), range: "-90 to 90 degrees" })
 }
 
 /// Moment of inertia of a rectangle about its centre (kg m^2), from its mass (kg) and sides (m).
