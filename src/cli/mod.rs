@@ -11,6 +11,8 @@ mod evaluate;
 
 mod field;
 
+mod grasp;
+
 mod inputs;
 
 mod invert;
@@ -63,6 +65,8 @@ enum Command {
     Warp(warp::Options),
     /// Turn a displacement field around: deformed to initial
     Invert(invert::Options),
+    /// Simulate a soft-finger grasp from a scene file
+    Grasp(grasp::Options),
     /// Make a synthetic pair of volumes with exactly known displacement
     Phantom(phantom::Options),
     /// Score a displacement field against exact truth
@@ -88,6 +92,7 @@ pub fn run() -> ExitCode {
         Command::Field(options) => field::run(&options, &console),
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
+        Command::Grasp(options) => grasp::run(&options, &console),
         Command::Phantom(options) => phantom::run(&options, &console),
         Command::Evaluate(options) => evaluate::run(&options, &console),
         Command::Demo(options) => demo::run(&options, &console),

@@ -311,7 +311,10 @@ fn run<const N: usize, S: System<N>>(
     let first_eigenvalue = start.smallest_eigenvalue;
     let (first, reading) = run.sample(&at_rest, 0.0, &state);
     run.result.samples.push(first);
-    run.goes_on(&at_rest, 0.0, &reading, &state);
+    if !run.goes_on(&at_rest, 0.0, &reading, &state) {
+        let what = run.result.events.pop().map_or(String::new(), |e| format!("{}: {}", e.kind.name(), e.what));
+        return Err(GraspError::NoStart { what, hint: "change the scene's start".into() });
+    }
     let mut next_end = 0;
     let mut next_output = 1;
     if ends[0].0 == 0.0 {

@@ -38,4 +38,11 @@ pub mod text;
 
 pub mod json;
 
+pub mod plot;
+
+pub mod grasp_scene;
+
+pub mod grasp;
+
 pub use field::FieldReport;
+pub use grasp::GraspReport;
