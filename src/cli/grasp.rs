@@ -28,7 +28,7 @@ pub struct Options {
 }
 
 /// What replaces values of the scene file.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub struct Choices {
     /// parallel, parallel-normal, radial or rigid [default: by the scene]
     #[arg(long)]

@@ -38,7 +38,10 @@ pub fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<()
 }
 
 fn motion_row(m: &MotionRow) -> Vec<String> {
-    std::iter::once(m.step.to_string()).chain(m.row().map(number)).collect()
+    let [a, b, rest @ ..] = m.row();
+    // Desired angles as they were written, without the rounding of degrees to radians and back.
+    let desired = [a, b].map(|v| number((v * 1e9).round() / 1e9));
+    std::iter::once(m.step.to_string()).chain(desired).chain(rest.map(number)).collect()
 }
 
 /// Writes [`MotionRow::COLUMNS`] (m, degrees, N), a row a motion.

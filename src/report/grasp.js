@@ -32,10 +32,10 @@
     if (start !== null) requestAnimationFrame(tick);
   };
   const play = () => {
-    button.textContent = "\u23F8";
+    button.textContent = "Pause";
     requestAnimationFrame((now) => { start = now - 1000 * frames[frame][0]; tick(now); });
   };
-  const pause = () => { start = null; button.textContent = "\u25B6"; };
+  const pause = () => { start = null; button.textContent = "Play"; };
   button.addEventListener("click", () => (start === null ? play() : pause()));
   slider.addEventListener("input", () => { pause(); frame = +slider.value; show(frame); });
   if (last > 0 && !matchMedia("(prefers-reduced-motion: reduce)").matches) play();

@@ -89,9 +89,9 @@ pub fn text(report: &GraspReport<'_>) -> String {
     let drift = run.constraint_drift;
     let _ = writeln!(
         out,
-        "  drift        energy {:.1e}, constraints {:.1e} m",
-        run.energy_drift,
-        drift.normal.max(drift.rolling)
+        "  drift        energy {}, constraints {} m",
+        tiny(run.energy_drift),
+        tiny(drift.normal.max(drift.rolling))
     );
     for e in run.events.iter().take(8) {
         let _ = writeln!(out, "  event        {}", event_line(e));
@@ -174,7 +174,10 @@ pub fn time_plots(report: &GraspReport<'_>) -> String {
     let mm = |v: f64| 1e3 * v;
     [
         plot("Object's angle, degrees", &[("theta", &|s| s.pose[2].to_degrees())]),
-        plot("Object's place, mm", &[("x", &|s| mm(s.pose[0])), ("y", &|s| mm(s.pose[1]))]),
+        plot(
+            "Object's place, mm",
+            &[("x", &|s| mm(s.pose[0])), ("y + link", &|s| mm(s.pose[1] + report.scene.finger.link))],
+        ),
         plot(
             "Joint angles, degrees",
             &[("finger 1", &|s| s.joints[0].to_degrees()), ("finger 2", &|s| s.joints[1].to_degrees())],
@@ -223,6 +226,11 @@ fn motions(run: &GraspRun) -> String {
     table(&head, &rows)
 }
 
+/// A small number by its size.
+fn tiny(v: f64) -> String {
+    if v == 0.0 { "0".into() } else { format!("{v:.0e}") }
+}
+
 /// Two digits after the point, no minus before zero.
 pub(super) fn fixed2(v: f64) -> String {
     let s = format!("{v:.2}");
@@ -266,14 +274,10 @@ pub fn page(report: &GraspReport<'_>) -> String {
         escape(report.name),
         escape(&headline(report)),
         tile(&short(simulated), "s", "simulated"),
-        tile(&format!("{low:.1} to {high:.1}"), "°", "turn of the object"),
+        tile(&format!("{low:.1} to {high:.1}"), "deg", "turn of the object"),
         tile(&format!("{:.1}", largest_force(&run.samples)), "N", "largest contact force"),
-        tile(&format!("{:.0e}", run.energy_drift), "", "energy drift"),
-        tile(
-            &format!("{:.0e}", run.constraint_drift.normal.max(run.constraint_drift.rolling)),
-            "m",
-            "constraint drift"
-        ),
+        tile(&tiny(run.energy_drift), "", "energy drift"),
+        tile(&tiny(run.constraint_drift.normal.max(run.constraint_drift.rolling)), "m", "constraint drift"),
         tile(&own_stable_step(report).map_or("-".into(), |s| format!("{:.1}", 1e3 * s)), "ms", "largest stable step"),
     );
     let notes: Vec<String> = run.events.iter().map(event_line).chain(report.warnings.iter().cloned()).collect();

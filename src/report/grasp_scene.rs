@@ -131,7 +131,7 @@ pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
     }
     let span = 1e3 * scene.finger.half_span;
     format!(
-        r#"<div class="animation" data-span="{span:.3}" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">&#9654;</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
+        r#"<div class="animation" data-span="{span:.3}" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">Play</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
         frames.trim_end_matches(','),
         moment(scene, first, largest, samples),
         samples.iter().step_by(step).count() - 1,

@@ -44,5 +44,9 @@ pub mod grasp_scene;
 
 pub mod grasp;
 
+pub mod grasp_surface;
+
+pub mod grasp_analysis;
+
 pub use field::FieldReport;
 pub use grasp::GraspReport;
