@@ -217,8 +217,9 @@ pub fn tip_of(fingertip: &Fingertip, model: FingertipModel) -> Box<dyn Tip> {
 /// Exact energy of springs along the radii of a hemisphere of radius `a` (m) that is pressed flat by `d` (m):
 /// pi E a^3 (1 - c^2 + 2 c ln c) with c = 1 - d / a (J). [`Radial`] is its first term in d / a.
 pub fn exact_radial_energy(radius: f64, youngs_modulus: f64, d: f64) -> f64 {
-    let c = 1.0 - d / radius;
-    PI * youngs_modulus * radius.powi(3) * (1.0 - c * c + 2.0 * c * c.ln())
+    let part = d / radius;
+    // 1 - c^2 and ln c without the difference to 1.
+    PI * youngs_modulus * radius.powi(3) * (part * (2.0 - part) + 2.0 * (1.0 - part) * (-part).ln_1p())
 }
 
 /// Where the closed forms hold: 0 < d < a (1 - |sin tilt|), so that neither the face nor the back plate cuts the rim.

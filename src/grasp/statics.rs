@@ -279,20 +279,35 @@ impl<'a> Statics<'a> {
         let mut here = *start;
         let from = [start.q[3], start.q[4]];
         let whole = (0..2).map(|i| (joints[i] - from[i]).abs()).fold(0.0, f64::max);
-        let (mut done, mut part) = (0.0, (stride / whole).min(1.0));
+        if whole == 0.0 {
+            return Ok(here);
+        }
+        let at = |done: f64| [0, 1].map(|i| from[i] + done * (joints[i] - from[i]));
+        // Way of the pose (x, y, a theta) from one equilibrium to the next.
+        let way = |from: &Equilibrium, to: &Equilibrium| {
+            let turn = self.geometry.radius * (to.q[2] - from.q[2]);
+            [to.q[0] - from.q[0], to.q[1] - from.q[1], turn]
+        };
+        let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let most = (stride / whole).min(1.0);
+        let (mut done, mut part) = (0.0, most);
+        let tiny = 1e-6 / whole.max(1e-6);
+        let Some(first) = self.equilibrium(at(tiny), &here) else { return Err((Lost::Fold, Box::new(here))) };
+        let mut speed = way(&here, &first).map(|v| v / tiny);
         while done < 1.0 {
-            let next = (done + part).min(1.0);
-            let wanted = [0, 1].map(|i| from[i] + next * (joints[i] - from[i]));
-            let found = self.equilibrium(wanted, &here).filter(|e| e.smallest_eigenvalue > 0.0);
-            let near = found.filter(|e| {
-                let moved = (0..2).map(|k| (e.q[k] - here.q[k]).abs());
-                let moved = moved.fold(self.geometry.radius * (e.q[2] - here.q[2]).abs(), f64::max);
-                // A branch that is followed moves no faster than some link lengths per radian.
-                moved <= 5.0 * self.geometry.link * part * whole + 1e-9
+            // No crumb of a step is left for the end: its way would be all rounding.
+            let next = if done + part > 1.0 - 1e-6 { 1.0 } else { done + part };
+            let step = next - done;
+            let found = self.equilibrium(at(next), &here).filter(|e| e.smallest_eigenvalue > 0.0);
+            // A branch that is followed goes on as it went: another one, or a fold ahead, shows as a change of pace.
+            let same = found.filter(|e| {
+                let moved = way(&here, e);
+                let off = std::array::from_fn(|k| moved[k] - speed[k] * step);
+                length(off) <= 0.5 * step * (length(speed) + self.geometry.link * whole)
             });
-            let Some(equilibrium) = near else {
-                part *= 0.5;
-                if part * whole < 1e-7 {
+            let Some(equilibrium) = same else {
+                part = 0.5 * step;
+                if part * whole < 1e-8 {
                     return Err((Lost::Fold, Box::new(here)));
                 }
                 continue;
@@ -300,9 +315,10 @@ impl<'a> Statics<'a> {
             if let Some(lost) = self.out_of_range(&equilibrium.q) {
                 return Err((lost, Box::new(here)));
             }
+            speed = way(&here, &equilibrium).map(|v| v / step);
             here = equilibrium;
             done = next;
-            part = (2.0 * part).min((stride / whole).min(1.0));
+            part = (2.0 * part).min(most);
         }
         Ok(here)
     }
