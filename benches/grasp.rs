@@ -1,6 +1,7 @@
 //! Simulated seconds per CPU second on the reference scene, for each integrator and formulation; one thread.
 //!
-//! `cargo bench --bench grasp [-- REPEATS]`; the best of some runs is printed. `benches/grasp_mujoco.py` runs this and
+//! `cargo bench --bench grasp [-- REPEATS]`; the best of some runs is printed, with the largest error of the object's angle
+//! at the end of a hold, against the adaptive integrator at a tolerance of 1e-12. `benches/grasp_mujoco.py` runs this and
 //! MuJoCo side by side.
 
 use palpate::grasp::simulate::simulate;
@@ -20,7 +21,19 @@ fn cpu_seconds(start: Instant) -> f64 {
 fn main() {
     let repeats: usize = std::env::args().filter_map(|a| a.parse().ok()).next().unwrap_or(20);
     let start = Instant::now();
-    println!("{:>20} {:>12} {:>8} {:>10} {:>14}", "method", "form", "step, s", "CPU s", "simulated s/s");
+    let mut exact = Scene::reference();
+    exact.integrator.method = Method::Adaptive;
+    exact.integrator.tolerance = 1e-12;
+    let exact = match simulate(&exact, &|_| {}) {
+        Ok(run) => run.motions,
+        Err(error) => return println!("{error}"),
+    };
+    let angles: Vec<String> = exact.iter().map(|m| format!("{:.9}", m.reached.pose[2].to_degrees())).collect();
+    println!("postures, degrees: {}", angles.join(" "));
+    println!(
+        "{:>20} {:>12} {:>8} {:>10} {:>14} {:>16}",
+        "method", "form", "step, s", "CPU s", "simulated s/s", "angle error, deg"
+    );
     let cases = [
         (Method::Rk4, Formulation::Minimal),
         (Method::SemiImplicitEuler, Formulation::Minimal),
@@ -34,12 +47,15 @@ fn main() {
         scene.integrator.formulation = formulation;
         // Several runs in one measurement: the clock of the scheduler ticks in milliseconds.
         let runs = 10;
-        let mut best = f64::INFINITY;
+        let (mut best, mut error) = (f64::INFINITY, 0.0f64);
         for _ in 0..repeats {
             let before = cpu_seconds(start);
             for _ in 0..runs {
                 match simulate(&scene, &|_| {}) {
-                    Ok(run) if run.completed => std::hint::black_box(&run).steps,
+                    Ok(run) if run.completed => {
+                        let off = run.motions.iter().zip(&exact).map(|(a, b)| a.reached.pose[2] - b.reached.pose[2]);
+                        error = off.fold(0.0, |e, v| v.abs().max(e)).to_degrees();
+                    }
                     Ok(run) => return println!("{}: {:?}", method.name(), run.events),
                     Err(error) => return println!("{}: {error}", method.name()),
                 };
@@ -48,7 +64,7 @@ fn main() {
         }
         let rate = scene.duration() / best;
         println!(
-            "{:>20} {:>12} {:>8} {best:>10.5} {rate:>14.0}",
+            "{:>20} {:>12} {:>8} {best:>10.5} {rate:>14.0} {error:>16.1e}",
             method.name(),
             formulation.name(),
             scene.integrator.step

@@ -481,7 +481,6 @@ fn constraints_hold_with_a_proper_gain_and_drift_with_an_improper_one() {
         run(&scene).constraint_drift
     };
     let [once, often] = [1, 8].map(|rounds| longer(Rolling::Velocity, rounds));
-    println!("{once:?} {often:?} {:?} {:?}", longer(Rolling::Integrated, 1), longer(Rolling::Integrated, 8));
     assert!(once.rolling_velocity < 1e-8 && often.rolling > 4.0 * once.rolling, "{once:?} {often:?}");
     let [once, often] = [1, 8].map(|rounds| longer(Rolling::Integrated, rounds));
     assert!(often.rolling < 1.5 * once.rolling, "{once:?} {often:?}");
