@@ -4,8 +4,8 @@
 
 use palpate::error::GraspError;
 use palpate::grasp::constraints::Geometry;
-use palpate::grasp::control::Inputs;
-use palpate::grasp::integrators::System;
+use palpate::grasp::control::{Inputs, Phase};
+use palpate::grasp::integrators::{Rk4, SemiImplicitEuler, Stepper, System};
 use palpate::grasp::minimal::Minimal;
 use palpate::grasp::models::{Parallel, Tilt, Tip, exact_radial_energy, tip_of};
 use palpate::grasp::multipliers::Multipliers;
@@ -538,10 +538,8 @@ fn a_push_turns_the_object_and_it_comes_back() {
 /// The first event that ends the run of the reference scene with these motions (degrees).
 fn ends_with(motions: &[[f64; 2]], change: impl Fn(&mut Scene)) -> (EventKind, f64, Option<usize>, GraspRun) {
     let mut scene = Scene::reference();
-    scene.motions = motions
-        .iter()
-        .map(|m| Motion { target: m.map(f64::to_radians), duration: 0.5, hold: 1.0 })
-        .collect();
+    scene.motions =
+        motions.iter().map(|m| Motion { target: m.map(f64::to_radians), duration: 0.5, hold: 1.0 }).collect();
     change(&mut scene);
     let result = run(&scene);
     assert!(!result.completed);
@@ -555,8 +553,10 @@ fn ends_with(motions: &[[f64; 2]], change: impl Fn(&mut Scene)) -> (EventKind, f
 #[test]
 fn contact_loss_is_found_with_its_finger() {
     // Finger 1 is pulled away sideways by a push to the right; with both opened slowly the object falls first.
-    let push = |force: f64| move |s: &mut Scene| {
-        s.pushes = vec![Push { start: 0.1, duration: 0.2, force: [force, 0.0], at: [0.0, 0.0] }];
+    let push = |force: f64| {
+        move |s: &mut Scene| {
+            s.pushes = vec![Push { start: 0.1, duration: 0.2, force: [force, 0.0], at: [0.0, 0.0] }];
+        }
     };
     let (kind, time, finger, _) = ends_with(&[], push(40.0));
     assert_eq!((kind, finger), (EventKind::ContactLoss, Some(1)));
@@ -638,6 +638,45 @@ fn a_step_that_is_too_long_is_refused_with_the_stable_one() {
         scene.integrator.step = 1.05 * stable;
         assert!(matches!(simulate(&scene, &|_| {}), Err(GraspError::BadStep { .. })));
     }
+}
+
+/// Steps of the reference plant from a slightly disturbed pinch, without any watch: how far the last state is from rest.
+fn disturbed<P: Stepper>(step: f64, steps: usize) -> f64 {
+    let scene = Scene::reference();
+    let tip = Parallel { stiffness: PI * E };
+    let start = Statics::new(&scene, &tip).pinch(&scene);
+    let system = Minimal(Plant::new(&scene, tip, &start));
+    let rest = system.start(&start);
+    let mut state = rest;
+    (0..5).for_each(|k| state[k] += 1e-9);
+    for _ in 0..steps {
+        state = P::step(&system, &Phase::hold([0.0; 2]), 0.0, step, &state).0;
+    }
+    let off = (0..5).map(|k| (state[k] - rest[k]).abs());
+    off.fold(0.0, |m, v| if v.is_finite() { v.max(m) } else { f64::INFINITY })
+}
+
+#[test]
+fn the_stable_step_is_where_disturbances_begin_to_grow() {
+    let scene = Scene::reference();
+    let tip = tip_of(&scene.fingertip, FingertipModel::Parallel);
+    let pinch = Statics::new(&scene, tip.as_ref()).pinch(&scene);
+    let limit = |method| stepping::stable_step(&scene, method, Formulation::Minimal, &[pinch]);
+    let (rk4, euler) = (limit(Method::Rk4), limit(Method::SemiImplicitEuler));
+    assert!(disturbed::<Rk4>(0.97 * rk4, 2000) < 1e-9);
+    assert!(disturbed::<Rk4>(1.06 * rk4, 150) > 1e-7);
+    assert!(disturbed::<SemiImplicitEuler>(0.97 * euler, 2000) < 1e-9);
+    assert!(disturbed::<SemiImplicitEuler>(1.06 * euler, 150) > 1e-7);
+}
+
+#[test]
+fn control_that_is_unstable_itself_is_not_blamed_on_the_step() {
+    let mut scene = short();
+    // kp kd / inertia = 1000 < ki: the integral wins.
+    scene.finger.gains.kd = 0.01;
+    let result = run(&scene);
+    assert!(result.step_growth <= 1.0, "{}", result.step_growth);
+    assert!(result.events.iter().all(|e| e.kind != EventKind::BadStep), "{:?}", result.events);
 }
 
 #[test]

@@ -13,21 +13,19 @@ fn allowed(part: &str) -> &'static [&'static str] {
         "features" | "matching" | "consistency" | "mesh" | "field" | "grasp" | "synth" | "evaluate" => {
             &["types", "error", "numerics"]
         }
-        "pipeline" => {
-            &[
-                "types",
-                "error",
-                "numerics",
-                "features",
-                "matching",
-                "consistency",
-                "mesh",
-                "field",
-                "grasp",
-                "synth",
-                "evaluate",
-            ]
-        }
+        "pipeline" => &[
+            "types",
+            "error",
+            "numerics",
+            "features",
+            "matching",
+            "consistency",
+            "mesh",
+            "field",
+            "grasp",
+            "synth",
+            "evaluate",
+        ],
         "cli" | "main" => &[
             "types",
             "error",

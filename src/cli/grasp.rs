@@ -88,8 +88,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     seconds.push(("write".into(), started.elapsed().as_secs_f64()));
     let without = outcome.without_tangential.map(|r| r.map_err(|e| e.to_string()));
-    let sweep: Vec<_> =
-        file.sweep.into_iter().zip(results.into_iter().map(|r| r.map_err(|e| e.to_string()))).collect();
+    let sweep: Vec<_> = file.sweep.into_iter().zip(results.into_iter().map(|r| r.map_err(|e| e.to_string()))).collect();
     let report = GraspReport {
         name: &name,
         scene: &file.scene,

@@ -23,15 +23,8 @@ pub struct Options {
     force: bool,
 }
 
-const FILES: [&str; 7] = [
-    "posture_force.csv",
-    "energy.csv",
-    "stability.csv",
-    "pinch_map.csv",
-    "push.csv",
-    "summary.json",
-    "report.html",
-];
+const FILES: [&str; 7] =
+    ["posture_force.csv", "energy.csv", "stability.csv", "pinch_map.csv", "push.csv", "summary.json", "report.html"];
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { scene: path, output, force } = options;

@@ -43,10 +43,7 @@ impl Geometry {
     /// Tip centres O1, O2 (m) at joint angles (rad).
     pub fn tips(&self, joints: [f64; 2]) -> [[f64; 2]; 2] {
         let ([s1, s2], [c1, c2]) = sin_cos(joints);
-        [
-            [self.link * s1 - self.half_span, -self.link * c1],
-            [self.half_span - self.link * s2, -self.link * c2],
-        ]
+        [[self.link * s1 - self.half_span, -self.link * c1], [self.half_span - self.link * s2, -self.link * c2]]
     }
 
     /// The contact at a pose and joint angles.
@@ -68,10 +65,7 @@ impl Geometry {
             sine: [s1 * c - c1 * s, s2 * c + c2 * s],
             cosine: [c1 * c + s1 * s, c2 * c - s2 * s],
             normal: [reach - along[0], reach + along[1]],
-            tangential: [
-                across[0] - self.radius * (q[3] - q[2]),
-                across[1] - self.radius * (q[4] + q[2]),
-            ],
+            tangential: [across[0] - self.radius * (q[3] - q[2]), across[1] - self.radius * (q[4] + q[2])],
         }
     }
 }

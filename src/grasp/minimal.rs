@@ -38,8 +38,7 @@ impl<T: Tip> System<STATE> for Minimal<T> {
         let (a, torques) = plant.accelerations(inputs, &contact, &q, &v, &integral, &mut f, &moments, 0.0);
         let power = plant.power(inputs, &contact, &v, &torques, &w);
         let errors = [q[3] - inputs.desired[0], q[4] - inputs.desired[1]];
-        let rate =
-            [v[0], v[1], v[2], v[3], v[4], a[0], a[1], a[2], a[3], a[4], errors[0], errors[1], power];
+        let rate = [v[0], v[1], v[2], v[3], v[4], a[0], a[1], a[2], a[3], a[4], errors[0], errors[1], power];
         let sin_tilt = [contact.tilt(0).sin, contact.tilt(1).sin];
         (rate, Reading { displacements: d, forces: f, sin_tilt })
     }

@@ -71,8 +71,7 @@ impl<T: Tip> System<STATE> for Multipliers<T> {
             if !plant.holds(k) {
                 let position = if k >= 2 && self.rolling == Rolling::Velocity { 0.0 } else { g * g };
                 rate[13 + k] = w[k];
-                rate[17 + k] =
-                    second[k] + bias[k] + 2.0 * g * (speed[k] - w[k]) + position * (whole[k] - d[k]);
+                rate[17 + k] = second[k] + bias[k] + 2.0 * g * (speed[k] - w[k]) + position * (whole[k] - d[k]);
             }
         }
         (rate, Reading { displacements: d, forces: f, sin_tilt: [contact.tilt(0).sin, contact.tilt(1).sin] })

@@ -76,9 +76,8 @@ pub fn surfaces(scene: &Scene, step: usize, at: &Equilibrium) -> Vec<EnergySurfa
     let least = at.displacements[0].min(at.displacements[1]);
     // theta to 12 degrees, y to a fifth of the radius, x until a tip leaves.
     let sides = [("y", 1, 0.2 * a), ("x", 0, (0.95 * least).min(0.2 * a))];
-    let steps = |half: f64| -> Vec<f64> {
-        (0..POINTS).map(|i| half * (2.0 * i as f64 / (POINTS - 1) as f64 - 1.0)).collect()
-    };
+    let steps =
+        |half: f64| -> Vec<f64> { (0..POINTS).map(|i| half * (2.0 * i as f64 / (POINTS - 1) as f64 - 1.0)).collect() };
     let mut out = Vec::new();
     for model in COMPARED {
         let tip = tip_of(&scene.fingertip, model);

@@ -126,8 +126,20 @@ pub fn write_energy(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<
 /// [`IoError`] when the file cannot be written.
 pub fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
     let columns = [
-        "step", "theta1_deg", "theta2_deg", "model", "x", "y", "theta_deg", "dn1", "dn2", "lambda1", "lambda2",
-        "lambda3", "residual", "class",
+        "step",
+        "theta1_deg",
+        "theta2_deg",
+        "model",
+        "x",
+        "y",
+        "theta_deg",
+        "dn1",
+        "dn2",
+        "lambda1",
+        "lambda2",
+        "lambda3",
+        "residual",
+        "class",
     ];
     let rows = analysis.stability.iter().map(|r| {
         let mut row = vec![r.step.to_string()];
@@ -148,8 +160,21 @@ pub fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Resu
 /// [`IoError`] when the file cannot be written.
 pub fn write_pinch_map(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
     let columns = [
-        "theta1_deg", "theta2_deg", "state", "x", "y", "theta_deg", "dn1", "dn2", "dt1", "dt2", "fn1", "fn2", "ft1",
-        "ft2", "smallest_eigenvalue",
+        "theta1_deg",
+        "theta2_deg",
+        "state",
+        "x",
+        "y",
+        "theta_deg",
+        "dn1",
+        "dn2",
+        "dt1",
+        "dt2",
+        "fn1",
+        "fn2",
+        "ft1",
+        "ft2",
+        "smallest_eigenvalue",
     ];
     let rows = analysis.pinch.cells.iter().map(|c| {
         let s = &c.sample;

@@ -25,12 +25,12 @@ mod deflate;
 mod gzip;
 
 pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
+pub use grasp::{
+    write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
+};
 pub use nifti::{
     count_non_finite, read_field, read_labels, read_mask, read_volume, write_field, write_integers, write_labels,
     write_volume,
-};
-pub use grasp::{
-    write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};

@@ -2,13 +2,13 @@
 
 use super::{format, os};
 use crate::error::{IoError, SceneError};
+use crate::types::Fingertip;
 use crate::types::fingertip::FingertipModel;
 use crate::types::names;
 use crate::types::scene::{
     Finger, Formulation, Gains, Initial, Integrator, Method, Motion, Object, Push, Rolling, Scene, SweepCase,
     rectangle_inertia,
 };
-use crate::types::Fingertip;
 use serde::Deserialize;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -123,7 +123,8 @@ fn known(path: &Path, place: &str, table: &Table, keys: &[&'static str]) -> Resu
     for key in table.keys() {
         if !keys.contains(&key.as_str()) {
             let found = names::choose("key", key, &choices).err();
-            let hint = found.as_ref().and_then(|e| e.nearest).map_or(String::new(), |n| format!("did you mean '{n}'? "));
+            let hint =
+                found.as_ref().and_then(|e| e.nearest).map_or(String::new(), |n| format!("did you mean '{n}'? "));
             let what = format!("{place} has the unknown key '{key}'");
             return Err(format(path, what, format!("{hint}known: {}", keys.join(", "))));
         }

@@ -5,9 +5,9 @@ use crate::report::html::{document, escape};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
+use crate::types::Scene;
 use crate::types::grasp::{Event, GraspRun, Sample, StableStep};
 use crate::types::scene::{Method, SweepCase};
-use crate::types::Scene;
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 
@@ -206,8 +206,20 @@ pub fn time_plots(report: &GraspReport<'_>) -> String {
 /// The table of motions.
 fn motions(run: &GraspRun) -> String {
     let head = [
-        "Motion", "theta 1, deg", "theta 2, deg", "x, mm", "y, mm", "theta, deg", "d_n1, mm", "d_n2, mm", "d_t1, mm",
-        "d_t2, mm", "f_n1, N", "f_n2, N", "f_t1, N", "f_t2, N",
+        "Motion",
+        "theta 1, deg",
+        "theta 2, deg",
+        "x, mm",
+        "y, mm",
+        "theta, deg",
+        "d_n1, mm",
+        "d_n2, mm",
+        "d_t1, mm",
+        "d_t2, mm",
+        "f_n1, N",
+        "f_n2, N",
+        "f_t1, N",
+        "f_t2, N",
     ];
     let rows: Vec<Vec<String>> = run
         .motions
@@ -380,7 +392,10 @@ pub(super) fn scene_table(scene: &Scene) -> String {
     let (tip, finger, object, i) = (&scene.fingertip, &scene.finger, &scene.object, &scene.integrator);
     let mm = |v: f64| format!("{} mm", short(1e3 * v));
     let rows = [
-        ("Fingertip", format!("{}, radius {}, E {} kPa", tip.model.name(), mm(tip.radius), short(tip.youngs_modulus / 1e3))),
+        (
+            "Fingertip",
+            format!("{}, radius {}, E {} kPa", tip.model.name(), mm(tip.radius), short(tip.youngs_modulus / 1e3)),
+        ),
         ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
         ("Link, half span", format!("{}, {}", mm(finger.link), mm(finger.half_span))),
         ("Object", format!("{} x {}, {} kg", mm(object.width), mm(object.height), short(object.mass))),

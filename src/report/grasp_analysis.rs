@@ -184,7 +184,12 @@ fn stability_table(rows: &[StabilityRow]) -> String {
 
 fn freedom_table(rows: &[Freedom]) -> String {
     let head = [
-        "Tips", "Moving fingers", "Coordinates", "Rank", "Degrees of freedom", "of the object, joints locked",
+        "Tips",
+        "Moving fingers",
+        "Coordinates",
+        "Rank",
+        "Degrees of freedom",
+        "of the object, joints locked",
         "Joint angles set",
     ];
     let cells = |f: &Freedom| {
@@ -254,7 +259,8 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     );
     if !a.lost.is_empty() {
         let items: String = a.lost.iter().map(|(n, why)| format!("<li>Motion {n}: {}</li>", escape(why))).collect();
-        let _ = write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
+        let _ =
+            write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
     }
     let _ = write!(
         body,
@@ -273,8 +279,9 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     for &step in &steps {
         body.push_str(&surface_card(a, step)?);
     }
-    let postures: Vec<(usize, [f64; 2])> =
-        std::iter::once((0, [0.0; 2])).chain(report.scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target))).collect();
+    let postures: Vec<(usize, [f64; 2])> = std::iter::once((0, [0.0; 2]))
+        .chain(report.scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target)))
+        .collect();
     let legend: String = PinchState::ALL
         .iter()
         .map(|s| {

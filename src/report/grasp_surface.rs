@@ -60,8 +60,7 @@ pub fn surface(s: &EnergySurface, largest: f64) -> Result<String, ReportError> {
     let _ = write!(svg, r#"<path class="axis" d="M{:.1} {cy:.1}h8M{cx:.1} {:.1}v8"/>"#, cx - 4.0, cy - 4.0);
     for v in ticks(x0, x1, 4.0) {
         let x = left + (v - x0) / (x1 - x0) * w;
-        let _ =
-            write!(svg, r#"<text x="{x:.1}" y="{:.0}" text-anchor="middle">{}</text>"#, top + h + 13.0, short(v));
+        let _ = write!(svg, r#"<text x="{x:.1}" y="{:.0}" text-anchor="middle">{}</text>"#, top + h + 13.0, short(v));
     }
     for v in ticks(y0, y1, 3.0) {
         let y = top + (y1 - v) / (y1 - y0) * h;

@@ -94,13 +94,8 @@ impl Plot<'_> {
         }
         let _ = write!(svg, r#"<path class="axis" d="M{LEFT} {base}H{:.0}"/>"#, WIDTH - RIGHT);
         for v in ticks(x0, x1, 6.0) {
-            let _ = write!(
-                svg,
-                r#"<text x="{:.1}" y="{:.0}" text-anchor="middle">{}</text>"#,
-                x(v),
-                base + 15.0,
-                short(v)
-            );
+            let _ =
+                write!(svg, r#"<text x="{:.1}" y="{:.0}" text-anchor="middle">{}</text>"#, x(v), base + 15.0, short(v));
         }
         let _ = write!(
             svg,
@@ -109,7 +104,6 @@ impl Plot<'_> {
             HEIGHT - 4.0,
             escape(self.across)
         );
-        let mut right = WIDTH - RIGHT;
         for line in lines {
             let class = format!("line c{}{}", line.colour % 4, if line.dashed { " dashed" } else { "" });
             let mut path = String::new();
@@ -124,16 +118,18 @@ impl Plot<'_> {
             }
             let _ = write!(svg, r#"<path class="{class}" d="{path}"/>"#);
         }
-        for line in lines.iter().rev().filter(|l| !l.name.is_empty()) {
+        // The legend, from the left below the axis.
+        let (mut left, under) = (LEFT, HEIGHT - 4.0);
+        for line in lines.iter().filter(|l| !l.name.is_empty()) {
             let class = format!("line c{}{}", line.colour % 4, if line.dashed { " dashed" } else { "" });
-            let wide = 6.6 * line.name.chars().count() as f64;
             let _ = write!(
                 svg,
-                r#"<text x="{right:.0}" y="12" text-anchor="end">{}</text><path class="{class}" d="M{:.0} 8h16"/>"#,
-                escape(&line.name),
-                right - wide - 22.0
+                r#"<path class="{class}" d="M{left:.0} {:.0}h16"/><text x="{:.0}" y="{under:.0}">{}</text>"#,
+                under - 4.0,
+                left + 21.0,
+                escape(&line.name)
             );
-            right -= wide + 34.0;
+            left += 21.0 + 7.2 * line.name.chars().count() as f64 + 12.0;
         }
         svg.push_str("</svg>");
         svg

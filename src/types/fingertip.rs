@@ -61,12 +61,7 @@ impl Fingertip {
     ///
     /// # Errors
     /// [`ParamError`] names the first value out of range.
-    pub fn new(
-        radius: f64,
-        youngs_modulus: f64,
-        damping: [f64; 2],
-        model: FingertipModel,
-    ) -> Result<Self, ParamError> {
+    pub fn new(radius: f64, youngs_modulus: f64, damping: [f64; 2], model: FingertipModel) -> Result<Self, ParamError> {
         let tip = Self { radius, youngs_modulus, damping, model };
         tip.check()?;
         Ok(tip)

@@ -24,9 +24,8 @@ pub struct Sample {
 
 impl Sample {
     /// Columns of trajectory.csv.
-    pub const COLUMNS: [&str; 14] = [
-        "time", "x", "y", "theta", "theta1", "theta2", "dn1", "dn2", "dt1", "dt2", "fn1", "fn2", "ft1", "ft2",
-    ];
+    pub const COLUMNS: [&str; 14] =
+        ["time", "x", "y", "theta", "theta1", "theta2", "dn1", "dn2", "dt1", "dt2", "fn1", "fn2", "ft1", "ft2"];
 
     /// One row of trajectory.csv.
     pub fn row(&self) -> [f64; 14] {

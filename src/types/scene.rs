@@ -217,16 +217,8 @@ pub struct Scene {
 }
 
 /// The eight motions of the source (degrees).
-pub const EIGHT_MOTIONS: [[f64; 2]; 8] = [
-    [6.0, 6.0],
-    [20.0, -10.0],
-    [-2.0, 13.0],
-    [-10.0, 20.0],
-    [-7.0, 17.0],
-    [17.0, -7.0],
-    [-15.0, 25.0],
-    [5.0, 5.0],
-];
+pub const EIGHT_MOTIONS: [[f64; 2]; 8] =
+    [[6.0, 6.0], [20.0, -10.0], [-2.0, 13.0], [-10.0, 20.0], [-7.0, 17.0], [17.0, -7.0], [-15.0, 25.0], [5.0, 5.0]];
 
 /// Most steps and most samples of one run, so that a slip of the pen does not run for days or fill the memory.
 const MOST_STEPS: f64 = 2e9;
@@ -337,7 +329,8 @@ impl Scene {
         for push in &self.pushes {
             at_least_zero("push.start", push.start, "0 or more s")?;
             positive("push.duration", push.duration, 1e6, "above 0 s")?;
-            for (name, value) in push.force.map(|f| ("push.force", f)).into_iter().chain(push.at.map(|p| ("push.at", p)))
+            for (name, value) in
+                push.force.map(|f| ("push.force", f)).into_iter().chain(push.at.map(|p| ("push.at", p)))
             {
                 if !value.is_finite() {
                     return Err(ParamError { name, value, range: "a finite number" }.into());
