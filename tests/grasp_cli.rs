@@ -125,7 +125,7 @@ fn bad_scenes_are_refused_with_a_hint() {
     refused(replaced("width = 0.060", "wdith = 0.060"), &["[object]", "'wdith'", "did you mean 'width'"]);
     refused(replaced("[integrator]", "[intergrator]"), &["'intergrator'", "did you mean 'integrator'"]);
     refused(replaced("kd = 1.0", "kq = 1.0"), &["finger.gains", "'kq'"]);
-    refused(replaced("theta = [6.0, 6.0]", "tetha = [6.0, 6.0]"), &["[[motion]]", "did you mean 'theta'"]);
+    refused(replaced("theta = [6.0, 6.0]", "tehta = [6.0, 6.0]"), &["[[motion]]", "did you mean 'theta'"]);
     refused(replaced("mass = 0.10", "mass = -0.10"), &["object.mass is -0.1", "above 0 kg"]);
     refused(replaced("mass = 0.10", "mass = nan"), &["object.mass is NaN"]);
     refused(replaced("mass = 0.10", "mass = \"heavy\""), &["mass"]);

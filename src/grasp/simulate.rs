@@ -73,8 +73,7 @@ pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspE
             hint: "change initial.normal_displacement or fingertip.radius".into(),
         });
     }
-    // Not `<=`: an eigenvalue that is no number is not stable either.
-    if !(start.smallest_eigenvalue > 0.0) {
+    if start.smallest_eigenvalue.is_nan() || start.smallest_eigenvalue <= 0.0 {
         return Err(GraspError::NoStart {
             what: format!(
                 "the pinch is not stable (smallest eigenvalue of the Hessian {:.3e} N/m)",

@@ -253,7 +253,7 @@ impl<'a> Statics<'a> {
                 f[k] += part * step[3 + k];
             }
             let away = (0..2).map(|k| (q[k] - guess.q[k]).abs()).fold(a * (q[2] - guess.q[2]).abs(), f64::max);
-            if !(away < 0.25 * a) {
+            if away.is_nan() || away >= 0.25 * a {
                 return None;
             }
             // Rounding is reached when steps stop shrinking.

@@ -9,7 +9,7 @@ use std::path::Path;
 /// A number as short as it can be read back without loss; `NaN` where there is none.
 fn number(v: f64) -> String {
     match v {
-        v if v == 0.0 => "0".into(),
+        0.0 => "0".into(),
         v if v.abs() < 1e-4 || v.abs() >= 1e6 => format!("{v:e}"),
         v => v.to_string(),
     }

@@ -101,12 +101,12 @@ pub fn spectral_radius<const N: usize>(a: &Square<N>) -> f64 {
     let mut m = *a;
     let mut log = 0.0;
     for k in 0..=SQUARINGS {
-        let norm = m.iter().flatten().fold(0.0, |l: f64, v| if v.is_nan() { f64::NAN } else { l.max(v.abs()) });
+        if !m.iter().flatten().all(|v| v.is_finite()) {
+            return f64::INFINITY;
+        }
+        let norm = m.iter().flatten().fold(0.0, |l: f64, v| l.max(v.abs()));
         if norm == 0.0 {
             return 0.0;
-        }
-        if !norm.is_finite() {
-            return f64::INFINITY;
         }
         log += norm.ln() / f64::from(k).exp2();
         if k == SQUARINGS {

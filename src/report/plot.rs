@@ -50,7 +50,7 @@ pub fn ticks(low: f64, high: f64, wanted: f64) -> Vec<f64> {
     }
     let raw = span / wanted;
     let power = 10f64.powf(raw.log10().floor());
-    let step = [1.0, 2.0, 5.0, 10.0].into_iter().find(|s| s * power >= raw * 0.999).unwrap_or(10.0) * power;
+    let step = [1.0, 2.0, 5.0, 10.0].into_iter().find(|s| s * power >= raw * 0.75).unwrap_or(10.0) * power;
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;
     (first..=last).map(|i| i as f64 * step).collect()
@@ -65,7 +65,8 @@ impl Plot<'_> {
         };
         let [x0, x1] = range(0);
         let [mut y0, mut y1] = range(1);
-        if !(x1 > x0) {
+        // Also where there is no finite point: the range is then upside down.
+        if x1 <= x0 {
             return format!(r#"<p class="none">{}: nothing to show</p>"#, escape(self.title));
         }
         let room = (0.06 * (y1 - y0)).max(1e-6 * y0.abs().max(y1.abs())).max(1e-12);
@@ -142,7 +143,7 @@ mod tests {
 
     #[test]
     fn ticks_are_round_and_inside() {
-        assert_eq!(ticks(0.0, 12.5, 6.0), [0.0, 5.0, 10.0]);
+        assert_eq!(ticks(0.0, 12.5, 6.0), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0]);
         assert_eq!(ticks(-0.3, 0.31, 3.0), [-0.2, 0.0, 0.2]);
         assert_eq!(ticks(1.0, 1.0, 3.0), [1.0]);
     }

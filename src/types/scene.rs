@@ -306,7 +306,7 @@ impl Scene {
             return Err(ParamError { name: "initial.normal_displacement", value: depth, range }.into());
         }
         at_least_zero("initial.rest", initial.rest, "0 or more s")?;
-        if !(self.gravity.abs() <= 1000.0) {
+        if !(-1000.0..=1000.0).contains(&self.gravity) {
             return Err(ParamError { name: "gravity.y", value: self.gravity, range: "-1000 to 1000 m/s^2" }.into());
         }
         positive("integrator.step", integrator.step, 1.0, "above 0 and at most 1 s")?;
@@ -365,7 +365,8 @@ fn small_angle(name: &'static str, angle: f64) -> Result<(), ParamError> {
     if angle.abs() < std::f64::consts::FRAC_PI_2 {
         return Ok(());
     }
-    Err(ParamError { name, value: angle.to_degrees(), range: "-90 to 90 degrees" })
+    // As it was written in degrees, without the rounding of there and back.
+    Err(ParamError { name, value: (angle.to_degrees() * 1e9).round() / 1e9, range: "-90 to 90 degrees" })
 }
 
 /// Moment of inertia of a rectangle about its centre (kg m^2), from its mass (kg) and sides (m).
