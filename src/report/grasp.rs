@@ -286,7 +286,7 @@ pub fn page(report: &GraspReport<'_>) -> String {
         escape(report.name),
         escape(&headline(report)),
         tile(&short(simulated), "s", "simulated"),
-        tile(&format!("{low:.1} to {high:.1}"), "deg", "turn of the object"),
+        tile(&format!("{low:.0} to {high:.0}"), "deg", "turn of the object"),
         tile(&format!("{:.1}", largest_force(&run.samples)), "N", "largest contact force"),
         tile(&tiny(run.energy_drift), "", "energy drift"),
         tile(&tiny(run.constraint_drift.normal.max(run.constraint_drift.rolling)), "m", "constraint drift"),

@@ -71,7 +71,7 @@ fn push_words(analysis: &GraspAnalysis) -> String {
     let (most, left) = push_turn(analysis);
     match analysis.push.events.first() {
         Some(e) => format!("turned up to {most:.2} degrees; {}", event_line(e)),
-        None => format!("turned up to {most:.2} degrees without slip and came back to {left:.1e} degrees"),
+        None => format!("turned up to {most:.2} degrees without slip and came back to within {left:.1e} degrees"),
     }
 }
 

@@ -69,7 +69,9 @@ impl Plot<'_> {
         if x1 <= x0 {
             return format!(r#"<p class="none">{}: nothing to show</p>"#, escape(self.title));
         }
-        let room = (0.06 * (y1 - y0)).max(1e-6 * y0.abs().max(y1.abs())).max(1e-12);
+        // A level line is not blown up to its rounding.
+        let size = y0.abs().max(y1.abs()).max(1e-9);
+        let room = if y1 - y0 > 1e-4 * size { 0.06 * (y1 - y0) } else { 0.1 * size };
         (y0, y1) = (y0 - room, y1 + room);
         let x = |v: f64| LEFT + (v - x0) / (x1 - x0) * (WIDTH - LEFT - RIGHT);
         let y = |v: f64| TOP + (y1 - v) / (y1 - y0) * (HEIGHT - TOP - BOTTOM);
