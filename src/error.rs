@@ -264,7 +264,7 @@ pub enum SceneError {
     #[error("rigid tips start at joint angles 0; remove initial.theta or choose another fingertip.model")]
     RigidStart,
     /// More steps or samples than a run may have.
-    #[error("{duration} s take more than 2e9 steps or 5e6 samples; lengthen integrator.step or output_every")]
+    #[error("{duration} s take more than 2e9 steps or 2e6 samples; lengthen integrator.step or output_every")]
     TooLong {
         /// Of the whole run (s).
         duration: f64,

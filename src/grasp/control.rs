@@ -80,15 +80,40 @@ impl Phase {
     }
 }
 
-/// Times (s) between which the inputs are smooth: where motions, holds and pushes begin and end.
-pub fn borders(scene: &Scene) -> Vec<f64> {
-    let mut t = scene.initial.rest;
-    let mut times = vec![0.0, t];
-    for motion in &scene.motions {
-        times.push(t + motion.duration);
-        t += motion.duration + motion.hold;
-        times.push(t);
+/// Times closer than this are one (s).
+pub const SAME: f64 = 1e-9;
+
+/// The times of a run (s).
+#[derive(Debug, Clone)]
+pub struct Schedule {
+    /// Rising from 0: where motions, holds and pushes begin and end, and samples; between them the inputs are smooth.
+    pub times: Vec<f64>,
+    /// Ends of the rest and of each hold, with the number of the motion (0 for the rest) and its target (rad).
+    pub ends: Vec<(f64, usize, [f64; 2])>,
+    /// The end.
+    pub duration: f64,
+}
+
+impl Schedule {
+    /// Of a scene.
+    pub fn of(scene: &Scene) -> Self {
+        let mut t = scene.initial.rest;
+        let mut times = vec![0.0, t];
+        let mut ends = vec![(t, 0, scene.initial.joints)];
+        for (i, Motion { target, duration, hold }) in scene.motions.iter().enumerate() {
+            times.push(t + duration);
+            t += duration + hold;
+            times.push(t);
+            ends.push((t, i + 1, *target));
+        }
+        times.extend(scene.pushes.iter().flat_map(|p| [p.start, p.start + p.duration]));
+        let (duration, every) = (scene.duration(), scene.integrator.output_every);
+        let samples = (duration / every + SAME).floor() as usize;
+        times.extend((1..=samples).map(|k| k as f64 * every));
+        times.sort_by(f64::total_cmp);
+        times.dedup_by(|a, b| *a - *b < SAME);
+        // Without a rest its end is the start, which no interval ends at.
+        ends.retain(|end| end.0 > SAME);
+        Self { times, ends, duration }
     }
-    times.extend(scene.pushes.iter().flat_map(|p| [p.start, p.start + p.duration]));
-    times
 }

@@ -122,7 +122,7 @@ const ERROR: [f64; 7] =
 /// Size below which a coordinate's error is measured against this (m, rad, and their rates).
 const FLOOR: f64 = 1e-3;
 /// Shortest step that is tried (s).
-pub const SHORTEST: f64 = 1e-10;
+pub const SHORTEST: f64 = 1e-8;
 
 /// A step with control: the state, the contacts before it, the step taken and the one to try next (s). None where no
 /// step down to [`SHORTEST`] meets the tolerance.

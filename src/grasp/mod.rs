@@ -3,7 +3,8 @@
 //! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue); docs/grasp.md has every
 //! equation and two signs of the slides that had to be settled. Order: [`models`] (fingertips), [`constraints`] (where
 //! they touch), [`statics`] (equilibria), [`control`], [`plant`] (forces), [`minimal`] and [`multipliers`] (equations of
-//! motion), [`integrators`], [`stepping`] (which step is stable), [`simulate`] (the loop and its events), then the
+//! motion), [`integrators`], [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail),
+//! [`simulate`] (the loop), then the
 //! analyses: [`stability`], [`freedom`], [`pinch`], [`posture`].
 //!
 //! Promises: SI units and radians everywhere; the same bits for the same scene; the object's pose is never fed back.
@@ -27,6 +28,10 @@ pub mod multipliers;
 pub mod integrators;
 
 pub mod stepping;
+
+pub mod watch;
+
+pub mod branch;
 
 pub mod simulate;
 

@@ -124,6 +124,17 @@ pub struct ConstraintDrift {
     pub rolling: f64,
 }
 
+impl ConstraintDrift {
+    /// The larger of both, one by one.
+    pub fn worse(self, other: Self) -> Self {
+        Self {
+            normal: self.normal.max(other.normal),
+            rolling_velocity: self.rolling_velocity.max(other.rolling_velocity),
+            rolling: self.rolling.max(other.rolling),
+        }
+    }
+}
+
 /// A whole run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GraspRun {

@@ -222,7 +222,7 @@ pub const EIGHT_MOTIONS: [[f64; 2]; 8] =
 
 /// Most steps and most samples of one run, so that a slip of the pen does not run for days or fill the memory.
 const MOST_STEPS: f64 = 2e9;
-const MOST_SAMPLES: f64 = 5e6;
+const MOST_SAMPLES: f64 = 2e6;
 
 impl Scene {
     /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest (docs/grasp.md).
@@ -315,7 +315,10 @@ impl Scene {
             return Err(ParamError { name: "integrator.output_every", value: integrator.output_every, range }.into());
         }
         positive("integrator.baumgarte", integrator.baumgarte, 1e9, "above 0 1/s")?;
-        positive("integrator.tolerance", integrator.tolerance, 1e-2, "above 0 and at most 0.01")?;
+        if !(1e-14..=1e-2).contains(&integrator.tolerance) {
+            let range = "1e-14 to 0.01";
+            return Err(ParamError { name: "integrator.tolerance", value: integrator.tolerance, range }.into());
+        }
         for angle in initial.joints {
             small_angle("initial.theta", angle)?;
         }
