@@ -138,7 +138,7 @@ fn bad_scenes_are_refused_with_a_hint() {
     refused(replaced("step = 1.0e-3", "step = 1.0e-9"), &["more than 2e9 steps"]);
     refused(replaced("output_every = 0.01", "output_every = 0.0001"), &["output_every", "at least integrator.step"]);
     refused(|s| s.replace("[[motion]]", "[[motions]]"), &["'motions'", "did you mean 'motion'"]);
-    refused(|s| s.replacen("[object]", "[finger]", 1), &["line 16", "duplicate"]);
+    refused(|s| s.replacen("[object]", "[finger]", 1), &["line 15", "duplicate"]);
     refused(|s| s.replacen("[object]", "[[object]]", 1), &["object is not a table"]);
     refused(|s| format!("{s}\n[[sweep]]\nkey = \"object.mas\"\nvalues = [1]\n"), &["did you mean 'mass'"]);
     refused(|s| format!("{s}\n[[sweep]]\nkey = \"thing.mass\"\nvalues = [1]\n"), &["no table 'thing'"]);

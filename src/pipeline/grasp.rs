@@ -34,7 +34,7 @@ pub struct GraspOutcome {
 /// Runs `scene`, the same without tangential deformation, and finds the stable steps.
 ///
 /// # Errors
-/// [`GraspError`] where nothing can be simulated; see [`simulate`].
+/// [`GraspError`] where nothing can be simulated; see [`simulate()`].
 pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspError> {
     let started = Instant::now();
     let run = simulate(scene, &|f| progress("simulate", 0.7 * f))?;
