@@ -291,9 +291,14 @@ impl<'a> Statics<'a> {
         let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
         let most = (stride / whole).min(1.0);
         let (mut done, mut part) = (0.0, most);
+        // Pace here, as a way for the whole: from a tiny step, as a longer one's mean says little where the branch bends.
         let tiny = 1e-6 / whole.max(1e-6);
-        let Some(first) = self.equilibrium(at(tiny), &here) else { return Err((Lost::Fold, Box::new(here))) };
-        let mut speed = way(&here, &first).map(|v| v / tiny);
+        let pace = |here: &Equilibrium, done: f64| {
+            let next = self.equilibrium(at(done + tiny), here)?;
+            Some(way(here, &next).map(|v| v / tiny))
+        };
+        let Some(mut speed) = pace(&here, 0.0) else { return Err((Lost::Fold, Box::new(here))) };
+        let mut of_here = true;
         while done < 1.0 {
             // No crumb of a step is left for the end: its way would be all rounding.
             let next = if done + part > 1.0 - 1e-6 { 1.0 } else { done + part };
@@ -306,6 +311,11 @@ impl<'a> Statics<'a> {
                 length(off) <= 0.5 * step * (length(speed) + self.geometry.link * whole)
             });
             let Some(equilibrium) = same else {
+                if !of_here {
+                    let Some(now) = pace(&here, done) else { return Err((Lost::Fold, Box::new(here))) };
+                    (speed, of_here) = (now, true);
+                    continue;
+                }
                 part = 0.5 * step;
                 if part * whole < 1e-8 {
                     return Err((Lost::Fold, Box::new(here)));
@@ -315,10 +325,10 @@ impl<'a> Statics<'a> {
             if let Some(lost) = self.out_of_range(&equilibrium.q) {
                 return Err((lost, Box::new(here)));
             }
-            speed = way(&here, &equilibrium).map(|v| v / step);
+            (speed, of_here) = (way(&here, &equilibrium).map(|v| v / step), false);
             here = equilibrium;
             done = next;
-            part = (2.0 * part).min(most);
+            part = (2.0 * step).min(most);
         }
         Ok(here)
     }
