@@ -233,3 +233,87 @@ pub enum ReportError {
         what: String,
     },
 }
+
+/// A grasp scene.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum SceneError {
+    /// A value out of range.
+    #[error(transparent)]
+    Param(#[from] ParamError),
+    /// The half span and the normal displacement contradict each other.
+    #[error(
+        "finger.half_span {half_span} m and initial.normal_displacement {depth} m do not go together: \
+         radius + width / 2 - half_span is {by_geometry:.6} m; leave one of the two out"
+    )]
+    Geometry {
+        /// As given (m).
+        half_span: f64,
+        /// Normal displacement as given (m).
+        depth: f64,
+        /// Normal displacement by the geometry (m).
+        by_geometry: f64,
+    },
+    /// Motions of joints that are locked.
+    #[error("finger.fixed is true, but there are motions; remove the [[motion]] tables or set fixed = false")]
+    FixedMotion,
+    /// Rigid tips and locked joints.
+    #[error("rigid tips and fixed joints leave nothing to move; choose another fingertip.model or set fixed = false")]
+    NothingMoves,
+    /// Rigid tips away from joint angles 0.
+    #[error("rigid tips start at joint angles 0; remove initial.theta or choose another fingertip.model")]
+    RigidStart,
+    /// More steps or samples than a run may have.
+    #[error("{duration} s take more than 2e9 steps or 2e6 samples; lengthen integrator.step or output_every")]
+    TooLong {
+        /// Of the whole run (s).
+        duration: f64,
+    },
+}
+
+/// The grasp simulator.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum GraspError {
+    /// The scene.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    /// No equilibrium to start from.
+    #[error("at time 0, {what}; {hint}")]
+    NoStart {
+        /// What is wrong.
+        what: String,
+        /// What to try.
+        hint: String,
+    },
+    /// The step is too long from the start.
+    #[error(
+        "at time 0, a step of {step} s grows {growth:.3}-fold each time it is taken ({method}); \
+         take integrator.step at or under {stable:.2e} s"
+    )]
+    BadStep {
+        /// The step (s).
+        step: f64,
+        /// Spectral radius of one step.
+        growth: f64,
+        /// Integrator and formulation.
+        method: String,
+        /// Largest stable step (s).
+        stable: f64,
+    },
+    /// The gain of the constraint stabilisation is too high for the step.
+    #[error(
+        "at time 0, a Baumgarte gain of {gain} 1/s is too high for a step of {step} s (growth {growth:.3} a step); \
+         take integrator.baumgarte at or under {stable:.0} 1/s, or a shorter step"
+    )]
+    BadGain {
+        /// The gain (1/s).
+        gain: f64,
+        /// The step (s).
+        step: f64,
+        /// Spectral radius of one step.
+        growth: f64,
+        /// Largest stable gain (1/s).
+        stable: f64,
+    },
+}

@@ -1,4 +1,4 @@
-//! `palpate` measures how soft tissue deforms inside from a pair of MR volumes.
+//! `palpate` measures how soft tissue deforms inside from a pair of MR volumes, and simulates soft-finger grasps.
 //!
 //! The modules stand in the order of the pipeline.
 
@@ -19,6 +19,8 @@ pub mod consistency;
 pub mod mesh;
 
 pub mod field;
+
+pub mod grasp;
 
 pub mod synth;
 

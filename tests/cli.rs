@@ -22,7 +22,7 @@ fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
 fn help_names_every_subcommand_and_exits_with_0() {
     let folder = TempDir::new().unwrap();
     let (out, _) = run(folder.path(), &["--help"], 0);
-    let commands = ["field", "warp", "invert", "phantom", "evaluate", "demo"];
+    let commands = ["field", "warp", "invert", "grasp", "grasp-analysis", "phantom", "evaluate", "demo"];
     for command in commands {
         assert!(out.contains(&format!("\n  {command}")), "{command} is missing in\n{out}");
         let (own, _) = run(folder.path(), &[command, "--help"], 0);

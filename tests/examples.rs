@@ -30,7 +30,7 @@ fn every_example_has_a_test() {
         .map(|e| e.unwrap().path().file_stem().unwrap().to_string_lossy().into_owned())
         .collect();
     names.sort();
-    assert_eq!(names, ["own_pair", "seed"]);
+    assert_eq!(names, ["eight_motions", "grasp", "own_pair", "seed", "stability_map"]);
 }
 
 #[test]
@@ -57,4 +57,29 @@ fn own_pair_measures_the_press() {
     assert!((largest - 6.0).abs() < 1.5, "{out}");
     assert_eq!(before(&out, " folds"), 0.0, "{out}");
     assert!(folder.path().join("out/displacement.nii.gz").is_file());
+}
+
+#[test]
+fn grasp_makes_the_eight_motions() {
+    let (out, folder) = example("grasp", &[]);
+    let rows: Vec<Vec<f64>> =
+        out.lines().skip(1).map(|l| l.split_whitespace().map(|v| v.parse().unwrap_or(f64::NAN)).collect()).collect();
+    assert_eq!(rows.len(), 9, "{out}");
+    // Motions 2 and 4 mirror each other.
+    assert!((rows[2][3] + rows[4][3]).abs() < 2e-3 && rows[2][3] < -10.0, "{out}");
+    assert!(std::fs::read_to_string(folder.path().join("out/grasp.html")).unwrap().contains("8 of 8 motions"));
+}
+
+#[test]
+fn the_stability_map_falls_with_stiffness() {
+    let (out, folder) = example("stability_map", &["--quick"]);
+    let step = |factor: &str, name: &str| -> f64 {
+        let row = out.lines().find(|l| l.contains("Stiffness") && l.contains(factor) && l.contains(name)).unwrap();
+        row.split_whitespace().last().unwrap().parse().unwrap()
+    };
+    // Frequencies grow with the root of the stiffness: a hundredfold E takes about a tenth of the step.
+    let fall = step(" 1.000", " rk4 ") / step(" 100.000", " rk4 ");
+    assert!(fall > 2.0 && fall < 12.0, "{fall}: {out}");
+    assert!(step(" 1.000", "semi-implicit ") < step(" 1.000", " rk4 "), "{out}");
+    assert!(folder.path().join("out/stability-map.svg").is_file());
 }

@@ -10,12 +10,22 @@ fn allowed(part: &str) -> &'static [&'static str] {
         "error" => &[],
         "types" | "report" => &["types", "error"],
         "numerics" | "io" => &["types", "error", "numerics"],
-        "features" | "matching" | "consistency" | "mesh" | "field" | "synth" | "evaluate" => {
+        "features" | "matching" | "consistency" | "mesh" | "field" | "grasp" | "synth" | "evaluate" => {
             &["types", "error", "numerics"]
         }
-        "pipeline" => {
-            &["types", "error", "numerics", "features", "matching", "consistency", "mesh", "field", "synth", "evaluate"]
-        }
+        "pipeline" => &[
+            "types",
+            "error",
+            "numerics",
+            "features",
+            "matching",
+            "consistency",
+            "mesh",
+            "field",
+            "grasp",
+            "synth",
+            "evaluate",
+        ],
         "cli" | "main" => &[
             "types",
             "error",
@@ -26,6 +36,7 @@ fn allowed(part: &str) -> &'static [&'static str] {
             "consistency",
             "mesh",
             "field",
+            "grasp",
             "synth",
             "evaluate",
             "report",

@@ -11,6 +11,10 @@ mod evaluate;
 
 mod field;
 
+mod grasp;
+
+mod grasp_analysis;
+
 mod inputs;
 
 mod invert;
@@ -63,6 +67,10 @@ enum Command {
     Warp(warp::Options),
     /// Turn a displacement field around: deformed to initial
     Invert(invert::Options),
+    /// Simulate a soft-finger grasp from a scene file
+    Grasp(grasp::Options),
+    /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
+    GraspAnalysis(grasp_analysis::Options),
     /// Make a synthetic pair of volumes with exactly known displacement
     Phantom(phantom::Options),
     /// Score a displacement field against exact truth
@@ -86,6 +94,8 @@ pub fn run() -> ExitCode {
         Command::Field(options) => field::run(&options, &console),
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
+        Command::Grasp(options) => grasp::run(&options, &console),
+        Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
         Command::Phantom(options) => phantom::run(&options, &console),
         Command::Evaluate(options) => evaluate::run(&options, &console),
         Command::Demo(options) => demo::run(&options, &console),

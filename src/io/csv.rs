@@ -113,7 +113,11 @@ fn some_rows(path: &Path, rows: usize) -> Result<(), IoError> {
     }
 }
 
-fn write_table(path: &Path, columns: &[&str], rows: impl Iterator<Item = Vec<String>>) -> Result<(), IoError> {
+pub(super) fn write_table(
+    path: &Path,
+    columns: &[&str],
+    rows: impl Iterator<Item = Vec<String>>,
+) -> Result<(), IoError> {
     write_atomic(path, |w| {
         let mut table = Writer::from_writer(w);
         table.write_record(columns)?;

@@ -10,6 +10,10 @@ pub mod csv;
 
 pub mod vtu;
 
+pub mod scene;
+
+pub mod grasp;
+
 pub mod text;
 
 pub mod output;
@@ -21,11 +25,15 @@ mod deflate;
 mod gzip;
 
 pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
+pub use grasp::{
+    write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
+};
 pub use nifti::{
     count_non_finite, read_field, read_labels, read_mask, read_volume, write_field, write_integers, write_labels,
     write_steps, write_volume,
 };
 pub use output::OutputFolder;
+pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use text::{write_bytes, write_json, write_text};
 pub use vtu::{write_tet_mesh, write_tri_mesh};
 

@@ -27,3 +27,7 @@ pub mod statistics;
 pub mod random;
 
 pub mod neighbours;
+
+pub mod dense;
+
+pub mod trig;

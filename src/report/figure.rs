@@ -50,6 +50,24 @@ pub fn figure(title: &str, panels: &[Panel]) -> String {
     stand_alone([WIDTH, height], &body)
 }
 
+/// Plots of [`crate::report::plot`] as one file that stands alone, `columns` beside each other.
+pub fn sheet(title: &str, plots: &[String], columns: usize) -> String {
+    let (wide, tall) = (560.0, 236.0);
+    let rows = plots.len().div_ceil(columns.max(1));
+    let mut body = format!(
+        "<style>.strong{{font-weight:600;fill:#222}}.rule{{stroke:#e1e4ea}}.axis{{stroke:#5b6472;fill:none}}.mark{{stroke:#999;\
+         stroke-dasharray:2 3}}.line{{fill:none;stroke:#3b6fb6;stroke-width:1.8;stroke-linejoin:round}}.c1{{stroke:#c7672b}}\
+         .c2{{stroke:#2c8a5b}}.c3{{stroke:#8356b0}}.dashed{{stroke-dasharray:5 4;stroke-width:1.3}}</style>\
+         <text x=\"{LEFT}\" y=\"34\" class=\"title\">{}</text>",
+        escape(title)
+    );
+    for (i, plot) in plots.iter().enumerate() {
+        let (x, y) = (LEFT + (i % columns) as f64 * wide, 56.0 + (i / columns) as f64 * tall);
+        let _ = write!(body, r#"<svg x="{x}" y="{y}" width="520" height="210">{plot}</svg>"#);
+    }
+    stand_alone([LEFT + columns as f64 * wide, 60.0 + rows as f64 * tall], &body)
+}
+
 /// A scale from `place` (its upper left corner) down, `tall` high, with three ticks; `number` sets it apart from others.
 pub(super) fn colour_bar(scale: &Scale, number: usize, [x, top]: [f64; 2], tall: f64) -> String {
     let stops: String = (0..9)

@@ -87,10 +87,15 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
         chart::stage_times(&result.summary.seconds)
     );
     let title = format!("{} to {}", escape(report.names[0]), escape(report.names[1]));
-    Ok(format!(
-        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title><style>{STYLE}</style></head><body><main>{body}{}</main></body></html>\n",
-        footer()
-    ))
+    body.push_str(footer());
+    Ok(document(&title, &body))
+}
+
+/// A page around `body`; `title` is HTML already.
+pub(super) fn document(title: &str, body: &str) -> String {
+    format!(
+        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>\n"
+    )
 }
 
 /// Verdict, key numbers, warnings.

@@ -38,4 +38,15 @@ pub mod text;
 
 pub mod json;
 
+pub mod plot;
+
+pub mod grasp_scene;
+
+pub mod grasp;
+
+pub mod grasp_surface;
+
+pub mod grasp_analysis;
+
 pub use field::FieldReport;
+pub use grasp::GraspReport;

@@ -66,7 +66,7 @@ impl Picture {
 }
 
 /// An indexed PNG, rows from the top.
-fn encode(width: usize, height: usize, palette: Vec<u8>, indices: &[u8]) -> Result<Vec<u8>, ReportError> {
+pub(super) fn encode(width: usize, height: usize, palette: Vec<u8>, indices: &[u8]) -> Result<Vec<u8>, ReportError> {
     let failed = |e: png::EncodingError| ReportError::Picture { what: e.to_string() };
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, width as u32, height as u32);

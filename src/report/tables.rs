@@ -7,7 +7,7 @@ use crate::types::{Metrics, MotionModel};
 use std::fmt::Write;
 
 /// A table from a head (may be empty) and rows; the first column is text, the others are numbers.
-fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     let mut out = String::from("<div class=\"scroll\"><table>");
     if !head.is_empty() {
         let cells: String = head.iter().map(|h| format!("<th>{h}</th>")).collect();

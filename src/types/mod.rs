@@ -1,4 +1,4 @@
-//! Data only: geometry, volumes, points, fields, meshes, parameters, metrics.
+//! Data only: geometry, volumes, points, fields, meshes, parameters, metrics, grasp scenes.
 //!
 //! Every constructor checks what it is given, so that a value that exists is valid. Nothing here computes more than
 //! its own geometry, opens a file or prints. Frames: a [`VoxelPoint`] counts voxels (centre of the first voxel =
@@ -22,11 +22,19 @@ pub mod result;
 
 pub mod names;
 
+pub mod fingertip;
+
+pub mod scene;
+
+pub mod grasp;
+
 pub use field::DenseField;
+pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{TetMesh, TriMesh};
 pub use metrics::Metrics;
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
 pub use result::{Counts, FieldResult, FieldSummary, LevelReport, Mesh, MotionModel};
+pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use volume::{Mask, Volume};

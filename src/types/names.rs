@@ -20,18 +20,36 @@ pub fn choose<T: Copy>(what: &'static str, found: &str, known: &[(&'static str, 
     Err(UnknownName { what, found: found.into(), known: known.iter().map(|(name, _)| *name).collect(), nearest })
 }
 
-/// Insertions, deletions and replacements that turn `a` into `b` (Levenshtein).
+/// Insertions, deletions, replacements and swaps of neighbours that turn `a` into `b` (optimal string alignment).
 fn edit_distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, ca) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, cb) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(ca != *cb);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(diagonal + 1).min(row[j] + 1);
+    let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());
+    let mut rows: Vec<Vec<usize>> = vec![(0..=b.len()).collect()];
+    for i in 0..a.len() {
+        let mut row = vec![i + 1];
+        for j in 0..b.len() {
+            let replaced = rows[i][j] + usize::from(a[i] != b[j]);
+            let swapped = if i > 0 && j > 0 && a[i] == b[j - 1] && a[i - 1] == b[j] {
+                rows[i - 1][j - 1] + 1
+            } else {
+                usize::MAX
+            };
+            row.push(replaced.min(rows[i][j + 1] + 1).min(row[j] + 1).min(swapped));
+        }
+        rows.push(row);
+    }
+    rows[a.len()][b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::edit_distance;
+
+    #[test]
+    fn edits_are_counted() {
+        let cases = [("width", "width", 0), ("wdith", "width", 1), ("", "ab", 2), ("mas", "mass", 1), ("abc", "ca", 3)];
+        for (a, b, edits) in cases {
+            assert_eq!(edit_distance(a, b), edits, "{a} {b}");
+            assert_eq!(edit_distance(b, a), edits, "{b} {a}");
         }
     }
-    row[b.len()]
 }

@@ -1,0 +1,179 @@
+//! Where the tips touch: displacements as functions of pose and joint angles, with their derivatives.
+//!
+//! With n = (cos theta, sin theta), t = (-sin theta, cos theta), tip centres O1, O2 and r_i = p - O_i, the normal
+//! constraints C_H and the integrated rolling constraints C_N of the source give
+//!
+//! ```text
+//! d_n1 = a + W/2 - r_1 . n        d_t1 = r_1 . t - a (theta_1 - theta)
+//! d_n2 = a + W/2 + r_2 . n        d_t2 = r_2 . t - a (theta_2 + theta)
+//! ```
+//!
+//! and the tilts are theta - theta_1 and -(theta + theta_2) (docs/grasp.md has both signs settled). Rows of a Jacobian
+//! stand in the order d_n1, d_n2, d_t1, d_t2; coordinates in the order x, y, theta, theta_1, theta_2.
+
+use crate::grasp::models::Tilt;
+use crate::numerics::trig::sin_cos;
+use crate::types::{FingertipModel, Scene};
+
+/// Pose and joint angles (m, rad): x, y, theta, theta_1, theta_2.
+pub type Coordinates = [f64; 5];
+
+/// Lengths of a scene (m).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Geometry {
+    /// Radius a of the tips.
+    pub radius: f64,
+    /// Link length l.
+    pub link: f64,
+    /// Half the distance between the joints, L_b.
+    pub half_span: f64,
+    /// Half the object's width.
+    pub half_width: f64,
+}
+
+impl Geometry {
+    /// Of a scene. Rigid tips cannot be pressed in, so their joints stand apart until they just touch.
+    pub fn of(scene: &Scene) -> Self {
+        let (radius, half_width) = (scene.fingertip.radius, 0.5 * scene.object.width);
+        let rigid = scene.fingertip.model == FingertipModel::Rigid;
+        let half_span = if rigid { radius + half_width } else { scene.finger.half_span };
+        Self { radius, link: scene.finger.link, half_span, half_width }
+    }
+
+    /// Tip centres O1, O2 (m) at joint angles (rad).
+    pub fn tips(&self, joints: [f64; 2]) -> [[f64; 2]; 2] {
+        let ([s1, s2], [c1, c2]) = sin_cos(joints);
+        [[self.link * s1 - self.half_span, -self.link * c1], [self.half_span - self.link * s2, -self.link * c2]]
+    }
+
+    /// The contact at a pose and joint angles.
+    #[inline(always)]
+    pub fn contact(&self, q: &Coordinates) -> Contact {
+        let ([s, s1, s2], [c, c1, c2]) = sin_cos([q[2], q[3], q[4]]);
+        let r1 = [q[0] + self.half_span - self.link * s1, q[1] + self.link * c1];
+        let r2 = [q[0] - self.half_span + self.link * s2, q[1] + self.link * c2];
+        let along = [r1[0] * c + r1[1] * s, r2[0] * c + r2[1] * s];
+        let across = [r1[1] * c - r1[0] * s, r2[1] * c - r2[0] * s];
+        let reach = self.radius + self.half_width;
+        Contact {
+            geometry: *self,
+            face: [c, s],
+            link_x: [self.link * c1, -self.link * c2],
+            link_y: [self.link * s1, self.link * s2],
+            along,
+            across,
+            sine: [s1 * c - c1 * s, s2 * c + c2 * s],
+            cosine: [c1 * c + s1 * s, c2 * c - s2 * s],
+            normal: [reach - along[0], reach + along[1]],
+            tangential: [across[0] - self.radius * (q[3] - q[2]), across[1] - self.radius * (q[4] + q[2])],
+        }
+    }
+}
+
+/// The contact at one pose; index 0 is the left finger.
+#[derive(Debug, Clone, Copy)]
+pub struct Contact {
+    geometry: Geometry,
+    /// cos theta, sin theta.
+    face: [f64; 2],
+    /// d O_i / d theta_i.
+    link_x: [f64; 2],
+    link_y: [f64; 2],
+    /// r_i . n.
+    along: [f64; 2],
+    /// r_i . t.
+    across: [f64; 2],
+    /// Sine and cosine of theta_1 - theta and theta_2 + theta.
+    sine: [f64; 2],
+    cosine: [f64; 2],
+    /// d_n (m).
+    pub normal: [f64; 2],
+    /// d_t (m).
+    pub tangential: [f64; 2],
+}
+
+impl Contact {
+    /// Tilt of finger `i`: theta - theta_1, -(theta + theta_2).
+    #[inline(always)]
+    pub fn tilt(&self, i: usize) -> Tilt {
+        Tilt { sin: -self.sine[i], cos: self.cosine[i] }
+    }
+
+    /// d_n1, d_n2, d_t1, d_t2 (m).
+    #[inline(always)]
+    pub fn displacements(&self) -> [f64; 4] {
+        [self.normal[0], self.normal[1], self.tangential[0], self.tangential[1]]
+    }
+
+    /// J v: rates of d_n1, d_n2, d_t1, d_t2 (m/s) at the velocity `v`.
+    #[inline(always)]
+    pub fn rates(&self, v: &Coordinates) -> [f64; 4] {
+        let [c, s] = self.face;
+        let a = self.geometry.radius;
+        let along = |i: usize| {
+            let (x, y) = (v[0] - self.link_x[i] * v[3 + i], v[1] - self.link_y[i] * v[3 + i]);
+            (x * c + y * s + self.across[i] * v[2], y * c - x * s - self.along[i] * v[2])
+        };
+        let ((n1, t1), (n2, t2)) = (along(0), along(1));
+        [-n1, n2, t1 - a * (v[3] - v[2]), t2 - a * (v[4] + v[2])]
+    }
+
+    /// J' v: what the second derivatives of the displacements have beside J v' (m/s^2).
+    #[inline(always)]
+    pub fn acceleration_bias(&self, v: &Coordinates) -> [f64; 4] {
+        let [c, s] = self.face;
+        let bias = |i: usize| {
+            let w = v[3 + i];
+            let (x, y) = (v[0] - self.link_x[i] * w, v[1] - self.link_y[i] * w);
+            // r'' at v' = 0: minus the centripetal part of the tip's acceleration.
+            let sign = if i == 0 { 1.0 } else { -1.0 };
+            let (ax, ay) = (sign * self.link_y[i] * w * w, -sign * self.link_x[i] * w * w);
+            let along = ax * c + ay * s + 2.0 * v[2] * (y * c - x * s) - self.along[i] * v[2] * v[2];
+            let across = ay * c - ax * s - 2.0 * v[2] * (x * c + y * s) - self.across[i] * v[2] * v[2];
+            (along, across)
+        };
+        let ((n1, t1), (n2, t2)) = (bias(0), bias(1));
+        [-n1, n2, t1, t2]
+    }
+
+    /// J^T f plus the moments' part: generalised forces (N, N m) of the forces d_n1, d_n2, d_t1, d_t2 (N) and of the
+    /// moments on the tilts (N m).
+    #[inline(always)]
+    pub fn pull(&self, f: &[f64; 4], moments: &[f64; 2]) -> Coordinates {
+        let [c, s] = self.face;
+        let Geometry { radius: a, link: l, .. } = self.geometry;
+        let [n1, n2, t1, t2] = *f;
+        let (squeeze, drag) = (n2 - n1, t1 + t2);
+        [
+            c * squeeze - s * drag,
+            s * squeeze + c * drag,
+            self.across[1] * n2 - self.across[0] * n1 + t1 * (a - self.along[0]) - t2 * (a + self.along[1])
+                + moments[0]
+                - moments[1],
+            l * (n1 * self.cosine[0] - t1 * self.sine[0]) - a * t1 - moments[0],
+            l * (n2 * self.cosine[1] - t2 * self.sine[1]) - a * t2 - moments[1],
+        ]
+    }
+
+    /// Moment about the object's centre (N m) of pushes, from [`crate::grasp::control::Inputs::moment`].
+    #[inline(always)]
+    pub fn turn(&self, moment: [f64; 2]) -> f64 {
+        moment[0] * self.face[0] - moment[1] * self.face[1]
+    }
+
+    /// J: derivatives of d_n1, d_n2, d_t1, d_t2, row by row.
+    pub fn jacobian(&self) -> [Coordinates; 4] {
+        std::array::from_fn(|row| self.pull(&std::array::from_fn(|k| f64::from(u8::from(k == row))), &[0.0; 2]))
+    }
+
+    /// Sum of `f`_k times the second derivatives of d_k in (x, y, theta), joints fixed (N/m, N, N m).
+    pub fn curvature(&self, f: &[f64; 4]) -> [[f64; 3]; 3] {
+        let [c, s] = self.face;
+        let [n1, n2, t1, t2] = *f;
+        let (squeeze, drag) = (n2 - n1, t1 + t2);
+        let x = -s * squeeze - c * drag;
+        let y = c * squeeze - s * drag;
+        let turn = n1 * self.along[0] - n2 * self.along[1] - t1 * self.across[0] - t2 * self.across[1];
+        [[0.0, 0.0, x], [0.0, 0.0, y], [x, y, turn]]
+    }
+}

@@ -1,0 +1,312 @@
+//! A whole run: steps from border to border of the inputs, samples, and the watch over everything that can fail.
+
+use crate::error::GraspError;
+use crate::grasp::branch::{Branch, STRIDE};
+use crate::grasp::control::{Phase, SAME, Schedule};
+use crate::grasp::integrators::{Rk4, SemiImplicitEuler, Stepper, System, dormand_prince};
+use crate::grasp::minimal::Minimal;
+use crate::grasp::models::{self, Tip};
+use crate::grasp::multipliers::Multipliers;
+use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::statics::{Equilibrium, Lost, Statics};
+use crate::grasp::stepping::{self, LIMIT};
+use crate::grasp::watch::Watch;
+use crate::types::grasp::{ConstraintDrift, Event, EventKind, GraspRun, MotionRow, Sample};
+use crate::types::scene::{Formulation, Integrator, Method};
+use crate::types::{FingertipModel, Scene};
+use std::f64::consts::PI;
+
+/// Called with the fraction of the run that is done (0 to 1).
+pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
+
+/// Events of slip that are kept at most; a tip at the edge may begin to slip in every step.
+const MOST_SLIPS: usize = 1000;
+
+/// Simulates a scene from its pinch at rest.
+///
+/// The run ends early at the first event that [`EventKind::ends_run`]; what came before is given back.
+///
+/// # Errors
+/// [`GraspError`] where nothing can be simulated: a scene out of range, no stable equilibrium at the start, or a step or
+/// stabilisation gain that is unstable from the start.
+pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
+    scene.check()?;
+    let stiffness = PI * scene.fingertip.youngs_modulus;
+    match scene.fingertip.model {
+        FingertipModel::Parallel => with_tip(scene, models::Parallel { stiffness }, progress),
+        FingertipModel::ParallelNormal => with_tip(scene, models::ParallelNormal { stiffness }, progress),
+        FingertipModel::Radial => with_tip(scene, models::Radial { stiffness }, progress),
+        FingertipModel::Rigid => with_tip(scene, models::Rigid, progress),
+    }
+}
+
+fn with_tip<T: Tip + Clone>(scene: &Scene, tip: T, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
+    let statics = Statics::new(scene, &tip);
+    let start = start(scene, &statics)?;
+    let plant = Plant::new(scene, tip.clone(), &start);
+    let Integrator { formulation, baumgarte, rolling, .. } = scene.integrator;
+    match formulation {
+        Formulation::Minimal => run(scene, &Minimal(plant), &statics, start, progress),
+        Formulation::Multipliers => {
+            run(scene, &Multipliers { plant, gain: baumgarte, rolling }, &statics, start, progress)
+        }
+    }
+}
+
+/// The equilibrium that a run starts in: the pinch, followed to the first joint angles.
+///
+/// # Errors
+/// [`GraspError::NoStart`] where the pinch is not stable or not in the model's range, or the branch does not reach so far.
+pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspError> {
+    let start = statics.pinch(scene);
+    let depth = scene.initial.normal_displacement * 1e3;
+    if let Some(lost) = statics.out_of_range(&start.q) {
+        let (what, finger) = match lost {
+            Lost::Contact(i) => ("does not touch the object", i + 1),
+            Lost::Range(i) => ("is pressed out of the model's range", i + 1),
+            Lost::Fold => ("has no equilibrium", 1),
+        };
+        return Err(GraspError::NoStart {
+            what: format!("finger {finger} {what} (d_n {depth:.3} mm)"),
+            hint: "change initial.normal_displacement or fingertip.radius".into(),
+        });
+    }
+    if start.smallest_eigenvalue.is_nan() || start.smallest_eigenvalue <= 0.0 {
+        return Err(GraspError::NoStart {
+            what: format!(
+                "the pinch is not stable (smallest eigenvalue of the Hessian {:.3e} N/m)",
+                start.smallest_eigenvalue
+            ),
+            hint: "widen object.width, stiffen fingertip.youngs_modulus or press more (initial.normal_displacement)"
+                .into(),
+        });
+    }
+    if scene.initial.joints == [0.0; 2] {
+        return Ok(start);
+    }
+    statics.follow(&start, scene.initial.joints, STRIDE).map_err(|(lost, last)| GraspError::NoStart {
+        what: format!(
+            "initial.theta cannot be reached from the pinch: at joint angles {:.2} and {:.2} degrees {}",
+            last.q[3].to_degrees(),
+            last.q[4].to_degrees(),
+            lost.words()
+        ),
+        hint: "choose other angles in initial.theta".into(),
+    })
+}
+
+/// A run in progress.
+struct Run<'a, const N: usize, S: System<N>> {
+    scene: &'a Scene,
+    system: &'a S,
+    watch: Watch,
+    state: [f64; N],
+    /// State of the step before, with its time.
+    before: ([f64; N], f64),
+    result: GraspRun,
+    /// Next trial step of the adaptive method.
+    trial: f64,
+}
+
+impl<const N: usize, S: System<N>> Run<'_, N, S> {
+    /// Contacts of a state.
+    fn sample(&self, phase: &Phase, t: f64, state: &[f64; N]) -> (Sample, Reading) {
+        let reading = self.system.rate(&phase.inputs(t), state).1;
+        let q = std::array::from_fn(|k| state[k]);
+        (reading.sample(t, &q), reading)
+    }
+
+    /// Looks at the contacts of the state at `t`; true where the run goes on.
+    #[inline(always)]
+    fn goes_on(&mut self, phase: &Phase, t: f64, reading: &Reading, state: &[f64; N]) -> bool {
+        self.watch.fine(reading) || self.record_flaw(phase, t, reading, state)
+    }
+
+    #[cold]
+    fn record_flaw(&mut self, phase: &Phase, t: f64, reading: &Reading, state: &[f64; N]) -> bool {
+        let (fatal, slips) = self.watch.flaws(reading);
+        for (kind, i, what) in slips {
+            if self.result.events.len() < MOST_SLIPS {
+                let q = std::array::from_fn(|k| state[k]);
+                let last_valid = reading.sample(t, &q);
+                self.result.events.push(Event { kind, time: t, finger: Some(i + 1), what, last_valid });
+            }
+        }
+        let Some((kind, i, what)) = fatal else { return true };
+        let kind = self.cause(phase, &self.before.0).unwrap_or(kind);
+        self.end(phase, kind, t, Some(i + 1), what);
+        false
+    }
+
+    /// Records what ends the run at `t`, with the state of the step before.
+    fn end(&mut self, phase: &Phase, kind: EventKind, t: f64, finger: Option<usize>, what: String) {
+        let (before, time) = self.before;
+        let (last_valid, _) = self.sample(phase, time, &before);
+        self.result.events.push(Event { kind, time: t, finger, what, last_valid });
+    }
+
+    /// Whether the step or the gain is to blame at `state`.
+    fn cause(&self, phase: &Phase, state: &[f64; N]) -> Option<EventKind> {
+        let Integrator { method, step, .. } = self.scene.integrator;
+        let growth = stepping::growth_of(method, self.system, phase, step, state);
+        if growth <= LIMIT {
+            return None;
+        }
+        let here = Equilibrium { q: std::array::from_fn(|k| state[k]), ..Equilibrium::default() };
+        let minimal = stepping::growth_at(self.scene, method, Formulation::Minimal, step, 0.0, &here);
+        let gain = self.scene.integrator.formulation == Formulation::Multipliers && minimal <= LIMIT;
+        Some(if gain { EventKind::BadGain } else { EventKind::BadStep })
+    }
+
+    /// Steps of a fixed length from `t0` to `t1`; true where the run goes on.
+    fn fixed<P: Stepper>(&mut self, phase: &Phase, t0: f64, t1: f64) -> bool {
+        let count = ((t1 - t0) / self.scene.integrator.step - 1e-9).ceil().max(1.0);
+        let h = (t1 - t0) / count;
+        let mut state = self.state;
+        for k in 0..count as u64 {
+            let t = t0 + k as f64 * h;
+            let (next, reading) = P::step(self.system, phase, t, h, &state);
+            if !self.goes_on(phase, t, &reading, &state) {
+                return false;
+            }
+            self.before = (state, t);
+            state = next;
+        }
+        self.state = state;
+        self.result.steps += count as u64;
+        true
+    }
+
+    /// Steps under error control from `t0` to `t1`; true where the run goes on.
+    fn adaptive(&mut self, phase: &Phase, t0: f64, t1: f64) -> bool {
+        let tolerance = self.scene.integrator.tolerance;
+        let mut t = t0;
+        while t < t1 {
+            let last = t1 - t <= self.trial * 1.000_001;
+            let trial = if last { t1 - t } else { self.trial };
+            let state = self.state;
+            let Some((next, reading, taken, proposed)) =
+                dormand_prince(self.system, phase, t, trial, tolerance, &state)
+            else {
+                let what = "no step meets integrator.tolerance; loosen it".into();
+                self.end(phase, EventKind::BadStep, t, None, what);
+                return false;
+            };
+            if !self.goes_on(phase, t, &reading, &state) {
+                return false;
+            }
+            self.before = (state, t);
+            // The last step of an interval is cut short; it says little about the next one.
+            self.trial = if last && taken == trial { self.trial.max(proposed) } else { proposed };
+            t = if last && taken == trial { t1 } else { t + taken };
+            self.state = next;
+            self.result.steps += 1;
+        }
+        true
+    }
+
+    /// One interval between borders or samples; true where the run goes on.
+    fn interval(&mut self, phase: &Phase, t0: f64, t1: f64) -> bool {
+        match self.scene.integrator.method {
+            Method::Rk4 => self.fixed::<Rk4>(phase, t0, t1),
+            Method::SemiImplicitEuler => self.fixed::<SemiImplicitEuler>(phase, t0, t1),
+            Method::Adaptive => self.adaptive(phase, t0, t1),
+        }
+    }
+
+    /// From the start to the end, or to the first event that ends the run.
+    fn through(mut self, mut branch: Branch<'_>, progress: Progress<'_>) -> GraspRun {
+        let (scene, system) = (self.scene, self.system);
+        let output_every = scene.integrator.output_every;
+        let schedule = Schedule::of(scene);
+        let start_energy = system.energy(&self.state).0;
+        let mut largest_energy = 0.0f64;
+        let mut ends = schedule.ends.iter().peekable();
+        let mut next_output = 1.0;
+        for pair in schedule.times.windows(2) {
+            let [t0, t1] = [pair[0], pair[1]];
+            let phase = Phase::at(scene, 0.5 * (t0 + t1));
+            if !self.interval(&phase, t0, t1) {
+                break;
+            }
+            let now = self.state;
+            let (sample, reading) = self.sample(&phase, t1, &now);
+            if !self.goes_on(&phase, t1, &reading, &now) {
+                break;
+            }
+            let (energy, moving) = system.energy(&now);
+            largest_energy = largest_energy.max(moving);
+            self.result.energy_drift = self.result.energy_drift.max((energy - start_energy - now[S::WORK]).abs());
+            self.result.constraint_drift = self.result.constraint_drift.worse(system.drift(&now));
+
+            let end = ends.next_if(|end| t1 >= end.0 - SAME);
+            let [q, v]: [[f64; 5]; 2] = [0, 5].map(|from| std::array::from_fn(|k| now[from + k]));
+            if let Some(what) = branch.lost(&q, &v, &reading.forces, end.is_some()) {
+                self.end(&phase, EventKind::Fold, t1, None, what);
+                break;
+            }
+            if let Some(&(_, step, target)) = end {
+                self.result.motions.push(MotionRow { step, target, reached: sample });
+                if let Some(kind) = self.cause(&phase, &now) {
+                    let what = format!("a step of {} s is no longer stable here", scene.integrator.step);
+                    self.end(&phase, kind, t1, None, what);
+                    break;
+                }
+            }
+            if t1 >= next_output * output_every - SAME || t1 >= schedule.duration - SAME {
+                self.result.samples.push(sample);
+                next_output += 1.0;
+                progress(t1 / schedule.duration);
+            }
+        }
+        if largest_energy > 0.0 {
+            self.result.energy_drift /= largest_energy;
+        }
+        self.result
+    }
+}
+
+fn run<const N: usize, S: System<N>>(
+    scene: &Scene,
+    system: &S,
+    statics: &Statics<'_>,
+    start: Equilibrium,
+    progress: Progress<'_>,
+) -> Result<GraspRun, GraspError> {
+    let Integrator { method, step, formulation, baumgarte, .. } = scene.integrator;
+    let state = system.start(&start);
+    let at_rest = Phase::hold(scene.initial.joints);
+    let step_growth = stepping::growth_of(method, system, &at_rest, step, &state);
+    let result = GraspRun {
+        samples: Vec::new(),
+        motions: Vec::new(),
+        events: Vec::new(),
+        energy_drift: 0.0,
+        constraint_drift: ConstraintDrift::default(),
+        step_growth,
+        steps: 0,
+        completed: false,
+    };
+    let mut run = Run { scene, system, watch: Watch::new(scene), state, before: (state, 0.0), result, trial: step };
+    if step_growth > LIMIT {
+        let gain_to_blame = run.cause(&at_rest, &state) == Some(EventKind::BadGain);
+        return Err(if gain_to_blame {
+            let stable = stepping::stable_gain(scene, &start);
+            GraspError::BadGain { gain: baumgarte, step, growth: step_growth, stable }
+        } else {
+            let method_name = format!("{}, {}", method.name(), formulation.name());
+            let stable = stepping::stable_step(scene, method, formulation, &[start]);
+            GraspError::BadStep { step, growth: step_growth, method: method_name, stable }
+        });
+    }
+
+    let (first, reading) = run.sample(&at_rest, 0.0, &state);
+    run.result.samples.push(first);
+    if !run.goes_on(&at_rest, 0.0, &reading, &state) {
+        let what = run.result.events.pop().map_or(String::new(), |e| format!("{}: {}", e.kind.name(), e.what));
+        return Err(GraspError::NoStart { what, hint: "change the scene's start".into() });
+    }
+    let mut result = run.through(Branch::new(statics, &start), progress);
+    result.completed = !result.events.iter().any(|e| e.kind.ends_run());
+    Ok(result)
+}

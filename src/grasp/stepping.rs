@@ -1,0 +1,141 @@
+//! Which steps are stable: the spectral radius of one step about a state, and the largest step that keeps it at 1.
+
+use crate::grasp::control::Phase;
+use crate::grasp::integrators::{Rk4, SemiImplicitEuler, Stepper, System};
+use crate::grasp::minimal::Minimal;
+use crate::grasp::models::{self, Tip};
+use crate::grasp::multipliers::Multipliers;
+use crate::grasp::plant::Plant;
+use crate::grasp::statics::Equilibrium;
+use crate::numerics::dense::spectral_radius;
+use crate::types::grasp::StableStep;
+use crate::types::scene::{Formulation, Method};
+use crate::types::{FingertipModel, Scene};
+use std::f64::consts::PI;
+
+/// Growth of a step that still counts as stable: rounding of the derivatives is far below, and it means a factor e in
+/// 100,000 steps.
+pub const LIMIT: f64 = 1.0 + 1e-5;
+
+/// Spectral radius of one step of `h` seconds about `state`, from central differences of the step itself.
+pub fn growth<P: Stepper, const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> f64 {
+    let mut matrix = [[0.0; N]; N];
+    for k in 0..N {
+        if k == S::WORK {
+            continue;
+        }
+        // Displacements of a thousandth of a millimetre or a rad, rates of a millimetre or a rad a second.
+        let delta = if (5..10).contains(&k) || k > 16 { 1e-4 } else { 1e-7 };
+        let moved = |sign: f64| {
+            let mut s = *state;
+            s[k] += sign * delta;
+            P::step(system, phase, 0.0, h, &s).0
+        };
+        let (up, down) = (moved(1.0), moved(-1.0));
+        for row in (0..N).filter(|&row| row != S::WORK) {
+            matrix[row][k] = (up[row] - down[row]) / (2.0 * delta);
+        }
+    }
+    spectral_radius(&matrix)
+}
+
+/// Parts of a step by which the motion's own growth is measured.
+const PARTS: u16 = 50;
+
+/// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp itself is unstable (by
+/// its control, say) and the step follows that growth to 2 %, the step is not to blame, and 1 is given back.
+pub fn growth_of<const N: usize, S: System<N>>(
+    method: Method,
+    system: &S,
+    phase: &Phase,
+    h: f64,
+    state: &[f64; N],
+) -> f64 {
+    let found = match method {
+        Method::Rk4 => growth::<Rk4, N, S>(system, phase, h, state),
+        Method::SemiImplicitEuler => growth::<SemiImplicitEuler, N, S>(system, phase, h, state),
+        Method::Adaptive => 0.0,
+    };
+    if found <= LIMIT {
+        return found;
+    }
+    let own = growth::<Rk4, N, S>(system, phase, h / f64::from(PARTS), state).powi(PARTS.into());
+    if own > LIMIT && found <= 1.02 * own { 1.0 } else { found }
+}
+
+/// Largest value between `low` and `high` up to which `stable` holds, to 1 %; `low` where it does not hold even there.
+pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
+    let (mut good, mut bad) = (low, low);
+    // Upwards in factors of 1.5, so that an island of stability further up is not taken for the border.
+    while bad < high {
+        bad *= 1.5;
+        if !stable(bad) {
+            break;
+        }
+        good = bad;
+    }
+    while bad / good > 1.01 {
+        let middle = (good * bad).sqrt();
+        if stable(middle) { good = middle } else { bad = middle }
+    }
+    good
+}
+
+/// Largest stable step (s) at all of the equilibria `at`, to 1 %, with the scene's gains.
+pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: &[Equilibrium]) -> f64 {
+    let gain = scene.integrator.baumgarte;
+    largest(1e-7, 1.0, |h| at.iter().all(|e| growth_at(scene, method, formulation, h, gain, e) <= LIMIT))
+}
+
+/// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's step, to 1 %.
+pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
+    let (method, step) = (scene.integrator.method, scene.integrator.step);
+    largest(1e-3, 1e9, |g| growth_at(scene, method, Formulation::Multipliers, step, g, at) <= LIMIT)
+}
+
+/// Spectral radius of one step of `h` seconds about an equilibrium, with the gain `gain` (1/s) in the multiplier form.
+pub fn growth_at(scene: &Scene, method: Method, formulation: Formulation, h: f64, gain: f64, at: &Equilibrium) -> f64 {
+    let case = (method, formulation, h, gain);
+    let stiffness = PI * scene.fingertip.youngs_modulus;
+    match scene.fingertip.model {
+        FingertipModel::Parallel => growth_with(scene, models::Parallel { stiffness }, case, at),
+        FingertipModel::ParallelNormal => growth_with(scene, models::ParallelNormal { stiffness }, case, at),
+        FingertipModel::Radial => growth_with(scene, models::Radial { stiffness }, case, at),
+        FingertipModel::Rigid => growth_with(scene, models::Rigid, case, at),
+    }
+}
+
+fn growth_with<T: Tip + Clone>(
+    scene: &Scene,
+    tip: T,
+    (method, formulation, h, gain): (Method, Formulation, f64, f64),
+    at: &Equilibrium,
+) -> f64 {
+    let plant = Plant::new(scene, tip, at);
+    let phase = Phase::hold([at.q[3], at.q[4]]);
+    match formulation {
+        Formulation::Minimal => {
+            let system = Minimal(plant);
+            growth_of(method, &system, &phase, h, &system.start(at))
+        }
+        Formulation::Multipliers => {
+            let system = Multipliers { plant, gain, rolling: scene.integrator.rolling };
+            growth_of(method, &system, &phase, h, &system.start(at))
+        }
+    }
+}
+
+/// Largest stable steps of both fixed-step methods in both formulations, at all of the equilibria `at`.
+pub fn stable_steps(scene: &Scene, at: &[Equilibrium]) -> Vec<StableStep> {
+    let cases = [
+        (Method::Rk4, Formulation::Minimal),
+        (Method::Rk4, Formulation::Multipliers),
+        (Method::SemiImplicitEuler, Formulation::Minimal),
+        (Method::SemiImplicitEuler, Formulation::Multipliers),
+    ];
+    let step = |(method, formulation)| {
+        let step = stable_step(scene, method, formulation, at);
+        StableStep { method, formulation, step }
+    };
+    cases.map(step).to_vec()
+}

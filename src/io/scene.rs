@@ -1,0 +1,381 @@
+//! Grasp scenes: TOML, SI units, angles in degrees. Every error names the file, the key, what is wrong and what to try.
+
+use super::{format, os};
+use crate::error::{IoError, SceneError};
+use crate::types::Fingertip;
+use crate::types::fingertip::FingertipModel;
+use crate::types::names;
+use crate::types::scene::{
+    Finger, Formulation, Gains, Initial, Integrator, Method, Motion, Object, Push, Rolling, Scene, SweepCase,
+    rectangle_inertia,
+};
+use serde::Deserialize;
+use std::fs;
+use std::path::{Path, PathBuf};
+use toml::{Table, Value};
+
+/// Values set from outside the file, for all scenes in it.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct SceneOverrides {
+    /// Instead of `fingertip.model`.
+    pub model: Option<FingertipModel>,
+    /// Instead of `integrator.formulation`.
+    pub formulation: Option<Formulation>,
+    /// Instead of `integrator.step` (s); `output_every` is lengthened to it where it is shorter.
+    pub step: Option<f64>,
+}
+
+/// What a scene file holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneFile {
+    /// The scene without any sweep.
+    pub scene: Scene,
+    /// One case for each combination of the `[[sweep]]` tables' values, the last table's fastest; empty without one.
+    pub sweep: Vec<SweepCase>,
+    /// The file that `fingertip.file` names, where it does.
+    pub fingertip_file: Option<PathBuf>,
+}
+
+/// Keys of each table; a test holds them against what is deserialised.
+const KEYS: [(&str, &[&str]); 10] = [
+    ("", &["fingertip", "finger", "object", "initial", "gravity", "integrator", "motion", "push", "sweep"]),
+    ("fingertip", &["file", "radius", "youngs_modulus", "damping", "model"]),
+    ("finger", &["link", "half_span", "inertia", "gains", "fixed"]),
+    ("object", &["width", "height", "mass", "inertia", "friction"]),
+    ("initial", &["normal_displacement", "theta", "rest"]),
+    ("gravity", &["y"]),
+    ("integrator", &["method", "step", "output_every", "formulation", "baumgarte", "rolling", "tolerance"]),
+    ("motion", &["theta", "move", "hold"]),
+    ("push", &["start", "duration", "force", "at"]),
+    ("sweep", &["key", "values"]),
+];
+const GAINS: [&str; 3] = ["kp", "kd", "ki"];
+/// Most cases of an ensemble.
+const MOST_CASES: usize = 100_000;
+
+/// Reads a scene file.
+///
+/// # Errors
+/// [`IoError`] when the file or its fingertip file cannot be read or is no TOML, a key is unknown (with the nearest known
+/// one), missing or of a wrong type, or a value of any case is out of range.
+pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<SceneFile, IoError> {
+    let path = path.as_ref();
+    let mut table = read_table(path)?;
+    check_keys(path, &table)?;
+    let fingertip_file = merge_fingertip(path, &mut table)?;
+    let sweeps = take_sweeps(path, &mut table)?;
+    let scene = scene(path, table.clone(), overrides)?;
+    let count = sweeps.iter().try_fold(1usize, |n, (_, values)| n.checked_mul(values.len()));
+    if count.is_none_or(|n| n > MOST_CASES) {
+        return Err(format(path, "[[sweep]] asks for more than 100,000 scenes", "give fewer values"));
+    }
+    let mut sweep = Vec::new();
+    for case in 0..if sweeps.is_empty() { 0 } else { count.unwrap_or(0) } {
+        let (mut changed, mut values, mut rest) = (table.clone(), Vec::new(), case);
+        for (key, choices) in sweeps.iter().rev() {
+            let value = &choices[rest % choices.len()];
+            rest /= choices.len();
+            set(path, &mut changed, key, value)?;
+            values.push((key.clone(), value.to_string()));
+        }
+        values.reverse();
+        sweep.push(SweepCase { values, scene: self::scene(path, changed, overrides)? });
+    }
+    Ok(SceneFile { scene, sweep, fingertip_file })
+}
+
+fn read_table(path: &Path) -> Result<Table, IoError> {
+    let text = fs::read_to_string(path).map_err(os(path, "read"))?;
+    text.parse().map_err(|error: toml::de::Error| {
+        let line = error.span().map_or(1, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+        let what = format!("line {line}: {}", error.message().trim_end().replace('\n', ", "));
+        format(path, what, "correct that line (TOML: one `key = value` a line under a [table])")
+    })
+}
+
+/// Every key must be known.
+fn check_keys(path: &Path, table: &Table) -> Result<(), IoError> {
+    known(path, "the scene", table, KEYS[0].1)?;
+    for (name, keys) in &KEYS[1..] {
+        let Some(value) = table.get(*name) else { continue };
+        let many = matches!(*name, "motion" | "push" | "sweep");
+        let parts: Vec<&Table> = match value {
+            Value::Table(part) if !many => vec![part],
+            Value::Array(parts) if many => parts.iter().filter_map(Value::as_table).collect(),
+            _ => {
+                let brackets = if many { format!("[[{name}]]") } else { format!("[{name}]") };
+                return Err(format(path, format!("{name} is not a table"), format!("write {brackets} above its keys")));
+            }
+        };
+        for part in parts {
+            let shown = if many { format!("[[{name}]]") } else { format!("[{name}]") };
+            known(path, &shown, part, keys)?;
+            if let Some(gains) = part.get("gains").and_then(Value::as_table) {
+                known(path, "finger.gains", gains, &GAINS)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn known(path: &Path, place: &str, table: &Table, keys: &[&'static str]) -> Result<(), IoError> {
+    let choices: Vec<(&'static str, ())> = keys.iter().map(|k| (*k, ())).collect();
+    for key in table.keys() {
+        if !keys.contains(&key.as_str()) {
+            let found = names::choose("key", key, &choices).err();
+            let hint =
+                found.as_ref().and_then(|e| e.nearest).map_or(String::new(), |n| format!("did you mean '{n}'? "));
+            let what = format!("{place} has the unknown key '{key}'");
+            return Err(format(path, what, format!("{hint}known: {}", keys.join(", "))));
+        }
+    }
+    Ok(())
+}
+
+/// Puts the keys of the file that `fingertip.file` names under those of `[fingertip]`.
+fn merge_fingertip(path: &Path, table: &mut Table) -> Result<Option<PathBuf>, IoError> {
+    let Some(tip) = table.get_mut("fingertip").and_then(Value::as_table_mut) else { return Ok(None) };
+    let Some(file) = tip.remove("file") else { return Ok(None) };
+    let Some(file) = file.as_str() else {
+        return Err(format(path, "fingertip.file is not text", "give the name of a TOML file in quotes"));
+    };
+    let file = path.parent().unwrap_or(Path::new("")).join(file);
+    let mut other = read_table(&file)?;
+    // The keys may stand alone or under [fingertip]; other tables of the file say where it comes from.
+    let keys = match other.remove("fingertip") {
+        Some(Value::Table(keys)) => keys,
+        _ => other.into_iter().filter(|(_, v)| !v.is_table()).collect(),
+    };
+    known(&file, "the fingertip", &keys, &KEYS[1].1[1..])?;
+    for (key, value) in keys {
+        tip.entry(key).or_insert(value);
+    }
+    Ok(Some(file))
+}
+
+/// Keys and values of the `[[sweep]]` tables, which are removed.
+fn take_sweeps(path: &Path, table: &mut Table) -> Result<Vec<(String, Vec<Value>)>, IoError> {
+    #[derive(Deserialize)]
+    struct Sweep {
+        key: String,
+        values: Vec<Value>,
+    }
+    let Some(sweeps) = table.remove("sweep") else { return Ok(Vec::new()) };
+    let sweeps: Vec<Sweep> = sweeps.try_into().map_err(|e: toml::de::Error| {
+        format(path, format!("[[sweep]]: {}", e.message()), "give key = \"table.key\" and values = [...]")
+    })?;
+    if sweeps.iter().any(|s| s.values.is_empty()) {
+        return Err(format(path, "[[sweep]] has no values", "give at least one, or remove the table"));
+    }
+    Ok(sweeps.into_iter().map(|s| (s.key, s.values)).collect())
+}
+
+/// Sets `table.key`, `motion.0.theta` or the like.
+fn set(path: &Path, table: &mut Table, key: &str, value: &Value) -> Result<(), IoError> {
+    let parts: Vec<&str> = key.split('.').collect();
+    let wrong = |what: String, hint: &str| format(path, format!("[[sweep]] key '{key}': {what}"), hint);
+    let (Some((last, inner)), Some(first)) = (parts.split_last(), parts.first()) else {
+        return Err(wrong("is empty".into(), "write table.key"));
+    };
+    if inner.is_empty() {
+        return Err(wrong("names no key of a table".into(), "write table.key, such as object.mass"));
+    }
+    let Some((_, keys)) = KEYS.iter().find(|(name, _)| !name.is_empty() && name == first) else {
+        let tables: Vec<&str> = KEYS[1..9].iter().map(|k| k.0).collect();
+        return Err(wrong(format!("there is no table '{first}'"), &format!("known: {}", tables.join(", "))));
+    };
+    let mut at = table.entry(*first).or_insert_with(|| Value::Table(Table::new()));
+    for part in &inner[1..] {
+        let next = match (part.parse::<usize>(), at) {
+            (Ok(i), Value::Array(list)) => list.get_mut(i),
+            (_, Value::Table(inside)) => inside.get_mut(*part),
+            _ => None,
+        };
+        at = next.ok_or_else(|| wrong(format!("there is no '{part}' in the scene"), "count tables from 0"))?;
+    }
+    match (last.parse::<usize>(), at) {
+        (Ok(i), Value::Array(list)) if i < list.len() => list[i] = value.clone(),
+        (_, Value::Table(inside)) => {
+            let one = Table::from_iter([((*last).to_string(), Value::Boolean(true))]);
+            let keys = if inner.last() == Some(&"gains") { &GAINS[..] } else { keys };
+            known(path, &format!("[[sweep]] key '{key}': {}", inner.join(".")), &one, keys)?;
+            inside.insert((*last).to_string(), value.clone());
+        }
+        _ => return Err(wrong(format!("there is no '{last}' in the scene"), "write table.key; count tables from 0")),
+    }
+    Ok(())
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawScene {
+    fingertip: RawFingertip,
+    finger: RawFinger,
+    object: RawObject,
+    initial: Option<RawInitial>,
+    gravity: Option<RawGravity>,
+    integrator: Option<RawIntegrator>,
+    #[serde(default)]
+    motion: Vec<RawMotion>,
+    #[serde(default)]
+    push: Vec<RawPush>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawFingertip {
+    radius: f64,
+    youngs_modulus: f64,
+    damping: Option<[f64; 2]>,
+    model: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawFinger {
+    link: f64,
+    half_span: Option<f64>,
+    inertia: f64,
+    gains: Option<Gains>,
+    fixed: Option<bool>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawObject {
+    width: f64,
+    height: f64,
+    mass: f64,
+    inertia: Option<f64>,
+    friction: Option<f64>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(deny_unknown_fields)]
+struct RawInitial {
+    normal_displacement: Option<f64>,
+    theta: Option<[f64; 2]>,
+    rest: Option<f64>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(deny_unknown_fields)]
+struct RawGravity {
+    y: Option<f64>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(deny_unknown_fields)]
+struct RawIntegrator {
+    method: Option<String>,
+    step: Option<f64>,
+    output_every: Option<f64>,
+    formulation: Option<String>,
+    baumgarte: Option<f64>,
+    rolling: Option<String>,
+    tolerance: Option<f64>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawMotion {
+    theta: [f64; 2],
+    #[serde(rename = "move")]
+    duration: Option<f64>,
+    hold: Option<f64>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawPush {
+    start: f64,
+    duration: f64,
+    force: [f64; 2],
+    at: Option<[f64; 2]>,
+}
+
+/// A checked scene from its table; what the file leaves out is as in [`Scene::reference`].
+fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene, IoError> {
+    let raw: RawScene = Value::Table(table).try_into().map_err(|error: toml::de::Error| {
+        // The message's further lines name the place: "in `object.mass`".
+        let message = error.to_string().trim_end().replace('\n', " ");
+        format(path, message, "docs/grasp.md shows a whole scene")
+    })?;
+    let named = |error: crate::error::UnknownName, key: &str| format(path, error.to_string(), format!("correct {key}"));
+    let default = Scene::reference();
+    let (tip, finger, object) = (raw.fingertip, raw.finger, raw.object);
+    let (initial, integrator) = (raw.initial.unwrap_or_default(), raw.integrator.unwrap_or_default());
+
+    let depth_by = |half_span: f64| tip.radius + 0.5 * object.width - half_span;
+    let (half_span, depth) = match (finger.half_span, initial.normal_displacement) {
+        (Some(half_span), Some(depth)) => (half_span, depth),
+        (Some(half_span), None) => (half_span, depth_by(half_span)),
+        (None, depth) => {
+            let depth = depth.unwrap_or(default.initial.normal_displacement);
+            (depth_by(depth), depth)
+        }
+    };
+    let model = tip.model.as_deref().map(str::parse::<FingertipModel>).transpose();
+    let model = model.map_err(|e| named(e, "fingertip.model"))?.unwrap_or_default();
+    let method = integrator.method.as_deref().map(str::parse::<Method>).transpose();
+    let formulation = integrator.formulation.as_deref().map(str::parse::<Formulation>).transpose();
+    let rolling = integrator.rolling.as_deref().map(str::parse::<Rolling>).transpose();
+    let step = overrides.step.or(integrator.step).unwrap_or(default.integrator.step);
+    let every = integrator.output_every.unwrap_or(default.integrator.output_every);
+    let motion = |m: RawMotion| Motion {
+        target: m.theta.map(f64::to_radians),
+        duration: m.duration.unwrap_or(0.5),
+        hold: m.hold.unwrap_or(1.0),
+    };
+    let push = |p: RawPush| Push { start: p.start, duration: p.duration, force: p.force, at: p.at.unwrap_or_default() };
+    let scene = Scene {
+        fingertip: Fingertip {
+            radius: tip.radius,
+            youngs_modulus: tip.youngs_modulus,
+            damping: tip.damping.unwrap_or(default.fingertip.damping),
+            model: overrides.model.unwrap_or(model),
+        },
+        finger: Finger {
+            link: finger.link,
+            half_span,
+            inertia: finger.inertia,
+            gains: finger.gains.unwrap_or(default.finger.gains),
+            fixed: finger.fixed.unwrap_or(false),
+        },
+        object: Object {
+            width: object.width,
+            height: object.height,
+            mass: object.mass,
+            inertia: object.inertia.unwrap_or(rectangle_inertia(object.mass, object.width, object.height)),
+            friction: object.friction,
+        },
+        initial: Initial {
+            normal_displacement: depth,
+            joints: initial.theta.unwrap_or_default().map(f64::to_radians),
+            rest: initial.rest.unwrap_or(default.initial.rest),
+        },
+        gravity: raw.gravity.and_then(|g| g.y).unwrap_or(default.gravity),
+        integrator: Integrator {
+            method: method.map_err(|e| named(e, "integrator.method"))?.unwrap_or_default(),
+            step,
+            output_every: if overrides.step.is_some() { every.max(step) } else { every },
+            formulation: match overrides.formulation {
+                Some(formulation) => formulation,
+                None => formulation.map_err(|e| named(e, "integrator.formulation"))?.unwrap_or_default(),
+            },
+            baumgarte: integrator.baumgarte.unwrap_or(default.integrator.baumgarte),
+            rolling: rolling.map_err(|e| named(e, "integrator.rolling"))?.unwrap_or_default(),
+            tolerance: integrator.tolerance.unwrap_or(default.integrator.tolerance),
+        },
+        motions: raw.motion.into_iter().map(motion).collect(),
+        pushes: raw.push.into_iter().map(push).collect(),
+    };
+    scene.check().map_err(|error| {
+        let hint = match &error {
+            SceneError::Param(param) => format!("change {}", param.name),
+            _ => "correct the scene".into(),
+        };
+        format(path, error.to_string(), hint)
+    })?;
+    Ok(scene)
+}

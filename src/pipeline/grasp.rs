@@ -1,0 +1,136 @@
+//! A scene to a run, an ensemble of runs, or an analysis.
+
+use crate::error::GraspError;
+use crate::grasp::models::tip;
+use crate::grasp::simulate::{self, simulate};
+use crate::grasp::statics::Statics;
+use crate::grasp::{freedom, pinch, posture, stability, stepping};
+use crate::types::grasp::{GraspAnalysis, GraspRun, StableStep};
+use crate::types::scene::{Push, SweepCase};
+use crate::types::{FingertipModel, Scene};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Instant;
+
+/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
+pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
+
+/// Largest joint angle of the pinch map (degrees), and angles along each side.
+const MAP: (f64, usize) = (30.0, 61);
+
+/// A run with what it is shown beside.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GraspOutcome {
+    /// The run.
+    pub run: GraspRun,
+    /// The same scene without tangential deformation, where the scene's tips have it.
+    pub without_tangential: Option<Result<GraspRun, GraspError>>,
+    /// Largest stable steps at the start and at each motion's target.
+    pub stable_steps: Vec<StableStep>,
+    /// Stage names and wall seconds.
+    pub seconds: Vec<(String, f64)>,
+}
+
+/// Runs `scene`, the same without tangential deformation, and finds the stable steps.
+///
+/// # Errors
+/// [`GraspError`] where nothing can be simulated; see [`simulate()`].
+pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspError> {
+    let started = Instant::now();
+    let run = simulate(scene, &|f| progress("simulate", 0.7 * f))?;
+    let mut seconds = vec![("simulate".into(), started.elapsed().as_secs_f64())];
+    let started = Instant::now();
+    progress("compare", 0.7);
+    let without_tangential = (scene.fingertip.model == FingertipModel::Parallel)
+        .then(|| simulate(&with_model(scene, FingertipModel::ParallelNormal), &|_| {}));
+    seconds.push(("compare".into(), started.elapsed().as_secs_f64()));
+    let started = Instant::now();
+    progress("stable steps", 0.9);
+    let stable_steps = stable_steps(scene);
+    seconds.push(("stable steps".into(), started.elapsed().as_secs_f64()));
+    Ok(GraspOutcome { run, without_tangential, stable_steps, seconds })
+}
+
+/// Runs all cases of an ensemble in parallel; results are in the order of the cases.
+pub fn ensemble(cases: &[SweepCase], progress: Progress<'_>) -> Vec<Result<GraspRun, GraspError>> {
+    let done = AtomicUsize::new(0);
+    let one = |case: &SweepCase| {
+        let result = simulate(&case.scene, &|_| {}).map(|mut run| {
+            // An ensemble keeps what was reached, not each trajectory.
+            run.samples = run.samples.last().copied().into_iter().collect();
+            run
+        });
+        let n = done.fetch_add(1, Ordering::Relaxed) + 1;
+        progress("sweep", n as f64 / cases.len() as f64);
+        result
+    };
+    cases.par_iter().map(one).collect()
+}
+
+/// Analyses the grasp of `scene`; `push` is the push on the object with both joints fixed at the first motion's target.
+///
+/// # Errors
+/// [`GraspError`] where the pinch or the posture for the push is no stable equilibrium.
+pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, Vec<(String, f64)>), GraspError> {
+    scene.check()?;
+    let mut clock = (Vec::new(), Instant::now());
+    let mut book = |stage: &str, fraction: f64| {
+        clock.0.push((stage.to_string(), clock.1.elapsed().as_secs_f64()));
+        clock.1 = Instant::now();
+        progress(stage, fraction);
+    };
+    let soft = with_model(scene, FingertipModel::Parallel);
+    simulate::start(&soft, &Statics::new(&soft, tip(&soft.fingertip).as_ref()))?;
+    let force = posture::force(&soft.fingertip);
+    let (mut stability, mut surfaces, mut lost) = (Vec::new(), Vec::new(), Vec::new());
+    for (step, _, found) in stability::postures(&soft, FingertipModel::Parallel) {
+        match found {
+            Ok(at) => {
+                stability.extend(stability::rows(&soft, step, &at));
+                surfaces.extend(stability::surfaces(&soft, step, &at));
+            }
+            Err(reason) => lost.push((step, reason)),
+        }
+    }
+    book("stability", 0.2);
+    let freedom = freedom::table(&soft);
+    book("freedom", 0.25);
+    let push = simulate(&pushed(&soft), &|_| {})?;
+    book("push", 0.3);
+    let map = |f: f64| progress("pinch map", 0.3 + 0.6 * f);
+    let pinch = pinch::map(&soft, FingertipModel::Parallel, MAP.0.to_radians(), MAP.1, &map);
+    book("pinch map", 0.9);
+    let stable_steps = stable_steps(&soft);
+    book("stable steps", 1.0);
+    Ok((GraspAnalysis { force, surfaces, stability, lost, freedom, pinch, push, stable_steps }, clock.0))
+}
+
+/// `scene` with tips of another model.
+fn with_model(scene: &Scene, model: FingertipModel) -> Scene {
+    let mut scene = scene.clone();
+    scene.fingertip.model = model;
+    scene
+}
+
+/// The scene's pushes, or one of 10 N below the object's centre, with both joints fixed at the first motion's target.
+pub fn pushed(scene: &Scene) -> Scene {
+    let mut scene = scene.clone();
+    scene.finger.fixed = true;
+    scene.initial.joints = scene.motions.first().map_or(scene.initial.joints, |m| m.target);
+    scene.motions.clear();
+    if scene.pushes.is_empty() {
+        let at = [0.0, -0.5 * scene.object.height];
+        scene.pushes = vec![Push { start: 0.1, duration: 0.2, force: [10.0, 0.0], at }];
+    }
+    // Long enough to see it come back.
+    scene.initial.rest = scene.pushes.iter().map(|p| p.start + p.duration).fold(0.0, f64::max) + 0.3;
+    scene.integrator.output_every = scene.integrator.step.max(0.002);
+    scene
+}
+
+/// Largest stable steps at the start and at each motion's target that can be reached.
+fn stable_steps(scene: &Scene) -> Vec<StableStep> {
+    let postures = stability::postures(scene, scene.fingertip.model).into_iter();
+    let at: Vec<_> = postures.filter_map(|(_, _, found)| found.ok()).collect();
+    stepping::stable_steps(scene, &at)
+}

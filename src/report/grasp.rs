@@ -1,0 +1,408 @@
+//! The report of `palpate grasp`: page, summary.json and the short summary.
+
+use crate::report::grasp_scene::{animation, largest_force, moment};
+use crate::report::html::{document, escape};
+use crate::report::plot::{Line, Plot};
+use crate::report::scale::short;
+use crate::report::tables::table;
+use crate::types::Scene;
+use crate::types::grasp::{Event, GraspRun, Sample, StableStep};
+use crate::types::scene::{Method, SweepCase};
+use serde_json::{Map, Value, json};
+use std::fmt::Write;
+
+/// A run with what it came from.
+#[derive(Debug, Clone, Copy)]
+pub struct GraspReport<'a> {
+    /// The scene file's name.
+    pub name: &'a str,
+    /// The scene.
+    pub scene: &'a Scene,
+    /// What was found.
+    pub run: &'a GraspRun,
+    /// The same without tangential deformation, or why there is none.
+    pub without_tangential: Option<&'a Result<GraspRun, String>>,
+    /// Largest stable steps at the postures of the scene.
+    pub stable_steps: &'a [StableStep],
+    /// The ensemble, with the error where a case has no result.
+    pub sweep: &'a [(SweepCase, Result<GraspRun, String>)],
+    /// Stage names and wall seconds.
+    pub seconds: &'a [(String, f64)],
+    /// What to know before trusting the result.
+    pub warnings: &'a [String],
+}
+
+/// An event in one line: time, kind, finger, what.
+pub fn event_line(e: &Event) -> String {
+    let finger = e.finger.map_or(String::new(), |f| format!(" of finger {f}"));
+    format!("{:.3} s: {}{finger}: {}", e.time, e.kind.name(), e.what)
+}
+
+/// What happened, in one sentence.
+fn headline(report: &GraspReport<'_>) -> String {
+    let (run, all) = (report.run, report.scene.motions.len());
+    let done = run.motions.iter().filter(|m| m.step > 0).count();
+    let last = run.samples.last().map_or(0.0, |s| s.time);
+    let motions = match all {
+        0 => format!("{} s", short(last)),
+        _ => format!("{done} of {all} motions in {} s", short(last)),
+    };
+    match run.events.iter().find(|e| e.kind.ends_run()) {
+        Some(event) => format!("{motions}, then the run ended: {}.", event_line(event)),
+        None if run.events.is_empty() => format!("{motions}; the grasp held throughout."),
+        None => format!("{motions}; tips slipped {} times.", run.events.len()),
+    }
+}
+
+/// The stable step of the scene's own method and formulation.
+fn own_stable_step(report: &GraspReport<'_>) -> Option<f64> {
+    let integrator = &report.scene.integrator;
+    let own = |s: &&StableStep| s.method == integrator.method && s.formulation == integrator.formulation;
+    report.stable_steps.iter().find(own).map(|s| s.step)
+}
+
+/// Least and largest of a quantity over samples.
+fn range(samples: &[Sample], value: impl Fn(&Sample) -> f64) -> [f64; 2] {
+    samples.iter().map(value).fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)])
+}
+
+/// A few lines for a terminal.
+pub fn text(report: &GraspReport<'_>) -> String {
+    let (scene, run) = (report.scene, report.run);
+    let i = &scene.integrator;
+    let mut out = format!("{}\n", headline(report));
+    let step = match (i.method, own_stable_step(report)) {
+        (Method::Adaptive, _) => format!("tolerance {:e}", i.tolerance),
+        (_, Some(stable)) => format!("step {} ms, stable to {:.2} ms", short(1e3 * i.step), 1e3 * stable),
+        _ => format!("step {} ms", short(1e3 * i.step)),
+    };
+    let _ = writeln!(
+        out,
+        "  model        {}, {} form, {}, {step}",
+        scene.fingertip.model.name(),
+        i.formulation.name(),
+        i.method.name()
+    );
+    let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
+    let _ = writeln!(out, "  object       turned {low:.2} to {high:.2} degrees");
+    let _ = writeln!(out, "  force        up to {:.2} N at a contact", largest_force(&run.samples));
+    let drift = run.constraint_drift;
+    let _ = writeln!(
+        out,
+        "  drift        energy {}, constraints {} m",
+        tiny(run.energy_drift),
+        tiny(drift.normal.max(drift.rolling))
+    );
+    for e in run.events.iter().take(8) {
+        let _ = writeln!(out, "  event        {}", event_line(e));
+    }
+    if !report.sweep.is_empty() {
+        let held = report.sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.completed)).count();
+        let _ = writeln!(out, "  sweep        {} scenes, {held} ran to their end", report.sweep.len());
+    }
+    let _ = writeln!(out, "  time         {:.3} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
+    out
+}
+
+/// Events for summary.json.
+pub fn events(run: &GraspRun) -> Value {
+    json!(run.events)
+}
+
+/// summary.json; the keys are those of docs/file-formats.md.
+pub fn summary(report: &GraspReport<'_>) -> Value {
+    let (scene, run) = (report.scene, report.run);
+    let seconds: Map<String, Value> = report.seconds.iter().map(|(s, t)| (s.clone(), json!(t))).collect();
+    let sweep: Vec<Value> = report
+        .sweep
+        .iter()
+        .map(|(case, result)| {
+            let values: Map<String, Value> = case.values.iter().map(|(k, v)| (k.clone(), json!(v))).collect();
+            match result {
+                Ok(run) => json!({ "values": values, "completed": run.completed, "events": events(run) }),
+                Err(error) => json!({ "values": values, "completed": false, "error": error }),
+            }
+        })
+        .collect();
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "grasp",
+        "inputs": { "scene": report.name },
+        "model": scene.fingertip.model,
+        "formulation": scene.integrator.formulation,
+        "method": scene.integrator.method,
+        "step": scene.integrator.step,
+        "completed": run.completed,
+        "simulated_seconds": run.samples.last().map_or(0.0, |s| s.time),
+        "steps": run.steps,
+        "motions_finished": run.motions.iter().filter(|m| m.step > 0).count(),
+        "motions": scene.motions.len(),
+        "events": events(run),
+        "energy_drift": run.energy_drift,
+        "constraint_drift": run.constraint_drift,
+        "step_growth": run.step_growth,
+        "stable_steps": report.stable_steps,
+        "sweep": sweep,
+        "seconds": seconds,
+        "warnings": report.warnings,
+        "scene": scene,
+    })
+}
+
+/// Lines of one quantity of both fingers, and of the run without tangential deformation dashed.
+fn both(report: &GraspReport<'_>, values: &[(&str, &dyn Fn(&Sample) -> f64)]) -> Vec<Line> {
+    let mut lines = Vec::new();
+    let other = report.without_tangential.and_then(|r| r.as_ref().ok());
+    for (dashed, run) in [(true, other), (false, Some(report.run))] {
+        let Some(run) = run else { continue };
+        let step = run.samples.len().div_ceil(1500).max(1);
+        for (colour, (name, value)) in values.iter().enumerate() {
+            let points = run.samples.iter().step_by(step).map(|s| [s.time, value(s)]).collect();
+            lines.push(Line::new(if dashed { "" } else { name }, colour, dashed, points));
+        }
+    }
+    lines
+}
+
+/// Time plots, with motions and events marked.
+pub fn time_plots(report: &GraspReport<'_>) -> String {
+    let mut marks: Vec<(f64, bool)> = report.run.motions.iter().map(|m| (m.reached.time, false)).collect();
+    marks.extend(report.run.events.iter().map(|e| (e.time, true)));
+    let plot = |title: &str, values: &[(&str, &dyn Fn(&Sample) -> f64)]| {
+        Plot { title, across: "s", marks: &marks }.draw(&both(report, values))
+    };
+    let mm = |v: f64| 1e3 * v;
+    [
+        plot("Object's angle, degrees", &[("theta", &|s| s.pose[2].to_degrees())]),
+        plot(
+            "Object's place, mm",
+            &[("x", &|s| mm(s.pose[0])), ("y + link", &|s| mm(s.pose[1] + report.scene.finger.link))],
+        ),
+        plot(
+            "Joint angles, degrees",
+            &[("finger 1", &|s| s.joints[0].to_degrees()), ("finger 2", &|s| s.joints[1].to_degrees())],
+        ),
+        plot("Normal displacement, mm", &[("finger 1", &|s| mm(s.normal[0])), ("finger 2", &|s| mm(s.normal[1]))]),
+        plot(
+            "Tangential displacement, mm",
+            &[("finger 1", &|s| mm(s.tangential[0])), ("finger 2", &|s| mm(s.tangential[1]))],
+        ),
+        plot("Normal force, N", &[("finger 1", &|s| s.normal_force[0]), ("finger 2", &|s| s.normal_force[1])]),
+        plot(
+            "Tangential force, N",
+            &[("finger 1", &|s| s.tangential_force[0]), ("finger 2", &|s| s.tangential_force[1])],
+        ),
+        plot(
+            "|f_t / f_n|, to be under the friction",
+            &[
+                ("finger 1", &|s| (s.tangential_force[0] / s.normal_force[0]).abs()),
+                ("finger 2", &|s| (s.tangential_force[1] / s.normal_force[1]).abs()),
+            ],
+        ),
+    ]
+    .concat()
+}
+
+/// The table of motions.
+fn motions(run: &GraspRun) -> String {
+    let head = [
+        "Motion",
+        "theta 1, deg",
+        "theta 2, deg",
+        "x, mm",
+        "y, mm",
+        "theta, deg",
+        "d_n1, mm",
+        "d_n2, mm",
+        "d_t1, mm",
+        "d_t2, mm",
+        "f_n1, N",
+        "f_n2, N",
+        "f_t1, N",
+        "f_t2, N",
+    ];
+    let rows: Vec<Vec<String>> = run
+        .motions
+        .iter()
+        .map(|m| {
+            let s = &m.reached;
+            let mut row = vec![if m.step == 0 { "rest".into() } else { m.step.to_string() }];
+            row.extend(m.target.map(|v| short((v.to_degrees() * 1e6).round() / 1e6)));
+            let ([x, y, theta], [n1, n2], [t1, t2]) = (s.pose, s.normal, s.tangential);
+            row.extend([1e3 * x, 1e3 * y, theta.to_degrees()].map(fixed2));
+            row.extend([n1, n2, t1, t2].map(|v| fixed3(1e3 * v)));
+            row.extend(s.normal_force.into_iter().chain(s.tangential_force).map(fixed2));
+            row
+        })
+        .collect();
+    table(&head, &rows)
+}
+
+/// A small number by its size.
+fn tiny(v: f64) -> String {
+    if v == 0.0 { "0".into() } else { format!("{v:.0e}") }
+}
+
+/// Two digits after the point, no minus before zero.
+pub(super) fn fixed2(v: f64) -> String {
+    let s = format!("{v:.2}");
+    if s == "-0.00" { "0.00".into() } else { s }
+}
+
+fn fixed3(v: f64) -> String {
+    let s = format!("{v:.3}");
+    if s == "-0.000" { "0.000".into() } else { s }
+}
+
+/// One tile of a page's head.
+pub(super) fn tile(value: &str, unit: &str, name: &str) -> String {
+    format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
+}
+
+/// Largest stable steps as a table.
+pub(super) fn steps_table(steps: &[StableStep]) -> String {
+    let rows: Vec<Vec<String>> = steps
+        .iter()
+        .map(|s| vec![s.method.name().into(), s.formulation.name().into(), format!("{:.2}", 1e3 * s.step)])
+        .collect();
+    table(&["Integrator", "Form", "Largest stable step, ms"], &rows)
+}
+
+/// The page.
+pub fn page(report: &GraspReport<'_>) -> String {
+    let (scene, run) = (report.scene, report.run);
+    let bad = run.events.iter().any(|e| e.kind.ends_run());
+    let (class, word) = match (bad, run.events.is_empty()) {
+        (true, _) => ("low", "ended early"),
+        (false, true) => ("high", "held"),
+        (false, false) => ("moderate", "slipped"),
+    };
+    let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
+    let simulated = run.samples.last().map_or(0.0, |s| s.time);
+    let mut body = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>grasp</span></h1><p class=\"verdict\">{}</p>\
+         <p class=\"trust {class}\"><b>{word}</b></p></header><div class=\"tiles\">{}{}{}{}{}{}</div>",
+        env!("CARGO_PKG_VERSION"),
+        escape(report.name),
+        escape(&headline(report)),
+        tile(&short(simulated), "s", "simulated"),
+        tile(&format!("{low:.0} to {high:.0}"), "deg", "turn of the object"),
+        tile(&format!("{:.1}", largest_force(&run.samples)), "N", "largest contact force"),
+        tile(&tiny(run.energy_drift), "", "energy drift"),
+        tile(&tiny(run.constraint_drift.normal.max(run.constraint_drift.rolling)), "m", "constraint drift"),
+        tile(&own_stable_step(report).map_or("-".into(), |s| format!("{:.1}", 1e3 * s)), "ms", "largest stable step"),
+    );
+    let notes: Vec<String> = run.events.iter().map(event_line).chain(report.warnings.iter().cloned()).collect();
+    if !notes.is_empty() {
+        let items: String = notes.iter().take(40).map(|w| format!("<li>{}</li>", escape(w))).collect();
+        let _ = write!(body, "<article class=\"warnings\"><h3>Events and warnings</h3><ul>{items}</ul></article>");
+    }
+    let _ = write!(
+        body,
+        "<section><h2>The grasp</h2><p class=\"lead\">Arrows are the contact forces on the object; the line is the way of \
+         its centre.</p><div class=\"grid\"><article>{}</article>",
+        animation(scene, &run.samples)
+    );
+    let largest = largest_force(&run.samples);
+    let postures: String = run
+        .motions
+        .iter()
+        .map(|m| {
+            let [a, b] = m.target.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
+            let name = if m.step == 0 { "rest".into() } else { format!("{}: {a}°, {b}°", m.step) };
+            format!("<div>{}<span>{name}</span></div>", moment(scene, &m.reached, largest, &[]))
+        })
+        .collect();
+    let _ = write!(
+        body,
+        "<article><h3>Postures reached</h3><p>At the end of each hold, with the desired joint angles.</p><div class=\"postures\">{postures}</div></article></div></section>"
+    );
+    let beside = match report.without_tangential {
+        Some(Ok(other)) => match other.events.iter().find(|e| e.kind.ends_run()) {
+            Some(e) => format!(
+                "Dashed: the same scene without tangential deformation; that run ended at {}.",
+                escape(&event_line(e))
+            ),
+            None => "Dashed: the same scene without tangential deformation.".into(),
+        },
+        Some(Err(error)) => format!("Without tangential deformation the scene has no result: {}.", escape(error)),
+        None => String::new(),
+    };
+    let _ = write!(
+        body,
+        "<section><h2>Over time</h2><p class=\"lead\">{beside} Upright lines: ends of motions; red: events.</p><div class=\"plots\">{}</div></section>\
+         <section><h2>Numbers</h2><div class=\"grid\"><article class=\"wide\"><h3>Motions</h3>{}</article>",
+        time_plots(report),
+        motions(run)
+    );
+    if !report.sweep.is_empty() {
+        let _ = write!(body, "<article class=\"wide\"><h3>Ensemble</h3>{}</article>", ensemble(report.sweep));
+    }
+    let _ = write!(
+        body,
+        "<article><h3>Scene</h3>{}</article><article><h3>Stable steps</h3><p>At the start and at all postures of the scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
+        scene_table(scene),
+        steps_table(report.stable_steps),
+        crate::report::chart::stage_times(report.seconds)
+    );
+    body.push_str(
+        "<footer><p>SI units; angles counter-clockwise but for joint 2, so that a positive angle closes either finger. \
+         d_n and d_t are the displacements of a tip along the face's normal and tangent. The object's pose is never fed \
+         back to the joints.</p></footer>",
+    );
+    document(&format!("{} grasp", escape(report.name)), &body)
+}
+
+/// Cases of an ensemble: how each ended, and the last posture.
+fn ensemble(sweep: &[(SweepCase, Result<GraspRun, String>)]) -> String {
+    let mut head: Vec<String> = vec!["Case".into()];
+    head.extend(sweep.first().map_or(Vec::new(), |(c, _)| c.values.iter().map(|v| escape(&v.0)).collect()));
+    head.extend(["Outcome", "Motions", "theta, deg", "largest f_n at rest, N"].map(String::from));
+    let rows: Vec<Vec<String>> = sweep
+        .iter()
+        .take(500)
+        .enumerate()
+        .map(|(i, (case, result))| {
+            let mut row = vec![(i + 1).to_string()];
+            row.extend(case.values.iter().map(|v| escape(&v.1)));
+            match result {
+                Ok(run) => {
+                    let end = run.events.iter().find(|e| e.kind.ends_run());
+                    row.push(end.map_or("completed".into(), |e| escape(&event_line(e))));
+                    row.push(run.motions.iter().filter(|m| m.step > 0).count().to_string());
+                    let last = run.motions.last().map(|m| m.reached);
+                    row.push(last.map_or("-".into(), |s| fixed2(s.pose[2].to_degrees())));
+                    let most = run.motions.iter().flat_map(|m| m.reached.normal_force).fold(0.0, f64::max);
+                    row.push(fixed2(most));
+                }
+                Err(error) => {
+                    row.push(escape(error));
+                    row.extend(["0", "-", "-"].map(String::from));
+                }
+            }
+            row
+        })
+        .collect();
+    let head: Vec<&str> = head.iter().map(String::as_str).collect();
+    table(&head, &rows)
+}
+
+/// What the scene says.
+pub(super) fn scene_table(scene: &Scene) -> String {
+    let (tip, finger, object, i) = (&scene.fingertip, &scene.finger, &scene.object, &scene.integrator);
+    let mm = |v: f64| format!("{} mm", short(1e3 * v));
+    let rows = [
+        (
+            "Fingertip",
+            format!("{}, radius {}, E {} kPa", tip.model.name(), mm(tip.radius), short(tip.youngs_modulus / 1e3)),
+        ),
+        ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
+        ("Link, half span", format!("{}, {}", mm(finger.link), mm(finger.half_span))),
+        ("Object", format!("{} x {}, {} kg", mm(object.width), mm(object.height), short(object.mass))),
+        ("Friction", object.friction.map_or("not checked".into(), short)),
+        ("First displacement", mm(scene.initial.normal_displacement)),
+        ("Gains", format!("{}, {}, {}", short(finger.gains.kp), short(finger.gains.kd), short(finger.gains.ki))),
+        ("Integrator", format!("{}, {} form, step {} ms", i.method.name(), i.formulation.name(), short(1e3 * i.step))),
+    ];
+    table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+}

@@ -1,0 +1,329 @@
+//! The report of `palpate grasp-analysis`: page, summary.json and the short summary.
+
+use crate::error::ReportError;
+use crate::report::grasp::{GraspReport, event_line, fixed2, scene_table, steps_table, tile, time_plots};
+use crate::report::grasp_scene::animation;
+use crate::report::grasp_surface::{pinch_map, state_colour, state_words, surface};
+use crate::report::html::{document, escape};
+use crate::report::plot::{Line, Plot};
+use crate::report::scale::short;
+use crate::report::tables::table;
+use crate::types::grasp::{Freedom, GraspAnalysis, PinchState, PostureForce, Stability, StabilityRow};
+use crate::types::{FingertipModel, Scene};
+use serde_json::{Map, Value, json};
+use std::fmt::Write;
+
+/// An analysis with what it came from.
+#[derive(Debug, Clone, Copy)]
+pub struct AnalysisReport<'a> {
+    /// The scene file's name.
+    pub name: &'a str,
+    /// The scene.
+    pub scene: &'a Scene,
+    /// The scene of the push: joints fixed.
+    pub pushed: &'a Scene,
+    /// What was found.
+    pub analysis: &'a GraspAnalysis,
+    /// Stage names and wall seconds.
+    pub seconds: &'a [(String, f64)],
+}
+
+/// Rows of one model.
+fn of(analysis: &GraspAnalysis, model: FingertipModel) -> impl Iterator<Item = &StabilityRow> {
+    analysis.stability.iter().filter(move |r| r.model == model)
+}
+
+/// How many rows of a model are of a class.
+fn count(analysis: &GraspAnalysis, model: FingertipModel, class: Stability) -> usize {
+    of(analysis, model).filter(|r| r.class == class).count()
+}
+
+/// Cells of the pinch map in a state, as a part of all.
+fn share(analysis: &GraspAnalysis, state: PinchState) -> f64 {
+    let cells = &analysis.pinch.cells;
+    cells.iter().filter(|c| c.state == state).count() as f64 / cells.len().max(1) as f64
+}
+
+/// In one sentence.
+fn headline(report: &AnalysisReport<'_>) -> String {
+    let a = report.analysis;
+    let all = of(a, FingertipModel::Parallel).count();
+    let radial = FingertipModel::Radial;
+    format!(
+        "The parallel model has a minimum of energy at {} of {} postures; the radial one is a saddle at {} and neutral at {} of them.",
+        count(a, FingertipModel::Parallel, Stability::Minimum),
+        all + a.lost.len(),
+        count(a, radial, Stability::Saddle),
+        count(a, radial, Stability::Neutral)
+    )
+}
+
+/// Largest turn under the push (degrees), and what is left of it at the end.
+fn push_turn(analysis: &GraspAnalysis) -> (f64, f64) {
+    let samples = &analysis.push.samples;
+    let first = samples.first().map_or(0.0, |s| s.pose[2]);
+    let off = |s: &crate::types::grasp::Sample| (s.pose[2] - first).abs().to_degrees();
+    (samples.iter().map(off).fold(0.0, f64::max), samples.last().map_or(0.0, off))
+}
+
+/// How the push went, in words.
+fn push_words(analysis: &GraspAnalysis) -> String {
+    let (most, left) = push_turn(analysis);
+    match analysis.push.events.first() {
+        Some(e) => format!("turned up to {most:.2} degrees; {}", event_line(e)),
+        None => format!("turned up to {most:.2} degrees without slip and came back to within {left:.1e} degrees"),
+    }
+}
+
+/// A few lines for a terminal.
+pub fn text(report: &AnalysisReport<'_>) -> String {
+    let a = report.analysis;
+    let mut out = format!("{}\n", headline(report));
+    for (step, reason) in &a.lost {
+        let _ = writeln!(out, "  motion {step}     cannot be reached: {reason}");
+    }
+    for f in a.freedom.iter().filter(|f| f.fingers == 2) {
+        let _ = writeln!(
+            out,
+            "  {:<15} {} degrees of freedom; two joint angles set {}",
+            f.model.name(),
+            f.freedom,
+            f.controls()
+        );
+    }
+    let _ = writeln!(out, "  push         {}", push_words(a));
+    let _ = writeln!(
+        out,
+        "  pinch map    {:.0} % of the joint angles to {:.0} degrees hold",
+        100.0 * share(a, PinchState::Good),
+        a.pinch.angles.last().map_or(0.0, |v| v.to_degrees())
+    );
+    let _ = writeln!(out, "  time         {:.2} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
+    out
+}
+
+/// summary.json; the keys are those of docs/file-formats.md.
+pub fn summary(report: &AnalysisReport<'_>) -> Value {
+    let a = report.analysis;
+    let seconds: Map<String, Value> = report.seconds.iter().map(|(s, t)| (s.clone(), json!(t))).collect();
+    let states: Map<String, Value> =
+        PinchState::ALL.iter().map(|s| (s.name().to_string(), json!(share(a, *s)))).collect();
+    let freedom: Vec<Value> = a
+        .freedom
+        .iter()
+        .map(|f| {
+            let mut value = json!(f);
+            value["controls"] = json!(f.controls());
+            value
+        })
+        .collect();
+    let lost: Vec<Value> = a.lost.iter().map(|(step, why)| json!({ "step": step, "reason": why })).collect();
+    let (most, left) = push_turn(a);
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "grasp-analysis",
+        "inputs": { "scene": report.name },
+        "stability": a.stability,
+        "lost": lost,
+        "freedom": freedom,
+        "pinch_map": states,
+        "push": { "events": a.push.events, "turn_deg": most, "left_deg": left, "energy_drift": a.push.energy_drift },
+        "stable_steps": a.stable_steps,
+        "seconds": seconds,
+        "scene": report.scene,
+    })
+}
+
+/// Force against displacement, and against tilt.
+fn force_plots(f: &PostureForce) -> String {
+    let across = f.tilts.len();
+    let tilt_at = |degrees: f64| (0..across).min_by_key(|&i| ((f.tilts[i].to_degrees() - degrees).abs() * 1e6) as u64);
+    let mut against_d = Vec::new();
+    let mut against_tilt = Vec::new();
+    for (colour, degrees) in [0.0, 20.0, 40.0].into_iter().enumerate() {
+        let Some(i) = tilt_at(degrees) else { continue };
+        let points = |values: &[f64]| -> Vec<[f64; 2]> {
+            (0..f.displacements.len()).map(|j| [1e3 * f.displacements[j], values[j * across + i]]).collect()
+        };
+        against_d.push(Line::new(&format!("{degrees} deg"), colour, false, points(&f.parallel)));
+        if colour == 0 {
+            continue;
+        }
+        against_d.push(Line::new("", colour, true, points(&f.radial)));
+    }
+    for (colour, row) in [10, 20, 30].into_iter().filter(|r| *r < f.displacements.len()).enumerate() {
+        let name = format!("{} mm", short(1e3 * f.displacements[row]));
+        let points = |values: &[f64]| -> Vec<[f64; 2]> {
+            (0..across).map(|i| [f.tilts[i].to_degrees(), values[row * across + i]]).collect()
+        };
+        against_tilt.push(Line::new(&name, colour, false, points(&f.parallel)));
+        against_tilt.push(Line::new("", colour, true, points(&f.radial)));
+    }
+    let plot = |title, across, lines: &[Line]| Plot { title, across, marks: &[] }.draw(lines);
+    plot("Force against displacement, N", "d, mm", &against_d)
+        + &plot("Force against tilt, N", "tilt, degrees", &against_tilt)
+}
+
+/// Hessians as a table.
+fn stability_table(rows: &[StabilityRow]) -> String {
+    let head = ["Posture", "theta 1, 2, deg", "Model", "Eigenvalues, N/m", "Gradient, N", "The pose is a"];
+    let cells = |r: &StabilityRow| {
+        let [a, b] = r.joints.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
+        let eigenvalues: Vec<String> = r.eigenvalues.iter().map(|v| short((v * 10.0).round() / 10.0)).collect();
+        vec![
+            if r.step == 0 { "pinch".into() } else { r.step.to_string() },
+            format!("{a}, {b}"),
+            r.model.name().into(),
+            eigenvalues.join(", "),
+            format!("{:.1e}", r.residual),
+            r.class.name().into(),
+        ]
+    };
+    table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+}
+
+fn freedom_table(rows: &[Freedom]) -> String {
+    let head = [
+        "Tips",
+        "Moving fingers",
+        "Coordinates",
+        "Rank",
+        "Degrees of freedom",
+        "of the object, joints locked",
+        "Joint angles set",
+    ];
+    let cells = |f: &Freedom| {
+        let numbers = [f.fingers, f.coordinates, f.rank, f.freedom, f.object_freedom];
+        let mut row = vec![f.model.name().to_string()];
+        row.extend(numbers.map(|n| n.to_string()));
+        row.push(f.controls().into());
+        row
+    };
+    table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+}
+
+/// The surfaces of one posture: parallel and radial side by side.
+fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
+    let mut pictures = String::new();
+    for axis in ["y", "x"] {
+        let both: Vec<_> = a.surfaces.iter().filter(|s| s.step == step && s.axis == axis).collect();
+        let finite = both.iter().flat_map(|s| &s.energy).filter(|e| e.is_finite());
+        let largest = finite.fold(1e-12, |l: f64, e| l.max(e.abs()));
+        for s in both {
+            let _ = write!(
+                pictures,
+                "<div>{}<span>{}, to {} mJ</span></div>",
+                surface(s, largest)?,
+                s.model.name(),
+                short(1e3 * largest)
+            );
+        }
+    }
+    let title = match a.stability.iter().find(|r| r.step == step) {
+        Some(r) if step > 0 => {
+            let [p, q] = r.joints.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
+            format!("Motion {step}: {p} and {q} degrees")
+        }
+        _ => "Pinch".into(),
+    };
+    let classes: Vec<String> = a
+        .stability
+        .iter()
+        .filter(|r| r.step == step)
+        .map(|r| format!("{}: {} ({} N/m)", r.model.name(), r.class.name(), fixed2(r.eigenvalues[0])))
+        .collect();
+    Ok(format!(
+        "<article><h3>{title}</h3><p>Smallest eigenvalue: {}.</p><div class=\"surfaces\">{pictures}</div></article>",
+        classes.join("; ")
+    ))
+}
+
+/// The page.
+///
+/// # Errors
+/// [`ReportError`] when a picture cannot be encoded.
+pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
+    let a = report.analysis;
+    let (most, left) = push_turn(a);
+    let minima = count(a, FingertipModel::Parallel, Stability::Minimum);
+    let mut body = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>grasp analysis</span></h1><p class=\"verdict\">{}</p></header>\
+         <div class=\"tiles\">{}{}{}{}</div>",
+        env!("CARGO_PKG_VERSION"),
+        escape(report.name),
+        escape(&headline(report)),
+        tile(&minima.to_string(), "", "stable postures, parallel tips"),
+        tile(&format!("{:.0}", 100.0 * share(a, PinchState::Good)), "%", "of the pinch map holds"),
+        tile(&format!("{most:.2}"), "°", "turn under the push"),
+        tile(&format!("{left:.0e}"), "°", "left after it"),
+    );
+    if !a.lost.is_empty() {
+        let items: String = a.lost.iter().map(|(n, why)| format!("<li>Motion {n}: {}</li>", escape(why))).collect();
+        let _ =
+            write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
+    }
+    let _ = write!(
+        body,
+        "<section><h2>Force depends on posture</h2><p class=\"lead\">Along the back plate's normal. Lines: springs in \
+         parallel; dashed: springs along radii, which know no posture.</p><div class=\"plots\">{}</div></section>",
+        force_plots(&a.force)
+    );
+    let _ = write!(
+        body,
+        "<section><h2>Energy about the postures</h2><p class=\"lead\">Joints fixed, tips and gravity, less the energy at the \
+         posture (the cross). Red is more, blue is less, bands are even in the root; gray is out of the model's range. \
+         Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><h3>Hessians</h3>{}</article>",
+        stability_table(&a.stability)
+    );
+    let steps: Vec<usize> = of(a, FingertipModel::Parallel).map(|r| r.step).collect();
+    for &step in &steps {
+        body.push_str(&surface_card(a, step)?);
+    }
+    let postures: Vec<(usize, [f64; 2])> = std::iter::once((0, [0.0; 2]))
+        .chain(report.scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target)))
+        .collect();
+    let legend: String = PinchState::ALL
+        .iter()
+        .map(|s| {
+            let part = 100.0 * share(a, *s);
+            format!("<li><i style=\"background:{}\"></i>{} <b>{part:.0} %</b></li>", state_colour(*s), state_words(*s))
+        })
+        .collect();
+    let _ = write!(
+        body,
+        "</div></section><section><h2>Which postures hold</h2><div class=\"grid\"><article><h3>Pinch map</h3><p>Reached from \
+         the pinch step by step; numbers are the scene's motions.</p>{}<ul class=\"legend\">{legend}</ul></article>\
+         <article><h3>Rigid and soft tips</h3><p>Degrees of freedom by the rank of the constraints at the pinch; what joint \
+         angles can set by the rank of d(theta, grip force)/d(joint angles).</p>{}</article></div></section>",
+        pinch_map(&a.pinch, &postures),
+        freedom_table(&a.freedom)
+    );
+    let pushed = GraspReport {
+        name: report.name,
+        scene: report.pushed,
+        run: &a.push,
+        without_tangential: None,
+        stable_steps: &a.stable_steps,
+        sweep: &[],
+        seconds: report.seconds,
+        warnings: &[],
+    };
+    let _ = write!(
+        body,
+        "<section><h2>A push with both joints fixed</h2><p class=\"lead\">The object {}.</p><div class=\"grid\"><article>{}</article>\
+         <article><h3>Scene</h3>{}</article></div><div class=\"plots\">{}</div></section>\
+         <section><h2>Numbers</h2><div class=\"grid\"><article><h3>Stable steps</h3><p>At the pinch and at all postures of the \
+         scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
+        escape(&push_words(a)),
+        animation(report.pushed, &a.push.samples),
+        scene_table(report.scene),
+        time_plots(&pushed),
+        steps_table(&a.stable_steps),
+        crate::report::chart::stage_times(report.seconds)
+    );
+    body.push_str(
+        "<footer><p>The parallel model is judged at its own equilibria, the radial one at the same poses: without tangential \
+         springs nothing holds the object up, and its gradient says so.</p></footer>",
+    );
+    Ok(document(&format!("{} grasp analysis", escape(report.name)), &body))
+}

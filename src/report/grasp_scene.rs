@@ -1,0 +1,140 @@
+//! Drawings of a grasp: fingers, tips, object and contact forces; one moment, or an animation that runs in the page.
+//!
+//! Millimetres, y up. A finger is drawn once, hanging from its joint, and turned by its joint angle.
+
+use crate::types::Scene;
+use crate::types::grasp::Sample;
+use std::fmt::Write;
+
+/// Frames of an animation at most.
+const FRAMES: usize = 500;
+/// Length of the arrow for the largest force (mm).
+const ARROW: f64 = 26.0;
+const SCRIPT: &str = include_str!("grasp.js");
+
+/// Lengths of a scene in mm: radius, link, half span, object's width and height.
+fn lengths(scene: &Scene) -> [f64; 5] {
+    let object = &scene.object;
+    [scene.fingertip.radius, scene.finger.link, scene.finger.half_span, object.width, object.height].map(|v| 1e3 * v)
+}
+
+/// The largest contact force over samples (N), at least 1e-9.
+pub fn largest_force(samples: &[Sample]) -> f64 {
+    let force = |s: &Sample| (0..2).map(|i| s.normal_force[i].hypot(s.tangential_force[i])).fold(0.0, f64::max);
+    samples.iter().map(force).filter(|f| f.is_finite()).fold(1e-9, f64::max)
+}
+
+/// Forces on the object as arrows from the contacts (mm), the largest over the run `largest` (N).
+fn arrows(scene: &Scene, s: &Sample, largest: f64) -> [[f64; 4]; 2] {
+    let [a, l, span, ..] = lengths(scene);
+    let (sin, cos) = s.pose[2].sin_cos();
+    [0, 1].map(|i| {
+        let side = if i == 0 { 1.0 } else { -1.0 };
+        let (js, jc) = s.joints[i].sin_cos();
+        let (ox, oy) = (side * (l * js - span), -l * jc);
+        let reach = side * (a - 1e3 * s.normal[i]);
+        let (n, t) = (side * s.normal_force[i] * ARROW / largest, -s.tangential_force[i] * ARROW / largest);
+        [ox + reach * cos, oy + reach * sin, n * cos - t * sin, n * sin + t * cos]
+    })
+}
+
+/// An arrow as a path.
+fn arrow([x, y, dx, dy]: [f64; 4]) -> String {
+    let length = dx.hypot(dy);
+    if length < 0.3 {
+        return format!("M{x:.1} {y:.1}h0");
+    }
+    let head = (0.35 * length).min(4.5) / length;
+    let (bx, by) = (-0.87 * head * dx, -0.87 * head * dy);
+    let (sx, sy) = (-0.5 * head * dy, 0.5 * head * dx);
+    let (tx, ty) = (x + dx, y + dy);
+    format!(
+        "M{x:.1} {y:.1}L{tx:.1} {ty:.1}M{:.1} {:.1}L{tx:.1} {ty:.1}L{:.1} {:.1}",
+        tx + bx + sx,
+        ty + by + sy,
+        tx + bx - sx,
+        ty + by - sy
+    )
+}
+
+/// The drawing of one moment; `trail` are places (m) that the object's centre went through.
+pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> String {
+    let [a, l, span, w, h] = lengths(scene);
+    let [x, y, theta] = [1e3 * s.pose[0], 1e3 * s.pose[1], s.pose[2].to_degrees()];
+    let (left, wide) = (-span - a - 12.0, 2.0 * (span + a + 12.0));
+    let (top, tall) = (-12.0, l + 0.5 * (w * w + h * h).sqrt() + 14.0 + 12.0);
+    let mut svg = format!(
+        r#"<svg class="grasp" viewBox="{left:.1} {top:.1} {wide:.1} {tall:.1}" role="img" aria-label="the grasp"><g transform="scale(1,-1)">"#
+    );
+    for i in 0..2 {
+        let side = if i == 0 { 1.0 } else { -1.0 };
+        let turn = side * s.joints[i].to_degrees();
+        let sweep = if i == 0 { 0 } else { 1 };
+        let plate = if i == 0 { -3.0 } else { 0.0 };
+        let _ = write!(
+            svg,
+            r#"<g class="f{n}" transform="translate({jx:.2},0) rotate({turn:.3})"><path class="tip" d="M0 {lo:.2}A{a} {a} 0 0 {arc} 0 {hi:.2}Z"/><rect class="plate" x="{plate}" y="{lo:.2}" width="3" height="{two:.2}"/><path class="link" d="M0 0V{down:.2}"/><circle class="joint" r="3.4"/></g>"#,
+            n = i + 1,
+            jx = -side * span,
+            lo = -l - a,
+            hi = -l + a,
+            two = 2.0 * a,
+            arc = 1 - sweep,
+            down = -l
+        );
+    }
+    let _ = write!(
+        svg,
+        r#"<g class="object" transform="translate({x:.3},{y:.3}) rotate({theta:.4})"><rect x="{:.2}" y="{:.2}" width="{w:.2}" height="{h:.2}" rx="0.6"/><path d="M-4 0H4M0 -4V4M0 {:.2}V{:.2}"/></g>"#,
+        -0.5 * w,
+        -0.5 * h,
+        0.5 * h - 7.0,
+        0.5 * h - 2.0
+    );
+    if !trail.is_empty() {
+        let step = trail.len().div_ceil(FRAMES).max(1);
+        let mut path = String::new();
+        for (i, p) in trail.iter().step_by(step).enumerate() {
+            let _ = write!(path, "{}{:.2} {:.2}", if i == 0 { 'M' } else { 'L' }, 1e3 * p.pose[0], 1e3 * p.pose[1]);
+        }
+        let _ = write!(svg, r#"<path class="trail" d="{path}"/>"#);
+    }
+    for (i, f) in arrows(scene, s, largest).into_iter().enumerate() {
+        let _ = write!(svg, r#"<path class="force a{}" d="{}"/>"#, i + 1, arrow(f));
+    }
+    svg.push_str("</g></svg>");
+    svg
+}
+
+/// An animation of samples at even times, with play, pause and a slider; without scripts it shows the first moment.
+pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
+    let Some(first) = samples.first() else { return String::new() };
+    let largest = largest_force(samples);
+    let step = samples.len().div_ceil(FRAMES).max(1);
+    let mut frames = String::new();
+    for s in samples.iter().step_by(step) {
+        let [p, q] = arrows(scene, s, largest);
+        let numbers = [
+            (s.time, 3),
+            (1e3 * s.pose[0], 3),
+            (1e3 * s.pose[1], 3),
+            (s.pose[2].to_degrees(), 3),
+            (s.joints[0].to_degrees(), 3),
+            (-s.joints[1].to_degrees(), 3),
+        ];
+        frames.push('[');
+        for (v, digits) in numbers {
+            let _ = write!(frames, "{v:.digits$},");
+        }
+        let forces: Vec<String> = p.iter().chain(&q).map(|v| format!("{v:.1}")).collect();
+        let _ = write!(frames, "{}],", forces.join(","));
+    }
+    let span = 1e3 * scene.finger.half_span;
+    format!(
+        r#"<div class="animation" data-span="{span:.3}" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">Play</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
+        frames.trim_end_matches(','),
+        moment(scene, first, largest, samples),
+        samples.iter().step_by(step).count() - 1,
+        first.time
+    )
+}
