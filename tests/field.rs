@@ -76,6 +76,22 @@ fn small_motions_and_slides_are_never_worse_than_nothing() {
 }
 
 #[test]
+fn inverted_contrast_is_refused_or_warned_of_never_silent() {
+    for kind in [PhantomKind::Head, PhantomKind::Calf] {
+        let p = phantom(&PhantomParams::new(kind).sized(48)).unwrap();
+        let top = p.deformed.as_slice().iter().fold(0.0f32, |a, &v| a.max(v));
+        let turned = |&v: &f32| if v > 0.1 * top { 1.1 * top - v } else { v };
+        let turned = p.deformed.as_slice().iter().map(turned).collect();
+        let deformed = Volume::from_vec(*p.deformed.grid(), turned).unwrap();
+        if let Ok(result) = run(&p.initial, &deformed, Some(&p.mask), &FieldParams::default(), &|_, _| {}) {
+            let m = evaluate::metrics(&result.displacement, &p.truth, Some(&p.mask), &p.landmarks).unwrap();
+            let sound = m.mean_mm < m.identity_mm;
+            assert!(sound || !result.summary.warnings.is_empty(), "{kind:?}: {m:?}");
+        }
+    }
+}
+
+#[test]
 fn a_pressed_fingertip_is_measured_and_its_far_side_stays_still() {
     let (result, m) = measure(&PhantomParams::new(PhantomKind::Fingertip));
     assert!(m.mean_mm < m.identity_mm / 3.0 && m.still_mm.unwrap() < 0.05, "{m:?}");

@@ -86,7 +86,7 @@ pub fn run(
                 progress("matching", done(0.0));
                 let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
                 let points = pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(share).clamp(40, COARSE_POINTS);
-                let wide = MatchParams { points, reach_mm: search, patch: 2, strain: 0.3 };
+                let wide = MatchParams { points, thorough: true, reach_mm: search, patch: 2, strain: 0.3 };
                 let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
                 clock.book("matching");
                 let enough = report.counts.kept >= FEWEST;
@@ -106,7 +106,8 @@ pub fn run(
             let inside = pair.mask.iter().filter(|&&m| m != 0).count();
             let points = if params.points > 0 { params.points } else { (inside / params.voxels_per_point).max(200) };
             let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
-            let near = MatchParams { points, reach_mm: finest, patch: 3, strain: 0.05 };
+            let thorough = params.points > 0;
+            let near = MatchParams { points, thorough, reach_mm: finest, patch: 3, strain: 0.05 };
             let (matches, _, report) = level::matches(&pair, Some(&field), field.lattice.clone(), near);
             if !first || reports.is_empty() {
                 reports.push(report);
@@ -149,6 +150,12 @@ pub fn run(
         Interpolation::Barycentric => barycentric(&mesh, &node_displacement, smooth)?,
     };
     clock.book("interpolation");
+    let length = lengths(&displacement, &mask);
+    // Matches that do not bear each other out and a motion past all that was looked for: not a measurement.
+    if kept * 5 < matches.len() && length.1 > 1.2 * search {
+        let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
+        return Err(FieldError::TooFew { found: kept, what: "matches survive", needed: matches.len().div_ceil(5), hint });
+    }
 
     progress("jacobian", 0.94);
     let jacobian = jacobian::jacobian_determinant(&displacement);
@@ -170,7 +177,6 @@ pub fn run(
     if let Some(r) = last {
         r.counts = counts;
     }
-    let length = lengths(&displacement, &mask);
     let mut sigma: Vec<f32> =
         uncertainty.as_slice().iter().zip(mask.as_slice()).filter(|(_, m)| **m != 0).map(|(u, _)| *u).collect();
     let summary = FieldSummary {

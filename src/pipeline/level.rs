@@ -160,6 +160,8 @@ pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]
 pub struct MatchParams {
     /// Features wanted in the initial volume; up to five times as many in the deformed one.
     pub points: usize,
+    /// Whether just so many were asked for: then corners are sought voxel by voxel even where there is room for blocks.
+    pub thorough: bool,
     /// Reach of the search about the known field (mm).
     pub reach_mm: f64,
     /// Patch radius (voxels of the finest axis).
@@ -211,9 +213,10 @@ pub fn matches(
             smooth.as_slice()
         }
     };
-    let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, params.points);
+    let quick = !params.thorough && room >= BLOCKS;
+    let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, quick, params.points);
     let within = known.is_some().then_some(pair.mask.as_slice());
-    let deformed = corners(smooth_data, shape, spacing, within, noise, room, 5 * params.points);
+    let deformed = corners(smooth_data, shape, spacing, within, noise, room, quick, 5 * params.points);
     let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
     let fixed = if known.is_some() { &pair.fixed_smooth[..] } else { &pair.fixed[..] };
     let searchable = if known.is_some() { Searchable::near } else { Searchable::new };
@@ -351,8 +354,8 @@ fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
 /// Voxels a point from which on corners are sought on blocks of two voxels.
 const BLOCKS: f64 = 100.0;
 
-/// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with more of it the structure tensor
-/// is worked out on blocks of two voxels, at an eighth of the cost; with less the window is narrower, which has more maxima.
+/// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with less of it the window is
+/// narrower, which has more maxima. `quick` works the structure tensor out on blocks of two voxels, at an eighth of the cost.
 fn corners(
     smooth: &[f32],
     shape: [usize; 3],
@@ -360,6 +363,7 @@ fn corners(
     mask: Option<&[u8]>,
     noise: f32,
     room: f64,
+    quick: bool,
     wanted: usize,
 ) -> Vec<Corner> {
     let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
@@ -367,7 +371,7 @@ fn corners(
     let sigma = (room.cbrt() / 8.0).clamp(0.7, widest);
     // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
     let least = 0.002 * (f64::from(noise) / finest).powi(2) as f32;
-    let halved = |a: usize| room >= BLOCKS && shape[a] >= 24 && spacing[a] < 1.5 * finest;
+    let halved = |a: usize| quick && shape[a] >= 24 && spacing[a] < 1.5 * finest;
     let step: [usize; 3] = std::array::from_fn(|a| if halved(a) { 2 } else { 1 });
     if step == [1; 3] {
         let r = block_response(smooth, shape, spacing, sigma, step);
