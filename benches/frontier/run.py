@@ -95,6 +95,7 @@ def chart(rows, groups, path):
     matplotlib.use("svg")
     matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "palpate", "font.size": 10})
     import matplotlib.pyplot as plt
+    import matplotlib.ticker
 
     figure, axes = plt.subplots(1, len(groups), figsize=(5.6 * len(groups), 4.6), squeeze=False)
     for axis, (title, inside) in zip(axes[0], groups):
@@ -108,16 +109,23 @@ def chart(rows, groups, path):
                 front.append((c, e))
                 best = e
         axis.plot(*zip(*front), color="0.6", lw=1.2, zorder=1)
-        for c, e, m in points:
+        for n, (c, e, m) in enumerate(points):
             ours = m.startswith("palpate")
             axis.scatter(c, e, s=46, color="#c0392b" if ours else "#34495e", zorder=2)
-            axis.annotate(m, (c, e), xytext=(7, 4), textcoords="offset points", color="#c0392b" if ours else "0.2")
+            # Below where the point before would be written over.
+            crowded = n > 0 and c / points[n - 1][0] < 2 and abs(np.log(e / points[n - 1][1])) < 0.25
+            axis.annotate(m, (c, e), xytext=(5, -13) if crowded else (7, 4), textcoords="offset points", color="#c0392b" if ours else "0.2")
         axis.axhline(still, color="0.75", ls=":", lw=1)
         axis.annotate("doing nothing", (1, still), xycoords=("axes fraction", "data"), xytext=(-4, 3), textcoords="offset points", ha="right", color="0.5")
         axis.set(xscale="log", yscale="log", xlabel="CPU time (s), files included", ylabel="mean error (mm)")
         axis.set_title(f"{title} ({count} cases)", fontsize=11)
         low, high = axis.get_xlim()
         axis.set_xlim(low, high * 2.5)
+        axis.set_ylim(axis.get_ylim()[0] / 1.15, None)
+        for which in (axis.xaxis, axis.yaxis):
+            which.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
+            which.set_major_formatter(matplotlib.ticker.FuncFormatter(lambda v, _: f"{v:g}"))
+            which.set_minor_formatter(matplotlib.ticker.NullFormatter())
         axis.grid(which="both", color="0.92", lw=0.6)
         for side in ("top", "right"):
             axis.spines[side].set_visible(False)

@@ -216,6 +216,7 @@ pub fn matches(
     let quick = !params.thorough && room >= BLOCKS;
     let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, quick, params.points);
     let within = known.is_some().then_some(pair.mask.as_slice());
+    let room = if params.thorough && known.is_some() { room / 5.0 } else { room };
     let deformed = corners(smooth_data, shape, spacing, within, noise, room, quick, 5 * params.points);
     let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
     let fixed = if known.is_some() { &pair.fixed_smooth[..] } else { &pair.fixed[..] };
