@@ -154,7 +154,12 @@ pub fn run(
     // Matches that do not bear each other out and a motion past all that was looked for: not a measurement.
     if kept * 5 < matches.len() && length.1 > 1.2 * search {
         let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
-        return Err(FieldError::TooFew { found: kept, what: "matches survive", needed: matches.len().div_ceil(5), hint });
+        return Err(FieldError::TooFew {
+            found: kept,
+            what: "matches survive",
+            needed: matches.len().div_ceil(5),
+            hint,
+        });
     }
 
     progress("jacobian", 0.94);
