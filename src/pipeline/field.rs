@@ -152,14 +152,9 @@ pub fn run(
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
     // Matches that do not bear each other out and a motion past all that was looked for: not a measurement.
-    if kept * 5 < matches.len() && length.1 > 1.2 * search {
+    if kept * 5 < found && length.1 > 1.2 * search {
         let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
-        return Err(FieldError::TooFew {
-            found: kept,
-            what: "matches survive",
-            needed: matches.len().div_ceil(5),
-            hint,
-        });
+        return Err(FieldError::TooFew { found: kept, what: "matches survive", needed: found.div_ceil(5), hint });
     }
 
     progress("jacobian", 0.94);
