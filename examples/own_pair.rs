@@ -25,7 +25,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let [i, j, k] = grid.shape().map(|n| n / 2);
     let at = grid.index(i, j, k);
     let u = result.displacement.at(at).map(f64::from);
-    let (x, sigma) = (grid.world(i, j, k), result.uncertainty.as_slice()[at]);
+    let (x, sigma) = (grid.world(i, j, k), result.uncertainty.at(at));
     println!("{:.2?} mm lies at {:.2?} mm, give or take {sigma:.2} mm", x.0, x.moved(u).0);
 
     std::fs::create_dir_all("out")?;

@@ -6,12 +6,13 @@
 //!
 //! Without files a synthetic calf is measured; `--quick` takes a small block and few points.
 
+use palpate::pipeline::field::FieldResult;
 use palpate::report::colormap::ColorMap;
 use palpate::report::nodes;
 use palpate::report::scale::Scale;
 use palpate::synth::{PhantomKind, PhantomParams, phantom};
 use palpate::types::params::Interpolation;
-use palpate::types::{DenseField, FieldParams, FieldResult, Mask, Mesh, Volume};
+use palpate::types::{DenseField, FieldParams, Mask, Mesh, Volume};
 use palpate::{evaluate, io, pipeline};
 use std::error::Error;
 use std::time::Instant;

@@ -4,10 +4,10 @@
 use palpate::error::FieldError;
 use palpate::evaluate;
 use palpate::numerics::sampling::displacement;
-use palpate::pipeline::field::run;
+use palpate::pipeline::field::{FieldResult, run};
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom, phantom_on};
 use palpate::types::params::{Interpolation, Preset};
-use palpate::types::{Affine, FieldParams, FieldResult, Grid, Mask, Mesh, Metrics, MotionModel, Volume};
+use palpate::types::{Affine, FieldParams, Grid, Mask, Mesh, Metrics, MotionModel, Volume};
 
 /// A block of `n` voxels a side, 1 mm each, with 1 % noise.
 fn block(n: usize, motion: MotionKind, amplitude: f64) -> PhantomParams {
@@ -190,7 +190,8 @@ fn a_block_that_is_not_finite_is_survived_with_a_warning() {
     spoil(&mut p.initial);
     spoil(&mut p.deformed);
     let (result, _) = measure_with(&p, &FieldParams::default());
-    for values in [result.displacement.as_slice(), result.uncertainty.as_slice(), result.jacobian.as_slice()] {
+    let uncertainty = result.uncertainty.volume();
+    for values in [result.displacement.as_slice(), uncertainty.as_slice()] {
         assert!(values.iter().all(|v| v.is_finite()));
     }
     for (at, m) in p.mask.as_mut_slice().iter_mut().enumerate() {
@@ -229,10 +230,11 @@ fn the_uncertainty_is_calibrated_on_smooth_motions() {
         let p = phantom(&params).unwrap();
         let (result, _) = measure_with(&p, &FieldParams::default());
         // Shares of the components inside of 1, 2 and 3 sigma; 0.68, 0.95 and 0.997 would be exact.
+        let sigma = result.uncertainty.volume().into_vec();
         let mut inside = [0usize; 3];
         let mut all = 0;
         for at in (0..p.mask.grid().len()).filter(|&at| p.mask.as_slice()[at] != 0) {
-            let (u, t, s) = (result.displacement.at(at), p.truth.at(at), result.uncertainty.as_slice()[at]);
+            let (u, t, s) = (result.displacement.at(at), p.truth.at(at), sigma[at]);
             for c in 0..3 {
                 all += 1;
                 (1..=3).for_each(|k| inside[k - 1] += usize::from((u[c] - t[c]).abs() <= k as f32 * s));

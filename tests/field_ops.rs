@@ -3,7 +3,7 @@
 
 use palpate::field::composition::compose;
 use palpate::field::inverse::invert;
-use palpate::field::jacobian::{count_folds, jacobian_determinant};
+use palpate::field::jacobian::{count_folds, determinant_at, jacobian_determinant};
 use palpate::field::warp::{warp_image, warp_labels, warp_points};
 use palpate::numerics::sampling::{Interpolation, Sampler, nearest};
 use palpate::types::space::{Matrix3, determinant};
@@ -179,13 +179,15 @@ fn a_single_slice_has_the_determinant_of_its_plane() {
 fn folds_are_counted_inside_the_mask() {
     let grid = cube(8, 8.0);
     let field = DenseField::from_fn(grid, |p| if p.0[0] > 4.0 { [-2.0 * p.0[0] + 8.0, 0.0, 0.0] } else { [0.0; 3] });
-    let jacobian = jacobian_determinant(&field);
+    let jacobian = jacobian_determinant(&field).into_vec();
+    assert!((0..grid.len()).all(|at| determinant_at(&field, at) == jacobian[at]));
     let mask = Volume::from_voxels(grid, |_, p| u8::from(p.0[2] < 2.0));
     // x = 5, 6, 7 fold (slope -2); x = 4 has the mean of slopes -1 (from 3.5 to 4.5) and -2.
-    let all = count_folds(&jacobian, None).unwrap();
+    let all = count_folds(&field, None).unwrap();
     assert_eq!(all, 4 * 64);
-    assert_eq!(count_folds(&jacobian, Some(&mask)).unwrap(), all / 4);
-    assert!(count_folds(&jacobian, Some(&Volume::filled(cube(7, 8.0), 1))).is_err());
+    assert_eq!(all, jacobian.iter().filter(|&&j| j <= 0.0).count());
+    assert_eq!(count_folds(&field, Some(&mask)).unwrap(), all / 4);
+    assert!(count_folds(&field, Some(&Volume::filled(cube(7, 8.0), 1))).is_err());
 }
 
 #[test]

@@ -44,12 +44,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         command: "demo",
         names: ["initial.nii.gz", "deformed.nii.gz", "mask.nii.gz"],
         initial: &pair.initial,
-        deformed: &pair.deformed,
+        deformed: pair.deformed,
         mask,
         params: &params,
         truth: Some((&pair.truth, &metrics)),
     };
-    let summary = write_field(&mut folder, &measured, &mut result)?;
+    let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;
     drop(progress);
     explain(console, &result.summary);

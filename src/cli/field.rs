@@ -97,12 +97,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         command: "field",
         names: [&names[0], &names[1], &names[2]],
         initial: &fixed,
-        deformed: &moving,
+        deformed: moving,
         mask: inside.as_ref(),
         params: &params,
         truth: None,
     };
-    let summary = write_field(&mut folder, &measured, &mut result)?;
+    let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;
     drop(progress);
     explain(console, &result.summary);

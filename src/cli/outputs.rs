@@ -1,12 +1,13 @@
 //! The files of a field run.
 
 use anyhow::Result;
-use palpate::field::warp::warp_image;
+use palpate::field::jacobian::{determinant_at, jacobian_determinant};
+use palpate::field::warp::warp_sampled;
 use palpate::io::{self, OutputFolder};
-use palpate::numerics::sampling::Interpolation;
+use palpate::numerics::sampling::Sampler;
+use palpate::pipeline::field::FieldResult;
 use palpate::report::{FieldReport, html, json};
-use palpate::types::{DenseField, FieldParams, FieldResult, Mask, Mesh, Metrics, Volume};
-use std::borrow::Cow;
+use palpate::types::{DenseField, FieldParams, Mask, Mesh, Metrics, Volume};
 use std::time::Instant;
 
 /// Names of what [`write_field`] writes.
@@ -26,45 +27,77 @@ pub struct Measured<'a> {
     pub command: &'a str,
     pub names: [&'a str; 3],
     pub initial: &'a Volume,
-    pub deformed: &'a Volume,
+    /// Filtered in place when it is warped.
+    pub deformed: Volume,
     pub mask: Option<&'a Mask>,
     pub params: &'a FieldParams,
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
 }
 
-/// Stages all files, adds the time of writing to the summary, and gives the short summary for stdout back.
-pub fn write_field(folder: &mut OutputFolder, measured: &Measured<'_>, result: &mut FieldResult) -> Result<String> {
+/// Stages all files, adds the times of warping and writing to the summary, and gives the short summary for stdout back.
+pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &mut FieldResult) -> Result<String> {
+    let Measured { command, names, initial, deformed, mask, params, truth } = measured;
+    // One volume at a time: each is made where it is written, so that few are held.
     let started = Instant::now();
-    let (initial, deformed) = (measured.initial, measured.deformed);
-    let still = if deformed.grid() == initial.grid() {
-        Cow::Borrowed(deformed)
-    } else {
-        Cow::Owned(warp_image(deformed, &DenseField::zeros(*initial.grid()), None, Interpolation::Linear, 0.0))
+    write_volumes(folder, result)?;
+    let mut writing = started.elapsed();
+    let started = Instant::now();
+    let deformed_grid = *deformed.grid();
+    let sampler = Sampler::owning(deformed, 0.0);
+    let warped = warp_sampled(&sampler, &deformed_grid, &result.displacement);
+    result.summary.seconds.push(("warp".into(), started.elapsed().as_secs_f64()));
+
+    let started = Instant::now();
+    let affine = deformed_grid.affine();
+    let still = |offset| {
+        let [i, j, k] = initial.grid().voxel(offset);
+        sampler.at(affine.to_voxel(initial.grid().world(i, j, k)))
     };
-    // The page is made while the volumes are packed and written.
-    let (written, page) =
-        rayon::join(|| write_volumes(folder, result), || html::page(&describe(measured, &still, result)));
+    let swelling = |offset| determinant_at(&result.displacement, offset);
+    let vague = |offset| result.uncertainty.at(offset);
+    let mut report = FieldReport {
+        command,
+        names,
+        initial,
+        deformed: &still,
+        deformed_grid: &deformed_grid,
+        warped: &warped,
+        mask,
+        params,
+        displacement: &result.displacement,
+        jacobian: &swelling,
+        uncertainty: &vague,
+        matches: &result.matches,
+        mesh: &result.mesh,
+        node_displacement: &result.node_displacement,
+        summary: &result.summary,
+        truth,
+    };
+    let (written, page) = rayon::join(
+        || folder.write("warped.nii.gz", |p| io::write_volume(p, &warped, "palpate: deformed at x + u(x)")),
+        || html::page(&report),
+    );
     written?;
     let page = page?;
     folder.write("report.html", |p| io::write_text(p, &page))?;
-    result.summary.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
-    let report = describe(measured, &still, result);
+    let mut summary = result.summary.clone();
+    writing += started.elapsed();
+    summary.seconds.push(("write".into(), writing.as_secs_f64()));
+    report.summary = &summary;
     folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
-    Ok(palpate::report::text::field_summary(&report))
-}
-
-/// `still` is the deformed volume on the initial grid.
-fn describe<'a>(measured: &Measured<'a>, still: &'a Volume, result: &'a FieldResult) -> FieldReport<'a> {
-    let Measured { command, names, initial, deformed, mask, params, truth } = *measured;
-    let deformed_grid = deformed.grid();
-    FieldReport { command, names, initial, deformed: still, deformed_grid, mask, params, result, truth }
+    let text = palpate::report::text::field_summary(&report);
+    result.summary = summary;
+    Ok(text)
 }
 
 fn write_volumes(folder: &mut OutputFolder, result: &FieldResult) -> Result<()> {
     folder.write("displacement.nii.gz", |p| io::write_field(p, &result.displacement))?;
-    folder.write("warped.nii.gz", |p| io::write_volume(p, &result.warped, "palpate: deformed at x + u(x)"))?;
-    folder.write("jacobian.nii.gz", |p| io::write_steps(p, &result.jacobian, "palpate: Jacobian determinant", 13))?;
-    folder.write("uncertainty.nii.gz", |p| io::write_steps(p, &result.uncertainty, "palpate: 1 sigma of u, mm", 12))?;
+    folder.write("jacobian.nii.gz", |p| {
+        io::write_steps(p, &jacobian_determinant(&result.displacement), "palpate: Jacobian determinant", 13)
+    })?;
+    folder.write("uncertainty.nii.gz", |p| {
+        io::write_steps(p, &result.uncertainty.volume(), "palpate: 1 sigma of u, mm", 12)
+    })?;
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
     folder.write("mesh.vtu", |p| match &result.mesh {
         Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),

@@ -4,59 +4,123 @@
 //! change through the slice, so that derivative is zero and the determinant is that of the in-plane 2 x 2 block.
 
 use crate::error::FieldError;
-use crate::numerics::filters::gradient_rows;
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Mask, Volume};
 use rayon::prelude::*;
 
 /// The Jacobian determinant of x + u(x) with respect to world mm (1): 1 = volume kept, at or below 0 = folded.
 pub fn jacobian_determinant(field: &DenseField) -> Volume {
-    let grid = *field.grid();
-    let shape = grid.shape();
-    let [nx, ny, _] = shape;
-    let inverse = grid.affine().inverse_linear().map(|row| row.map(|v| v as f32));
-    let components: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
-    let mut out = Volume::filled(grid, 1.0f32);
-    out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
-        // g[c][a]: derivative of component c by voxel index along axis a.
-        let mut g: [[Vec<f32>; 3]; 3] = std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; nx]));
-        dispatch(
-            #[inline(always)]
-            || {
-                for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                    for (component, [x, y, z]) in components.iter().zip(&mut g) {
-                        gradient_rows(component, shape, j, k, [x, y, z]);
-                    }
-                    for (i, out) in row.iter_mut().enumerate() {
-                        let f = |c: usize, d: usize| {
-                            let own = if c == d { 1.0 } else { 0.0 };
-                            own + g[c][0][i] * inverse[0][d] + g[c][1][i] * inverse[1][d] + g[c][2][i] * inverse[2][d]
-                        };
-                        *out = f(0, 0) * (f(1, 1) * f(2, 2) - f(1, 2) * f(2, 1))
-                            - f(0, 1) * (f(1, 0) * f(2, 2) - f(1, 2) * f(2, 0))
-                            + f(0, 2) * (f(1, 0) * f(2, 1) - f(1, 1) * f(2, 0));
-                    }
-                }
-            },
-        );
+    let derivative = Derivative::new(field);
+    let [nx, ny, _] = derivative.shape;
+    let mut out = Volume::filled(*field.grid(), 1.0f32);
+    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| {
+        derivative.determinants([0, row % ny, row / ny], out);
     });
     out
+}
+
+/// [`jacobian_determinant`] at one voxel offset (x fastest).
+pub fn determinant_at(field: &DenseField, offset: usize) -> f32 {
+    let mut out = [1.0];
+    Derivative::new(field).determinants(field.grid().voxel(offset), &mut out);
+    out[0]
 }
 
 /// How many voxels have a determinant at or below zero, within `mask` (everywhere when `None`).
 ///
 /// # Errors
 /// [`FieldError::GridMismatch`] when the mask has another shape.
-pub fn count_folds(jacobian: &Volume, mask: Option<&Mask>) -> Result<usize, FieldError> {
-    let folded = jacobian.as_slice().iter().map(|&j| j <= 0.0);
-    let Some(mask) = mask else { return Ok(folded.filter(|&f| f).count()) };
-    if mask.grid().shape() != jacobian.grid().shape() {
+pub fn count_folds(field: &DenseField, mask: Option<&Mask>) -> Result<usize, FieldError> {
+    let derivative = Derivative::new(field);
+    let [nx, ny, nz] = derivative.shape;
+    if let Some(mask) = mask.filter(|m| m.grid().shape() != derivative.shape) {
         return Err(FieldError::GridMismatch {
             what: "the mask".into(),
             found: mask.grid().shape(),
             reference: "the field".into(),
-            expected: jacobian.grid().shape(),
+            expected: derivative.shape,
         });
     }
-    Ok(folded.zip(mask.as_slice()).filter(|&(f, &m)| f && m != 0).count())
+    let mask = mask.map(Mask::as_slice);
+    let slice = |k: usize| -> usize {
+        let mut row = vec![1.0; nx];
+        let mut folds = |j: usize| {
+            let inside = mask.map(|m| &m[nx * (j + ny * k)..][..nx]);
+            if inside.is_some_and(|m| m.iter().all(|&m| m == 0)) {
+                return 0;
+            }
+            derivative.determinants([0, j, k], &mut row);
+            (0..nx).filter(|&i| row[i] <= 0.0 && inside.is_none_or(|m| m[i] != 0)).count()
+        };
+        (0..ny).map(&mut folds).sum()
+    };
+    Ok((0..nz).into_par_iter().map(slice).sum())
+}
+
+/// What the determinants are worked out from.
+struct Derivative<'a> {
+    components: [&'a [f32]; 3],
+    shape: [usize; 3],
+    /// Voxels for each world mm.
+    inverse: [[f32; 3]; 3],
+}
+
+impl<'a> Derivative<'a> {
+    fn new(field: &'a DenseField) -> Self {
+        Self {
+            components: std::array::from_fn(|c| field.component(c)),
+            shape: field.grid().shape(),
+            inverse: field.grid().affine().inverse_linear().map(|row| row.map(|v| v as f32)),
+        }
+    }
+
+    /// The determinants at `out.len()` voxels of a row, from voxel `[i, j, k]` on.
+    fn determinants(&self, [i, j, k]: [usize; 3], out: &mut [f32]) {
+        let nx = self.shape[0];
+        let (inner, end) = (i.max(1), (i + out.len()).min(nx - 1).max(i.max(1)));
+        let (first, rest) = out.split_at_mut((inner - i).min(out.len()));
+        let (middle, last) = rest.split_at_mut((end - inner).min(rest.len()));
+        let side = nx > 1;
+        self.run([i, j, k], [0, usize::from(side)], f32::from(u8::from(side)), first);
+        self.run([inner, j, k], [1, 1], 0.5, middle);
+        self.run([end, j, k], [1, 0], 1.0, last);
+    }
+
+    /// The same for a run with the same differences along x: over `before` and `after` voxels, times `scale`.
+    fn run(&self, [i, j, k]: [usize; 3], [before, after]: [usize; 2], scale: f32, out: &mut [f32]) {
+        if out.is_empty() {
+            return;
+        }
+        let ([nx, ny, nz], n) = (self.shape, out.len());
+        let at = |j: usize, k: usize| i + nx * (j + ny * k);
+        let ends = |at: usize, n: usize| (at.saturating_sub(1), (at + 1).min(n - 1));
+        let ((j0, j1), (k0, k1)) = (ends(j, ny), ends(k, nz));
+        let sides = [(at(j, k) - before, at(j, k) + after), (at(j0, k), at(j1, k)), (at(j, k0), at(j, k1))];
+        let scale = [scale, 1.0 / (j1 - j0).max(1) as f32, 1.0 / (k1 - k0).max(1) as f32];
+        let ends: [[[&[f32]; 2]; 3]; 3] =
+            self.components.map(|c| sides.map(|(low, high)| [&c[low..][..n], &c[high..][..n]]));
+        let inverse = self.inverse;
+        dispatch(
+            #[inline(always)]
+            || {
+                let [[x0, x1, x2], [y0, y1, y2], [z0, z1, z2]] = ends;
+                for l in 0..n {
+                    // g[c][a]: derivative of component c by voxel index along axis a.
+                    let d = |e: [&[f32]; 2], a: usize| scale[a] * (e[1][l] - e[0][l]);
+                    let g = [
+                        [d(x0, 0), d(x1, 1), d(x2, 2)],
+                        [d(y0, 0), d(y1, 1), d(y2, 2)],
+                        [d(z0, 0), d(z1, 1), d(z2, 2)],
+                    ];
+                    let f = |c: usize, d: usize| {
+                        let own = if c == d { 1.0 } else { 0.0 };
+                        own + g[c][0] * inverse[0][d] + g[c][1] * inverse[1][d] + g[c][2] * inverse[2][d]
+                    };
+                    out[l] = f(0, 0) * (f(1, 1) * f(2, 2) - f(1, 2) * f(2, 1))
+                        - f(0, 1) * (f(1, 0) * f(2, 2) - f(1, 2) * f(2, 0))
+                        + f(0, 2) * (f(1, 0) * f(2, 1) - f(1, 1) * f(2, 0));
+                }
+            },
+        );
+    }
 }

@@ -41,22 +41,45 @@ pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField
     out
 }
 
-/// A scalar on the nodes (repeated as three components) as a volume.
-pub fn scalar(grid: &Grid, lattice: &Lattice, values: &[f32]) -> Volume {
-    let [nx, ny, _] = grid.shape();
-    let three: Vec<f32> = values.iter().chain(values).chain(values).copied().collect();
-    let mut out = Volume::filled(*grid, 0.0);
-    out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
-        let slice = lattice.slice(&three, k);
-        let mut nodes = vec![0.0; lattice.nodes[0]];
-        dispatch(
-            #[inline(always)]
-            || {
-                for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                    lattice.row(&slice, 0, j, &mut nodes, row);
-                }
-            },
-        );
-    });
-    out
+/// A smooth scalar over a grid, kept as its B-spline coefficients: small, and worked out where it is asked for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScalarSpline {
+    grid: Grid,
+    lattice: Lattice,
+    values: Vec<f32>,
+}
+
+impl ScalarSpline {
+    /// From coefficients on the nodes of a lattice that lies over `grid`'s shape.
+    pub fn new(grid: Grid, lattice: Lattice, values: Vec<f32>) -> Self {
+        Self { grid, lattice, values }
+    }
+
+    /// The value at a voxel offset (x fastest).
+    pub fn at(&self, offset: usize) -> f32 {
+        let mut sum = 0.0;
+        self.lattice.for_each_tap(self.grid.voxel(offset).map(|i| i as f64), |node, w| sum += w * self.values[node]);
+        sum
+    }
+
+    /// The value at every voxel.
+    pub fn volume(&self) -> Volume {
+        let Self { grid, lattice, values } = self;
+        let [nx, ny, _] = grid.shape();
+        let three: Vec<f32> = [&values[..]; 3].concat();
+        let mut out = Volume::filled(*grid, 0.0);
+        out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
+            let slice = lattice.slice(&three, k);
+            let mut nodes = vec![0.0; lattice.nodes[0]];
+            dispatch(
+                #[inline(always)]
+                || {
+                    for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
+                        lattice.row(&slice, 0, j, &mut nodes, row);
+                    }
+                },
+            );
+        });
+        out
+    }
 }

@@ -21,13 +21,13 @@ pub fn warp_image(
     let sampler = Sampler::new(image, interpolation, background);
     let affine = *image.grid().affine();
     if reference.is_none_or(|r| r == field.grid()) {
-        return warp_rows(image.grid(), field, &sampler);
+        return warp_sampled(&sampler, image.grid(), field);
     }
     warp_with(field, reference, background, |target| sampler.at(affine.to_voxel(target)))
 }
 
-/// On the field's own grid: row by row, no field to be interpolated.
-fn warp_rows(image: &Grid, field: &DenseField, sampler: &Sampler<'_>) -> Volume {
+/// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be sampled.
+pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &DenseField) -> Volume {
     let grid = field.grid();
     let [nx, ny, _] = grid.shape();
     let components: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));

@@ -32,17 +32,28 @@ impl Chunk {
     }
 }
 
-/// Writes one member that unpacks to the chunks' bytes, one after the other.
-pub(super) fn write_member(out: &mut impl Write, chunks: &[Chunk]) -> io::Result<()> {
-    out.write_all(&[0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 4, 255])?; // no name, no time, fastest, unknown system
-    let mut crc = Crc::new();
-    for chunk in chunks {
-        out.write_all(&chunk.packed)?;
-        crc.combine(&chunk.crc);
+/// One member in the making: unpacks to the bytes of all its chunks, one after the other.
+pub(super) struct Member<'a, W> {
+    out: &'a mut W,
+    crc: Crc,
+}
+
+impl<'a, W: Write> Member<'a, W> {
+    pub(super) fn start(out: &'a mut W) -> io::Result<Self> {
+        out.write_all(&[0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 4, 255])?; // no name, no time, fastest, unknown system
+        Ok(Self { out, crc: Crc::new() })
     }
-    out.write_all(&FINISH)?;
-    out.write_all(&crc.sum().to_le_bytes())?;
-    out.write_all(&crc.amount().to_le_bytes())
+
+    pub(super) fn add(&mut self, chunk: &Chunk) -> io::Result<()> {
+        self.crc.combine(&chunk.crc);
+        self.out.write_all(&chunk.packed)
+    }
+
+    pub(super) fn finish(self) -> io::Result<()> {
+        self.out.write_all(&FINISH)?;
+        self.out.write_all(&self.crc.sum().to_le_bytes())?;
+        self.out.write_all(&self.crc.amount().to_le_bytes())
+    }
 }
 
 /// The first `length` bytes, or fewer when there are no more or the stream is damaged.

@@ -121,15 +121,23 @@ pub struct Sampler<'a> {
     background: f32,
 }
 
+impl Sampler<'static> {
+    /// Cubic, from a volume that is not needed any more: it is filtered in place.
+    pub fn owning(volume: Volume, background: f32) -> Self {
+        let shape = volume.grid().shape();
+        let values = bspline_coefficients(volume.into_vec(), shape).into();
+        Self { shape, values, interpolation: Interpolation::Cubic, background }
+    }
+}
+
 impl<'a> Sampler<'a> {
     /// Prepares `volume`; `background` is the value outside. Cubic filters a copy of the volume, the others borrow it.
     pub fn new(volume: &'a Volume, interpolation: Interpolation, background: f32) -> Self {
-        let shape = volume.grid().shape();
-        let values = match interpolation {
-            Interpolation::Cubic => Cow::Owned(bspline_coefficients(volume.as_slice().to_vec(), shape)),
-            _ => Cow::Borrowed(volume.as_slice()),
-        };
-        Self { shape, values, interpolation, background }
+        if interpolation == Interpolation::Cubic {
+            return Sampler::owning(volume.clone(), background);
+        }
+        let values = Cow::Borrowed(volume.as_slice());
+        Self { shape: volume.grid().shape(), values, interpolation, background }
     }
 
     /// The value at a position in voxels.

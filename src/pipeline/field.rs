@@ -3,12 +3,12 @@
 use crate::consistency::coupling;
 use crate::consistency::models::{Choice, choose};
 use crate::error::{FieldError, MeshError};
-use crate::field::{interpolation, jacobian, spline, warp};
+use crate::field::spline::ScalarSpline;
+use crate::field::{interpolation, jacobian, spline};
 use crate::matching::levels::{Aligned, factors, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::bspline::Lattice;
-use crate::numerics::sampling;
 use crate::numerics::statistics::median;
 use crate::pipeline::check;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
@@ -19,6 +19,27 @@ use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
+
+/// The result of `palpate field`, on the initial volume's grid.
+///
+/// What follows from these is made where it is wanted: `uncertainty.volume()`, the determinant by
+/// [`jacobian::jacobian_determinant`], the deformed volume made to look like the initial one by
+/// [`crate::field::warp::warp_image`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct FieldResult {
+    /// Displacement, initial to deformed (mm, RAS).
+    pub displacement: DenseField,
+    /// One standard deviation of the displacement (mm).
+    pub uncertainty: ScalarSpline,
+    /// All matches with covariance.
+    pub matches: SparseField,
+    /// The mesh through the kept matches (initial positions).
+    pub mesh: Mesh,
+    /// Displacement at the mesh's nodes (mm, RAS).
+    pub node_displacement: Vec<[f64; 3]>,
+    /// The rest.
+    pub summary: FieldSummary,
+}
 
 /// Fewest matches that a result may rest on.
 const FEWEST: usize = 20;
@@ -135,6 +156,8 @@ pub fn run(
     choice.evidence.push(why_so_many(params, points, found));
     let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
+    drop(pair);
+    drop(aligned);
     clock.book("model");
 
     // Mesh and dense field.
@@ -158,15 +181,12 @@ pub fn run(
     }
 
     progress("jacobian", 0.94);
-    let jacobian = jacobian::jacobian_determinant(&displacement);
-    let folds = jacobian::count_folds(&jacobian, Some(&mask))?;
+    let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
     progress("uncertainty", 0.95);
     let uncertainty = uncertainty(&grid, &field, spacing, params.seed);
+    let uncertainty_median_mm = f64::from(median_inside(&uncertainty, &mask));
     clock.book("uncertainty");
-    progress("warp", 0.98);
-    let warped = warp::warp_image(deformed, &displacement, None, sampling::Interpolation::Cubic, 0.0);
-    clock.book("warp");
 
     let last = reports.last_mut();
     let mut counts = last.as_ref().map(|r| r.counts).unwrap_or_default();
@@ -177,23 +197,21 @@ pub fn run(
     if let Some(r) = last {
         r.counts = counts;
     }
-    let mut sigma: Vec<f32> =
-        uncertainty.as_slice().iter().zip(mask.as_slice()).filter(|(_, m)| **m != 0).map(|(u, _)| *u).collect();
     let summary = FieldSummary {
         counts,
         model: choice.model,
         evidence: choice.evidence,
         levels: reports,
         folds,
-        mask_voxels: sigma.len(),
+        mask_voxels: length.2,
         mean_mm: length.0,
         max_mm: length.1,
-        uncertainty_median_mm: f64::from(median(&mut sigma)),
+        uncertainty_median_mm,
         seconds: clock.0,
         warnings: warnings(counts, folds, not_finite, length.1, search),
     };
     progress("done", 1.0);
-    Ok(FieldResult { displacement, warped, jacobian, uncertainty, matches: sparse, mesh, node_displacement, summary })
+    Ok(FieldResult { displacement, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 
 /// Voxels of the coarsest mask for each feature there, and the most features.
@@ -312,7 +330,7 @@ fn barycentric(mesh: &Mesh, nodes: &[[f64; 3]], mut outside: DenseField) -> Resu
 }
 
 /// Posterior standard deviation of the coupled field (mm), from a lattice twice as coarse as the field's own.
-fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -> Volume {
+fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -> ScalarSpline {
     let fine = &field.lattice;
     let coarse = Lattice::new(fine.shape, fine.step.map(|s| 2 * s));
     let mut blocks = vec![[0.0f32; 6]; coarse.len()];
@@ -331,15 +349,25 @@ fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -
     let factor: [usize; 3] = std::array::from_fn(|a| (spacing[a] / grid.spacing()[a]).round() as usize);
     let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));
     if full.nodes == coarse.nodes {
-        return spline::scalar(grid, &full, &deviation);
+        return ScalarSpline::new(*grid, full, deviation);
     }
     let three: Vec<f32> = deviation.iter().chain(&deviation).chain(&deviation).copied().collect();
     let values = full.fit(|p| coarse.at(&three, to_level(p, factor)));
-    spline::scalar(grid, &full, &values[..full.len()])
+    let values = values[..full.len()].to_vec();
+    ScalarSpline::new(*grid, full, values)
 }
 
-/// Mean and largest length over the mask (mm).
-fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64) {
+/// The median over the mask, from at most about 100,000 of its voxels.
+fn median_inside(values: &ScalarSpline, mask: &Mask) -> f32 {
+    let mask = mask.as_slice();
+    let inside = || (0..mask.len()).filter(|&at| mask[at] != 0);
+    let step = (inside().count() / 100_000).max(1);
+    let mut picked: Vec<f32> = inside().step_by(step).map(|at| values.at(at)).collect();
+    median(&mut picked)
+}
+
+/// Mean and largest length over the mask (mm), and its voxels.
+fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
     let nx = field.grid().shape()[0];
     let [x, y, z] = [0, 1, 2].map(|c| field.component(c));
     let rows: Vec<(f64, f32, usize)> = mask
@@ -358,7 +386,7 @@ fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64) {
         })
         .collect();
     let (sum, top, n) = rows.iter().fold((0.0, 0.0f32, 0), |a, r| (a.0 + r.0, a.1.max(r.1), a.2 + r.2));
-    (sum / n.max(1) as f64, f64::from(top))
+    (sum / n.max(1) as f64, f64::from(top), n)
 }
 
 /// What a user should know.

@@ -1,9 +1,12 @@
 //! What the report of `palpate field` is made from.
 
-use crate::types::{DenseField, FieldParams, FieldResult, Grid, Mask, Metrics, Volume};
+use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Volume};
 
-/// A result with the volumes it came from.
-#[derive(Debug, Clone, Copy)]
+/// A value for each voxel offset (x fastest): a volume, or what can be worked out where a picture asks for it.
+pub type Values<'a> = &'a (dyn Fn(usize) -> f32 + Sync);
+
+/// A result with the volumes it came from. All on the initial volume's grid.
+#[derive(Clone, Copy)]
 pub struct FieldReport<'a> {
     /// The subcommand, "field" or "demo".
     pub command: &'a str,
@@ -11,17 +14,31 @@ pub struct FieldReport<'a> {
     pub names: [&'a str; 3],
     /// The initial volume.
     pub initial: &'a Volume,
-    /// The deformed volume resampled on the initial grid without any displacement.
-    pub deformed: &'a Volume,
+    /// The deformed volume without any displacement.
+    pub deformed: Values<'a>,
     /// The grid the deformed volume came on.
     pub deformed_grid: &'a Grid,
-    /// The mask, on the initial grid.
+    /// The deformed volume at x + u(x).
+    pub warped: &'a Volume,
+    /// The mask.
     pub mask: Option<&'a Mask>,
     /// What was asked for.
     pub params: &'a FieldParams,
-    /// What was found.
-    pub result: &'a FieldResult,
-    /// The true displacement on the initial grid and the score against it, where the truth is known.
+    /// Displacement, initial to deformed (mm, RAS).
+    pub displacement: &'a DenseField,
+    /// Jacobian determinant of x + u(x) (1).
+    pub jacobian: Values<'a>,
+    /// One standard deviation of the displacement (mm).
+    pub uncertainty: Values<'a>,
+    /// All matches with covariance.
+    pub matches: &'a SparseField,
+    /// The mesh through the kept matches (initial positions).
+    pub mesh: &'a Mesh,
+    /// Displacement at the mesh's nodes (mm, RAS).
+    pub node_displacement: &'a [[f64; 3]],
+    /// The rest.
+    pub summary: &'a FieldSummary,
+    /// The true displacement and the score against it, where the truth is known.
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
 }
 
@@ -29,16 +46,23 @@ pub struct FieldReport<'a> {
 pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{
-        Affine, Counts, FieldSummary, LevelReport, Match, Mesh, MotionModel, SparseField, TetMesh, WorldPoint,
-    };
+    use crate::types::{Affine, Counts, LevelReport, Match, MotionModel, TetMesh, WorldPoint};
 
     /// A made-up result with known numbers.
     pub(crate) struct Case {
         pub(crate) initial: Volume,
-        pub(crate) params: FieldParams,
-        pub(crate) result: FieldResult,
+        pub(crate) warped: Volume,
+        pub(crate) deformed: Value,
+        pub(crate) uncertainty: Value,
+        pub(crate) displacement: DenseField,
+        pub(crate) summary: FieldSummary,
+        params: FieldParams,
+        jacobian: Value,
+        matches: SparseField,
+        mesh: Mesh,
     }
+
+    type Value = Box<dyn Fn(usize) -> f32 + Sync>;
 
     impl Case {
         pub(crate) fn new(shape: [usize; 3], spacing: [f64; 3]) -> Self {
@@ -82,17 +106,18 @@ pub(crate) mod tests {
                 seconds: vec![("features".into(), 1.0), ("matching".into(), 2.0)],
                 warnings: vec!["two of <three> slices are empty".into()],
             };
-            let result = FieldResult {
-                displacement,
+            Self {
                 warped: initial.clone(),
-                jacobian: Volume::filled(grid, 1.1),
-                uncertainty: Volume::filled(grid, 0.2),
+                deformed: Box::new(|o| (o % 97) as f32),
+                uncertainty: Box::new(|_| 0.2),
+                displacement,
+                summary,
+                params: FieldParams::default(),
+                jacobian: Box::new(|_| 1.1),
                 matches: SparseField { matches: nodes.iter().map(one).collect() },
                 mesh: Mesh::Tetrahedra(TetMesh::new(nodes, vec![[0, 1, 2, 3]]).unwrap()),
-                node_displacement: vec![[1.0, 0.0, 0.0]; 4],
-                summary,
-            };
-            Self { initial, params: FieldParams::default(), result }
+                initial,
+            }
         }
 
         pub(crate) fn report(&self) -> FieldReport<'_> {
@@ -100,11 +125,18 @@ pub(crate) mod tests {
                 command: "field",
                 names: ["initial.nii.gz", "a<b>.nii", ""],
                 initial: &self.initial,
-                deformed: &self.initial,
+                deformed: &*self.deformed,
                 deformed_grid: self.initial.grid(),
+                warped: &self.warped,
                 mask: None,
                 params: &self.params,
-                result: &self.result,
+                displacement: &self.displacement,
+                jacobian: &*self.jacobian,
+                uncertainty: &*self.uncertainty,
+                matches: &self.matches,
+                mesh: &self.mesh,
+                node_displacement: &[[1.0, 0.0, 0.0]; 4],
+                summary: &self.summary,
                 truth: None,
             }
         }

@@ -27,7 +27,6 @@ pub fn escape(text: &str) -> String {
 /// [`ReportError`] when a picture cannot be encoded.
 pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let views = Views::of(report)?;
-    let result = report.result;
     let mut body = head(report);
     body.push_str(&score(report, &views));
 
@@ -51,12 +50,12 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     );
     body.push_str(&drawn("Arrows", &note, &planes, arrows, lengths));
     if let Some(scale) = lengths {
-        let mesh_nodes = match &result.mesh {
+        let mesh_nodes = match report.mesh {
             Mesh::Tetrahedra(m) => m.nodes(),
             Mesh::Triangles(m) => m.nodes(),
         };
         let note = format!("Length at the {} mesh nodes.", thousands(mesh_nodes.len()));
-        let drawing = nodes::scatter(mesh_nodes, &result.node_displacement, scale);
+        let drawing = nodes::scatter(mesh_nodes, report.node_displacement, scale);
         let _ = write!(body, "<article><h3>Mesh nodes</h3><p>{note}</p>{drawing}{}</article>", legend(Some(scale)));
     }
     body.push_str(&card(&views.jacobian));
@@ -79,12 +78,12 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
         tables::counts(report),
         tables::inputs(report)
     );
-    let evidence: String = result.summary.evidence.iter().map(|e| format!("<li>{}</li>", escape(e))).collect();
+    let evidence: String = report.summary.evidence.iter().map(|e| format!("<li>{}</li>", escape(e))).collect();
     let _ = write!(
         body,
         "<article class=\"wide\"><h3>Coarse to fine</h3>{}</article><article><h3>Motion model</h3><ul>{evidence}</ul></article><article><h3>Time</h3>{}</article></div></section>",
         tables::levels(report),
-        chart::stage_times(&result.summary.seconds)
+        chart::stage_times(&report.summary.seconds)
     );
     let title = format!("{} to {}", escape(report.names[0]), escape(report.names[1]));
     body.push_str(footer());
@@ -100,7 +99,7 @@ pub(super) fn document(title: &str, body: &str) -> String {
 
 /// Verdict, key numbers, warnings.
 fn head(report: &FieldReport<'_>) -> String {
-    let (s, v) = (&report.result.summary, verdict(report));
+    let (s, v) = (report.summary, verdict(report));
     let [initial, deformed, _] = report.names.map(escape);
     let tile = |value: String, unit: &str, name: &str| {
         format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
@@ -201,27 +200,26 @@ fn blink(volumes: &[Panel]) -> String {
 }
 
 fn histograms(report: &FieldReport<'_>, views: &Views) -> String {
-    let result = report.result;
     let inside = sample(report.initial.grid().len(), report.mask);
     let of = |values: &dyn Fn(usize) -> f32, scale: &Scale| {
         Histogram::new(inside.iter().map(|&o| f64::from(values(o))), scale.low, scale.high, 40)
     };
     let mut out = String::new();
-    let motion = |o| length(&result.displacement, o);
+    let motion = |o| length(report.displacement, o);
     let panels: [(&Panel, &dyn Fn(usize) -> f32, &str); 3] = [
         (&views.magnitude, &motion, "Displacement"),
-        (&views.jacobian, &|o| result.jacobian.as_slice()[o], "Jacobian determinant"),
-        (&views.uncertainty, &|o| result.uncertainty.as_slice()[o], "Uncertainty"),
+        (&views.jacobian, report.jacobian, "Jacobian determinant"),
+        (&views.uncertainty, report.uncertainty, "Uncertainty"),
     ];
     for (panel, values, title) in panels {
         if let Some(scale) = &panel.scale {
             out.push_str(&chart::histogram(&of(values, scale), title, scale.unit, Some(scale)));
         }
     }
-    let ncc = Histogram::new(result.matches.kept().map(|m| f64::from(m.ncc)), 0.0, 1.0, 40);
+    let ncc = Histogram::new(report.matches.kept().map(|m| f64::from(m.ncc)), 0.0, 1.0, 40);
     out.push_str(&chart::histogram(&ncc, "Correlation of kept matches", "", None));
     let precision = &views.matches.2;
-    let sigma = Histogram::new(result.matches.kept().map(|m| m.sigma()), precision.low, precision.high, 40);
+    let sigma = Histogram::new(report.matches.kept().map(|m| m.sigma()), precision.low, precision.high, 40);
     out.push_str(&chart::histogram(&sigma, "Precision of kept matches", "mm", Some(precision)));
     out
 }
@@ -243,7 +241,7 @@ mod tests {
     fn the_page_stands_alone_and_closes_what_it_opens() {
         let case = Case::new([24, 20, 9], [1.0, 1.0, 4.0]);
         let metrics = Metrics { mean_mm: 0.25, ..Metrics::default() };
-        let html = page(&FieldReport { truth: Some((&case.result.displacement, &metrics)), ..case.report() }).unwrap();
+        let html = page(&FieldReport { truth: Some((&case.displacement, &metrics)), ..case.report() }).unwrap();
         for tag in ["article", "section", "figure", "div", "table", "svg", "p", "ul", "li", "b", "span", "i"] {
             let opened = html.matches(&format!("<{tag}>")).count() + html.matches(&format!("<{tag} ")).count();
             assert_eq!(opened, html.matches(&format!("</{tag}>")).count(), "<{tag}>");

@@ -11,7 +11,7 @@ pub fn grid(g: &Grid) -> Value {
 
 /// The keys are those of docs/file-formats.md.
 pub fn field_summary(report: &FieldReport<'_>) -> Value {
-    let s = &report.result.summary;
+    let s = report.summary;
     let seconds: Map<String, Value> = s.seconds.iter().map(|(stage, t)| (stage.clone(), json!(t))).collect();
     let [initial, deformed, mask] = report.names;
     let mut out = json!({

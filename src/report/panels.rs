@@ -22,13 +22,17 @@ pub struct Panel {
 }
 
 impl Panel {
-    /// A volume in gray, black at `range[0]` and white at `range[1]`.
+    /// The `value` at each voxel offset in gray, black at `range[0]` and white at `range[1]`.
     ///
     /// # Errors
     /// [`ReportError`] when a picture cannot be encoded.
-    pub fn gray(title: &str, sections: &[Section], volume: &Volume, range: [f64; 2]) -> Result<Self, ReportError> {
-        let values = volume.as_slice();
-        let pictures = sections.iter().map(|s| Picture::gray(s, |o| values[o], range)).collect::<Result<_, _>>()?;
+    pub fn gray(
+        title: &str,
+        sections: &[Section],
+        value: impl Fn(usize) -> f32,
+        range: [f64; 2],
+    ) -> Result<Self, ReportError> {
+        let pictures = sections.iter().map(|s| Picture::gray(s, &value, range)).collect::<Result<_, _>>()?;
         Ok(Self { title: title.into(), note: String::new(), scale: None, pictures })
     }
 
@@ -45,7 +49,8 @@ impl Panel {
         value: impl Fn(usize) -> f32,
     ) -> Result<Self, ReportError> {
         let gray = base.0.as_slice();
-        let inside = |o: usize| mask.is_none_or(|m| m.as_slice()[o] > 0);
+        let mask = mask.map(Mask::as_slice);
+        let inside = |o: usize| mask.is_none_or(|m| m[o] > 0);
         let picture = |s| Picture::overlay(s, |o| gray[o], base.1, |o| inside(o).then(|| value(o)), &scale);
         let pictures = sections.iter().map(picture).collect::<Result<_, _>>()?;
         Ok(Self { title: title.into(), note: String::new(), scale: Some(scale), pictures })
@@ -102,11 +107,12 @@ pub fn synthetic_pair(
 ) -> Result<Vec<Panel>, ReportError> {
     let sections = Section::through(initial.grid(), centre_of_motion(truth, mask));
     let range = gray_range(initial);
+    let (first, second) = (initial.as_slice(), deformed.as_slice());
     let most = quantile(sample(truth.grid().len(), mask).into_iter().map(|o| length(truth, o).into()), 0.999);
     let scale = Scale::from_zero(most, "mm", ColorMap::Viridis);
     Ok(vec![
-        Panel::gray("initial", &sections, initial, range)?,
-        Panel::gray("deformed", &sections, deformed, range)?,
+        Panel::gray("initial", &sections, |o| first[o], range)?,
+        Panel::gray("deformed", &sections, |o| second[o], range)?,
         Panel::coloured("true displacement", &sections, (initial, range), mask, scale, |o| length(truth, o))?,
     ])
 }

@@ -7,11 +7,14 @@ const SAMPLES: usize = 200_000;
 
 /// Offsets of the voxels inside `mask` (all of `len` without one), evenly thinned to at most 200,000.
 pub fn sample(len: usize, mask: Option<&Mask>) -> Vec<usize> {
-    let inside: Vec<usize> = match mask {
-        Some(m) => m.as_slice().iter().enumerate().filter(|(_, v)| **v > 0).map(|(i, _)| i).collect(),
-        None => (0..len).collect(),
-    };
-    inside.iter().copied().step_by(inside.len().div_ceil(SAMPLES).max(1)).collect()
+    match mask.map(Mask::as_slice) {
+        Some(mask) => {
+            let inside = mask.iter().filter(|m| **m > 0).count();
+            let offsets = mask.iter().enumerate().filter(|(_, m)| **m > 0).map(|(at, _)| at);
+            offsets.step_by(inside.div_ceil(SAMPLES).max(1)).collect()
+        }
+        None => (0..len).step_by(len.div_ceil(SAMPLES).max(1)).collect(),
+    }
 }
 
 /// The value below which the fraction `q` (0 to 1) of the finite `values` lies; 0 when there is none.

@@ -28,7 +28,7 @@ fn triple(v: [f64; 3]) -> String {
 
 /// What was counted.
 pub fn counts(report: &FieldReport<'_>) -> String {
-    let (s, c) = (&report.result.summary, report.result.summary.counts);
+    let (s, c) = (report.summary, report.summary.counts);
     let model = match s.model {
         MotionModel::Identity => "none",
         MotionModel::Rigid => "rigid",
@@ -52,7 +52,6 @@ pub fn counts(report: &FieldReport<'_>) -> String {
 /// The levels, coarse to fine.
 pub fn levels(report: &FieldReport<'_>) -> String {
     let rows: Vec<_> = report
-        .result
         .summary
         .levels
         .iter()

@@ -8,7 +8,7 @@ use std::fmt::Write;
 
 /// What a field run found, a few lines.
 pub fn field_summary(report: &FieldReport<'_>) -> String {
-    let (s, v) = (&report.result.summary, verdict(report));
+    let (s, v) = (report.summary, verdict(report));
     let c = s.counts;
     let mut out = format!("{}\n", v.headline);
     let _ = writeln!(

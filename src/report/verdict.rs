@@ -43,7 +43,7 @@ pub struct Verdict {
 /// high when nothing folds, the median uncertainty is under half an edge, and under a tenth of the voxels are uncertain by
 /// more than an edge.
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
-    let s = &report.result.summary;
+    let s = report.summary;
     let edge = report.initial.grid().spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
         MotionModel::Identity => "Nothing moved beyond the noise".to_string(),
@@ -93,14 +93,13 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
 
 /// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they lie to one side.
 fn uncertain(report: &FieldReport<'_>, limit: f64) -> (f64, String) {
-    let sigma = report.result.uncertainty.as_slice();
     let grid = report.initial.grid();
     let picked = sample(grid.len(), report.mask);
     let world = |&o: &usize| {
         let [i, j, k] = grid.voxel(o);
         grid.world(i, j, k).0
     };
-    let weak: Vec<usize> = picked.iter().copied().filter(|&o| f64::from(sigma[o]) > limit).collect();
+    let weak: Vec<usize> = picked.iter().copied().filter(|&o| f64::from((report.uncertainty)(o)) > limit).collect();
     if weak.is_empty() {
         return (0.0, String::new());
     }
@@ -141,7 +140,7 @@ mod tests {
         let good = verdict(&case.report());
         assert_eq!(good.trust, Trust::High, "{:?}", good.reasons);
         assert!(good.headline.contains("13,020 matches, median residual 0.12 mm"), "{}", good.headline);
-        case.result.summary.uncertainty_median_mm = 2.5;
+        case.summary.uncertainty_median_mm = 2.5;
         let vague = verdict(&case.report());
         assert_eq!(vague.trust, Trust::Low);
         assert!(vague.reasons[0].contains("2.5 mm"));
@@ -150,8 +149,8 @@ mod tests {
     #[test]
     fn folds_and_few_matches_are_named() {
         let mut case = Case::new([20, 20, 20], [1.0; 3]);
-        case.result.summary.folds = 100;
-        case.result.summary.counts.kept = 31;
+        case.summary.folds = 100;
+        case.summary.counts.kept = 31;
         let v = verdict(&case.report());
         assert_eq!((v.trust, v.reasons.len()), (Trust::Low, 2));
     }
@@ -159,7 +158,7 @@ mod tests {
     #[test]
     fn the_uncertain_side_is_named() {
         let mut case = Case::new([20, 20, 20], [1.0; 3]);
-        case.result.uncertainty.as_mut_slice()[20 * 20 * 16..].fill(3.0);
+        case.uncertainty = Box::new(|o| if o < 20 * 20 * 16 { 0.2 } else { 3.0 });
         let v = verdict(&case.report());
         assert_eq!(v.trust, Trust::Moderate);
         assert!(

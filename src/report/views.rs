@@ -3,13 +3,13 @@
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::drawing;
-use crate::report::field::FieldReport;
+use crate::report::field::{FieldReport, Values};
 use crate::report::panels::{Panel, centre_of_motion, gray_range, length};
 use crate::report::picture::Picture;
 use crate::report::scale::{Scale, short};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
-use crate::types::{Volume, WorldPoint};
+use crate::types::WorldPoint;
 
 /// Everything that is cut from the volumes, and the scales that go with it.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,44 +40,40 @@ impl Views {
     /// # Errors
     /// [`ReportError`] when a picture cannot be encoded.
     pub fn of(report: &FieldReport<'_>) -> Result<Self, ReportError> {
-        let FieldReport { initial, deformed, mask, result, .. } = *report;
+        let FieldReport { initial, deformed, warped, displacement, jacobian, uncertainty, mask, .. } = *report;
         let grid = initial.grid();
-        let centre = centre_of_motion(&result.displacement, mask);
+        let centre = centre_of_motion(displacement, mask);
         let sections = Section::through(grid, centre);
         let inside = sample(grid.len(), mask);
         let spread = |q: f64, f: &dyn Fn(usize) -> f32| quantile(inside.iter().map(|&o| f(o).into()), q);
         let range = gray_range(initial);
         let base = (initial, range);
-        let (before, after) = (matched(initial, deformed, &inside), matched(initial, &result.warped, &inside));
-        let values = initial.as_slice();
-        let gap = |v: &[f32], gain: f32, o: usize| (values[o] - v[o] * gain).abs();
+        let (values, warped) = (initial.as_slice(), warped.as_slice());
+        let warped: Values<'_> = &|o| warped[o];
+        let (before, after) = (matched(values, deformed, &inside), matched(values, warped, &inside));
+        let gap = |v: Values<'_>, gain: f32, o: usize| (values[o] - v(o) * gain).abs();
 
-        let worst = spread(0.99, &|o| gap(deformed.as_slice(), before, o));
-        let difference = |title: &str, v: &Volume, gain: f32| -> Result<Panel, ReportError> {
-            let v = v.as_slice();
+        let worst = spread(0.99, &|o| gap(deformed, before, o));
+        let difference = |title: &str, v: Values<'_>, gain: f32| -> Result<Panel, ReportError> {
             let scale = Scale { low: 0.0, high: worst.max(1e-6), unit: "", map: ColorMap::Magma };
             let mean = inside.iter().map(|&o| f64::from(gap(v, gain, o))).filter(|g| g.is_finite()).sum::<f64>();
             let mean = mean / inside.len().max(1) as f64 / (range[1] - range[0]) * 100.0;
             let panel = Panel::coloured(title, &sections, base, None, scale, |o| gap(v, gain, o))?;
             Ok(panel.with_note(format!("Mean {mean:.1} % of the gray range, in the same colours before and after.")))
         };
-        let gray = |title: &str, v: &Volume, gain: f32, note: &str| {
+        let gray = |title: &str, v: Values<'_>, gain: f32, note: &str| {
             let range = range.map(|r| r / f64::from(gain));
             Ok(Panel::gray(title, &sections, v, range)?.with_note(note))
         };
 
-        let motion = |o| length(&result.displacement, o);
+        let motion = |o| length(displacement, o);
         let lengths = Scale::from_zero(spread(0.998, &motion), "mm", ColorMap::Viridis);
-        let jacobian = result.jacobian.as_slice();
-        let jacobian = |o: usize| jacobian[o];
         let change = Scale::about(1.0, spread(0.99, &|o| (jacobian(o) - 1.0).abs()).clamp(0.05, 1.0), "");
-        let sigma = result.uncertainty.as_slice();
-        let sigma = |o: usize| sigma[o];
-        let vague = Scale::from_zero(spread(0.98, &sigma), "mm", ColorMap::Magma);
+        let vague = Scale::from_zero(spread(0.98, uncertainty), "mm", ColorMap::Magma);
 
         let error = report.truth.map(|(truth, _)| {
             let gap = |o: usize| {
-                let (u, t) = (result.displacement.at(o), truth.at(o));
+                let (u, t) = (displacement.at(o), truth.at(o));
                 (0..3).map(|c| (u[c] - t[c]).powi(2)).sum::<f32>().sqrt()
             };
             let scale = Scale::from_zero(spread(0.99, &gap), "mm", ColorMap::Magma);
@@ -90,30 +86,30 @@ impl Views {
         let each = |draw: &dyn Fn(&Section, &Picture) -> String| {
             sections.iter().zip(&backgrounds).map(|(s, b)| draw(s, b)).collect::<Vec<_>>()
         };
-        let arrows = each(&|s, b| drawing::arrows(s, b, &result.displacement, mask, factor, &lengths));
+        let arrows = each(&|s, b| drawing::arrows(s, b, displacement, mask, factor, &lengths));
         let slab = sections.iter().map(Section::thickness_mm).fold(1.0, f64::max);
-        let precision = quantile(result.matches.kept().map(|m| m.sigma()), 0.95);
+        let precision = quantile(report.matches.kept().map(|m| m.sigma()), 0.95);
         let precision = Scale::from_zero(precision, "mm", ColorMap::Viridis);
-        let dots = each(&|s, b| drawing::matches(s, b, &result.matches.matches, slab, &precision));
+        let dots = each(&|s, b| drawing::matches(s, b, &report.matches.matches, slab, &precision));
 
         Ok(Self {
             centre,
             volumes: vec![
-                gray("Initial", initial, 1.0, "")?,
+                gray("Initial", &|o| values[o], 1.0, "")?,
                 gray("Deformed", deformed, before, "As it came, on the initial grid.")?,
-                gray("Deformed, warped back", &result.warped, after, "Should look like the initial one.")?,
+                gray("Deformed, warped back", warped, after, "Should look like the initial one.")?,
             ],
             differences: vec![
                 difference("|initial − deformed|, before", deformed, before)?,
-                difference("|initial − warped|, after", &result.warped, after)?,
+                difference("|initial − warped|, after", warped, after)?,
             ],
             magnitude: Panel::coloured("Length of the displacement", &sections, base, mask, lengths, motion)?,
             jacobian: Panel::coloured("Jacobian determinant", &sections, base, mask, change, jacobian)?
                 .with_note("Blue: the tissue shrinks. Red: it grows. White: its volume stays."),
-            uncertainty: Panel::coloured("Uncertainty of the displacement", &sections, base, mask, vague, sigma)?
+            uncertainty: Panel::coloured("Uncertainty of the displacement", &sections, base, mask, vague, uncertainty)?
                 .with_note(format!(
                     "One standard deviation. Half of the voxels lie under {} mm.",
-                    short(spread(0.5, &sigma))
+                    short(spread(0.5, uncertainty))
                 )),
             error: error.transpose()?,
             arrows: (arrows, factor),
@@ -123,9 +119,10 @@ impl Views {
 }
 
 /// The gain that brings `volume` closest to `reference` in the least squares over `offsets`; 1 where there is none.
-fn matched(reference: &Volume, volume: &Volume, offsets: &[usize]) -> f32 {
-    let (a, b) = (reference.as_slice(), volume.as_slice());
-    let pairs = || offsets.iter().map(|&o| (f64::from(a[o]), f64::from(b[o]))).filter(|(x, y)| (x * y).is_finite());
+fn matched(reference: &[f32], volume: Values<'_>, offsets: &[usize]) -> f32 {
+    let pairs = || {
+        offsets.iter().map(|&o| (f64::from(reference[o]), f64::from(volume(o)))).filter(|(x, y)| (x * y).is_finite())
+    };
     let gain = pairs().map(|(x, y)| x * y).sum::<f64>() / pairs().map(|(_, y)| y * y).sum::<f64>();
     if gain.is_finite() && gain > 1e-6 { gain as f32 } else { 1.0 }
 }
@@ -156,7 +153,7 @@ mod tests {
     #[test]
     fn a_common_gain_is_taken_out() {
         let mut case = Case::new([12, 10, 8], [1.0; 3]);
-        case.result.warped.as_mut_slice().iter_mut().for_each(|v| *v *= 7.0);
+        case.warped.as_mut_slice().iter_mut().for_each(|v| *v *= 7.0);
         assert!(Views::of(&case.report()).unwrap().differences[1].note.starts_with("Mean 0.0 %"));
     }
 }

@@ -34,7 +34,7 @@ pub use mesh::{TetMesh, TriMesh};
 pub use metrics::Metrics;
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
-pub use result::{Counts, FieldResult, FieldSummary, LevelReport, Mesh, MotionModel};
+pub use result::{Counts, FieldSummary, LevelReport, Mesh, MotionModel};
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use volume::{Mask, Volume};

@@ -1,6 +1,6 @@
 //! What the field pipeline gives back.
 
-use crate::types::{DenseField, SparseField, TetMesh, TriMesh, Volume};
+use crate::types::{TetMesh, TriMesh};
 use serde::Serialize;
 
 /// The mesh through the kept matches: tetrahedra, or triangles for one slice.
@@ -83,25 +83,4 @@ pub struct FieldSummary {
     pub seconds: Vec<(String, f64)>,
     /// What the user should know before trusting the result.
     pub warnings: Vec<String>,
-}
-
-/// The result of `palpate field`. All volumes lie on the initial volume's grid.
-#[derive(Debug, Clone, PartialEq)]
-pub struct FieldResult {
-    /// Displacement, initial to deformed (mm, RAS).
-    pub displacement: DenseField,
-    /// The deformed volume resampled at x + u(x): looks like the initial one.
-    pub warped: Volume,
-    /// Jacobian determinant of x + u(x) (1).
-    pub jacobian: Volume,
-    /// One standard deviation of the displacement (mm).
-    pub uncertainty: Volume,
-    /// All matches with covariance.
-    pub matches: SparseField,
-    /// The mesh through the kept matches (initial positions).
-    pub mesh: Mesh,
-    /// Displacement at the mesh's nodes (mm, RAS).
-    pub node_displacement: Vec<[f64; 3]>,
-    /// The rest.
-    pub summary: FieldSummary,
 }

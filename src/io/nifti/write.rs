@@ -4,7 +4,7 @@ use super::affine::quaternion;
 use super::flaw::Flaw;
 use crate::error::IoError;
 use crate::io::atomic::write_atomic;
-use crate::io::gzip::{Chunk, write_member};
+use crate::io::gzip::{Chunk, Member};
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
@@ -13,6 +13,8 @@ use std::path::Path;
 
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
 const CHUNK: usize = 1 << 18;
+/// Chunks that are held packed at a time.
+const BATCH: usize = 32;
 /// Bits of a float32's mantissa that a volume keeps (of 23).
 const MANTISSA_BITS: u32 = 15;
 /// Displacements are multiples of 1 / this (mm): 2^-12 mm.
@@ -131,9 +133,20 @@ fn write<T: Copy + Sync, const N: usize>(
             chunks.iter().try_for_each(|chunk| w.write_all(&bytes(chunk)))
         });
     }
-    let mut packed = vec![Chunk::new(&header)];
-    packed.par_extend(chunks.par_iter().map(|chunk| Chunk::new(&bytes(chunk))));
-    write_atomic(path, |w| write_member(w, &packed))
+    write_atomic(path, |w| {
+        let mut member = Member::start(w)?;
+        let mut ready = vec![Chunk::new(&header)];
+        for batch in chunks.chunks(BATCH) {
+            let (written, packed) = rayon::join(
+                || ready.iter().try_for_each(|chunk| member.add(chunk)),
+                || batch.par_iter().map(|chunk| Chunk::new(&bytes(chunk))).collect(),
+            );
+            written?;
+            ready = packed;
+        }
+        ready.iter().try_for_each(|chunk| member.add(chunk))?;
+        member.finish()
+    })
 }
 
 /// A NIfTI-1 header and four zero bytes for "no extensions" (nifti1.h; offsets in bytes).
