@@ -4,7 +4,7 @@
 #[path = "fixtures/truth.rs"]
 mod truth;
 
-use palpate::numerics::bending::{Smoothness, apply_blocks, solve, solve_blocks};
+use palpate::numerics::bending::{Data, Smoothness, solve};
 use palpate::numerics::bspline::{Lattice, SmoothSampler, weights};
 use palpate::numerics::neighbours::Neighbours;
 use palpate::numerics::random::Random;
@@ -31,6 +31,17 @@ fn largest_difference(a: &[f32], b: &[f32]) -> f64 {
 }
 
 // Spline lattices
+
+/// `D x` for a block-diagonal `D`.
+fn apply_blocks(blocks: &[[f32; 6]], x: &[f32], out: &mut [f32]) {
+    let n = blocks.len();
+    for (i, a) in blocks.iter().enumerate() {
+        let v = [x[i], x[n + i], x[2 * n + i]];
+        out[i] = a[0] * v[0] + a[3] * v[1] + a[4] * v[2];
+        out[n + i] = a[3] * v[0] + a[1] * v[1] + a[5] * v[2];
+        out[2 * n + i] = a[4] * v[0] + a[5] * v[1] + a[2] * v[2];
+    }
+}
 
 #[test]
 fn spline_weights_are_the_cubic_b_spline() {
@@ -355,7 +366,7 @@ fn solving_gives_the_dense_solution() {
     let run = || {
         let mut x = vec![0.0f32; 3 * n];
         let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
-        let report = solve(&smoothness, lambda, data, &blocks, &b, &mut x, 1e-7, 500);
+        let report = solve(&smoothness, lambda, &blocks, Data::Operator(&data), true, &b, &mut x, 1e-7, 500);
         (x, report)
     };
     let (x, report) = run();
@@ -366,7 +377,7 @@ fn solving_gives_the_dense_solution() {
     assert_eq!(with_threads(1, run), with_threads(3, run));
 
     let mut x = vec![0.0f32; 3 * n];
-    let report = solve_blocks(&smoothness, lambda, &blocks, &b, &mut x, 1e-7, 2000);
+    let report = solve(&smoothness, lambda, &blocks, Data::Blocks, false, &b, &mut x, 1e-7, 2000);
     assert!(report.residual <= 1e-7, "{report:?}");
     for (i, (x, e)) in f64s(&x).zip(&exact).enumerate() {
         assert!((x - e).abs() < 1e-5 * top, "blocks alone, {i}: {x} is not {e}");
@@ -388,9 +399,9 @@ fn coarser_lattices_carry_sparse_data_in_few_iterations() {
     let solved = |limit: usize, multilevel: bool| {
         let mut x = vec![0.0f32; 3 * n];
         if multilevel {
-            solve(&smoothness, 1000.0, data, &blocks, &b, &mut x, 1e-9, limit);
+            solve(&smoothness, 1000.0, &blocks, Data::Operator(&data), true, &b, &mut x, 1e-9, limit);
         } else {
-            solve_blocks(&smoothness, 1000.0, &blocks, &b, &mut x, 1e-9, limit);
+            solve(&smoothness, 1000.0, &blocks, Data::Blocks, false, &b, &mut x, 1e-9, limit);
         }
         x
     };
@@ -429,7 +440,7 @@ fn a_solve_that_starts_at_the_solution_stays() {
     let blocks = random_blocks(16, 2);
     let mut x = vec![0.0f32; 48];
     let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
-    let report = solve(&smoothness, 1.0, data, &blocks, &[0.0; 48], &mut x, 1e-6, 50);
+    let report = solve(&smoothness, 1.0, &blocks, Data::Operator(&data), true, &[0.0; 48], &mut x, 1e-6, 50);
     assert_eq!((report.iterations, report.residual), (0, 0.0));
     assert!(x.iter().all(|v| *v == 0.0));
 }

@@ -2,11 +2,10 @@
 
 use super::console::Console;
 use super::inputs::{check_distinct, name, read_mask, read_volume, same_file, warn_all};
-use super::outputs::{FIELD_FILES, Measured, write_field};
+use super::outputs::{FIELD_FILES, Measured, Target, write_field};
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::error::UnknownName;
-use palpate::io::OutputFolder;
 use palpate::pipeline;
 use palpate::types::params::Preset;
 use palpate::types::{FieldParams, FieldSummary, names};
@@ -19,12 +18,8 @@ pub struct Options {
     initial: PathBuf,
     /// Volume after it, on any grid
     deformed: PathBuf,
-    /// Folder for the results
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
-    /// Write into a folder that is not empty
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    target: Target,
     /// Where to measure: a mask on the initial volume's grid, 0 outside
     #[arg(long, value_name = "M")]
     mask: Option<PathBuf>,
@@ -66,10 +61,10 @@ fn preset(name: &str) -> Result<Preset, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, output, force, mask, tuning } = options;
+    let Options { initial, deformed, target, mask, tuning } = options;
     let params = tuning.params()?;
     let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).map(PathBuf::as_path).collect();
-    check_distinct(&given, &FIELD_FILES.map(|f| output.join(f)))?;
+    check_distinct(&given, &target.files(&FIELD_FILES))?;
 
     let started = Instant::now();
     let mut warnings = Vec::new();
@@ -83,7 +78,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (fixed, moving) = (fixed?, moving?);
     warnings.extend(first.into_iter().chain(second));
     let inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
-    let mut folder = OutputFolder::create(output, *force)?;
+    let mut folder = target.create()?;
     let read = started.elapsed().as_secs_f64();
 
     let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
@@ -107,7 +102,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     drop(progress);
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
-    console.say(&format!("{summary}  results      {}", output.join("report.html").display()))
+    console.say(&format!("{summary}{}", target.look()))
 }
 
 /// Levels, reasons and stages, for -v.

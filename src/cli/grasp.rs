@@ -3,9 +3,10 @@
 use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
+use super::outputs::Target;
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use palpate::io::{self, OutputFolder, SceneFile, SceneOverrides};
+use palpate::io::{self, SceneFile, SceneOverrides};
 use palpate::pipeline;
 use palpate::report::{GraspReport, grasp};
 use palpate::types::FingertipModel;
@@ -17,12 +18,8 @@ use std::time::Instant;
 pub struct Options {
     /// Scene file (.toml); docs/grasp.md shows one
     scene: PathBuf,
-    /// Folder for the results
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
-    /// Write into a folder that is not empty
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    target: Target,
     #[command(flatten)]
     choices: Choices,
 }
@@ -53,17 +50,17 @@ impl Choices {
 }
 
 /// No result may replace the scene or its fingertip.
-pub fn check_inputs(path: &Path, file: &SceneFile, output: &Path, names: &[&str]) -> Result<()> {
+pub fn check_inputs(path: &Path, file: &SceneFile, target: &Target, names: &[&str]) -> Result<()> {
     let inputs: Vec<&Path> = std::iter::once(path).chain(file.fingertip_file.as_deref()).collect();
-    check_distinct(&inputs, &names.iter().map(|f| output.join(f)).collect::<Vec<_>>())
+    check_distinct(&inputs, &target.files(names))
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { scene: path, output, force, choices } = options;
+    let Options { scene: path, target, choices } = options;
     let file = choices.read(path)?;
     let names = ["trajectory.csv", "motions.csv", "sweep.csv", "summary.json", "report.html"];
-    check_inputs(path, &file, output, &names)?;
-    let mut folder = OutputFolder::create(output, *force)?;
+    check_inputs(path, &file, target, &names)?;
+    let mut folder = target.create()?;
 
     let progress = console.progress();
     let name = name(path);
@@ -105,5 +102,5 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     drop(progress);
     seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.3} s")));
     warn_all(console, &warnings);
-    console.say(&format!("{}  results      {}", grasp::text(&report), output.join("report.html").display()))
+    console.say(&format!("{}{}", grasp::text(&report), target.look()))
 }

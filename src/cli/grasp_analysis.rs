@@ -3,9 +3,10 @@
 use super::console::Console;
 use super::grasp::{Choices, check_inputs};
 use super::inputs::{name, warn_all};
+use super::outputs::Target;
 use anyhow::{Context, Result};
 use clap::Args;
-use palpate::io::{self, OutputFolder};
+use palpate::io;
 use palpate::pipeline;
 use palpate::report::grasp_analysis::{self, AnalysisReport};
 use palpate::types::FingertipModel;
@@ -15,22 +16,18 @@ use std::path::PathBuf;
 pub struct Options {
     /// Scene file (.toml); its motions are the postures that are looked at
     scene: PathBuf,
-    /// Folder for the results
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
-    /// Write into a folder that is not empty
-    #[arg(long)]
-    force: bool,
+    #[command(flatten)]
+    target: Target,
 }
 
 const FILES: [&str; 7] =
     ["posture_force.csv", "energy.csv", "stability.csv", "pinch_map.csv", "push.csv", "summary.json", "report.html"];
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { scene: path, output, force } = options;
+    let Options { scene: path, target } = options;
     let file = Choices::default().read(path)?;
-    check_inputs(path, &file, output, &FILES)?;
-    let mut folder = OutputFolder::create(output, *force)?;
+    check_inputs(path, &file, target, &FILES)?;
+    let mut folder = target.create()?;
     let progress = console.progress();
     let name = name(path);
     let (analysis, seconds) =
@@ -59,5 +56,5 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.3} s")));
     warn_all(console, &warnings);
-    console.say(&format!("{}  results      {}", grasp_analysis::text(&report), output.join("report.html").display()))
+    console.say(&format!("{}{}", grasp_analysis::text(&report), target.look()))
 }

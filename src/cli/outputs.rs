@@ -1,6 +1,7 @@
 //! The files of a field run.
 
 use anyhow::Result;
+use clap::Args;
 use palpate::field::jacobian::{determinant_at, jacobian_determinant};
 use palpate::field::warp::warp_sampled;
 use palpate::io::{self, OutputFolder};
@@ -8,6 +9,7 @@ use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
 use palpate::report::{FieldReport, html, json};
 use palpate::types::{DenseField, FieldParams, Mask, Mesh, Metrics, Volume};
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// Names of what [`write_field`] writes.
@@ -21,6 +23,34 @@ pub const FIELD_FILES: [&str; 8] = [
     "summary.json",
     "report.html",
 ];
+
+/// Where results go.
+#[derive(Debug, Args)]
+pub struct Target {
+    /// Folder for the results
+    #[arg(short, long, value_name = "DIR")]
+    pub output: PathBuf,
+    /// Write into a folder that is not empty
+    #[arg(long)]
+    force: bool,
+}
+
+impl Target {
+    /// The files of these names in the folder.
+    pub fn files(&self, names: &[&str]) -> Vec<PathBuf> {
+        names.iter().map(|name| self.output.join(name)).collect()
+    }
+
+    /// Makes the folder ready.
+    pub fn create(&self) -> Result<OutputFolder> {
+        Ok(OutputFolder::create(&self.output, self.force)?)
+    }
+
+    /// The last line of a summary: what to look at.
+    pub fn look(&self) -> String {
+        format!("  results      {}", self.output.join("report.html").display())
+    }
+}
 
 /// A measured pair, as the outputs need it.
 pub struct Measured<'a> {

@@ -1,7 +1,7 @@
 //! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
 //! energy of a spline lattice holds the places together.
 
-use crate::numerics::bending::{Smoothness, SolveReport, apply_blocks, solve, solve_blocks};
+use crate::numerics::bending::{Data, Smoothness, SolveReport, solve};
 use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
@@ -29,7 +29,7 @@ pub fn step(
         }
     }
     let mut d = vec![0.0f32; 3 * n];
-    let report = solve_blocks(smoothness, lambda, blocks, &b, &mut d, tolerance, limit);
+    let report = solve(smoothness, lambda, blocks, Data::Blocks, false, &b, &mut d, tolerance, limit);
     let mut moved = 0.0f64;
     for (c, d) in coefficients.iter_mut().zip(&d) {
         *c += d;
@@ -73,12 +73,8 @@ impl Probe {
         multilevel: bool,
     ) -> f64 {
         let n = blocks.len();
-        if multilevel {
-            let data = |x: &[f32], out: &mut [f32]| apply_blocks(blocks, x, out);
-            solve(smoothness, lambda, data, blocks, &self.signs, &mut self.solution, 1e-2, limit);
-        } else {
-            solve_blocks(smoothness, lambda, blocks, &self.signs, &mut self.solution, 1e-2, limit);
-        }
+        let (signs, solution) = (&self.signs, &mut self.solution);
+        solve(smoothness, lambda, blocks, Data::Blocks, multilevel, signs, solution, 1e-2, limit);
         let mut lx = vec![0.0f32; n];
         let mut trace = 0.0;
         for (x, z) in self.solution.chunks_exact(n).zip(self.signs.chunks_exact(n)) {
@@ -156,7 +152,7 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         };
         // Early rounds only sort the evidence; the last two settle the field.
         let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-3, 60) };
-        solve(smoothness, lambda, operator, &blocks, &rhs, &mut c, tolerance, limit);
+        solve(smoothness, lambda, &blocks, Data::Operator(&operator), true, &rhs, &mut c, tolerance, limit);
         let gamma = probe.determined(smoothness, lambda, &blocks, if round < 2 { 30 } else { 15 }, true).max(1.0);
         let energy = smoothness.energy(&c).max(1e-9);
         // Half way on the logarithm: whole steps swing to and fro.
@@ -199,7 +195,7 @@ pub fn deviation(
             }
         }
         let mut x = vec![0.0f32; 3 * n];
-        solve_blocks(smoothness, lambda, blocks, &b, &mut x, 1e-2, 200);
+        solve(smoothness, lambda, blocks, Data::Blocks, false, &b, &mut x, 1e-2, 200);
         for (i, s) in squares.iter_mut().enumerate() {
             *s += (x[i] * x[i] + x[n + i] * x[n + i] + x[2 * n + i] * x[2 * n + i]) / (3 * draws) as f32;
         }

@@ -1,7 +1,7 @@
 //! The 3D corner measure (Harris & Stephens 1988; Foerstner & Guelch 1987; Rohr 1997 for volumes).
 
 use crate::numerics::filters::{HalfKernel, gaussian, gaussian_kernel, gradient_rows, separable};
-use crate::numerics::pyramid::reduced_shape;
+use crate::numerics::pyramid::{self, reduced_shape};
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 
@@ -30,7 +30,7 @@ const SLAB: usize = 24;
 /// (Foerstner & Guelch 1987), needs no constant `k`, and is low on edges and planes. For one slice the in-plane 2 x 2
 /// form is used.
 pub fn response(data: &[f32], shape: [usize; 3], spacing: [f64; 3], params: HarrisParams) -> Vec<f32> {
-    let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(shape, spacing);
     let smooth = gaussian(data, shape, spacing.map(|s| params.derivative_sigma * finest / s));
     block_response(&smooth, shape, spacing, params.integration_sigma, [1; 3])
 }
@@ -50,7 +50,7 @@ pub fn block_response(
     let [nx, ny, nz] = shape;
     let blocks = reduced_shape(shape, step);
     let plane = blocks[0] * blocks[1];
-    let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(shape, spacing);
     // A block is a window itself, of variance (step^2 - 1) / 12.
     let kernels: [HalfKernel; 3] = std::array::from_fn(|a| {
         let own = ((step[a] * step[a]) as f64 - 1.0) / 12.0;

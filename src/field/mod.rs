@@ -10,4 +10,6 @@ pub mod inverse;
 
 pub mod composition;
 
+pub mod strain;
+
 pub mod warp;

@@ -6,7 +6,8 @@
 use super::deflate::{FINISH, deflate};
 use flate2::Crc;
 use flate2::bufread::GzDecoder;
-use std::io::{self, Read, Write};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::ops::Range;
 
 /// No DEFLATE stream unpacks to more than this many times its size.
 pub(super) const LARGEST_RATIO: u64 = 1032;
@@ -36,17 +37,53 @@ impl Chunk {
 pub(super) struct Member<'a, W> {
     out: &'a mut W,
     crc: Crc,
+    /// Bytes written so far.
+    written: u64,
+}
+
+/// Where a run of chunks stands in a file, to be put into another member as it is.
+#[derive(Debug)]
+pub(super) struct Run {
+    pub(super) bytes: Range<u64>,
+    crc: Crc,
 }
 
 impl<'a, W: Write> Member<'a, W> {
     pub(super) fn start(out: &'a mut W) -> io::Result<Self> {
-        out.write_all(&[0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 4, 255])?; // no name, no time, fastest, unknown system
-        Ok(Self { out, crc: Crc::new() })
+        const START: [u8; 10] = [0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 4, 255]; // no name, no time, fastest, unknown system
+        out.write_all(&START)?;
+        Ok(Self { out, crc: Crc::new(), written: START.len() as u64 })
     }
 
     pub(super) fn add(&mut self, chunk: &Chunk) -> io::Result<()> {
         self.crc.combine(&chunk.crc);
+        self.written += chunk.packed.len() as u64;
         self.out.write_all(&chunk.packed)
+    }
+
+    /// An empty run of the chunks that are added next.
+    pub(super) fn run(&self) -> Run {
+        Run { bytes: self.written..self.written, crc: Crc::new() }
+    }
+
+    /// Adds a chunk that belongs to `run`.
+    pub(super) fn add_to(&mut self, run: &mut Run, chunk: &Chunk) -> io::Result<()> {
+        self.add(chunk)?;
+        run.crc.combine(&chunk.crc);
+        run.bytes.end = self.written;
+        Ok(())
+    }
+
+    /// Adds a run of chunks as it stands in the file `from`.
+    pub(super) fn copy(&mut self, from: &mut (impl Read + Seek), run: &Run) -> io::Result<()> {
+        from.seek(SeekFrom::Start(run.bytes.start))?;
+        let length = run.bytes.end - run.bytes.start;
+        if io::copy(&mut from.take(length), self.out)? != length {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        self.crc.combine(&run.crc);
+        self.written += length;
+        Ok(())
     }
 
     pub(super) fn finish(self) -> io::Result<()> {

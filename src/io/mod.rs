@@ -29,8 +29,8 @@ pub use grasp::{
     write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };
 pub use nifti::{
-    count_non_finite, read_field, read_labels, read_mask, read_volume, write_field, write_integers, write_labels,
-    write_steps, write_volume,
+    PackedField, Series, count_non_finite, read_field, read_labels, read_mask, read_volume, write_field,
+    write_field_series, write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};

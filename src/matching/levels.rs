@@ -82,6 +82,7 @@ impl<'a> Aligned<'a> {
         Pair {
             shape,
             centres: [mean(&fixed), mean(&moving)],
+            inside: mask.iter().filter(|&&m| m != 0).count(),
             spans: Spans::new(&mask, shape),
             noise: noise_sigma(&fixed, shape, |i| mask[i] != 0),
             spacing: std::array::from_fn(|a| self.spacing[a] * factor[a] as f64),
@@ -118,7 +119,7 @@ pub fn from_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
 /// twice as coarse, up to voxels of about `coarsest_mm`; a coarse axis (thick slices) is left alone until the others
 /// have caught up, and no axis is reduced below 12 voxels.
 pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm: f64) -> Vec<[usize; 3]> {
-    let smallest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let smallest = pyramid::finest(shape, spacing);
     let mut out: Vec<[usize; 3]> = Vec::new();
     let mut scale = finest.max(1) as f64;
     loop {

@@ -19,6 +19,8 @@ pub struct Pair<'a> {
     pub fixed_smooth: Vec<f32>,
     /// Where matches are wanted (not 0), on the initial lattice.
     pub mask: Vec<u8>,
+    /// Voxels of the mask.
+    pub inside: usize,
     /// The mask's extent in each row.
     pub spans: Spans,
     /// Standard deviation of the initial volume's noise inside the mask (intensity).

@@ -270,43 +270,41 @@ pub struct SolveReport {
     pub residual: f64,
 }
 
-/// Conjugate gradients with a multilevel preconditioner for `(D + lambda L) x = b`, where `D` is any positive semidefinite data operator.
+/// A positive semidefinite data operator `D`.
+pub enum Data<'a> {
+    /// The 3 x 3 blocks on its diagonal are all of it.
+    Blocks,
+    /// Writes `D x` into the second (planar, three components).
+    Operator(&'a dyn Fn(&[f32], &mut [f32])),
+}
+
+/// Conjugate gradients for `(D + lambda L) x = b` (Hestenes & Stiefel 1952).
 ///
-/// `data(x, out)` writes `D x` (planar, three components); `blocks` holds (an upper bound of) its 3 x 3 diagonal blocks
-/// for the preconditioner; `x` holds the start and receives the result. Stops at `tolerance` (relative residual) or
-/// after `limit` iterations (Hestenes & Stiefel 1952).
+/// `blocks` holds (an upper bound of) the 3 x 3 diagonal blocks of `D`; `x` holds the start and receives the result.
+/// Preconditioned by the blocks alone, smooth errors go slowly, which early stopping makes use of; with `multilevel`
+/// coarser lattices take them. Stops at `tolerance` (relative residual) or after `limit` iterations.
 pub fn solve(
     smoothness: &Smoothness,
     lambda: f32,
-    data: impl Fn(&[f32], &mut [f32]),
     blocks: &[[f32; 6]],
+    data: Data<'_>,
+    multilevel: bool,
     b: &[f32],
     x: &mut [f32],
     tolerance: f64,
     limit: usize,
 ) -> SolveReport {
-    let system = System::new(smoothness, lambda, blocks, true);
-    let n = blocks.len();
-    let mut values = vec![0.0f32; 3 * n];
-    system.iterate(b, x, tolerance, limit, |p, ap| {
-        data(p, &mut values);
-        system.apply(p, ap, Some(&values))
-    })
-}
-
-/// As [`solve`] for block-diagonal data: `D` is `blocks` itself. Preconditioned by the blocks alone: smooth errors go
-/// slowly, which early stopping makes use of.
-pub fn solve_blocks(
-    smoothness: &Smoothness,
-    lambda: f32,
-    blocks: &[[f32; 6]],
-    b: &[f32],
-    x: &mut [f32],
-    tolerance: f64,
-    limit: usize,
-) -> SolveReport {
-    let system = System::new(smoothness, lambda, blocks, false);
-    system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None))
+    let system = System::new(smoothness, lambda, blocks, multilevel);
+    match data {
+        Data::Blocks => system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None)),
+        Data::Operator(data) => {
+            let mut values = vec![0.0f32; b.len()];
+            system.iterate(b, x, tolerance, limit, |p, ap| {
+                data(p, &mut values);
+                system.apply(p, ap, Some(&values))
+            })
+        }
+    }
 }
 
 /// The matrix `D + lambda L` with its preconditioner, in slabs of node planes.
@@ -519,15 +517,4 @@ fn dot(a: &[f32], b: &[f32]) -> f64 {
 
 fn sum(parts: Vec<f64>) -> f64 {
     parts.iter().sum()
-}
-
-/// `D x` for block-diagonal data.
-pub fn apply_blocks(blocks: &[[f32; 6]], x: &[f32], out: &mut [f32]) {
-    let n = blocks.len();
-    for (i, a) in blocks.iter().enumerate() {
-        let v = [x[i], x[n + i], x[2 * n + i]];
-        out[i] = a[0] * v[0] + a[3] * v[1] + a[4] * v[2];
-        out[n + i] = a[3] * v[0] + a[1] * v[1] + a[5] * v[2];
-        out[2 * n + i] = a[4] * v[0] + a[5] * v[1] + a[2] * v[2];
-    }
 }

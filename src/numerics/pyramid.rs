@@ -3,6 +3,11 @@
 use rayon::prelude::*;
 use std::borrow::Cow;
 
+/// The smallest voxel edge (mm) of the axes with more than one voxel.
+pub fn finest(shape: [usize; 3], spacing: [f64; 3]) -> f64 {
+    (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min)
+}
+
 /// Voxels along each axis after averaging blocks of `factor` voxels (a last, partial block counts).
 pub fn reduced_shape(shape: [usize; 3], factor: [usize; 3]) -> [usize; 3] {
     std::array::from_fn(|a| shape[a].div_ceil(factor[a]))
@@ -13,9 +18,28 @@ pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [f
     if factor == [1, 1, 1] {
         return Cow::Borrowed(data);
     }
+    Cow::Owned(blocks(data, shape, factor, |v| v, |mean| mean))
+}
+
+/// Blocks of which at least half the voxels are set.
+pub fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Vec<u8> {
+    if factor == [1, 1, 1] {
+        return mask.to_vec();
+    }
+    blocks(mask, shape, factor, |m| f32::from(u8::from(m != 0)), |share| u8::from(share >= 0.5))
+}
+
+/// `result` of the mean `value` of each block of voxels.
+fn blocks<T: Copy + Sync, U: Clone + Default + Send>(
+    data: &[T],
+    shape: [usize; 3],
+    factor: [usize; 3],
+    value: impl Fn(T) -> f32 + Sync,
+    result: impl Fn(f32) -> U + Sync,
+) -> Vec<U> {
     let [nx, ny, _] = shape;
     let s = reduced_shape(shape, factor);
-    let mut out = vec![0.0f32; s.iter().product()];
+    let mut out = vec![U::default(); s.iter().product()];
     out.par_chunks_mut(s[0] * s[1]).enumerate().for_each(|(k, plane)| {
         let mut sums = vec![0.0f32; nx];
         for (j, row) in plane.chunks_exact_mut(s[0]).enumerate() {
@@ -25,45 +49,15 @@ pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [f
             for kk in ks {
                 for jj in js.clone() {
                     let from = nx * (jj + ny * kk);
-                    for (a, v) in sums.iter_mut().zip(&data[from..from + nx]) {
-                        *a += v;
+                    for (sum, v) in sums.iter_mut().zip(&data[from..from + nx]) {
+                        *sum += value(*v);
                     }
                 }
             }
             for (i, o) in row.iter_mut().enumerate() {
                 let r = span(i, factor[0], nx);
                 let n = (rows * r.len()) as f32;
-                *o = sums[r].iter().sum::<f32>() / n;
-            }
-        }
-    });
-    Cow::Owned(out)
-}
-
-/// Blocks of which at least half the voxels are set.
-pub fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Vec<u8> {
-    if factor == [1, 1, 1] {
-        return mask.to_vec();
-    }
-    let [nx, ny, _] = shape;
-    let s = reduced_shape(shape, factor);
-    let mut out = vec![0u8; s.iter().product()];
-    out.par_chunks_mut(s[0] * s[1]).enumerate().for_each(|(k, plane)| {
-        let mut sums = vec![0u16; nx];
-        for (j, row) in plane.chunks_exact_mut(s[0]).enumerate() {
-            sums.fill(0);
-            let (ks, js) = (span(k, factor[2], shape[2]), span(j, factor[1], shape[1]));
-            let rows = ks.len() * js.len();
-            for (kk, jj) in ks.flat_map(|kk| js.clone().map(move |jj| (kk, jj))) {
-                let from = nx * (jj + ny * kk);
-                for (a, v) in sums.iter_mut().zip(&mask[from..from + nx]) {
-                    *a += u16::from(*v != 0);
-                }
-            }
-            for (i, o) in row.iter_mut().enumerate() {
-                let r = span(i, factor[0], nx);
-                let all = rows * r.len();
-                *o = u8::from(2 * sums[r].iter().map(|&v| usize::from(v)).sum::<usize>() >= all);
+                *o = result(sums[r].iter().sum::<f32>() / n);
             }
         }
     });

@@ -74,3 +74,20 @@ pub fn cholesky_solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> 
     }
     Some(b)
 }
+
+/// Eigenvalues of a symmetric matrix, largest first, in closed form (Smith 1961, Communications of the ACM 4:168).
+#[inline]
+pub fn eigenvalues(m: &Symmetric3) -> [f64; 3] {
+    let mean = (m[0] + m[1] + m[2]) / 3.0;
+    let (a, b, c) = (m[0] - mean, m[1] - mean, m[2] - mean);
+    let off = m[3] * m[3] + m[4] * m[4] + m[5] * m[5];
+    let size = ((a * a + b * b + c * c + 2.0 * off) / 6.0).sqrt();
+    if size <= 1e-300 {
+        return [mean; 3];
+    }
+    let unit = [a, b, c, m[3], m[4], m[5]].map(|v| v / size);
+    let angle = (determinant(&unit) / 2.0).clamp(-1.0, 1.0).acos() / 3.0;
+    let high = mean + 2.0 * size * angle.cos();
+    let low = mean + 2.0 * size * (angle + 2.0 * std::f64::consts::FRAC_PI_3).cos();
+    [high, 3.0 * mean - high - low, low]
+}

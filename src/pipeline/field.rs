@@ -9,6 +9,7 @@ use crate::matching::levels::{Aligned, factors, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::bspline::Lattice;
+use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
@@ -29,6 +30,8 @@ pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 pub struct FieldResult {
     /// Displacement, initial to deformed (mm, RAS).
     pub displacement: DenseField,
+    /// The field as the search left it, a start for a volume taken soon after.
+    pub spline: Start,
     /// One standard deviation of the displacement (mm).
     pub uncertainty: ScalarSpline,
     /// All matches with covariance.
@@ -59,6 +62,29 @@ impl Clock {
     }
 }
 
+/// A field where another search may start.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Start {
+    field: SplineField,
+    /// Voxels that a voxel of its level stands for.
+    factor: [usize; 3],
+}
+
+impl Start {
+    /// As far again as from `before` to here: where steady motion would be next. None when the two do not lie on one
+    /// lattice.
+    pub fn extrapolated(&self, before: &Self) -> Option<Self> {
+        if self.factor != before.factor || self.field.lattice != before.field.lattice {
+            return None;
+        }
+        let mut next = self.clone();
+        for (n, b) in next.field.coefficients.iter_mut().zip(&before.field.coefficients) {
+            *n += *n - b;
+        }
+        Some(next)
+    }
+}
+
 /// Measures the displacement from `initial` to `deformed`.
 ///
 /// `mask` lies on the initial grid: features are taken, residuals weighed and statistics made inside it. The volumes
@@ -72,6 +98,22 @@ pub fn run(
     deformed: &Volume,
     mask: Option<&Mask>,
     params: &FieldParams,
+    progress: Progress<'_>,
+) -> Result<FieldResult, FieldError> {
+    run_from(initial, deformed, mask, params, &[], progress)
+}
+
+/// As [`run`], with fields from which the search may start beside the ones it finds itself; the agreement of the volumes
+/// decides.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_from(
+    initial: &Volume,
+    deformed: &Volume,
+    mask: Option<&Mask>,
+    params: &FieldParams,
+    starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
     params.check()?;
@@ -106,27 +148,30 @@ pub fn run(
             None => {
                 progress("matching", done(0.0));
                 let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
-                let points = pair.mask.iter().filter(|&&m| m != 0).count().div_ceil(share).clamp(40, COARSE_POINTS);
+                let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
                 let wide = MatchParams { points, thorough: true, reach_mm: search, patch: 2, strain: 0.3 };
                 let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
                 clock.book("matching");
                 let enough = report.counts.kept >= FEWEST;
                 reports.push(report);
-                let starts = [fitted.filter(|_| enough), Some(SplineField::still(lattice))];
-                let refined = starts.into_iter().flatten().map(|mut start| {
+                let given = starts
+                    .iter()
+                    .map(|s| level::carry(&s.field, lattice.clone(), |p| to_level(from_level(p, factor), s.factor)));
+                let own = [fitted.filter(|_| enough), Some(SplineField::still(lattice.clone()))];
+                let refined = own.into_iter().flatten().chain(given).map(|mut start| {
                     level::refine(&pair, &mut start, passes, params.seed, tick);
                     start
                 });
-                // Two starts, the matches' field and stillness: the one that ends at the better agreement goes on.
+                // The matches' field, stillness, what is given: the one that ends at the better agreement goes on.
                 refined.reduce(|a, b| level::better(&pair, a, b)).ok_or_else(|| too_few(0, search))?
             }
         };
         clock.book("residual");
         if last {
             progress("matching", done(0.9));
-            let inside = pair.mask.iter().filter(|&&m| m != 0).count();
-            let points = if params.points > 0 { params.points } else { (inside / params.voxels_per_point).max(200) };
-            let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
+            let points =
+                if params.points > 0 { params.points } else { (pair.inside / params.voxels_per_point).max(200) };
+            let finest = pyramid::finest(pair.shape, pair.spacing);
             let thorough = params.points > 0;
             let near = MatchParams { points, thorough, reach_mm: finest, patch: 3, strain: 0.05 };
             let (matches, _, report) = level::matches(&pair, Some(&field), field.lattice.clone(), near);
@@ -211,7 +256,8 @@ pub fn run(
         warnings: warnings(counts, folds, not_finite, length.1, search),
     };
     progress("done", 1.0);
-    Ok(FieldResult { displacement, uncertainty, matches: sparse, mesh, node_displacement, summary })
+    let spline = Start { field, factor };
+    Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 
 /// Voxels of the coarsest mask for each feature there, and the most features.
@@ -262,7 +308,7 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
 /// Chooses the model from the kept matches and the free field.
 fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: u64) -> Choice {
     let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
-    let finest = pair.spacing.iter().fold(f64::INFINITY, |m, &s| m.min(s));
+    let finest = pyramid::finest(pair.shape, pair.spacing);
     choose(&measured, level::excess(pair, field), level::determined(pair, field, seed), 0.02 * finest)
 }
 

@@ -23,7 +23,7 @@ use crate::types::{Counts, LevelReport};
 use rayon::prelude::*;
 
 /// A spline field on one level, with the state of its coupling.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SplineField {
     /// Nodes over the level's initial lattice.
     pub lattice: Lattice,
@@ -63,7 +63,7 @@ pub fn smoothness(lattice: &Lattice, spacing: [f64; 3]) -> Smoothness {
 
 /// A lattice whose nodes are `step` of the finest axis' voxels apart along every axis (in mm).
 pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
-    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(pair.shape, pair.spacing);
     Lattice::new(pair.shape, pair.spacing.map(|s| ((step as f64 * finest / s).round() as usize).max(1)))
 }
 
@@ -88,7 +88,7 @@ pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64
     let cell = cell_volume(&field.lattice, pair.spacing);
     let active = pair.spans.grown(1);
     let weight = independent(pair);
-    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(pair.shape, pair.spacing);
     let mut before = field.coefficients.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     for pass in 0..passes {
@@ -195,10 +195,10 @@ pub fn matches(
     params: MatchParams,
 ) -> (Vec<LevelMatch>, Option<SplineField>, LevelReport) {
     let spacing = pair.spacing;
-    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(pair.shape, spacing);
     let radius: [usize; 3] = spacing.map(|s| ((params.patch as f64 * finest / s).round() as usize).max(1));
     let noise = pair.noise;
-    let room = pair.mask.iter().filter(|&&m| m != 0).count() as f64 / params.points as f64;
+    let room = pair.inside as f64 / params.points as f64;
     // The deformed side: as it is, or warped by the known field, where both volumes' features share one frame.
     let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &pair.spans.grown(radius[0] + 3)));
     let smooth;
@@ -367,17 +367,13 @@ fn corners(
     quick: bool,
     wanted: usize,
 ) -> Vec<Corner> {
-    let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(shape, spacing);
     let widest = HarrisParams::default().integration_sigma;
     let sigma = (room.cbrt() / 8.0).clamp(0.7, widest);
     // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
     let least = 0.002 * (f64::from(noise) / finest).powi(2) as f32;
     let halved = |a: usize| quick && shape[a] >= 24 && spacing[a] < 1.5 * finest;
     let step: [usize; 3] = std::array::from_fn(|a| if halved(a) { 2 } else { 1 });
-    if step == [1; 3] {
-        let r = block_response(smooth, shape, spacing, sigma, step);
-        return spread(&r, shape, spacing, mask, wanted, least);
-    }
     let r = block_response(smooth, shape, spacing, sigma, step);
     let blocks = pyramid::reduced_shape(shape, step);
     let inside = mask.map(|m| pyramid::reduce_mask(m, shape, step));
@@ -406,10 +402,10 @@ fn fit(
     radius: &[usize; 3],
 ) -> SplineField {
     // Patches overlap: each match counts for the share of voxels that is its own.
-    let inside = pair.mask.iter().filter(|&&m| m != 0).count().max(1) as f64;
+    let inside = pair.inside.max(1) as f64;
     let patch: f64 = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| (2 * radius[a] + 1) as f64).product();
     let share = (inside / (refined.len().max(1) as f64 * patch)).min(1.0);
-    let finest = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| pair.spacing[a]).fold(f64::INFINITY, f64::min);
+    let finest = pyramid::finest(pair.shape, pair.spacing);
     let evidence: Vec<Evidence> = refined
         .iter()
         .filter_map(|(i, start, r)| {

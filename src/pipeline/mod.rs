@@ -10,3 +10,5 @@ pub mod level;
 pub mod check;
 
 pub mod grasp;
+
+pub mod track;

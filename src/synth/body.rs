@@ -111,6 +111,15 @@ impl Body {
         self.outline(self.own_frame(p)) > 0.5
     }
 
+    /// The region that shows at a world position, counted from 1; 0 outside the body.
+    pub fn region(&self, p: WorldPoint) -> u8 {
+        let q = self.own_frame(p);
+        if self.outline(q) <= 0.5 {
+            return 0;
+        }
+        self.regions.iter().rposition(|r| self.cover(&r.shape, q) > 0.5).map_or(0, |at| at as u8 + 1)
+    }
+
     fn outline(&self, q: [f64; 3]) -> f64 {
         self.regions.first().map_or(0.0, |r| self.cover(&r.shape, q))
     }

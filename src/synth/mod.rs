@@ -18,5 +18,8 @@ pub mod params;
 
 pub mod phantom;
 
+pub mod sequence;
+
 pub use params::{MotionKind, PhantomKind, PhantomParams};
 pub use phantom::{Description, MIN_JACOBIAN, Phantom, phantom, phantom_on};
+pub use sequence::{Sequence, SequenceKind, SequenceParams};

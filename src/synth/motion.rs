@@ -174,13 +174,7 @@ impl Law {
                 std::array::from_fn(|r| dot(m[r], d) + shift[r])
             }
             Law::Smooth { coarse, fine } => add(coarse.vector(p), fine.vector(p), 0.35),
-            Law::Press { contact, inward, radius, depth } => {
-                let d = add(p, *contact, -1.0);
-                let inside = dot(d, *inward);
-                let lateral = add(d, *inward, -inside);
-                let push = (-(dot(lateral, lateral) / (radius * radius) + (inside / depth).powi(2)) / 2.0).exp();
-                add(inward.map(|v| v * push), lateral, 0.25 * push / radius)
-            }
+            Law::Press { contact, inward, radius, depth } => press(p, *contact, *inward, *radius, *depth),
             Law::Plate { contact, curvature, travel, depth } => {
                 let d = add(p, *contact, -1.0);
                 let surface = 0.5 * (curvature[0] * d[0] * d[0] + curvature[1] * d[1] * d[1]);
@@ -209,11 +203,21 @@ fn slice_normal(grid: &Grid) -> Option<[f64; 3]> {
     Some(unit(cross(edge(axis + 1), edge(axis + 2))))
 }
 
-fn add(a: [f64; 3], b: [f64; 3], factor: f64) -> [f64; 3] {
+/// A push of 1 at `contact` along the unit vector `inward`: a Gaussian of `radius` across it and `depth` along it (mm),
+/// with a bulge around.
+pub(super) fn press(p: [f64; 3], contact: [f64; 3], inward: [f64; 3], radius: f64, depth: f64) -> [f64; 3] {
+    let d = add(p, contact, -1.0);
+    let inside = dot(d, inward);
+    let lateral = add(d, inward, -inside);
+    let push = (-(dot(lateral, lateral) / (radius * radius) + (inside / depth).powi(2)) / 2.0).exp();
+    add(inward.map(|v| v * push), lateral, 0.25 * push / radius)
+}
+
+pub(super) fn add(a: [f64; 3], b: [f64; 3], factor: f64) -> [f64; 3] {
     std::array::from_fn(|i| a[i] + factor * b[i])
 }
 
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 

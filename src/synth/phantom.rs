@@ -215,7 +215,7 @@ fn biased(clean: &Imaged, params: &PhantomParams) -> Volume {
 }
 
 /// Magnitude of the clean value plus complex Gaussian noise of deviation `sigma` a channel (Gudbjartsson, Patz 1995).
-fn rician(clean: &Volume, sigma: f64, seed: u64, stream: u64) -> Volume {
+pub(super) fn rician(clean: &Volume, sigma: f64, seed: u64, stream: u64) -> Volume {
     let base = Random::new(seed, stream).bits();
     Volume::from_voxels(*clean.grid(), |at, _| {
         let [real, imaginary] = Random::new(base, at as u64).normals();

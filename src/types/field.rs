@@ -2,7 +2,7 @@
 
 use crate::error::SpaceError;
 use crate::types::space::{Grid, WorldPoint};
-use ndarray::{Array4, ShapeBuilder};
+use ndarray::{ArrayView4, ShapeBuilder};
 use rayon::prelude::*;
 
 /// Displacements on the initial volume's grid, in world mm, RAS components, initial to deformed.
@@ -12,14 +12,13 @@ use rayon::prelude::*;
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenseField {
     grid: Grid,
-    data: Array4<f32>,
+    values: Vec<f32>,
 }
 
 impl DenseField {
     /// No motion.
     pub fn zeros(grid: Grid) -> Self {
-        let s = grid.shape();
-        Self { grid, data: Array4::zeros((s[0], s[1], s[2], 3).f()) }
+        Self { grid, values: vec![0.0; 3 * grid.len()] }
     }
 
     /// From the three components one after the other, each x fastest (mm, RAS).
@@ -28,10 +27,10 @@ impl DenseField {
     /// [`SpaceError::Length`] when the length is not three times the grid's.
     pub fn from_vec(grid: Grid, values: Vec<f32>) -> Result<Self, SpaceError> {
         let (expected, found) = (3 * grid.len(), values.len());
-        let s = grid.shape();
-        let data = Array4::from_shape_vec((s[0], s[1], s[2], 3).f(), values)
-            .map_err(|_| SpaceError::Length { expected, found })?;
-        Ok(Self { grid, data })
+        if expected != found {
+            return Err(SpaceError::Length { expected, found });
+        }
+        Ok(Self { grid, values })
     }
 
     /// The displacement (mm) that `f` gives for each voxel centre.
@@ -76,18 +75,20 @@ impl DenseField {
     }
 
     /// The (nx, ny, nz, 3) array.
-    pub fn array(&self) -> &Array4<f32> {
-        &self.data
+    pub fn array(&self) -> ArrayView4<'_, f32> {
+        let [nx, ny, nz] = self.grid.shape();
+        ArrayView4::from_shape((nx, ny, nz, 3).f(), &self.values)
+            .unwrap_or_else(|_| unreachable!("the length is the grid's"))
     }
 
     /// All three components, one after the other, x fastest.
     pub fn as_slice(&self) -> &[f32] {
-        self.data.as_slice_memory_order().unwrap_or_default()
+        &self.values
     }
 
     /// The same, to be changed in place.
     pub fn as_mut_slice(&mut self) -> &mut [f32] {
-        self.data.as_slice_memory_order_mut().unwrap_or_default()
+        &mut self.values
     }
 
     /// Component `c` (0 = right, 1 = front, 2 = up), x fastest.
@@ -105,6 +106,6 @@ impl DenseField {
 
     /// The three components, x fastest.
     pub fn into_vec(self) -> Vec<f32> {
-        self.data.into_raw_vec_and_offset().0
+        self.values
     }
 }

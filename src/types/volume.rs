@@ -2,14 +2,14 @@
 
 use crate::error::SpaceError;
 use crate::types::space::{Grid, WorldPoint};
-use ndarray::{Array3, ShapeBuilder};
+use ndarray::{Array3, ArrayView3, ShapeBuilder};
 use rayon::prelude::*;
 
 /// Values on a [`Grid`]; the array has shape (nx, ny, nz) and lies in memory with x fastest (NIfTI's order).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Volume<T = f32> {
     grid: Grid,
-    data: Array3<T>,
+    values: Vec<T>,
 }
 
 /// A mask (0 = outside) or a label map (one number a region).
@@ -22,10 +22,10 @@ impl<T: Clone> Volume<T> {
     /// [`SpaceError::Length`] when it is not.
     pub fn from_vec(grid: Grid, values: Vec<T>) -> Result<Self, SpaceError> {
         let (expected, found) = (grid.len(), values.len());
-        let s = grid.shape();
-        let data = Array3::from_shape_vec((s[0], s[1], s[2]).f(), values)
-            .map_err(|_| SpaceError::Length { expected, found })?;
-        Ok(Self { grid, data })
+        if expected != found {
+            return Err(SpaceError::Length { expected, found });
+        }
+        Ok(Self { grid, values })
     }
 
     /// From an (nx, ny, nz) array in any memory order (copied when not already x-fastest).
@@ -59,8 +59,7 @@ impl<T: Clone> Volume<T> {
 
     /// The same value everywhere.
     pub fn filled(grid: Grid, value: T) -> Self {
-        let s = grid.shape();
-        Self { grid, data: Array3::from_elem((s[0], s[1], s[2]).f(), value) }
+        Self { grid, values: vec![value; grid.len()] }
     }
 
     /// The lattice.
@@ -69,22 +68,24 @@ impl<T: Clone> Volume<T> {
     }
 
     /// The (nx, ny, nz) array.
-    pub fn array(&self) -> &Array3<T> {
-        &self.data
+    pub fn array(&self) -> ArrayView3<'_, T> {
+        let [nx, ny, nz] = self.grid.shape();
+        ArrayView3::from_shape((nx, ny, nz).f(), &self.values)
+            .unwrap_or_else(|_| unreachable!("the length is the grid's"))
     }
 
     /// All values, x fastest.
     pub fn as_slice(&self) -> &[T] {
-        self.data.as_slice_memory_order().unwrap_or_default()
+        &self.values
     }
 
     /// All values, x fastest, to be changed in place.
     pub fn as_mut_slice(&mut self) -> &mut [T] {
-        self.data.as_slice_memory_order_mut().unwrap_or_default()
+        &mut self.values
     }
 
     /// The values, x fastest.
     pub fn into_vec(self) -> Vec<T> {
-        self.data.into_raw_vec_and_offset().0
+        self.values
     }
 }

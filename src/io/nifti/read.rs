@@ -139,18 +139,18 @@ fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
 }
 
 /// What the header says about the voxels, checked.
-struct Plan {
-    grid: Grid,
+pub(super) struct Plan {
+    pub(super) grid: Grid,
     kind: Kind,
     big_endian: bool,
     scaling: (f64, f64),
     /// First byte and number of bytes.
-    start: u64,
-    bytes: u64,
+    pub(super) start: u64,
+    pub(super) bytes: u64,
 }
 
 impl Plan {
-    fn new(head: &[u8], layout: Layout) -> Result<Self, Flaw> {
+    pub(super) fn new(head: &[u8], layout: Layout) -> Result<Self, Flaw> {
         let header = Header::parse(head)?;
         let axes = header.axes()?;
         let kind = Kind::from_code(header.datatype)?;
@@ -169,7 +169,7 @@ impl Plan {
     }
 
     /// The end of the voxels, when a file that unpacks to at most `size` bytes can hold them.
-    fn end_within(&self, size: u64) -> Result<usize, Flaw> {
+    pub(super) fn end_within(&self, size: u64) -> Result<usize, Flaw> {
         let end = self.start.saturating_add(self.bytes);
         usize::try_from(end).ok().filter(|_| end <= size).ok_or_else(|| {
             let shape = self.grid.shape();
@@ -229,7 +229,7 @@ impl Kind {
     }
 }
 
-fn decode(plan: &Plan, bytes: &[u8]) -> Vec<f32> {
+pub(super) fn decode(plan: &Plan, bytes: &[u8]) -> Vec<f32> {
     macro_rules! decode_as {
         ($t:ty) => {
             if plan.big_endian {

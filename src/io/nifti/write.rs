@@ -4,12 +4,13 @@ use super::affine::quaternion;
 use super::flaw::Flaw;
 use crate::error::IoError;
 use crate::io::atomic::write_atomic;
-use crate::io::gzip::{Chunk, Member};
+use crate::io::gzip::{Chunk, Member, Run};
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
+use std::fs::File;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
 const CHUNK: usize = 1 << 18;
@@ -29,8 +30,8 @@ const STEPS_PER_MM: f32 = 4096.0;
 /// [`IoError`] when the name ends in neither `.nii` nor `.nii.gz`, an axis has more than 32,767 voxels or the file
 /// cannot be written.
 pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) -> Result<(), IoError> {
-    let form = Form { datatype: 16, bits: 32, vector: false, description };
-    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| shortened(v).to_le_bytes())
+    let form = Form { description, ..Form::FLOATS };
+    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| shortened(v).to_le_bytes()).map(drop)
 }
 
 /// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it packs well.
@@ -38,11 +39,12 @@ pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) 
 /// # Errors
 /// As [`write_volume`].
 pub fn write_steps(path: impl AsRef<Path>, volume: &Volume, description: &str, bits: i32) -> Result<(), IoError> {
-    let form = Form { datatype: 16, bits: 32, vector: false, description };
+    let form = Form { description, ..Form::FLOATS };
     let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| {
         ((v * up).round_ties_even() * down + 0.0).to_le_bytes()
     })
+    .map(drop)
 }
 
 /// Writes a volume as int16, each value rounded to the nearest whole number: half the size of [`write_volume`].
@@ -55,8 +57,9 @@ pub fn write_integers(path: impl AsRef<Path>, volume: &Volume, description: &str
         let what = format!("the value {v} does not fit in 16 bits");
         return Err(Flaw::new(what, "scale the intensities, or write float32").at(path.as_ref()));
     }
-    let form = Form { datatype: 4, bits: 16, vector: false, description };
+    let form = Form { datatype: 4, bits: 16, description, ..Form::FLOATS };
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| (v.round_ties_even() as i16).to_le_bytes())
+        .map(drop)
 }
 
 /// Writes a mask or label map as uint8.
@@ -64,8 +67,8 @@ pub fn write_integers(path: impl AsRef<Path>, volume: &Volume, description: &str
 /// # Errors
 /// As [`write_volume`].
 pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) -> Result<(), IoError> {
-    let form = Form { datatype: 2, bits: 8, vector: false, description };
-    write(path.as_ref(), labels.grid(), form, &[labels.as_slice()], |_, v: u8| [v])
+    let form = Form { datatype: 2, bits: 8, description, ..Form::FLOATS };
+    write(path.as_ref(), labels.grid(), form, &[labels.as_slice()], |_, v: u8| [v]).map(drop)
 }
 
 /// Writes a displacement field (mm) as ITK, ANTs and Slicer read it: (nx, ny, nz, 1, 3), intent 1007, float32, LPS.
@@ -75,13 +78,88 @@ pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) ->
 /// # Errors
 /// As [`write_volume`].
 pub fn write_field(path: impl AsRef<Path>, field: &DenseField) -> Result<(), IoError> {
-    let form = Form { datatype: 16, bits: 32, vector: true, description: "displacement, initial to deformed, LPS mm" };
+    write_series_field(path, field).map(drop)
+}
+
+/// As [`write_field`]; what is given back puts the field into a series (see [`write_field_series`]).
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_series_field(path: impl AsRef<Path>, field: &DenseField) -> Result<PackedField, IoError> {
+    let form = Form { description: DISPLACEMENT, ..Form::VECTORS };
     let components = [field.component(0), field.component(1), field.component(2)];
-    write(path.as_ref(), field.grid(), form, &components, |c, v| {
+    let runs = write(path.as_ref(), field.grid(), form, &components, |c, v| {
         let lps = if c < 2 { -v } else { v };
         // Adding 0 turns -0 into 0.
         ((lps * STEPS_PER_MM).round_ties_even() / STEPS_PER_MM + 0.0).to_le_bytes()
+    })?;
+    Ok(PackedField { path: path.as_ref().into(), runs })
+}
+
+/// What the header of a field says.
+const DISPLACEMENT: &str = "displacement, initial to deformed, LPS mm";
+
+/// A field as it stands packed in a file.
+#[derive(Debug)]
+pub struct PackedField {
+    path: PathBuf,
+    runs: Vec<Run>,
+}
+
+/// Joins fields on one grid into a series over time, (nx, ny, nz, nt, 3), intent 1007, LPS mm, without packing them
+/// again; a frame without a field is NaN. `step_s` is the time between frames (s; 0 when not known).
+///
+/// # Errors
+/// [`IoError`] when a frame's file cannot be read any more, or as [`write_volume`].
+pub fn write_field_series(
+    path: impl AsRef<Path>,
+    grid: &Grid,
+    frames: &[Option<PackedField>],
+    step_s: f64,
+) -> Result<(), IoError> {
+    let path = path.as_ref();
+    let form = Form { frames: frames.len(), step_s, description: DISPLACEMENT, ..Form::VECTORS };
+    let header = header(grid, &form).map_err(|flaw| flaw.at(path))?;
+    let missing = |voxels: usize| Chunk::new(&f32::NAN.to_le_bytes().repeat(voxels));
+    write_atomic(path, |w| {
+        let mut member = Member::start(w)?;
+        member.add(&Chunk::new(&header))?;
+        for component in 0..3 {
+            for frame in frames {
+                match frame.as_ref().and_then(|f| Some((&f.path, f.runs.get(component)?))) {
+                    Some((file, run)) => member.copy(&mut File::open(file)?, run)?,
+                    None => {
+                        for from in (0..grid.len()).step_by(CHUNK) {
+                            member.add(&missing(CHUNK.min(grid.len() - from)))?;
+                        }
+                    }
+                }
+            }
+        }
+        member.finish()
     })
+}
+
+/// Writes a symmetric tensor a voxel as NIfTI's intent 1005 has it: (nx, ny, nz, 1, 6), the lower triangle row by row,
+/// with axes in LPS. `tensors` are xx, yy, zz, xy, xz, yz in RAS, x fastest; rounded to multiples of 2^-18.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_tensors(
+    path: impl AsRef<Path>,
+    grid: &Grid,
+    tensors: &[[f32; 6]],
+    description: &str,
+) -> Result<(), IoError> {
+    /// Component of ours, and its sign in LPS, for each one on disk.
+    const ON_DISK: [(usize, f32); 6] = [(0, 1.0), (3, 1.0), (1, 1.0), (4, -1.0), (5, -1.0), (2, 1.0)];
+    const STEPS: f32 = 262_144.0;
+    let form = Form { components: 6, intent: 1005, description, ..Form::FLOATS };
+    write(path.as_ref(), grid, form, &[tensors; 6], |c, t: [f32; 6]| {
+        let (component, sign) = ON_DISK[c];
+        ((sign * t[component] * STEPS).round_ties_even() / STEPS + 0.0).to_le_bytes()
+    })
+    .map(drop)
 }
 
 /// The nearest number with [`MANTISSA_BITS`] bits, ties to even; NaN and infinity stay.
@@ -95,22 +173,35 @@ fn shortened(v: f32) -> f32 {
     if near.is_finite() { near } else { v }
 }
 
+#[derive(Clone, Copy)]
 struct Form<'a> {
     datatype: i16,
     bits: i16,
-    /// Three components on the fifth axis.
-    vector: bool,
+    /// On the fifth axis; a scalar volume has one and no such axis.
+    components: i16,
+    intent: i16,
+    /// On the fourth axis.
+    frames: usize,
+    /// From frame to frame (s), 0 when not known.
+    step_s: f64,
     description: &'a str,
 }
 
-/// Header, then the parts one after the other; `stored` turns a value of a part (by its number) into bytes.
+impl Form<'_> {
+    const FLOATS: Self =
+        Self { datatype: 16, bits: 32, components: 1, intent: 0, frames: 1, step_s: 0.0, description: "" };
+    const VECTORS: Self = Self { components: 3, intent: 1007, ..Self::FLOATS };
+}
+
+/// Header, then the parts one after the other; `stored` turns a value of a part (by its number) into bytes. Gives the
+/// place of each part in a packed file.
 fn write<T: Copy + Sync, const N: usize>(
     path: &Path,
     grid: &Grid,
     form: Form<'_>,
     parts: &[&[T]],
     stored: impl Fn(usize, T) -> [u8; N] + Sync,
-) -> Result<(), IoError> {
+) -> Result<Vec<Run>, IoError> {
     let name = path.to_string_lossy().to_lowercase();
     let pack = name.ends_with(".nii.gz");
     if !pack && !name.ends_with(".nii") {
@@ -131,29 +222,43 @@ fn write<T: Copy + Sync, const N: usize>(
         return write_atomic(path, |w| {
             w.write_all(&header)?;
             chunks.iter().try_for_each(|chunk| w.write_all(&bytes(chunk)))
-        });
+        })
+        .map(|()| Vec::new());
     }
+    let mut runs: Vec<Run> = Vec::new();
     write_atomic(path, |w| {
         let mut member = Member::start(w)?;
-        let mut ready = vec![Chunk::new(&header)];
+        member.add(&Chunk::new(&header))?;
+        let mut add = |ready: &[(usize, Chunk)]| {
+            ready.iter().try_for_each(|(part, chunk)| {
+                if runs.len() == *part {
+                    runs.push(member.run());
+                }
+                member.add_to(&mut runs[*part], chunk)
+            })
+        };
+        let mut ready = Vec::new();
         for batch in chunks.chunks(BATCH) {
             let (written, packed) = rayon::join(
-                || ready.iter().try_for_each(|chunk| member.add(chunk)),
-                || batch.par_iter().map(|chunk| Chunk::new(&bytes(chunk))).collect(),
+                || add(&ready),
+                || batch.par_iter().map(|chunk| (chunk.0, Chunk::new(&bytes(chunk)))).collect(),
             );
             written?;
             ready = packed;
         }
-        ready.iter().try_for_each(|chunk| member.add(chunk))?;
+        add(&ready)?;
         member.finish()
-    })
+    })?;
+    Ok(runs)
 }
 
 /// A NIfTI-1 header and four zero bytes for "no extensions" (nifti1.h; offsets in bytes).
 fn header(grid: &Grid, form: &Form<'_>) -> Result<[u8; 352], Flaw> {
     let mut h = [0; 352];
     let shape = grid.shape();
-    let mut dim = [if form.vector { 5i16 } else { 3 }, 1, 1, 1, 1, if form.vector { 3 } else { 1 }, 1, 1];
+    let mut dim = [if form.components > 1 { 5i16 } else { 3 }, 1, 1, 1, 1, form.components, 1, 1];
+    dim[4] = i16::try_from(form.frames)
+        .map_err(|_| Flaw::new(format!("{} frames: NIfTI-1 ends at 32767", form.frames), "cut the series"))?;
     for a in 0..3 {
         dim[a + 1] = i16::try_from(shape[a]).map_err(|_| {
             Flaw::new(format!("{shape:?} voxels: NIfTI-1 ends at 32767 an axis"), "crop or resample it")
@@ -161,14 +266,16 @@ fn header(grid: &Grid, form: &Form<'_>) -> Result<[u8; 352], Flaw> {
     }
     put(&mut h, 0, &348i32.to_le_bytes());
     put(&mut h, 40, &dim.map(i16::to_le_bytes).concat());
-    put(&mut h, 68, &if form.vector { 1007i16 } else { 0 }.to_le_bytes());
+    put(&mut h, 68, &form.intent.to_le_bytes());
     put(&mut h, 70, &form.datatype.to_le_bytes());
     put(&mut h, 72, &form.bits.to_le_bytes());
     let (rows, size, orientation) = (grid.affine().rows(), grid.spacing(), quaternion(grid.affine()));
     let (qfac, [b, c, d]) = orientation.unwrap_or((1.0, [0.0; 3]));
-    put_floats(&mut h, 76, &[qfac, size[0], size[1], size[2], 1.0, 1.0, 1.0, 1.0]);
+    let step = if form.step_s > 0.0 { form.step_s } else { 1.0 };
+    put_floats(&mut h, 76, &[qfac, size[0], size[1], size[2], step, 1.0, 1.0, 1.0]);
     put_floats(&mut h, 108, &[352.0, 1.0, 0.0]); // vox_offset, scl_slope, scl_inter
-    put(&mut h, 123, &[2]); // millimetres
+    let seconds = if form.step_s > 0.0 { 8 } else { 0 };
+    put(&mut h, 123, &[2 + seconds]); // millimetres
     let mut end = form.description.len().min(79);
     while !form.description.is_char_boundary(end) {
         end -= 1;

@@ -1,0 +1,139 @@
+//! A series of volumes in one file, read one at a time.
+
+use super::flaw::Flaw;
+use super::header::{Header, LONGEST};
+use super::read::{Plan, decode};
+use crate::error::IoError;
+use crate::io::{gzip, os};
+use crate::types::{Grid, Volume};
+use flate2::bufread::MultiGzDecoder;
+use std::fs::File;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// A 4-D NIfTI file, (nx, ny, nz, nt); a single volume is a series of one.
+pub struct Series {
+    path: PathBuf,
+    plan: Plan,
+    frames: usize,
+    step_s: Option<f64>,
+    source: Source,
+}
+
+/// Where the voxels come from.
+enum Source {
+    Plain(File),
+    /// With the number of bytes that were unpacked so far.
+    Packed(Box<MultiGzDecoder<BufReader<File>>>, u64),
+}
+
+impl Source {
+    fn packed(path: &Path) -> io::Result<Self> {
+        Ok(Self::Packed(Box::new(MultiGzDecoder::new(BufReader::with_capacity(1 << 18, File::open(path)?))), 0))
+    }
+}
+
+impl Series {
+    /// Opens a file and checks its header against its size.
+    ///
+    /// # Errors
+    /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of these.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self, IoError> {
+        let path = path.as_ref();
+        let mut file = File::open(path).map_err(os(path, "read"))?;
+        let metadata = file.metadata().map_err(os(path, "read"))?;
+        if !metadata.is_file() {
+            return Err(Flaw::new("is not a regular file", "give a .nii or .nii.gz").at(path));
+        }
+        let mut head = Vec::new();
+        file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
+        let (source, most) = if gzip::is_gzip(&head) {
+            head.clear();
+            let mut start = Source::packed(path).map_err(os(path, "read"))?;
+            if let Source::Packed(unpacked, _) = &mut start {
+                // A damaged stream is reported when it is read; what came before may already say what the file is.
+                let _ = unpacked.take(LONGEST as u64).read_to_end(&mut head);
+            }
+            let fresh = Source::packed(path).map_err(os(path, "read"))?;
+            (fresh, metadata.len().saturating_mul(gzip::LARGEST_RATIO))
+        } else {
+            (Source::Plain(file), metadata.len())
+        };
+        let header = Header::parse(&head).map_err(|flaw| flaw.at(path))?;
+        let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
+        plan.end_within(most).map_err(|flaw| flaw.at(path))?;
+        let frames = header.axes().map_err(|flaw| flaw.at(path))?[3];
+        let unit = match header.xyzt_units >> 3 & 7 {
+            1 => 1.0,
+            2 => 1e-3,
+            3 => 1e-6,
+            _ => f64::NAN,
+        };
+        let step_s = Some(header.pixdim[4] * unit).filter(|s| s.is_finite() && *s > 0.0);
+        Ok(Self { path: path.into(), plan, frames, step_s, source })
+    }
+
+    /// How many volumes there are.
+    pub fn frames(&self) -> usize {
+        self.frames
+    }
+
+    /// Time from one to the next (s), where the file says.
+    pub fn step_s(&self) -> Option<f64> {
+        self.step_s
+    }
+
+    /// The grid of each.
+    pub fn grid(&self) -> &Grid {
+        &self.plan.grid
+    }
+
+    /// Volume number `at`, counted from 0. Cheap in rising order; going back unpacks a packed file from its start.
+    ///
+    /// # Errors
+    /// [`IoError`] when there are not so many, or the file cannot be read, is damaged or cut short.
+    pub fn read(&mut self, at: usize) -> Result<Volume, IoError> {
+        let path = &self.path;
+        if at >= self.frames {
+            let what = format!("has {} frames, so there is no frame {at} (counted from 0)", self.frames);
+            return Err(Flaw::new(what, "ask for one that is there").at(path));
+        }
+        let length = self.plan.bytes / self.frames as u64;
+        let from = self.plan.start + at as u64 * length;
+        let mut data = Vec::new();
+        let damaged = |e: io::Error| {
+            Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again").at(path)
+        };
+        if matches!(self.source, Source::Packed(_, done) if done > from) {
+            self.source = Source::packed(path).map_err(os(path, "read"))?;
+        }
+        match &mut self.source {
+            Source::Plain(file) => {
+                file.seek(SeekFrom::Start(from)).map_err(os(path, "read"))?;
+                file.take(length).read_to_end(&mut data).map_err(os(path, "read"))?;
+            }
+            Source::Packed(unpacked, done) => {
+                io::copy(&mut unpacked.by_ref().take(from - *done), &mut io::sink()).map_err(damaged)?;
+                unpacked.by_ref().take(length).read_to_end(&mut data).map_err(damaged)?;
+                *done = from + length;
+            }
+        }
+        if data.len() as u64 != length {
+            let what = format!("ends inside frame {at}");
+            return Err(Flaw::new(what, "the file is cut short: copy or export it again").at(path));
+        }
+        Volume::from_vec(self.plan.grid, decode(&self.plan, &data))
+            .map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
+    }
+}
+
+/// The frames stand where a field has its components: both are volumes one after the other.
+fn layout(_: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
+    match axes[4..].iter().product::<usize>() {
+        1 => Ok(axes[3]),
+        _ => Err(Flaw::new(
+            format!("has axes {axes:?}: more than space and time"),
+            "give a series of scalar volumes, (x, y, z, t)",
+        )),
+    }
+}
