@@ -30,7 +30,7 @@ fn every_example_has_a_test() {
         .map(|e| e.unwrap().path().file_stem().unwrap().to_string_lossy().into_owned())
         .collect();
     names.sort();
-    assert_eq!(names, ["eight_motions", "grasp", "own_pair", "seed", "stability_map"]);
+    assert_eq!(names, ["eight_motions", "grasp", "own_pair", "seed", "sequence", "stability_map"]);
 }
 
 #[test]
@@ -57,6 +57,15 @@ fn own_pair_measures_the_press() {
     assert!((largest - 6.0).abs() < 1.5, "{out}");
     assert_eq!(before(&out, " folds"), 0.0, "{out}");
     assert!(folder.path().join("out/displacement.nii.gz").is_file());
+}
+
+#[test]
+fn sequence_follows_a_pinch() {
+    let (out, _) = example("sequence", &["pinch", "3", "32"]);
+    let rows: Vec<Vec<f64>> =
+        out.lines().skip(1).map(|l| l.split_whitespace().map(|v| v.parse().unwrap()).collect()).collect();
+    assert_eq!(rows.len(), 2, "{out}");
+    assert!(rows.iter().all(|r| r[2] < 0.5 * r[1]), "{out}");
 }
 
 #[test]

@@ -50,18 +50,23 @@ pub fn check_output_file(path: &Path, endings: &[&str]) -> Result<()> {
 
 /// A volume to measure on; warns about single voxels without a number and refuses a volume without any.
 pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
-    let volume = io::read_volume(path)?;
+    usable(io::read_volume(path)?, &path.display().to_string(), warnings)
+}
+
+/// `volume`, called `path`, if something can be found in it.
+pub fn usable(volume: Volume, path: &str, warnings: &mut Vec<String>) -> Result<Volume> {
     let (bad, all) = (io::count_non_finite(&volume), volume.grid().len());
     if bad == all {
-        bail!("{}: every voxel is NaN or infinite; export it again", path.display());
+        bail!("{path}: every voxel is NaN or infinite; export it again");
     }
     if bad > 0 {
-        warnings.push(format!("{}: {bad} of {all} voxels are NaN or infinite and are not used", name(path)));
+        let short = name(Path::new(path));
+        warnings.push(format!("{short}: {bad} of {all} voxels are NaN or infinite and are not used"));
     }
     let mut finite = volume.as_slice().iter().filter(|v| v.is_finite());
     let first = finite.next();
     if finite.all(|v| Some(v) == first) {
-        bail!("{}: every voxel has the same value, so nothing can be found in it; check the file", path.display());
+        bail!("{path}: every voxel has the same value, so nothing can be found in it; check the file");
     }
     Ok(volume)
 }

@@ -23,6 +23,10 @@ mod outputs;
 
 mod phantom;
 
+mod sequence;
+
+mod track;
+
 mod warp;
 
 use clap::{Args, Parser, Subcommand};
@@ -67,6 +71,8 @@ enum Command {
     Warp(warp::Options),
     /// Turn a displacement field around: deformed to initial
     Invert(invert::Options),
+    /// Follow the tissue of one volume through a sequence of others
+    Track(track::Options),
     /// Simulate a soft-finger grasp from a scene file
     Grasp(grasp::Options),
     /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
@@ -94,6 +100,7 @@ pub fn run() -> ExitCode {
         Command::Field(options) => field::run(&options, &console),
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
+        Command::Track(options) => track::run(&options, &console),
         Command::Grasp(options) => grasp::run(&options, &console),
         Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
         Command::Phantom(options) => phantom::run(&options, &console),

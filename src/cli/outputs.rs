@@ -9,7 +9,7 @@ use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
 use palpate::report::{FieldReport, html, json};
 use palpate::types::{DenseField, FieldParams, Mask, Mesh, Metrics, Volume};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Names of what [`write_field`] writes.
@@ -37,7 +37,7 @@ pub struct Target {
 
 impl Target {
     /// The files of these names in the folder.
-    pub fn files(&self, names: &[&str]) -> Vec<PathBuf> {
+    pub fn files(&self, names: &[impl AsRef<Path>]) -> Vec<PathBuf> {
         names.iter().map(|name| self.output.join(name)).collect()
     }
 

@@ -1,18 +1,24 @@
 //! `palpate phantom`: a synthetic pair with exactly known displacement.
 
-use super::Usage;
 use super::console::Console;
+use super::{Usage, sequence};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::UnknownName;
 use palpate::io::{self, OutputFolder};
 use palpate::report::{figure, panels};
-use palpate::synth::{self, MotionKind, Phantom, PhantomKind, PhantomParams};
+use palpate::synth::{self, MotionKind, Phantom, PhantomKind, PhantomParams, SequenceKind, SequenceParams};
+use palpate::types::names::choose;
 use std::path::PathBuf;
+
+/// Default of --bias.
+const BIAS: f64 = 0.15;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// calf, slice, head, block or fingertip
-    kind: PhantomKind,
+    /// A pair: calf, slice, head, block or fingertip; a sequence: pinch, pen or contraction
+    #[arg(value_parser = kind)]
+    kind: Kind,
     /// Folder for the results
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
@@ -25,6 +31,9 @@ pub struct Options {
     /// Voxel edges in mm, one number or x,y,z; the number of voxels stays [default: by kind]
     #[arg(long, value_name = "MM", value_delimiter = ',')]
     spacing: Vec<f64>,
+    /// Frames of a sequence, the one at rest included
+    #[arg(long, value_name = "N", default_value_t = 16)]
+    frames: usize,
     /// Seed of anatomy, motion and noise
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
@@ -38,24 +47,56 @@ pub struct Options {
     #[arg(long, value_name = "PART", default_value_t = 0.03)]
     noise: f64,
     /// Largest change of brightness across the deformed volume, as a part
-    #[arg(long, value_name = "PART", default_value_t = 0.15)]
+    #[arg(long, value_name = "PART", default_value_t = BIAS)]
     bias: f64,
 }
 
+/// What is made.
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Pair(PhantomKind),
+    Sequence(SequenceKind),
+}
+
+fn kind(name: &str) -> Result<Kind, UnknownName> {
+    let pairs = PhantomKind::KNOWN.map(|(name, kind)| (name, Kind::Pair(kind)));
+    let sequences = SequenceKind::KNOWN.map(|(name, kind)| (name, Kind::Sequence(kind)));
+    choose("phantom", name, &[&pairs[..], &sequences].concat())
+}
+
 impl Options {
-    /// Parameters in range.
-    fn params(&self) -> Result<PhantomParams> {
-        let mut p =
-            PhantomParams { seed: self.seed, noise: self.noise, bias: self.bias, ..PhantomParams::new(self.kind) };
+    /// Voxel edges, where they are asked for (mm).
+    fn spacing(&self) -> Result<Option<[f64; 3]>> {
+        match self.spacing[..] {
+            [] => Ok(None),
+            [v] => Ok(Some([v; 3])),
+            [x, y, z] => Ok(Some([x, y, z])),
+            _ => bail!(Usage("--spacing takes one number or three, as 1.5,1.5,5".into())),
+        }
+    }
+
+    /// A sequence's parameters; their range is checked when it is made.
+    fn sequence(&self, kind: SequenceKind) -> Result<SequenceParams> {
+        if self.motion.is_some() || self.bias != BIAS {
+            bail!(Usage("a sequence has a motion of its own and no bias: leave --motion and --bias out".into()));
+        }
+        let Self { frames, seed, noise, .. } = *self;
+        let mut p = SequenceParams { frames, seed, noise, ..SequenceParams::new(kind) };
         if let Some(n) = self.size {
             p = p.sized(n);
         }
-        match self.spacing[..] {
-            [] => {}
-            [v] => p.spacing = [v; 3],
-            [x, y, z] => p.spacing = [x, y, z],
-            _ => bail!(Usage("--spacing takes one number or three, as 1.5,1.5,5".into())),
+        p.spacing = self.spacing()?.unwrap_or(p.spacing);
+        p.amplitude = self.amplitude.unwrap_or(p.amplitude);
+        Ok(p)
+    }
+
+    /// Parameters in range.
+    fn params(&self, kind: PhantomKind) -> Result<PhantomParams> {
+        let mut p = PhantomParams { seed: self.seed, noise: self.noise, bias: self.bias, ..PhantomParams::new(kind) };
+        if let Some(n) = self.size {
+            p = p.sized(n);
         }
+        p.spacing = self.spacing()?.unwrap_or(p.spacing);
         p.motion = self.motion.unwrap_or(p.motion);
         p.amplitude = self.amplitude.unwrap_or(p.amplitude);
         p.check()?;
@@ -64,7 +105,18 @@ impl Options {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let params = options.params()?;
+    let picture = options.output.join("phantom.svg");
+    let kind = match options.kind {
+        Kind::Pair(kind) => kind,
+        Kind::Sequence(kind) => {
+            let params = options.sequence(kind)?;
+            let mut folder = OutputFolder::create(&options.output, options.force)?;
+            let summary = sequence::write(&mut folder, &params, console)?;
+            folder.commit()?;
+            return console.say(&format!("{summary}  results      {}", picture.display()));
+        }
+    };
+    let params = options.params(kind)?;
     let mut folder = OutputFolder::create(&options.output, options.force)?;
     let phantom = synth::phantom(&params)?;
     write(&mut folder, &phantom)?;
@@ -78,7 +130,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         d.max_mm,
         d.mask_voxels,
         phantom.landmarks.len(),
-        options.output.join("phantom.svg").display()
+        picture.display()
     ))
 }
 

@@ -102,7 +102,7 @@ pub fn write_points(path: impl AsRef<Path>, table: &PointTable) -> Result<(), Io
     write_table(path.as_ref(), &columns, rows)
 }
 
-fn decimal(v: f64) -> String {
+pub(super) fn decimal(v: f64) -> String {
     format!("{v:.6}")
 }
 

@@ -2,10 +2,15 @@
 //!
 //! Every frame is measured against the reference itself, so that errors do not add up; the search starts from where the
 //! tissue was in the frame before and where steady motion would take it, beside the starts that a pair of volumes has.
+//! Only the reference, the frame at hand and what comes of it are held.
 
 use crate::error::FieldError;
+use crate::field::strain::{StrainField, StrainStatistics};
+use crate::numerics::sampling::{displacement, inside};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
-use crate::types::{FieldParams, Mask, Volume};
+use crate::types::*;
+use std::collections::HashMap;
+use std::time::Instant;
 
 /// Follows the tissue of one volume through others that were taken one after the other.
 #[derive(Debug, Clone)]
@@ -40,5 +45,165 @@ impl<'a> Tracker<'a> {
         self.past.swap(0, 1);
         self.past[0] = Some(result.spline.clone());
         Ok(result)
+    }
+}
+
+/// A frame that was measured, as the caller of [`run`] gets it to keep what it wants.
+#[derive(Debug, Clone, Copy)]
+pub struct Frame<'a> {
+    /// Its number, from 0.
+    pub number: usize,
+    /// Its image.
+    pub volume: &'a Volume,
+    /// Its displacement and all that goes with it.
+    pub result: &'a FieldResult,
+    /// Its strain.
+    pub strain: &'a StrainField,
+}
+
+/// Measures `frames` volumes against number `origin` of them: forward from it to the last, then backward to the first.
+///
+/// `read` gives a volume by its number, `keep` gets each result as soon as it is there. `labels` (on the reference's
+/// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them. A frame that cannot be
+/// measured is reported as lost, and the next one starts from the frames before it.
+///
+/// # Errors
+/// Those of `read` and `keep`, and [`FieldError`] when no frame at all can be measured.
+pub fn run<E: From<FieldError>>(
+    (frames, origin): (usize, usize),
+    reference: &Volume,
+    (mask, labels): (Option<&Mask>, Option<&Mask>),
+    params: &FieldParams,
+    mut read: impl FnMut(usize) -> Result<Volume, E>,
+    mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
+    progress: Progress<'_>,
+) -> Result<Tracked, E> {
+    let regions = regions(reference, mask, labels);
+    let mut tracker = Tracker::new(reference, mask, params);
+    let mut points = Points::new(frames);
+    let mut tracked = Tracked::default();
+    let mut refused = None;
+    let order = (origin + 1..frames).chain((0..origin).rev());
+    for (done, number) in order.enumerate() {
+        if number + 1 == origin {
+            tracker.restart();
+        }
+        let volume = read(number)?;
+        let started = Instant::now();
+        let part = |stage: &str, f: f64| progress(stage, (done as f64 + f) / (frames - 1) as f64);
+        match tracker.next(&volume, &part) {
+            Ok(result) => {
+                let strain = StrainField::of(&result.displacement);
+                points.add(number, &result, volume.grid());
+                for (label, offsets) in &regions {
+                    let s = StrainStatistics::over(&strain, offsets);
+                    let StrainStatistics { voxels, mean, peak, shear, volume_change } = s;
+                    tracked.strain.push(StrainRow {
+                        frame: number,
+                        label: *label,
+                        voxels,
+                        mean,
+                        peak,
+                        shear,
+                        volume_change,
+                    });
+                }
+                tracked.frames.push(summary(number, &result.summary, started.elapsed().as_secs_f64()));
+                keep(Frame { number, volume: &volume, result: &result, strain: &strain })?;
+            }
+            Err(error) => {
+                tracked.frames.push(lost(number, &error));
+                refused = Some(error);
+            }
+        }
+    }
+    if let Some(error) = refused.filter(|_| tracked.frames.iter().all(|f| f.lost.is_some())) {
+        return Err(error.into());
+    }
+    tracked.frames.sort_by_key(|f| f.frame);
+    tracked.strain.sort_by_key(|s| (s.frame, s.label));
+    tracked.trajectories = points.list;
+    Ok(tracked)
+}
+
+/// The offsets of each region's voxels: by label, or of the whole mask (of everything without one) as label 1.
+fn regions(reference: &Volume, mask: Option<&Mask>, labels: Option<&Mask>) -> Vec<(u8, Vec<usize>)> {
+    let inside = |at: usize| mask.is_none_or(|m| m.as_slice()[at] != 0);
+    let all = (0..reference.grid().len()).filter(|&at| inside(at));
+    let Some(labels) = labels else { return vec![(1, all.collect())] };
+    let mut by_label: Vec<(u8, Vec<usize>)> = (0..=255).map(|label| (label, Vec::new())).collect();
+    all.for_each(|at| by_label[usize::from(labels.as_slice()[at])].1.push(at));
+    by_label.into_iter().skip(1).filter(|(_, offsets)| !offsets.is_empty()).collect()
+}
+
+fn summary(frame: usize, s: &FieldSummary, seconds: f64) -> FrameSummary {
+    FrameSummary {
+        frame,
+        lost: None,
+        counts: s.counts,
+        model: Some(s.model),
+        mean_mm: s.mean_mm,
+        max_mm: s.max_mm,
+        residual_mm: s.levels.last().map_or(0.0, |l| l.residual_mm),
+        uncertainty_median_mm: s.uncertainty_median_mm,
+        folds: s.folds,
+        seconds,
+        warnings: s.warnings.clone(),
+    }
+}
+
+fn lost(frame: usize, error: &FieldError) -> FrameSummary {
+    FrameSummary {
+        frame,
+        lost: Some(error.to_string()),
+        counts: Counts::default(),
+        model: None,
+        mean_mm: 0.0,
+        max_mm: 0.0,
+        residual_mm: 0.0,
+        uncertainty_median_mm: 0.0,
+        folds: 0,
+        seconds: 0.0,
+        warnings: Vec::new(),
+    }
+}
+
+/// The features of the reference, found again in each frame by their place.
+struct Points {
+    frames: usize,
+    list: Vec<Trajectory>,
+    known: HashMap<[u64; 3], usize>,
+}
+
+impl Points {
+    fn new(frames: usize) -> Self {
+        Self { frames, list: Vec::new(), known: HashMap::new() }
+    }
+
+    /// Books a frame: features matched for the first time become known, the others are measured or carried.
+    fn add(&mut self, frame: usize, result: &FieldResult, there: &Grid) {
+        let field = &result.displacement;
+        let grid = *field.grid();
+        let mut measured = vec![None; self.list.len()];
+        for m in result.matches.kept() {
+            let at = *self.known.entry(m.initial.0.map(f64::to_bits)).or_insert_with(|| {
+                self.list.push(Trajectory { initial: m.initial, places: vec![None; self.frames] });
+                measured.push(None);
+                self.list.len() - 1
+            });
+            measured[at] = Some(m.sigma());
+        }
+        for (trajectory, sigma) in self.list.iter_mut().zip(measured) {
+            let position = trajectory.initial.moved(displacement(field, trajectory.initial));
+            let [i, j, k] = grid.affine().to_voxel(trajectory.initial).0.map(|v| v.round().max(0.0) as usize);
+            let [nx, ny, nz] = grid.shape();
+            let offset = grid.index(i.min(nx - 1), j.min(ny - 1), k.min(nz - 1));
+            let state = match sigma {
+                Some(_) => PointState::Measured,
+                None if inside(there.shape(), there.affine().to_voxel(position)) => PointState::Carried,
+                None => PointState::Outside,
+            };
+            trajectory.places[frame] = Some(Place { position, sigma: result.uncertainty.at(offset), state });
+        }
     }
 }

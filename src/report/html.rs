@@ -140,7 +140,7 @@ fn score(report: &FieldReport<'_>, views: &Views) -> String {
 }
 
 /// A picture or drawing with its sides named.
-fn figure(plane: Plane, size: [f64; 2], content: &str) -> String {
+pub(super) fn figure(plane: Plane, size: [f64; 2], content: &str) -> String {
     let [l, r, t, b] = plane.labels();
     format!(
         "<figure style=\"flex:{:.2}\">{content}<i class=\"l\">{l}</i><i class=\"r\">{r}</i><i class=\"t\">{t}</i><i class=\"b\">{b}</i></figure>",
@@ -159,7 +159,7 @@ fn image(picture: &Picture, class: &str, name: &str) -> String {
 }
 
 /// A colour bar with three values.
-fn legend(scale: Option<&Scale>) -> String {
+pub(super) fn legend(scale: Option<&Scale>) -> String {
     let Some(scale) = scale else { return String::new() };
     let [low, middle, high] = scale.ticks();
     format!(

@@ -9,10 +9,14 @@ pub fn grid(g: &Grid) -> Value {
     json!({ "shape": g.shape(), "spacing_mm": g.spacing(), "affine_ras": g.affine().rows() })
 }
 
+/// Seconds by stage.
+pub fn seconds(stages: &[(String, f64)]) -> Map<String, Value> {
+    stages.iter().map(|(stage, t)| (stage.clone(), json!(t))).collect()
+}
+
 /// The keys are those of docs/file-formats.md.
 pub fn field_summary(report: &FieldReport<'_>) -> Value {
     let s = report.summary;
-    let seconds: Map<String, Value> = s.seconds.iter().map(|(stage, t)| (stage.clone(), json!(t))).collect();
     let [initial, deformed, mask] = report.names;
     let mut out = json!({
         "version": env!("CARGO_PKG_VERSION"),
@@ -29,7 +33,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
         "displacement_mean_mm": s.mean_mm,
         "displacement_max_mm": s.max_mm,
         "uncertainty_median_mm": s.uncertainty_median_mm,
-        "seconds": seconds,
+        "seconds": seconds(&s.seconds),
         "warnings": s.warnings,
         "params": report.params,
     });

@@ -40,6 +40,10 @@ pub mod json;
 
 pub mod plot;
 
+pub mod film;
+
+pub mod track;
+
 pub mod grasp_scene;
 
 pub mod grasp;

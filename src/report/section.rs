@@ -167,13 +167,18 @@ impl Section {
 
     /// Voxel offsets on an even lattice with about `across` nodes along the longer side, and the lattice's step (mm).
     pub fn lattice(&self, across: usize) -> (Vec<usize>, f64) {
+        let (columns, step_mm) = self.columns(across);
+        (columns.concat(), step_mm)
+    }
+
+    /// The same, column by column from the left, each from the top.
+    pub fn columns(&self, across: usize) -> (Vec<Vec<usize>>, f64) {
         let [h, v, _] = self.axes;
         let step_mm = (h.len as f64 * h.spacing).max(v.len as f64 * v.spacing) / across.max(1) as f64;
         let stride = |a: &Axis| ((step_mm / a.spacing).round() as usize).max(1);
         let (sh, sv) = (stride(&h), stride(&v));
-        let columns = (sh / 2..h.len).step_by(sh);
-        let nodes = columns.flat_map(|r| (sv / 2..v.len).step_by(sv).map(move |d| (r, d)));
-        (nodes.map(|(r, d)| self.offset(r, d)).collect(), step_mm)
+        let column = |right| (sv / 2..v.len).step_by(sv).map(|down| self.offset(right, down)).collect();
+        ((sh / 2..h.len).step_by(sh).map(column).collect(), step_mm)
     }
 
     /// Thickness of the plane (mm).

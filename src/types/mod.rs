@@ -20,6 +20,8 @@ pub mod metrics;
 
 pub mod result;
 
+pub mod track;
+
 pub mod names;
 
 pub mod fingertip;
@@ -37,4 +39,5 @@ pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
 pub use result::{Counts, FieldSummary, LevelReport, Mesh, MotionModel};
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
+pub use track::{FrameSummary, Place, PointState, StrainRow, Tracked, Trajectory};
 pub use volume::{Mask, Volume};

@@ -1,0 +1,218 @@
+//! `palpate track`: a sequence of volumes to fields, trajectories and strain over time.
+
+use super::Usage;
+use super::console::Console;
+use super::field::Tuning;
+use super::inputs::{check_distinct, name, read_mask, usable, warn_all};
+use super::outputs::Target;
+use anyhow::{Result, bail};
+use clap::Args;
+use palpate::field::warp::warp_image;
+use palpate::io::{self, PackedField, Series};
+use palpate::numerics::sampling::Interpolation;
+use palpate::pipeline::track::{self, Frame};
+use palpate::report::film::Film;
+use palpate::report::panels::{centre_of_motion, gray_range};
+use palpate::report::track::{TrackReport, page, summary, text};
+use palpate::types::{DenseField, Grid, Mask, Volume};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Two volumes or more in the order they were taken, or one 4-D file
+    #[arg(required = true)]
+    volumes: Vec<PathBuf>,
+    #[command(flatten)]
+    target: Target,
+    /// Number of the volume that the others are measured against, counted from 0
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    reference: usize,
+    /// Where to measure: a mask on the reference's grid, 0 outside
+    #[arg(long, value_name = "M")]
+    mask: Option<PathBuf>,
+    /// Regions whose strain is written to strain.csv: a label map on the reference's grid
+    #[arg(long, value_name = "L")]
+    labels: Option<PathBuf>,
+    #[command(flatten)]
+    tuning: Tuning,
+}
+
+/// Where the frames come from.
+enum Source<'a> {
+    Files(&'a [PathBuf]),
+    Series(&'a Path, Box<Series>),
+}
+
+impl<'a> Source<'a> {
+    fn open(volumes: &'a [PathBuf]) -> Result<Self> {
+        let [one] = volumes else { return Ok(Self::Files(volumes)) };
+        let series = Series::open(one)?;
+        if series.frames() < 2 {
+            bail!(Usage(format!("{}: is one volume; give two or more, or a 4-D file", one.display())));
+        }
+        Ok(Self::Series(one, Box::new(series)))
+    }
+
+    fn frames(&self) -> usize {
+        match self {
+            Self::Files(files) => files.len(),
+            Self::Series(_, series) => series.frames(),
+        }
+    }
+
+    fn step_s(&self) -> Option<f64> {
+        match self {
+            Self::Files(_) => None,
+            Self::Series(_, series) => series.step_s(),
+        }
+    }
+
+    fn name(&self, frame: usize) -> String {
+        match self {
+            Self::Files(files) => name(&files[frame]),
+            Self::Series(file, _) => format!("{}[{frame}]", name(file)),
+        }
+    }
+
+    fn read(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<Volume> {
+        let volume = match self {
+            Self::Files(files) => io::read_volume(&files[frame])?,
+            Self::Series(_, series) => series.read(frame)?,
+        };
+        usable(volume, &self.name(frame), warnings)
+    }
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let Options { volumes, target, reference: origin, mask, labels, tuning } = options;
+    let (params, origin) = (tuning.params()?, *origin);
+    let mut source = Source::open(volumes)?;
+    let frames = source.frames();
+    if origin >= frames {
+        bail!(Usage(format!("--reference is {origin}, but there are {frames} volumes (counted from 0)")));
+    }
+    let given: Vec<&Path> = volumes.iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
+    check_distinct(&given, &target.files(&files(frames, origin)))?;
+
+    let started = Instant::now();
+    let progress = console.progress();
+    progress.set("read", 0.0);
+    let mut warnings = Vec::new();
+    let reference = source.read(origin, &mut warnings)?;
+    let grid = *reference.grid();
+    let first = &volumes[origin.min(volumes.len() - 1)];
+    let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
+    let regions = labels.as_ref().map(|l| read_mask(l, &grid, first)).transpose()?;
+    let mut folder = target.create()?;
+    let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
+    let mut film = None;
+    let (mut reading, mut writing) = (started.elapsed(), std::time::Duration::ZERO);
+
+    let range = gray_range(&reference);
+    let shown = inside.as_ref().or(regions.as_ref());
+    let read = |frame: usize| -> Result<Volume> {
+        let started = Instant::now();
+        let volume = source.read(frame, &mut warnings);
+        reading += started.elapsed();
+        volume
+    };
+    let keep = |frame: Frame<'_>| -> Result<()> {
+        let started = Instant::now();
+        let Frame { number, volume, result, strain } = frame;
+        let field = &result.displacement;
+        let mut put = |number: usize, field: &DenseField| {
+            folder.write(&format!("displacement_{number:03}.nii.gz"), |p| {
+                packed[number] = Some(io::write_series_field(p, field)?);
+                Ok(())
+            })
+        };
+        put(number, field)?;
+        folder.write(&format!("strain_{number:03}.nii.gz"), |p| {
+            io::write_tensors(p, &grid, strain.tensors(), "palpate: Green-Lagrange strain, LPS axes")
+        })?;
+        let film = film.get_or_insert_with(|| start_film(&reference, field, shown, range));
+        add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
+        writing += started.elapsed();
+        Ok(())
+    };
+    let tracked =
+        track::run((frames, origin), &reference, (inside.as_ref(), regions.as_ref()), &params, read, keep, &|s, f| {
+            progress.set(s, f)
+        })?;
+
+    progress.set("write", 1.0);
+    let started = Instant::now();
+    let still = DenseField::zeros(grid);
+    folder.write(&format!("displacement_{origin:03}.nii.gz"), |p| {
+        packed[origin] = Some(io::write_series_field(p, &still)?);
+        Ok(())
+    })?;
+    let step_s = source.step_s();
+    folder.write("displacement.nii.gz", |p| io::write_field_series(p, &grid, &packed, step_s.unwrap_or(0.0)))?;
+    folder.write("trajectories.csv", |p| io::write_trajectories(p, &tracked.trajectories, step_s))?;
+    folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
+    let mut film = film.unwrap_or_else(|| start_film(&reference, &still, shown, range));
+    add_to(&mut film, origin, &reference, &still, &|_| 0.0)?;
+    for f in &tracked.frames {
+        let said = f.warnings.iter().map(String::as_str).chain(f.lost.as_deref());
+        warnings.extend(said.map(|w| format!("frame {}: {w}", f.frame)));
+    }
+    writing += started.elapsed();
+    let measuring = tracked.frames.iter().map(|f| f.seconds).sum();
+    let seconds = [("read", reading.as_secs_f64()), ("measure", measuring), ("write", writing.as_secs_f64())]
+        .map(|(stage, s)| (stage.to_string(), s));
+    let names: Vec<String> = (0..frames).map(|f| source.name(f)).collect();
+    let called = [mask, labels].map(|p| p.as_deref().map(name).unwrap_or_default());
+    let report = TrackReport {
+        names: &names,
+        reference: origin,
+        step_s,
+        grid: &grid,
+        regions: [&called[0], &called[1]],
+        params: &params,
+        tracked: &tracked,
+        film: &film,
+        warnings: &warnings,
+        seconds: &seconds,
+    };
+    folder.write("report.html", |p| io::write_text(p, &page(&report)))?;
+    folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
+    folder.commit()?;
+    drop(progress);
+    warn_all(console, &warnings);
+    console.say(&format!("{}{}", text(&report), target.look()))
+}
+
+/// What is written at most.
+fn files(frames: usize, origin: usize) -> Vec<String> {
+    let fixed = ["displacement.nii.gz", "trajectories.csv", "strain.csv", "summary.json", "report.html"];
+    let each = (0..frames).map(|t| format!("displacement_{t:03}.nii.gz"));
+    let strain = (0..frames).filter(|&t| t != origin).map(|t| format!("strain_{t:03}.nii.gz"));
+    fixed.map(String::from).into_iter().chain(each).chain(strain).collect()
+}
+
+/// A film whose planes cross where the first measured frame moves most.
+fn start_film(reference: &Volume, field: &DenseField, mask: Option<&Mask>, range: [f64; 2]) -> Film {
+    Film::new(reference.grid(), centre_of_motion(field, mask), mask, range)
+}
+
+/// Adds a frame, resampled where it lies on another grid.
+fn add_to(
+    film: &mut Film,
+    number: usize,
+    volume: &Volume,
+    field: &DenseField,
+    strain: &(dyn Fn(usize) -> f32 + Sync),
+) -> Result<()> {
+    let grid: &Grid = field.grid();
+    let moved;
+    let image = if volume.grid() == grid {
+        volume
+    } else {
+        moved = warp_image(volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0);
+        &moved
+    };
+    let values = image.as_slice();
+    Ok(film.add(number, &|o| values[o], field, strain)?)
+}

@@ -1,0 +1,235 @@
+//! report.html, summary.json and the short summary of `palpate track`.
+
+use crate::report::film::Film;
+use crate::report::grasp::tile;
+use crate::report::html::{document, escape};
+use crate::report::json::{grid, seconds};
+use crate::report::plot::{Line, Plot};
+use crate::report::scale::thousands;
+use crate::report::tables::table;
+use crate::report::verdict::short2;
+use crate::types::{FieldParams, Grid, PointState, StrainRow, Tracked};
+use serde_json::{Value, json};
+use std::fmt::Write;
+
+/// A tracked sequence.
+pub struct TrackReport<'a> {
+    /// What the volumes are called, by number.
+    pub names: &'a [String],
+    /// Number of the reference.
+    pub reference: usize,
+    /// Time between frames (s), where it is known.
+    pub step_s: Option<f64>,
+    /// The reference's grid.
+    pub grid: &'a Grid,
+    /// Mask and label map, as they are called; empty without.
+    pub regions: [&'a str; 2],
+    /// What was asked for.
+    pub params: &'a FieldParams,
+    /// What was found.
+    pub tracked: &'a Tracked,
+    /// Sections of the frames.
+    pub film: &'a Film,
+    /// What the user should know.
+    pub warnings: &'a [String],
+    /// Stage names and wall seconds.
+    pub seconds: &'a [(String, f64)],
+}
+
+impl TrackReport<'_> {
+    /// The time of a frame in words.
+    fn clock(&self, frame: usize) -> String {
+        match self.step_s {
+            Some(step) => format!("frame {frame}, {} s", short2(step * frame as f64)),
+            None => format!("frame {frame}"),
+        }
+    }
+
+    /// Horizontal position of a frame in plots.
+    fn time(&self, frame: usize) -> f64 {
+        self.step_s.unwrap_or(1.0) * frame as f64
+    }
+
+    fn measured(&self) -> usize {
+        self.tracked.frames.iter().filter(|f| f.lost.is_none()).count()
+    }
+
+    fn headline(&self) -> String {
+        let all = self.tracked.frames.len();
+        let largest = self.tracked.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max);
+        let lost = match all - self.measured() {
+            0 => String::new(),
+            n => format!("; {n} lost"),
+        };
+        format!(
+            "{} of {all} frames measured against frame {}{lost}: tissue moved {} mm at most, {} points followed.",
+            self.measured(),
+            self.reference,
+            short2(largest),
+            thousands(self.tracked.trajectories.len())
+        )
+    }
+}
+
+/// The keys are those of docs/file-formats.md.
+pub fn summary(report: &TrackReport<'_>) -> Value {
+    let t = report.tracked;
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "track",
+        "inputs": { "volumes": report.names, "mask": report.regions[0], "labels": report.regions[1] },
+        "reference": report.reference,
+        "step_s": report.step_s,
+        "grid": grid(report.grid),
+        "frames": t.frames,
+        "points": t.trajectories.len(),
+        "seconds": seconds(report.seconds),
+        "warnings": report.warnings,
+        "params": report.params,
+    })
+}
+
+/// What was found, a few lines.
+pub fn text(report: &TrackReport<'_>) -> String {
+    let t = report.tracked;
+    let mut out = format!("{}\n", report.headline());
+    for f in &t.frames {
+        let _ = match &f.lost {
+            Some(why) => writeln!(out, "  frame {:<5} lost: {why}", f.frame),
+            None => writeln!(
+                out,
+                "  frame {:<5} mean {:.2} mm, largest {:.2} mm, {} matches, uncertainty {:.2} mm",
+                f.frame,
+                f.mean_mm,
+                f.max_mm,
+                thousands(f.counts.kept),
+                f.uncertainty_median_mm
+            ),
+        };
+    }
+    let _ = writeln!(out, "  time         {:.1} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
+    out
+}
+
+/// The page.
+pub fn page(report: &TrackReport<'_>) -> String {
+    let t = report.tracked;
+    let (all, measured) = (t.frames.len(), report.measured());
+    let edge = report.grid.spacing().iter().product::<f64>().cbrt();
+    let uncertain = t.frames.iter().map(|f| f.uncertainty_median_mm).fold(0.0, f64::max);
+    let trust = match (measured == all, uncertain < edge / 2.0, measured * 2 >= all) {
+        (true, true, _) => "high",
+        (_, _, true) => "moderate",
+        _ => "low",
+    };
+    let largest = |f: &dyn Fn(&StrainRow) -> f64| t.strain.iter().map(f).fold(0.0, f64::max);
+    let mut body = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>and {all} more</span></h1><p class=\"verdict\">{}</p>\
+         <p class=\"trust {trust}\"><b>Trust is {trust}</b> median uncertainty at most {} mm in any frame.</p></header>\
+         <div class=\"tiles\">{}{}{}{}{}</div>",
+        env!("CARGO_PKG_VERSION"),
+        escape(&report.names[report.reference]),
+        escape(&report.headline()),
+        short2(uncertain),
+        tile(&measured.to_string(), "", "frames measured"),
+        tile(&short2(t.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max)), "mm", "largest motion"),
+        tile(&short2(largest(&|s| s.peak[0])), "", "peak principal strain"),
+        tile(&thousands(t.trajectories.len()), "", "points followed"),
+        tile(&format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "in all stages"),
+    );
+    if !report.warnings.is_empty() {
+        let items: String = report.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
+    }
+    let clock: Vec<String> = (0..=all).map(|f| report.clock(f)).collect();
+    let _ = write!(
+        body,
+        "<section><h2>The sequence</h2><p class=\"lead\">Sections of each frame; the mesh moves with the tissue, its colour is the \
+         largest principal strain.</p><article class=\"wide\">{}</article></section>",
+        report.film.player(&clock)
+    );
+    let _ = write!(
+        body,
+        "<section><h2>Over time</h2><p class=\"lead\">E1 and E3 are the largest and the smallest principal strain (Green-Lagrange), peaks their \
+         98th and 2nd percentile; volume is its relative change.</p><div class=\"grid\">{}</div></section>",
+        curves(report)
+    );
+    let rows: Vec<Vec<String>> = t
+        .frames
+        .iter()
+        .map(|f| {
+            let name = escape(&report.names[f.frame]);
+            match &f.lost {
+                Some(why) => vec![f.frame.to_string(), name, format!("lost: {}", escape(why))],
+                None => vec![
+                    f.frame.to_string(),
+                    name,
+                    f.model.map_or_else(String::new, |m| format!("{m:?}").to_lowercase()),
+                    short2(f.mean_mm),
+                    short2(f.max_mm),
+                    thousands(f.counts.kept),
+                    short2(f.residual_mm),
+                    short2(f.uncertainty_median_mm),
+                    f.folds.to_string(),
+                ],
+            }
+        })
+        .collect();
+    let head =
+        ["Frame", "Volume", "Motion", "Mean, mm", "Largest, mm", "Matches", "Residual, mm", "Uncertainty, mm", "Folds"];
+    let _ = write!(body, "<section><h2>Frames</h2><article class=\"wide\">{}</article></section>", table(&head, &rows));
+    document(&escape(&format!("{} and {all} more", report.names[report.reference])), &body)
+}
+
+/// Strain of each region, motion and points over time.
+fn curves(report: &TrackReport<'_>) -> String {
+    let t = report.tracked;
+    let across = if report.step_s.is_some() { "time, s" } else { "frame" };
+    let mut labels: Vec<u8> = t.strain.iter().map(|s| s.label).collect();
+    labels.sort_unstable();
+    labels.dedup();
+    let of = |label: u8, f: &dyn Fn(&StrainRow) -> f64| -> Vec<[f64; 2]> {
+        let rest = [report.time(report.reference), 0.0];
+        let rows = t.strain.iter().filter(|s| s.label == label).map(|s| [report.time(s.frame), f(s)]);
+        let mut points: Vec<[f64; 2]> = rows.chain([rest]).collect();
+        points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        points
+    };
+    let draw =
+        |title: &str, lines: &[Line]| format!("<article>{}</article>", Plot { title, across, marks: &[] }.draw(lines));
+    let mut out = String::new();
+    let frames = |f: &dyn Fn(usize) -> f64| -> Vec<[f64; 2]> {
+        (0..t.frames.len()).map(|at| [report.time(t.frames[at].frame), f(at)]).collect()
+    };
+    out += &draw(
+        "Displacement, mm",
+        &[
+            Line::new("mean", 0, false, frames(&|at| t.frames[at].mean_mm)),
+            Line::new("largest", 1, false, frames(&|at| t.frames[at].max_mm)),
+            Line::new("uncertainty", 2, true, frames(&|at| t.frames[at].uncertainty_median_mm)),
+        ],
+    );
+    let state = |frame: usize, state: PointState| {
+        t.trajectories.iter().filter(|p| p.places[frame].is_some_and(|p| p.state == state)).count() as f64
+    };
+    out += &draw(
+        "Points",
+        &[
+            Line::new("measured", 0, false, frames(&|at| state(t.frames[at].frame, PointState::Measured))),
+            Line::new("carried", 1, false, frames(&|at| state(t.frames[at].frame, PointState::Carried))),
+        ],
+    );
+    for label in labels.into_iter().take(8) {
+        out += &draw(
+            &format!("Strain, label {label}"),
+            &[
+                Line::new("E1 mean", 0, false, of(label, &|s| s.mean[0])),
+                Line::new("E1 peak", 0, true, of(label, &|s| s.peak[0])),
+                Line::new("E3 mean", 1, false, of(label, &|s| s.mean[2])),
+                Line::new("E3 peak", 1, true, of(label, &|s| s.peak[1])),
+                Line::new("volume", 2, false, of(label, &|s| s.volume_change)),
+            ],
+        );
+    }
+    out
+}

@@ -1,0 +1,210 @@
+//! Sequences followed against phantoms whose motion is known exactly.
+#![allow(clippy::unwrap_used)]
+
+use palpate::error::FieldError;
+use palpate::evaluate::metrics;
+use palpate::field::composition::compose;
+use palpate::field::strain::{StrainField, StrainStatistics, green_lagrange};
+use palpate::numerics::dense::symmetric_eigen;
+use palpate::numerics::random::Random;
+use palpate::numerics::small::eigenvalues;
+use palpate::pipeline::field::run as pair;
+use palpate::pipeline::track::{Tracker, run};
+use palpate::synth::{Sequence, SequenceKind, SequenceParams};
+use palpate::types::{DenseField, FieldParams, Mask, PointState, Volume};
+
+fn sequence(kind: SequenceKind, frames: usize) -> Sequence {
+    Sequence::new(&SequenceParams { frames, ..SequenceParams::new(kind).sized(40) }).unwrap()
+}
+
+/// Mean error over the tissue (mm).
+fn error(field: &DenseField, truth: &DenseField, mask: &Mask) -> f64 {
+    metrics(field, truth, Some(mask), &[]).unwrap().mean_mm
+}
+
+/// Tissue at least two voxels off its border.
+fn deep(mask: &Mask) -> Vec<usize> {
+    let (grid, inside) = (mask.grid(), mask.as_slice());
+    let [nx, ny, nz] = grid.shape();
+    let keep = |at: &usize| {
+        let v = grid.voxel(*at);
+        let near = |a: usize, n: usize| v[a].saturating_sub(2)..(v[a] + 3).min(n);
+        near(0, nx).all(|i| near(1, ny).all(|j| near(2, nz).all(|k| inside[grid.index(i, j, k)] != 0)))
+    };
+    (0..grid.len()).filter(keep).collect()
+}
+
+#[test]
+fn following_is_no_worse_than_pairs_and_far_better_than_a_chain() {
+    // The finer the steps, the more of them a chain has to add up.
+    for (kind, frames) in [(SequenceKind::Pinch, 12), (SequenceKind::Pen, 20)] {
+        let s = sequence(kind, frames);
+        let params = FieldParams::default();
+        let reference = s.frame(0);
+        let mut tracker = Tracker::new(&reference, Some(&s.mask), &params);
+        let (mut before, mut chain) = (reference.clone(), DenseField::zeros(*reference.grid()));
+        let mut last = [0.0; 2];
+        for t in 1..s.frames() {
+            let (frame, truth) = (s.frame(t), s.truth(t));
+            let followed = tracker.next(&frame, &|_, _| {}).unwrap().displacement;
+            if t % 3 == 1 {
+                let alone = pair(&reference, &frame, Some(&s.mask), &params, &|_, _| {}).unwrap().displacement;
+                let (followed, alone) = (error(&followed, &truth, &s.mask), error(&alone, &truth, &s.mask));
+                assert!(followed <= 1.3 * alone, "{kind:?}, frame {t}: {followed:.4} mm, alone {alone:.4} mm");
+            }
+            let step = pair(&before, &frame, None, &params, &|_, _| {}).unwrap().displacement;
+            chain = compose(&chain, &step);
+            last = [error(&followed, &truth, &s.mask), error(&chain, &truth, &s.mask)];
+            before = frame;
+        }
+        assert!(last[0] <= 0.5 * last[1], "{kind:?}: {:.4} mm, chained {:.4} mm", last[0], last[1]);
+    }
+}
+
+#[test]
+fn principal_strains_come_back() {
+    for kind in [SequenceKind::Pinch, SequenceKind::Pen] {
+        let s = sequence(kind, 7);
+        let (params, reference) = (FieldParams::default(), s.frame(0));
+        let inside = deep(&s.mask);
+        let mut tracker = Tracker::new(&reference, Some(&s.mask), &params);
+        for t in 1..s.frames() {
+            let found = tracker.next(&s.frame(t), &|_, _| {}).unwrap();
+            let (found, truth) = (StrainField::of(&found.displacement), StrainField::of(&s.truth(t)));
+            let apart = |&at: &usize| -> f64 {
+                let (a, b) = (found.principal(at), truth.principal(at));
+                (0..3).map(|k| (a[k] - b[k]).abs()).sum::<f64>() / 3.0
+            };
+            let mean = inside.iter().map(apart).sum::<f64>() / inside.len() as f64;
+            assert!(mean < 0.02, "{kind:?}, frame {t}: {mean:.4}");
+        }
+    }
+}
+
+#[test]
+fn a_lost_frame_does_not_stop_the_others() {
+    let s = sequence(SequenceKind::Pinch, 6);
+    let (params, reference) = (FieldParams::default(), s.frame(2));
+    let mut seen = Vec::new();
+    let read = |t: usize| -> Result<Volume, FieldError> {
+        let blank = Volume::filled(*reference.grid(), 0.0);
+        Ok(if t == 4 { blank } else { s.frame(t) })
+    };
+    let keep = |f: palpate::pipeline::track::Frame<'_>| -> Result<(), FieldError> {
+        seen.push(f.number);
+        Ok(())
+    };
+    let found = run((6, 2), &reference, (Some(&s.mask), Some(&s.labels)), &params, read, keep, &|_, _| {}).unwrap();
+    assert_eq!(seen, [3, 5, 1, 0]);
+    assert_eq!(found.frames.iter().map(|f| f.frame).collect::<Vec<_>>(), [0, 1, 3, 4, 5]);
+    assert!(found.frames[3].lost.as_ref().unwrap().contains("constant"), "{:?}", found.frames[3].lost);
+    assert!(found.strain.iter().all(|r| r.frame != 4 && r.label >= 1));
+    for t in &found.trajectories {
+        assert!(t.places[2].is_none() && t.places[4].is_none());
+        assert!(t.places.iter().flatten().any(|p| p.state == PointState::Measured));
+    }
+
+    let nothing = |_: usize| -> Result<Volume, FieldError> { Ok(Volume::filled(*reference.grid(), 0.0)) };
+    assert!(run((6, 2), &reference, (None, None), &params, nothing, |_| Ok(()), &|_, _| {}).is_err());
+}
+
+#[test]
+fn trajectories_follow_the_true_motion() {
+    let s = sequence(SequenceKind::Pen, 5);
+    let (params, reference) = (FieldParams::default(), s.frame(0));
+    let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
+    let found = run((5, 0), &reference, (Some(&s.mask), None), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+    assert!(found.trajectories.len() > 50, "{}", found.trajectories.len());
+    for t in 1..5 {
+        let places: Vec<_> = found.trajectories.iter().filter_map(|p| Some((p.initial, p.places[t]?))).collect();
+        let miss = |(from, place): &(palpate::types::WorldPoint, palpate::types::Place)| {
+            let d = from.moved(s.displacement(t, *from)).minus(place.position);
+            d.iter().map(|v| v * v).sum::<f64>().sqrt()
+        };
+        let mean = places.iter().map(miss).sum::<f64>() / places.len() as f64;
+        assert!(mean < 0.06, "frame {t}: {mean:.4} mm");
+    }
+}
+
+#[test]
+fn strain_is_free_of_rotation_and_exact_for_a_stretch() {
+    let (sin, cos) = 0.7f64.sin_cos();
+    let turn = [[cos - 1.0, -sin, 0.0], [sin, cos - 1.0, 0.0], [0.0; 3]];
+    assert!(green_lagrange(&turn).iter().all(|e| e.abs() < 1e-15));
+    let stretch = [[0.2, 0.0, 0.0], [0.0, -0.1, 0.0], [0.0; 3]];
+    let e = eigenvalues(&green_lagrange(&stretch));
+    for (found, truth) in e.iter().zip([0.5 * (1.2f64.powi(2) - 1.0), 0.0, 0.5 * (0.9f64.powi(2) - 1.0)]) {
+        assert!((found - truth).abs() < 1e-12, "{found} is not {truth}");
+    }
+}
+
+#[test]
+fn eigenvalues_agree_with_jacobi_rotations() {
+    let mut random = Random::new(3, 1);
+    for n in 0..2000 {
+        let size = [1.0, 1e-8, 1e6][n % 3];
+        let mut m: [f64; 6] = std::array::from_fn(|_| size * random.uniform(-1.0, 1.0));
+        if n % 5 == 0 {
+            m[3..].fill(0.0);
+        }
+        if n % 10 == 0 {
+            m[1] = m[0];
+        }
+        let full = [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]];
+        let truth = symmetric_eigen(&full).map(|p| p.0);
+        let found = eigenvalues(&m);
+        for k in 0..3 {
+            assert!((found[k] - truth[2 - k]).abs() < 2e-7 * size, "{m:?}: {found:?} is not {truth:?}");
+        }
+    }
+    assert_eq!(eigenvalues(&[2.0, 2.0, 2.0, 0.0, 0.0, 0.0]), [2.0; 3]);
+    assert_eq!(eigenvalues(&[0.0; 6]), [0.0; 3]);
+}
+
+#[test]
+fn statistics_of_a_uniform_strain() {
+    let s = sequence(SequenceKind::Pinch, 2);
+    let field = DenseField::from_fn(*s.mask.grid(), |p| [0.1 * p.0[0], -0.05 * p.0[1], 0.0]);
+    let offsets = deep(&s.mask);
+    let found = StrainStatistics::over(&StrainField::of(&field), &offsets);
+    let (e1, e3) = (0.5 * (1.1f64.powi(2) - 1.0), 0.5 * (0.95f64.powi(2) - 1.0));
+    assert_eq!(found.voxels, offsets.len());
+    for (value, truth) in [
+        (found.mean[0], e1),
+        (found.mean[2], e3),
+        (found.peak[0], e1),
+        (found.peak[1], e3),
+        (found.shear[0], 0.5 * (e1 - e3)),
+        (found.volume_change, 1.1 * 0.95 - 1.0),
+    ] {
+        assert!((value - truth).abs() < 1e-5, "{value} is not {truth}");
+    }
+}
+
+#[test]
+fn a_sequence_is_exact_and_the_same_twice() {
+    for (name, kind) in SequenceKind::KNOWN {
+        let s =
+            Sequence::new(&SequenceParams { noise: 0.0, frames: 5, ..SequenceParams::new(kind).sized(40) }).unwrap();
+        assert!(s.truth(0).as_slice().iter().all(|&u| u == 0.0), "{name}");
+        let again = Sequence::new(s.params()).unwrap();
+        assert_eq!(s.frame(3), again.frame(3), "{name}");
+        assert!(s.mask.as_slice().iter().zip(s.labels.as_slice()).all(|(m, l)| *m == 0 || *l > 0), "{name}");
+        // frame(x + u(x)) looks like frame 0, but for interpolation of texture two voxels wide.
+        let back = palpate::field::warp::warp_image(
+            &s.frame(3),
+            &s.truth(3),
+            None,
+            palpate::numerics::sampling::Interpolation::Cubic,
+            0.0,
+        );
+        let first = s.frame(0);
+        let inside = deep(&s.mask);
+        let off = |v: &Volume| {
+            let sum = |at: &usize| f64::from(v.as_slice()[*at] - first.as_slice()[*at]).powi(2);
+            (inside.iter().map(sum).sum::<f64>() / inside.len() as f64).sqrt()
+        };
+        let (still, warped) = (off(&s.frame(3)), off(&back));
+        assert!(warped < 0.25 * still, "{name}: {warped:.1} against {still:.1} without the motion");
+    }
+}

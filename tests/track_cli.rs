@@ -1,0 +1,175 @@
+//! `palpate track` and the sequences of `palpate phantom` as a user meets them.
+#![allow(clippy::unwrap_used)]
+
+mod fixtures;
+
+use fixtures::{Nifti, palpate, text};
+use flate2::{Compression, write::GzEncoder};
+use palpate::io;
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+use std::sync::LazyLock;
+use tempfile::TempDir;
+
+const FRAMES: usize = 4;
+
+/// A folder with a small pinch sequence.
+fn pinch() -> &'static Path {
+    static MADE: LazyLock<TempDir> = LazyLock::new(|| {
+        let folder = TempDir::new().unwrap();
+        let arguments = ["phantom", "pinch", "--size", "28", "--frames", "4", "-o", "."];
+        palpate(folder.path()).args(arguments).assert().success();
+        folder
+    });
+    MADE.path()
+}
+
+fn run(arguments: &[&str], code: i32) -> (String, String) {
+    let output = palpate(pinch()).args(arguments).output().unwrap();
+    let (out, err) = (text(&output.stdout), text(&output.stderr));
+    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
+    assert!(!err.contains("panicked"), "{err}");
+    (out, err)
+}
+
+fn frames() -> Vec<String> {
+    (0..FRAMES).map(|t| format!("frame_{t:03}.nii.gz")).collect()
+}
+
+/// The frames as one file, as another program would write it: float32, a frame every 0.25 s.
+fn series(pack: bool) -> Vec<u8> {
+    let volumes: Vec<_> = frames().iter().map(|f| io::read_volume(pinch().join(f)).unwrap()).collect();
+    let grid = *volumes[0].grid();
+    let mut bytes = Nifti {
+        dims: grid.shape().map(|n| n as i16),
+        times: FRAMES as i16,
+        datatype: 16,
+        sform: grid.affine().rows().map(|row| row.map(|v| v as f32)),
+        values: volumes.iter().flat_map(|v| v.as_slice().to_vec()).collect(),
+    }
+    .bytes();
+    bytes[92..96].copy_from_slice(&250f32.to_le_bytes());
+    bytes[123] = 2 + 16; // mm, ms
+    if !pack {
+        return bytes;
+    }
+    let mut packed = GzEncoder::new(Vec::new(), Compression::fast());
+    packed.write_all(&bytes).unwrap();
+    packed.finish().unwrap()
+}
+
+/// The table's rows without its first line.
+fn rows(path: &Path) -> Vec<Vec<String>> {
+    let file = fs::read_to_string(path).unwrap();
+    file.lines().skip(1).map(|l| l.split(',').map(String::from).collect()).collect()
+}
+
+#[test]
+fn volumes_and_a_series_give_the_same() {
+    let folder = TempDir::new().unwrap();
+    let out = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let frames = frames();
+    let listed: Vec<&str> = frames.iter().map(String::as_str).collect();
+    let from_files = [&["track"], &listed[..], &["--mask", "mask.nii.gz", "--labels", "labels.nii.gz", "-o"]].concat();
+    let (said, _) = run(&[&from_files[..], &[&out("files")]].concat(), 0);
+    assert!(said.starts_with("3 of 3 frames measured against frame 0"), "{said}");
+    for (name, pack) in [("series.nii", false), ("series.nii.gz", true)] {
+        fs::write(folder.path().join(name), series(pack)).unwrap();
+        let arguments = ["--mask", "mask.nii.gz", "--labels", "labels.nii.gz", "-o", &out("series"), "--force"];
+        run(&[&["track", &out(name)], &arguments[..]].concat(), 0);
+        for t in 0..FRAMES {
+            let field = |from: &str| {
+                io::read_field(folder.path().join(from).join(format!("displacement_{t:03}.nii.gz"))).unwrap()
+            };
+            assert!(field("files") == field("series"), "{name}, frame {t}");
+        }
+    }
+
+    let results = folder.path().join("series");
+    let summary: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(results.join("summary.json")).unwrap()).unwrap();
+    assert_eq!((&summary["step_s"], summary["reference"].as_u64()), (&serde_json::json!(0.25), Some(0)));
+    assert_eq!(summary["frames"].as_array().unwrap().len(), 3);
+    let strain = rows(&results.join("strain.csv"));
+    assert!(
+        strain.iter().all(|r| r.len() == 12) && strain.iter().any(|r| r[..3] == ["3", "0.750000", "2"]),
+        "{strain:?}"
+    );
+    let points = rows(&results.join("trajectories.csv"));
+    assert!(points.iter().all(|r| r.len() == 8 && ["measured", "carried", "outside"].contains(&r[7].as_str())));
+    let page = fs::read_to_string(results.join("report.html")).unwrap();
+    assert!(page.contains("<canvas>") && !page.contains("http"));
+
+    // The whole series holds each frame's field, unpacked to the same bytes.
+    let packed = fs::read(results.join("displacement.nii.gz")).unwrap();
+    let mut all = Vec::new();
+    std::io::Read::read_to_end(&mut flate2::read::GzDecoder::new(&packed[..]), &mut all).unwrap();
+    let dim: Vec<i16> = (0..6).map(|i| i16::from_le_bytes([all[40 + 2 * i], all[41 + 2 * i]])).collect();
+    let n = dim[1..4].iter().map(|&d| d as usize).product::<usize>();
+    assert_eq!((dim[0], dim[4], dim[5]), (5, FRAMES as i16, 3));
+    assert_eq!(all.len(), 352 + 4 * n * 3 * FRAMES);
+    for t in 0..FRAMES {
+        let field = io::read_field(results.join(format!("displacement_{t:03}.nii.gz"))).unwrap();
+        for (c, sign) in [-1.0, -1.0, 1.0].into_iter().enumerate() {
+            let from = 352 + 4 * n * (c * FRAMES + t);
+            let same = |at: usize| {
+                let v = f32::from_le_bytes(*all[from + 4 * at..].first_chunk().unwrap());
+                v == sign * field.component(c)[at]
+            };
+            assert!((0..n).all(same), "frame {t}, component {c}");
+        }
+    }
+}
+
+#[test]
+fn the_reference_may_be_any_frame() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("out");
+    let frames = frames();
+    let listed: Vec<&str> = frames.iter().map(String::as_str).collect();
+    run(&[&["track"], &listed[..], &["--reference", "2", "-o", out.to_str().unwrap()]].concat(), 0);
+    let still = io::read_field(out.join("displacement_002.nii.gz")).unwrap();
+    assert!(still.as_slice().iter().all(|&u| u == 0.0));
+    assert!(out.join("strain_003.nii.gz").exists() && !out.join("strain_002.nii.gz").exists());
+}
+
+#[test]
+fn what_cannot_be_tracked_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    fs::write(path("short.nii.gz"), &series(true)[..20_000]).unwrap();
+    fs::write(path("cut.nii"), &series(false)[..100_000]).unwrap();
+    let flat = Nifti { times: 3, values: vec![1.0; 3 * 512], ..Nifti::filled([8, 8, 8], 1.0) };
+    fs::write(path("flat.nii"), flat.bytes()).unwrap();
+    fs::write(path("other.nii"), Nifti::filled([5, 5, 5], 1.0).bytes()).unwrap();
+    let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
+    let (short, cut, flat, other, out) =
+        (path("short.nii.gz"), path("cut.nii"), path("flat.nii"), path("other.nii"), path("out"));
+    for (arguments, code, parts) in [
+        (vec![a], 2, ["frame_000.nii.gz", "two or more"]),
+        (vec![a, b, "--reference", "2"], 2, ["--reference is 2", "2 volumes"]),
+        (vec![a, "missing.nii"], 1, ["missing.nii", "check the spelling"]),
+        (vec![&short], 1, ["short.nii.gz", "cut short"]),
+        (vec![&cut], 1, ["cut.nii", "cut short"]),
+        (vec![&flat], 1, ["flat.nii", "same value"]),
+        (vec![a, b, "--labels", &other], 1, ["other.nii", "frame_000.nii.gz"]),
+        (vec!["truth_001.nii.gz"], 1, ["truth_001.nii.gz", "series of scalar volumes"]),
+    ] {
+        let all = [&["track"], &arguments[..], &["-o", &out]].concat();
+        let (said, err) = run(&all, code);
+        assert!(said.is_empty(), "{said}");
+        parts.iter().for_each(|p| assert!(err.contains(p), "should say {p:?}: {err}"));
+        assert!(!Path::new(&out).exists());
+    }
+}
+
+#[test]
+fn a_sequence_takes_no_motion_of_a_pair() {
+    let (_, err) = run(&["phantom", "pinch", "--motion", "press", "-o", "never"], 2);
+    assert!(err.contains("--motion"), "{err}");
+    let (_, err) = run(&["phantom", "pinhc", "-o", "never"], 2);
+    assert!(err.contains("pinch") && err.contains("calf"), "{err}");
+    let (_, err) = run(&["phantom", "pen", "--amplitude", "40", "-o", "never"], 1);
+    assert!(err.contains("amplitude"), "{err}");
+}
