@@ -241,6 +241,16 @@ pub enum SceneError {
     /// A value out of range.
     #[error(transparent)]
     Param(#[from] ParamError),
+    /// A value that does not go with the others.
+    #[error("{key} is {value}, but must be {range}")]
+    Value {
+        /// Its place in the scene.
+        key: String,
+        /// What was given.
+        value: String,
+        /// What may be given.
+        range: &'static str,
+    },
     /// The half span and the normal displacement contradict each other.
     #[error(
         "finger.half_span {half_span} m and initial.normal_displacement {depth} m do not go together: \

@@ -22,6 +22,8 @@ pub mod field;
 
 pub mod grasp;
 
+pub mod skin;
+
 pub mod synth;
 
 pub mod evaluate;

@@ -25,6 +25,8 @@ mod phantom;
 
 mod sequence;
 
+mod skin;
+
 mod track;
 
 mod warp;
@@ -77,6 +79,8 @@ enum Command {
     Grasp(grasp::Options),
     /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
     GraspAnalysis(grasp_analysis::Options),
+    /// Press, hold and let go layers of skin from a scene file
+    Skin(skin::Options),
     /// Make a synthetic pair of volumes with exactly known displacement
     Phantom(phantom::Options),
     /// Score a displacement field against exact truth
@@ -103,6 +107,7 @@ pub fn run() -> ExitCode {
         Command::Track(options) => track::run(&options, &console),
         Command::Grasp(options) => grasp::run(&options, &console),
         Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
+        Command::Skin(options) => skin::run(&options, &console),
         Command::Phantom(options) => phantom::run(&options, &console),
         Command::Evaluate(options) => evaluate::run(&options, &console),
         Command::Demo(options) => demo::run(&options, &console),

@@ -14,6 +14,8 @@ pub mod scene;
 
 pub mod grasp;
 
+pub mod skin;
+
 pub mod track;
 
 pub mod text;
@@ -36,6 +38,7 @@ pub use nifti::{
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
+pub use skin::{read_skin_scene, write_response};
 pub use text::{write_bytes, write_json, write_text};
 pub use track::{write_strain, write_trajectories};
 pub use vtu::{write_tet_mesh, write_tri_mesh};

@@ -84,7 +84,7 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
     Ok(SceneFile { scene, sweep, fingertip_file })
 }
 
-fn read_table(path: &Path) -> Result<Table, IoError> {
+pub(super) fn read_table(path: &Path) -> Result<Table, IoError> {
     let text = fs::read_to_string(path).map_err(os(path, "read"))?;
     text.parse().map_err(|error: toml::de::Error| {
         let line = error.span().map_or(1, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
@@ -118,7 +118,7 @@ fn check_keys(path: &Path, table: &Table) -> Result<(), IoError> {
     Ok(())
 }
 
-fn known(path: &Path, place: &str, table: &Table, keys: &[&'static str]) -> Result<(), IoError> {
+pub(super) fn known(path: &Path, place: &str, table: &Table, keys: &[&'static str]) -> Result<(), IoError> {
     let choices: Vec<(&'static str, ())> = keys.iter().map(|k| (*k, ())).collect();
     for key in table.keys() {
         if !keys.contains(&key.as_str()) {

@@ -20,6 +20,8 @@ pub mod bspline;
 pub mod cubic;
 mod multilevel;
 
+pub mod banded;
+
 pub mod bending;
 
 pub mod statistics;

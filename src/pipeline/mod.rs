@@ -11,4 +11,6 @@ pub mod check;
 
 pub mod grasp;
 
+pub mod skin;
+
 pub mod track;

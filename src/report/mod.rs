@@ -40,6 +40,8 @@ pub mod json;
 
 pub mod plot;
 
+pub mod skin;
+
 pub mod film;
 
 pub mod track;

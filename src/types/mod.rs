@@ -30,6 +30,8 @@ pub mod scene;
 
 pub mod grasp;
 
+pub mod skin;
+
 pub use field::DenseField;
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{TetMesh, TriMesh};

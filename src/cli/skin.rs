@@ -1,0 +1,52 @@
+//! `palpate skin`: layers of skin pressed, held and let go.
+
+use super::console::Console;
+use super::inputs::{check_distinct, name, warn_all};
+use super::outputs::Target;
+use anyhow::Result;
+use clap::Args;
+use palpate::io;
+use palpate::pipeline;
+use palpate::report::skin::{SkinReport, page, summary, text};
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Scene file (.toml); docs/skin.md shows one
+    scene: PathBuf,
+    #[command(flatten)]
+    target: Target,
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let Options { scene: path, target } = options;
+    let scene = io::read_skin_scene(path)?;
+    check_distinct(&[path], &target.files(&["response.csv", "summary.json", "report.html"]))?;
+    let mut folder = target.create()?;
+    let progress = console.progress();
+    progress.set("skin", 0.0);
+    let outcome = pipeline::skin::run(&scene);
+    let name = name(path);
+    let mut warnings = Vec::new();
+    if outcome.block.is_none() {
+        warnings.push(format!("{name}: the block has no solution; its values are too far apart"));
+    }
+    let report = SkinReport {
+        name: &name,
+        scene: &scene,
+        column: &outcome.column,
+        single: outcome.single.as_ref().map(|s| s.1.as_slice()),
+        block: outcome.block.as_ref(),
+        single_block: outcome.single_block.as_ref(),
+        residual: &outcome.residual,
+        seconds: &outcome.seconds,
+        warnings: &warnings,
+    };
+    folder.write("response.csv", |p| io::write_response(p, &scene, &outcome.column))?;
+    folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
+    folder.write("report.html", |p| io::write_text(p, &page(&report)))?;
+    folder.commit()?;
+    drop(progress);
+    warn_all(console, &warnings);
+    console.say(&format!("{}{}", text(&report), target.look()))
+}

@@ -1,0 +1,42 @@
+//! Layered skin: a scene to the response of the column and of the block, with and without its layers.
+
+use crate::skin::{block, column};
+use crate::types::skin::{BlockRun, SkinSample, SkinScene};
+use std::time::Instant;
+
+/// What a skin scene gives.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SkinOutcome {
+    /// The column of layers.
+    pub column: Vec<SkinSample>,
+    /// One layer in place of all, where their elements are alike: its scene and response.
+    pub single: Option<(SkinScene, Vec<SkinSample>)>,
+    /// The block of layers; none when a step has no solution.
+    pub block: Option<BlockRun>,
+    /// The block of one layer.
+    pub single_block: Option<BlockRun>,
+    /// Strain that stays after all time, by the impulse, for each layer without a lone spring.
+    pub residual: Vec<Option<f64>>,
+    /// Stage names and wall seconds.
+    pub seconds: Vec<(String, f64)>,
+}
+
+/// Runs a checked scene.
+pub fn run(scene: &SkinScene) -> SkinOutcome {
+    let mut seconds = Vec::new();
+    let mut timed = |name: &str, from: Instant| seconds.push((name.to_string(), from.elapsed().as_secs_f64()));
+    let started = Instant::now();
+    let column = column::respond(scene);
+    let single = scene.without_layers().map(|one| {
+        let response = column::respond(&one);
+        (one, response)
+    });
+    timed("column", started);
+    let started = Instant::now();
+    let (block, single_block) =
+        rayon::join(|| block::respond(scene), || single.as_ref().and_then(|(one, _)| block::respond(one)));
+    timed("block", started);
+    let impulse = column.last().map_or(0.0, |s| s.impulse);
+    let residual = scene.layers.iter().map(|l| column::residual(l, impulse)).collect();
+    SkinOutcome { column, single, block, single_block, residual, seconds }
+}
