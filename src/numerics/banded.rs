@@ -64,7 +64,8 @@ impl Band {
                 let at = self.at(i, j);
                 let rest = self.rows[at] - sum;
                 if i == j {
-                    if !(rest > 0.0) {
+                    let positive = rest > 0.0;
+                    if !positive {
                         return false;
                     }
                     self.rows[at] = rest.sqrt();

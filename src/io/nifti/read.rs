@@ -97,8 +97,8 @@ fn field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
 
 type Layout = fn(&Header, [usize; 7]) -> Result<usize, Flaw>;
 
-/// The grid and all values, component after component; `layout` judges the axes and gives the number of components.
-fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
+/// A regular file, its size and its first bytes, at most [`LONGEST`].
+pub(super) fn open(path: &Path) -> Result<(File, u64, Vec<u8>), IoError> {
     let mut file = File::open(path).map_err(os(path, "read"))?;
     let metadata = file.metadata().map_err(os(path, "read"))?;
     if !metadata.is_file() {
@@ -106,6 +106,12 @@ fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
     }
     let mut head = Vec::new();
     file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
+    Ok((file, metadata.len(), head))
+}
+
+/// The grid and all values, component after component; `layout` judges the axes and gives the number of components.
+fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
+    let (mut file, size, mut head) = open(path)?;
     let packed = if gzip::is_gzip(&head) {
         file.read_to_end(&mut head).map_err(os(path, "read"))?;
         let packed = std::mem::take(&mut head);
@@ -127,7 +133,7 @@ fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
             decode(&plan, &data[plan.start as usize..end])
         }
         None => {
-            let end = plan.end_within(metadata.len()).map_err(|flaw| flaw.at(path))?;
+            let end = plan.end_within(size).map_err(|flaw| flaw.at(path))?;
             let mut data = vec![0; end - plan.start as usize];
             file.seek(SeekFrom::Start(plan.start))
                 .and_then(|_| file.read_exact(&mut data))

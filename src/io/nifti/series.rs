@@ -2,7 +2,7 @@
 
 use super::flaw::Flaw;
 use super::header::{Header, LONGEST};
-use super::read::{Plan, decode};
+use super::read::{Plan, decode, open};
 use crate::error::IoError;
 use crate::io::{gzip, os};
 use crate::types::{Grid, Volume};
@@ -40,13 +40,7 @@ impl Series {
     /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of these.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, IoError> {
         let path = path.as_ref();
-        let mut file = File::open(path).map_err(os(path, "read"))?;
-        let metadata = file.metadata().map_err(os(path, "read"))?;
-        if !metadata.is_file() {
-            return Err(Flaw::new("is not a regular file", "give a .nii or .nii.gz").at(path));
-        }
-        let mut head = Vec::new();
-        file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
+        let (file, size, mut head) = open(path)?;
         let (source, most) = if gzip::is_gzip(&head) {
             head.clear();
             let mut start = Source::packed(path).map_err(os(path, "read"))?;
@@ -55,9 +49,9 @@ impl Series {
                 let _ = unpacked.take(LONGEST as u64).read_to_end(&mut head);
             }
             let fresh = Source::packed(path).map_err(os(path, "read"))?;
-            (fresh, metadata.len().saturating_mul(gzip::LARGEST_RATIO))
+            (fresh, size.saturating_mul(gzip::LARGEST_RATIO))
         } else {
-            (Source::Plain(file), metadata.len())
+            (Source::Plain(file), size)
         };
         let header = Header::parse(&head).map_err(|flaw| flaw.at(path))?;
         let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
