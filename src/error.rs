@@ -281,6 +281,39 @@ pub enum SceneError {
     },
 }
 
+/// Reducing a stiffness map to a fingertip.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum FingertipError {
+    /// Nothing hard under the tissue.
+    #[error(
+        "no bone or back plate lies under the pad; name that region bone (palpate stiffness --names 3=bone), or check the \
+         side that was pressed"
+    )]
+    NoBone,
+    /// Hardly any tissue.
+    #[error(
+        "only {found} columns of tissue lie between the surface and the bone, {needed} are needed; check the labels"
+    )]
+    TooFew {
+        /// How many there are.
+        found: usize,
+        /// How many are needed.
+        needed: usize,
+    },
+    /// The grid is askew to the contact.
+    #[error(
+        "the volume's axes are {degrees:.0} degrees off the pressed side; resample the labels along it (10 at most)"
+    )]
+    Askew {
+        /// Angle between the side and the nearest voxel axis (degrees).
+        degrees: f64,
+    },
+    /// Moduli without unit.
+    #[error("the stiffness map holds ratios; run palpate stiffness with --force, so that it is in kPa")]
+    NotAbsolute,
+}
+
 /// The grasp simulator.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]

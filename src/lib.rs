@@ -20,6 +20,8 @@ pub mod mesh;
 
 pub mod field;
 
+pub mod fingertip;
+
 pub mod grasp;
 
 pub mod skin;

@@ -11,6 +11,8 @@ mod evaluate;
 
 mod field;
 
+mod fingertip;
+
 mod grasp;
 
 mod grasp_analysis;
@@ -75,6 +77,8 @@ enum Command {
     Invert(invert::Options),
     /// Follow the tissue of one volume through a sequence of others
     Track(track::Options),
+    /// Reduce a stiffness map of a finger pad to a fingertip for grasps
+    Fingertip(fingertip::Options),
     /// Simulate a soft-finger grasp from a scene file
     Grasp(grasp::Options),
     /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
@@ -105,6 +109,7 @@ pub fn run() -> ExitCode {
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
         Command::Track(options) => track::run(&options, &console),
+        Command::Fingertip(options) => fingertip::run(&options, &console),
         Command::Grasp(options) => grasp::run(&options, &console),
         Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
         Command::Skin(options) => skin::run(&options, &console),

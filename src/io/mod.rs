@@ -14,6 +14,8 @@ pub mod scene;
 
 pub mod grasp;
 
+pub mod fingertip;
+
 pub mod skin;
 
 pub mod track;
@@ -29,6 +31,7 @@ mod deflate;
 mod gzip;
 
 pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
+pub use fingertip::{StiffnessFolder, StiffnessRegion, read_stiffness, write_fingertip};
 pub use grasp::{
     write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };

@@ -11,6 +11,8 @@ pub mod check;
 
 pub mod grasp;
 
+pub mod fingertip;
+
 pub mod skin;
 
 pub mod track;

@@ -78,6 +78,56 @@ impl Fingertip {
     }
 }
 
+/// A column of tissue between a pad's surface and its back plate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Column {
+    /// Across the contact (mm).
+    pub place: [f64; 2],
+    /// Cross section (mm^2).
+    pub area: f64,
+    /// How far its surface lies behind the foremost one (mm).
+    pub gap: f64,
+    /// Length (mm).
+    pub length: f64,
+    /// Sum of its layers' thickness over modulus (mm/kPa).
+    pub compliance: f64,
+}
+
+/// How much of a stiffness map a pad's force needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PadModel {
+    /// One modulus.
+    Uniform,
+    /// A layer of one compliance over a uniform rest.
+    Layered,
+    /// Every column its own.
+    Map,
+}
+
+/// A finger pad as a fingertip model.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PadReduction {
+    /// The smallest model whose forces are the map's, to 2 %.
+    pub model: PadModel,
+    /// The one modulus that in this shape gives the map's forces best (kPa).
+    pub effective_kpa: f64,
+    /// The modulus of the hemisphere whose force, pi E d^2, is nearest to the map's (kPa).
+    pub hemisphere_kpa: f64,
+    /// Relative distance of that force from the map's (1).
+    pub hemisphere_residual: f64,
+    /// Radius of the surface about its foremost place (mm).
+    pub radius_mm: f64,
+    /// Thickness of the tissue there (mm).
+    pub thickness_mm: f64,
+    /// Relative distance of the forces of one modulus, of layers and of the map from the map's (1).
+    pub residuals: [f64; 3],
+    /// Indentation (mm), force of the map and of one modulus (N).
+    pub curve: Vec<[f64; 3]>,
+    /// Columns.
+    pub columns: usize,
+}
+
 /// `value` must be a number above 0, to `most`.
 pub(super) fn positive(name: &'static str, value: f64, most: f64, range: &'static str) -> Result<(), ParamError> {
     if value > 0.0 && value <= most { Ok(()) } else { Err(ParamError { name, value, range }) }

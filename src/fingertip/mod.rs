@@ -1,0 +1,161 @@
+//! A stiffness map of a finger pad reduced to a fingertip model: springs on a hard back plate.
+//!
+//! The parallel distributed model (Inoue & Hirai 2006) with springs that are not alike: each column of tissue between the
+//! surface and the back plate (the bone) is a spring whose compliance is the sum of its layers', `sum dz / E` for each unit
+//! of area. A plate pressed in by d shortens a column that lies `gap` behind the foremost one by d - gap, so
+//! `F(d) = sum A (d - gap)+ / sum(dz / E)`. For a uniform hemisphere this is `pi E d^2`.
+
+use crate::error::FingertipError;
+use crate::types::Volume;
+use crate::types::fingertip::{Column, PadModel, PadReduction};
+
+/// Columns that a pad must have.
+const FEWEST: usize = 20;
+
+/// The columns of a pad under its surface, along the voxel axis that faces the contact.
+///
+/// `modulus` is Young's modulus (kPa; 0 outside), `bone` tells it from tissue by its offset. The contact comes from the
+/// end of `axis` (0, 1 or 2) that `from_end` names. Columns that pass the bone end at the depth where it begins nearest
+/// to the contact: the back plate is thought to go on there.
+///
+/// # Errors
+/// [`FingertipError`] when no column meets bone, or too few have tissue.
+pub fn columns(
+    modulus: &Volume,
+    bone: impl Fn(usize) -> bool,
+    axis: usize,
+    from_end: bool,
+) -> Result<Vec<Column>, FingertipError> {
+    let grid = modulus.grid();
+    let (shape, spacing, values) = (grid.shape(), grid.spacing(), modulus.as_slice());
+    let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+    let n = shape[axis];
+    let at = |i: usize, j: usize, depth: usize| {
+        let mut voxel = [0; 3];
+        (voxel[u], voxel[v]) = (i, j);
+        voxel[axis] = if from_end { n - 1 - depth } else { depth };
+        grid.index(voxel[0], voxel[1], voxel[2])
+    };
+    let lines = || (0..shape[v]).flat_map(|j| (0..shape[u]).map(move |i| (i, j)));
+    let surface = |i: usize, j: usize| (0..n).find(|&d| values[at(i, j, d)] > 0.0);
+    let bone_at = |i: usize, j: usize, from: usize| (from..n).find(|&d| bone(at(i, j, d)));
+    let starts: Vec<(usize, usize, usize, Option<usize>)> =
+        lines().filter_map(|(i, j)| surface(i, j).map(|s| (i, j, s, bone_at(i, j, s)))).collect();
+    let plate = starts.iter().filter_map(|c| c.3).min().ok_or(FingertipError::NoBone)?;
+    let foremost = starts.iter().map(|c| c.2).min().unwrap_or(0);
+    let thick = spacing[axis];
+    let area = spacing[u] * spacing[v];
+    let mut out = Vec::new();
+    for (i, j, start, bone) in starts {
+        let end = bone.unwrap_or(plate.max(start));
+        let tissue: Vec<f64> = (start..end).map(|d| f64::from(values[at(i, j, d)])).take_while(|e| *e > 0.0).collect();
+        if tissue.is_empty() {
+            continue;
+        }
+        out.push(Column {
+            place: [i as f64 * spacing[u], j as f64 * spacing[v]],
+            area,
+            gap: (start - foremost) as f64 * thick,
+            length: tissue.len() as f64 * thick,
+            compliance: tissue.iter().map(|e| thick / e).sum(),
+        });
+    }
+    if out.len() < FEWEST {
+        return Err(FingertipError::TooFew { found: out.len(), needed: FEWEST });
+    }
+    Ok(out)
+}
+
+/// Force of the columns on a plate pressed in by `depth` mm (N, with moduli in kPa).
+pub fn force(columns: &[Column], depth: f64) -> f64 {
+    columns.iter().map(|c| 1e-3 * c.area * (depth - c.gap).max(0.0) / c.compliance).sum()
+}
+
+/// The same with one modulus (kPa) everywhere.
+fn uniform_force(columns: &[Column], modulus: f64, depth: f64) -> f64 {
+    columns.iter().map(|c| 1e-3 * c.area * (depth - c.gap).max(0.0) * modulus / c.length).sum()
+}
+
+/// One modulus, layers, or the whole map: the smallest that gives the map's forces.
+///
+/// `deepest` is the indentation up to which they are compared (mm). Layered means that all columns have the compliance of
+/// a mean column of their length, `length * p + q`: a surface layer of one thickness over a uniform rest.
+pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
+    let depths: Vec<f64> = (1..=24).map(|i| deepest * f64::from(i) / 24.0).collect();
+    let map: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let size = dot(&map, &map).max(f64::MIN_POSITIVE);
+    let residual = |model: &[f64]| {
+        let off: Vec<f64> = model.iter().zip(&map).map(|(m, f)| m - f).collect();
+        (dot(&off, &off) / size).sqrt()
+    };
+    let one: Vec<f64> = depths.iter().map(|&d| uniform_force(columns, 1.0, d)).collect();
+    let effective = dot(&one, &map) / dot(&one, &one).max(f64::MIN_POSITIVE);
+    let uniform: Vec<f64> = one.iter().map(|f| effective * f).collect();
+    // Least squares of compliance against length, weighted by area and what the deepest press asks of a column.
+    let (mut a, mut b) = ([[0.0; 2]; 2], [0.0; 2]);
+    for c in columns {
+        let w = c.area * (deepest - c.gap).max(0.0);
+        for (r, x) in [c.length, 1.0].into_iter().enumerate() {
+            b[r] += w * x * c.compliance;
+            for (s, y) in [c.length, 1.0].into_iter().enumerate() {
+                a[r][s] += w * x * y;
+            }
+        }
+    }
+    let det = a[0][0] * a[1][1] - a[0][1] * a[1][0];
+    let flat = det.abs() <= 1e-12 * a[0][0].abs() * a[1][1].abs();
+    let [p, q] = match flat {
+        true => [b[0] / a[0][0].max(f64::MIN_POSITIVE), 0.0],
+        false => [(b[0] * a[1][1] - b[1] * a[0][1]) / det, (a[0][0] * b[1] - a[1][0] * b[0]) / det],
+    };
+    let mean: Vec<Column> =
+        columns.iter().map(|c| Column { compliance: (p * c.length + q).max(1e-12), ..*c }).collect();
+    let layered: Vec<f64> = depths.iter().map(|&d| force(&mean, d)).collect();
+    let residuals = [residual(&uniform), residual(&layered), 0.0];
+    let model = match residuals {
+        [r, ..] if r <= ENOUGH => PadModel::Uniform,
+        [_, r, _] if r <= ENOUGH => PadModel::Layered,
+        _ => PadModel::Map,
+    };
+    // The hemisphere whose force pi E d^2 is nearest: what the grasp simulator presses.
+    let square: Vec<f64> = depths.iter().map(|d| 1e-3 * std::f64::consts::PI * d * d).collect();
+    let hemisphere = dot(&square, &map) / dot(&square, &square).max(f64::MIN_POSITIVE);
+    PadReduction {
+        model,
+        effective_kpa: effective,
+        hemisphere_kpa: hemisphere,
+        hemisphere_residual: residual(&square.iter().map(|f| hemisphere * f).collect::<Vec<_>>()),
+        radius_mm: radius(columns, deepest),
+        thickness_mm: columns.iter().filter(|c| c.gap == 0.0).map(|c| c.length).fold(0.0, f64::max),
+        residuals,
+        curve: depths.iter().zip(&map).zip(&uniform).map(|((d, m), u)| [*d, *m, *u]).collect(),
+        columns: columns.len(),
+    }
+}
+
+/// Relative residual of the forces below which a smaller model is enough.
+const ENOUGH: f64 = 0.02;
+
+/// Radius of the surface about its foremost place (mm): gap = |place - apex|^2 / (2 R), least squares over the columns
+/// that a press of `deepest` mm touches.
+fn radius(columns: &[Column], deepest: f64) -> f64 {
+    // gap = a r^2 + b x + c y + d; R = 1 / (2 a).
+    let mut m = [[0.0; 4]; 4];
+    let mut rhs = [0.0; 4];
+    let near: Vec<&Column> = columns.iter().filter(|c| c.gap <= deepest).collect();
+    let n = near.len().max(1) as f64;
+    let middle = [0, 1].map(|a| near.iter().map(|c| c.place[a]).sum::<f64>() / n);
+    for c in near {
+        let [x, y] = [0, 1].map(|a| c.place[a] - middle[a]);
+        let basis = [x * x + y * y, x, y, 1.0];
+        for r in 0..4 {
+            rhs[r] += basis[r] * c.gap;
+            for s in 0..4 {
+                m[r][s] += basis[r] * basis[s];
+            }
+        }
+    }
+    let curvature = crate::numerics::dense::solve(&m, &rhs).map_or(0.0, |x| x[0]);
+    if curvature > 0.0 { 0.5 / curvature } else { f64::INFINITY }
+}

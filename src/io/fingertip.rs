@@ -1,0 +1,122 @@
+//! A folder of `palpate stiffness` read back, and fingertip files.
+
+use super::{format, os, write_text};
+use crate::error::IoError;
+use crate::io::nifti::read_volume;
+use crate::types::Volume;
+use crate::types::fingertip::PadReduction;
+use serde::Deserialize;
+use std::fs;
+use std::path::Path;
+
+/// What a stiffness folder says.
+#[derive(Debug, Clone)]
+pub struct StiffnessFolder {
+    /// Young's modulus (kPa where absolute; 0 outside).
+    pub map: Volume,
+    /// Whether it is in kPa.
+    pub absolute: bool,
+    /// Name, modulus and bound (`lower`, `upper` or none) of each region.
+    pub regions: Vec<StiffnessRegion>,
+    /// The pressed side as it was called, `z-` say.
+    pub load: String,
+    /// Force on it (N), where it was given.
+    pub force_n: Option<f64>,
+    /// How the pressed and the held patch moved (mm, RAS).
+    pub translation: [[f64; 3]; 2],
+}
+
+/// One region of a stiffness folder.
+#[derive(Debug, Clone, Deserialize)]
+pub struct StiffnessRegion {
+    /// Its name.
+    pub name: String,
+    /// Young's modulus, or the bound.
+    pub youngs_modulus: f64,
+    /// `lower` or `upper` where it is not identifiable.
+    pub bound: Option<String>,
+}
+
+#[derive(Deserialize)]
+struct RawSummary {
+    absolute: bool,
+    regions: Vec<StiffnessRegion>,
+    inputs: RawInputs,
+    force_n: Option<f64>,
+    patches: RawPatches,
+}
+
+#[derive(Deserialize)]
+struct RawInputs {
+    load: String,
+}
+
+#[derive(Deserialize)]
+struct RawPatches {
+    held: RawPatch,
+    loaded: RawPatch,
+}
+
+#[derive(Deserialize)]
+struct RawPatch {
+    translation: [f64; 3],
+}
+
+/// Reads `stiffness.nii.gz` and `summary.json` of a folder that `palpate stiffness` wrote.
+///
+/// # Errors
+/// [`IoError`] when a file cannot be read or is of another command.
+pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoError> {
+    let folder = folder.as_ref();
+    let path = folder.join("summary.json");
+    let text = fs::read_to_string(&path).map_err(os(&path, "read"))?;
+    let hint = "give the folder that `palpate stiffness` wrote";
+    let command: Option<String> = serde_json::from_str::<serde_json::Value>(&text)
+        .ok()
+        .and_then(|v| v.get("command").and_then(|c| c.as_str().map(String::from)));
+    if let Some(other) = command.filter(|c| c != "stiffness") {
+        return Err(format(&path, format!("is of `palpate {other}`"), hint));
+    }
+    let raw: RawSummary = serde_json::from_str(&text).map_err(|e| format(&path, e.to_string(), hint))?;
+    Ok(StiffnessFolder {
+        map: read_volume(folder.join("stiffness.nii.gz"))?,
+        absolute: raw.absolute,
+        regions: raw.regions,
+        load: raw.inputs.load,
+        force_n: raw.force_n,
+        translation: [raw.patches.loaded.translation, raw.patches.held.translation],
+    })
+}
+
+/// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of the hemisphere that
+/// presses like the pad, and how it was found under `[pad]`.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_fingertip(path: impl AsRef<Path>, pad: &PadReduction, radius_mm: f64, from: &str) -> Result<(), IoError> {
+    let rows = |k: usize| pad.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
+    let name = serde_json::to_value(pad.model).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default();
+    let [uniform, layered, _] = pad.residuals;
+    let text = format!(
+        "# A fingertip for the grasp simulator, from {from}: [fingertip] file = \"this file\"\n\
+         # The hemisphere whose force pi E d^2 is nearest to the pad's. SI units above, mm, kPa and N under [pad].\n\
+         radius = {:.6e}\nyoungs_modulus = {:.6e}\nmodel = \"parallel\"\n\n\
+         [pad]\n\
+         model = \"{name}\"          # the smallest of uniform, layered and map whose forces are the map's to 2 %\n\
+         effective_kpa = {:.6}      # one modulus in the pad's own shape\n\
+         residual_uniform = {uniform:.6}\nresidual_layered = {layered:.6}\nresidual_hemisphere = {:.6}\n\
+         surface_radius_mm = {}\nthickness_mm = {:.6}\ncolumns = {}\n\
+         indentation_mm = [{}]\nforce_n = [{}]\nforce_one_modulus_n = [{}]\n",
+        1e-3 * radius_mm,
+        1e3 * pad.hemisphere_kpa,
+        pad.effective_kpa,
+        pad.hemisphere_residual,
+        if pad.radius_mm.is_finite() { format!("{:.6}", pad.radius_mm) } else { "inf".into() },
+        pad.thickness_mm,
+        pad.columns,
+        rows(0),
+        rows(1),
+        rows(2),
+    );
+    write_text(path, &text)
+}

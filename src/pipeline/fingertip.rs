@@ -1,0 +1,46 @@
+//! A stiffness map of a finger pad to a fingertip model.
+
+use crate::error::FingertipError;
+use crate::fingertip::{columns, force, reduce};
+use crate::types::Volume;
+use crate::types::fingertip::PadReduction;
+
+/// Largest angle between the pressed side and a voxel axis (degrees).
+const ASKEW: f64 = 10.0;
+
+/// Part of the tissue's thickness to which forces are compared, where the press is not known to have gone further.
+const DEPTH: f64 = 0.2;
+
+/// What a pad was reduced to, and its force at the press that was measured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PadOutcome {
+    /// The model.
+    pub pad: PadReduction,
+    /// Indentation that was measured (mm), and force of the columns there (N).
+    pub at_press: Option<[f64; 2]>,
+}
+
+/// Reduces a map (kPa; 0 outside) that was pressed against `outward` (unit vector of the pressed side, RAS), by
+/// `indentation` mm where that is known.
+///
+/// # Errors
+/// [`FingertipError`] when the grid is askew, no bone lies under the pad, or there is hardly any tissue.
+pub fn run(
+    map: &Volume,
+    bone: impl Fn(usize) -> bool,
+    outward: [f64; 3],
+    indentation: Option<f64>,
+) -> Result<PadOutcome, FingertipError> {
+    let (linear, spacing) = (map.grid().affine().linear(), map.grid().spacing());
+    let along = |a: usize| (0..3).map(|r| linear[r][a] * outward[r]).sum::<f64>() / spacing[a];
+    let axis = (1..3).fold(0, |best, a| if along(a).abs() > along(best).abs() { a } else { best });
+    let degrees = along(axis).abs().min(1.0).acos().to_degrees();
+    if degrees > ASKEW {
+        return Err(FingertipError::Askew { degrees });
+    }
+    let columns = columns(map, bone, axis, along(axis) > 0.0)?;
+    let thickness = columns.iter().filter(|c| c.gap == 0.0).map(|c| c.length).fold(0.0, f64::max);
+    let known = indentation.filter(|d| *d > 0.0 && *d < thickness);
+    let pad = reduce(&columns, known.unwrap_or(0.0).max(DEPTH * thickness));
+    Ok(PadOutcome { at_press: known.map(|d| [d, force(&columns, d)]), pad })
+}
