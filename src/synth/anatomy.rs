@@ -9,7 +9,8 @@ use crate::types::Grid;
 
 const INFINITE: f64 = f64::INFINITY;
 
-/// The body of a kind, sized to the grid's field of view.
+/// The body of a kind, sized to the grid's field of view. (Those of known stiffness have a form of their own, see
+/// [`crate::synth::elastic`]; here they are blocks.)
 pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Body {
     let half = extent(grid).map(|e| e / 2.0);
     let radius = 0.84 * half[0].min(half[1]);
@@ -18,7 +19,9 @@ pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Body {
         PhantomKind::Calf => Body::new(leg([radius; 3]), grid, 0.125 / half[2], 0.02 * radius, seed),
         PhantomKind::Slice => Body::new(leg([radius; 3]), grid, 0.0, 0.02 * radius, seed),
         PhantomKind::Head => Body::new(head(half), grid, 0.0, 0.015 * radius, seed),
-        PhantomKind::Block => Body::new(block(half), grid, 0.0, 0.02 * radius, seed),
+        PhantomKind::Block | PhantomKind::Inclusion | PhantomKind::Slab => {
+            Body::new(block(half), grid, 0.0, 0.02 * radius, seed)
+        }
         PhantomKind::Fingertip => Body::new(fingertip(half), grid, 0.0, 0.004 * radius, seed),
     }
 }
