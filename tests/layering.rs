@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 const BASE: [&str; 3] = ["types", "error", "numerics"];
 
 /// The steps of the work; none knows another.
-const STAGES: [&str; 8] = ["features", "matching", "consistency", "mesh", "field", "grasp", "synth", "evaluate"];
+const STAGES: [&str; 9] =
+    ["features", "matching", "consistency", "mesh", "field", "stiffness", "grasp", "synth", "evaluate"];
 
 /// What each part of `src` may import of this crate. `pipeline` and `cli` may import every stage.
 fn allowed(part: &str) -> Vec<&'static str> {

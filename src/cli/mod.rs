@@ -27,6 +27,8 @@ mod sequence;
 
 mod track;
 
+mod stiffness;
+
 mod warp;
 
 use clap::{Args, Parser, Subcommand};
@@ -73,6 +75,8 @@ enum Command {
     Invert(invert::Options),
     /// Follow the tissue of one volume through a sequence of others
     Track(track::Options),
+    /// Young's modulus from a displacement field, region by region or without regions
+    Stiffness(stiffness::Options),
     /// Simulate a soft-finger grasp from a scene file
     Grasp(grasp::Options),
     /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
@@ -101,6 +105,7 @@ pub fn run() -> ExitCode {
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
         Command::Track(options) => track::run(&options, &console),
+        Command::Stiffness(options) => stiffness::run(&options, &console),
         Command::Grasp(options) => grasp::run(&options, &console),
         Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
         Command::Phantom(options) => phantom::run(&options, &console),

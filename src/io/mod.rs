@@ -16,6 +16,8 @@ pub mod grasp;
 
 pub mod track;
 
+pub mod stiffness;
+
 pub mod text;
 
 pub mod output;
@@ -36,9 +38,10 @@ pub use nifti::{
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
+pub use stiffness::{write_feb, write_inp, write_regions};
 pub use text::{write_bytes, write_json, write_text};
 pub use track::{write_strain, write_trajectories};
-pub use vtu::{write_tet_mesh, write_tri_mesh};
+pub use vtu::{write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;
 use std::path::Path;

@@ -30,4 +30,8 @@ pub mod neighbours;
 
 pub mod dense;
 
+pub mod sparse;
+
+pub mod cholesky;
+
 pub mod trig;

@@ -12,3 +12,7 @@ pub mod check;
 pub mod grasp;
 
 pub mod track;
+
+pub mod stiffness;
+
+mod search;
