@@ -83,6 +83,15 @@ pub enum MeshError {
     /// All points lie on one line.
     #[error("all points lie on one line, so there is no triangle among them")]
     Collinear,
+    /// No element fits into a labelled part.
+    #[error(
+        "no element of the mesh falls into label {label}: it is too small for the mesh; refine it with a larger --nodes, or \
+         merge that label with its neighbour"
+    )]
+    PartLost {
+        /// The label.
+        label: u8,
+    },
     /// All points lie in one plane (use the 2D Delaunay).
     #[error("all points lie in one plane, so there is no tetrahedron among them")]
     Coplanar,
@@ -223,6 +232,81 @@ pub enum SynthError {
     /// Geometry.
     #[error(transparent)]
     Space(#[from] SpaceError),
+}
+
+/// The stiffness.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum StiffnessError {
+    /// A parameter out of range.
+    #[error(transparent)]
+    Param(#[from] ParamError),
+    /// Geometry.
+    #[error(transparent)]
+    Space(#[from] SpaceError),
+    /// Meshing.
+    #[error(transparent)]
+    Mesh(#[from] MeshError),
+    /// The body is in several pieces.
+    #[error(
+        "{what} is in {pieces} pieces, the largest of {largest} and the next of {next} voxels; elasticity needs one piece: keep \
+         the largest component, or join them"
+    )]
+    Disconnected {
+        /// The mask or the labels.
+        what: String,
+        /// How many.
+        pieces: usize,
+        /// Voxels of the largest.
+        largest: usize,
+        /// Voxels of the second.
+        next: usize,
+    },
+    /// A patch without a surface.
+    #[error("the {which} patch ({name}) {what}; {hint}")]
+    Patch {
+        /// `held` or `loaded`.
+        which: &'static str,
+        /// As given.
+        name: String,
+        /// What is wrong.
+        what: String,
+        /// What to try.
+        hint: String,
+    },
+    /// Nothing is deformed.
+    #[error(
+        "no load: the loaded patch moves {moved:.3} mm against the held one, where the field is good to {noise:.3} mm; check \
+         --held and --load, and that the field is not of a body at rest"
+    )]
+    NoLoad {
+        /// Inward motion (mm).
+        moved: f64,
+        /// Precision (mm).
+        noise: f64,
+    },
+    /// Too few samples.
+    #[error(
+        "{found} places of the field lie in the body, {needed} are needed; check that field and labels belong together"
+    )]
+    TooFew {
+        /// Found.
+        found: usize,
+        /// Needed.
+        needed: usize,
+    },
+    /// The matrix cannot be factorised.
+    #[error(
+        "the equations of the body cannot be solved: a part of it can move freely, or memory is short; check that the held \
+         patch is part of the body, or take fewer --nodes"
+    )]
+    Unsolvable,
+    /// An element is inside out.
+    #[error("an element turns inside out under the measured load; check the field, or use --model linear")]
+    InsideOut,
+    /// Newton's method does not converge.
+    #[error("no equilibrium was found under the measured load; check the field, or use --model linear")]
+    NoEquilibrium,
 }
 
 /// Pictures and pages.

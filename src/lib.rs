@@ -20,6 +20,8 @@ pub mod mesh;
 
 pub mod field;
 
+pub mod stiffness;
+
 pub mod fingertip;
 
 pub mod grasp;

@@ -8,8 +8,19 @@ use std::path::{Path, PathBuf};
 const BASE: [&str; 3] = ["types", "error", "numerics"];
 
 /// The steps of the work; none knows another.
-const STAGES: [&str; 10] =
-    ["features", "matching", "consistency", "mesh", "field", "fingertip", "grasp", "skin", "synth", "evaluate"];
+const STAGES: [&str; 11] = [
+    "features",
+    "matching",
+    "consistency",
+    "mesh",
+    "field",
+    "stiffness",
+    "fingertip",
+    "grasp",
+    "skin",
+    "synth",
+    "evaluate",
+];
 
 /// What each part of `src` may import of this crate. `pipeline` and `cli` may import every stage.
 fn allowed(part: &str) -> Vec<&'static str> {

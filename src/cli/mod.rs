@@ -31,6 +31,8 @@ mod skin;
 
 mod track;
 
+mod stiffness;
+
 mod warp;
 
 use clap::{Args, Parser, Subcommand};
@@ -77,6 +79,8 @@ enum Command {
     Invert(invert::Options),
     /// Follow the tissue of one volume through a sequence of others
     Track(track::Options),
+    /// Young's modulus from a displacement field, region by region or without regions
+    Stiffness(stiffness::Options),
     /// Reduce a stiffness map of a finger pad to a fingertip for grasps
     Fingertip(fingertip::Options),
     /// Simulate a soft-finger grasp from a scene file
@@ -109,6 +113,7 @@ pub fn run() -> ExitCode {
         Command::Warp(options) => warp::run(&options, &console),
         Command::Invert(options) => invert::run(&options, &console),
         Command::Track(options) => track::run(&options, &console),
+        Command::Stiffness(options) => stiffness::run(&options, &console),
         Command::Fingertip(options) => fingertip::run(&options, &console),
         Command::Grasp(options) => grasp::run(&options, &console),
         Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),

@@ -20,6 +20,8 @@ pub mod skin;
 
 pub mod track;
 
+pub mod stiffness;
+
 pub mod text;
 
 pub mod output;
@@ -42,9 +44,10 @@ pub use nifti::{
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use skin::{read_skin_scene, write_response};
+pub use stiffness::{write_feb, write_inp, write_regions};
 pub use text::{write_bytes, write_json, write_text};
 pub use track::{write_strain, write_trajectories};
-pub use vtu::{write_tet_mesh, write_tri_mesh};
+pub use vtu::{write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;
 use std::path::Path;

@@ -7,7 +7,7 @@
 use super::atomic::write_atomic;
 use super::{format, os};
 use crate::error::IoError;
-use crate::types::{TetMesh, TriMesh, WorldPoint};
+use crate::types::{QuadraticMesh, TetMesh, TriMesh, WorldPoint};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use libdeflater::{CompressionLvl, Compressor};
 use std::fmt::Write as _;
@@ -16,9 +16,10 @@ use std::path::Path;
 
 /// Bytes compressed together.
 const BLOCK: usize = 1 << 20;
-/// VTK's numbers for the two cells.
+/// VTK's numbers for the cells.
 const VTK_TRIANGLE: u8 = 5;
 const VTK_TETRA: u8 = 10;
+const VTK_QUADRATIC_TETRA: u8 = 24;
 
 /// Writes tetrahedra with `displacement` (mm, RAS) and its `magnitude` at the nodes, and one number a cell for each
 /// `(name, values)` of `cell_data`.
@@ -32,6 +33,19 @@ pub fn write_tet_mesh(
     cell_data: &[(&str, &[f32])],
 ) -> Result<(), IoError> {
     write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_TETRA, displacement, cell_data)
+}
+
+/// Writes quadratic tetrahedra, as [`write_tet_mesh`] does linear ones.
+///
+/// # Errors
+/// As [`write_tet_mesh`].
+pub fn write_quadratic_mesh(
+    path: impl AsRef<Path>,
+    mesh: &QuadraticMesh,
+    displacement: &[[f64; 3]],
+    cell_data: &[(&str, &[f32])],
+) -> Result<(), IoError> {
+    write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_QUADRATIC_TETRA, displacement, cell_data)
 }
 
 /// Writes triangles, as [`write_tet_mesh`] does tetrahedra.

@@ -28,6 +28,8 @@ pub mod locate;
 
 pub mod quality;
 
+pub mod tetrahedral;
+
 /// Stands in a neighbour table where an element has none, on the hull.
 pub const NO_NEIGHBOUR: u32 = u32::MAX;
 

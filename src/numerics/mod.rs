@@ -32,4 +32,8 @@ pub mod neighbours;
 
 pub mod dense;
 
+pub mod sparse;
+
+pub mod cholesky;
+
 pub mod trig;

@@ -16,3 +16,7 @@ pub mod fingertip;
 pub mod skin;
 
 pub mod track;
+
+pub mod stiffness;
+
+mod search;

@@ -169,7 +169,7 @@ pub(super) fn legend(scale: Option<&Scale>) -> String {
     )
 }
 
-fn card(panel: &Panel) -> String {
+pub(super) fn card(panel: &Panel) -> String {
     let figures: String =
         panel.pictures.iter().map(|p| figure(p.plane, p.size_mm, &image(p, "", &panel.title))).collect();
     let note = if panel.note.is_empty() { String::new() } else { format!("<p>{}</p>", escape(&panel.note)) };

@@ -54,5 +54,7 @@ pub mod grasp_surface;
 
 pub mod grasp_analysis;
 
+pub mod stiffness;
+
 pub use field::FieldReport;
 pub use grasp::GraspReport;

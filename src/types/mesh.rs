@@ -59,6 +59,46 @@ impl TriMesh {
     }
 }
 
+/// A mesh of quadratic tetrahedra, each in one region.
+///
+/// The ten nodes of an element are its four corners, positively oriented, and then the middles of the edges 01, 12, 02, 03,
+/// 13, 23 (the order of VTK, Abaqus and FEBio). Edges may be curved.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct QuadraticMesh {
+    nodes: Vec<WorldPoint>,
+    tetrahedra: Vec<[u32; 10]>,
+    labels: Vec<u8>,
+}
+
+impl QuadraticMesh {
+    /// From nodes (mm, RAS), elements and the region's label of each.
+    ///
+    /// # Errors
+    /// As [`TetMesh::new`]; [`MeshError::Length`] when there are not as many labels as elements.
+    pub fn new(nodes: Vec<WorldPoint>, tetrahedra: Vec<[u32; 10]>, labels: Vec<u8>) -> Result<Self, MeshError> {
+        check(&nodes, tetrahedra.iter().flatten())?;
+        if labels.len() != tetrahedra.len() {
+            return Err(MeshError::Length { expected: tetrahedra.len(), found: labels.len() });
+        }
+        Ok(Self { nodes, tetrahedra, labels })
+    }
+
+    /// Node positions (mm, RAS).
+    pub fn nodes(&self) -> &[WorldPoint] {
+        &self.nodes
+    }
+
+    /// Node numbers of each element.
+    pub fn tetrahedra(&self) -> &[[u32; 10]] {
+        &self.tetrahedra
+    }
+
+    /// Label of each element's region.
+    pub fn labels(&self) -> &[u8] {
+        &self.labels
+    }
+}
+
 fn check<'a>(nodes: &[WorldPoint], mut indices: impl Iterator<Item = &'a u32>) -> Result<(), MeshError> {
     if let Some(node) = nodes.iter().position(|p| p.0.iter().any(|v| !v.is_finite())) {
         return Err(MeshError::NotFinite { node });

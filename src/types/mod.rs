@@ -24,6 +24,8 @@ pub mod track;
 
 pub mod names;
 
+pub mod stiffness;
+
 pub mod fingertip;
 
 pub mod scene;
@@ -34,12 +36,13 @@ pub mod skin;
 
 pub use field::DenseField;
 pub use fingertip::{Fingertip, FingertipModel};
-pub use mesh::{TetMesh, TriMesh};
+pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
 pub use metrics::Metrics;
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
 pub use result::{Counts, FieldSummary, LevelReport, Mesh, MotionModel};
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
+pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Tracked, Trajectory};
 pub use volume::{Mask, Volume};

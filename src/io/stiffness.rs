@@ -1,0 +1,215 @@
+//! Tables and simulation models of a stiffness result: regions.csv, FEBio (`.feb`), Abaqus and CalculiX (`.inp`).
+//!
+//! The models repeat the identified problem: the same quadratic tetrahedra, one material a region (or a class of modulus),
+//! the held and loaded nodes with their displacements. Units: mm, N, MPa (both programs take any consistent set).
+
+use super::atomic::write_atomic;
+use super::csv::write_table;
+use crate::error::IoError;
+use crate::types::stiffness::{Law, Prescribed, RegionStiffness, StiffnessResult};
+use std::io::{self, Write};
+use std::path::Path;
+
+/// Columns of regions.csv.
+const COLUMNS: [&str; 6] = ["label", "name", "youngs_modulus_kpa", "sd_kpa", "ratio", "identifiable"];
+
+/// Writes label, name, Young's modulus (kPa), standard deviation (kPa; empty where not identifiable), ratio to the reference
+/// region, identifiable (1 or 0). Without a force the kPa columns are empty.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_regions(path: impl AsRef<Path>, regions: &[RegionStiffness], absolute: bool) -> Result<(), IoError> {
+    let number = |v: f64| if v.is_finite() { format!("{v:.6}") } else { String::new() };
+    let kpa = |v: f64| if absolute { number(v) } else { String::new() };
+    let row = |r: &RegionStiffness| {
+        vec![
+            r.label.to_string(),
+            r.name.clone(),
+            kpa(r.youngs_modulus),
+            kpa(r.sd),
+            number(r.ratio),
+            u8::from(r.identifiable).to_string(),
+        ]
+    };
+    write_table(path.as_ref(), &COLUMNS, regions.iter().map(row))
+}
+
+/// Elements of one material: its number of region, modulus (MPa) and elements.
+fn materials(result: &StiffnessResult) -> Vec<(u8, f64, Vec<usize>)> {
+    let mut out: Vec<(u8, f64, Vec<usize>)> = Vec::new();
+    for (e, &label) in result.mesh.labels().iter().enumerate() {
+        match out.iter_mut().find(|m| m.0 == label) {
+            Some(m) => m.2.push(e),
+            None => out.push((label, result.element_modulus[e] / 1000.0, vec![e])),
+        }
+    }
+    out.sort_by_key(|m| m.0);
+    out
+}
+
+/// Sides of the coordinate axis along which a prescribed direction lies, where it lies along one.
+fn axis_of(p: &Prescribed) -> Option<usize> {
+    p.direction.and_then(|d| (0..3).find(|&a| d[a].abs() > 0.999))
+}
+
+/// The displacement components that are prescribed at a node.
+fn components(p: &Prescribed) -> Vec<(usize, f64)> {
+    match (p.direction, axis_of(p)) {
+        (None, _) => (0..3).map(|a| (a, p.displacement[a])).collect(),
+        (Some(d), Some(a)) => {
+            let along: f64 = (0..3).map(|b| d[b] * p.displacement[b]).sum();
+            vec![(a, along / d[a])]
+        }
+        // A slanted plane has no single component; the model keeps the node where it was found.
+        (Some(_), None) => (0..3).map(|a| (a, p.displacement[a])).collect(),
+    }
+}
+
+/// Writes the model for Abaqus and CalculiX: C3D10 elements, `*ELASTIC` or `*HYPERELASTIC, NEO HOOKE`, one static step with
+/// the prescribed displacements; displacements and reaction forces are printed.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_inp(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(), IoError> {
+    write_atomic(path.as_ref(), |w| {
+        writeln!(w, "*HEADING\npalpate {}: identified stiffness; mm, N, MPa", env!("CARGO_PKG_VERSION"))?;
+        writeln!(w, "*NODE, NSET=ALL")?;
+        for (n, p) in result.mesh.nodes().iter().enumerate() {
+            writeln!(w, "{}, {:.9}, {:.9}, {:.9}", n + 1, p.0[0], p.0[1], p.0[2])?;
+        }
+        let materials = materials(result);
+        for (label, _, elements) in &materials {
+            writeln!(w, "*ELEMENT, TYPE=C3D10, ELSET=REGION{label}")?;
+            for &e in elements {
+                let t = result.mesh.tetrahedra()[e].map(|n| (n + 1).to_string());
+                writeln!(w, "{}, {}", e + 1, t.join(", "))?;
+            }
+        }
+        for (patch, name) in ["HELD", "LOADED"].iter().enumerate() {
+            node_set(w, name, result.prescribed.iter().filter(|p| p.patch as usize == patch).map(|p| p.node))?;
+        }
+        let nu = result.poisson;
+        for (label, e, _) in &materials {
+            writeln!(w, "*MATERIAL, NAME=MATERIAL{label}")?;
+            match result.law {
+                Law::Linear => writeln!(w, "*ELASTIC\n{e:.9e}, {nu}")?,
+                Law::NeoHookean => {
+                    // C10 = mu / 2, D1 = 2 / K.
+                    let (mu, bulk) = (e / (2.0 * (1.0 + nu)), e / (3.0 * (1.0 - 2.0 * nu)));
+                    writeln!(w, "*HYPERELASTIC, NEO HOOKE\n{:.9e}, {:.9e}", 0.5 * mu, 2.0 / bulk)?;
+                }
+            }
+            writeln!(w, "*SOLID SECTION, ELSET=REGION{label}, MATERIAL=MATERIAL{label}")?;
+        }
+        match result.law {
+            Law::Linear => writeln!(w, "*STEP\n*STATIC")?,
+            Law::NeoHookean => writeln!(w, "*STEP, NLGEOM, INC=100\n*STATIC\n0.25, 1.0")?,
+        }
+        writeln!(w, "*BOUNDARY")?;
+        for p in &result.prescribed {
+            for (a, v) in components(p) {
+                writeln!(w, "{}, {}, {}, {v:.9e}", p.node + 1, a + 1, a + 1)?;
+            }
+        }
+        writeln!(
+            w,
+            "*NODE PRINT, NSET=ALL\nU\n*NODE PRINT, NSET=LOADED, TOTALS=ONLY\nRF\n*NODE FILE\nU\n*EL FILE\nS\n*END STEP"
+        )
+    })
+}
+
+fn node_set(w: &mut impl Write, name: &str, nodes: impl Iterator<Item = u32>) -> io::Result<()> {
+    writeln!(w, "*NSET, NSET={name}")?;
+    let all: Vec<String> = nodes.map(|n| (n + 1).to_string()).collect();
+    all.chunks(12).try_for_each(|line| writeln!(w, "{},", line.join(", ")))
+}
+
+/// Writes the model for FEBio 4: tet10 elements, `isotropic elastic` or `neo-Hookean` materials, prescribed displacements over
+/// one static step.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_feb(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(), IoError> {
+    write_atomic(path.as_ref(), |w| {
+        let materials = materials(result);
+        writeln!(
+            w,
+            "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<febio_spec version=\"4.0\">\n\t<Module type=\"solid\"/>"
+        )?;
+        writeln!(
+            w,
+            "\t<Control>\n\t\t<analysis>STATIC</analysis>\n\t\t<time_steps>10</time_steps>\n\t\t<step_size>0.1</step_size>\n\
+             \t\t<solver type=\"solid\"><symmetric_stiffness>symmetric</symmetric_stiffness></solver>\n\t</Control>\n\t<Material>"
+        )?;
+        for (i, (label, e, _)) in materials.iter().enumerate() {
+            let kind = if result.law == Law::Linear { "isotropic elastic" } else { "neo-Hookean" };
+            writeln!(
+                w,
+                "\t\t<material id=\"{}\" name=\"material{label}\" type=\"{kind}\"><E>{e:.9e}</E><v>{}</v></material>",
+                i + 1,
+                result.poisson
+            )?;
+        }
+        writeln!(w, "\t</Material>\n\t<Mesh>\n\t\t<Nodes name=\"body\">")?;
+        for (n, p) in result.mesh.nodes().iter().enumerate() {
+            writeln!(w, "\t\t\t<node id=\"{}\">{:.9},{:.9},{:.9}</node>", n + 1, p.0[0], p.0[1], p.0[2])?;
+        }
+        writeln!(w, "\t\t</Nodes>")?;
+        for (label, _, elements) in &materials {
+            writeln!(w, "\t\t<Elements type=\"tet10\" name=\"region{label}\">")?;
+            for &e in elements {
+                let t = result.mesh.tetrahedra()[e].map(|n| (n + 1).to_string());
+                writeln!(w, "\t\t\t<elem id=\"{}\">{}</elem>", e + 1, t.join(","))?;
+            }
+            writeln!(w, "\t\t</Elements>")?;
+        }
+        let groups = groups(result);
+        for (name, group) in &groups {
+            let all: Vec<String> = group.iter().map(|p| (p.node + 1).to_string()).collect();
+            writeln!(w, "\t\t<NodeSet name=\"{name}\">{}</NodeSet>", all.join(","))?;
+        }
+        writeln!(w, "\t</Mesh>\n\t<MeshDomains>")?;
+        for (label, _, _) in &materials {
+            writeln!(w, "\t\t<SolidDomain name=\"region{label}\" mat=\"material{label}\"/>")?;
+        }
+        writeln!(w, "\t</MeshDomains>\n\t<MeshData>")?;
+        let names = ["x", "y", "z"];
+        for (name, group) in &groups {
+            for a in 0..3 {
+                if !components(group[0]).iter().any(|c| c.0 == a) {
+                    continue;
+                }
+                writeln!(w, "\t\t<NodeData name=\"{name}_{}\" node_set=\"{name}\" data_type=\"scalar\">", names[a])?;
+                for (i, p) in group.iter().enumerate() {
+                    let v = components(p).iter().find(|c| c.0 == a).map_or(0.0, |c| c.1);
+                    writeln!(w, "\t\t\t<node lid=\"{}\">{v:.9e}</node>", i + 1)?;
+                }
+                writeln!(w, "\t\t</NodeData>")?;
+            }
+        }
+        writeln!(w, "\t</MeshData>\n\t<Boundary>")?;
+        for (name, group) in &groups {
+            for (a, _) in components(group[0]) {
+                let axis = names[a];
+                writeln!(
+                    w,
+                    "\t\t<bc name=\"{name}_{axis}\" type=\"prescribed displacement\" node_set=\"{name}\"><dof>{axis}</dof>\
+                     <value lc=\"1\" type=\"map\">{name}_{axis}</value><relative>0</relative></bc>"
+                )?;
+            }
+        }
+        writeln!(
+            w,
+            "\t</Boundary>\n\t<LoadData>\n\t\t<load_controller id=\"1\" name=\"ramp\" type=\"loadcurve\">\n\
+             \t\t\t<interpolate>LINEAR</interpolate>\n\t\t\t<extend>CONSTANT</extend>\n\
+             \t\t\t<points><pt>0,0</pt><pt>1,1</pt></points>\n\t\t</load_controller>\n\t</LoadData>\n\t<Output>\n\
+             \t\t<plotfile type=\"febio\"><var type=\"displacement\"/><var type=\"stress\"/></plotfile>\n\t</Output>\n</febio_spec>"
+        )
+    })
+}
+
+/// The prescribed nodes by patch.
+fn groups(result: &StiffnessResult) -> Vec<(&'static str, Vec<&Prescribed>)> {
+    let of = |patch: u8| result.prescribed.iter().filter(|p| p.patch == patch).collect::<Vec<_>>();
+    [("held", of(0)), ("loaded", of(1))].into_iter().filter(|g| !g.1.is_empty()).collect()
+}

@@ -1,0 +1,192 @@
+//! A displacement field to Young's modulus, region by region.
+
+use crate::error::StiffnessError;
+use crate::mesh::tetrahedral::{Fineness, mesh_labels, pieces};
+use crate::numerics::statistics::noise_sigma;
+use crate::pipeline::search;
+use crate::stiffness::choice::{choose, release};
+use crate::stiffness::identify::State;
+use crate::stiffness::level::Level;
+use crate::stiffness::patches::Place;
+use crate::stiffness::{geometry, maps, summary};
+use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
+use crate::types::{DenseField, Mask, QuadraticMesh, SparseField};
+use std::time::Instant;
+
+/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
+pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
+
+/// What is given.
+#[derive(Clone, Copy)]
+pub struct Inputs<'a> {
+    /// The displacement, on the grid of `labels`.
+    pub field: &'a DenseField,
+    /// Matches to use in place of the field inside the body.
+    pub matches: Option<&'a SparseField>,
+    /// Regions; 0 outside the body.
+    pub labels: &'a Mask,
+    /// Whether the labels name regions, or are a mask.
+    pub labelled: bool,
+    /// Where the body is held.
+    pub held: &'a Place,
+    /// Where it is pressed.
+    pub load: &'a Place,
+    /// A name for each label.
+    pub names: &'a dyn Fn(u8) -> String,
+}
+
+/// Nodes of the coarse mesh over those of the fine one.
+pub(super) const COARSE: f64 = 0.3;
+/// Precision of forward solutions on the fine mesh (mm).
+const PRECISION: f64 = 1e-5;
+
+/// Young's modulus of each labelled region, or of the regions that the data support.
+///
+/// # Errors
+/// [`StiffnessError`] when the input does not fit together or the equations cannot be solved.
+pub fn run(
+    inputs: &Inputs<'_>,
+    params: &StiffnessParams,
+    progress: Progress<'_>,
+) -> Result<StiffnessResult, StiffnessError> {
+    params.check()?;
+    check(inputs.labels)?;
+    if inputs.labelled {
+        return labelled(inputs, params, Vec::new(), progress);
+    }
+    let found = search::regions(inputs, params, &|s, f| progress(s, 0.5 * f))?;
+    let inputs = Inputs { labels: &found.labels, ..*inputs };
+    let mut result = labelled(&inputs, params, found.evidence, &|s, f| progress(s, 0.5 + 0.5 * f))?;
+    result.seconds.insert(0, ("search".into(), found.seconds));
+    Ok(result)
+}
+
+/// The chain for labelled regions; `tried` is the evidence that led to them.
+fn labelled(
+    inputs: &Inputs<'_>,
+    params: &StiffnessParams,
+    tried: Vec<Evidence>,
+    progress: Progress<'_>,
+) -> Result<StiffnessResult, StiffnessError> {
+    let mut clock = Clock { seconds: Vec::new(), since: Instant::now() };
+    progress("mesh", 0.0);
+    let volume = maps::volume(inputs.labels);
+    let fine_mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, params.nodes))?;
+    let coarse_nodes = (COARSE * params.nodes as f64) as usize;
+    let coarse_mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, coarse_nodes))?;
+    clock.book("mesh");
+
+    progress("read", 0.05);
+    let level =
+        |mesh: &QuadraticMesh| Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load);
+    let mut coarse = level(&coarse_mesh)?;
+    let mut fine = level(&fine_mesh)?;
+    let reference = fine.largest();
+    clock.book("read");
+
+    progress("coarse", 0.1);
+    let choice = choose(&mut coarse, params.model, params.poisson, reference)?;
+    clock.book("coarse");
+
+    progress("fine", 0.4);
+    for i in 0..2 {
+        fine.patches[i].contact = coarse.patches[i].contact;
+    }
+    let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
+    let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
+    let estimate = release(&mut fine, choice.law, params.poisson, reference, estimate, 3, PRECISION)?;
+    clock.book("fine");
+
+    progress("uncertainty", 0.9);
+    let setup = fine.setup(choice.law, params.poisson, reference);
+    let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
+    let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid())?;
+    let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n);
+    let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
+    let count = fine.body.labels.len();
+    let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();
+    let ratio_change: Vec<f64> = (0..count).map(|r| mesh_change[r] - mesh_change[reference]).collect();
+    let unseen = (0..count)
+        .map(|r| summary::unseen(&coarse_setup, &choice.estimate, r, moduli.ratio_variance[r]))
+        .collect::<Result<Vec<_>, _>>()?;
+    let changes = [mesh_change.as_slice(), &ratio_change];
+    let regions = summary::regions(&fine.body, &moduli, inputs.names, changes, &unseen, reference);
+    clock.book("uncertainty");
+
+    let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);
+    let map = of_region(&|r| regions[r].youngs_modulus);
+    let map_sd = of_region(&|r| regions[r].sd);
+    let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
+    let noise = maps::noise(inputs.field, inputs.labels, |data, shape, keep| f64::from(noise_sigma(data, shape, keep)));
+    let mut warnings = maps::warnings(&fine, &regions, &mesh_change, params);
+    warnings.dedup();
+    let patches = [0, 1].map(|i| {
+        let p = &fine.patches[i];
+        PatchReport {
+            name: p.name.clone(),
+            area: p.area(&fine.body),
+            nodes: p.nodes.len(),
+            contact: p.contact,
+            translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
+            residual_mm: p.residual[0].hypot(p.residual[1]),
+        }
+    });
+    let scale = moduli.log[reference].exp() / (2.0 * (1.0 + params.poisson));
+    let element_modulus = fine.body.region.iter().map(|&r| moduli.log[r as usize].exp()).collect();
+    let strain = summary::strain(&setup, &estimate.state);
+    clock.book("maps");
+    Ok(StiffnessResult {
+        correlation: summary::correlation(&moduli.covariance, count),
+        absolute: params.force_n.is_some(),
+        law: choice.law,
+        poisson: params.poisson,
+        force_n: params.force_n,
+        reference: fine.body.labels[reference],
+        residual_mm: estimate.rms,
+        noise_mm: noise,
+        evidence: tried.into_iter().chain(choice.evidence).collect(),
+        patches,
+        map,
+        map_sd,
+        residual,
+        element_modulus,
+        displacement: maps::node_displacement(&fine.body, &estimate),
+        prescribed: maps::prescribed(&fine, &estimate),
+        faces: geometry.map(|g| g.faces).unwrap_or_default(),
+        model_force: estimate.force[0] * scale / 1000.0,
+        mesh_change,
+        strain,
+        warnings,
+        seconds: clock.seconds,
+        samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
+        labelled: inputs.labelled,
+        regions,
+        mesh: fine_mesh,
+    })
+}
+
+/// The body must hang together.
+fn check(labels: &Mask) -> Result<(), StiffnessError> {
+    let found = pieces(labels);
+    match found[..] {
+        [largest, next, ..] => Err(StiffnessError::Disconnected {
+            what: "the body (mask or labels)".into(),
+            pieces: found.len(),
+            largest,
+            next,
+        }),
+        _ => Ok(()),
+    }
+}
+
+struct Clock {
+    seconds: Vec<(String, f64)>,
+    since: Instant,
+}
+
+impl Clock {
+    fn book(&mut self, stage: &str) {
+        self.seconds.push((stage.into(), self.since.elapsed().as_secs_f64()));
+        self.since = Instant::now();
+    }
+}

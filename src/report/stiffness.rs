@@ -1,0 +1,315 @@
+//! Text, JSON and page of a stiffness result.
+
+use crate::error::ReportError;
+use crate::report::colormap::ColorMap;
+use crate::report::html::{card, document, escape};
+use crate::report::panels::Panel;
+use crate::report::scale::{Scale, thousands};
+use crate::report::section::Section;
+use crate::report::statistics::quantile;
+use crate::report::tables::table;
+use crate::report::{chart, json};
+use crate::types::stiffness::{Evidence, RegionStiffness, StiffnessResult};
+use crate::types::{Mask, Volume, WorldPoint};
+use serde_json::{Map, Value, json};
+use std::fmt::Write;
+
+/// Names of what was given.
+#[derive(Debug, Clone, PartialEq)]
+pub struct InputNames {
+    /// The field.
+    pub field: String,
+    /// Mask or labels.
+    pub body: String,
+    /// Matches.
+    pub matches: Option<String>,
+    /// As on the command line.
+    pub held: String,
+    /// As on the command line.
+    pub load: String,
+}
+
+/// A modulus with its uncertainty, or the bound.
+fn modulus(r: &RegionStiffness, absolute: bool) -> String {
+    let unit = if absolute { " kPa" } else { "" };
+    match r.bound {
+        Some("lower") => format!("above {}{unit} (a bound: not identifiable)", digits(r.youngs_modulus)),
+        Some(_) => format!("below {}{unit} (a bound: not identifiable)", digits(r.youngs_modulus)),
+        None if r.sd == 0.0 => format!("{}{unit} (reference)", digits(r.youngs_modulus)),
+        None => format!("{} +- {}{unit}", digits(r.youngs_modulus), digits(r.sd)),
+    }
+}
+
+fn digits(v: f64) -> String {
+    match v.abs() {
+        a if !a.is_finite() => "unknown".into(),
+        a if a >= 100.0 => format!("{v:.0}"),
+        a if a >= 10.0 => format!("{v:.1}"),
+        a if a >= 1.0 => format!("{v:.2}"),
+        _ => format!("{v:.3}"),
+    }
+}
+
+/// What was found, in plain words.
+pub fn verdict(result: &StiffnessResult) -> String {
+    let seen = result.regions.iter().filter(|r| r.identifiable).count();
+    let count = result.regions.len();
+    let mut out = match (count, result.labelled) {
+        (1, false) => "The data do not support a second region: one modulus explains the field.".to_string(),
+        (n, false) => format!("The data support {n} regions."),
+        (1, true) => "One region.".into(),
+        (n, true) if seen == n => format!("All {n} regions are determined by the data."),
+        (n, true) => format!("{seen} of {n} regions are determined by the data."),
+    };
+    if !result.absolute {
+        out.push_str(" No force was given, so moduli are ratios.");
+    }
+    out
+}
+
+/// The short summary for stdout.
+pub fn text(result: &StiffnessResult) -> String {
+    let mut out = format!("{}\n", verdict(result));
+    for r in &result.regions {
+        let _ = writeln!(out, "  {:12} {}, ratio {}", r.name, modulus(r, result.absolute), digits(r.ratio));
+    }
+    let [held, load] = &result.patches;
+    let _ = writeln!(
+        out,
+        "  model        {}, Poisson's ratio {}, held {} ({}), loaded {} ({})",
+        result.law.name(),
+        result.poisson,
+        held.name,
+        held.contact.name(),
+        load.name,
+        load.contact.name()
+    );
+    for e in &result.evidence {
+        let _ = writeln!(out, "  evidence     {}", evidence_line(e));
+    }
+    let _ = writeln!(
+        out,
+        "  residual     {:.4} mm, roughness of the field {:.4} mm, {} samples worth {:.0}",
+        result.residual_mm,
+        result.noise_mm,
+        thousands(result.samples[0] as usize),
+        result.samples[1]
+    );
+    out
+}
+
+/// One model tried, in a line.
+pub fn evidence_line(e: &Evidence) -> String {
+    let mark = if e.chosen { "chosen" } else { "not chosen" };
+    format!(
+        "{}: {}: residual {:.4} mm, criterion {:.0}, {mark} ({})",
+        e.question, e.model, e.residual_mm, e.bic, e.reason
+    )
+}
+
+/// summary.json; the keys are those of docs/file-formats.md.
+pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
+    let seconds: Map<String, Value> = result.seconds.iter().map(|(s, t)| (s.clone(), json!(t))).collect();
+    let regions: Vec<Value> = result
+        .regions
+        .iter()
+        .zip(&result.mesh_change)
+        .map(|(r, change)| {
+            let mut v = json!(r);
+            v["mesh_change"] = json!(change.exp_m1());
+            v
+        })
+        .collect();
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "stiffness",
+        "inputs": {
+            "field": inputs.field, "body": inputs.body, "matches": inputs.matches, "held": inputs.held, "load": inputs.load,
+        },
+        "grid": json::grid(result.map.grid()),
+        "absolute": result.absolute,
+        "unit": if result.absolute { "kPa" } else { "ratio to the reference region" },
+        "labelled": result.labelled,
+        "verdict": verdict(result),
+        "regions": regions,
+        "region_count": result.regions.len(),
+        "reference": result.reference,
+        "correlation": result.correlation,
+        "model": result.law.name(),
+        "poisson": result.poisson,
+        "force_n": result.force_n,
+        "strain_p95": result.strain,
+        "residual_mm": result.residual_mm,
+        "noise_mm": result.noise_mm,
+        "samples": result.samples[0],
+        "effective_samples": result.samples[1],
+        "evidence": result.evidence,
+        "patches": { "held": result.patches[0], "loaded": result.patches[1] },
+        "face_offsets_voxels": result.faces.iter().map(|(n, v)| (n.clone(), json!(v))).collect::<Map<String, Value>>(),
+        "mesh": { "nodes": result.mesh.nodes().len(), "elements": result.mesh.tetrahedra().len() },
+        "seconds": seconds,
+        "warnings": result.warnings,
+    })
+}
+
+/// The page.
+///
+/// # Errors
+/// [`ReportError`] when a picture cannot be encoded.
+pub fn page(result: &StiffnessResult, inputs: &InputNames) -> Result<String, ReportError> {
+    let grid = *result.map.grid();
+    let inside = Mask::from_vec(grid, result.map.as_slice().iter().map(|&v| u8::from(v > 0.0)).collect());
+    let Ok(inside) = inside else { return Ok(String::new()) };
+    let sections = Section::through(&grid, centre(&result.map));
+    let base = Volume::filled(grid, 0.0f32);
+    let base = (&base, [0.0, 1.0]);
+    let unit = if result.absolute { "kPa" } else { "" };
+    let body: Vec<usize> = (0..grid.len()).filter(|&o| inside.as_slice()[o] > 0).collect();
+    let spread =
+        |v: &Volume, q: f64| quantile(body.iter().map(|&o| f64::from(v.as_slice()[o])).filter(|v| v.is_finite()), q);
+    let panel = |title: &str, v: &Volume, scale: Scale, note: &str| {
+        let values = v.as_slice();
+        Panel::coloured(title, &sections, base, Some(&inside), scale, |o| values[o]).map(|p| p.with_note(note))
+    };
+    let top = |v: &Volume, q: f64| spread(v, q).max(1e-9);
+    let map = panel(
+        "Young's modulus",
+        &result.map,
+        Scale::from_zero(top(&result.map, 1.0), unit, ColorMap::Viridis),
+        "One value a region. A region that is not identifiable shows its bound.",
+    )?;
+    let sd = panel(
+        "Standard deviation",
+        &result.map_sd,
+        Scale::from_zero(top(&result.map_sd, 1.0), unit, ColorMap::Magma),
+        "From the residuals, counted by blocks of the body, and the change with the mesh. Black: not identifiable.",
+    )?;
+    let rest = panel(
+        "Residual",
+        &result.residual,
+        Scale::from_zero(top(&result.residual, 0.995), "mm", ColorMap::Magma),
+        "Length of measured less modelled displacement. Structure here means that the model misses something.",
+    )?;
+    let total: f64 = result.seconds.iter().map(|s| s.1).sum();
+    let tile = |value: String, unit: &str, name: &str| {
+        format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
+    };
+    let mut out = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>Stiffness of {}</h1><p class=\"verdict\">{}</p></header>\
+         <div class=\"tiles\">{}{}{}{}{}</div>",
+        env!("CARGO_PKG_VERSION"),
+        escape(&inputs.body),
+        escape(&verdict(result)),
+        tile(result.regions.len().to_string(), "", "regions"),
+        tile(format!("{:.4}", result.residual_mm), "mm", "residual"),
+        tile(format!("{:.1}", 100.0 * result.strain), "%", "strain, 95th percentile"),
+        tile(thousands(result.mesh.nodes().len()), "", "mesh nodes"),
+        tile(format!("{total:.1}"), "s", "in all stages"),
+    );
+    if !result.warnings.is_empty() {
+        let items: String = result.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+        let _ = write!(out, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
+    }
+    let _ = write!(
+        out,
+        "<section><h2>Regions</h2><div class=\"grid\"><article class=\"wide\"><h3>Moduli</h3>{}</article></div></section>",
+        region_table(result)
+    );
+    let _ = write!(
+        out,
+        "<section><h2>Maps</h2><div class=\"grid\">{}{}{}</div></section>",
+        card(&map),
+        card(&sd),
+        card(&rest)
+    );
+    let _ = write!(
+        out,
+        "<section><h2>Evidence</h2><div class=\"grid\"><article class=\"wide\"><h3>Models tried</h3>{}</article>\
+         <article><h3>Patches</h3>{}</article><article><h3>Correlation of ln E</h3>{}</article><article><h3>Time</h3>{}</article></div></section>",
+        evidence_table(result),
+        patch_table(result),
+        correlation_table(result),
+        chart::stage_times(&result.seconds)
+    );
+    out.push_str(
+        "<footer><p>Moduli hold for the Poisson's ratio above, the same in all regions, and for an isotropic elastic body whose \
+         skin is free but for the two patches. Positions are world mm, RAS.</p></footer>",
+    );
+    Ok(document(&format!("Stiffness of {}", escape(&inputs.body)), &out))
+}
+
+/// The middle of what is stiffer or softer than the median, else of the body (mm, RAS).
+fn centre(map: &Volume) -> WorldPoint {
+    let values = map.as_slice();
+    let inside: Vec<usize> = (0..values.len()).filter(|&o| values[o] > 0.0).collect();
+    let median = quantile(inside.iter().map(|&o| f64::from(values[o])), 0.5) as f32;
+    let special: Vec<usize> = inside.iter().copied().filter(|&o| (values[o] / median).ln().abs() > 0.05).collect();
+    let chosen = if special.is_empty() { &inside } else { &special };
+    let mut sum = [0.0; 3];
+    for &o in chosen {
+        let [i, j, k] = map.grid().voxel(o);
+        let p = map.grid().world(i, j, k).0;
+        (0..3).for_each(|a| sum[a] += p[a]);
+    }
+    WorldPoint(sum.map(|s| s / chosen.len().max(1) as f64))
+}
+
+fn region_table(result: &StiffnessResult) -> String {
+    let rows: Vec<Vec<String>> = result
+        .regions
+        .iter()
+        .zip(&result.mesh_change)
+        .map(|(r, change)| {
+            vec![
+                escape(&r.name),
+                r.label.to_string(),
+                escape(&modulus(r, result.absolute)),
+                digits(r.ratio),
+                format!("{:.1} %", 100.0 * change.exp_m1()),
+                thousands(r.volume as usize),
+            ]
+        })
+        .collect();
+    table(&["Region", "Label", "Young's modulus", "Ratio", "Change with the mesh", "Volume, mm^3"], &rows)
+}
+
+fn evidence_table(result: &StiffnessResult) -> String {
+    let row = |e: &Evidence| {
+        vec![
+            format!("{}: {}", e.question, escape(&e.model)),
+            e.parameters.to_string(),
+            format!("{:.4}", e.residual_mm),
+            format!("{:.0}", e.bic),
+            if e.chosen { "chosen" } else { "" }.into(),
+            escape(&e.reason),
+        ]
+    };
+    let rows: Vec<_> = result.evidence.iter().map(row).collect();
+    table(&["Model", "Parameters", "Residual, mm", "Criterion", "", "Why"], &rows)
+}
+
+fn patch_table(result: &StiffnessResult) -> String {
+    let row = |(which, p): (&str, &crate::types::stiffness::PatchReport)| {
+        vec![
+            format!("{which} ({})", escape(&p.name)),
+            p.contact.name().into(),
+            format!("{:.1} mm^2", p.area),
+            p.translation.map(|v| format!("{v:.2}")).join(", ") + " mm",
+        ]
+    };
+    let [held, load] = &result.patches;
+    table(&["Patch", "Contact", "Area", "Motion"], &[row(("held", held)), row(("loaded", load))])
+}
+
+fn correlation_table(result: &StiffnessResult) -> String {
+    let head: Vec<String> =
+        std::iter::once(String::new()).chain(result.regions.iter().map(|r| escape(&r.name))).collect();
+    let head: Vec<&str> = head.iter().map(String::as_str).collect();
+    let rows: Vec<Vec<String>> = result
+        .regions
+        .iter()
+        .zip(&result.correlation)
+        .map(|(r, c)| std::iter::once(escape(&r.name)).chain(c.iter().map(|v| format!("{v:.2}"))).collect())
+        .collect();
+    table(&head, &rows)
+}

@@ -1,0 +1,177 @@
+//! No more model than the data ask for: contact, law and number of regions by evidence.
+
+use crate::error::StiffnessError;
+use crate::stiffness::contact::released;
+use crate::stiffness::identify::{Estimate, State};
+use crate::stiffness::level::Level;
+use crate::stiffness::patches::Patch;
+use crate::types::space::dot;
+use crate::types::stiffness::{Contact, Evidence, Law, LawChoice};
+
+/// A model must beat a smaller one by this much (Kass and Raftery 1995: more than 10 is very strong).
+pub const MARGIN: f64 = 10.0;
+/// Precision of forward solutions on the coarse mesh (mm).
+const COARSE: f64 = 1e-4;
+/// Iterations at most on the coarse mesh.
+const ITERATIONS: usize = 12;
+
+/// What was chosen on the coarse mesh.
+#[derive(Debug)]
+pub struct Choice {
+    /// The law.
+    pub law: Law,
+    /// The estimate with it.
+    pub estimate: Estimate,
+    /// All that was tried.
+    pub evidence: Vec<Evidence>,
+}
+
+/// The Bayesian information criterion: `samples` ln(squares / samples) + `parameters` ln(samples).
+pub fn bic(squares: f64, samples: f64, parameters: usize) -> f64 {
+    samples * (squares.max(1e-300) / samples).ln() + parameters as f64 * samples.max(2.0).ln()
+}
+
+/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or guided.
+fn candidates(level: &Level) -> [Vec<Contact>; 2] {
+    let [held, load] = &level.patches;
+    let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
+    let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
+    let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
+    let one = |patch: &Patch| {
+        // Free sliding spreads a flat face by half the strain.
+        let free = 0.5 * strain * patch.radius;
+        let limit = (0.25 * free).max(2.0 * level.surface_error);
+        let flat = patch.bend() == 0.0;
+        if patch.residual[1] < limit && flat {
+            vec![Contact::Sticking]
+        } else {
+            vec![Contact::Sliding, Contact::Guided]
+        }
+    };
+    [one(held), one(load)]
+}
+
+/// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the contact chosen, without the
+/// facets that a plate would have to pull.
+///
+/// # Errors
+/// [`StiffnessError`] where no candidate can be solved.
+pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usize) -> Result<Choice, StiffnessError> {
+    let mut evidence = Vec::new();
+    let names = candidates(level);
+    let first = if wanted == LawChoice::NeoHookean { Law::NeoHookean } else { Law::Linear };
+    let mut tried: Vec<([Contact; 2], Estimate)> = Vec::new();
+    let mut failure = None;
+    for &a in &names[0] {
+        for &b in &names[1] {
+            level.patches[0].contact = a;
+            level.patches[1].contact = b;
+            let setup = level.setup(first, poisson, reference);
+            match setup.run(setup.start(), ITERATIONS, COARSE) {
+                Ok(e) => tried.push(([a, b], e)),
+                Err(e) => failure = Some(e),
+            }
+        }
+    }
+    let samples = tried.iter().map(|t| t.1.effective).fold(f64::INFINITY, f64::min);
+    // A guided patch is given twelve numbers of its own.
+    let count =
+        |t: &([Contact; 2], Estimate)| t.1.parameters + 12 * t.0.iter().filter(|c| **c == Contact::Guided).count();
+    let score = |t: &([Contact; 2], Estimate)| bic(t.1.squares, samples, count(t));
+    let best = (0..tried.len()).fold(None, |m: Option<usize>, i| match m {
+        Some(k) if score(&tried[k]) <= score(&tried[i]) => Some(k),
+        _ => Some(i),
+    });
+    let Some(best) = best else { return Err(failure.unwrap_or(StiffnessError::NoEquilibrium)) };
+    for (i, t) in tried.iter().enumerate() {
+        evidence.push(Evidence {
+            question: "contact",
+            model: format!("held {}, loaded {}", t.0[0].name(), t.0[1].name()),
+            parameters: count(t),
+            residual_mm: t.1.rms,
+            bic: score(t),
+            chosen: i == best,
+            reason: match tried.len() {
+                1 => "both patches move as rigid bodies".into(),
+                _ if i == best => "explains the field best".into(),
+                _ => "explains it less".into(),
+            },
+        });
+    }
+    let (contact, mut estimate) = tried.swap_remove(best);
+    for i in 0..2 {
+        level.patches[i].contact = contact[i];
+    }
+    let mut law = first;
+    estimate = release(level, law, poisson, reference, estimate, ITERATIONS, COARSE)?;
+    if wanted != LawChoice::Linear && first == Law::Linear {
+        let start = State { x: None, ..estimate.state.clone() };
+        let large = level.setup(Law::NeoHookean, poisson, reference).run(start, ITERATIONS, COARSE)?;
+        let samples = estimate.effective.min(large.effective);
+        let scores = [&estimate, &large].map(|e| bic(e.squares, samples, e.parameters));
+        let better = scores[1] + MARGIN < scores[0];
+        for (i, e) in [&estimate, &large].into_iter().enumerate() {
+            let gain = scores[0] - scores[1];
+            evidence.push(Evidence {
+                question: "law",
+                model: [Law::Linear, Law::NeoHookean][i].name().into(),
+                parameters: e.parameters,
+                residual_mm: e.rms,
+                bic: scores[i],
+                chosen: (i == 1) == better,
+                reason: if better {
+                    format!("the strain asks for it: the criterion falls by {gain:.0}, {MARGIN} are needed")
+                } else {
+                    format!("small strain suffices: the criterion would fall by {gain:.0}, {MARGIN} are needed")
+                },
+            });
+        }
+        if better {
+            law = Law::NeoHookean;
+            estimate = release(level, law, poisson, reference, large, ITERATIONS, COARSE)?;
+        }
+    } else {
+        evidence.push(Evidence {
+            question: "law",
+            model: law.name().into(),
+            parameters: estimate.parameters,
+            residual_mm: estimate.rms,
+            bic: bic(estimate.squares, estimate.effective, estimate.parameters),
+            chosen: true,
+            reason: "as asked".into(),
+        });
+    }
+    Ok(Choice { law, estimate, evidence })
+}
+
+/// Lets go what a curved body's plate would have to pull, and identifies again, a few times.
+///
+/// # Errors
+/// As [`crate::stiffness::identify::Setup::run`].
+pub fn release(
+    level: &mut Level,
+    law: Law,
+    poisson: f64,
+    reference: usize,
+    mut estimate: Estimate,
+    iterations: usize,
+    precision: f64,
+) -> Result<Estimate, StiffnessError> {
+    let flat = level.patches[1].bend() == 0.0;
+    for _ in 0..4 {
+        if flat {
+            break;
+        }
+        let next = {
+            let setup = level.setup(law, poisson, reference);
+            let problem = setup.problem(&estimate.state);
+            let x = estimate.state.x.clone().unwrap_or_default();
+            released(&problem, &level.patches[1], &x)
+        };
+        let Some(patch) = next else { break };
+        level.patches[1] = patch;
+        let start = estimate.state.clone();
+        estimate = level.setup(law, poisson, reference).run(start, iterations, precision)?;
+    }
+    Ok(estimate)
+}

@@ -1,0 +1,226 @@
+//! The forward problem: displacement and pressure of a body whose surface is held and pressed in places.
+//!
+//! Prescribed displacements are ties, springs 10^6 times as stiff as the tissue around (relative error of a prescribed
+//! value about 10^-6); the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law
+//! takes one step.
+
+use crate::error::StiffnessError;
+use crate::numerics::sparse::Factor;
+use crate::stiffness::body::{Body, SIDE};
+use crate::stiffness::law::{Material, residual, residual_by_modulus, tangent};
+use crate::types::stiffness::Law;
+use rayon::prelude::*;
+
+/// Stiffness of a tie over that of the tissue.
+const TIE: f64 = 1e6;
+/// Newton steps at most for one load.
+const STEPS: usize = 25;
+/// Elements computed together.
+const CHUNK: usize = 256;
+
+/// A node whose displacement is prescribed along a direction, or wholly.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tie {
+    /// The node.
+    pub node: u32,
+    /// The unit vector along which it is prescribed; none for all three components.
+    pub direction: Option<[f64; 3]>,
+    /// The displacement (mm).
+    pub target: [f64; 3],
+    /// Spring constant over that of a firm tie (1): 1 to prescribe, far less to hold a body that would else slip away.
+    pub strength: f64,
+}
+
+/// A solution: unknowns, and the tangent factorised at (or just before) it.
+#[derive(Debug)]
+pub struct Solution<'a> {
+    /// Displacements and pressures (see [`Body::displacement`]).
+    pub x: Vec<f64>,
+    /// The factorised tangent.
+    pub factor: Factor<'a>,
+    /// Newton steps taken.
+    pub steps: usize,
+}
+
+/// One forward problem.
+#[derive(Debug, Clone)]
+pub struct Problem<'a> {
+    /// The body.
+    pub body: &'a Body,
+    /// The law.
+    pub law: Law,
+    /// The material of each element.
+    pub materials: Vec<Material>,
+    /// Prescribed displacements.
+    pub ties: Vec<Tie>,
+    /// Spring constant of a firm tie (kPa mm).
+    pub spring: f64,
+}
+
+impl<'a> Problem<'a> {
+    /// A problem with the spring constant that goes with the body's stiffness and element size.
+    pub fn new(body: &'a Body, law: Law, materials: Vec<Material>, ties: Vec<Tie>) -> Self {
+        let volume: f64 = body.volumes.iter().sum();
+        let size = (volume / body.cells.len() as f64).cbrt();
+        let stiffest = materials.iter().fold(0.0, |m: f64, v| m.max(v.mu));
+        Self { body, law, materials, ties, spring: TIE * stiffest * size }
+    }
+
+    /// Force (kPa mm^2) with which a tie pulls its node.
+    pub fn pull(&self, tie: &Tie, x: &[f64]) -> [f64; 3] {
+        let u = self.body.displacement(x, tie.node);
+        let k = self.spring * tie.strength;
+        let gap: [f64; 3] = std::array::from_fn(|a| tie.target[a] - u[a]);
+        match tie.direction {
+            None => gap.map(|g| k * g),
+            Some(n) => {
+                let along = k * (gap[0] * n[0] + gap[1] * n[1] + gap[2] * n[2]);
+                n.map(|v| along * v)
+            }
+        }
+    }
+
+    /// Internal forces less the ties'; none where an element turns inside out.
+    pub fn residual(&self, x: &[f64]) -> Option<Vec<f64>> {
+        let body = self.body;
+        let mut out = vec![0.0; body.pattern.unknowns()];
+        let one = |e: usize| residual(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e));
+        let count = body.cells.len();
+        for start in (0..count).step_by(16 * CHUNK) {
+            let part: Vec<_> = (start..(start + 16 * CHUNK).min(count)).into_par_iter().map(one).collect();
+            for (e, r) in part.into_iter().enumerate() {
+                body.scatter(&mut out, start + e, &r?);
+            }
+        }
+        for tie in &self.ties {
+            let (at, pull) = (body.pattern.first(tie.node), self.pull(tie, x));
+            (0..3).for_each(|a| out[at + a] -= pull[a]);
+        }
+        Some(out)
+    }
+
+    /// The derivative of the residual with respect to ln mu of the elements of which `of` holds.
+    pub fn residual_by_modulus(
+        &self,
+        x: &[f64],
+        of: impl Fn(usize) -> bool + Sync,
+    ) -> Result<Vec<f64>, StiffnessError> {
+        let body = self.body;
+        let mut out = vec![0.0; body.pattern.unknowns()];
+        let chosen: Vec<usize> = (0..body.cells.len()).filter(|&e| of(e)).collect();
+        let one = |&e: &usize| {
+            residual_by_modulus(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e)).map(|r| (e, r))
+        };
+        for part in chosen.chunks(16 * CHUNK) {
+            let done: Option<Vec<(usize, [f64; SIDE])>> = part.par_iter().map(one).collect();
+            for (e, r) in done.ok_or(StiffnessError::InsideOut)? {
+                body.scatter(&mut out, e, &r);
+            }
+        }
+        Ok(out)
+    }
+
+    /// The tangent at `x`.
+    fn tangent(&self, x: &[f64]) -> Option<Vec<f64>> {
+        let body = self.body;
+        let mut values = body.pattern.zeros();
+        let one = |e: usize| tangent(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e));
+        let count = body.cells.len();
+        for start in (0..count).step_by(CHUNK) {
+            let part: Vec<_> = (start..(start + CHUNK).min(count)).into_par_iter().map(one).collect();
+            for (e, k) in part.into_iter().enumerate() {
+                body.pattern.add(&mut values, start + e, &k?[..], SIDE);
+            }
+        }
+        for tie in &self.ties {
+            let k = self.spring * tie.strength;
+            for r in 0..3 {
+                for c in 0..=r {
+                    let value = match tie.direction {
+                        None => f64::from(u8::from(r == c)),
+                        Some(n) => n[r] * n[c],
+                    };
+                    body.pattern.add_at_node(&mut values, tie.node, r, c, k * value);
+                }
+            }
+        }
+        Some(values)
+    }
+
+    /// Factorises the tangent at `x`.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when an element is inside out or the body can move freely.
+    pub fn factorise(&self, x: &[f64]) -> Result<Factor<'a>, StiffnessError> {
+        let values = self.tangent(x).ok_or(StiffnessError::InsideOut)?;
+        self.body.pattern.factorise(&values).map_err(|_| StiffnessError::Unsolvable)
+    }
+
+    /// Solves, from `start` where one is given. `precision` (mm) ends Newton's method.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when no equilibrium is found.
+    pub fn solve(&self, start: Option<&[f64]>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
+        let zero = vec![0.0; self.body.pattern.unknowns()];
+        if self.law == Law::Linear {
+            let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
+            x.iter_mut().for_each(|v| *v = -*v);
+            let factor = self.factorise(&zero)?;
+            factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
+            return Ok(Solution { x, factor, steps: 1 });
+        }
+        if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision).ok()) {
+            return Ok(done);
+        }
+        let mut x = zero;
+        let (mut reached, mut step) = (0.0, 1.0f64);
+        loop {
+            let next = (reached + step).min(1.0);
+            let mut part = self.clone();
+            part.ties.iter_mut().for_each(|t| t.target = t.target.map(|v| v * next));
+            match part.newton(x.clone(), if next < 1.0 { 1e-3 } else { precision }) {
+                Ok(done) if next >= 1.0 => return Ok(done),
+                Ok(done) => {
+                    x = done.x;
+                    reached = next;
+                }
+                Err(error) if step < 0.06 => return Err(error),
+                Err(_) => step *= 0.5,
+            }
+        }
+    }
+
+    fn newton(&self, mut x: Vec<f64>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
+        let body = self.body;
+        let mut last = f64::INFINITY;
+        for steps in 1..=STEPS {
+            let factor = self.factorise(&x)?;
+            let mut step = self.residual(&x).ok_or(StiffnessError::InsideOut)?;
+            step.iter_mut().for_each(|v| *v = -*v);
+            factor.solve(&mut step).map_err(|_| StiffnessError::Unsolvable)?;
+            let mut part = 1.0;
+            let moved = loop {
+                let trial: Vec<f64> = x.iter().zip(&step).map(|(a, b)| a + part * b).collect();
+                if self.residual(&trial).is_some() {
+                    break trial;
+                }
+                part *= 0.5;
+                if part < 1e-3 {
+                    return Err(StiffnessError::InsideOut);
+                }
+            };
+            x = moved;
+            let size = (0..body.places.len() as u32)
+                .flat_map(|n| body.displacement(&step, n))
+                .fold(0.0, |m: f64, v| m.max(v.abs()));
+            if part == 1.0 && (size < precision || (size < 1e-3 && size * size / last.max(1e-300) < 0.1 * precision)) {
+                return Ok(Solution { x, factor, steps });
+            }
+            if steps > 4 && size > 2.0 * last {
+                break;
+            }
+            last = size;
+        }
+        Err(StiffnessError::NoEquilibrium)
+    }
+}

@@ -1,0 +1,482 @@
+//! Gauss-Newton on the logarithms of the regions' shear moduli and on the motion of the plates.
+//!
+//! Unknowns are theta_r = ln(mu_r / mu_reference) and six (sliding: three) numbers for each plate. The misfit is the sum of
+//! Huber's rho over the observations, (H u - d) / sigma. One factorisation an iteration gives all sensitivities exactly:
+//! A y = -dR/dtheta for a modulus, A y = K b for a plate's motion b tied by springs K; the rows of the Jacobian are H y.
+
+use crate::error::StiffnessError;
+use crate::numerics::cholesky::Cholesky;
+use crate::numerics::statistics::percentile;
+use crate::stiffness::body::Body;
+use crate::stiffness::forward::{Problem, Solution, Tie};
+use crate::stiffness::law::Material;
+use crate::stiffness::observations::Observation;
+use crate::stiffness::patches::Patch;
+use crate::types::space::dot;
+use crate::types::stiffness::Law;
+
+/// Largest change of ln mu in one step (METHODS: 1.5 converged from contrasts of 100).
+const LONGEST: f64 = 1.5;
+/// Bound of |ln(mu / mu_reference)|.
+pub const BOUND: f64 = 7.6;
+/// Huber's constant (Huber 1981: 95 % efficiency for normal errors), times the root mean square length of three components.
+const HUBER: f64 = 1.345;
+/// Standard deviation of the prior of ln mu: weak, it only keeps what the data do not see from wandering.
+const PRIOR: f64 = 5.0;
+/// Blocks that the body is cut into for the covariance.
+const BLOCKS: f64 = 160.0;
+/// Median length of a vector of three independent unit normal numbers.
+const MAXWELL_MEDIAN: f64 = 1.538;
+
+/// What is to be identified, on one mesh.
+#[derive(Debug, Clone)]
+pub struct Setup<'a> {
+    /// The body.
+    pub body: &'a Body,
+    /// The law.
+    pub law: Law,
+    /// Poisson's ratio.
+    pub poisson: f64,
+    /// Held and loaded patch.
+    pub patches: [Patch; 2],
+    /// What was measured.
+    pub observations: &'a [Observation],
+    /// The region whose modulus is 1.
+    pub reference: usize,
+    /// Standard deviation of the prior of the plates' motion about the fitted one (mm).
+    pub plate_prior: f64,
+    /// A region whose ln(mu / mu_reference) is not free, and its value.
+    pub pinned: Option<(usize, f64)>,
+}
+
+/// Where an identification starts or ends.
+#[derive(Debug, Clone, Default)]
+pub struct State {
+    /// ln(mu / mu_reference) of each region.
+    pub theta: Vec<f64>,
+    /// Change of the plates' motion from the fitted one (mm).
+    pub plates: [Vec<f64>; 2],
+    /// The solution.
+    pub x: Option<Vec<f64>>,
+}
+
+/// What was identified.
+#[derive(Debug, Clone)]
+pub struct Estimate {
+    /// Moduli, plates, solution.
+    pub state: State,
+    /// Number of parameters: moduli, then the held plate's, then the loaded plate's.
+    pub parameters: usize,
+    /// Their covariance (row by row), with residuals that hang together counted as such.
+    pub covariance: Vec<f64>,
+    /// Normal matrix J^T W J over the variance of the residuals, without prior.
+    pub information: Vec<f64>,
+    /// Measured less modelled displacement of each observation (mm).
+    pub residuals: Vec<[f64; 3]>,
+    /// Root mean square residual of one component (mm).
+    pub rms: f64,
+    /// Sum of the weighted squares (in units of the observations' sigma).
+    pub squares: f64,
+    /// How many independent samples (components) the data are worth.
+    pub effective: f64,
+    /// Force on the loaded and on the held plate for a reference shear modulus of 1 kPa (kPa mm^2).
+    pub force: [f64; 2],
+    /// Derivative of the logarithm of the force on the loaded plate by each parameter.
+    pub force_slope: Vec<f64>,
+    /// Displacement at the observations for a unit of each parameter.
+    pub rows: Vec<Vec<[f64; 3]>>,
+    /// Iterations.
+    pub iterations: usize,
+    /// Factorisations.
+    pub factorisations: usize,
+}
+
+impl Setup<'_> {
+    /// Regions whose modulus is free, ascending.
+    pub fn free(&self) -> Vec<usize> {
+        let pinned = self.pinned.map(|p| p.0);
+        (0..self.body.labels.len()).filter(|&r| r != self.reference && Some(r) != pinned).collect()
+    }
+
+    /// The forward problem for a state.
+    pub fn problem(&self, state: &State) -> Problem<'_> {
+        let material = |&r: &u16| Material { mu: state.theta[r as usize].exp(), poisson: self.poisson };
+        let materials: Vec<Material> = self.body.region.iter().map(material).collect();
+        let mut ties: Vec<Tie> = Vec::new();
+        for (patch, change) in self.patches.iter().zip(&state.plates) {
+            ties.extend(patch.ties(self.body, change));
+        }
+        let slides = |p: &Patch| p.contact == crate::types::stiffness::Contact::Sliding;
+        if self.patches.iter().all(slides) {
+            // Two frictionless plates leave the body free to move along them; faint springs hold it.
+            for patch in &self.patches {
+                for tie in patch.ties(self.body, &[]) {
+                    ties.push(Tie { direction: None, strength: 1e-10, ..tie });
+                }
+            }
+        }
+        Problem::new(self.body, self.law, materials, ties)
+    }
+
+    /// A state with equal moduli and the plates as fitted.
+    pub fn start(&self) -> State {
+        let plates = [0, 1].map(|i| vec![0.0; self.patches[i].parameters()]);
+        State { theta: vec![0.0; self.body.labels.len()], plates, x: None }
+    }
+
+    pub(super) fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
+        let problem = self.problem(state);
+        let solution = problem.solve(state.x.as_deref(), precision)?;
+        Ok((problem, solution))
+    }
+
+    /// Right-hand sides of the sensitivities, one after the other.
+    fn right_sides(&self, problem: &Problem<'_>, x: &[f64]) -> Result<Vec<f64>, StiffnessError> {
+        let body = self.body;
+        let mut out = Vec::new();
+        for r in self.free() {
+            let part = problem.residual_by_modulus(x, |e| body.region[e] as usize == r)?;
+            out.extend(part.into_iter().map(|v| -v));
+        }
+        out.extend(self.plate_sides(problem));
+        Ok(out)
+    }
+
+    /// Right-hand sides for the plates' parameters, one after the other.
+    pub fn plate_sides(&self, problem: &Problem<'_>) -> Vec<f64> {
+        let (body, n) = (self.body, self.body.pattern.unknowns());
+        let (mut out, zero) = (Vec::new(), vec![0.0; n]);
+        for patch in &self.patches {
+            for k in 0..patch.parameters() {
+                let mut column = vec![0.0; n];
+                for tie in patch.ties(body, &[]) {
+                    let push = Tie { target: patch.basis(k, body.places[tie.node as usize]), ..tie };
+                    let force = problem.pull(&push, &zero);
+                    let at = body.pattern.first(tie.node);
+                    (0..3).for_each(|a| column[at + a] += force[a]);
+                }
+                out.extend(column);
+            }
+        }
+        out
+    }
+
+    /// Force (kPa mm^2) with which each plate pushes the body (loaded, held).
+    pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
+        [1, 0].map(|i| {
+            let patch = &self.patches[i];
+            let ties = patch.ties(self.body, &state.plates[i]);
+            -ties.iter().map(|t| dot(problem.pull(t, x), patch.normal)).sum::<f64>()
+        })
+    }
+
+    /// Residuals (mm) and Huber weights times 1 / sigma^2; `scale` is the robust standard deviation in units of sigma.
+    fn residuals(&self, x: &[f64]) -> Vec<[f64; 3]> {
+        use rayon::prelude::*;
+        let one = |o: &Observation| {
+            let u = o.read(self.body, x);
+            std::array::from_fn(|a| o.displacement[a] - u[a])
+        };
+        self.observations.par_iter().map(one).collect()
+    }
+
+    pub(super) fn scale(&self, residuals: &[[f64; 3]]) -> f64 {
+        let mut sizes: Vec<f64> =
+            residuals.iter().zip(self.observations).map(|(r, o)| dot(*r, *r).sqrt() / o.sigma).collect();
+        (percentile(&mut sizes, 50.0) / MAXWELL_MEDIAN).max(1e-9)
+    }
+
+    pub(super) fn weights(&self, residuals: &[[f64; 3]], scale: f64) -> Vec<f64> {
+        let limit = HUBER * scale * 3f64.sqrt();
+        let one = |(r, o): (&[f64; 3], &Observation)| {
+            let size = dot(*r, *r).sqrt() / o.sigma;
+            let huber = if size > limit { limit / size } else { 1.0 };
+            huber / (o.sigma * o.sigma)
+        };
+        residuals.iter().zip(self.observations).map(one).collect()
+    }
+
+    fn squares(&self, residuals: &[[f64; 3]], weights: &[f64]) -> f64 {
+        residuals.iter().zip(weights).map(|(r, w)| w * dot(*r, *r)).sum()
+    }
+
+    fn prior(&self, state: &State) -> f64 {
+        let moduli: f64 = self.free().iter().map(|&r| (state.theta[r] / PRIOR).powi(2)).sum();
+        let plates: f64 = state.plates.iter().flatten().map(|c| (c / self.plate_prior).powi(2)).sum();
+        moduli + plates
+    }
+
+    /// Identifies from `start`; `most` iterations at most, `precision` (mm) of each forward solution.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when the forward problem cannot be solved.
+    pub fn run(&self, start: State, most: usize, precision: f64) -> Result<Estimate, StiffnessError> {
+        let free = self.free();
+        let parameters = free.len() + self.patches[0].parameters() + self.patches[1].parameters();
+        let mut state = start;
+        if let Some((r, value)) = self.pinned {
+            state.theta[r] = value;
+        }
+        let mut factorisations = 0;
+        let (mut problem, mut solution) = self.solve(&state, precision)?;
+        factorisations += solution.steps;
+        let mut residuals = self.residuals(&solution.x);
+        let mut iterations = 0;
+        loop {
+            iterations += 1;
+            let scale = self.scale(&residuals);
+            let weights = self.weights(&residuals, scale);
+            let columns = self.sensitivities(&problem, &solution)?;
+            let (normal, right) = self.normal(&columns, &residuals, &weights);
+            let (variance, prior) = (scale * scale, self.prior_terms(&state));
+            let mut a: Vec<f64> = normal.iter().map(|v| v / variance).collect();
+            let mut step: Vec<f64> = right.iter().map(|v| v / variance).collect();
+            for k in 0..parameters {
+                a[k * parameters + k] += prior[k].0;
+                step[k] -= prior[k].0 * prior[k].1;
+            }
+            let Some(factor) = Cholesky::new(a, parameters) else { return Err(StiffnessError::Unsolvable) };
+            factor.solve(&mut step);
+            let longest = step[..free.len()].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
+            let mut part = if longest > LONGEST { LONGEST / longest } else { 1.0 };
+            let plates = step[free.len()..].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
+            let small = part * longest < 2e-3 && plates < 1e-4;
+            if small || iterations > most {
+                return self.finish(state, &problem, &solution, columns, residuals, iterations, factorisations);
+            }
+            let before = self.squares(&residuals, &weights) / variance + self.prior(&state);
+            let mut best = None;
+            for _ in 0..4 {
+                let mut trial = self.moved(&state, &step, part, &free);
+                // First-order guess of the solution.
+                let n = self.body.pattern.unknowns();
+                let mut x = solution.x.clone();
+                for (k, column) in columns.chunks_exact(n).enumerate() {
+                    x.iter_mut().zip(column).for_each(|(v, c)| *v += part * step[k] * c);
+                }
+                trial.x = Some(x);
+                if let Ok((p, s)) = self.solve(&trial, precision) {
+                    factorisations += s.steps;
+                    let rest = self.residuals(&s.x);
+                    let after = self.squares(&rest, &weights) / variance + self.prior(&trial);
+                    if after <= before * (1.0 + 1e-9) || part < 0.2 {
+                        best = Some((trial, p, s, rest, after));
+                        break;
+                    }
+                }
+                part *= 0.4;
+            }
+            let Some((trial, p, s, rest, after)) = best else {
+                return self.finish(state, &problem, &solution, columns, residuals, iterations, factorisations);
+            };
+            let stalled = after > before * (1.0 - 1e-7);
+            (state, problem, solution, residuals) = (trial, p, s, rest);
+            if stalled {
+                let columns = self.sensitivities(&problem, &solution)?;
+                return self.finish(state, &problem, &solution, columns, residuals, iterations, factorisations);
+            }
+        }
+    }
+
+    fn sensitivities(&self, problem: &Problem<'_>, solution: &Solution<'_>) -> Result<Vec<f64>, StiffnessError> {
+        let mut columns = self.right_sides(problem, &solution.x)?;
+        solution.factor.solve(&mut columns).map_err(|_| StiffnessError::Unsolvable)?;
+        Ok(columns)
+    }
+
+    fn moved(&self, state: &State, step: &[f64], part: f64, free: &[usize]) -> State {
+        let mut out = state.clone();
+        let mut values = step.iter().map(|s| part * s);
+        for &r in free {
+            out.theta[r] = (out.theta[r] + values.next().unwrap_or(0.0)).clamp(-BOUND, BOUND);
+        }
+        for c in out.plates.iter_mut().flatten() {
+            *c += values.next().unwrap_or(0.0);
+        }
+        out
+    }
+
+    /// 1 / variance and present distance of each parameter's prior.
+    pub(super) fn prior_terms(&self, state: &State) -> Vec<(f64, f64)> {
+        let moduli = self.free().into_iter().map(|r| (PRIOR.powi(-2), state.theta[r]));
+        let plates = state.plates.iter().flatten().map(|&c| (self.plate_prior.powi(-2), c));
+        moduli.chain(plates).collect()
+    }
+
+    /// J^T W J and J^T W e.
+    fn normal(&self, columns: &[f64], residuals: &[[f64; 3]], weights: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let rows = self.rows(columns);
+        let p = rows.len();
+        let (mut normal, mut right) = (vec![0.0; p * p], vec![0.0; p]);
+        for block in grouped_normal(self.observations, &rows, residuals, weights) {
+            normal.iter_mut().zip(&block.normal).for_each(|(a, b)| *a += b);
+            right.iter_mut().zip(&block.score).for_each(|(a, b)| *a += b);
+        }
+        (normal, right)
+    }
+
+    /// The sensitivities at the observations.
+    fn rows(&self, columns: &[f64]) -> Vec<Vec<[f64; 3]>> {
+        use rayon::prelude::*;
+        let read = |y: &[f64]| self.observations.iter().map(|o| o.read(self.body, y)).collect();
+        columns.par_chunks_exact(self.body.pattern.unknowns()).map(read).collect()
+    }
+
+    fn finish(
+        &self,
+        mut state: State,
+        problem: &Problem<'_>,
+        solution: &Solution<'_>,
+        columns: Vec<f64>,
+        residuals: Vec<[f64; 3]>,
+        iterations: usize,
+        factorisations: usize,
+    ) -> Result<Estimate, StiffnessError> {
+        let rows = self.rows(&columns);
+        let p = rows.len();
+        let weights = self.weights(&residuals, self.scale(&residuals));
+        let blocks = grouped_normal(self.observations, &rows, &residuals, &weights);
+        let squares = self.squares(&residuals, &weights);
+        let samples = 3.0 * residuals.len() as f64;
+        let (covariance, information, inflation) = covariance(&blocks, &self.prior_terms(&state), squares, samples)?;
+        let force = self.forces(problem, &state, &solution.x);
+        let force_slope = self.force_slope(problem, &columns, force[0]);
+        let rms = (residuals.iter().map(|r| dot(*r, *r)).sum::<f64>() / samples).sqrt();
+        state.x = Some(solution.x.clone());
+        Ok(Estimate {
+            state,
+            parameters: p,
+            covariance,
+            information,
+            residuals,
+            rms,
+            squares,
+            effective: samples / inflation,
+            force,
+            force_slope,
+            rows,
+            iterations,
+            factorisations,
+        })
+    }
+
+    /// Derivatives of ln(force on the loaded plate).
+    fn force_slope(&self, problem: &Problem<'_>, columns: &[f64], force: f64) -> Vec<f64> {
+        let n = self.body.pattern.unknowns();
+        let first = self.free().len() + self.patches[0].parameters();
+        let patch = &self.patches[1];
+        let ties = patch.ties(self.body, &[]);
+        let slope = |(k, y): (usize, &[f64])| {
+            let push = |tie: &Tie| {
+                let target = match k.checked_sub(first) {
+                    Some(own) => patch.basis(own, self.body.places[tie.node as usize]),
+                    None => [0.0; 3],
+                };
+                -dot(problem.pull(&Tie { target, ..*tie }, y), patch.normal)
+            };
+            ties.iter().map(push).sum::<f64>() / force
+        };
+        columns.chunks_exact(n).enumerate().map(slope).collect()
+    }
+}
+
+/// A block's share of the normal equations.
+#[derive(Debug, Clone)]
+pub(super) struct Block {
+    pub normal: Vec<f64>,
+    pub score: Vec<f64>,
+}
+
+/// The normal equations block by block of the body.
+pub(super) fn grouped_normal(
+    observations: &[Observation],
+    rows: &[Vec<[f64; 3]>],
+    residuals: &[[f64; 3]],
+    weights: &[f64],
+) -> Vec<Block> {
+    use rayon::prelude::*;
+    let p = rows.len();
+    let one = |group: &Vec<u32>| {
+        let mut block = Block { normal: vec![0.0; p * p], score: vec![0.0; p] };
+        for i in group.iter().map(|&i| i as usize) {
+            for a in 0..p {
+                let weighted = rows[a][i].map(|v| v * weights[i]);
+                block.score[a] += dot(weighted, residuals[i]);
+                for b in 0..=a {
+                    block.normal[a * p + b] += dot(weighted, rows[b][i]);
+                }
+            }
+        }
+        for a in 0..p {
+            for b in a + 1..p {
+                block.normal[a * p + b] = block.normal[b * p + a];
+            }
+        }
+        block
+    };
+    grouped(observations).par_iter().map(one).collect()
+}
+
+/// Covariance with residuals that hang together within a block (the sandwich of Liang and Zeger, Biometrika 73, 1986, never
+/// below the plain one), the plain information, and by how much the variances grow on average.
+pub(super) fn covariance(
+    blocks: &[Block],
+    prior: &[(f64, f64)],
+    squares: f64,
+    samples: f64,
+) -> Result<(Vec<f64>, Vec<f64>, f64), StiffnessError> {
+    let p = prior.len();
+    let variance = (squares / (samples - p as f64).max(1.0)).max(1e-18);
+    let mut information = vec![0.0; p * p];
+    let mut meat = vec![0.0; p * p];
+    for block in blocks {
+        for a in 0..p {
+            for b in 0..p {
+                information[a * p + b] += block.normal[a * p + b] / variance;
+                meat[a * p + b] += block.score[a] * block.score[b] / (variance * variance);
+            }
+        }
+    }
+    let mut a = information.clone();
+    for (k, (weight, _)) in prior.iter().enumerate() {
+        a[k * p + k] += weight;
+    }
+    let bread = Cholesky::new(a, p).ok_or(StiffnessError::Unsolvable)?.inverse();
+    // With few blocks the sandwich is too small (Bell and McCaffrey 2002).
+    let few = blocks.len() as f64 / (blocks.len() as f64 - p as f64).max(1.0);
+    let sandwich = product(&product(&bread, &meat, p), &bread, p);
+    let growth: Vec<f64> = (0..p).map(|k| (few * sandwich[k * p + k] / bread[k * p + k]).max(1.0)).collect();
+    let scaled = |i: usize| {
+        let (r, c) = (i / p, i % p);
+        let correlation = sandwich[i] / (sandwich[r * p + r] * sandwich[c * p + c]).max(1e-300).sqrt();
+        let correlation = if r == c { 1.0 } else { correlation.clamp(-1.0, 1.0) };
+        correlation * (bread[r * p + r] * bread[c * p + c] * growth[r] * growth[c]).sqrt()
+    };
+    let out = (0..p * p).map(scaled).collect();
+    Ok((out, information, growth.iter().sum::<f64>() / p.max(1) as f64))
+}
+
+fn product(a: &[f64], b: &[f64], n: usize) -> Vec<f64> {
+    (0..n * n).map(|i| (0..n).map(|k| a[i / n * n + k] * b[k * n + i % n]).sum()).collect()
+}
+
+/// Numbers of the observations in each block of space.
+fn grouped(observations: &[Observation]) -> Vec<Vec<u32>> {
+    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    for o in observations {
+        for a in 0..3 {
+            low[a] = low[a].min(o.place[a]);
+            high[a] = high[a].max(o.place[a]);
+        }
+    }
+    let volume: f64 = (0..3).map(|a| (high[a] - low[a]).max(1e-3)).product();
+    let size = (volume / BLOCKS).cbrt();
+    let count: [usize; 3] = std::array::from_fn(|a| ((high[a] - low[a]) / size) as usize + 1);
+    let mut out = vec![Vec::new(); count.iter().product()];
+    for (i, o) in observations.iter().enumerate() {
+        let c: [usize; 3] = std::array::from_fn(|a| (((o.place[a] - low[a]) / size) as usize).min(count[a] - 1));
+        out[c[0] + count[0] * (c[1] + count[1] * c[2])].push(i as u32);
+    }
+    out.retain(|g| !g.is_empty());
+    out
+}

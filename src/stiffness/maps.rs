@@ -1,0 +1,105 @@
+//! Results back on voxels and nodes.
+
+use crate::stiffness::body::Body;
+use crate::stiffness::identify::Estimate;
+use crate::stiffness::level::Level;
+use crate::stiffness::observations::Observation;
+use crate::types::stiffness::{Prescribed, RegionStiffness, StiffnessParams};
+use crate::types::{DenseField, Mask, Volume, WorldPoint};
+
+/// Volume of the voxels that are not 0 (mm^3).
+pub fn volume(labels: &Mask) -> f64 {
+    let voxel = crate::types::space::determinant(labels.grid().affine().linear()).abs();
+    labels.as_slice().iter().filter(|&&v| v > 0).count() as f64 * voxel
+}
+
+/// The value of each voxel's region; 0 outside.
+pub fn by_label(labels: &Mask, known: &[u8], value: &dyn Fn(usize) -> f64) -> Volume {
+    let mut table = [0.0f32; 256];
+    for (r, &label) in known.iter().enumerate() {
+        table[label as usize] = value(r) as f32;
+    }
+    let mut out = Volume::filled(*labels.grid(), 0.0);
+    out.as_mut_slice().iter_mut().zip(labels.as_slice()).for_each(|(v, &l)| *v = table[l as usize]);
+    out
+}
+
+/// Length of the residual (mm): over the block of each sample, or at the voxel of each match.
+pub fn residual(labels: &Mask, observations: &[Observation], residuals: &[[f64; 3]], block: usize) -> Volume {
+    let grid = *labels.grid();
+    let mut out = Volume::filled(grid, 0.0f32);
+    let values = out.as_mut_slice();
+    let side = block.max(1);
+    for (o, r) in observations.iter().zip(residuals) {
+        let at = grid.affine().to_voxel(WorldPoint(o.place)).0;
+        let length = r.iter().map(|v| v * v).sum::<f64>().sqrt() as f32;
+        let first = at.map(|v| (v - 0.5 * (side - 1) as f64).round().max(0.0) as usize);
+        for c in 0..side * side * side {
+            let v = [first[0] + c % side, first[1] + c / side % side, first[2] + c / (side * side)];
+            if (0..3).all(|a| v[a] < grid.shape()[a]) {
+                values[grid.index(v[0], v[1], v[2])] = length;
+            }
+        }
+    }
+    out
+}
+
+/// Standard deviation of what is rough in a field (mm, a component), the mean over the components; `sigma` measures it in
+/// one volume.
+pub fn noise(
+    field: &DenseField,
+    labels: &Mask,
+    sigma: impl Fn(&[f32], [usize; 3], &dyn Fn(usize) -> bool) -> f64,
+) -> f64 {
+    let shape = field.grid().shape();
+    let inside = labels.as_slice();
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let keep = |o: usize| {
+        let near = |s: usize| inside[o.saturating_sub(s)] > 0 && inside[(o + s).min(inside.len() - 1)] > 0;
+        inside[o] > 0 && stride.iter().all(|&s| near(s))
+    };
+    (0..3).map(|c| sigma(field.component(c), shape, &keep)).sum::<f64>() / 3.0
+}
+
+/// The model's displacement of each node (mm, RAS).
+pub fn node_displacement(body: &Body, estimate: &Estimate) -> Vec<[f64; 3]> {
+    let Some(x) = &estimate.state.x else { return vec![[0.0; 3]; body.places.len()] };
+    (0..body.places.len() as u32).map(|n| body.displacement(x, n)).collect()
+}
+
+/// What the patches prescribe.
+pub fn prescribed(level: &Level, estimate: &Estimate) -> Vec<Prescribed> {
+    let mut out = Vec::new();
+    for (i, patch) in level.patches.iter().enumerate() {
+        for tie in patch.ties(&level.body, &estimate.state.plates[i]) {
+            out.push(Prescribed { node: tie.node, patch: i as u8, direction: tie.direction, displacement: tie.target });
+        }
+    }
+    out
+}
+
+/// What to know before trusting the moduli.
+pub fn warnings(
+    level: &Level,
+    regions: &[RegionStiffness],
+    mesh_change: &[f64],
+    params: &StiffnessParams,
+) -> Vec<String> {
+    let mut out = Vec::new();
+    for r in regions.iter().filter(|r| !r.identifiable) {
+        let bound = r.bound.unwrap_or("lower");
+        out.push(format!("the data do not determine the modulus of {}: its value is a {bound} bound", r.name));
+    }
+    for (r, change) in regions.iter().zip(mesh_change).filter(|(r, c)| r.identifiable && c.abs() > 0.15) {
+        let percent = 100.0 * change.exp_m1();
+        out.push(format!("the modulus of {} changes by {percent:.0} % with the mesh; try more --nodes", r.name));
+    }
+    let area = level.patches[1].area(&level.body);
+    if area < 100.0 * level.voxel * level.voxel {
+        out.push(format!("the loaded patch is small ({area:.1} mm^2), so absolute moduli hang on its edge"));
+    }
+    if params.poisson < 0.4 {
+        out.push(format!("Poisson's ratio {} is low for soft tissue, which is nearly incompressible", params.poisson));
+    }
+    out
+}

@@ -1,0 +1,235 @@
+//! What was measured inside the body: places with a displacement, and how a solution is read there.
+
+use crate::stiffness::body::Body;
+use crate::stiffness::elements::{locate, shapes};
+use crate::types::space::{Matrix3, determinant};
+use crate::types::{DenseField, Mask, SparseField, VoxelPoint, WorldPoint};
+use rayon::prelude::*;
+
+/// Barycentric coordinates down to this count as inside an element.
+const SLACK: f64 = 1e-6;
+/// Samples of a dense field at most; blocks of voxels are averaged so that there are fewer.
+const SAMPLES: usize = 60_000;
+
+/// A measured displacement in an element.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Observation {
+    /// Where (mm, RAS).
+    pub place: [f64; 3],
+    /// The element that holds it.
+    pub element: u32,
+    /// The shape functions there.
+    pub weights: [f64; 10],
+    /// Measured displacement (mm, RAS).
+    pub displacement: [f64; 3],
+    /// Its standard deviation (mm, a component), up to a common factor.
+    pub sigma: f64,
+}
+
+impl Observation {
+    /// The displacement of a vector of unknowns at this place (mm).
+    #[inline]
+    pub fn read(&self, body: &Body, x: &[f64]) -> [f64; 3] {
+        let mut u = [0.0; 3];
+        for (&n, &w) in body.cells[self.element as usize].iter().zip(&self.weights) {
+            let at = body.pattern.first(n);
+            for a in 0..3 {
+                u[a] += w * x[at + a];
+            }
+        }
+        u
+    }
+}
+
+/// The element that holds each place (mm, RAS) and the shape functions there; none outside the body.
+pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<(u32, [f64; 10])>> {
+    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    for p in &body.places {
+        for a in 0..3 {
+            low[a] = low[a].min(p[a]);
+            high[a] = high[a].max(p[a]);
+        }
+    }
+    let volume: f64 = (0..3).map(|a| (high[a] - low[a]).max(1e-9)).product();
+    let size = (8.0 * volume / places.len().max(8) as f64).cbrt();
+    let count: [usize; 3] = std::array::from_fn(|a| ((high[a] - low[a]) / size) as usize + 1);
+    let cell = |p: &[f64; 3]| -> [usize; 3] {
+        std::array::from_fn(|a| (((p[a] - low[a]) / size).max(0.0) as usize).min(count[a] - 1))
+    };
+    let key = |c: [usize; 3]| c[0] + count[0] * (c[1] + count[1] * c[2]);
+    let mut start = vec![0u32; count.iter().product::<usize>() + 1];
+    places.iter().for_each(|p| start[key(cell(p)) + 1] += 1);
+    (1..start.len()).for_each(|i| start[i] += start[i - 1]);
+    let mut fill = start.clone();
+    let mut sorted = vec![0u32; places.len()];
+    for (i, p) in places.iter().enumerate() {
+        let at = &mut fill[key(cell(p))];
+        sorted[*at as usize] = i as u32;
+        *at += 1;
+    }
+    let search = |e: usize| {
+        let nodes = body.cells[e].map(|n| body.places[n as usize]);
+        let (mut l, mut h) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+        for p in &nodes {
+            for a in 0..3 {
+                l[a] = l[a].min(p[a]);
+                h[a] = h[a].max(p[a]);
+            }
+        }
+        let straight: Matrix3 = std::array::from_fn(|a| std::array::from_fn(|b| nodes[b + 1][a] - nodes[0][a]));
+        let det = determinant(&straight);
+        let (c0, c1) = (cell(&l), cell(&h));
+        let mut found = Vec::new();
+        for z in c0[2]..=c1[2] {
+            for y in c0[1]..=c1[1] {
+                for x in c0[0]..=c1[0] {
+                    let k = key([x, y, z]);
+                    for &i in &sorted[start[k] as usize..start[k + 1] as usize] {
+                        let p = places[i as usize];
+                        if (0..3).any(|a| p[a] < l[a] - 0.1 || p[a] > h[a] + 0.1) || !near(&straight, det, nodes[0], p)
+                        {
+                            continue;
+                        }
+                        if let Some(b) = locate(&nodes, p).filter(|b| b.iter().all(|&v| v >= -SLACK)) {
+                            found.push((i, shapes(b)));
+                        }
+                    }
+                }
+            }
+        }
+        found
+    };
+    let per: Vec<Vec<(u32, [f64; 10])>> = (0..body.cells.len()).into_par_iter().map(search).collect();
+    let mut out = vec![None; places.len()];
+    for (e, list) in per.into_iter().enumerate() {
+        for (i, w) in list {
+            out[i as usize].get_or_insert((e as u32, w));
+        }
+    }
+    out
+}
+
+/// Whether a place may lie in a curved element, by its coordinates in the straight one.
+fn near(j: &Matrix3, det: f64, origin: [f64; 3], p: [f64; 3]) -> bool {
+    let d: [f64; 3] = std::array::from_fn(|a| p[a] - origin[a]);
+    let mut sum = 0.0;
+    for b in 0..3 {
+        let mut m = *j;
+        (0..3).for_each(|a| m[a][b] = d[a]);
+        let l = determinant(&m) / det;
+        if l < -0.3 {
+            return false;
+        }
+        sum += l;
+    }
+    sum < 1.3
+}
+
+fn located(body: &Body, raw: Vec<([f64; 3], [f64; 3], f64)>) -> Vec<Observation> {
+    let places: Vec<[f64; 3]> = raw.iter().map(|r| r.0).collect();
+    let found = find(body, &places);
+    let join = |((place, displacement, sigma), f): (([f64; 3], [f64; 3], f64), Option<(u32, [f64; 10])>)| {
+        f.map(|(element, weights)| Observation { place, element, weights, displacement, sigma })
+    };
+    raw.into_iter().zip(found).filter_map(join).collect()
+}
+
+/// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The second value is the number of
+/// voxels along a block's edge.
+pub fn from_field(body: &Body, field: &DenseField, mask: &Mask) -> (Vec<Observation>, usize) {
+    let grid = field.grid();
+    let [nx, ny, nz] = grid.shape();
+    let inside = mask.as_slice();
+    let voxels = inside.iter().filter(|&&v| v > 0).count();
+    let block = (1..6).find(|b| voxels / (b * b * b) <= SAMPLES).unwrap_or(6);
+    let parts: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
+    let row = |k: usize| {
+        let mut out = Vec::new();
+        for j in (0..ny.saturating_sub(block - 1)).step_by(block) {
+            'next: for i in (0..nx.saturating_sub(block - 1)).step_by(block) {
+                let mut sum = [0.0; 3];
+                for c in 0..block * block * block {
+                    let o = grid.index(i + c % block, j + c / block % block, k + c / (block * block));
+                    if inside[o] == 0 {
+                        continue 'next;
+                    }
+                    for a in 0..3 {
+                        sum[a] += f64::from(parts[a][o]);
+                    }
+                }
+                let middle = 0.5 * (block - 1) as f64;
+                let p = grid.affine().to_world(VoxelPoint([i as f64 + middle, j as f64 + middle, k as f64 + middle]));
+                let mean = sum.map(|s| s / (block * block * block) as f64);
+                if mean.iter().all(|v| v.is_finite()) {
+                    out.push((p.0, mean, 1.0));
+                }
+            }
+        }
+        out
+    };
+    let layers: Vec<usize> = (0..nz.saturating_sub(block - 1)).step_by(block).collect();
+    let raw: Vec<_> = layers.into_par_iter().map(row).collect::<Vec<_>>().concat();
+    (located(body, raw), block)
+}
+
+/// The kept matches that lie in the body.
+pub fn from_matches(body: &Body, matches: &SparseField) -> Vec<Observation> {
+    let raw = matches.kept().map(|m| (m.initial.0, m.displacement, m.sigma().max(1e-4))).collect();
+    located(body, raw)
+}
+
+/// The field and its standard error (mm, a component) at a place of the surface: an affine fit to the voxels of the mask
+/// within `reach` voxels, so that nothing outside the body is read and noise is averaged.
+pub fn at_surface(field: &DenseField, mask: &Mask, p: [f64; 3], reach: f64) -> Option<([f64; 3], f64)> {
+    let grid = field.grid();
+    let (shape, at) = (grid.shape(), grid.affine().to_voxel(WorldPoint(p)).0);
+    let range = |a: usize| {
+        let low = (at[a] - reach).ceil().max(0.0) as usize;
+        let high = ((at[a] + reach).floor() as i64).clamp(-1, shape[a] as i64 - 1) + 1;
+        low..high.max(0) as usize
+    };
+    let mut normal = [[0.0; 4]; 4];
+    let mut right = [[0.0; 4]; 3];
+    let mut square = [0.0; 3];
+    let (mut total, mut count) = (0.0, 0);
+    for k in range(2) {
+        for j in range(1) {
+            for i in range(0) {
+                let o = grid.index(i, j, k);
+                let d = [i as f64 - at[0], j as f64 - at[1], k as f64 - at[2]];
+                let r2 = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / (reach * reach);
+                if mask.as_slice()[o] == 0 || r2 > 1.0 {
+                    continue;
+                }
+                let w = (1.0 - r2).powi(2) + 1e-3;
+                let row = [1.0, d[0], d[1], d[2]];
+                total += w;
+                count += 1;
+                for a in 0..4 {
+                    for b in 0..4 {
+                        normal[a][b] += w * row[a] * row[b];
+                    }
+                }
+                let u = field.at(o);
+                for c in 0..3 {
+                    square[c] += w * f64::from(u[c]).powi(2);
+                    for a in 0..4 {
+                        right[c][a] += w * row[a] * f64::from(u[c]);
+                    }
+                }
+            }
+        }
+    }
+    if count < 8 {
+        return None;
+    }
+    let inverse = crate::numerics::dense::solve(&normal, &[1.0, 0.0, 0.0, 0.0])?;
+    let mut out = [0.0; 3];
+    let mut rest = 0.0;
+    for c in 0..3 {
+        let fit = crate::numerics::dense::solve(&normal, &right[c])?;
+        out[c] = fit[0];
+        rest += (square[c] - (0..4).map(|a| fit[a] * right[c][a]).sum::<f64>()).max(0.0) / total / 3.0;
+    }
+    out.iter().all(|v| v.is_finite()).then(|| (out, (rest * total * inverse[0]).max(0.0).sqrt()))
+}

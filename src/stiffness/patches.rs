@@ -1,0 +1,517 @@
+//! Where the body is held and pressed, found on its surface from the measured motion, and what is prescribed there.
+//!
+//! A **held** base is the flat end of the undeformed body on that side. A **loaded** patch is what comes to lie on one plane:
+//! the surface that is pushed in the furthest gives the plane, by least squares on its deformed places, and the patch is
+//! the surface that ends within a tolerance of it. Facets that the plate would have to pull are let go later
+//! ([`crate::stiffness::contact`]). The displacement of a patch is that of a plate, six numbers fitted to all its nodes, and
+//! these are fitted again with the moduli: no node's own noise is imposed on the solution.
+
+use crate::error::StiffnessError;
+use crate::numerics::dense::{solve, symmetric_eigen};
+use crate::stiffness::body::Body;
+use crate::stiffness::forward::Tie;
+use crate::stiffness::observations::at_surface;
+use crate::types::space::{cross, dot};
+use crate::types::stiffness::{Contact, Side};
+use crate::types::{DenseField, Mask, VoxelPoint, WorldPoint};
+use rayon::prelude::*;
+
+/// Voxels around a surface node that are read for its motion.
+const REACH: f64 = 3.0;
+
+/// Where a patch is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Place {
+    /// On a side of the body.
+    Side(Side),
+    /// Inside a mask on the initial grid, given by its name.
+    Mask(Mask, String),
+}
+
+impl Place {
+    /// As on the command line.
+    pub fn name(&self) -> String {
+        match self {
+            Place::Side(side) => side.name(),
+            Place::Mask(_, name) => name.clone(),
+        }
+    }
+}
+
+/// The measured displacement of the surface nodes (by node number) and its typical standard error (mm).
+#[derive(Debug, Clone)]
+pub struct SurfaceMotion {
+    /// Displacement (mm, RAS); none where the field gives nothing.
+    pub displacement: Vec<Option<[f64; 3]>>,
+    /// Median standard error of one component (mm).
+    pub error: f64,
+}
+
+impl SurfaceMotion {
+    /// Reads the field at the surface of a body.
+    pub fn new(body: &Body, field: &DenseField, mask: &Mask) -> Self {
+        let mut nodes: Vec<u32> = body.surface.iter().flat_map(|f| f.nodes).collect();
+        nodes.sort_unstable();
+        nodes.dedup();
+        let read = |&n: &u32| at_surface(field, mask, body.places[n as usize], REACH);
+        let values: Vec<_> = nodes.par_iter().map(read).collect();
+        let mut displacement = vec![None; body.places.len()];
+        let mut errors = Vec::new();
+        for (&n, v) in nodes.iter().zip(&values) {
+            if let Some((u, e)) = v {
+                displacement[n as usize] = Some(*u);
+                errors.push(*e);
+            }
+        }
+        Self { displacement, error: crate::numerics::statistics::percentile(&mut errors, 50.0) }
+    }
+}
+
+/// A patch of the surface and the motion of the plate on it.
+#[derive(Debug, Clone)]
+pub struct Patch {
+    /// As given.
+    pub name: String,
+    /// Facets (numbers in [`Body::surface`]).
+    pub facets: Vec<usize>,
+    /// Nodes, ascending.
+    pub nodes: Vec<u32>,
+    /// Outward unit normal of the plate's plane.
+    pub normal: [f64; 3],
+    /// Middle of the patch (mm, RAS).
+    pub middle: [f64; 3],
+    /// Root mean square distance of its nodes from the middle (mm).
+    pub radius: f64,
+    /// Translation and rotation (both mm; rotations times `radius`) of the plate.
+    pub rigid: [f64; 6],
+    /// How it touches.
+    pub contact: Contact,
+    /// For each node the tangential motion besides the rigid one (mm), a quadratic fit; used by [`Contact::Guided`].
+    guided: Vec<[f64; 3]>,
+    /// For each node the motion along the normal besides the rigid one (mm) that brings it onto the plane.
+    onto_plane: Vec<f64>,
+    /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
+    pub residual: [f64; 2],
+}
+
+impl Patch {
+    /// Number of plate parameters.
+    pub fn parameters(&self) -> usize {
+        if self.contact == Contact::Sliding { 3 } else { 6 }
+    }
+
+    /// The displacement (mm) at `p` for a unit of plate parameter `k`.
+    pub fn basis(&self, k: usize, p: [f64; 3]) -> [f64; 3] {
+        let r: [f64; 3] = std::array::from_fn(|a| (p[a] - self.middle[a]) / self.radius);
+        let mut e = [0.0; 3];
+        if self.contact == Contact::Sliding {
+            let [u, v] = tangents(self.normal);
+            return match k {
+                0 => self.normal,
+                1 => cross(u, r),
+                _ => cross(v, r),
+            };
+        }
+        e[k % 3] = 1.0;
+        if k < 3 { e } else { cross(e, r) }
+    }
+
+    /// The ties for plate parameters `change` from the fitted motion.
+    pub fn ties(&self, body: &Body, change: &[f64]) -> Vec<Tie> {
+        let one = |(i, &node): (usize, &u32)| {
+            let p = body.places[node as usize];
+            let mut u = rigid_motion(&self.rigid, self.middle, self.radius, p);
+            for (k, c) in change.iter().enumerate() {
+                let b = self.basis(k, p);
+                (0..3).for_each(|a| u[a] += c * b[a]);
+            }
+            let direction = match self.contact {
+                Contact::Sticking => None,
+                Contact::Sliding => Some(self.normal),
+                Contact::Guided => None,
+            };
+            if self.contact != Contact::Sticking {
+                for a in 0..3 {
+                    u[a] += self.onto_plane[i] * self.normal[a];
+                    if self.contact == Contact::Guided {
+                        u[a] += self.guided[i][a];
+                    }
+                }
+            }
+            Tie { node, direction, target: u, strength: 1.0 }
+        };
+        self.nodes.iter().enumerate().map(one).collect()
+    }
+
+    /// Root mean square motion along the normal, besides the rigid one, that brings the nodes onto the plane (mm): how
+    /// far the patch is from flat before it is pressed.
+    pub fn bend(&self) -> f64 {
+        (self.onto_plane.iter().map(|v| v * v).sum::<f64>() / self.onto_plane.len().max(1) as f64).sqrt()
+    }
+
+    /// Area of the facets in contact (mm^2).
+    pub fn area(&self, body: &Body) -> f64 {
+        self.facets.iter().map(|&f| body.surface[f].area).sum()
+    }
+
+    /// The patch with only the facets of which `keep` holds.
+    pub fn restricted(&self, body: &Body, keep: impl Fn(usize) -> bool) -> Patch {
+        let mut out = self.clone();
+        out.facets.retain(|&f| keep(f));
+        let mut nodes: Vec<u32> = out.facets.iter().flat_map(|&f| body.surface[f].nodes).collect();
+        nodes.sort_unstable();
+        nodes.dedup();
+        let pick: Vec<usize> = nodes.iter().map(|n| self.nodes.partition_point(|m| m < n)).collect();
+        out.guided = pick.iter().map(|&i| self.guided[i]).collect();
+        out.onto_plane = pick.iter().map(|&i| self.onto_plane[i]).collect();
+        out.nodes = nodes;
+        out
+    }
+}
+
+/// Two unit vectors across `n` and each other.
+fn tangents(n: [f64; 3]) -> [[f64; 3]; 2] {
+    let least = (0..3).fold(0, |m, a| if n[a].abs() < n[m].abs() { a } else { m });
+    let mut e = [0.0; 3];
+    e[least] = 1.0;
+    let u = cross(n, e);
+    let length = dot(u, u).sqrt();
+    let u = u.map(|v| v / length);
+    [u, cross(n, u)]
+}
+
+/// Small rotations are taken as exact ones, so that large tilts of a plate do not stretch it.
+fn rigid_motion(rigid: &[f64; 6], middle: [f64; 3], radius: f64, p: [f64; 3]) -> [f64; 3] {
+    let w = [rigid[3] / radius, rigid[4] / radius, rigid[5] / radius];
+    let angle = dot(w, w).sqrt();
+    let r: [f64; 3] = std::array::from_fn(|a| p[a] - middle[a]);
+    let turn = cross(w, r);
+    let (s, c) = if angle < 1e-8 { (1.0, 0.5) } else { (angle.sin() / angle, (1.0 - angle.cos()) / (angle * angle)) };
+    let twice = cross(w, turn);
+    std::array::from_fn(|a| rigid[a] + s * turn[a] + c * twice[a])
+}
+
+/// What is wrong with a patch, and what to try.
+fn refuse(which: &'static str, place: &Place, what: &str, hint: &str) -> StiffnessError {
+    StiffnessError::Patch { which, name: place.name(), what: what.into(), hint: hint.into() }
+}
+
+/// Finds the held and the loaded patch. `voxel` is the least voxel size (mm).
+///
+/// # Errors
+/// [`StiffnessError::Patch`] for a patch without surface, [`StiffnessError::NoLoad`] when they do not move against each other.
+pub fn find(
+    body: &Body,
+    motion: &SurfaceMotion,
+    held: &Place,
+    load: &Place,
+    voxel: f64,
+) -> Result<[Patch; 2], StiffnessError> {
+    let hint_held = "name the side where the tissue is fixed, as x-, x+ ... z+, or give a mask that covers it";
+    let base = match held {
+        Place::Side(side) => base_facets(body, *side, voxel),
+        Place::Mask(mask, _) => masked_facets(body, mask),
+    };
+    let area: f64 = base.iter().map(|&f| body.surface[f].area).sum();
+    if base.is_empty() || area < 9.0 * voxel * voxel {
+        return Err(refuse("held", held, "is empty: no surface of the body lies there", hint_held));
+    }
+    let held_patch = build(body, motion, held.name(), base, None, voxel)
+        .ok_or_else(|| refuse("held", held, "holds no measured motion", "check that the field covers it"))?;
+    let against = |n: u32| {
+        let p = body.places[n as usize];
+        let plate = rigid_motion(&held_patch.rigid, held_patch.middle, held_patch.radius, p);
+        motion.displacement[n as usize].map(|u| -> [f64; 3] { std::array::from_fn(|a| u[a] - plate[a]) })
+    };
+    let hint_load = "name the side that the plate presses, or give a mask that covers the patch";
+    let (facets, plane, moved) = match load {
+        Place::Side(side) => pressed_facets(body, motion, &against, *side, voxel)
+            .ok_or_else(|| refuse("loaded", load, "is empty: no surface faces that way", hint_load))?,
+        Place::Mask(mask, _) => {
+            let facets = masked_facets(body, mask);
+            if facets.is_empty() {
+                return Err(refuse("loaded", load, "is empty: no surface of the body lies there", hint_load));
+            }
+            let mut moved: Vec<f64> = facets
+                .iter()
+                .filter_map(|&f| {
+                    let facet = &body.surface[f];
+                    against(facet.nodes[0]).map(|u| -dot(u, facet.normal))
+                })
+                .collect();
+            let moved = crate::numerics::statistics::percentile(&mut moved, 50.0);
+            (facets, None, if moved.is_finite() { moved } else { 0.0 })
+        }
+    };
+    let noise = (4.0 * motion.error).max(0.02 * voxel);
+    if moved.is_nan() || moved <= noise {
+        return Err(StiffnessError::NoLoad { moved, noise });
+    }
+    if facets.is_empty() {
+        let hint = "the pressed surface does not come to lie on one plane: give a mask that covers the patch";
+        return Err(refuse("loaded", load, "is empty", hint));
+    }
+    if facets.iter().any(|f| held_patch.facets.contains(f)) {
+        return Err(refuse("loaded", load, "overlaps the held one", "choose two different sides"));
+    }
+    let load_patch = build(body, motion, load.name(), facets, plane, voxel)
+        .ok_or_else(|| refuse("loaded", load, "holds no measured motion", "check that the field covers it"))?;
+    Ok([held_patch, load_patch])
+}
+
+/// Facets whose nodes lie within a voxel of the end of the undeformed body.
+fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
+    let d = side.direction();
+    let facing = |f: &usize| dot(body.surface[*f].normal, d) > 0.7;
+    let height = |n: u32| dot(body.places[n as usize], d);
+    let end = (0..body.surface.len())
+        .filter(facing)
+        .flat_map(|f| body.surface[f].nodes)
+        .map(height)
+        .fold(f64::NEG_INFINITY, f64::max);
+    (0..body.surface.len())
+        .filter(facing)
+        .filter(|&f| body.surface[f].nodes.iter().all(|&n| height(n) > end - voxel))
+        .collect()
+}
+
+/// Facets whose middle, or a place just inside of it, lies in a mask.
+fn masked_facets(body: &Body, mask: &Mask) -> Vec<usize> {
+    let grid = mask.grid();
+    let step = grid.spacing().iter().fold(f64::INFINITY, |m, &v| m.min(v));
+    let inside = |p: [f64; 3]| {
+        let v = grid.affine().to_voxel(WorldPoint(p));
+        crate::numerics::sampling::nearest(grid.shape(), VoxelPoint(v.0)).is_some_and(|o| mask.as_slice()[o] > 0)
+    };
+    let covered = |f: &usize| {
+        let facet = &body.surface[*f];
+        [0.5, -0.5, 0.0].iter().any(|s| inside(std::array::from_fn(|a| facet.centre[a] + s * step * facet.normal[a])))
+    };
+    (0..body.surface.len()).filter(covered).collect()
+}
+
+/// A plane: a point (mm) and its outward unit normal.
+type Plane = ([f64; 3], [f64; 3]);
+
+/// The facets that come to lie on the plane of those pushed in the furthest, that plane, and how far they went in (mm).
+fn pressed_facets(
+    body: &Body,
+    motion: &SurfaceMotion,
+    against: &impl Fn(u32) -> Option<[f64; 3]>,
+    side: Side,
+    voxel: f64,
+) -> Option<(Vec<usize>, Option<Plane>, f64)> {
+    let d = side.direction();
+    let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > 0.3).collect();
+    let mut nodes: Vec<u32> = facing.iter().flat_map(|&f| body.surface[f].nodes).collect();
+    nodes.sort_unstable();
+    nodes.dedup();
+    nodes.retain(|&n| against(n).is_some());
+    if nodes.len() < 6 {
+        return None;
+    }
+    let inward = |n: u32| against(n).map_or(f64::NEG_INFINITY, |u| -dot(u, d));
+    let mut all: Vec<f64> = nodes.iter().map(|&n| inward(n)).collect();
+    let most = crate::numerics::statistics::percentile(&mut all, 98.0);
+    let ended = |n: u32| -> Option<[f64; 3]> {
+        let (p, u) = (body.places[n as usize], motion.displacement[n as usize]?);
+        Some(std::array::from_fn(|a| p[a] + u[a]))
+    };
+    let mut chosen: Vec<u32> = nodes.iter().copied().filter(|&n| inward(n) > 0.8 * most).collect();
+    let tolerance = (0.15 * voxel).max(3.0 * motion.error);
+    let mut plane = None;
+    for round in 0..8 {
+        let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
+        let found = fit_plane(&ends, d)?;
+        let limit = tolerance * if round < 3 { 2.0 } else { 1.0 };
+        let distance = |n: u32| ended(n).map_or(f64::INFINITY, |q| dot(sub(q, found.0), found.1).abs());
+        chosen = nodes.iter().copied().filter(|&n| distance(n) < limit && inward(n) > 0.2 * most).collect();
+        plane = Some(found);
+        if chosen.len() < 6 {
+            return Some((Vec::new(), None, most));
+        }
+    }
+    // The rim of a flat face is rounded in the mesh: it ends a little short of the plane, but moves with the plate.
+    let (middle, count) = (mean_place(body, &chosen), chosen.len() as f64);
+    let spread: f64 = chosen.iter().map(|&n| square(sub(body.places[n as usize], middle))).sum::<f64>() / count;
+    let radius = spread.sqrt().max(voxel);
+    let seen: Vec<([f64; 3], [f64; 3])> =
+        chosen.iter().filter_map(|&n| motion.displacement[n as usize].map(|u| (body.places[n as usize], u))).collect();
+    let (plate, at) = (fit_rigid(&seen, middle, radius)?, plane?);
+    for &n in &nodes {
+        let (Some(end), Some(u)) = (ended(n), motion.displacement[n as usize]) else { continue };
+        let with = sub(u, rigid_motion(&plate, middle, radius, body.places[n as usize]));
+        let short = -dot(sub(end, at.0), at.1);
+        if short.abs() < voxel && dot(with, at.1).abs() < tolerance {
+            chosen.push(n);
+        }
+    }
+    chosen.sort_unstable();
+    chosen.dedup();
+    let on = |n: &u32| chosen.binary_search(n).is_ok();
+    let facets: Vec<usize> =
+        facing.into_iter().filter(|&f| body.surface[f].nodes.iter().filter(|n| on(n)).count() >= 5).collect();
+    Some((facets, plane, most))
+}
+
+fn square(v: [f64; 3]) -> f64 {
+    dot(v, v)
+}
+
+fn mean_place(body: &Body, nodes: &[u32]) -> [f64; 3] {
+    std::array::from_fn(|a| nodes.iter().map(|&n| body.places[n as usize][a]).sum::<f64>() / nodes.len() as f64)
+}
+
+fn sub(p: [f64; 3], q: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|a| p[a] - q[a])
+}
+
+/// The plane through places by least squares, its normal on the side of `d`.
+fn fit_plane(places: &[[f64; 3]], d: [f64; 3]) -> Option<Plane> {
+    if places.len() < 3 {
+        return None;
+    }
+    let n = places.len() as f64;
+    let mean: [f64; 3] = std::array::from_fn(|a| places.iter().map(|p| p[a]).sum::<f64>() / n);
+    let mut m = [[0.0; 3]; 3];
+    for p in places {
+        let r = sub(*p, mean);
+        for a in 0..3 {
+            for b in 0..3 {
+                m[a][b] += r[a] * r[b] / n;
+            }
+        }
+    }
+    let eigen = symmetric_eigen(&m);
+    let normal = eigen[0].1;
+    let sign = if dot(normal, d) < 0.0 { -1.0 } else { 1.0 };
+    // A patch too small to tell its tilt keeps the direction asked for.
+    if eigen[1].0 < 25.0 * eigen[0].0 || dot(normal, d).abs() < 0.8 {
+        return Some((mean, d));
+    }
+    Some((mean, normal.map(|v| sign * v)))
+}
+
+/// Fits the plate's motion to the patch's nodes.
+fn build(
+    body: &Body,
+    motion: &SurfaceMotion,
+    name: String,
+    facets: Vec<usize>,
+    plane: Option<Plane>,
+    voxel: f64,
+) -> Option<Patch> {
+    let mut nodes: Vec<u32> = facets.iter().flat_map(|&f| body.surface[f].nodes).collect();
+    nodes.sort_unstable();
+    nodes.dedup();
+    let middle = mean_place(body, &nodes);
+    let spread: f64 = nodes.iter().map(|&n| square(sub(body.places[n as usize], middle))).sum();
+    let radius = (spread / nodes.len() as f64).sqrt().max(voxel);
+    let total: f64 = facets.iter().map(|&f| body.surface[f].area).sum();
+    let mean: [f64; 3] = std::array::from_fn(|a| {
+        facets.iter().map(|&f| body.surface[f].area * body.surface[f].normal[a]).sum::<f64>() / total
+    });
+    let length = dot(mean, mean).sqrt().max(1e-9);
+    let normal = plane.map_or(mean.map(|v| v / length), |p| p.1);
+    let seen: Vec<([f64; 3], [f64; 3])> =
+        nodes.iter().filter_map(|&n| motion.displacement[n as usize].map(|u| (body.places[n as usize], u))).collect();
+    if seen.len() < 3 {
+        return None;
+    }
+    let rigid = fit_rigid(&seen, middle, radius)?;
+    let rest: Vec<([f64; 3], [f64; 3])> =
+        seen.iter().map(|&(p, u)| (p, sub(u, rigid_motion(&rigid, middle, radius, p)))).collect();
+    let part = |along: bool| {
+        let one = |(_, r): &([f64; 3], [f64; 3])| {
+            let n = dot(*r, normal);
+            if along { n * n } else { 0.5 * (dot(*r, *r) - n * n) }
+        };
+        (rest.iter().map(one).sum::<f64>() / rest.len() as f64).sqrt()
+    };
+    let residual = [part(true), part(false)];
+    let quadratic = fit_quadratic(&rest, middle, radius, normal);
+    let guided = nodes.iter().map(|&n| quadratic(body.places[n as usize])).collect();
+    let onto = |&n: &u32| match plane {
+        Some((q, normal)) => {
+            let p = body.places[n as usize];
+            let u = rigid_motion(&rigid, middle, radius, p);
+            dot(sub(q, p), normal) - dot(u, normal)
+        }
+        None => 0.0,
+    };
+    let mut onto_plane: Vec<f64> = nodes.iter().map(onto).collect();
+    let mut sizes: Vec<f64> = onto_plane.iter().map(|v| v.abs()).collect();
+    // A flat face stays as it is, rim and all.
+    if crate::numerics::statistics::percentile(&mut sizes, 75.0) < (0.1 * voxel).max(2.0 * motion.error) {
+        onto_plane.fill(0.0);
+    }
+    let contact = Contact::Sticking;
+    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, onto_plane, residual })
+}
+
+/// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.
+fn fit_rigid(seen: &[([f64; 3], [f64; 3])], middle: [f64; 3], radius: f64) -> Option<[f64; 6]> {
+    let mut rigid = [0.0; 6];
+    for _ in 0..8 {
+        let rest: Vec<[f64; 3]> = seen.iter().map(|(p, u)| sub(*u, rigid_motion(&rigid, middle, radius, *p))).collect();
+        let mut sizes: Vec<f64> = rest.iter().map(|r| dot(*r, *r).sqrt()).collect();
+        let scale = crate::numerics::statistics::percentile(&mut sizes, 50.0).max(1e-9);
+        let (mut m, mut b) = ([[0.0; 6]; 6], [0.0; 6]);
+        for ((p, u), r) in seen.iter().zip(&rest) {
+            let size = dot(*r, *r).sqrt();
+            let w = if size > 2.5 * scale { 2.5 * scale / size } else { 1.0 };
+            let moved: [f64; 3] = std::array::from_fn(|a| (p[a] + u[a] - r[a] - middle[a] - rigid[a]) / radius);
+            let rows: [[f64; 3]; 6] = std::array::from_fn(|k| {
+                let mut e = [0.0; 3];
+                e[k % 3] = 1.0;
+                if k < 3 { e } else { cross(e, moved) }
+            });
+            for i in 0..6 {
+                b[i] += w * dot(rows[i], *r);
+                for j in 0..6 {
+                    m[i][j] += w * dot(rows[i], rows[j]);
+                }
+            }
+        }
+        (0..6).for_each(|i| m[i][i] *= 1.0 + 1e-9);
+        let step = solve(&m, &b)?;
+        (0..6).for_each(|i| rigid[i] += step[i]);
+        if step.iter().all(|s| s.abs() < 1e-9) {
+            break;
+        }
+    }
+    Some(rigid)
+}
+
+/// A quadratic polynomial of the place in the patch's plane, fitted to the part of the motion across `normal`.
+fn fit_quadratic(
+    rest: &[([f64; 3], [f64; 3])],
+    middle: [f64; 3],
+    radius: f64,
+    normal: [f64; 3],
+) -> impl Fn([f64; 3]) -> [f64; 3] {
+    let [t, s] = tangents(normal);
+    let row = move |p: [f64; 3]| {
+        let r = sub(p, middle);
+        let (a, b) = (dot(r, t) / radius, dot(r, s) / radius);
+        [1.0, a, b, a * a, a * b, b * b]
+    };
+    let (mut m, mut b) = ([[0.0; 6]; 6], [[0.0; 6]; 2]);
+    for (p, u) in rest {
+        let f = row(*p);
+        for i in 0..6 {
+            b[0][i] += f[i] * dot(*u, t);
+            b[1][i] += f[i] * dot(*u, s);
+            for j in 0..6 {
+                m[i][j] += f[i] * f[j];
+            }
+        }
+    }
+    (0..6).for_each(|i| m[i][i] *= 1.0 + 1e-6);
+    let fit = b.map(|b| solve(&m, &b).unwrap_or([0.0; 6]));
+    move |p| {
+        let f = row(p);
+        let [a, b] = fit.map(|c| (0..6).map(|i| c[i] * f[i]).sum::<f64>());
+        std::array::from_fn(|k| a * t[k] + b * s[k])
+    }
+}

@@ -1,0 +1,158 @@
+//! From an estimate to moduli with their uncertainty.
+
+use crate::error::StiffnessError;
+use crate::stiffness::body::Body;
+use crate::stiffness::choice::bic;
+use crate::stiffness::geometry::Geometry;
+use crate::stiffness::identify::{BOUND, Estimate, Setup, State};
+use crate::stiffness::law::stress;
+use crate::types::stiffness::RegionStiffness;
+
+/// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies within two of them).
+const VAGUE: f64 = 0.35;
+/// What is left at the interfaces of a label map, as a standard deviation of ln E: this, and this much more for each unit of
+/// |ln contrast| (the displacement tells less and less of a stiffer inclusion). From the spread over the phantoms.
+const INTERFACE: [f64; 2] = [0.006, 0.005];
+/// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
+const RESOLVED: f64 = 0.1;
+/// Contrasts beyond e^this are checked against a rigid region (12).
+const HIGH: f64 = 2.5;
+
+/// ln E of each region with gradient and covariance.
+#[derive(Debug, Clone)]
+pub struct Moduli {
+    /// ln of Young's modulus (kPa with a force, else over the reference's).
+    pub log: Vec<f64>,
+    /// Covariance of these, row by row.
+    pub covariance: Vec<f64>,
+    /// Covariance of ln of the ratio to the reference.
+    pub ratio_variance: Vec<f64>,
+}
+
+/// The moduli of an estimate; `force_n` sets the scale, `geometry` corrects for the faces' offsets.
+pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry>, force_n: Option<f64>) -> Moduli {
+    let regions = setup.body.labels.len();
+    let none = vec![0.0; estimate.parameters];
+    let (step, covariance) = geometry.map_or((&none, &estimate.covariance), |g| (&g.step, &g.covariance));
+    let p = step.len();
+    let free = setup.free();
+    let mut gradient = vec![0.0; regions * p];
+    for (k, &r) in free.iter().enumerate() {
+        gradient[r * p + k] = 1.0;
+    }
+    let ratio_variance =
+        (0..regions).map(|r| free.iter().position(|&f| f == r).map_or(0.0, |k| covariance[k * p + k])).collect();
+    let mut shift = 0.0;
+    if let Some(force) = force_n {
+        let slopes = estimate.force_slope.iter().chain(geometry.iter().flat_map(|g| &g.force_slope));
+        for (k, slope) in slopes.enumerate() {
+            (0..regions).for_each(|r| gradient[r * p + k] -= slope);
+        }
+        shift = (1000.0 * force / estimate.force[0] * 2.0 * (1.0 + setup.poisson)).ln();
+    }
+    let change = |r: usize| (0..p).map(|k| gradient[r * p + k] * step[k]).sum::<f64>();
+    let log = (0..regions).map(|r| estimate.state.theta[r] + shift + change(r)).collect();
+    let entry = |i: usize| {
+        let (r, s) = (i / regions, i % regions);
+        let inner = |a: usize| (0..p).map(|b| covariance[a * p + b] * gradient[s * p + b]).sum::<f64>();
+        (0..p).map(|a| gradient[r * p + a] * inner(a)).sum()
+    };
+    Moduli { log, covariance: (0..regions * regions).map(entry).collect(), ratio_variance }
+}
+
+/// Whether region `r` could as well be rigid (`lower`) or empty (`upper`) for all the data say: the misfit with its modulus at
+/// the bound, the others fitted again, rises by less than two standard deviations (4 in -2 ln likelihood).
+///
+/// # Errors
+/// As [`Setup::run`].
+pub fn unseen(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    r: usize,
+    variance: f64,
+) -> Result<Option<&'static str>, StiffnessError> {
+    let theta = estimate.state.theta[r];
+    if r == setup.reference || (variance.sqrt() < VAGUE && theta.abs() < HIGH) {
+        return Ok(None);
+    }
+    let side = if theta >= 0.0 { "lower" } else { "upper" };
+    if variance.sqrt() > VAGUE || theta.abs() > BOUND - 0.1 {
+        return Ok(Some(side));
+    }
+    // Far enough to be as good as rigid, near enough to be solved.
+    let far = theta + theta.signum() * 2.5;
+    let mut fixed = setup.clone();
+    fixed.pinned = Some((r, far));
+    let start = State { x: None, ..estimate.state.clone() };
+    let end = fixed.run(start, 4, 1e-4)?;
+    let samples = estimate.effective;
+    let rise = bic(end.squares, samples, 0) - bic(estimate.squares, samples, 0);
+    Ok((rise < 4.0).then_some(side))
+}
+
+/// Everything about the regions. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
+/// counts as the error of the fine one, or all of it where it is large.
+pub fn regions(
+    body: &Body,
+    moduli: &Moduli,
+    names: &dyn Fn(u8) -> String,
+    [mesh_change, ratio_change]: [&[f64]; 2],
+    unseen: &[Option<&'static str>],
+    reference: usize,
+) -> Vec<RegionStiffness> {
+    let count = body.labels.len();
+    let one = |r: usize| {
+        let mesh = |change: f64| if change.abs() < RESOLVED { change / 3.0 } else { change };
+        let interface = INTERFACE[0] + INTERFACE[1] * (moduli.log[r] - moduli.log[reference]).abs();
+        let data = moduli.covariance[r * count + r].max(0.0);
+        let model = if data > 0.0 && count > 1 { interface * interface } else { 0.0 };
+        let sd = (data + mesh(mesh_change[r]).powi(2) + model).sqrt();
+        let between = if r == reference { 0.0 } else { mesh(ratio_change[r]).powi(2) + interface * interface };
+        let ratio_sd = (moduli.ratio_variance[r] + between).sqrt();
+        let unseen = unseen[r].or((sd > VAGUE).then_some(if moduli.log[r] >= moduli.log[reference] {
+            "lower"
+        } else {
+            "upper"
+        }));
+        let value = match unseen {
+            None => moduli.log[r],
+            // Two standard deviations from the estimate, towards the side that the data exclude.
+            Some("lower") => moduli.log[r] - (2.0 * sd).min(6.0),
+            Some(_) => moduli.log[r] + (2.0 * sd).min(6.0),
+        };
+        let e = value.exp();
+        let ratio = (value - moduli.log[reference]).exp();
+        let seen = unseen.is_none();
+        RegionStiffness {
+            label: body.labels[r],
+            name: names(body.labels[r]),
+            youngs_modulus: e,
+            sd: if seen { e * sd } else { f64::INFINITY },
+            ratio,
+            ratio_sd: if seen { ratio * ratio_sd } else { f64::INFINITY },
+            identifiable: seen,
+            bound: unseen,
+            volume: body.volumes[r],
+        }
+    };
+    (0..count).map(one).collect()
+}
+
+/// Correlation from a covariance.
+pub fn correlation(covariance: &[f64], n: usize) -> Vec<Vec<f64>> {
+    let sd = |i: usize| covariance[i * n + i].max(1e-300).sqrt();
+    (0..n).map(|i| (0..n).map(|j| covariance[i * n + j] / (sd(i) * sd(j))).collect()).collect()
+}
+
+/// The 95th percentile over the elements of the largest principal strain (1).
+pub fn strain(setup: &Setup<'_>, state: &State) -> f64 {
+    let problem = setup.problem(state);
+    let Some(x) = &state.x else { return 0.0 };
+    let mut all: Vec<f64> = (0..setup.body.cells.len())
+        .filter_map(|e| {
+            let q = &setup.body.quadrature[e][0];
+            stress(setup.law, q, problem.materials[e], &setup.body.gather(x, e)).map(|s| s.1)
+        })
+        .collect();
+    crate::numerics::statistics::percentile(&mut all, 95.0)
+}

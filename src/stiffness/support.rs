@@ -1,0 +1,181 @@
+//! Whether the data support one more region.
+//!
+//! Three things must hold. *Discrepancy*: with the field's own roughness s (white noise of a voxel), the present model's misfit
+//! beyond the noise must show: sqrt(s^2 + misfit^2) > 1.1 s; the noise of a measured field is not known to better than
+//! that. *Geometry*: the misfit must exceed what a surface known to half a voxel explains, half a voxel times the strain.
+//! *Evidence*: the Bayesian information criterion, by effective samples, must fall by more than 10 and the misfit by a
+//! fifth, and the new region's modulus must differ from the first one's by two standard deviations and by a quarter.
+
+use crate::error::StiffnessError;
+use crate::stiffness::choice::{Choice, MARGIN, bic};
+use crate::stiffness::identify::Estimate;
+use crate::stiffness::level::Level;
+use crate::types::space::dot;
+use crate::types::stiffness::{Evidence, Law};
+
+/// How far a residual must stand out of the noise (1).
+const DISCREPANCY: f64 = 1.1;
+/// Parameters that a region's shape stands for: place, size, flatness, besides its modulus.
+const SHAPE: usize = 6;
+
+/// The case for more regions, so far.
+#[derive(Debug)]
+pub struct Support {
+    /// Roughness of a voxel and of a sample (mm).
+    noise: [f64; 2],
+    /// What geometry alone may do (mm).
+    geometry: f64,
+    /// Squares, misfit beyond the noise (mm), effective samples and parameters of the model that stands.
+    squares: f64,
+    misfit: f64,
+    effective: f64,
+    parameters: usize,
+    rms: f64,
+    /// What was tried.
+    pub evidence: Vec<Evidence>,
+}
+
+/// Identifies labelled regions on a coarse mesh.
+///
+/// # Errors
+/// As [`crate::stiffness::identify::Setup::run`].
+pub fn identify(level: &Level, law: Law, poisson: f64) -> Result<Estimate, StiffnessError> {
+    let setup = level.setup(law, poisson, level.largest());
+    setup.run(setup.start(), 12, 1e-4)
+}
+
+impl Support {
+    /// From the identification of one region; `noise` is the field's roughness (mm).
+    pub fn new(level: &Level, choice: &Choice, noise: f64) -> Self {
+        let [held, load] = &level.patches;
+        let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
+        let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
+        let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
+        let block = level.block.max(1) as f64;
+        let e = &choice.estimate;
+        let sample = noise / block.powf(1.5);
+        let misfit = (e.rms * e.rms - sample * sample).max(0.0).sqrt();
+        let mut out = Self {
+            noise: [noise, sample],
+            geometry: 0.5 * level.voxel * strain,
+            squares: e.squares,
+            misfit,
+            effective: e.effective,
+            parameters: e.parameters,
+            rms: e.rms,
+            evidence: Vec::new(),
+        };
+        let reason = match out.refusal() {
+            Some(why) => format!("the data do not support a second region: {why}"),
+            None => format!("its misfit of {misfit:.4} mm stands out of noise and geometry"),
+        };
+        let chosen = !out.may_hold_more();
+        out.push(1, chosen, reason);
+        out
+    }
+
+    fn push(&mut self, count: usize, chosen: bool, reason: String) {
+        self.evidence.push(Evidence {
+            question: "regions",
+            model: count.to_string(),
+            parameters: self.parameters,
+            residual_mm: self.rms,
+            bic: bic(self.squares, self.effective, self.parameters),
+            chosen,
+            reason,
+        });
+    }
+
+    fn refusal(&self) -> Option<String> {
+        let shown = self.noise[0].hypot(self.misfit) / self.noise[0].max(1e-12);
+        if shown <= DISCREPANCY {
+            return Some(format!(
+                "its misfit of {:.4} mm does not stand out of a field rough by {:.4} mm ({shown:.2} times, {DISCREPANCY} needed)",
+                self.misfit, self.noise[0]
+            ));
+        }
+        (self.misfit <= self.geometry).then(|| {
+            format!(
+                "its misfit of {:.4} mm is no more than a surface known to half a voxel explains ({:.4} mm)",
+                self.misfit, self.geometry
+            )
+        })
+    }
+
+    /// Whether a further region is worth a search.
+    pub fn may_hold_more(&self) -> bool {
+        self.refusal().is_none()
+    }
+
+    /// The residual (mm, one component of a sample) at which a map explains the data.
+    pub fn target(&self) -> f64 {
+        self.noise[1].hypot(0.5 * self.geometry)
+    }
+
+    /// No such regions came out of the map.
+    pub fn none(&mut self, count: usize) {
+        self.evidence.push(Evidence {
+            question: "regions",
+            model: count.to_string(),
+            parameters: 0,
+            residual_mm: self.rms,
+            bic: f64::INFINITY,
+            chosen: false,
+            reason: "the map does not fall into so many regions".into(),
+        });
+        self.close();
+    }
+
+    /// Judges the estimate with `count` regions; true makes it the model that stands.
+    pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize) -> bool {
+        let misfit = (e.rms * e.rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
+        let parameters = e.parameters + SHAPE * (count - 1);
+        let samples = self.effective.min(e.effective);
+        let gain = bic(self.squares, samples, self.parameters) - bic(e.squares, samples, parameters);
+        let setup = level.setup(Law::Linear, 0.49, level.largest());
+        let contrast = setup
+            .free()
+            .iter()
+            .enumerate()
+            .map(|(k, &r)| {
+                let sd = e.covariance[k * e.parameters + k].max(0.0).sqrt();
+                (e.state.theta[r].abs(), sd)
+            })
+            .fold((f64::INFINITY, 0.0), |m, c| if c.0 < m.0 { c } else { m });
+        let why = if gain <= MARGIN {
+            Some(format!("the criterion falls by {gain:.0} only, {MARGIN} are needed"))
+        } else if misfit > 0.8 * self.misfit {
+            Some(format!("the misfit falls from {:.4} to {misfit:.4} mm only", self.misfit))
+        } else if contrast.0 < (2.0 * contrast.1).max(0.22) {
+            Some(format!("its modulus differs by a factor of {:.2} only", contrast.0.exp()))
+        } else {
+            None
+        };
+        let mut trial = Self { evidence: Vec::new(), ..*self };
+        (trial.squares, trial.misfit, trial.rms, trial.parameters) = (e.squares, misfit, e.rms, parameters);
+        trial.effective = samples;
+        let accepted = why.is_none();
+        let reason = match why {
+            Some(why) => why,
+            None => format!("the criterion falls by {gain:.0}, the misfit from {:.4} to {misfit:.4} mm", self.misfit),
+        };
+        trial.push(count, false, reason);
+        self.evidence.append(&mut trial.evidence);
+        if accepted {
+            let evidence = std::mem::take(&mut self.evidence);
+            *self = Self { evidence, ..trial };
+        }
+        self.close_at(if accepted { count } else { count - 1 });
+        accepted
+    }
+
+    fn close(&mut self) {
+        let standing = self.evidence.iter().rposition(|e| e.bic.is_finite()).unwrap_or(0);
+        self.evidence.iter_mut().enumerate().for_each(|(i, e)| e.chosen = i == standing);
+    }
+
+    fn close_at(&mut self, count: usize) {
+        let name = count.to_string();
+        self.evidence.iter_mut().for_each(|e| e.chosen = e.model == name);
+    }
+}

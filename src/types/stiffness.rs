@@ -1,0 +1,284 @@
+//! The stiffness problem and what comes out of it.
+
+use crate::error::{ParamError, UnknownName};
+use crate::types::names::choose;
+use crate::types::{QuadraticMesh, Volume};
+use serde::{Deserialize, Serialize};
+use std::str::FromStr;
+
+/// How stress follows strain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Law {
+    /// Small strain: stress = 2 mu strain + p I, p = lambda div u.
+    Linear,
+    /// Compressible neo-Hookean: first Piola-Kirchhoff stress P = mu (F - F^-T) + p F^-T, p = lambda ln J.
+    NeoHookean,
+}
+
+impl Law {
+    /// The name used in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Law::Linear => "linear",
+            Law::NeoHookean => "neo-hookean",
+        }
+    }
+}
+
+/// The law that is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "kebab-case")]
+pub enum LawChoice {
+    /// Linear unless the data ask for more.
+    #[default]
+    Auto,
+    /// Always linear.
+    Linear,
+    /// Always neo-Hookean.
+    NeoHookean,
+}
+
+impl FromStr for LawChoice {
+    type Err = UnknownName;
+
+    fn from_str(name: &str) -> Result<Self, UnknownName> {
+        let known = [("auto", Self::Auto), ("linear", Self::Linear), ("neo-hookean", Self::NeoHookean)];
+        choose("model", name, &known)
+    }
+}
+
+/// A side of the body in world axes: the outward unit vector is `sign` along `axis` (0 = x, 1 = y, 2 = z; RAS).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Side {
+    /// 0, 1 or 2.
+    pub axis: usize,
+    /// Whether the side faces the positive direction.
+    pub positive: bool,
+}
+
+impl Side {
+    /// The outward unit vector (RAS).
+    pub fn direction(self) -> [f64; 3] {
+        let mut d = [0.0; 3];
+        d[self.axis] = if self.positive { 1.0 } else { -1.0 };
+        d
+    }
+
+    /// As on the command line: `z+`.
+    pub fn name(self) -> String {
+        format!("{}{}", ["x", "y", "z"][self.axis], if self.positive { '+' } else { '-' })
+    }
+
+    /// From `x-`, `z+` ...; none for anything else.
+    pub fn parse(text: &str) -> Option<Self> {
+        let (axis, sign) = text.split_at_checked(1)?;
+        let axis = ["x", "y", "z"].iter().position(|a| a.eq_ignore_ascii_case(axis))?;
+        match sign {
+            "+" => Some(Self { axis, positive: true }),
+            "-" => Some(Self { axis, positive: false }),
+            _ => None,
+        }
+    }
+}
+
+/// What the surface does where a plate or a base touches it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Contact {
+    /// It moves with the plate as one rigid body.
+    Sticking,
+    /// It stays on the plate's plane and slides without friction.
+    Sliding,
+    /// It stays on the plate's plane, and moves along it as measured (a quadratic fit).
+    Guided,
+}
+
+impl Contact {
+    /// In lower case.
+    pub fn name(self) -> &'static str {
+        match self {
+            Contact::Sticking => "sticking",
+            Contact::Sliding => "sliding",
+            Contact::Guided => "guided",
+        }
+    }
+}
+
+/// Parameters of [`crate::pipeline::stiffness`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StiffnessParams {
+    /// Poisson's ratio of all regions (1): 0 to below 0.5. Soft tissue is nearly incompressible; 0.49 is usual in
+    /// elastography (Goenezen, Barbone, Oberai 2011).
+    pub poisson: f64,
+    /// The law.
+    pub model: LawChoice,
+    /// Total force on the loaded patch (N), its magnitude; none gives ratios.
+    pub force_n: Option<f64>,
+    /// Nodes of the fine mesh, about (1): 500 to 500,000.
+    pub nodes: usize,
+    /// Regions tried without labels (1): 1 to 8.
+    pub regions: usize,
+}
+
+impl Default for StiffnessParams {
+    fn default() -> Self {
+        Self { poisson: 0.49, model: LawChoice::Auto, force_n: None, nodes: 20_000, regions: 4 }
+    }
+}
+
+impl StiffnessParams {
+    /// Checks every range.
+    ///
+    /// # Errors
+    /// [`ParamError`] names the first value out of range.
+    pub fn check(&self) -> Result<(), ParamError> {
+        if !(self.poisson >= 0.0 && self.poisson < 0.5) {
+            let range = "0 or more and below 0.5 (exactly incompressible tissue has no stiffness matrix; try 0.499)";
+            return Err(ParamError { name: "poisson", value: self.poisson, range });
+        }
+        if let Some(force) = self.force_n
+            && !(force > 0.0 && force.is_finite())
+        {
+            let range = "above 0 N: give the magnitude of the total force on the loaded patch, without a sign";
+            return Err(ParamError { name: "force", value: force, range });
+        }
+        if !(500..=500_000).contains(&self.nodes) {
+            return Err(ParamError { name: "nodes", value: self.nodes as f64, range: "500 to 500,000" });
+        }
+        if !(1..=8).contains(&self.regions) {
+            return Err(ParamError { name: "regions", value: self.regions as f64, range: "1 to 8" });
+        }
+        Ok(())
+    }
+}
+
+/// Young's modulus of one region.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RegionStiffness {
+    /// Its label.
+    pub label: u8,
+    /// Its name.
+    pub name: String,
+    /// Young's modulus: kPa where a force is known, else over that of the reference region. Of a region that is not
+    /// identifiable, the bound that the data give.
+    pub youngs_modulus: f64,
+    /// One standard deviation, in the same unit; infinite where not identifiable.
+    pub sd: f64,
+    /// Over the reference region's modulus.
+    pub ratio: f64,
+    /// One standard deviation of the ratio.
+    pub ratio_sd: f64,
+    /// Whether the data determine it.
+    pub identifiable: bool,
+    /// `lower` or `upper` where it is not: the modulus lies beyond `youngs_modulus`.
+    pub bound: Option<&'static str>,
+    /// Volume (mm^3).
+    pub volume: f64,
+}
+
+/// One model that was tried, with how well it explains the data.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Evidence {
+    /// What was varied.
+    pub question: &'static str,
+    /// The model.
+    pub model: String,
+    /// Free parameters.
+    pub parameters: usize,
+    /// Root mean square residual (mm, one component).
+    pub residual_mm: f64,
+    /// Bayesian information criterion, by the effective number of samples; lower is better.
+    pub bic: f64,
+    /// Whether it was chosen.
+    pub chosen: bool,
+    /// Why, in words.
+    pub reason: String,
+}
+
+/// A patch of the surface that a plate or base holds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PatchReport {
+    /// `z-` or a file's name.
+    pub name: String,
+    /// Area in contact (mm^2).
+    pub area: f64,
+    /// Nodes in contact.
+    pub nodes: usize,
+    /// How it touches.
+    pub contact: Contact,
+    /// Translation of the patch's middle (mm, RAS).
+    pub translation: [f64; 3],
+    /// Root mean square distance of the measured displacement from that of the plate (mm).
+    pub residual_mm: f64,
+}
+
+/// The result of `palpate stiffness`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StiffnessResult {
+    /// Region by region, by label.
+    pub regions: Vec<RegionStiffness>,
+    /// Correlation of the logarithms of the regions' moduli.
+    pub correlation: Vec<Vec<f64>>,
+    /// Whether moduli are in kPa.
+    pub absolute: bool,
+    /// The law that was used.
+    pub law: Law,
+    /// Poisson's ratio that was assumed.
+    pub poisson: f64,
+    /// The force that was given (N).
+    pub force_n: Option<f64>,
+    /// Label of the region that ratios refer to.
+    pub reference: u8,
+    /// Root mean square residual (mm, one component).
+    pub residual_mm: f64,
+    /// Noise of the data, from their own roughness (mm, one component).
+    pub noise_mm: f64,
+    /// Everything tried.
+    pub evidence: Vec<Evidence>,
+    /// Held and loaded patch.
+    pub patches: [PatchReport; 2],
+    /// Young's modulus on the mask's grid (0 outside).
+    pub map: Volume,
+    /// Its standard deviation.
+    pub map_sd: Volume,
+    /// Length of the residual on the mask's grid (mm).
+    pub residual: Volume,
+    /// The mesh.
+    pub mesh: QuadraticMesh,
+    /// Young's modulus of each element.
+    pub element_modulus: Vec<f64>,
+    /// Displacement of the model at the nodes (mm, RAS).
+    pub displacement: Vec<[f64; 3]>,
+    /// Nodes that are held or loaded, with what is prescribed there.
+    pub prescribed: Vec<Prescribed>,
+    /// Flat faces of the body (side and voxel axis) and how far outwards the data put them (voxels).
+    pub faces: Vec<(String, f64)>,
+    /// Force of the model on the loaded patch for the moduli found (N; kPa mm^2 / 1000 without a force).
+    pub model_force: f64,
+    /// Relative change of each region's modulus from the coarse to the fine mesh.
+    pub mesh_change: Vec<f64>,
+    /// Largest principal strain (1), 95th percentile over the body.
+    pub strain: f64,
+    /// What to know before trusting it.
+    pub warnings: Vec<String>,
+    /// Stage names and wall seconds.
+    pub seconds: Vec<(String, f64)>,
+    /// Samples used, and how many independent ones they are worth.
+    pub samples: [f64; 2],
+    /// Whether regions came from labels.
+    pub labelled: bool,
+}
+
+/// A displacement that a plate or base prescribes at a node.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Prescribed {
+    /// The node.
+    pub node: u32,
+    /// 0 held, 1 loaded.
+    pub patch: u8,
+    /// The direction that is prescribed, a unit vector; none for all three components.
+    pub direction: Option<[f64; 3]>,
+    /// The displacement (mm, RAS), or any with the right component along the direction.
+    pub displacement: [f64; 3],
+}

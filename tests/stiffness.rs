@@ -1,0 +1,319 @@
+//! Forward models against closed forms, sensitivities, and identification of fields with a closed form.
+#![allow(clippy::unwrap_used)]
+
+use palpate::mesh::tetrahedral::{Fineness, mesh_labels};
+use palpate::pipeline::stiffness::{Inputs, run};
+use palpate::stiffness::body::Body;
+use palpate::stiffness::forward::{Problem, Tie};
+use palpate::stiffness::law::Material;
+use palpate::stiffness::patches::Place;
+use palpate::types::stiffness::{Contact, Law, LawChoice, Side};
+use palpate::types::{Affine, DenseField, Grid, Mask, StiffnessParams, StiffnessResult, WorldPoint};
+use std::collections::HashSet;
+
+fn grid(shape: [usize; 3], spacing: f64) -> Grid {
+    Grid::new(shape, Affine::scaled([spacing; 3], [0.0; 3]).unwrap()).unwrap()
+}
+
+fn labels(shape: [usize; 3], spacing: f64, f: impl Fn([f64; 3]) -> u8 + Sync) -> Mask {
+    Mask::from_voxels(grid(shape, spacing), |_, p| f(p.0))
+}
+
+/// A block of 16 x 16 x 16 voxels of 1 mm in a grid of 20: faces at 1.5 and 17.5 mm.
+fn block() -> Mask {
+    labels([20, 20, 20], 1.0, |p| u8::from(p.iter().all(|v| (2.0..18.0).contains(v))))
+}
+
+fn body(map: &Mask, nodes: usize) -> Body {
+    let volume =
+        map.as_slice().iter().filter(|&&v| v > 0).count() as f64 * map.grid().spacing().iter().product::<f64>();
+    Body::new(&mesh_labels(map, &Fineness::for_nodes(volume, nodes)).unwrap()).unwrap()
+}
+
+fn surface_nodes(body: &Body) -> Vec<u32> {
+    let all: HashSet<u32> = body.surface.iter().flat_map(|f| f.nodes).collect();
+    let mut all: Vec<u32> = all.into_iter().collect();
+    all.sort_unstable();
+    all
+}
+
+fn tied(body: &Body, nodes: &[u32], u: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<Tie> {
+    let tie = |&node: &u32| Tie { node, direction: None, target: u(body.places[node as usize]), strength: 1.0 };
+    nodes.iter().map(tie).collect()
+}
+
+/// Root mean square and largest distance of a solution from `exact` (mm).
+fn errors(body: &Body, x: &[f64], exact: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 2] {
+    let (mut sum, mut largest) = (0.0, 0.0f64);
+    for (n, p) in body.places.iter().enumerate() {
+        let (u, e) = (body.displacement(x, n as u32), exact(*p));
+        let d: f64 = (0..3).map(|a| (u[a] - e[a]).powi(2)).sum();
+        sum += d;
+        largest = largest.max(d.sqrt());
+    }
+    [(sum / body.places.len() as f64).sqrt(), largest]
+}
+
+fn uniform(body: &Body, e: f64, nu: f64) -> Vec<Material> {
+    vec![Material::of_youngs_modulus(e, nu); body.cells.len()]
+}
+
+#[test]
+fn the_patch_test_is_passed_at_any_poisson_ratio() {
+    let body = body(&block(), 2500);
+    for nu in [0.3, 0.49, 0.499] {
+        let u = |p: [f64; 3]| [1e-3 * p[0] + 2e-3 * p[1], -1e-3 * p[1] + 5e-4 * p[2], 3e-3 * p[0]];
+        let ties = tied(&body, &surface_nodes(&body), u);
+        let problem = Problem::new(&body, Law::Linear, uniform(&body, 10.0, nu), ties);
+        let s = problem.solve(None, 1e-9).unwrap();
+        let [_, largest] = errors(&body, &s.x, u);
+        assert!(largest < 1e-7, "nu {nu}: {largest}");
+    }
+}
+
+/// u = 4 (1 - nu) psi - grad(x . psi) with psi harmonic solves the equations without body force (Papkovich, Neuber).
+#[test]
+fn polynomial_solutions_are_approached_at_third_order_up_to_incompressibility() {
+    let bodies = [700, 5000].map(|n| body(&block(), n));
+    for nu in [0.3, 0.49, 0.499] {
+        // psi = (0, 0, q) with q = x^3 y - x y^3 + z (x^2 - y^2), harmonic; centred and scaled.
+        let exact = |p: [f64; 3]| {
+            let [x, y, z] = p.map(|v| (v - 9.5) / 8.0);
+            let q = x * x * x * y - x * y * y * y + z * (x * x - y * y);
+            let slope =
+                [3.0 * x * x * y - y * y * y + 2.0 * x * z, x * x * x - 3.0 * x * y * y - 2.0 * y * z, x * x - y * y];
+            [-z * slope[0], -z * slope[1], 4.0 * (1.0 - nu) * q - q - z * slope[2]]
+        };
+        let found: Vec<(f64, f64)> = bodies
+            .iter()
+            .map(|b| {
+                let ties = tied(b, &surface_nodes(b), exact);
+                let problem = Problem::new(b, Law::Linear, uniform(b, 10.0, nu), ties);
+                let size = (b.volumes[0] / b.cells.len() as f64).cbrt();
+                (errors(b, &problem.solve(None, 1e-9).unwrap().x, exact)[0], size)
+            })
+            .collect();
+        let rate = (found[0].0 / found[1].0).ln() / (found[0].1 / found[1].1).ln();
+        assert!(rate > 2.6, "nu {nu}: errors {found:?}, rate {rate:.2}");
+    }
+}
+
+/// Ties of a block between two frictionless plates, with the least that keeps it from sliding away.
+fn plates(body: &Body, compression: f64) -> Vec<Tie> {
+    let mut ties = Vec::new();
+    for n in surface_nodes(body) {
+        let p = body.places[n as usize];
+        let z = Some([0.0, 0.0, 1.0]);
+        if p[2] < 1.75 {
+            ties.push(Tie { node: n, direction: z, target: [0.0; 3], strength: 1.0 });
+        } else if p[2] > 17.25 {
+            ties.push(Tie { node: n, direction: z, target: [0.0, 0.0, -compression], strength: 1.0 });
+        }
+    }
+    for tie in ties.clone() {
+        ties.push(Tie { direction: None, strength: 1e-11, target: [0.0, 0.0, tie.target[2]], ..tie });
+    }
+    ties
+}
+
+fn pushes(problem: &Problem<'_>, x: &[f64], top: bool) -> f64 {
+    let on = |t: &&Tie| (problem.body.places[t.node as usize][2] > 10.0) == top;
+    problem.ties.iter().filter(on).map(|t| problem.pull(t, x)[2]).sum()
+}
+
+#[test]
+fn a_bar_gives_its_modulus_back_and_forces_balance() {
+    let body = body(&block(), 4000);
+    for (law, nu) in [(Law::Linear, 0.3), (Law::Linear, 0.49), (Law::NeoHookean, 0.3), (Law::NeoHookean, 0.49)] {
+        let (e, depth) = (10.0, 0.8);
+        let problem = Problem::new(&body, law, uniform(&body, e, nu), plates(&body, depth));
+        let s = problem.solve(None, 1e-9).unwrap();
+        let (top, bottom) = (pushes(&problem, &s.x, true), pushes(&problem, &s.x, false));
+        assert!((top + bottom).abs() < 1e-6 * top.abs(), "{top} {bottom}");
+        let exact = match law {
+            Law::Linear => 256.0 * e * depth / 16.0,
+            Law::NeoHookean => 256.0 * uniaxial(e, nu, 1.0 - depth / 16.0),
+        };
+        // The mesh rounds the block's edges by a fraction of a voxel.
+        assert!((-top / exact - 1.0).abs() < 0.01, "{law:?} {nu}: {top} for {exact}");
+    }
+}
+
+/// Nominal pressure of a neo-Hookean bar at stretch `l`: the transverse stretch makes the side's stress vanish.
+fn uniaxial(e: f64, nu: f64, l: f64) -> f64 {
+    let (mu, lambda) = (e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)));
+    let side = |t: f64| mu * (t - 1.0 / t) + lambda * (l * t * t).ln() / t;
+    let (mut low, mut high) = (0.5, 2.0);
+    for _ in 0..80 {
+        let t = 0.5 * (low + high);
+        if side(t) < 0.0 { low = t } else { high = t }
+    }
+    -(mu * (l - 1.0 / l) + lambda * (l * low * low).ln() / l)
+}
+
+#[test]
+fn neo_hookean_simple_shear_is_homogeneous_and_its_traction_exact() {
+    let body = body(&block(), 2500);
+    let (e, nu, shear) = (10.0, 0.49, 0.2);
+    let u = |p: [f64; 3]| [shear * (p[2] - 9.5), 0.0, 0.0];
+    let problem = Problem::new(&body, Law::NeoHookean, uniform(&body, e, nu), tied(&body, &surface_nodes(&body), u));
+    let s = problem.solve(None, 1e-9).unwrap();
+    assert!(errors(&body, &s.x, u)[1] < 1e-6);
+    // J = 1, so P = mu (F - F^-T): on the top P_xz = mu k. The work of all tractions is mu k^2 times the volume.
+    let work: f64 = problem
+        .ties
+        .iter()
+        .map(|t| {
+            let (f, p) = (problem.pull(t, &s.x), body.places[t.node as usize]);
+            f[0] * (p[2] - 9.5)
+        })
+        .sum();
+    let volume: f64 = body.volumes.iter().sum();
+    let exact = e / (2.0 * (1.0 + nu)) * shear * volume;
+    assert!((work / exact - 1.0).abs() < 1e-4, "{work} for {exact}");
+}
+
+/// A hollow ball whose inner and outer surface are moved radially: u = A r + B / r^2 (Lame).
+#[test]
+fn a_thick_sphere_follows_lame() {
+    let map = labels([26, 26, 26], 1.0, |p| {
+        let r = p.iter().map(|v| (v - 12.6).powi(2)).sum::<f64>().sqrt();
+        u8::from(r < 11.0 && r > 5.0)
+    });
+    let body = body(&map, 9000);
+    let exact = |p: [f64; 3]| {
+        let d = p.map(|v| v - 12.6);
+        let r = d.iter().map(|v| v * v).sum::<f64>().sqrt();
+        d.map(|v| v / r * (4.0 / (r * r)))
+    };
+    let nu = 0.49;
+    let problem = Problem::new(&body, Law::Linear, uniform(&body, 10.0, nu), tied(&body, &surface_nodes(&body), exact));
+    let s = problem.solve(None, 1e-9).unwrap();
+    let [rms, largest] = errors(&body, &s.x, exact);
+    // The displacement is 0.16 mm inside, 0.033 mm outside; the coarse shell has two elements across.
+    assert!(rms < 8e-4 && largest < 0.012, "{rms} {largest}");
+}
+
+/// A flat frictionless round punch on a half space: F = 2 E / (1 - nu^2) a d (Johnson, Contact Mechanics, 3.36). The block is
+/// 6 radii wide and deep, which stiffens it; the edge of the punch is as rough as the mesh.
+#[test]
+fn a_punch_needs_the_force_of_a_half_space_within_a_seventh() {
+    let map = labels([52, 52, 34], 1.0, |p| {
+        u8::from((2.0..50.0).contains(&p[0]) && (2.0..50.0).contains(&p[1]) && (2.0..32.0).contains(&p[2]))
+    });
+    let body = body(&map, 12_000);
+    let (a, d, e, nu) = (6.0, 0.1, 10.0, 0.3);
+    let mut ties = Vec::new();
+    for f in &body.surface {
+        let r = ((f.centre[0] - 25.5).powi(2) + (f.centre[1] - 25.5).powi(2)).sqrt();
+        for n in f.nodes {
+            if f.normal[2] > 0.9 && r < a {
+                ties.push((
+                    n,
+                    Tie { node: n, direction: Some([0.0, 0.0, 1.0]), target: [0.0, 0.0, -d], strength: 1.0 },
+                ));
+            } else if f.normal[2] < -0.9 {
+                ties.push((n, Tie { node: n, direction: None, target: [0.0; 3], strength: 1.0 }));
+            }
+        }
+    }
+    ties.sort_by_key(|t| t.0);
+    ties.dedup_by_key(|t| t.0);
+    let area: f64 = body
+        .surface
+        .iter()
+        .filter(|f| f.normal[2] > 0.9 && ((f.centre[0] - 25.5).powi(2) + (f.centre[1] - 25.5).powi(2)).sqrt() < a)
+        .map(|f| f.area)
+        .sum();
+    // The facets stand for a disc of their own area.
+    let radius = (area / std::f64::consts::PI).sqrt();
+    let problem = Problem::new(&body, Law::Linear, uniform(&body, e, nu), ties.into_iter().map(|t| t.1).collect());
+    let s = problem.solve(None, 1e-9).unwrap();
+    let exact = 2.0 * e / (1.0 - nu * nu) * radius * d;
+    let force = -pushes(&problem, &s.x, true);
+    assert!((0.95..1.3).contains(&(force / exact)), "{force} for {exact}");
+}
+
+#[test]
+fn sensitivities_are_those_of_finite_differences() {
+    let map = labels([20, 20, 20], 1.0, |p| {
+        let inside = p.iter().all(|v| (2.0..18.0).contains(v));
+        let ball = p.iter().map(|v| (v - 9.7).powi(2)).sum::<f64>() < 25.0;
+        if inside { 1 + u8::from(ball) } else { 0 }
+    });
+    let body = body(&map, 2500);
+    for law in [Law::Linear, Law::NeoHookean] {
+        let problem = |theta: f64| {
+            let m = body.region.iter().map(|&r| Material { mu: (f64::from(r) * theta).exp(), poisson: 0.49 }).collect();
+            Problem { spring: 1e7, ..Problem::new(&body, law, m, plates(&body, 1.0)) }
+        };
+        let (theta, h) = (0.8, 1e-3);
+        let at = problem(theta);
+        let s = at.solve(None, 1e-11).unwrap();
+        let mut y: Vec<f64> =
+            at.residual_by_modulus(&s.x, |e| body.region[e] == 1).unwrap().into_iter().map(|v| -v).collect();
+        at.factorise(&s.x).unwrap().solve(&mut y).unwrap();
+        let [low, high] = [-h, h].map(|d| problem(theta + d).solve(None, 1e-11).unwrap().x);
+        let size = y.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
+        for i in 0..y.len() {
+            let difference = (high[i] - low[i]) / (2.0 * h);
+            assert!((difference - y[i]).abs() < 1e-4 * size, "{law:?}: {} for {difference}", y[i]);
+        }
+    }
+}
+
+/// The field of a homogeneous block between frictionless plates, linear: closed form, whatever the modulus.
+fn squeezed(strain: f64, nu: f64) -> DenseField {
+    DenseField::from_fn(grid([20, 20, 20], 1.0), |p: WorldPoint| {
+        [nu * strain * (p.0[0] - 9.5), nu * strain * (p.0[1] - 9.5), -strain * (p.0[2] - 1.5)]
+    })
+}
+
+fn identify(map: &Mask, field: &DenseField, params: &StiffnessParams) -> StiffnessResult {
+    let (held, load) = (Place::Side(Side::parse("z-").unwrap()), Place::Side(Side::parse("z+").unwrap()));
+    let names = |l: u8| format!("region {l}");
+    let inputs = Inputs { field, matches: None, labels: map, labelled: true, held: &held, load: &load, names: &names };
+    run(&inputs, params, &|_, _| {}).unwrap()
+}
+
+#[test]
+fn a_homogeneous_block_in_two_labels_has_one_modulus_and_the_right_one() {
+    let halves =
+        labels(
+            [20, 20, 20],
+            1.0,
+            |p| {
+                if p.iter().all(|v| (2.0..18.0).contains(v)) { 1 + u8::from(p[2] > 9.0) } else { 0 }
+            },
+        );
+    let (e, strain) = (25.0, 0.03);
+    let force = e * 256.0 * strain / 1000.0;
+    let params = StiffnessParams { model: LawChoice::Auto, force_n: Some(force), nodes: 4000, ..Default::default() };
+    let result = identify(&halves, &squeezed(strain, 0.49), &params);
+    assert_eq!(result.patches[1].contact, Contact::Sliding);
+    assert_eq!(result.law, Law::Linear, "{:?}", result.evidence);
+    for r in &result.regions {
+        assert!((r.youngs_modulus / e - 1.0).abs() < 0.02, "{r:?}");
+        assert!(r.identifiable);
+    }
+    assert!((result.model_force / force - 1.0).abs() < 1e-6);
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let map =
+        labels(
+            [20, 20, 20],
+            1.0,
+            |p| {
+                if p.iter().all(|v| (2.0..18.0).contains(v)) { 1 + u8::from(p[0] > 9.0) } else { 0 }
+            },
+        );
+    let params = StiffnessParams { model: LawChoice::Linear, nodes: 1500, ..Default::default() };
+    let [one, two] = [1, 3].map(|n| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
+        pool.install(|| identify(&map, &squeezed(0.05, 0.49), &params))
+    });
+    assert_eq!(one.regions, two.regions);
+    assert_eq!(one.displacement, two.displacement);
+}

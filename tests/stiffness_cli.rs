@@ -1,0 +1,184 @@
+//! `palpate stiffness` as a user meets it: files, exit codes, what it says to bad input, and other programs on its models.
+#![allow(clippy::unwrap_used)]
+
+use assert_cmd::Command;
+use palpate::io;
+use palpate::types::{Affine, DenseField, Grid, Mask};
+use std::fs;
+use std::path::Path;
+use tempfile::TempDir;
+
+fn grid(shape: [usize; 3]) -> Grid {
+    Grid::new(shape, Affine::scaled([1.0; 3], [-3.0, 5.0, 1.0]).unwrap()).unwrap()
+}
+
+/// A block squeezed by 3 % between frictionless plates, and its label map of two halves.
+fn folder() -> TempDir {
+    let folder = TempDir::new().unwrap();
+    let g = grid([16, 16, 16]);
+    let inside = |i: usize| (2..14).contains(&i);
+    let block = |o: usize| g.voxel(o).into_iter().all(inside);
+    let labels = Mask::from_voxels(g, |o, _| if block(o) { 1 + u8::from(g.voxel(o)[0] > 7) } else { 0 });
+    let middle = g.world(0, 0, 0).moved([7.5; 3]).0;
+    let field = DenseField::from_fn(g, |p| {
+        let d: [f64; 3] = std::array::from_fn(|a| p.0[a] - middle[a]);
+        [0.49 * 0.03 * d[0], 0.49 * 0.03 * d[1], -0.03 * d[2]]
+    });
+    let at = |name: &str| folder.path().join(name);
+    io::write_field(at("field.nii.gz"), &field).unwrap();
+    io::write_labels(at("labels.nii.gz"), &labels, "").unwrap();
+    folder
+}
+
+fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("palpate"));
+    let output = command.current_dir(folder).args(arguments).output().unwrap();
+    let [out, err] = [output.stdout, output.stderr].map(|b| String::from_utf8_lossy(&b).into_owned());
+    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
+    assert!(!err.contains("panicked"), "{err}");
+    (out, err)
+}
+
+const BASE: [&str; 9] =
+    ["stiffness", "--field", "field.nii.gz", "--labels", "labels.nii.gz", "--nodes", "1500", "-o", "results"];
+
+/// Runs with more arguments; must end with `code`, say all of `parts` and leave nothing.
+fn refused(folder: &Path, more: &[&str], code: i32, parts: &[&str]) {
+    let (out, err) = run(folder, &[&BASE, more].concat(), code);
+    assert!(out.is_empty(), "{out}");
+    for part in parts {
+        assert!(err.contains(part), "should say {part:?}: {err}");
+    }
+    assert!(!folder.join("results").exists());
+}
+
+#[test]
+fn everything_promised_is_written() {
+    let folder = folder();
+    let (out, _) = run(folder.path(), &[&BASE[..], &["--force", "0.1", "--names", "1=left,2=right"]].concat(), 0);
+    assert!(out.contains("All 2 regions are determined by the data.") && out.contains("left"), "{out}");
+    let results = folder.path().join("results");
+    let table = fs::read_to_string(results.join("regions.csv")).unwrap();
+    assert!(table.starts_with("label,name,youngs_modulus_kpa,sd_kpa,ratio,identifiable\n1,left,"), "{table}");
+    let summary: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(results.join("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["absolute"], true);
+    // E = F / (A strain) = 0.1 N / (144 mm^2 x 0.03).
+    for r in summary["regions"].as_array().unwrap() {
+        let e = r["youngs_modulus"].as_f64().unwrap();
+        assert!((e / 23.148 - 1.0).abs() < 0.03, "{e}");
+    }
+    for key in ["residual_mm", "evidence", "patches", "correlation", "seconds", "mesh", "verdict"] {
+        assert!(!summary[key].is_null(), "{key}");
+    }
+    let map = io::read_volume(results.join("stiffness.nii.gz")).unwrap();
+    assert!(map.as_slice()[0] == 0.0 && map.as_slice()[map.grid().index(7, 7, 7)] > 20.0);
+    let page = fs::read_to_string(results.join("report.html")).unwrap();
+    assert!(page.contains("left") && !page.contains("NaN") && !page.contains("http"));
+    for file in ["stiffness_sd.nii.gz", "residual.nii.gz", "mesh.vtu", "model.feb", "model.inp"] {
+        assert!(fs::metadata(results.join(file)).unwrap().len() > 500, "{file}");
+    }
+    check_febio(&fs::read_to_string(results.join("model.feb")).unwrap());
+    run_calculix(&results, &summary);
+}
+
+/// The sections of a FEBio 4 file, in the order its manual gives, each opened and closed.
+fn check_febio(text: &str) {
+    assert!(text.contains("<febio_spec version=\"4.0\">"));
+    let mut last = 0;
+    for section in ["Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "LoadData", "Output"] {
+        let (open, close) = (format!("<{section}>"), format!("</{section}>"));
+        assert_eq!((text.matches(&open).count(), text.matches(&close).count()), (1, 1), "{section}");
+        let at = text.find(&open).unwrap();
+        assert!(at > last, "{section} stands too early");
+        last = at;
+    }
+    assert!(text.contains("<Elements type=\"tet10\" name=\"region1\">"));
+    assert!(text.contains("<SolidDomain name=\"region2\" mat=\"material2\"/>"));
+}
+
+/// CalculiX solves our model to our displacements; skipped where it is not installed.
+fn run_calculix(results: &Path, summary: &serde_json::Value) {
+    let Ok(output) = std::process::Command::new("ccx").arg("model").current_dir(results).output() else {
+        println!("ccx is not installed: model.inp was not run");
+        return;
+    };
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(said.contains("Job finished"), "{said}");
+    let printed = fs::read_to_string(results.join("model.dat")).unwrap();
+    let rows: Vec<Vec<f64>> = printed
+        .lines()
+        .map(|l| l.split_whitespace().map_while(|v| v.parse().ok()).collect::<Vec<f64>>())
+        .filter(|r| r.len() == 4)
+        .collect();
+    assert_eq!(rows.len(), summary["mesh"]["nodes"].as_u64().unwrap() as usize);
+    let ours = displacements(&fs::read_to_string(results.join("mesh.vtu")).unwrap());
+    let size = rows.iter().map(|r| r[3].abs()).fold(0.0, f64::max);
+    let mut worst = 0.0f64;
+    for (r, u) in rows.iter().zip(&ours) {
+        (0..3).for_each(|a| worst = worst.max((r[a + 1] - u[a]).abs()));
+    }
+    println!("CalculiX and we differ by {worst:.5} mm of {size:.3} mm");
+    assert!(size > 0.1 && worst < 0.03 * size, "{worst} of {size}");
+}
+
+/// The displacement array of one of our .vtu files.
+fn displacements(vtu: &str) -> Vec<[f64; 3]> {
+    use base64::{Engine, engine::general_purpose::STANDARD};
+    let data = vtu.split_once("<AppendedData encoding=\"base64\">\n_").unwrap().1.split('\n').next().unwrap();
+    let header = STANDARD.decode(&data[..44]).unwrap();
+    let word = |i: usize| u64::from_le_bytes(header[8 * i..8 * i + 8].try_into().unwrap()) as usize;
+    assert_eq!(word(0), 1);
+    let packed = STANDARD.decode(&data[44..44 + word(3).div_ceil(3) * 4]).unwrap();
+    let mut raw = vec![0; word(2)];
+    libdeflater::Decompressor::new().zlib_decompress(&packed, &mut raw).unwrap();
+    let floats: Vec<f64> = raw.as_chunks::<4>().0.iter().map(|b| f64::from(f32::from_le_bytes(*b))).collect();
+    floats.as_chunks::<3>().0.to_vec()
+}
+
+#[test]
+fn bad_numbers_are_usage_errors_that_say_the_range() {
+    let folder = folder();
+    refused(folder.path(), &["--force", "-2"], 2, &["force", "-2", "above 0 N", "without a sign"]);
+    refused(folder.path(), &["--poisson", "0.5"], 2, &["poisson", "0.5", "below 0.5", "0.499"]);
+    refused(folder.path(), &["--nodes", "3"], 2, &["nodes"]);
+    refused(folder.path(), &["--names", "7=skin"], 2, &["no label 7"]);
+    refused(folder.path(), &["--model", "hyper"], 2, &["hyper", "neo-hookean"]);
+}
+
+#[test]
+fn labels_on_another_grid_are_refused() {
+    let folder = folder();
+    let other = Mask::filled(grid([16, 16, 15]), 1);
+    io::write_labels(folder.path().join("labels.nii.gz"), &other, "").unwrap();
+    refused(folder.path(), &[], 1, &["labels.nii.gz", "another grid", "palpate warp --reference"]);
+}
+
+#[test]
+fn an_empty_held_patch_is_refused() {
+    let folder = folder();
+    let mut mask = Mask::filled(grid([16, 16, 16]), 0);
+    mask.as_mut_slice()[0] = 1;
+    io::write_labels(folder.path().join("nail.nii.gz"), &mask, "").unwrap();
+    refused(folder.path(), &["--held", "nail.nii.gz"], 1, &["held", "nail.nii.gz", "is empty", "x-"]);
+    refused(folder.path(), &["--held", "zz"], 1, &["--held zz", "neither a side"]);
+    refused(folder.path(), &["--held", "z+"], 1, &["overlaps"]);
+}
+
+#[test]
+fn a_body_at_rest_has_no_load() {
+    let folder = folder();
+    io::write_field(folder.path().join("field.nii.gz"), &DenseField::zeros(grid([16, 16, 16]))).unwrap();
+    refused(folder.path(), &[], 1, &["no load", "--load"]);
+}
+
+#[test]
+fn a_body_in_two_pieces_is_refused() {
+    let folder = folder();
+    let path = folder.path().join("labels.nii.gz");
+    let mut labels = io::read_labels(&path).unwrap();
+    let at = labels.grid().index(0, 0, 0);
+    labels.as_mut_slice()[at] = 1;
+    io::write_labels(&path, &labels, "").unwrap();
+    refused(folder.path(), &[], 1, &["2 pieces", "keep the largest component"]);
+}

@@ -1,0 +1,128 @@
+//! The mesh of a label map: volumes, conformity, shapes, grading.
+#![allow(clippy::unwrap_used)]
+
+use palpate::mesh::quality::{quality, volume};
+use palpate::mesh::tetrahedral::{Fineness, curving, mesh_labels, pieces};
+use palpate::types::{Affine, Grid, Mask, QuadraticMesh, WorldPoint};
+use std::collections::HashMap;
+
+fn labels(shape: [usize; 3], spacing: f64, f: impl Fn([f64; 3]) -> u8 + Sync) -> Mask {
+    let grid = Grid::new(shape, Affine::scaled([spacing; 3], [0.0; 3]).unwrap()).unwrap();
+    Mask::from_voxels(grid, |_, p| f(p.0))
+}
+
+/// Volume of each region's curved elements.
+fn volumes(mesh: &QuadraticMesh) -> HashMap<u8, f64> {
+    let mut out = HashMap::new();
+    for (t, &label) in mesh.tetrahedra().iter().zip(mesh.labels()) {
+        let p = t.map(|n| mesh.nodes()[n as usize].0);
+        *out.entry(label).or_insert(0.0) += curving::volume(p);
+    }
+    out
+}
+
+fn report(name: &str, mesh: &QuadraticMesh) -> f64 {
+    let mut faces: HashMap<[u32; 3], u32> = HashMap::new();
+    let mut least = f64::INFINITY;
+    let mut determinant = f64::INFINITY;
+    let mut angles = Vec::new();
+    for t in mesh.tetrahedra() {
+        let p = t.map(|n| mesh.nodes()[n as usize]);
+        let corners: [WorldPoint; 4] = [p[0], p[1], p[2], p[3]];
+        assert!(volume(corners) > 0.0);
+        angles.push(quality(corners).min_dihedral_angle.to_degrees());
+        least = least.min(quality(corners).min_dihedral_angle.to_degrees());
+        determinant = determinant.min(curving::least_determinant(p.map(|q| q.0)));
+        for i in 0..4 {
+            let mut f = [t[(i + 1) % 4], t[(i + 2) % 4], t[(i + 3) % 4]];
+            f.sort_unstable();
+            *faces.entry(f).or_default() += 1;
+        }
+    }
+    assert!(faces.values().all(|&n| n <= 2));
+    angles.sort_by(f64::total_cmp);
+    println!(
+        "{name}: {} nodes, {} elements, least dihedral angle {least:.1} (hundredth {:.1}) degrees, least determinant {determinant:.2}",
+        mesh.nodes().len(),
+        mesh.tetrahedra().len(),
+        angles[angles.len() / 100]
+    );
+    assert!(determinant > 0.1);
+    least
+}
+
+#[test]
+fn a_ball_in_a_block_keeps_its_volume() {
+    let r = 7.0;
+    let c = [24.2, 23.7, 16.1];
+    let map = labels([96, 96, 64], 0.5, |p| {
+        let inside = (2.0..46.0).contains(&p[0]) && (2.0..46.0).contains(&p[1]) && (2.0..30.0).contains(&p[2]);
+        let d: f64 = (0..3).map(|a| (p[a] - c[a]).powi(2)).sum();
+        if !inside {
+            0
+        } else if d < r * r {
+            2
+        } else {
+            1
+        }
+    });
+    let count = map.as_slice().iter().filter(|&&v| v == 2).count() as f64 * 0.125;
+    for (nodes, tolerance) in [(6000, 0.03), (20_000, 0.005)] {
+        let mesh = mesh_labels(&map, &Fineness::for_nodes(44.0 * 44.0 * 28.0, nodes)).unwrap();
+        let least = report("ball in block", &mesh);
+        let v = volumes(&mesh);
+        let exact = 4.0 / 3.0 * std::f64::consts::PI * r * r * r;
+        println!("ball {:.1} of {exact:.1} (voxels {count:.1}), all {:.0} of {}", v[&2], v[&1] + v[&2], 44 * 44 * 28);
+        assert!(least > 5.0);
+        assert!((v[&2] / exact - 1.0).abs() < tolerance);
+        assert!(((v[&1] + v[&2]) / (44.0 * 44.0 * 28.0) - 1.0).abs() < 0.003);
+    }
+}
+
+#[test]
+fn layers_are_cut_where_they_meet() {
+    let map = labels([64, 64, 48], 0.5, |p| {
+        let inside = (2.0..28.0).contains(&p[0]) && (2.0..28.0).contains(&p[1]) && (2.0..20.0).contains(&p[2]);
+        if !inside {
+            0
+        } else if p[2] > 18.2 {
+            3
+        } else if p[2] > 14.2 {
+            2
+        } else {
+            1
+        }
+    });
+    let mesh = mesh_labels(&map, &Fineness::for_nodes(26.0 * 26.0 * 18.0, 8000)).unwrap();
+    let least = report("layers", &mesh);
+    let v = volumes(&mesh);
+    println!("{v:?}");
+    for (label, count) in [
+        (1, map.as_slice().iter().filter(|&&v| v == 1).count()),
+        (2, map.as_slice().iter().filter(|&&v| v == 2).count()),
+        (3, map.as_slice().iter().filter(|&&v| v == 3).count()),
+    ] {
+        let exact = count as f64 * 0.125;
+        assert!((v[&label] / exact - 1.0).abs() < 0.02, "{label}: {} of {exact}", v[&label]);
+    }
+    assert!(least > 3.0);
+}
+
+#[test]
+fn a_ball_is_round() {
+    let map = labels([50, 50, 50], 0.5, |p| {
+        let d: f64 = (0..3).map(|a| (p[a] - 12.3).powi(2)).sum();
+        u8::from(d < 100.0)
+    });
+    let exact = 4.0 / 3.0 * std::f64::consts::PI * 1000.0;
+    let mesh = mesh_labels(&map, &Fineness::for_nodes(exact, 6000)).unwrap();
+    let least = report("ball", &mesh);
+    let v = volumes(&mesh);
+    println!("ball {:.1} of {exact:.1}", v[&1]);
+    assert!((v[&1] / exact - 1.0).abs() < 0.005);
+    assert!(least > 8.0);
+    let far =
+        mesh.nodes().iter().map(|p| p.0.iter().map(|v| (v - 12.3).powi(2)).sum::<f64>().sqrt()).fold(0.0, f64::max);
+    assert!((far - 10.0).abs() < 0.25, "{far}");
+    assert_eq!(pieces(&map).len(), 1);
+}
