@@ -217,6 +217,9 @@ pub enum SynthError {
     /// A parameter out of range.
     #[error(transparent)]
     Param(#[from] ParamError),
+    /// A body whose stiffness is not known.
+    #[error("this phantom has no known stiffness; an elastic motion needs fingertip, inclusion or slab")]
+    NotElastic,
     /// Geometry.
     #[error(transparent)]
     Space(#[from] SpaceError),

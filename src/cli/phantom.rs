@@ -7,7 +7,9 @@ use clap::Args;
 use palpate::error::UnknownName;
 use palpate::io::{self, OutputFolder};
 use palpate::report::{figure, panels};
-use palpate::synth::{self, MotionKind, Phantom, PhantomKind, PhantomParams, SequenceKind, SequenceParams};
+use palpate::synth::{
+    self, ElasticParams, MotionKind, Phantom, PhantomKind, PhantomParams, SequenceKind, SequenceParams,
+};
 use palpate::types::names::choose;
 use std::path::PathBuf;
 
@@ -16,7 +18,7 @@ const BIAS: f64 = 0.15;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// A pair: calf, slice, head, block or fingertip; a sequence: pinch, pen or contraction
+    /// A pair: calf, slice, head, block, fingertip, inclusion or slab; a sequence: pinch, pen or contraction
     #[arg(value_parser = kind)]
     kind: Kind,
     /// Folder for the results
@@ -37,12 +39,21 @@ pub struct Options {
     /// Seed of anatomy, motion and noise
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
-    /// none, translate, rotate, affine, smooth, press or slide [default: by kind]
+    /// none, translate, rotate, affine, smooth, press, slide or elastic [default: by kind]
     #[arg(long)]
     motion: Option<MotionKind>,
     /// Largest displacement in mm, or degrees for rotate [default: by kind]
     #[arg(long, value_name = "MM")]
     amplitude: Option<f64>,
+    /// Elastic: Young's modulus of one inclusion over the background's
+    #[arg(long, value_name = "RATIO", default_value_t = 5.0)]
+    contrast: f64,
+    /// Elastic: inclusions, 0, 1 or 2 (of 0.5 and 4 times the background's modulus)
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    inclusions: usize,
+    /// Elastic: Poisson's ratio
+    #[arg(long, value_name = "NU", default_value_t = 0.49)]
+    poisson: f64,
     /// Standard deviation of the Rician noise, as a part of the brightest tissue
     #[arg(long, value_name = "PART", default_value_t = 0.03)]
     noise: f64,
@@ -97,7 +108,11 @@ impl Options {
             p = p.sized(n);
         }
         p.spacing = self.spacing()?.unwrap_or(p.spacing);
-        p.motion = self.motion.unwrap_or(p.motion);
+        if let Some(motion) = self.motion {
+            p = p.moving(motion);
+        }
+        let Self { contrast, inclusions, poisson, .. } = *self;
+        p.elastic = ElasticParams { contrast, inclusions, poisson };
         p.amplitude = self.amplitude.unwrap_or(p.amplitude);
         p.check()?;
         Ok(p)
@@ -136,12 +151,19 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
 /// Stages both volumes, truth, mask, landmarks, description and picture.
 pub fn write(folder: &mut OutputFolder, phantom: &Phantom) -> Result<()> {
-    let Phantom { initial, deformed, truth, mask, landmarks, description } = phantom;
+    let Phantom { initial, deformed, truth, mask, landmarks, stiffness, description } = phantom;
     folder.write("initial.nii.gz", |p| io::write_integers(p, initial, "palpate phantom: initial"))?;
     folder.write("deformed.nii.gz", |p| io::write_integers(p, deformed, "palpate phantom: deformed"))?;
     folder.write("truth.nii.gz", |p| io::write_field(p, truth))?;
     folder.write("mask.nii.gz", |p| io::write_labels(p, mask, "palpate phantom: tissue"))?;
     folder.write("landmarks.csv", |p| io::write_landmarks(p, landmarks))?;
+    if let Some(stiffness) = stiffness {
+        let (labels, modulus) = (&stiffness.labels, &stiffness.youngs_modulus_kpa);
+        folder.write("labels.nii.gz", |p| io::write_labels(p, labels, "palpate phantom: tissue regions"))?;
+        folder.write("youngs_modulus.nii.gz", |p| {
+            io::write_volume(p, modulus, "palpate phantom: Young's modulus, kPa")
+        })?;
+    }
     folder.write("phantom.json", |p| io::write_json(p, description))?;
     let params = &description.params;
     let title = format!("{:?}, {:?} motion, seed {}", params.kind, params.motion, params.seed);

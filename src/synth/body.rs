@@ -6,7 +6,7 @@
 //! the function can be sampled and interpolated without much aliasing.
 
 use crate::numerics::random::Random;
-use crate::synth::noise::{COARSE, FINE, SmoothNoise};
+use crate::synth::noise::{COARSE, SmoothNoise, Texture};
 use crate::types::space::Matrix3;
 use crate::types::{Grid, WorldPoint};
 
@@ -47,14 +47,11 @@ pub struct Body {
     /// Longest voxel edge, in space and seen along z (mm).
     edge: f64,
     edge_in_plane: f64,
-    texture: [SmoothNoise<1>; 3],
+    texture: Texture,
     bend: SmoothNoise<4>,
     bend_mm: f64,
     taper: f64,
 }
-
-/// Weights of the coarser texture cells, and how many times the finest they are.
-const OCTAVES: [(f64, f64); 3] = [(1.0, 1.0), (2.3, 0.8), (5.1, 0.6)];
 
 impl Body {
     /// The body of `regions` in the middle of `grid`, turned by up to 3 degrees and shifted by 0.3 to 0.7 mm or
@@ -69,9 +66,7 @@ impl Body {
         let middle = centre(grid);
         let shifted = std::array::from_fn(|a| middle[a] + small * random.uniform(0.3, 0.7));
         let linear = grid.affine().linear();
-        let cell: [f64; 3] = std::array::from_fn(|a| 2.0 * linear[a].iter().map(|v| v * v).sum::<f64>().sqrt());
         let extent = extent(grid);
-        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0), FINE);
         let longest = |axes: usize| {
             let squares = |a: usize| (0..axes).map(|w| linear[w][a] * linear[w][a]).sum::<f64>();
             (0..3).map(squares).fold(0.0, f64::max).sqrt()
@@ -83,7 +78,7 @@ impl Body {
             rotation: rotation(angles),
             centre: shifted,
             edges: std::array::from_fn(|a| std::array::from_fn(|w| linear[w][a])),
-            texture: std::array::from_fn(noise),
+            texture: Texture::new(grid, seed),
             bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3], COARSE),
             bend_mm,
             taper,
@@ -97,8 +92,7 @@ impl Body {
         if outline == 0.0 {
             return (0.0, false);
         }
-        let norm = OCTAVES.iter().map(|o| o.1 * o.1).sum::<f64>().sqrt();
-        let texture: f64 = self.texture.iter().zip(OCTAVES).map(|(t, o)| t.at(p.0)[0] * o.1 / norm).sum();
+        let texture = self.texture.at(p);
         let painted = self.regions.iter().fold(0.0, |below, region| {
             let cover = self.cover(&region.shape, q);
             below + cover * (region.mean * (1.0 + region.texture * texture) - below)

@@ -3,12 +3,18 @@
 use crate::numerics::differences::gradient;
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
-use crate::synth::motion::Motion;
 use crate::types::{Landmark, Mask, Volume, VoxelPoint, WorldPoint};
 
 /// Up to `wanted` random places between voxel centres, two voxels inside `mask`, where the gradient of `clean` is among
-/// its upper 40 %, and four times the shortest voxel edge apart; each with its exact place after `motion`.
-pub fn landmarks(clean: &Volume, mask: &Mask, motion: &Motion, wanted: usize, mut random: Random) -> Vec<Landmark> {
+/// its upper 40 %, and four times the shortest voxel edge apart; each with its place after the motion that `displacements`
+/// gives (mm).
+pub fn landmarks(
+    clean: &Volume,
+    mask: &Mask,
+    wanted: usize,
+    mut random: Random,
+    displacements: impl FnOnce(&[WorldPoint]) -> Vec<[f64; 3]>,
+) -> Vec<Landmark> {
     let grid = *clean.grid();
     let slope = |at: usize| gradient(clean.as_slice(), &grid, grid.voxel(at)).iter().map(|g| g * g).sum::<f64>();
     let inside: Vec<(usize, f64)> =
@@ -30,7 +36,8 @@ pub fn landmarks(clean: &Volume, mask: &Mask, motion: &Motion, wanted: usize, mu
             found.push(p);
         }
     }
-    found.into_iter().map(|p| Landmark { initial: p, deformed: p.moved(motion.at(p)) }).collect()
+    let moved = displacements(&found);
+    found.into_iter().zip(moved).map(|(p, u)| Landmark { initial: p, deformed: p.moved(u) }).collect()
 }
 
 /// Whether the mask goes on for two voxels each way along every axis of more than one voxel.

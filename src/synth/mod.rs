@@ -8,6 +8,8 @@ mod anatomy;
 
 mod body;
 
+pub mod elastic;
+
 mod landmarks;
 
 mod motion;
@@ -18,8 +20,13 @@ pub mod params;
 
 pub mod phantom;
 
+<<<<<<< HEAD
 pub mod sequence;
 
 pub use params::{MotionKind, PhantomKind, PhantomParams};
 pub use phantom::{Description, MIN_JACOBIAN, Phantom, phantom, phantom_on};
 pub use sequence::{Sequence, SequenceKind, SequenceParams};
+=======
+pub use params::{ElasticParams, MotionKind, PhantomKind, PhantomParams};
+pub use phantom::{Description, MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
+>>>>>>> 3b1c98d (Elastic phantoms: inclusion and slab, solved with triquadratic hexahedra)

@@ -2,13 +2,14 @@
 
 use crate::numerics::random::Random;
 use crate::numerics::sampling::cubic_bspline;
+use crate::types::{Grid, WorldPoint};
 
 /// Root of the integral of the squared three-dimensional cubic B-spline, (151/315)^(3/2): the function's deviation
 /// for independent coefficients of deviation 1.
 const DEVIATION: f64 = 0.331_893;
 
 /// Coefficients along each axis of a texture: it repeats after so many cells.
-pub const FINE: usize = 64;
+const FINE: usize = 64;
 
 /// Coefficients along each axis of a function with at most a dozen cells in the field of view.
 pub const COARSE: usize = 16;
@@ -66,5 +67,28 @@ impl SmoothNoise<4> {
     pub fn vector(&self, p: [f64; 3]) -> [f64; 3] {
         let [x, y, z, _] = self.at(p);
         [x, y, z]
+    }
+}
+
+/// Weights of the coarser texture cells, and how many times the finest they are.
+const OCTAVES: [(f64, f64); 3] = [(1.0, 1.0), (2.3, 0.8), (5.1, 0.6)];
+
+/// The fine texture of a body, mean 0 and deviation 1; its finest cells are two voxels.
+#[derive(Debug, Clone)]
+pub struct Texture([SmoothNoise<1>; 3]);
+
+impl Texture {
+    /// For volumes on `grid`.
+    pub fn new(grid: &Grid, seed: u64) -> Self {
+        let linear = grid.affine().linear();
+        let cell: [f64; 3] = std::array::from_fn(|a| 2.0 * linear[a].iter().map(|v| v * v).sum::<f64>().sqrt());
+        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0), FINE);
+        Self(std::array::from_fn(noise))
+    }
+
+    /// The value at a world position.
+    pub fn at(&self, p: WorldPoint) -> f64 {
+        let norm = OCTAVES.iter().map(|o| o.1 * o.1).sum::<f64>().sqrt();
+        self.0.iter().zip(OCTAVES).map(|(t, o)| t.at(p.0)[0] * o.1 / norm).sum()
     }
 }

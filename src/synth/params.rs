@@ -20,6 +20,10 @@ pub enum PhantomKind {
     Block,
     /// The end of a finger: pulp, bone, nail.
     Fingertip,
+    /// A block with one or two balls of another stiffness, or none, pressed by a plate.
+    Inclusion,
+    /// Skin, fat and muscle under a punch.
+    Slab,
 }
 
 /// How it moves from the initial to the deformed volume.
@@ -38,24 +42,49 @@ pub enum MotionKind {
     Smooth,
     /// A blunt indenter: a push that decays with depth, with a bulge around it; a fingertip is pressed on a flat plate.
     Press,
+    /// As elasticity has it: held on one side, pressed on the other (fingertip, inclusion and slab only).
+    Elastic,
     /// The two sides of a plane glide in opposite directions, with a little smooth motion on top.
     Slide,
 }
 
 impl PhantomKind {
     /// Names and kinds.
-    pub const KNOWN: [(&'static str, Self); 5] = [
+    pub const KNOWN: [(&'static str, Self); 7] = [
         ("calf", Self::Calf),
         ("slice", Self::Slice),
         ("head", Self::Head),
         ("block", Self::Block),
         ("fingertip", Self::Fingertip),
+        ("inclusion", Self::Inclusion),
+        ("slab", Self::Slab),
     ];
+
+    /// The motion that is taken if none is asked for.
+    fn usual_motion(self) -> MotionKind {
+        match self {
+            Self::Fingertip | Self::Inclusion | Self::Slab => MotionKind::Elastic,
+            _ => MotionKind::Smooth,
+        }
+    }
+
+    /// The amplitude that is taken if none is asked for (mm, or degrees for a rotation).
+    fn usual_amplitude(self, motion: MotionKind) -> f64 {
+        match (self, motion) {
+            (Self::Fingertip, MotionKind::Elastic) => 1.0,
+            (Self::Fingertip, _) => 1.5,
+            (Self::Calf | Self::Slice, _) => 6.0,
+            (Self::Head, _) => 8.0,
+            (Self::Block, _) => 3.0,
+            (Self::Inclusion, _) => 1.8,
+            (Self::Slab, _) => 1.6,
+        }
+    }
 }
 
 impl MotionKind {
     /// Names and motions.
-    pub const KNOWN: [(&'static str, Self); 7] = [
+    pub const KNOWN: [(&'static str, Self); 8] = [
         ("none", Self::None),
         ("translate", Self::Translate),
         ("rotate", Self::Rotate),
@@ -63,6 +92,7 @@ impl MotionKind {
         ("smooth", Self::Smooth),
         ("press", Self::Press),
         ("slide", Self::Slide),
+        ("elastic", Self::Elastic),
     ];
 }
 
@@ -80,6 +110,17 @@ impl FromStr for MotionKind {
     fn from_str(name: &str) -> Result<Self, UnknownName> {
         choose("motion", name, &Self::KNOWN)
     }
+}
+
+/// Settings of an elastic phantom.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ElasticParams {
+    /// Young's modulus of a single inclusion over the background's.
+    pub contrast: f64,
+    /// Inclusions: none, one, or two (of 0.5 and 4 times the background's modulus).
+    pub inclusions: usize,
+    /// Poisson's ratio of every region.
+    pub poisson: f64,
 }
 
 /// All settings of a phantom. The body fills the field of view, so size times spacing is also its scale.
@@ -103,19 +144,40 @@ pub struct PhantomParams {
     pub bias: f64,
     /// Landmarks wanted; fewer come where there is no room for them.
     pub landmarks: usize,
+    /// Of an elastic motion.
+    #[serde(skip)]
+    pub elastic: ElasticParams,
 }
 
 impl PhantomParams {
     /// The defaults of a kind: seed 1, noise 3 %, bias 15 %, 200 landmarks, and a size, spacing and motion that suit it.
     pub fn new(kind: PhantomKind) -> Self {
-        let (size, spacing, motion, amplitude) = match kind {
-            PhantomKind::Calf => ([96, 96, 40], [1.5, 1.5, 5.0], MotionKind::Smooth, 6.0),
-            PhantomKind::Slice => ([160, 160, 1], [0.9, 0.9, 5.0], MotionKind::Smooth, 6.0),
-            PhantomKind::Head => ([96, 112, 96], [2.0, 2.0, 2.0], MotionKind::Smooth, 8.0),
-            PhantomKind::Block => ([64, 64, 64], [1.0, 1.0, 1.0], MotionKind::Smooth, 3.0),
-            PhantomKind::Fingertip => ([64, 80, 60], [0.35, 0.35, 0.35], MotionKind::Press, 1.5),
+        let (size, spacing) = match kind {
+            PhantomKind::Calf => ([96, 96, 40], [1.5, 1.5, 5.0]),
+            PhantomKind::Slice => ([160, 160, 1], [0.9, 0.9, 5.0]),
+            PhantomKind::Head => ([96, 112, 96], [2.0; 3]),
+            PhantomKind::Block => ([64; 3], [1.0; 3]),
+            PhantomKind::Fingertip => ([64, 80, 60], [0.35; 3]),
+            PhantomKind::Inclusion | PhantomKind::Slab => ([96, 96, 64], [0.5; 3]),
         };
-        Self { kind, motion, amplitude, size, spacing, seed: 1, noise: 0.03, bias: 0.15, landmarks: 200 }
+        Self {
+            kind,
+            motion: MotionKind::None,
+            amplitude: 0.0,
+            size,
+            spacing,
+            seed: 1,
+            noise: 0.03,
+            bias: 0.15,
+            landmarks: 200,
+            elastic: ElasticParams { contrast: 5.0, inclusions: 1, poisson: 0.49 },
+        }
+        .moving(kind.usual_motion())
+    }
+
+    /// With another motion, by the amplitude that suits it.
+    pub fn moving(self, motion: MotionKind) -> Self {
+        Self { motion, amplitude: self.kind.usual_amplitude(motion), ..self }
     }
 
     /// The same field of view with `n` voxels along x, and the other sides in proportion.
@@ -153,6 +215,9 @@ impl PhantomParams {
         within("amplitude", self.amplitude, 0.0, 1000.0, "0 to 1000 (mm, or degrees for rotate)")?;
         within("noise", self.noise, 0.0, 1.0, "0 to 1")?;
         within("bias", self.bias, 0.0, 2.0, "0 to 2")?;
+        if self.motion == MotionKind::Elastic {
+            self.check_elastic()?;
+        }
         let single = self.size.iter().filter(|&&n| n == 1).count();
         for a in 0..3 {
             within("spacing", self.spacing[a], 1e-3, 1e3, "0.001 to 1000 mm")?;
@@ -161,6 +226,27 @@ impl PhantomParams {
                 let range = "8 to 4096 voxels a side (one side may be 1)";
                 return Err(ParamError { name: "size", value: self.size[a] as f64, range });
             }
+        }
+        Ok(())
+    }
+
+    fn check_elastic(&self) -> Result<(), ParamError> {
+        let refuse = |name, value, range| Err(ParamError { name, value, range });
+        let ElasticParams { contrast, inclusions, poisson } = self.elastic;
+        if !(self.amplitude > 0.0) {
+            return refuse("amplitude", self.amplitude, "over 0 for an elastic motion (mm)");
+        }
+        if !(0.01..=1000.0).contains(&contrast) {
+            return refuse("contrast", contrast, "0.01 to 1000");
+        }
+        if inclusions > 2 {
+            return refuse("inclusions", inclusions as f64, "0, 1 or 2");
+        }
+        if !(0.0..=0.499).contains(&poisson) {
+            return refuse("poisson", poisson, "0 to 0.499");
+        }
+        if self.size.contains(&1) {
+            return refuse("size", 1.0, "8 to 4096 voxels along every side for an elastic motion");
         }
         Ok(())
     }

@@ -11,7 +11,9 @@ use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::synth::anatomy::{FINGERTIP_RADII, body};
-use crate::synth::body::{Body, extent};
+use crate::synth::body::extent;
+use crate::synth::elastic::tissue::Tissue;
+use crate::synth::elastic::{ElasticDescription, press};
 use crate::synth::landmarks::landmarks;
 use crate::synth::motion::Motion;
 use crate::synth::noise::{COARSE, SmoothNoise};
@@ -37,8 +39,19 @@ pub struct Phantom {
     pub mask: Mask,
     /// Places with contrast inside the mask, between voxel centres, and where they go, exact.
     pub landmarks: Vec<Landmark>,
+    /// What it is made of, where that is known.
+    pub stiffness: Option<Stiffness>,
     /// How it was made, and what came out.
     pub description: Description,
+}
+
+/// What a phantom is made of, on the initial grid.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stiffness {
+    /// Tissue regions, 0 outside.
+    pub labels: Mask,
+    /// Young's modulus (kPa), 0 outside.
+    pub youngs_modulus_kpa: Volume,
 }
 
 /// Settings and figures of a phantom.
@@ -63,6 +76,9 @@ pub struct Description {
     pub mask_voxels: usize,
     /// Landmarks found.
     pub landmarks_found: usize,
+    /// Mechanics of an elastic motion.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub elastic: Option<ElasticDescription>,
 }
 
 /// The phantom that `params` ask for, both volumes on [`PhantomParams::grid`].
@@ -81,24 +97,19 @@ pub fn phantom(params: &PhantomParams) -> Result<Phantom, SynthError> {
 /// As [`phantom`].
 pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Phantom, SynthError> {
     params.check()?;
-    let body = body(params.kind, &initial, params.seed);
-    let (motion, truth, control_spacing_mm) = motion(params, &body, initial)?;
-    let rest_first = params.motion == MotionKind::Press;
-    let before = Volume::from_voxels(initial, |at, x| {
-        body.sample(if rest_first { x } else { x.moved(truth.at(at).map(f64::from)) })
-    });
-    let after = Volume::from_voxels(deformed, |_, y| body.sample(if rest_first { motion.origin_of(y) } else { y }));
-    let clean = intensities(&before);
+    let pair = pair(params, initial, deformed)?;
+    let Pair { before, after, truth, displacements, .. } = &pair;
+    let clean = intensities(before);
     let mut values: Vec<f64> = after.as_slice().iter().map(|v| v.0).collect();
     let noise_sigma = params.noise * percentile(&mut values, 99.0);
-    let mask = mask(&before, &truth, &deformed);
-    let landmarks = landmarks(&clean, &mask, &motion, params.landmarks, Random::new(params.seed, 50));
+    let mask = mask(before, truth, &deformed);
+    let landmarks = landmarks(&clean, &mask, params.landmarks, Random::new(params.seed, 50), displacements);
     let inside = || (0..initial.len()).filter(|&at| mask.as_slice()[at] != 0);
     let lengths: Vec<f64> = inside().map(|at| length(truth.at(at))).collect();
-    let (jacobian_min, jacobian_max) = jacobian_range(&truth, |at| mask.as_slice()[at] != 0);
+    let (jacobian_min, jacobian_max) = jacobian_range(truth, |at| mask.as_slice()[at] != 0);
     let description = Description {
         params: PhantomParams { size: initial.shape(), spacing: initial.spacing(), ..params.clone() },
-        control_spacing_mm,
+        control_spacing_mm: pair.control_spacing_mm,
         noise_sigma,
         mean_mm: lengths.iter().sum::<f64>() / lengths.len().max(1) as f64,
         max_mm: lengths.iter().copied().fold(0.0, f64::max),
@@ -106,25 +117,121 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
         jacobian_max,
         mask_voxels: lengths.len(),
         landmarks_found: landmarks.len(),
+        elastic: pair.elastic.clone(),
     };
-    let biased = biased(&after, params);
+    let biased = biased(after, params);
     Ok(Phantom {
         initial: rician(&clean, noise_sigma, params.seed, 60),
         deformed: rician(&biased, noise_sigma, params.seed, 61),
-        truth,
+        truth: pair.truth,
         mask,
         landmarks,
+        stiffness: pair.stiffness,
         description,
     })
 }
 
+/// Both images without noise and bias, and what is known of them.
+struct Pair {
+    before: Imaged,
+    after: Imaged,
+    truth: DenseField,
+    /// Displacements of world positions (mm).
+    displacements: Box<dyn Fn(&[WorldPoint]) -> Vec<[f64; 3]>>,
+    control_spacing_mm: Option<f64>,
+    stiffness: Option<Stiffness>,
+    elastic: Option<ElasticDescription>,
+}
+
+fn pair(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Pair, SynthError> {
+    match (body(params.kind, &initial, params.seed), params.motion) {
+        (None, MotionKind::Elastic) => elastic_pair(params, initial, deformed),
+        (Some(_), MotionKind::Elastic) if params.kind == PhantomKind::Fingertip => {
+            elastic_pair(params, initial, deformed)
+        }
+        (Some(_), MotionKind::Elastic) => Err(SynthError::NotElastic),
+        (Some(body), _) => {
+            let inside = |p| body.contains(p);
+            moved_pair(params, initial, deformed, &|p| body.sample(p), &inside)
+        }
+        (None, _) => {
+            let tissue = Tissue::new(params, &initial);
+            let inside = |p| tissue.region(p).is_some();
+            let pair = moved_pair(params, initial, deformed, &|p| tissue.sample(p), &inside)?;
+            Ok(Pair { stiffness: Some(stiffness(&tissue, &pair.before)), ..pair })
+        }
+    }
+}
+
+/// A motion in closed form.
+fn moved_pair(
+    params: &PhantomParams,
+    initial: Grid,
+    deformed: Grid,
+    sample: &(dyn Fn(WorldPoint) -> (f64, bool) + Sync),
+    inside: &(dyn Fn(WorldPoint) -> bool + Sync),
+) -> Result<Pair, SynthError> {
+    let (motion, truth, control_spacing_mm) = motion(params, inside, initial)?;
+    let rest_first = params.motion == MotionKind::Press;
+    let before =
+        Volume::from_voxels(initial, |at, x| sample(if rest_first { x } else { x.moved(truth.at(at).map(f64::from)) }));
+    let after = Volume::from_voxels(deformed, |_, y| sample(if rest_first { motion.origin_of(y) } else { y }));
+    let displacements = Box::new(move |points: &[WorldPoint]| points.iter().map(|&p| motion.at(p)).collect());
+    Ok(Pair { before, after, truth, displacements, control_spacing_mm, stiffness: None, elastic: None })
+}
+
+/// A motion solved from elasticity.
+fn elastic_pair(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Pair, SynthError> {
+    let pressed = press(params, Tissue::new(params, &initial), halvings(params, &initial))?;
+    let tissue = pressed.tissue();
+    let truth = pressed.field(initial);
+    let before = Volume::from_voxels(initial, |_, x| tissue.sample(x));
+    let origins = pressed.origins(&deformed);
+    let after = Volume::from_voxels(deformed, |at, _| origins[at].map_or((0.0, false), |x| tissue.sample(x)));
+    let (stiffness, elastic) = (Some(stiffness(tissue, &before)), Some(pressed.description.clone()));
+    let displacements = Box::new(move |points: &[WorldPoint]| {
+        pressed.at(&initial, points).into_iter().map(Option::unwrap_or_default).collect()
+    });
+    Ok(Pair { before, after, truth, displacements, control_spacing_mm: None, stiffness, elastic })
+}
+
+/// Times the hexahedra are halved: elements of two to three voxels, as far as a minute allows.
+fn halvings(params: &PhantomParams, grid: &Grid) -> usize {
+    let most = if params.kind == PhantomKind::Slab { 2 } else { 3 };
+    let across = grid.shape()[0].max(grid.shape()[1]);
+    if across >= 64 {
+        most
+    } else if across >= 32 {
+        most - 1
+    } else {
+        1
+    }
+}
+
+/// Labels and moduli at the voxel centres in the body.
+fn stiffness(tissue: &Tissue, before: &Imaged) -> Stiffness {
+    let grid = *before.grid();
+    let region = Volume::from_voxels(grid, |_, x| tissue.region(x).map(|n| n as u8 + 1).unwrap_or_default());
+    let of = |n: u8| n.checked_sub(1).map(|n| &tissue.regions()[usize::from(n)]);
+    Stiffness {
+        labels: Volume::from_voxels(grid, |at, _| of(region.as_slice()[at]).map_or(0, |r| r.label)),
+        youngs_modulus_kpa: Volume::from_voxels(grid, |at, _| {
+            of(region.as_slice()[at]).map_or(0.0, |r| r.youngs_modulus_kpa as f32)
+        }),
+    }
+}
+
 /// The motion asked for, its field on `grid`, and the control spacing (mm) if it is smooth.
-fn motion(params: &PhantomParams, body: &Body, grid: Grid) -> Result<(Motion, DenseField, Option<f64>), SynthError> {
+fn motion(
+    params: &PhantomParams,
+    inside: &(dyn Fn(WorldPoint) -> bool + Sync),
+    grid: Grid,
+) -> Result<(Motion, DenseField, Option<f64>), SynthError> {
     let centres = (0..grid.len()).into_par_iter().map(|at| {
         let [i, j, k] = grid.voxel(at);
         grid.world(i, j, k)
     });
-    let tissue: Vec<WorldPoint> = centres.filter(|&p| body.contains(p)).collect();
+    let tissue: Vec<WorldPoint> = centres.filter(|&p| inside(p)).collect();
     let (seed, amplitude) = (params.seed, params.amplitude);
     let random = Random::new(seed, 30);
     let half = extent(&grid).map(|e| e / 2.0);
@@ -151,7 +258,7 @@ fn motion(params: &PhantomParams, body: &Body, grid: Grid) -> Result<(Motion, De
         return Err(folds.into());
     }
     let motion = match params.motion {
-        MotionKind::None | MotionKind::Smooth => Motion::none(&grid),
+        MotionKind::None | MotionKind::Smooth | MotionKind::Elastic => Motion::none(&grid),
         MotionKind::Translate => Motion::translate(&grid, amplitude, random),
         MotionKind::Rotate => Motion::rotate(&grid, amplitude, random),
         MotionKind::Affine => Motion::affine(&grid, random).scaled(amplitude, &tissue),
