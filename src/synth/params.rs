@@ -71,7 +71,7 @@ impl PhantomKind {
     /// The amplitude that is taken if none is asked for (mm, or degrees for a rotation).
     fn usual_amplitude(self, motion: MotionKind) -> f64 {
         match (self, motion) {
-            (Self::Fingertip, MotionKind::Elastic) => 1.0,
+            (Self::Fingertip, MotionKind::Elastic) => 0.8,
             (Self::Fingertip, _) => 1.5,
             (Self::Calf | Self::Slice, _) => 6.0,
             (Self::Head, _) => 8.0,

@@ -197,7 +197,7 @@ fn elastic_pair(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result
 
 /// Times the hexahedra are halved: elements of two to three voxels, as far as a minute allows.
 fn halvings(params: &PhantomParams, grid: &Grid) -> usize {
-    let most = if params.kind == PhantomKind::Slab { 2 } else { 3 };
+    let most = if params.kind == PhantomKind::Inclusion { 3 } else { 2 };
     let across = grid.shape()[0].max(grid.shape()[1]);
     if across >= 64 {
         most

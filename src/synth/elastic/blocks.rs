@@ -182,30 +182,64 @@ pub fn layered_block(
 
 /// Half ellipsoids, one in the other, that hang from a flat face at the height of `centre`, which is held. `radii` from the
 /// outside in; surface n is curved surface n, and the outermost is pressed. The space within surface n is region n.
+///
+/// The innermost holds a box of 4 x 4 x 3 cells; from its lower side and its four flanks a cell a layer leads out.
 pub fn dome(centre: [f64; 3], radii: &[[f64; 3]]) -> HexMesh {
-    let mut mesh = HexMesh::default();
-    // Corners of a half cube, the flat face above.
-    let mut shell = |radii: [f64; 3], share: f64, surfaces: Surfaces| -> [u32; 8] {
-        std::array::from_fn(|c| {
-            let down = if c >> 2 == 0 { -0.62 } else { 0.0 };
-            let across = ((1.0 - down * down) / 2.0f64).sqrt();
-            let sign = |a: usize| if c >> a & 1 == 1 { across } else { -across };
-            let unit = [sign(0), sign(1), down];
-            let held = if c >> 2 == 1 { HELD } else { 0 };
-            mesh.vertex(std::array::from_fn(|a| centre[a] + share * radii[a] * unit[a]), surfaces | held)
-        })
+    const CELLS: [usize; 3] = [4, 4, 3];
+    // Place of a lattice point on the box, which is as wide as 1 and as deep as this.
+    const DEPTH: f64 = 1.7;
+    let on_box = |v: [usize; 3]| -> [f64; 3] {
+        let across = |a: usize| {
+            let t = 2.0 * v[a] as f64 / CELLS[a] as f64 - 1.0;
+            (t * std::f64::consts::FRAC_PI_4).tan()
+        };
+        // Even in angle down the flanks.
+        let down = (1.0 - v[2] as f64 / CELLS[2] as f64) * DEPTH.atan();
+        [across(0), across(1), -down.tan()]
     };
-    let shells: Vec<[u32; 8]> =
-        (0..radii.len()).map(|n| shell(radii[n], 1.0, CURVED << n | if n == 0 { PRESSED } else { 0 })).collect();
+    let mut mesh = HexMesh::default();
     let innermost = radii.len() - 1;
-    let inner = shell(radii[innermost], 0.5, 0);
-    mesh.between(side(&inner, 2, 0), side(&inner, 2, 1), innermost as u8);
-    let chain: Vec<([u32; 8], u8)> =
-        std::iter::once((inner, innermost as u8)).chain((0..=innermost).rev().map(|n| (shells[n], n as u8))).collect();
-    for pair in chain.windows(2) {
-        for (axis, high) in [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)] {
-            mesh.between(side(&pair[0].0, axis, high), side(&pair[1].0, axis, high), pair[1].1);
+    let planes = CELLS.map(|n| (0..=n).map(|i| i as f64).collect::<Vec<_>>());
+    let held = |v: [usize; 3]| if v[2] == CELLS[2] { HELD } else { 0 };
+    let place = |v: [usize; 3]| {
+        let p = on_box(v);
+        std::array::from_fn(|a| centre[a] + [0.4, 0.4, 0.3][a] * radii[innermost][a] * p[a])
+    };
+    let cells = lattice(&mut mesh, &planes, place, held);
+    for (_, corners) in &cells {
+        mesh.between(side(corners, 2, 0), side(corners, 2, 1), innermost as u8);
+    }
+    // The same lattice point on the box and on each surface, from the inside out.
+    let index = |v: [usize; 3]| v[0] + (CELLS[0] + 1) * (v[1] + (CELLS[1] + 1) * v[2]);
+    let points = (CELLS[0] + 1) * (CELLS[1] + 1) * (CELLS[2] + 1);
+    let mut below: Vec<u32> = (0..points as u32).collect();
+    for n in (0..radii.len()).rev() {
+        let mut shell = vec![u32::MAX; points];
+        for k in 0..=CELLS[2] {
+            for j in 0..=CELLS[1] {
+                for i in 0..=CELLS[0] {
+                    let inside = i > 0 && i < CELLS[0] && j > 0 && j < CELLS[1] && k > 0;
+                    if !inside {
+                        let p = on_box([i, j, k]);
+                        let length = p.iter().map(|v| v * v).sum::<f64>().sqrt();
+                        let q = std::array::from_fn(|a| centre[a] + radii[n][a] * p[a] / length);
+                        let pressed = if n == 0 { PRESSED } else { 0 };
+                        shell[index([i, j, k])] = mesh.vertex(q, CURVED << n | pressed | held([i, j, k]));
+                    }
+                }
+            }
         }
+        for (cell, _) in &cells {
+            for (axis, high) in [(0, 0), (0, 1), (1, 0), (1, 1), (2, 0)] {
+                if cell[axis] == high * (CELLS[axis] - 1) {
+                    let corners: [usize; 8] =
+                        std::array::from_fn(|c| index(std::array::from_fn(|a| cell[a] + (c >> a & 1))));
+                    let (low, up) = (corners.map(|c| below[c]), corners.map(|c| shell[c]));
+                    mesh.between(side(&low, axis, high), side(&up, axis, high), n as u8);
+                }
+            }
+        }
+        below = shell;
     }
     mesh
 }

@@ -23,6 +23,50 @@ pub struct HexMesh {
     pub hexes: Vec<[u32; 8]>,
     /// Tissue region of each hexahedron.
     pub region: Vec<u8>,
+    /// The hexahedra that all this was cut from.
+    blocks: Vec<Block>,
+    /// The block of each hexahedron, and its low corner and side there.
+    origin: Vec<(u32, [f64; 3], f64)>,
+}
+
+/// A curved hexahedron on [0, 1]^3.
+#[derive(Debug, Clone, Copy)]
+struct Block {
+    corners: [[f64; 3]; 8],
+    surfaces: [Surfaces; 8],
+}
+
+/// Brings a place onto all of some surfaces.
+pub type Project<'a> = dyn Fn(Surfaces, [f64; 3]) -> [f64; 3] + 'a;
+
+impl Block {
+    /// The place at `t`: the transfinite blend (Gordon and Hall 1973) of the faces, those of the edges, those of the corners;
+    /// each face and edge that lies on a surface is brought onto it.
+    fn at(&self, t: [f64; 3], project: &Project<'_>) -> [f64; 3] {
+        let free: Vec<usize> = (0..3).filter(|&a| t[a] != 0.0 && t[a] != 1.0).collect();
+        let on_it = |c: usize| (0..3).all(|a| free.contains(&a) || (t[a] == 1.0) == (c >> a & 1 == 1));
+        if free.is_empty() {
+            return (0..8).find(|&c| on_it(c)).map_or([0.0; 3], |c| self.corners[c]);
+        }
+        let mut sum = [0.0; 3];
+        // Boolean sum over the ends of each set of free axes.
+        for set in 1..1usize << free.len() {
+            let axes: Vec<usize> = (0..free.len()).filter(|i| set >> i & 1 == 1).map(|i| free[i]).collect();
+            let sign = if axes.len() % 2 == 1 { 1.0 } else { -1.0 };
+            for ends in 0..1usize << axes.len() {
+                let (mut s, mut weight) = (t, sign);
+                for (i, &a) in axes.iter().enumerate() {
+                    let high = ends >> i & 1 == 1;
+                    weight *= if high { t[a] } else { 1.0 - t[a] };
+                    s[a] = if high { 1.0 } else { 0.0 };
+                }
+                let p = self.at(s, project);
+                (0..3).for_each(|a| sum[a] += weight * p[a]);
+            }
+        }
+        let surfaces = (0..8).filter(|&c| on_it(c)).fold(Surfaces::MAX, |s, c| s & self.surfaces[c]);
+        project(surfaces, sum)
+    }
 }
 
 /// The lattice `i + 3 j + 9 k` of a halved hexahedron: corners, middles of edges and faces, centre.
@@ -48,86 +92,57 @@ impl HexMesh {
             hex.swap(1, 2);
             hex.swap(5, 6);
         }
+        let corners = hex.map(|v| self.vertices[v as usize]);
+        self.blocks.push(Block { corners, surfaces: hex.map(|v| self.surfaces[v as usize]) });
+        self.origin.push((self.blocks.len() as u32 - 1, [0.0; 3], 1.0));
         self.hexes.push(hex);
         self.region.push(region);
     }
 
     /// Each hexahedron cut into eight (child `c` of hexahedron `e` is number `8 e + c`), and its lattice.
     ///
-    /// Vertices keep their numbers. New ones lie at the transfinite middle of their edge, face or cell (Gordon and Hall
-    /// 1973); `project` brings one that lies on all of the given surfaces onto them.
-    pub fn refined(&self, project: &dyn Fn(Surfaces, [f64; 3]) -> [f64; 3]) -> (HexMesh, Vec<Lattice>) {
-        let mut out = HexMesh { vertices: self.vertices.clone(), surfaces: self.surfaces.clone(), ..Self::default() };
+    /// Vertices keep their numbers; `project` keeps the new ones on the curved surfaces.
+    pub fn refined(&self, project: &Project<'_>) -> (HexMesh, Vec<Lattice>) {
+        let (vertices, surfaces) = (self.vertices.clone(), self.surfaces.clone());
+        let mut out = HexMesh { vertices, surfaces, blocks: self.blocks.clone(), ..Self::default() };
         let mut middles: HashMap<[u32; 4], u32> = HashMap::new();
         let mut lattices = Vec::with_capacity(self.hexes.len());
-        for (hex, &region) in self.hexes.iter().zip(&self.region) {
+        for (e, hex) in self.hexes.iter().enumerate() {
+            let (block, low, side) = self.origin[e];
             let mut lattice = [u32::MAX; 27];
-            for (c, &v) in hex.iter().enumerate() {
-                lattice[2 * (c & 1) + 6 * (c >> 1 & 1) + 18 * (c >> 2)] = v;
-            }
-            // Edges have one odd index, faces two, the centre three: each is made from those before.
-            for odd in 1..=3 {
-                for n in 0..27 {
-                    let place = [n % 3, n / 3 % 3, n / 9];
-                    if place.iter().filter(|&&p| p == 1).count() == odd {
-                        lattice[n] = out.middle(&lattice, place, &mut middles, project);
+            for n in 0..27 {
+                let place = [n % 3, n / 3 % 3, n / 9];
+                let on_it = |c: &usize| (0..3).all(|a| place[a] == 1 || place[a] / 2 == (c >> a & 1));
+                let mut corners: Vec<u32> = (0..8).filter(on_it).map(|c| hex[c]).collect();
+                if let [corner] = corners[..] {
+                    lattice[n] = corner;
+                    continue;
+                }
+                corners.sort_unstable();
+                let key = std::array::from_fn(|c| corners.get(c).copied().unwrap_or(u32::MAX));
+                let inner = corners.len() == 8;
+                lattice[n] = match middles.get(&key) {
+                    Some(&known) if !inner => known,
+                    _ => {
+                        let t = std::array::from_fn(|a| low[a] + side * place[a] as f64 / 2.0);
+                        let shared = corners.iter().fold(Surfaces::MAX, |s, &v| s & self.surfaces[v as usize]);
+                        out.vertex(self.blocks[block as usize].at(t, project), shared)
                     }
+                };
+                if !inner {
+                    middles.insert(key, lattice[n]);
                 }
             }
             for c in 0..8 {
-                let corner = (c & 1) + 3 * (c >> 1 & 1) + 9 * (c >> 2);
-                out.hexes.push(std::array::from_fn(|d| lattice[corner + (d & 1) + 3 * (d >> 1 & 1) + 9 * (d >> 2)]));
-                out.region.push(region);
+                let octant = [c & 1, c >> 1 & 1, c >> 2];
+                let first = octant[0] + 3 * octant[1] + 9 * octant[2];
+                out.hexes.push(std::array::from_fn(|d| lattice[first + (d & 1) + 3 * (d >> 1 & 1) + 9 * (d >> 2)]));
+                out.region.push(self.region[e]);
+                out.origin.push((block, std::array::from_fn(|a| low[a] + side / 2.0 * octant[a] as f64), side / 2.0));
             }
             lattices.push(lattice);
         }
         (out, lattices)
-    }
-
-    /// The vertex at the lattice's `place`, made if no neighbour has made it.
-    fn middle(
-        &mut self,
-        lattice: &Lattice,
-        place: [usize; 3],
-        middles: &mut HashMap<[u32; 4], u32>,
-        project: &dyn Fn(Surfaces, [f64; 3]) -> [f64; 3],
-    ) -> u32 {
-        // All lattice places where the odd indices are replaced by 0, 1 or 2.
-        let choices = |p: usize| if p == 1 { 0..3 } else { p..p + 1 };
-        let mut corners = Vec::with_capacity(8);
-        let mut sum = [0.0; 3];
-        let odd = place.iter().filter(|&&p| p == 1).count();
-        for k in choices(place[2]) {
-            for j in choices(place[1]) {
-                for i in choices(place[0]) {
-                    let moved = [i, j, k].iter().zip(place).filter(|(a, b)| **a != *b).count();
-                    if moved == 0 {
-                        continue;
-                    }
-                    let v = lattice[i + 3 * j + 9 * k];
-                    // Boolean sum of the linear blends: sides half, their edges minus a quarter, corners an eighth.
-                    let weight = [0.5, -0.25, 0.125][moved - 1];
-                    let p = self.vertices[v as usize];
-                    (0..3).for_each(|a| sum[a] += weight * p[a]);
-                    if moved == odd {
-                        corners.push(v);
-                    }
-                }
-            }
-        }
-        corners.sort_unstable();
-        let key = std::array::from_fn(|c| corners.get(c).copied().unwrap_or(u32::MAX));
-        if odd < 3
-            && let Some(&known) = middles.get(&key)
-        {
-            return known;
-        }
-        let surfaces = corners.iter().fold(Surfaces::MAX, |s, &v| s & self.surfaces[v as usize]);
-        let made = self.vertex(project(surfaces, sum), surfaces);
-        if odd < 3 {
-            middles.insert(key, made);
-        }
-        made
     }
 }
 

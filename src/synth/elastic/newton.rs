@@ -1,6 +1,6 @@
 //! Equilibrium by Newton's method, from coarse to fine.
 
-use crate::synth::elastic::hexahedra::{HexMesh, PRESSED, Surfaces};
+use crate::synth::elastic::hexahedra::{HELD, HexMesh, PRESSED, Project, Surfaces};
 use crate::synth::elastic::material::{Lame, Pressure, State, predicted, state};
 use crate::synth::elastic::multigrid::Multigrid;
 use crate::synth::elastic::space::Space;
@@ -13,7 +13,7 @@ pub struct Problem<'a> {
     /// The coarsest hexahedra.
     pub mesh: HexMesh,
     /// Brings a place onto all of the given surfaces.
-    pub project: &'a dyn Fn(Surfaces, [f64; 3]) -> [f64; 3],
+    pub project: &'a Project<'a>,
     /// Moduli by region (kPa).
     pub lame: Vec<Lame>,
     /// The displacement (mm) of the components that are held or pressed, from a node's surfaces and place.
@@ -57,7 +57,11 @@ pub struct Equilibrium {
 
 /// Largest free force against the norm of the others, on the finest level and on coarser ones.
 const TOLERANCE: [f64; 2] = [2e-6, 1e-4];
-const MOST_STEPS: usize = 40;
+/// Which nodes touch the plate is asked once the forces are in equilibrium to this part.
+const TOUCHING: f64 = 1e-2;
+/// Penetration (mm), and pull over the largest nodal force, that are let pass.
+const SLACK: f64 = 2e-4;
+const MOST_STEPS: usize = 60;
 const MOST_ITERATIONS: usize = 400;
 
 /// The displacement in equilibrium; `None` where Newton's method fails, because the tissue is pressed too far.
@@ -86,7 +90,7 @@ pub fn equilibrium(problem: &Problem<'_>) -> Option<Equilibrium> {
         pressure = last;
         let change = u.iter().zip(&start).map(|(a, b)| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>());
         let rms = (change.clone().sum::<f64>() / u.len() as f64).sqrt();
-        let pressed = space.surfaces.iter().zip(&state.forces).filter(|(s, _)| *s & PRESSED != 0);
+        let pressed = space.surfaces.iter().zip(&state.forces).filter(|(s, _)| *s & (PRESSED | HELD) == PRESSED);
         levels.push(LevelReport {
             elements: space.elements.len(),
             nodes: space.nodes.len(),
@@ -95,6 +99,9 @@ pub fn equilibrium(problem: &Problem<'_>) -> Option<Equilibrium> {
             force: pressed.map(|(_, f)| f[2]).sum(),
             change: [rms, change.fold(0.0, f64::max).sqrt()],
         });
+        if std::env::var("DBG").is_ok() {
+            eprintln!("{:?}", levels.last());
+        }
         (displacement, forces) = (u, state.forces);
     }
     drop(multigrid);
@@ -157,32 +164,34 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
     /// Newton steps and conjugate gradient iterations until the free forces vanish.
     fn run(&mut self, tolerance: f64) -> Option<(usize, usize)> {
         let mut iterations = 0;
-        let mut settled = self.touch();
-        self.multigrid.hold(&self.free);
         self.state = state(self.space, &self.problem.lame, &self.u, &self.pressure);
+        self.touch(SLACK);
+        self.multigrid.hold(&self.free);
         for steps in 0..MOST_STEPS {
             if !self.state.energy.is_finite() {
                 return None;
             }
-            let residual = self.residual();
+            let (residual, lift) = (self.residual(), self.lift());
             let relative = norm(&residual) / norm(&self.state.forces).max(f64::MIN_POSITIVE);
             if std::env::var("DBG").is_ok() {
                 eprintln!(
-                    "  {} nodes step {steps} rel {relative:.2e} its {iterations} E {:.9e} settled {settled}",
+                    "  {} nodes step {steps} rel {relative:.2e} its {iterations} E {:.9e} touching {} lift {:.2e}",
                     self.u.len(),
-                    self.state.energy
+                    self.state.energy,
+                    self.touching.iter().filter(|t| **t).count(),
+                    norm(&lift)
                 );
             }
-            if relative <= tolerance && settled {
+            let on_plate = norm(&lift) <= 1e-9;
+            if relative <= tolerance.max(TOUCHING) && on_plate && self.touch(-SLACK) {
+                self.multigrid.hold(&self.free);
+                continue;
+            }
+            if relative <= tolerance && on_plate {
                 return Some((steps, iterations));
             }
             let inner = (0.3 * tolerance / relative).clamp(1e-3, 0.02).max((0.05 * relative).min(0.02));
-            iterations += self.step(&residual, inner)?;
-            settled = self.touch();
-            if !settled {
-                self.multigrid.hold(&self.free);
-                self.state = state(self.space, &self.problem.lame, &self.u, &self.pressure);
-            }
+            iterations += self.step(&residual, &lift, inner)?;
         }
         None
     }
@@ -193,16 +202,32 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
         pairs.map(|(f, free)| std::array::from_fn(|c| -f[c] * f64::from(free[c]))).collect()
     }
 
+    /// How far the nodes that touch the plate have to move to lie on it (mm).
+    fn lift(&self) -> Vec<[f64; 3]> {
+        let height = self.problem.plate.unwrap_or_default();
+        let up = |n: usize| if self.touching[n] { height - self.space.nodes[n][2] - self.u[n][2] } else { 0.0 };
+        (0..self.u.len()).map(|n| [0.0, 0.0, up(n)]).collect()
+    }
+
     /// One step to the tangent's solution, halved while it turns an element inside out.
-    fn step(&mut self, residual: &[[f64; 3]], inner: f64) -> Option<usize> {
-        let size = norm(residual);
-        let b: Nodal = residual.iter().map(|r| r.map(|v| (v / size) as f32)).collect();
+    fn step(&mut self, residual: &[[f64; 3]], lift: &[[f64; 3]], inner: f64) -> Option<usize> {
         let stiffness = Stiffness::new(self.space, std::mem::take(&mut self.state.batches));
+        let lifted: Nodal = lift.iter().map(|d| d.map(|v| v as f32)).collect();
+        let mut answer = vec![[0.0; 3]; lift.len()];
+        stiffness.apply(&lifted, &self.free, &mut answer);
+        let load: Vec<[f64; 3]> =
+            residual.iter().zip(&answer).map(|(r, k)| std::array::from_fn(|c| r[c] - f64::from(k[c]))).collect();
+        let size = norm(&load);
+        let b: Nodal = load.iter().map(|r| r.map(|v| (v / size) as f32)).collect();
         let (d, iterations) = self.multigrid.solve(&stiffness, &b, inner, MOST_ITERATIONS);
         drop(stiffness);
         let mut length = 1.0;
         while length > 1e-3 {
-            let d: Vec<[f64; 3]> = d.iter().map(|d| d.map(|v| length * size * f64::from(v))).collect();
+            let d: Vec<[f64; 3]> = d
+                .iter()
+                .zip(lift)
+                .map(|(d, g)| std::array::from_fn(|c| length * (size * f64::from(d[c]) + g[c])))
+                .collect();
             let moved: Vec<[f64; 3]> =
                 self.u.iter().zip(&d).map(|(u, d)| std::array::from_fn(|c| u[c] + d[c])).collect();
             let pressure = predicted(self.space, &self.problem.lame, &self.u, &d);
@@ -216,26 +241,22 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
         None
     }
 
-    /// Puts nodes under the plate on it and lets go those that it would pull; whether nothing changed.
-    fn touch(&mut self) -> bool {
-        let Some(height) = self.problem.plate else { return true };
-        let mut settled = true;
+    /// Lets nodes less than `near` (mm) above the plate touch it, and lets go those that it would pull; whether anything changed.
+    fn touch(&mut self, near: f64) -> bool {
+        let Some(height) = self.problem.plate else { return false };
+        let slack = SLACK * self.state.forces.iter().fold(0.0, |m: f64, f| m.max(f[2]));
+        let mut changed = false;
         for n in 0..self.u.len() {
-            if self.space.surfaces[n] & PRESSED == 0 {
+            if self.space.surfaces[n] & PRESSED == 0 || self.space.surfaces[n] & HELD != 0 {
                 continue;
             }
             let gap = self.space.nodes[n][2] + self.u[n][2] - height;
-            let pushed = self.state.forces.get(n).is_none_or(|f| f[2] >= 0.0);
-            let touches = if self.touching[n] { pushed } else { gap < -1e-12 };
-            if touches != self.touching[n] {
-                settled = false;
-                self.touching[n] = touches;
-                self.free[n][2] = if touches { 0.0 } else { 1.0 };
-            }
-            if touches {
-                self.u[n][2] = height - self.space.nodes[n][2];
-            }
+            // A little slack on either side, or nodes at the rim take turns for ever.
+            let touches = if self.touching[n] { self.state.forces[n][2] > -slack } else { gap < near };
+            changed |= touches != self.touching[n];
+            self.touching[n] = touches;
+            self.free[n][2] = if touches { 0.0 } else { 1.0 };
         }
-        settled
+        changed
     }
 }

@@ -197,13 +197,18 @@ impl Tissue {
         }
     }
 
-    /// A displacement to start from: squeezed evenly.
+    /// A displacement to start from (mm).
     pub fn squeezed(&self, p: [f64; 3], amplitude: f64) -> [f64; 3] {
         match &self.shape {
             Shape::Balls { low, high, .. } | Shape::Layers { low, high, .. } => {
                 [0.0, 0.0, -amplitude * (p[2] - low[2]) / (high[2] - low[2])]
             }
-            Shape::Dome { .. } => [0.0; 3],
+            Shape::Dome { centre, radii } => {
+                // The bone stays; what is around it moves the more the nearer it is to the skin, and the lower.
+                let below = (-self.within(radii.len() - 1, p)).max(0.0);
+                let share = below / (below + self.within(0, p).max(0.0)).max(1e-9);
+                [0.0, 0.0, amplitude * share * (centre[2] - p[2]) / radii[0][2]]
+            }
         }
     }
 }
@@ -263,8 +268,8 @@ fn fingertip(middle: [f64; 3], half: [f64; 3], random: &mut Random) -> (Vec<Regi
         region(2, "pulp", 25.0, [850.0, 0.25]),
         region(3, "bone", 15_000.0, [250.0, 0.2]),
     ];
-    let centre = [middle[0], middle[1], middle[2] + 0.6 * half[2]];
-    let outer = [0.76 * half[0], 0.78 * half[1], 1.2 * half[2]].map(|r| r * random.uniform(0.97, 1.03));
+    let centre = [middle[0], middle[1], middle[2] + 0.45 * half[2]];
+    let outer = [0.76 * half[0], 0.78 * half[1], 0.95 * half[2]].map(|r| r * random.uniform(0.97, 1.03));
     let skin = 0.12 * half[2] * random.uniform(0.9, 1.1);
     let pulp = outer.map(|r| r - skin);
     let bone = [0.5, 0.58, 0.5].map(|share| share * random.uniform(0.95, 1.05));
