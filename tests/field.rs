@@ -93,7 +93,7 @@ fn inverted_contrast_is_refused_or_warned_of_never_silent() {
 
 #[test]
 fn a_pressed_fingertip_is_measured_and_its_far_side_stays_still() {
-    let (result, m) = measure(&PhantomParams::new(PhantomKind::Fingertip));
+    let (result, m) = measure(&PhantomParams::new(PhantomKind::Fingertip).moving(MotionKind::Press));
     assert!(m.mean_mm < m.identity_mm / 3.0 && m.still_mm.unwrap() < 0.05, "{m:?}");
     assert_eq!((m.folds, result.summary.folds, result.summary.model), (0.0, 0, MotionModel::Free));
 }

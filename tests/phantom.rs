@@ -8,7 +8,12 @@ use palpate::synth::{MIN_JACOBIAN, MotionKind, Phantom, PhantomKind, PhantomPara
 use palpate::types::{Affine, DenseField, Grid};
 
 fn small(kind: PhantomKind) -> PhantomParams {
-    PhantomParams::new(kind).sized(if kind == PhantomKind::Slice { 96 } else { 40 })
+    PhantomParams::new(kind).sized(match kind {
+        PhantomKind::Slice => 96,
+        PhantomKind::Inclusion | PhantomKind::Slab => 30,
+        PhantomKind::Fingertip => 25,
+        _ => 40,
+    })
 }
 
 fn clean(mut params: PhantomParams) -> Phantom {
@@ -39,13 +44,14 @@ fn the_truth_explains_every_kind_to_interpolation_error() {
     for (name, kind) in PhantomKind::KNOWN {
         let p = clean(small(kind));
         assert_explains(&p, name);
-        assert!(p.description.mask_voxels > p.initial.grid().len() / 5, "{name}: {}", p.description.mask_voxels);
+        assert!(p.description.mask_voxels > p.initial.grid().len() / 8, "{name}: {}", p.description.mask_voxels);
     }
 }
 
 #[test]
 fn the_truth_explains_every_motion() {
-    for (name, motion) in MotionKind::KNOWN {
+    // Elastic motions have tests of their own, in phantom_elastic.rs.
+    for (name, motion) in MotionKind::KNOWN.into_iter().filter(|m| m.1 != MotionKind::Elastic) {
         let p = clean(PhantomParams { motion, ..small(PhantomKind::Block) });
         match motion {
             MotionKind::None => assert_eq!(p.initial, p.deformed),
@@ -97,7 +103,7 @@ fn the_amplitude_is_the_largest_motion_at_rest() {
 
 #[test]
 fn a_pressed_fingertip_is_flat_where_it_touches_the_plate() {
-    let params = PhantomParams::new(PhantomKind::Fingertip);
+    let params = PhantomParams::new(PhantomKind::Fingertip).moving(MotionKind::Press);
     let p = clean(params.clone());
     let g = p.initial.grid();
     let inside = |v: &palpate::types::Volume, i: usize, j: usize| {
@@ -192,7 +198,7 @@ fn landmarks_agree_with_the_truth_between_voxels_and_lie_in_the_mask() {
 
 #[test]
 fn a_single_slice_moves_in_its_plane_only() {
-    for (_, motion) in MotionKind::KNOWN {
+    for (_, motion) in MotionKind::KNOWN.into_iter().filter(|m| m.1 != MotionKind::Elastic) {
         let p = phantom(&PhantomParams { motion, ..small(PhantomKind::Slice) }).unwrap();
         assert!(p.truth.component(2).iter().all(|&u| u.abs() < 1e-6), "{motion:?}");
         assert!(p.truth.component(0).iter().any(|&u| u != 0.0) || motion == MotionKind::None, "{motion:?}");
@@ -227,6 +233,9 @@ fn what_cannot_be_made_is_refused_with_a_reason() {
     assert!(message(PhantomParams { size: [40, 3, 40], ..params.clone() }).contains("size"));
     assert!(message(PhantomParams { size: [1, 1, 40], ..params }).contains("size"));
     let unknown = "clf".parse::<PhantomKind>().unwrap_err().to_string();
-    assert_eq!(unknown, "unknown phantom 'clf', did you mean 'calf'?; known: calf, slice, head, block, fingertip");
+    assert_eq!(
+        unknown,
+        "unknown phantom 'clf', did you mean 'calf'?; known: calf, slice, head, block, fingertip, inclusion, slab"
+    );
     assert!("pres".parse::<MotionKind>().unwrap_err().to_string().contains("'press'"));
 }

@@ -9,20 +9,21 @@ use crate::types::Grid;
 
 const INFINITE: f64 = f64::INFINITY;
 
-/// The body of a kind, sized to the grid's field of view; none for those made of tissue of known stiffness.
-pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Option<Body> {
+/// The body of a kind, sized to the grid's field of view. (Those of known stiffness have a form of their own, see
+/// [`crate::synth::elastic`]; here they are blocks.)
+pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Body {
     let half = extent(grid).map(|e| e / 2.0);
     let radius = 0.84 * half[0].min(half[1]);
-    let body = match kind {
+    match kind {
         // The leg grows by a quarter over the field of view, towards the knee.
         PhantomKind::Calf => Body::new(leg([radius; 3]), grid, 0.125 / half[2], 0.02 * radius, seed),
         PhantomKind::Slice => Body::new(leg([radius; 3]), grid, 0.0, 0.02 * radius, seed),
         PhantomKind::Head => Body::new(head(half), grid, 0.0, 0.015 * radius, seed),
-        PhantomKind::Block => Body::new(block(half), grid, 0.0, 0.02 * radius, seed),
+        PhantomKind::Block | PhantomKind::Inclusion | PhantomKind::Slab => {
+            Body::new(block(half), grid, 0.0, 0.02 * radius, seed)
+        }
         PhantomKind::Fingertip => Body::new(fingertip(half), grid, 0.0, 0.004 * radius, seed),
-        PhantomKind::Inclusion | PhantomKind::Slab => return None,
-    };
-    Some(body)
+    }
 }
 
 /// A region with centre and radii in units of `unit`.

@@ -1,8 +1,8 @@
 //! Phantoms: pairs of volumes whose displacement is known exactly.
 //!
-//! A body is an intensity B(p) at every world position, a motion a displacement u(x) in closed form, so neither volume
-//! is interpolated. The same settings give the same bytes for any number of threads. Fails when a setting is out of
-//! range or the motion folds.
+//! A body is an intensity B(p) at every world position, a motion a displacement u(x) in closed form or, for the elastic
+//! ones, that of finite elements; so neither volume is interpolated. The same settings give the same bytes for any number
+//! of threads. Fails when a setting is out of range or the motion folds.
 
 mod anatomy;
 
@@ -20,13 +20,8 @@ pub mod params;
 
 pub mod phantom;
 
-<<<<<<< HEAD
 pub mod sequence;
 
-pub use params::{MotionKind, PhantomKind, PhantomParams};
-pub use phantom::{Description, MIN_JACOBIAN, Phantom, phantom, phantom_on};
-pub use sequence::{Sequence, SequenceKind, SequenceParams};
-=======
 pub use params::{ElasticParams, MotionKind, PhantomKind, PhantomParams};
 pub use phantom::{Description, MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
->>>>>>> 3b1c98d (Elastic phantoms: inclusion and slab, solved with triquadratic hexahedra)
+pub use sequence::{Sequence, SequenceKind, SequenceParams};

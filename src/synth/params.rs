@@ -233,7 +233,7 @@ impl PhantomParams {
     fn check_elastic(&self) -> Result<(), ParamError> {
         let refuse = |name, value, range| Err(ParamError { name, value, range });
         let ElasticParams { contrast, inclusions, poisson } = self.elastic;
-        if !(self.amplitude > 0.0) {
+        if self.amplitude <= 0.0 {
             return refuse("amplitude", self.amplitude, "over 0 for an elastic motion (mm)");
         }
         if !(0.01..=1000.0).contains(&contrast) {

@@ -144,23 +144,20 @@ struct Pair {
 }
 
 fn pair(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Pair, SynthError> {
-    match (body(params.kind, &initial, params.seed), params.motion) {
-        (None, MotionKind::Elastic) => elastic_pair(params, initial, deformed),
-        (Some(_), MotionKind::Elastic) if params.kind == PhantomKind::Fingertip => {
-            elastic_pair(params, initial, deformed)
-        }
-        (Some(_), MotionKind::Elastic) => Err(SynthError::NotElastic),
-        (Some(body), _) => {
-            let inside = |p| body.contains(p);
-            moved_pair(params, initial, deformed, &|p| body.sample(p), &inside)
-        }
-        (None, _) => {
-            let tissue = Tissue::new(params, &initial);
-            let inside = |p| tissue.region(p).is_some();
-            let pair = moved_pair(params, initial, deformed, &|p| tissue.sample(p), &inside)?;
-            Ok(Pair { stiffness: Some(stiffness(&tissue, &pair.before)), ..pair })
-        }
+    let stiffness_known = matches!(params.kind, PhantomKind::Inclusion | PhantomKind::Slab);
+    if params.motion == MotionKind::Elastic {
+        return match stiffness_known || params.kind == PhantomKind::Fingertip {
+            true => elastic_pair(params, initial, deformed),
+            false => Err(SynthError::NotElastic),
+        };
     }
+    if stiffness_known {
+        let tissue = Tissue::new(params, &initial);
+        let inside = |p| tissue.region(p).is_some();
+        return moved_pair(params, initial, deformed, &|p| tissue.sample(p), &inside);
+    }
+    let body = body(params.kind, &initial, params.seed);
+    moved_pair(params, initial, deformed, &|p| body.sample(p), &|p| body.contains(p))
 }
 
 /// A motion in closed form.
@@ -188,14 +185,14 @@ fn elastic_pair(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result
     let before = Volume::from_voxels(initial, |_, x| tissue.sample(x));
     let origins = pressed.origins(&deformed);
     let after = Volume::from_voxels(deformed, |at, _| origins[at].map_or((0.0, false), |x| tissue.sample(x)));
-    let (stiffness, elastic) = (Some(stiffness(tissue, &before)), Some(pressed.description.clone()));
+    let (stiffness, elastic) = (Some(stiffness(tissue, initial)), Some(pressed.description.clone()));
     let displacements = Box::new(move |points: &[WorldPoint]| {
         pressed.at(&initial, points).into_iter().map(Option::unwrap_or_default).collect()
     });
     Ok(Pair { before, after, truth, displacements, control_spacing_mm: None, stiffness, elastic })
 }
 
-/// Times the hexahedra are halved: elements of two to three voxels, as far as a minute allows.
+/// Times the hexahedra are halved: fewer for coarse images, and as far as a minute allows.
 fn halvings(params: &PhantomParams, grid: &Grid) -> usize {
     let most = if params.kind == PhantomKind::Inclusion { 3 } else { 2 };
     let across = grid.shape()[0].max(grid.shape()[1]);
@@ -209,8 +206,7 @@ fn halvings(params: &PhantomParams, grid: &Grid) -> usize {
 }
 
 /// Labels and moduli at the voxel centres in the body.
-fn stiffness(tissue: &Tissue, before: &Imaged) -> Stiffness {
-    let grid = *before.grid();
+fn stiffness(tissue: &Tissue, grid: Grid) -> Stiffness {
     let region = Volume::from_voxels(grid, |_, x| tissue.region(x).map(|n| n as u8 + 1).unwrap_or_default());
     let of = |n: u8| n.checked_sub(1).map(|n| &tissue.regions()[usize::from(n)]);
     Stiffness {

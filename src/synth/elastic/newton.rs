@@ -49,6 +49,8 @@ pub struct Equilibrium {
     pub space: Space,
     /// Displacement of each node (mm).
     pub displacement: Vec<[f64; 3]>,
+    /// Stored energy (mN mm).
+    pub energy: f64,
     /// Force on each node from outside (mN); zero but for held and pressed ones, to the tolerance.
     pub forces: Vec<[f64; 3]>,
     /// Coarse to fine.
@@ -71,7 +73,7 @@ pub fn equilibrium(problem: &Problem<'_>) -> Option<Equilibrium> {
     let mut displacement: Vec<[f64; 3]> = Vec::new();
     let mut pressure: Vec<Pressure> = Vec::new();
     let mut levels = Vec::new();
-    let mut forces = Vec::new();
+    let (mut forces, mut energy) = (Vec::new(), 0.0);
     for (n, space) in spaces.iter().enumerate() {
         multigrid.push(space, &transfers[n], &problem.lame);
         let start = match n {
@@ -99,14 +101,11 @@ pub fn equilibrium(problem: &Problem<'_>) -> Option<Equilibrium> {
             force: pressed.map(|(_, f)| f[2]).sum(),
             change: [rms, change.fold(0.0, f64::max).sqrt()],
         });
-        if std::env::var("DBG").is_ok() {
-            eprintln!("{:?}", levels.last());
-        }
-        (displacement, forces) = (u, state.forces);
+        (displacement, forces, energy) = (u, state.forces, state.energy);
     }
     drop(multigrid);
     let space = spaces.into_iter().next_back()?;
-    Some(Equilibrium { space, displacement, forces, levels })
+    Some(Equilibrium { space, displacement, energy, forces, levels })
 }
 
 /// All levels, coarse to fine, and what leads up to each.
@@ -173,15 +172,6 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
             }
             let (residual, lift) = (self.residual(), self.lift());
             let relative = norm(&residual) / norm(&self.state.forces).max(f64::MIN_POSITIVE);
-            if std::env::var("DBG").is_ok() {
-                eprintln!(
-                    "  {} nodes step {steps} rel {relative:.2e} its {iterations} E {:.9e} touching {} lift {:.2e}",
-                    self.u.len(),
-                    self.state.energy,
-                    self.touching.iter().filter(|t| **t).count(),
-                    norm(&lift)
-                );
-            }
             let on_plate = norm(&lift) <= 1e-9;
             if relative <= tolerance.max(TOUCHING) && on_plate && self.touch(-SLACK) {
                 self.multigrid.hold(&self.free);

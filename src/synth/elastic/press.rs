@@ -53,7 +53,7 @@ pub struct Accuracy {
     pub error_rms_mm: f64,
     /// The same for the force, over the force (1).
     pub force_error: f64,
-    /// Sum of all forces, held and pressed, over the force (1).
+    /// Sum of the forces on the held and the pressed side, over the force (1).
     pub imbalance: f64,
 }
 
@@ -121,7 +121,8 @@ fn accuracy(solved: &Equilibrium) -> Accuracy {
     };
     let before = (levels.len() > 2).then(|| levels[levels.len() - 2].change[0]);
     let force_change = step(1).unwrap_or(f64::NAN);
-    let sum = solved.forces.iter().fold([0.0; 3], |s: [f64; 3], f| std::array::from_fn(|c| s[c] + f[c]));
+    let outer = solved.space.surfaces.iter().zip(&solved.forces).filter(|(s, _)| *s & (HELD | PRESSED) != 0);
+    let sum = outer.fold([0.0; 3], |s: [f64; 3], (_, f)| std::array::from_fn(|c| s[c] + f[c]));
     Accuracy {
         elements: last.elements,
         nodes: last.nodes,
