@@ -71,7 +71,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         reduce(&folder.map, bone, side, Some(indentation)).with_context(|| stiffness.display().to_string())?;
     let PadOutcome { pad, at_press } = &outcome;
     let radius = if pad.radius_mm.is_finite() { pad.radius_mm } else { pad.thickness_mm };
-    io::write_fingertip(output, pad, radius, &from)?;
+    let calibration = match (at_press, folder.force_n) {
+        (Some([_, force]), Some(measured)) => measured / force,
+        _ => 1.0,
+    };
+    io::write_fingertip(output, pad, radius, calibration, &from)?;
     io::write_text(output.with_extension("svg"), &picture(&outcome, folder.force_n))?;
 
     let [uniform, layered, _] = pad.residuals;
@@ -93,8 +97,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     );
     if let (Some([depth, force]), Some(measured)) = (at_press, folder.force_n) {
         text += &format!(
-            "  press        {depth:.2} mm: columns {force:.2} N, measured {measured:.2} N ({:+.0} %)\n",
-            100.0 * (force / measured - 1.0)
+            "  press        {depth:.2} mm: columns {force:.3} N, measured {measured:.3} N; the hemisphere gets E {:.1} kPa\n",
+            calibration * pad.hemisphere_kpa
         );
     }
     if radius > 2.0 * pad.thickness_mm {

@@ -89,11 +89,14 @@ pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoErr
 }
 
 /// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of the hemisphere that
-/// presses like the pad, and how it was found under `[pad]`.
+/// presses like the pad, and how it was found under `[pad]`. `calibration` is the measured force over the columns' (1 where
+/// none was measured); the hemisphere's modulus is multiplied by it.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_fingertip(path: impl AsRef<Path>, pad: &PadReduction, radius_mm: f64, from: &str) -> Result<(), IoError> {
+pub fn write_fingertip(path: impl AsRef<Path>, pad: &PadReduction, radius_mm: f64,
+    calibration: f64,
+    from: &str) -> Result<(), IoError> {
     let rows = |k: usize| pad.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
     let name = serde_json::to_value(pad.model).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default();
     let [uniform, layered, _] = pad.residuals;
@@ -103,12 +106,13 @@ pub fn write_fingertip(path: impl AsRef<Path>, pad: &PadReduction, radius_mm: f6
          radius = {:.6e}\nyoungs_modulus = {:.6e}\nmodel = \"parallel\"\n\n\
          [pad]\n\
          model = \"{name}\"          # the smallest of uniform, layered and map whose forces are the map's to 2 %\n\
+         calibration = {calibration:.6}        # measured force over the columns'; columns are free to bulge, tissue is not\n\
          effective_kpa = {:.6}      # one modulus in the pad's own shape\n\
          residual_uniform = {uniform:.6}\nresidual_layered = {layered:.6}\nresidual_hemisphere = {:.6}\n\
          surface_radius_mm = {}\nthickness_mm = {:.6}\ncolumns = {}\n\
          indentation_mm = [{}]\nforce_n = [{}]\nforce_one_modulus_n = [{}]\n",
         1e-3 * radius_mm,
-        1e3 * pad.hemisphere_kpa,
+        1e3 * calibration * pad.hemisphere_kpa,
         pad.effective_kpa,
         pad.hemisphere_residual,
         if pad.radius_mm.is_finite() { format!("{:.6}", pad.radius_mm) } else { "inf".into() },

@@ -116,9 +116,11 @@ pub fn regions(
         }));
         let value = match unseen {
             None => moduli.log[r],
-            // Two standard deviations from the estimate, towards the side that the data exclude.
-            Some("lower") => moduli.log[r] - (2.0 * sd).min(6.0),
-            Some(_) => moduli.log[r] + (2.0 * sd).min(6.0),
+            // Two standard deviations from the estimate, towards the side that the data exclude. What is all but rigid
+            // moves in proportion to its compliance, what is all but empty to its modulus: there the deviation of the
+            // logarithm is a relative one.
+            Some("lower") => moduli.log[r] - (2.0 * sd).ln_1p(),
+            Some(_) => moduli.log[r] + (2.0 * sd).ln_1p(),
         };
         let e = value.exp();
         let ratio = (value - moduli.log[reference]).exp();

@@ -1,0 +1,167 @@
+//! Finger pads reduced to springs, against closed forms, and the command.
+#![allow(clippy::unwrap_used)]
+
+use palpate::error::FingertipError;
+use palpate::fingertip::{columns, force, reduce};
+use palpate::io;
+use palpate::pipeline::fingertip::run;
+use palpate::types::fingertip::PadModel;
+use palpate::types::{Affine, Grid, Volume};
+use std::fs;
+use std::path::Path;
+use tempfile::TempDir;
+
+const BONE: f32 = 15_000.0;
+
+/// A pad that faces z-: tissue of `modulus` by position (mm), bone from z = `top` up.
+fn pad(n: [usize; 3], spacing: f64, top: f64, tissue: impl Fn([f64; 3]) -> f32 + Sync) -> Volume {
+    let grid = Grid::new(n, Affine::scaled([spacing; 3], [0.0; 3]).unwrap()).unwrap();
+    Volume::from_voxels(grid, |_, p| if p.0[2] >= top { BONE } else { tissue(p.0) })
+}
+
+fn bone(map: &Volume) -> impl Fn(usize) -> bool + '_ {
+    |o| map.as_slice()[o] == BONE
+}
+
+#[test]
+fn a_hemisphere_presses_as_pi_e_d_squared() {
+    let (radius, e) = (10.0, 40.0f32);
+    let inside = |p: [f64; 3]| (p[0] - 12.0).powi(2) + (p[1] - 12.0).powi(2) + (p[2] - 11.0).powi(2) < radius * radius;
+    let map = pad([121, 121, 60], 0.2, 11.0, |p| if inside(p) { e } else { 0.0 });
+    let cut = columns(&map, bone(&map), 2, false).unwrap();
+    // The foremost voxel's centre lies up to half a voxel inside.
+    for d in [2.0, 3.0, 4.0] {
+        let truth = 1e-3 * std::f64::consts::PI * f64::from(e) * d * d;
+        let found = force(&cut, d);
+        assert!((found / truth - 1.0).abs() < 0.06, "{d} mm: {found:.4} N is not {truth:.4} N");
+    }
+    let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(3.0)).unwrap();
+    assert_eq!(out.pad.model, PadModel::Uniform);
+    assert!((out.pad.effective_kpa - 40.0).abs() < 1e-6, "{}", out.pad.effective_kpa);
+    assert!((out.pad.hemisphere_kpa / 40.0 - 1.0).abs() < 0.06, "{}", out.pad.hemisphere_kpa);
+    assert!((out.pad.radius_mm / radius - 1.0).abs() < 0.15, "{}", out.pad.radius_mm);
+}
+
+#[test]
+fn layers_add_up_in_series() {
+    let map = pad([20, 20, 20], 0.5, 8.0, |p| if p[2] < 2.0 { 80.0 } else { 20.0 });
+    let cut = columns(&map, bone(&map), 2, false).unwrap();
+    assert_eq!(cut.len(), 400);
+    for c in &cut {
+        assert!((c.compliance - (2.0 / 80.0 + 6.0 / 20.0)).abs() < 1e-9 && (c.length - 8.0).abs() < 1e-9);
+    }
+    // A flat pad of one thickness needs no more than one modulus, whatever its layers.
+    let flat = reduce(&cut, 1.0);
+    assert_eq!(flat.model, PadModel::Uniform);
+    assert!((flat.effective_kpa - 8.0 / 0.325).abs() < 1e-6);
+    // From the other end, over bone at once: nothing to press.
+    assert_eq!(columns(&map, bone(&map), 2, true).unwrap_err(), FingertipError::TooFew { found: 0, needed: 20 });
+}
+
+#[test]
+fn one_modulus_layers_and_map_are_told_apart() {
+    // A wedge: thin on one side, with stiff skin of one thickness. Its columns are no longer alike.
+    let surface = |p: [f64; 3]| 0.12 * (p[0] - 2.0).max(0.0);
+    let wedge = |p: [f64; 3], skin: f64| match p[2] - surface(p) {
+        z if z < 0.0 => 0.0,
+        z if z < skin => 400.0,
+        _ => 10.0f32,
+    };
+    let map = pad([60, 30, 80], 0.25, 6.0, |p| wedge(p, 1.0));
+    let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(1.5)).unwrap();
+    assert!(out.pad.residuals[1] < out.pad.residuals[0], "{:?}", out.pad.residuals);
+    // One half soft, the other stiff, at different depths: only the map knows.
+    let step = |p: [f64; 3]| match (p[0] < 7.0, p[2] >= if p[0] < 7.0 { 0.0 } else { 1.0 }) {
+        (_, false) => 0.0,
+        (true, _) => 5.0,
+        (false, _) => 500.0f32,
+    };
+    let map = pad([60, 30, 40], 0.25, 6.0, step);
+    let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(2.0)).unwrap();
+    assert_eq!(out.pad.model, PadModel::Map, "{:?}", out.pad.residuals);
+}
+
+#[test]
+fn what_is_no_pad_is_refused() {
+    let map = pad([20, 20, 20], 0.5, 100.0, |_| 20.0);
+    assert_eq!(run(&map, bone(&map), [0.0, 0.0, -1.0], None).unwrap_err(), FingertipError::NoBone);
+    let map = pad([20, 20, 20], 0.5, 8.0, |_| 20.0);
+    let askew = run(&map, bone(&map), [0.0, 0.6, -0.8], None).unwrap_err();
+    assert!(matches!(askew, FingertipError::Askew { degrees } if (degrees - 36.87).abs() < 0.1), "{askew:?}");
+}
+
+/// A folder as `palpate stiffness` leaves it.
+fn stiffness_folder(absolute: bool, bone_name: &str) -> TempDir {
+    let folder = TempDir::new().unwrap();
+    let radius = 8.0;
+    let inside = |p: [f64; 3]| (p[0] - 9.0).powi(2) + (p[1] - 9.0).powi(2) + (p[2] - 9.0).powi(2) < radius * radius;
+    let hard = if bone_name == "bone" { BONE } else { 60.0 };
+    let grid = Grid::new([46, 46, 30], Affine::scaled([0.4; 3], [0.0; 3]).unwrap()).unwrap();
+    let map = Volume::from_voxels(grid, |_, p| match p.0[2] {
+        z if z >= 9.0 => hard,
+        _ if inside(p.0) => 40.0,
+        _ => 0.0f32,
+    });
+    let out = folder.path().join("stiffness");
+    fs::create_dir(&out).unwrap();
+    io::write_volume(out.join("stiffness.nii.gz"), &map, "").unwrap();
+    let summary = serde_json::json!({
+        "command": "stiffness", "absolute": absolute, "force_n": 0.3,
+        "inputs": { "load": "z-" },
+        "regions": [
+            { "name": "pulp", "youngs_modulus": 40.0, "bound": null },
+            { "name": bone_name, "youngs_modulus": hard, "bound": null },
+        ],
+        "patches": { "held": { "translation": [0.0, 0.0, 0.0] }, "loaded": { "translation": [0.0, 0.0, 1.2] } },
+    });
+    io::write_json(out.join("summary.json"), &summary).unwrap();
+    folder
+}
+
+fn palpate(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
+    let mut command = assert_cmd::Command::new(assert_cmd::cargo::cargo_bin!("palpate"));
+    let output = command.current_dir(folder).args(arguments).output().unwrap();
+    let [out, err] = [output.stdout, output.stderr].map(|b| String::from_utf8_lossy(&b).into_owned());
+    assert_eq!(output.status.code(), Some(code), "{out}{err}");
+    (out, err)
+}
+
+#[test]
+fn a_pad_becomes_a_tip_that_a_grasp_reads() {
+    let folder = stiffness_folder(true, "bone");
+    let (out, _) = palpate(folder.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 0);
+    assert!(out.contains("one modulus is enough") && out.contains("1.20 mm"), "{out}");
+    let file: toml::Table = fs::read_to_string(folder.path().join("tip.toml")).unwrap().parse().unwrap();
+    let pad = file["pad"].as_table().unwrap();
+    assert!((pad["effective_kpa"].as_float().unwrap() - 40.0).abs() < 1e-3);
+    // The hemisphere gives the measured force at the measured press.
+    let e = file["youngs_modulus"].as_float().unwrap();
+    let force = std::f64::consts::PI * e * 1.2e-3f64.powi(2);
+    assert!((force / 0.3 - 1.0).abs() < 0.1, "{force}");
+    assert!(fs::read_to_string(folder.path().join("tip.svg")).unwrap().contains("hemisphere"));
+
+    let scene = include_str!("../examples/eight_motions.toml")
+        .lines()
+        .filter(|l| !["radius", "youngs_modulus", "half_span"].iter().any(|k| l.starts_with(k)))
+        .collect::<Vec<_>>()
+        .join("\n")
+        .replace("[fingertip]", "[fingertip]\nfile = \"tip.toml\"");
+    fs::write(folder.path().join("scene.toml"), scene).unwrap();
+    let (out, err) = palpate(folder.path(), &["grasp", "scene.toml", "-o", "grasp"], 0);
+    assert!(out.contains("grasp/report.html"), "{out}{err}");
+}
+
+#[test]
+fn bad_folders_are_refused() {
+    let ratios = stiffness_folder(false, "bone");
+    let (_, err) = palpate(ratios.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);
+    assert!(err.contains("ratios") && err.contains("--force"), "{err}");
+    let soft = stiffness_folder(true, "muscle");
+    let (_, err) = palpate(soft.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);
+    assert!(err.contains("no bone") && err.contains("--names"), "{err}");
+    assert!(!soft.path().join("tip.toml").exists());
+    let (_, err) = palpate(soft.path(), &["fingertip", "nowhere", "-o", "tip.toml"], 1);
+    assert!(err.contains("summary.json"), "{err}");
+    let (_, err) = palpate(soft.path(), &["fingertip", "stiffness", "-o", "tip.json"], 2);
+    assert!(err.contains(".toml"), "{err}");
+}
