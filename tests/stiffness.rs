@@ -8,7 +8,7 @@ use palpate::stiffness::forward::{Problem, Tie};
 use palpate::stiffness::law::Material;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{Contact, Law, LawChoice, Side};
-use palpate::types::{Affine, DenseField, Grid, Mask, StiffnessParams, StiffnessResult, WorldPoint};
+use palpate::types::{Affine, DenseField, Grid, Mask, QuadraticMesh, StiffnessParams, StiffnessResult, WorldPoint};
 use std::collections::HashSet;
 
 fn grid(shape: [usize; 3], spacing: f64) -> Grid {
@@ -28,6 +28,20 @@ fn body(map: &Mask, nodes: usize) -> Body {
     let volume =
         map.as_slice().iter().filter(|&&v| v > 0).count() as f64 * map.grid().spacing().iter().product::<f64>();
     Body::new(&mesh_labels(map, &Fineness::for_nodes(volume, nodes)).unwrap()).unwrap()
+}
+
+/// The same with straight edges, on which the quadrature is exact.
+fn straight(map: &Mask, nodes: usize) -> Body {
+    let volume = map.as_slice().iter().filter(|&&v| v > 0).count() as f64;
+    let mesh = mesh_labels(map, &Fineness::for_nodes(volume, nodes)).unwrap();
+    let mut places = mesh.nodes().to_vec();
+    for t in mesh.tetrahedra() {
+        for (k, [i, j]) in palpate::stiffness::elements::EDGES.into_iter().enumerate() {
+            let (p, q) = (places[t[i] as usize].0, places[t[j] as usize].0);
+            places[t[4 + k] as usize] = WorldPoint(std::array::from_fn(|a| 0.5 * (p[a] + q[a])));
+        }
+    }
+    Body::new(&QuadraticMesh::new(places, mesh.tetrahedra().to_vec(), mesh.labels().to_vec()).unwrap()).unwrap()
 }
 
 fn surface_nodes(body: &Body) -> Vec<u32> {
@@ -60,21 +74,25 @@ fn uniform(body: &Body, e: f64, nu: f64) -> Vec<Material> {
 
 #[test]
 fn the_patch_test_is_passed_at_any_poisson_ratio() {
-    let body = body(&block(), 2500);
-    for nu in [0.3, 0.49, 0.499] {
-        let u = |p: [f64; 3]| [1e-3 * p[0] + 2e-3 * p[1], -1e-3 * p[1] + 5e-4 * p[2], 3e-3 * p[0]];
-        let ties = tied(&body, &surface_nodes(&body), u);
-        let problem = Problem::new(&body, Law::Linear, uniform(&body, 10.0, nu), ties);
-        let s = problem.solve(None, 1e-9).unwrap();
-        let [_, largest] = errors(&body, &s.x, u);
-        assert!(largest < 1e-7, "nu {nu}: {largest}");
+    // Exact with straight edges; with curved ones the quadrature errs by a part in 10^4 of the largest displacement.
+    for (body, tolerance) in [(straight(&block(), 2500), 1e-8), (body(&block(), 2500), 5e-6)] {
+        for nu in [0.3, 0.49, 0.499] {
+            let u = |p: [f64; 3]| [1e-3 * p[0] + 2e-3 * p[1], -1e-3 * p[1] + 5e-4 * p[2], 3e-3 * p[0]];
+            let ties = tied(&body, &surface_nodes(&body), u);
+            let problem = Problem::new(&body, Law::Linear, uniform(&body, 10.0, nu), ties);
+            let s = problem.solve(None, 1e-9).unwrap();
+            let [_, largest] = errors(&body, &s.x, u);
+            assert!(largest < tolerance, "nu {nu}: {largest}");
+        }
     }
 }
 
 /// u = 4 (1 - nu) psi - grad(x . psi) with psi harmonic solves the equations without body force (Papkovich, Neuber).
 #[test]
 fn polynomial_solutions_are_approached_at_third_order_up_to_incompressibility() {
-    let bodies = [700, 5000].map(|n| body(&block(), n));
+    // A ball: its edges bend by the square of their length. (A block's edges are rounded by the voxels, on any mesh.)
+    let ball = labels([20, 20, 20], 1.0, |p| u8::from(p.iter().map(|v| (v - 9.5).powi(2)).sum::<f64>() < 64.0));
+    let bodies = [1200, 8000].map(|n| body(&ball, n));
     for nu in [0.3, 0.49, 0.499] {
         // psi = (0, 0, q) with q = x^3 y - x y^3 + z (x^2 - y^2), harmonic; centred and scaled.
         let exact = |p: [f64; 3]| {
@@ -104,9 +122,9 @@ fn plates(body: &Body, compression: f64) -> Vec<Tie> {
     for n in surface_nodes(body) {
         let p = body.places[n as usize];
         let z = Some([0.0, 0.0, 1.0]);
-        if p[2] < 1.75 {
+        if p[2] < 2.1 {
             ties.push(Tie { node: n, direction: z, target: [0.0; 3], strength: 1.0 });
-        } else if p[2] > 17.25 {
+        } else if p[2] > 16.9 {
             ties.push(Tie { node: n, direction: z, target: [0.0, 0.0, -compression], strength: 1.0 });
         }
     }
@@ -153,7 +171,7 @@ fn uniaxial(e: f64, nu: f64, l: f64) -> f64 {
 
 #[test]
 fn neo_hookean_simple_shear_is_homogeneous_and_its_traction_exact() {
-    let body = body(&block(), 2500);
+    let body = straight(&block(), 2500);
     let (e, nu, shear) = (10.0, 0.49, 0.2);
     let u = |p: [f64; 3]| [shear * (p[2] - 9.5), 0.0, 0.0];
     let problem = Problem::new(&body, Law::NeoHookean, uniform(&body, e, nu), tied(&body, &surface_nodes(&body), u));
@@ -292,11 +310,13 @@ fn a_homogeneous_block_in_two_labels_has_one_modulus_and_the_right_one() {
     let result = identify(&halves, &squeezed(strain, 0.49), &params);
     assert_eq!(result.patches[1].contact, Contact::Sliding);
     assert_eq!(result.law, Law::Linear, "{:?}", result.evidence);
+    // Where the faces lie within a voxel is worth some percent of 16 voxels; it is said so, and does not touch the ratio.
     for r in &result.regions {
-        assert!((r.youngs_modulus / e - 1.0).abs() < 0.02, "{r:?}");
-        assert!(r.identifiable);
+        assert!(r.identifiable && r.sd < 0.06 * e, "{r:?}");
+        assert!((r.youngs_modulus - e).abs() < 2.0 * r.sd, "{r:?}");
+        assert!((r.ratio - 1.0).abs() < 0.03, "{r:?}");
     }
-    assert!((result.model_force / force - 1.0).abs() < 1e-6);
+    assert!((result.model_force / force - 1.0).abs() < 0.05);
 }
 
 #[test]

@@ -65,8 +65,9 @@ fn everything_promised_is_written() {
     assert_eq!(summary["absolute"], true);
     // E = F / (A strain) = 0.1 N / (144 mm^2 x 0.03).
     for r in summary["regions"].as_array().unwrap() {
-        let e = r["youngs_modulus"].as_f64().unwrap();
-        assert!((e / 23.148 - 1.0).abs() < 0.03, "{e}");
+        let [e, sd] = ["youngs_modulus", "sd"].map(|k| r[k].as_f64().unwrap());
+        // Halves side by side of so small a body are told apart badly, and that is said.
+        assert!((e - 23.148).abs() < 2.0 * sd && sd < 4.0, "{e} +- {sd}");
     }
     for key in ["residual_mm", "evidence", "patches", "correlation", "seconds", "mesh", "verdict"] {
         assert!(!summary[key].is_null(), "{key}");
@@ -162,7 +163,7 @@ fn an_empty_held_patch_is_refused() {
     io::write_labels(folder.path().join("nail.nii.gz"), &mask, "").unwrap();
     refused(folder.path(), &["--held", "nail.nii.gz"], 1, &["held", "nail.nii.gz", "is empty", "x-"]);
     refused(folder.path(), &["--held", "zz"], 1, &["--held zz", "neither a side"]);
-    refused(folder.path(), &["--held", "z+"], 1, &["overlaps"]);
+    refused(folder.path(), &["--held", "z+"], 1, &["is the held one", "two different sides"]);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The forward problem: displacement and pressure of a body whose surface is held and pressed in places.
 //!
-//! Prescribed displacements are ties, springs 10^6 times as stiff as the tissue around (relative error of a prescribed
-//! value about 10^-6); the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law
+//! Prescribed displacements are ties, springs 10^8 times as stiff as the tissue around (relative error of a prescribed
+//! value about 10^-8); the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law
 //! takes one step.
 
 use crate::error::StiffnessError;
@@ -12,7 +12,7 @@ use crate::types::stiffness::Law;
 use rayon::prelude::*;
 
 /// Stiffness of a tie over that of the tissue.
-const TIE: f64 = 1e6;
+const TIE: f64 = 1e8;
 /// Newton steps at most for one load.
 const STEPS: usize = 25;
 /// Elements computed together.

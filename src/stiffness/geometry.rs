@@ -15,6 +15,9 @@ use crate::types::{Grid, VoxelPoint, WorldPoint};
 const FACE: f64 = 0.288_675;
 /// Least part of the box's face that a flat face fills.
 const FLAT: f64 = 0.2;
+/// Samples (components) for each independent one, at least: on a body of a few hundred cubic voxels' size the errors of a
+/// rounded edge reach that far.
+const DILUTION: f64 = 100.0;
 /// Power of the distance from the middle with which an offset fades inwards: the outermost tenth moves by two thirds or more.
 const FADE: i32 = 4;
 
@@ -63,8 +66,9 @@ pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option
     prior.extend(faces.iter().map(|_| (FACE.powi(-2), 0.0)));
     let scale = setup.scale(&estimate.residuals);
     let weights = setup.weights(&estimate.residuals, scale);
-    // Residuals hang together: as many independent samples as the estimate found.
-    let dilution = 3.0 * estimate.residuals.len() as f64 / estimate.effective;
+    // Residuals hang together: as many independent samples as the estimate found, and no more than a model that knows the
+    // surface this badly can claim.
+    let dilution = (3.0 * estimate.residuals.len() as f64 / estimate.effective).max(DILUTION);
     let blocks = grouped_normal(setup.observations, &rows, &estimate.residuals, &weights);
     let variance = estimate.squares / (3.0 * estimate.residuals.len() as f64) * dilution;
     let mut a = vec![0.0; p * p];
@@ -88,6 +92,10 @@ pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
     let (covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
     let first = p - faces.len();
+    if step[first..].iter().any(|v| v.abs() > 1.0) {
+        // Beyond a voxel it is not the face that is wrong.
+        return Ok(None);
+    }
     let name = |k: usize| format!("{}{}", if faces[k].1 { '+' } else { '-' }, faces[k].0);
     let faces = (0..faces.len()).map(|k| (name(k), step[first + k])).collect();
     Ok(Some(Geometry { faces, step, covariance, force_slope }))

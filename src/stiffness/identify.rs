@@ -45,6 +45,8 @@ pub struct Setup<'a> {
     pub reference: usize,
     /// Standard deviation of the prior of the plates' motion about the fitted one (mm).
     pub plate_prior: f64,
+    /// The model's own error (in units of the observations' sigma): no residual is taken to be smaller.
+    pub floor: f64,
     /// A region whose ln(mu / mu_reference) is not free, and its value.
     pub pinned: Option<(usize, f64)>,
 }
@@ -108,11 +110,12 @@ impl Setup<'_> {
         }
         let slides = |p: &Patch| p.contact == crate::types::stiffness::Contact::Sliding;
         if self.patches.iter().all(slides) {
-            // Two frictionless plates leave the body free to move along them; faint springs hold it.
+            // Two frictionless plates leave the body free to move along them: springs as soft as the tissue, to where the
+            // surface was measured to go, hold it and pull next to nothing.
             for patch in &self.patches {
-                for tie in patch.ties(self.body, &[]) {
-                    ties.push(Tie { direction: None, strength: 1e-10, ..tie });
-                }
+                let mut guided = patch.clone();
+                guided.contact = crate::types::stiffness::Contact::Guided;
+                ties.extend(guided.ties(self.body, &[]).into_iter().map(|t| Tie { strength: 1e-9, ..t }));
             }
         }
         Problem::new(self.body, self.law, materials, ties)
@@ -183,7 +186,7 @@ impl Setup<'_> {
     pub(super) fn scale(&self, residuals: &[[f64; 3]]) -> f64 {
         let mut sizes: Vec<f64> =
             residuals.iter().zip(self.observations).map(|(r, o)| dot(*r, *r).sqrt() / o.sigma).collect();
-        (percentile(&mut sizes, 50.0) / MAXWELL_MEDIAN).max(1e-9)
+        (percentile(&mut sizes, 50.0) / MAXWELL_MEDIAN).max(self.floor)
     }
 
     pub(super) fn weights(&self, residuals: &[[f64; 3]], scale: f64) -> Vec<f64> {
@@ -336,8 +339,8 @@ impl Setup<'_> {
         let p = rows.len();
         let weights = self.weights(&residuals, self.scale(&residuals));
         let blocks = grouped_normal(self.observations, &rows, &residuals, &weights);
-        let squares = self.squares(&residuals, &weights);
         let samples = 3.0 * residuals.len() as f64;
+        let squares = self.squares(&residuals, &weights).max(samples * self.floor * self.floor);
         let (covariance, information, inflation) = covariance(&blocks, &self.prior_terms(&state), squares, samples)?;
         let force = self.forces(problem, &state, &solution.x);
         let force_slope = self.force_slope(problem, &columns, force[0]);

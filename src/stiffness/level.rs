@@ -9,6 +9,8 @@ use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
 use crate::types::stiffness::Law;
 use crate::types::{DenseField, Mask, QuadraticMesh, SparseField};
 
+/// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
+const FLOOR: f64 = 0.005;
 /// Observations needed for each parameter, at least.
 const NEEDED: usize = 100;
 
@@ -67,6 +69,7 @@ impl Level {
             reference,
             // The surface motion is extrapolated by half a voxel; the plate may be off by as much of the motion's change.
             plate_prior: 0.25 * self.voxel + 3.0 * self.surface_error,
+            floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
             pinned: None,
         }
     }

@@ -90,6 +90,8 @@ pub struct Patch {
     guided: Vec<[f64; 3]>,
     /// For each node the motion along the normal besides the rigid one (mm) that brings it onto the plane.
     onto_plane: Vec<f64>,
+    /// For each node the motion besides the plate's (mm) of one that lies a little inside of a flat face, on its rounded rim.
+    rim: Vec<[f64; 3]>,
     /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
     pub residual: [f64; 2],
 }
@@ -138,6 +140,7 @@ impl Patch {
                     }
                 }
             }
+            (0..3).for_each(|a| u[a] += self.rim[i][a]);
             Tie { node, direction, target: u, strength: 1.0 }
         };
         self.nodes.iter().enumerate().map(one).collect()
@@ -162,6 +165,7 @@ impl Patch {
         nodes.sort_unstable();
         nodes.dedup();
         let pick: Vec<usize> = nodes.iter().map(|n| self.nodes.partition_point(|m| m < n)).collect();
+        out.rim = pick.iter().map(|&i| self.rim[i]).collect();
         out.guided = pick.iter().map(|&i| self.guided[i]).collect();
         out.onto_plane = pick.iter().map(|&i| self.onto_plane[i]).collect();
         out.nodes = nodes;
@@ -207,6 +211,9 @@ pub fn find(
     load: &Place,
     voxel: f64,
 ) -> Result<[Patch; 2], StiffnessError> {
+    if held == load {
+        return Err(refuse("loaded", load, "is the held one", "choose two different sides"));
+    }
     let hint_held = "name the side where the tissue is fixed, as x-, x+ ... z+, or give a mask that covers it";
     let base = match held {
         Place::Side(side) => base_facets(body, *side, voxel),
@@ -216,7 +223,7 @@ pub fn find(
     if base.is_empty() || area < 9.0 * voxel * voxel {
         return Err(refuse("held", held, "is empty: no surface of the body lies there", hint_held));
     }
-    let held_patch = build(body, motion, held.name(), base, None, voxel)
+    let mut held_patch = build(body, motion, held.name(), base, None, voxel)
         .ok_or_else(|| refuse("held", held, "holds no measured motion", "check that the field covers it"))?;
     let against = |n: u32| {
         let p = body.places[n as usize];
@@ -254,9 +261,35 @@ pub fn find(
     if facets.iter().any(|f| held_patch.facets.contains(f)) {
         return Err(refuse("loaded", load, "overlaps the held one", "choose two different sides"));
     }
-    let load_patch = build(body, motion, load.name(), facets, plane, voxel)
+    let mut load_patch = build(body, motion, load.name(), facets, plane, voxel)
         .ok_or_else(|| refuse("loaded", load, "holds no measured motion", "check that the field covers it"))?;
+    let before = held_patch.clone();
+    round_rim(body, &mut held_patch, &load_patch, voxel);
+    round_rim(body, &mut load_patch, &before, voxel);
     Ok([held_patch, load_patch])
+}
+
+/// The mesh rounds the rim of a flat face by a part of a voxel, so its nodes lie inside of the plate's plane. They do not move
+/// as the plate but as tissue at that depth, to first order: between the two plates in proportion.
+fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
+    if patch.bend() > 0.0 {
+        return;
+    }
+    let height = |p: [f64; 3]| dot(sub(p, patch.middle), patch.normal);
+    let mut all: Vec<f64> = patch.nodes.iter().map(|&n| height(body.places[n as usize])).collect();
+    let face = crate::numerics::statistics::percentile(&mut all, 75.0);
+    let apart = face - height(other.middle);
+    let lag = |&n: &u32| {
+        let p = body.places[n as usize];
+        let depth = face - height(p);
+        if !(0.0..1.5 * voxel).contains(&depth) || apart < 4.0 * voxel {
+            return [0.0; 3];
+        }
+        let own = rigid_motion(&patch.rigid, patch.middle, patch.radius, p);
+        let far = rigid_motion(&other.rigid, other.middle, other.radius, p);
+        std::array::from_fn(|a| depth / apart * (far[a] - own[a]))
+    };
+    patch.rim = patch.nodes.iter().map(lag).collect();
 }
 
 /// Facets whose nodes lie within a voxel of the end of the undeformed body.
@@ -313,12 +346,12 @@ fn pressed_facets(
     let inward = |n: u32| against(n).map_or(f64::NEG_INFINITY, |u| -dot(u, d));
     let mut all: Vec<f64> = nodes.iter().map(|&n| inward(n)).collect();
     let most = crate::numerics::statistics::percentile(&mut all, 98.0);
-    let ended = |n: u32| -> Option<[f64; 3]> {
-        let (p, u) = (body.places[n as usize], motion.displacement[n as usize]?);
-        Some(std::array::from_fn(|a| p[a] + u[a]))
-    };
+    let ended = |n: u32| ended(body, motion, n);
     let mut chosen: Vec<u32> = nodes.iter().copied().filter(|&n| inward(n) > 0.8 * most).collect();
-    let tolerance = (0.15 * voxel).max(3.0 * motion.error);
+    if chosen.len() < 6 {
+        return Some((Vec::new(), None, most));
+    }
+    let tolerance = on_plane(voxel, motion.error);
     let mut plane = None;
     for round in 0..8 {
         let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
@@ -352,6 +385,17 @@ fn pressed_facets(
     let facets: Vec<usize> =
         facing.into_iter().filter(|&f| body.surface[f].nodes.iter().filter(|n| on(n)).count() >= 5).collect();
     Some((facets, plane, most))
+}
+
+/// How near to the plane counts as on it (mm).
+fn on_plane(voxel: f64, error: f64) -> f64 {
+    (0.15 * voxel).max(3.0 * error)
+}
+
+/// Where a node of the surface ends (mm, RAS).
+fn ended(body: &Body, motion: &SurfaceMotion, n: u32) -> Option<[f64; 3]> {
+    let (p, u) = (body.places[n as usize], motion.displacement[n as usize]?);
+    Some(std::array::from_fn(|a| p[a] + u[a]))
 }
 
 fn square(v: [f64; 3]) -> f64 {
@@ -431,22 +475,22 @@ fn build(
     let residual = [part(true), part(false)];
     let quadratic = fit_quadratic(&rest, middle, radius, normal);
     let guided = nodes.iter().map(|&n| quadratic(body.places[n as usize])).collect();
-    let onto = |&n: &u32| match plane {
-        Some((q, normal)) => {
-            let p = body.places[n as usize];
-            let u = rigid_motion(&rigid, middle, radius, p);
-            dot(sub(q, p), normal) - dot(u, normal)
-        }
-        None => 0.0,
+    let tolerance = on_plane(voxel, motion.error);
+    let onto = |&n: &u32| {
+        let (Some((q, normal)), Some(end)) = (plane, ended(body, motion, n)) else { return 0.0 };
+        let p = body.places[n as usize];
+        // The rim of a flat face is rounded in the mesh: it ends short of the plane and moves with the plate as it is.
+        let on = dot(sub(end, q), normal).abs() < tolerance;
+        let u = rigid_motion(&rigid, middle, radius, p);
+        if on { dot(sub(q, p), normal) - dot(u, normal) } else { 0.0 }
     };
     let mut onto_plane: Vec<f64> = nodes.iter().map(onto).collect();
     let mut sizes: Vec<f64> = onto_plane.iter().map(|v| v.abs()).collect();
-    // A flat face stays as it is, rim and all.
     if crate::numerics::statistics::percentile(&mut sizes, 75.0) < (0.1 * voxel).max(2.0 * motion.error) {
         onto_plane.fill(0.0);
     }
-    let contact = Contact::Sticking;
-    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, onto_plane, residual })
+    let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
+    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, onto_plane, rim, residual })
 }
 
 /// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.

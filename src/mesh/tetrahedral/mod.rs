@@ -148,7 +148,10 @@ fn calibrate(made: &Made, levels: &mut Levels) {
         volume[k as usize] += curving::volume(t.map(|n| made.places[n as usize]));
     }
     let (mut outer, mut inner) = (0.0, vec![0.0; wanted.len()]);
-    for (f, [a, b]) in faces(&corners) {
+    // Sums in a fixed order.
+    let mut all: Vec<([u32; 3], [u32; 2])> = faces(&corners).into_iter().collect();
+    all.sort_unstable();
+    for (f, [a, b]) in all {
         let [p, q, r] = f.map(|v| made.places[v as usize]);
         let to = |s: [f64; 3]| std::array::from_fn::<f64, 3, _>(|a| s[a] - p[a]);
         let n = crate::types::space::cross(to(q), to(r));
