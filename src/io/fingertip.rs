@@ -94,9 +94,13 @@ pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoErr
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_fingertip(path: impl AsRef<Path>, pad: &PadReduction, radius_mm: f64,
+pub fn write_fingertip(
+    path: impl AsRef<Path>,
+    pad: &PadReduction,
+    radius_mm: f64,
     calibration: f64,
-    from: &str) -> Result<(), IoError> {
+    from: &str,
+) -> Result<(), IoError> {
     let rows = |k: usize| pad.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
     let name = serde_json::to_value(pad.model).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default();
     let [uniform, layered, _] = pad.residuals;
