@@ -116,7 +116,7 @@ fn picture(outcome: &PadOutcome, force_n: Option<f64>) -> String {
     };
     let square = |c: &[f64; 3]| 1e-3 * std::f64::consts::PI * pad.hemisphere_kpa * c[0] * c[0];
     let mut lines = vec![
-        line("columns of the map", 0, false, &|c| c[1]),
+        line("columns", 0, false, &|c| c[1]),
         line("one modulus", 1, true, &|c| c[2]),
         line("hemisphere", 2, true, &square),
     ];
@@ -125,6 +125,6 @@ fn picture(outcome: &PadOutcome, force_n: Option<f64>) -> String {
         let arm = 0.02 * pad.curve.last().map_or(1.0, |c| c[0]);
         lines.push(Line::new("measured", 3, false, vec![[depth - arm, force], [depth + arm, force]]));
     }
-    let plot = Plot { title: "Force on the pad, N", across: "indentation, mm", marks: &marks }.draw(&lines);
+    let plot = Plot { title: "Force on the pad, N, over indentation", across: "mm", marks: &marks }.draw(&lines);
     sheet("Finger pad as a fingertip", &[plot], 1)
 }

@@ -172,11 +172,13 @@ pub fn page(result: &StiffnessResult, inputs: &InputNames) -> Result<String, Rep
         Panel::coloured(title, &sections, base, Some(&inside), scale, |o| values[o]).map(|p| p.with_note(note))
     };
     let top = |v: &Volume, q: f64| spread(v, q).max(1e-9);
+    let seen = result.regions.iter().filter(|r| r.identifiable).map(|r| r.youngs_modulus).fold(0.0, f64::max);
+    let seen = if seen > 0.0 { seen } else { top(&result.map, 1.0) };
     let map = panel(
         "Young's modulus",
         &result.map,
-        Scale::from_zero(top(&result.map, 1.0), unit, ColorMap::Viridis),
-        "One value a region. A region that is not identifiable shows its bound.",
+        Scale::from_zero(seen, unit, ColorMap::Viridis),
+        "One value a region. A region that is not identifiable shows its bound, at the end of the scale if beyond.",
     )?;
     let sd = panel(
         "Standard deviation",
