@@ -134,7 +134,7 @@ fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place>
             if !path.exists() {
                 bail!("{flag} {text}: is neither a side (x-, x+, y-, y+, z-, z+) nor a file; check the spelling");
             }
-            Ok(Place::Mask(read_mask(path, grid, reference)?, name(path)))
+            Ok(Place::Mask(Box::new(read_mask(path, grid, reference)?), name(path)))
         }
     }
 }

@@ -25,7 +25,7 @@ pub enum Place {
     /// On a side of the body.
     Side(Side),
     /// Inside a mask on the initial grid, given by its name.
-    Mask(Mask, String),
+    Mask(Box<Mask>, String),
 }
 
 impl Place {

@@ -8,6 +8,7 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::Cholesky;
+use crate::numerics::filters::gaussian;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::Observation;
 use crate::types::space::dot;
@@ -22,6 +23,8 @@ const SAMPLES: usize = 5000;
 const SMOOTH: f64 = 0.05;
 /// Iterations at most.
 const ITERATIONS: usize = 9;
+/// Standard deviation of the Gaussian that rounds regions (lattice steps).
+const ROUND: f64 = 0.4;
 /// Parts of the body smaller than this are no region of their own.
 const SMALLEST: f64 = 0.004;
 
@@ -291,7 +294,24 @@ pub fn regions(map: &Map, body: &Mask, wanted: usize) -> Option<Mask> {
         let at = large.iter().position(|l| l.1 == pieces.0[o] as usize);
         labels[o] = at.map_or(1, |k| k as u8 + 1);
     }
-    Mask::from_vec(grid, labels).ok()
+    let sigma = grid.spacing().map(|s| ROUND * map.lattice.size / s);
+    let labels = rounded(&labels, grid.shape(), sigma, wanted);
+    (1..=wanted as u8).all(|l| labels.contains(&l)).then(|| Mask::from_vec(grid, labels).ok()).flatten()
+}
+
+/// Each voxel takes the label that weighs most in a Gaussian around it: the map cannot tell spikes from noise.
+fn rounded(labels: &[u8], shape: [usize; 3], sigma: [f64; 3], count: usize) -> Vec<u8> {
+    let mut best = vec![(0.0f32, 0u8); labels.len()];
+    for label in 1..=count as u8 {
+        let own: Vec<f32> = labels.iter().map(|&l| f32::from(u8::from(l == label))).collect();
+        let near = gaussian(&own, shape, sigma);
+        best.iter_mut().zip(near).for_each(|(b, v)| {
+            if v > b.0 {
+                *b = (v, label);
+            }
+        });
+    }
+    labels.iter().zip(best).map(|(&l, b)| if l == 0 { 0 } else { b.1 }).collect()
 }
 
 /// Centres of `count` classes on a line (Lloyd's iteration from even quantiles of the range).
