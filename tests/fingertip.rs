@@ -29,16 +29,17 @@ fn a_hemisphere_presses_as_pi_e_d_squared() {
     let inside = |p: [f64; 3]| (p[0] - 12.0).powi(2) + (p[1] - 12.0).powi(2) + (p[2] - 11.0).powi(2) < radius * radius;
     let map = pad([121, 121, 60], 0.2, 11.0, |p| if inside(p) { e } else { 0.0 });
     let cut = columns(&map, bone(&map), 2, false).unwrap();
-    // The foremost voxel's centre lies up to half a voxel inside.
+    // The surface is known to half a voxel, 0.1 mm, and so is each column's length: another 2 %.
     for d in [2.0, 3.0, 4.0] {
-        let truth = 1e-3 * std::f64::consts::PI * f64::from(e) * d * d;
+        let truth = |d: f64| 1e-3 * std::f64::consts::PI * f64::from(e) * d * d;
         let found = force(&cut, d);
-        assert!((found / truth - 1.0).abs() < 0.06, "{d} mm: {found:.4} N is not {truth:.4} N");
+        let range = 0.98 * truth(d - 0.1)..1.02 * truth(d + 0.1);
+        assert!(range.contains(&found), "{d} mm: {found:.4} N is not in {range:.4?} N");
     }
     let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(3.0)).unwrap();
     assert_eq!(out.pad.model, PadModel::Uniform);
     assert!((out.pad.effective_kpa - 40.0).abs() < 1e-6, "{}", out.pad.effective_kpa);
-    assert!((out.pad.hemisphere_kpa / 40.0 - 1.0).abs() < 0.06, "{}", out.pad.hemisphere_kpa);
+    assert!((out.pad.hemisphere_kpa / 40.0 - 1.0).abs() < 0.1, "{}", out.pad.hemisphere_kpa);
     assert!((out.pad.radius_mm / radius - 1.0).abs() < 0.15, "{}", out.pad.radius_mm);
 }
 
@@ -70,11 +71,12 @@ fn one_modulus_layers_and_map_are_told_apart() {
     let map = pad([60, 30, 80], 0.25, 6.0, |p| wedge(p, 1.0));
     let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(1.5)).unwrap();
     assert!(out.pad.residuals[1] < out.pad.residuals[0], "{:?}", out.pad.residuals);
-    // One half soft, the other stiff, at different depths: only the map knows.
-    let step = |p: [f64; 3]| match (p[0] < 7.0, p[2] >= if p[0] < 7.0 { 0.0 } else { 1.0 }) {
-        (_, false) => 0.0,
-        (true, _) => 5.0,
-        (false, _) => 500.0f32,
+    // Three strips of different depth, the middle one stiff: only the map knows.
+    let step = |p: [f64; 3]| match ((p[0] / 5.0) as usize, p[2]) {
+        (0, _) => 5.0,
+        (1, z) if z >= 0.5 => 500.0,
+        (2, z) if z >= 1.0 => 5.0f32,
+        _ => 0.0,
     };
     let map = pad([60, 30, 40], 0.25, 6.0, step);
     let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(2.0)).unwrap();

@@ -65,6 +65,20 @@ fn components(p: &Prescribed) -> Vec<(usize, f64)> {
     }
 }
 
+/// Nodes and axes that hold the body where every plate slides along the same plane: without force, as nothing else does.
+fn pins(result: &StiffnessResult) -> Vec<(u32, usize)> {
+    let Some(first) = result.prescribed.first() else { return Vec::new() };
+    let Some(normal) = axis_of(first).filter(|a| result.prescribed.iter().all(|p| axis_of(p) == Some(*a))) else {
+        return Vec::new();
+    };
+    let [u, v] = [(normal + 1) % 3, (normal + 2) % 3];
+    let place = |p: &Prescribed| result.mesh.nodes()[p.node as usize].0;
+    let apart = |p: &Prescribed, a: usize| (place(p)[a] - place(first)[a]).abs();
+    let far = result.prescribed.iter().max_by(|a, b| apart(a, u).total_cmp(&apart(b, u)));
+    // Held at one node along both axes, and against turning at the one furthest off along the first axis.
+    [(first.node, u), (first.node, v)].into_iter().chain(far.map(|p| (p.node, v))).collect()
+}
+
 /// Writes the model for Abaqus and CalculiX: C3D10 elements, `*ELASTIC` or `*HYPERELASTIC, NEO HOOKE`, one static step with
 /// the prescribed displacements; displacements and reaction forces are printed.
 ///
@@ -110,6 +124,9 @@ pub fn write_inp(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(),
             for (a, v) in components(p) {
                 writeln!(w, "{}, {}, {}, {v:.9e}", p.node + 1, a + 1, a + 1)?;
             }
+        }
+        for (node, a) in pins(result) {
+            writeln!(w, "{}, {}, {}, {:.9e}", node + 1, a + 1, a + 1, result.displacement[node as usize][a])?;
         }
         writeln!(
             w,

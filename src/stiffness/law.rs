@@ -2,8 +2,10 @@
 //!
 //! Both are the stationary point of a functional of displacement u and pressure p (mixed form; lambda = 2 mu nu / (1 - 2 nu)):
 //!
-//!     linear:       int mu eps:eps + p div u - p^2 / (2 lambda)
-//!     neo-Hookean:  int mu/2 (F:F - 3) - mu ln J + p ln J - p^2 / (2 lambda)
+//! ```text
+//! linear:       int mu eps:eps + p div u - p^2 / (2 lambda)
+//! neo-Hookean:  int mu/2 (F:F - 3) - mu ln J + p ln J - p^2 / (2 lambda)
+//! ```
 //!
 //! so the tangent is symmetric. Eliminating p gives W = mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2 (Bonet and Wood, Nonlinear
 //! Continuum Mechanics, 2008, eq. 6.27).
