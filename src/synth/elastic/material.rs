@@ -6,7 +6,7 @@
 //! (Brezzi and Fortin 1991, VI.3), and symmetric.
 
 use crate::synth::elastic::quadratic::{GAUSS, NODES, Nodal, Tables, divergence, gradient, line, weight};
-use crate::synth::elastic::space::{LANES, Space};
+use crate::synth::elastic::space::{Entries, LANES, Space, entries};
 use crate::synth::elastic::tangent::Batch;
 use crate::types::space::{Matrix3, determinant};
 use rayon::prelude::*;
@@ -178,7 +178,7 @@ fn moved(space: &Space, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
 pub fn state(space: &Space, lame: &[Lame], u: &[[f64; 3]], pressure: &[Pressure]) -> State {
     let tables = Tables::new(|v| v);
     let moved = moved(space, u);
-    let all: Vec<(f64, [Nodal<f64, LANES>; 3], Batch)> = (0..space.batches())
+    let all: Vec<(f64, Entries<f64>, Batch)> = (0..space.batches())
         .into_par_iter()
         .map(|b| {
             let zero = [[[0.0; LANES]; NODES]; 3];
@@ -193,7 +193,7 @@ pub fn state(space: &Space, lame: &[Lame], u: &[[f64; 3]], pressure: &[Pressure]
                 let law = lame[usize::from(space.region[e])];
                 energy += element(&rest, &now, &x, l, law, &pressure[e], &mut stress, &mut batch);
             }
-            let forces = std::array::from_fn(|c| divergence(&tables, &stress[c]));
+            let forces = entries(&[0, 1, 2].map(|c| divergence(&tables, &stress[c])));
             (energy, forces, batch)
         })
         .collect();

@@ -7,6 +7,23 @@ use rayon::prelude::*;
 /// Elements worked on side by side.
 pub const LANES: usize = 8;
 
+/// What each of a batch's elements gives to its nodes: `[element][node][component]`.
+pub type Entries<T> = [[[T; 3]; NODES]; LANES];
+
+/// [`Entries`] from `[component][node][element]`.
+#[inline(always)]
+pub fn entries<T: Copy + Default>(by_component: &[[[T; LANES]; NODES]; 3]) -> Entries<T> {
+    let mut out = [[[T::default(); 3]; NODES]; LANES];
+    for l in 0..LANES {
+        for a in 0..NODES {
+            for c in 0..3 {
+                out[l][a][c] = by_component[c][a][l];
+            }
+        }
+    }
+    out
+}
+
 /// A finite element space: nodes, elements, and which element entries add up to which node.
 #[derive(Debug, Clone)]
 pub struct Space {
@@ -63,19 +80,20 @@ impl Space {
     /// Adds the element entries of each node in their order; `finish` gets the node and the sum.
     pub fn assemble<T: Copy + Default + std::ops::AddAssign + Send + Sync>(
         &self,
-        parts: &[[[[T; LANES]; NODES]; 3]],
+        parts: &[Entries<T>],
         out: &mut [[T; 3]],
         finish: impl Fn(usize, [T; 3]) -> [T; 3] + Sync,
     ) {
         const CHUNK: usize = 2048;
+        let parts = parts.as_flattened().as_flattened();
         out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
             for (i, v) in out.iter_mut().enumerate() {
                 let node = chunk * CHUNK + i;
                 let mut sum = [T::default(); 3];
                 for &entry in &self.entries[self.starts[node] as usize..self.starts[node + 1] as usize] {
-                    let (e, a) = (entry as usize / NODES, entry as usize % NODES);
+                    let part = &parts[entry as usize];
                     for c in 0..3 {
-                        sum[c] += parts[e / LANES][c][a][e % LANES];
+                        sum[c] += part[c];
                     }
                 }
                 *v = finish(node, sum);

@@ -6,7 +6,7 @@
 
 use crate::numerics::simd::dispatch;
 use crate::synth::elastic::quadratic::{GAUSS, NODES, Nodal, Tables, divergence, gradient, line};
-use crate::synth::elastic::space::{LANES, Space};
+use crate::synth::elastic::space::{Entries, LANES, Space, entries};
 use crate::types::space::Matrix3;
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
@@ -110,13 +110,13 @@ pub struct Stiffness<'a> {
     batches: Vec<Batch>,
     tables: Tables<f32>,
     /// Entries of the elements before they are added up, kept from one product to the next.
-    parts: Mutex<Vec<[Nodal<f32, LANES>; 3]>>,
+    parts: Mutex<Vec<Entries<f32>>>,
 }
 
 impl<'a> Stiffness<'a> {
     /// From the data at the Gauss points.
     pub fn new(space: &'a Space, batches: Vec<Batch>) -> Self {
-        let parts = Mutex::new(vec![[[[0.0; LANES]; NODES]; 3]; batches.len()]);
+        let parts = Mutex::new(vec![[[[0.0; 3]; NODES]; LANES]; batches.len()]);
         Self { space, batches, tables: Tables::new(|v| v as f32), parts }
     }
 
@@ -133,7 +133,7 @@ impl<'a> Stiffness<'a> {
     }
 
     #[inline(always)]
-    fn batch(&self, b: usize, x: &[[f32; 3]]) -> [Nodal<f32, LANES>; 3] {
+    fn batch(&self, b: usize, x: &[[f32; 3]]) -> Entries<f32> {
         let mut w = [[[0.0f32; LANES]; NODES]; 3];
         self.space.gather(b, x, &mut w);
         let t = &self.tables;
@@ -154,7 +154,7 @@ impl<'a> Stiffness<'a> {
         for (q, point) in points.iter().enumerate() {
             point.stress(&mut g, q, &share);
         }
-        [divergence(t, &g[0]), divergence(t, &g[1]), divergence(t, &g[2])]
+        entries(&[divergence(t, &g[0]), divergence(t, &g[1]), divergence(t, &g[2])])
     }
 
     /// The diagonal of K.
@@ -166,15 +166,14 @@ impl<'a> Stiffness<'a> {
                 std::array::from_fn(|a| (0..3).map(|c| t[c][usize::from(a == c)][i[c]]).product())
             })
         });
-        let parts: Vec<[Nodal<f32, LANES>; 3]> =
-            self.batches.par_iter().map(|batch| diagonal_of(batch, &slopes)).collect();
+        let parts: Vec<Entries<f32>> = self.batches.par_iter().map(|batch| diagonal_of(batch, &slopes)).collect();
         let mut out = vec![[0.0; 3]; self.space.nodes.len()];
         self.space.assemble(&parts, &mut out, |_, v| v);
         out
     }
 }
 
-fn diagonal_of(batch: &Batch, slopes: &[[[f64; 3]; NODES]; NODES]) -> [Nodal<f32, LANES>; 3] {
+fn diagonal_of(batch: &Batch, slopes: &[[[f64; 3]; NODES]; NODES]) -> Entries<f32> {
     let mut out = [[[0.0f32; LANES]; NODES]; 3];
     for n in 0..NODES {
         let mut share = [[[0.0f32; LANES]; 4]; 3];
@@ -200,5 +199,5 @@ fn diagonal_of(batch: &Batch, slopes: &[[[f64; 3]; NODES]; NODES]) -> [Nodal<f32
             }
         }
     }
-    out
+    entries(&out)
 }
