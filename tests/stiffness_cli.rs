@@ -83,7 +83,6 @@ fn everything_promised_is_written() {
 }
 
 #[test]
-#[ignore = "known defect: the exported moduli belong to a later step than our displacement; see docs/stiffness.md"]
 fn calculix_solves_our_model_to_our_displacements() {
     let folder = folder();
     run(folder.path(), &[&BASE[..], &["--force", "0.1"]].concat(), 0);

@@ -109,7 +109,7 @@ pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
     Ok(scene)
 }
 
-/// Writes time (s), stress_pa, displacement_m and strain_<layer> (compression positive), a row for each sample.
+/// Writes time (s), stress_pa, displacement_m and `strain_<layer>` (compression positive), a row for each sample.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

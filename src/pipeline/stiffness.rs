@@ -101,6 +101,7 @@ fn labelled(
     let setup = fine.setup(choice.law, params.poisson, reference);
     let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
     let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid())?;
+    let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| estimate.advanced(&setup.free(), &g.step));
     let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n);
     let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
     let count = fine.body.labels.len();
@@ -133,7 +134,7 @@ fn labelled(
     });
     let scale = moduli.log[reference].exp() / (2.0 * (1.0 + params.poisson));
     let element_modulus = fine.body.region.iter().map(|&r| moduli.log[r as usize].exp()).collect();
-    let strain = summary::strain(&setup, &estimate.state);
+    let strain = summary::strain(&setup, &state);
     clock.book("maps");
     Ok(StiffnessResult {
         correlation: summary::correlation(&moduli.covariance, count),
@@ -150,8 +151,8 @@ fn labelled(
         map_sd,
         residual,
         element_modulus,
-        displacement: maps::node_displacement(&fine.body, &estimate),
-        prescribed: maps::prescribed(&fine, &estimate),
+        displacement: maps::node_displacement(&fine.body, &state),
+        prescribed: maps::prescribed(&fine, &state),
         faces: geometry.map(|g| g.faces).unwrap_or_default(),
         model_force: estimate.force[0] * scale / 1000.0,
         mesh_change,

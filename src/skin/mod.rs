@@ -1,6 +1,6 @@
 //! Layered skin: rheological elements in a column, and in a block under a punch.
 //!
-//! [`column`] is exact: the laws are linear between the corners of the load, so the matrix exponential solves them,
+//! [`mod@column`] is exact: the laws are linear between the corners of the load, so the matrix exponential solves them,
 //! however stiff. [`block`] is a plane-strain finite element model with the same laws.
 
 pub mod block;

@@ -85,12 +85,30 @@ pub struct Estimate {
     pub force: [f64; 2],
     /// Derivative of the logarithm of the force on the loaded plate by each parameter.
     pub force_slope: Vec<f64>,
+    /// The solution's derivative by each parameter, one after the other.
+    pub columns: Vec<f64>,
     /// Displacement at the observations for a unit of each parameter.
     pub rows: Vec<Vec<[f64; 3]>>,
     /// Iterations.
     pub iterations: usize,
     /// Factorisations.
     pub factorisations: usize,
+}
+
+impl Estimate {
+    /// The state a (small) step further: moduli and plates by the step, the solution to first order.
+    pub fn advanced(&self, free: &[usize], step: &[f64]) -> State {
+        let mut out = self.state.clone();
+        let mut values = step.iter().copied();
+        free.iter().for_each(|&r| out.theta[r] += values.next().unwrap_or(0.0));
+        out.plates.iter_mut().flatten().for_each(|c| *c += values.next().unwrap_or(0.0));
+        if let Some(x) = &mut out.x {
+            for (column, s) in self.columns.chunks_exact(x.len()).zip(step) {
+                x.iter_mut().zip(column).for_each(|(v, c)| *v += s * c);
+            }
+        }
+        out
+    }
 }
 
 impl Setup<'_> {
@@ -357,6 +375,7 @@ impl Setup<'_> {
             effective: samples / inflation,
             force,
             force_slope,
+            columns,
             rows,
             iterations,
             factorisations,

@@ -1,7 +1,7 @@
 //! Results back on voxels and nodes.
 
 use crate::stiffness::body::Body;
-use crate::stiffness::identify::Estimate;
+use crate::stiffness::identify::State;
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
 use crate::types::stiffness::{Prescribed, RegionStiffness, StiffnessParams};
@@ -62,16 +62,16 @@ pub fn noise(
 }
 
 /// The model's displacement of each node (mm, RAS).
-pub fn node_displacement(body: &Body, estimate: &Estimate) -> Vec<[f64; 3]> {
-    let Some(x) = &estimate.state.x else { return vec![[0.0; 3]; body.places.len()] };
+pub fn node_displacement(body: &Body, state: &State) -> Vec<[f64; 3]> {
+    let Some(x) = &state.x else { return vec![[0.0; 3]; body.places.len()] };
     (0..body.places.len() as u32).map(|n| body.displacement(x, n)).collect()
 }
 
 /// What the patches prescribe.
-pub fn prescribed(level: &Level, estimate: &Estimate) -> Vec<Prescribed> {
+pub fn prescribed(level: &Level, state: &State) -> Vec<Prescribed> {
     let mut out = Vec::new();
     for (i, patch) in level.patches.iter().enumerate() {
-        for tie in patch.ties(&level.body, &estimate.state.plates[i]) {
+        for tie in patch.ties(&level.body, &state.plates[i]) {
             out.push(Prescribed { node: tie.node, patch: i as u8, direction: tie.direction, displacement: tie.target });
         }
     }

@@ -282,7 +282,7 @@ fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
     let lag = |&n: &u32| {
         let p = body.places[n as usize];
         let depth = face - height(p);
-        if !(0.0..1.5 * voxel).contains(&depth) || apart < 4.0 * voxel {
+        if !(0.0..3.0 * voxel).contains(&depth) || apart < 4.0 * voxel {
             return [0.0; 3];
         }
         let own = rigid_motion(&patch.rigid, patch.middle, patch.radius, p);
