@@ -101,7 +101,11 @@ fn labelled(
     let setup = fine.setup(choice.law, params.poisson, reference);
     let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
     let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid())?;
-    let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| estimate.advanced(&setup.free(), &g.step));
+    let corrected = |step: &[f64]| {
+        let x = estimate.state.x.as_deref().unwrap_or_default();
+        setup.advanced(&estimate.state, x, &estimate.columns, step)
+    };
+    let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
     let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n);
     let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
     let count = fine.body.labels.len();

@@ -190,8 +190,34 @@ impl<'a> Problem<'a> {
         }
     }
 
+    /// Solves from `start` by steps with the factorised tangent of a problem nearby (the chord method); none where these do
+    /// not contract. `precision` (mm) ends it.
+    pub fn solve_near(&self, start: &[f64], factor: &Factor<'_>, precision: f64) -> Option<Vec<f64>> {
+        let (mut x, mut last) = (start.to_vec(), f64::INFINITY);
+        for _ in 0..STEPS {
+            let mut step = self.residual(&x)?;
+            step.iter_mut().for_each(|v| *v = -*v);
+            factor.solve(&mut step).ok()?;
+            x.iter_mut().zip(&step).for_each(|(v, s)| *v += s);
+            let size = self.size(&step);
+            if size < precision {
+                return Some(x);
+            }
+            if size > 0.5 * last {
+                return None;
+            }
+            last = size;
+        }
+        None
+    }
+
+    /// The largest component of a displacement (mm).
+    fn size(&self, x: &[f64]) -> f64 {
+        let all = (0..self.body.places.len() as u32).flat_map(|n| self.body.displacement(x, n));
+        all.fold(0.0, |m: f64, v| m.max(v.abs()))
+    }
+
     fn newton(&self, mut x: Vec<f64>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
-        let body = self.body;
         let mut last = f64::INFINITY;
         for steps in 1..=STEPS {
             let factor = self.factorise(&x)?;
@@ -210,9 +236,7 @@ impl<'a> Problem<'a> {
                 }
             };
             x = moved;
-            let size = (0..body.places.len() as u32)
-                .flat_map(|n| body.displacement(&step, n))
-                .fold(0.0, |m: f64, v| m.max(v.abs()));
+            let size = self.size(&step);
             if part == 1.0 && (size < precision || (size < 1e-3 && size * size / last.max(1e-300) < 0.1 * precision)) {
                 return Ok(Solution { x, factor, steps });
             }

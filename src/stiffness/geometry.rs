@@ -20,6 +20,8 @@ const FLAT: f64 = 0.2;
 const DILUTION: f64 = 100.0;
 /// Power of the distance from the middle with which an offset fades inwards: the outermost tenth moves by two thirds or more.
 const FADE: i32 = 4;
+/// Precision of the solutions (mm).
+const PRECISION: f64 = 1e-6;
 
 /// What the faces' offsets change.
 #[derive(Debug, Clone, Default)]
@@ -43,22 +45,26 @@ pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option
     let Some(x) = estimate.state.x.as_deref().filter(|_| !faces.is_empty()) else { return Ok(None) };
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
     let mut rows = estimate.rows.clone();
+    let factor = setup.problem(&estimate.state).factorise(x)?;
     let mut force_slope = Vec::new();
     for &(axis, positive) in &faces {
         let body = shifted(setup.body, grid, axis, positive, FACE);
         let found = find(&body, &places);
         let moved = Setup { body: &body, ..setup.clone() };
-        let (problem, solution) = moved.solve(&estimate.state, 1e-5)?;
+        let problem = moved.problem(&estimate.state);
+        let y = match problem.solve_near(x, &factor, PRECISION) {
+            Some(y) => y,
+            None => problem.solve(Some(x), PRECISION)?.x,
+        };
         let column = setup.observations.iter().zip(&found).map(|(o, f)| {
             let old = o.read(setup.body, x);
             f.map_or([0.0; 3], |(element, weights)| {
-                let new =
-                    crate::stiffness::observations::Observation { element, weights, ..*o }.read(&body, &solution.x);
+                let new = crate::stiffness::observations::Observation { element, weights, ..*o }.read(&body, &y);
                 std::array::from_fn(|a| (new[a] - old[a]) / FACE)
             })
         });
         rows.push(column.collect());
-        let force = moved.forces(&problem, &estimate.state, &solution.x)[0];
+        let force = moved.forces(&problem, &estimate.state, &y)[0];
         force_slope.push((force / estimate.force[0]).ln() / FACE);
     }
     let p = rows.len();
