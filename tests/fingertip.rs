@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::error::FingertipError;
-use palpate::fingertip::{columns, force, reduce};
+use palpate::fingertip::{columns, force, profile_force, reduce};
 use palpate::io;
 use palpate::pipeline::fingertip::run;
 use palpate::types::fingertip::PadModel;
@@ -81,6 +81,27 @@ fn one_modulus_layers_and_map_are_told_apart() {
     let map = pad([60, 30, 40], 0.25, 6.0, step);
     let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(2.0)).unwrap();
     assert_eq!(out.pad.model, PadModel::Map, "{:?}", out.pad.residuals);
+}
+
+#[test]
+fn unlike_springs_on_a_hemisphere_give_the_pads_force() {
+    // A constant profile is the closed form.
+    let flat = vec![[0.0, 30.0], [1.0, 30.0], [4.0, 30.0]];
+    for d in [0.5, 2.0, 3.5] {
+        let truth = 1e-3 * std::f64::consts::PI * 30.0 * d * d;
+        assert!((profile_force(&flat, d) / truth - 1.0).abs() < 1e-3, "{d}");
+    }
+    // Springs that get stiffer outwards, E = 10 + 20 s: F = pi 10 d^2 + 2 pi 20 d^3 / 6.
+    let line: Vec<[f64; 2]> = (0..9).map(|k| f64::from(k) * 0.5).map(|s| [s, 10.0 + 20.0 * s]).collect();
+    for d in [0.7f64, 2.0, 3.9] {
+        let truth = 1e-3 * std::f64::consts::PI * (10.0 * d * d + 20.0 * d.powi(3) / 3.0);
+        assert!((profile_force(&line, d) / truth - 1.0).abs() < 1e-3, "{d}");
+    }
+    // A flat pad is no hemisphere, and springs that are soft outside press more like it.
+    let map = pad([40, 40, 24], 0.5, 10.0, |_| 25.0);
+    let out = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(2.0)).unwrap().pad;
+    assert!(out.hemisphere_residual > 0.1 && out.profile_residual < 0.5 * out.hemisphere_residual && out.tabulated());
+    assert!(out.profile[0][1] > 3.0 * out.profile.last().unwrap()[1], "{:?}", out.profile);
 }
 
 #[test]

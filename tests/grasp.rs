@@ -54,6 +54,18 @@ fn gauss(n: usize) -> Vec<(f64, f64)> {
 /// pressed by `d` against a face with the outward direction `normal` (from the tip to the face), their feet dragged by
 /// `d_t` along `tangent`; all in the world frame, summed over the cap that the face cuts off.
 fn summed_springs(axis: [f64; 2], normal: [f64; 2], tangent: [f64; 2], d: f64, d_t: f64) -> f64 {
+    summed_unlike_springs(axis, normal, tangent, d, d_t, &|_| E)
+}
+
+/// The same where Young's modulus depends on how far (m) a spring ends behind the foremost one, along the axis.
+fn summed_unlike_springs(
+    axis: [f64; 2],
+    normal: [f64; 2],
+    tangent: [f64; 2],
+    d: f64,
+    d_t: f64,
+    modulus: &impl Fn(f64) -> f64,
+) -> f64 {
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
     let side = [-normal[1], normal[0]];
     let (turns, rim) = (24, 1.0 - d / A);
@@ -71,7 +83,7 @@ fn summed_springs(axis: [f64; 2], normal: [f64; 2], tangent: [f64; 2], d: f64, d
             let foot = [d_t * tangent[0] - pressed * axis[0], d_t * tangent[1] - pressed * axis[1]];
             // dS / L = A dOmega, whatever the tilt.
             let solid_angle = 0.5 * (1.0 - rim) * weight * 2.0 * PI / f64::from(turns);
-            energy += 0.5 * E * A * dot(foot, foot) * solid_angle;
+            energy += 0.5 * modulus(A * (1.0 - dot(u, axis))) * A * dot(foot, foot) * solid_angle;
         }
     }
     energy
@@ -832,4 +844,80 @@ fn an_ensemble_is_the_same_for_any_number_of_threads() {
     assert_eq!(one[4].as_ref().unwrap().motions, lone.motions);
     let hang = |r: &Result<GraspRun, GraspError>| r.as_ref().unwrap().motions[0].reached.pose[1];
     assert!(one.windows(2).all(|pair| hang(&pair[1]) < hang(&pair[0])));
+}
+
+/// A scene with a tabulated fingertip.
+fn tabulated(profile: Vec<[f64; 2]>) -> Scene {
+    let mut scene = Scene::reference();
+    scene.fingertip.model = FingertipModel::Tabulated;
+    scene.fingertip.profile = profile;
+    scene
+}
+
+#[test]
+fn a_uniform_table_is_the_closed_form() {
+    let closed = Parallel { stiffness: PI * E };
+    for profile in [Vec::new(), vec![[0.0, E], [0.004, E], [0.02, E]]] {
+        let mut fingertip = tabulated(profile).fingertip;
+        (fingertip.radius, fingertip.youngs_modulus) = (A, E);
+        let table = tip_of(&fingertip, FingertipModel::Tabulated);
+        for (d, d_t, tilt) in [(3e-3, 1e-3, 0.3), (5e-3, -2e-3, -0.4), (1e-4, 2e-6, 0.0), (8e-3, 1e-3, 0.5)] {
+            let tilt = Tilt::of(tilt);
+            assert!(relative(table.energy(d, d_t, tilt), closed.energy(d, d_t, tilt)) < 1e-9);
+            let [g, h] = [table.gradient(d, d_t, tilt), closed.gradient(d, d_t, tilt)];
+            let size = PI * E * d * d;
+            assert!((g.normal - h.normal).abs() < 1e-6 * size && (g.tangential - h.tangential).abs() < 1e-6 * size);
+            assert!((g.moment - h.moment).abs() < 1e-6 * size * d);
+            let [g, h] = [table.curvature(d, d_t, tilt), closed.curvature(d, d_t, tilt)];
+            for (i, j) in (0..3).flat_map(|i| (0..3).map(move |j| (i, j))) {
+                assert!((g[i][j] - h[i][j]).abs() < 1e-6 * PI * E * d, "{i}{j}: {} {}", g[i][j], h[i][j]);
+            }
+        }
+    }
+    // And so is a whole run.
+    let mut scene = short();
+    let closed = simulate(&scene, &|_| {}).unwrap();
+    scene.fingertip.model = FingertipModel::Tabulated;
+    let table = simulate(&scene, &|_| {}).unwrap();
+    assert_eq!(closed.samples.len(), table.samples.len());
+    for (a, b) in closed.samples.iter().zip(&table.samples) {
+        for (a, b) in a.row().iter().zip(b.row()) {
+            assert!((a - b).abs() < 1e-6 * a.abs().max(1.0), "{a} {b}");
+        }
+    }
+}
+
+#[test]
+fn a_table_is_the_sum_of_its_unlike_springs() {
+    let modulus = |depth: f64| E * (1.0 + 40.0 * depth + 3.0 * (depth / 0.01).powi(2));
+    let table = palpate::grasp::tabulated::Tabulated::new(A, modulus);
+    for (d, d_t, tilt) in [(1.5e-3, 0.0, 0.0), (4e-3, 1e-3, 0.2), (6e-3, -1.5e-3, -0.35), (9e-3, 5e-4, 0.5)] {
+        let (normal, tangent) = ([f64::cos(tilt), f64::sin(tilt)], [-f64::sin(tilt), f64::cos(tilt)]);
+        let summed = summed_unlike_springs([1.0, 0.0], normal, tangent, d, d_t, &modulus);
+        let energy = table.energy(d, d_t, Tilt::of(tilt));
+        assert!(relative(energy, summed) < 2e-3, "d {d}, d_t {d_t}, tilt {tilt}: {energy}, {summed}");
+    }
+    // Derivatives are those of the energy.
+    let (h, at) = (1e-6, (4e-3, 1e-3, 0.2));
+    let energy = |d: f64, t: f64, a: f64| table.energy(d, t, Tilt::of(a));
+    let g = table.gradient(at.0, at.1, Tilt::of(at.2));
+    let size = PI * E * at.0 * at.0;
+    let slope = (energy(at.0 + h * A, at.1, at.2) - energy(at.0 - h * A, at.1, at.2)) / (2.0 * h * A);
+    assert!((slope - g.normal).abs() < 1e-6 * size, "{slope} {}", g.normal);
+    let slope = (energy(at.0, at.1, at.2 + h) - energy(at.0, at.1, at.2 - h)) / (2.0 * h);
+    assert!((slope - g.moment).abs() < 1e-6 * size * A, "{slope} {}", g.moment);
+    let moment = |a: f64| table.gradient(at.0, at.1, Tilt::of(a)).moment;
+    let bend = (moment(at.2 + h) - moment(at.2 - h)) / (2.0 * h);
+    let curvature = table.curvature(at.0, at.1, Tilt::of(at.2));
+    assert!((bend - curvature[2][2]).abs() < 1e-5 * size * A, "{bend} {}", curvature[2][2]);
+    let normal = |d: f64| table.gradient(d, at.1, Tilt::of(at.2)).normal;
+    let bend = (normal(at.0 + h * A) - normal(at.0 - h * A)) / (2.0 * h * A);
+    assert!((bend - curvature[0][0]).abs() < 1e-5 * size / A, "{bend} {}", curvature[0][0]);
+}
+
+#[test]
+fn a_soft_middle_on_a_stiff_rim_holds() {
+    let scene = tabulated(vec![[0.0, 0.5 * E], [0.001, 0.8 * E], [0.004, 2.0 * E]]);
+    let run = simulate(&scene, &|_| {}).unwrap();
+    assert!(run.completed, "{:?}", run.events);
 }

@@ -91,6 +91,63 @@ fn calculix_solves_our_model_to_our_displacements() {
     run_calculix(&results, &summary);
 }
 
+/// The block of [`folder`] in `frames` noisy frames as `palpate track` leaves them; frame 1 is the reference, the last is at rest.
+fn tracked(frames: usize) -> TempDir {
+    let folder = folder();
+    let field = io::read_field(folder.path().join("field.nii.gz")).unwrap();
+    let mut random = palpate::numerics::random::Random::new(3, 1);
+    for frame in (0..frames).filter(|&f| f != 1) {
+        let mut noisy = DenseField::zeros(*field.grid());
+        if frame + 1 < frames {
+            for (v, u) in noisy.as_mut_slice().iter_mut().zip(field.as_slice()) {
+                *v = u + 0.03 * random.normals()[0] as f32;
+            }
+        }
+        io::write_field(folder.path().join(format!("displacement_{frame}.nii.gz")), &noisy).unwrap();
+    }
+    fs::write(folder.path().join("summary.json"), r#"{"command": "track", "reference": 1}"#).unwrap();
+    folder
+}
+
+#[test]
+fn frames_share_a_map_and_lower_its_noise() {
+    let folder = tracked(8);
+    let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1000", "--model", "linear"];
+    let forces = ["--forces", "0.1,0.1,0.1,0.1,0.1,0.1,0.1", "-o", "shared"];
+    let (out, _) = run(folder.path(), &[&base[..], &forces].concat(), 0);
+    assert!(out.contains("6 of 7 share these moduli"), "{out}");
+    let read = |file: &str| fs::read_to_string(folder.path().join("shared").join(file)).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&read("summary.json")).unwrap();
+    for r in summary["regions"].as_array().unwrap() {
+        let [e, sd] = ["youngs_modulus", "sd"].map(|k| r[k].as_f64().unwrap());
+        assert!((e - 23.148).abs() < 2.0 * sd, "{e} +- {sd}");
+        let gains = summary["sequence"]["gains"][r["label"].to_string()].as_array().unwrap();
+        assert_eq!(gains.len(), 6);
+        let part = |g: &serde_json::Value| g["data_sd"].as_f64().unwrap() / g["value"].as_f64().unwrap();
+        // One over the root of 6 is 0.41; frames differ in what they claim and in chance.
+        let fell = part(&gains[5]) / part(&gains[0]);
+        assert!((0.25..0.65).contains(&fell), "{fell}");
+    }
+    let frames = read("frames.csv");
+    assert_eq!(frames.lines().count(), 1 + 2 * 6 + 1, "{frames}");
+    assert!(frames.contains("\n7,0.000000,,,,,,,"), "{frames}");
+    assert!(read("report.html").contains("first over root of frames"));
+}
+
+#[test]
+fn what_is_no_sequence_is_refused() {
+    let folder = tracked(3);
+    let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "-o", "results"];
+    let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1"]].concat(), 2);
+    assert!(err.contains("1 forces for 2 frames"), "{err}");
+    let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1,-1"]].concat(), 2);
+    assert!(err.contains("-1") && err.contains("above 0 N"), "{err}");
+    fs::write(folder.path().join("summary.json"), r#"{"command": "field"}"#).unwrap();
+    let (_, err) = run(folder.path(), &base, 1);
+    assert!(err.contains("summary.json") && err.contains("palpate track"), "{err}");
+    assert!(!folder.path().join("results").exists());
+}
+
 /// The sections of a FEBio 4 file, in the order its manual gives, each opened and closed.
 fn check_febio(text: &str) {
     assert!(text.contains("<febio_spec version=\"4.0\">"));

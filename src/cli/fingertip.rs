@@ -5,6 +5,7 @@ use super::inputs::{check_output_file, name};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::FingertipError;
+use palpate::fingertip::profile_force;
 use palpate::io::{self, StiffnessFolder};
 use palpate::pipeline::fingertip::{PadOutcome, run as reduce};
 use palpate::report::figure::sheet;
@@ -101,6 +102,13 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             calibration * pad.hemisphere_kpa
         );
     }
+    text += &match pad.tabulated() {
+        true => format!(
+            "  grasp        springs of unlike modulus, a table (forces off by {:.1} %)\n",
+            100.0 * pad.profile_residual
+        ),
+        false => "  grasp        the hemisphere of one modulus\n".into(),
+    };
     if radius > 2.0 * pad.thickness_mm {
         console.warn("the pad is flat: a hemisphere is a poor picture of it");
     }
@@ -119,11 +127,12 @@ fn picture(outcome: &PadOutcome, force_n: Option<f64>) -> String {
         line("columns", 0, false, &|c| c[1]),
         line("one modulus", 1, true, &|c| c[2]),
         line("hemisphere", 2, true, &square),
+        line("unlike springs", 3, false, &|c| profile_force(&pad.profile, c[0])),
     ];
     let marks: Vec<(f64, bool)> = outcome.at_press.iter().map(|p| (p[0], false)).collect();
     if let (Some([depth, _]), Some(force)) = (outcome.at_press, force_n) {
         let arm = 0.02 * pad.curve.last().map_or(1.0, |c| c[0]);
-        lines.push(Line::new("measured", 3, false, vec![[depth - arm, force], [depth + arm, force]]));
+        lines.push(Line::new("measured", 1, false, vec![[depth - arm, force], [depth + arm, force]]));
     }
     let plot = Plot { title: "Force on the pad, N, over indentation", across: "mm", marks: &marks }.draw(&lines);
     sheet("Finger pad as a fingertip", &[plot], 1)

@@ -32,6 +32,7 @@ mod skin;
 mod track;
 
 mod stiffness;
+mod stiffness_sequence;
 
 mod warp;
 

@@ -5,18 +5,19 @@ use super::console::Console;
 use super::inputs::{check_distinct, name, read_mask, warn_all};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline;
 use palpate::pipeline::stiffness::Inputs;
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
-use palpate::types::{Grid, Mask, StiffnessParams, StiffnessResult};
+use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// What is written.
-const FILES: [&str; 9] = [
+pub(super) const FILES: [&str; 9] = [
     "stiffness.nii.gz",
     "stiffness_sd.nii.gz",
     "residual.nii.gz",
@@ -30,27 +31,34 @@ const FILES: [&str; 9] = [
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Displacement field, initial to deformed (5-D NIfTI, LPS mm)
-    #[arg(long, value_name = "F")]
-    field: PathBuf,
-    /// Use these matches inside the body, with their precision, in place of the field (matches.csv)
-    #[arg(long, value_name = "M.csv")]
+    /// Displacement field, initial to deformed (5-D NIfTI, LPS mm), or a folder of palpate field
+    #[arg(long, value_name = "F", required_unless_present = "sequence")]
+    field: Option<PathBuf>,
+    /// A folder of palpate track: one stiffness map for all its frames
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["field", "matches", "force"])]
+    sequence: Option<PathBuf>,
+    /// Sequence: total force in each frame but the reference, in order, in N; without, moduli are ratios
+    #[arg(long, value_name = "N,N,...", requires = "sequence", value_delimiter = ',')]
+    pub(super) forces: Vec<f64>,
+    /// Matches to use inside the body, with their precision, in place of the field, which smoothness flattens; none for the
+    /// field itself [default: matches.csv of the same results of palpate field, if any]
+    #[arg(long, value_name = "M.csv|none")]
     matches: Option<PathBuf>,
     /// The body: a mask on the field's grid; regions are then looked for
     #[arg(long, value_name = "M", conflicts_with = "labels", required_unless_present = "labels")]
     mask: Option<PathBuf>,
     /// Regions: a label map on the field's grid, 0 outside
     #[arg(long, value_name = "L")]
-    labels: Option<PathBuf>,
+    pub(super) labels: Option<PathBuf>,
     /// Names of the labels, as 1=skin,2=fat
     #[arg(long, value_name = "NAMES", requires = "labels")]
     names: Option<String>,
     /// Where the body is held: x-, x+ ... z+ in world axes, or a mask that covers the patch
     #[arg(long, value_name = "AXIS|FILE", default_value = "z-", allow_hyphen_values = true)]
-    held: String,
+    pub(super) held: String,
     /// Where it is pressed, in the same way
     #[arg(long, value_name = "AXIS|FILE", default_value = "z+", allow_hyphen_values = true)]
-    load: String,
+    pub(super) load: String,
     /// Total force on the loaded patch in N, its magnitude; without, moduli are ratios
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<f64>,
@@ -68,10 +76,10 @@ pub struct Options {
     regions: usize,
     /// Folder for the results
     #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
+    pub(super) output: PathBuf,
     /// Write into a folder that is not empty
     #[arg(long)]
-    overwrite: bool,
+    pub(super) overwrite: bool,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
@@ -80,50 +88,134 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     params.check()?;
     let body = options.labels.as_ref().or(options.mask.as_ref());
     let Some(body) = body else { bail!(Usage("give --labels or --mask".into())) };
-    let places = [&options.held, &options.load].map(|t| Side::parse(t).is_none().then(|| PathBuf::from(t)));
-    let given: Vec<&Path> = [Some(&options.field), Some(body), options.matches.as_ref()]
+    match (&options.sequence, &options.field) {
+        (Some(folder), _) => super::stiffness_sequence::run(options, &params, folder, body, console),
+        (None, Some(field)) => one(options, &params, field, body, console),
+        (None, None) => bail!(Usage("give --field or --sequence".into())),
+    }
+}
+
+/// Files named for the patches.
+pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
+    let named = [&options.held, &options.load].into_iter().filter(|t| Side::parse(t).is_none());
+    named.map(PathBuf::from).collect()
+}
+
+fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
+    let source = Source::of(field, options.matches.as_deref());
+    let patches = patch_files(options);
+    let given: Vec<&Path> = [Some(source.field.as_path()), Some(body), source.matches.as_deref()]
         .into_iter()
-        .chain(places.iter().map(Option::as_ref))
         .flatten()
-        .map(PathBuf::as_path)
+        .chain(patches.iter().map(PathBuf::as_path))
         .collect();
     check_distinct(&given, &FILES.map(|f| options.output.join(f)))?;
 
     let started = Instant::now();
     let progress = console.progress();
     progress.set("read", 0.0);
-    let field = io::read_field(&options.field)?;
-    let mut labels = read_mask(body, field.grid(), &options.field)?;
-    if options.labels.is_none() {
-        labels.as_mut_slice().iter_mut().for_each(|v| *v = u8::from(*v > 0));
-    }
-    let matches = options.matches.as_ref().map(io::read_matches).transpose()?;
-    let held = place(&options.held, field.grid(), &options.field, "--held")?;
-    let load = place(&options.load, field.grid(), &options.field, "--load")?;
-    let names = names(options.names.as_deref(), &labels)?;
+    let field = io::read_field(&source.field)?;
+    let setting = Setting::read(options, body, field.grid(), &source.field)?;
+    let matches = source.matches.as_ref().map(io::read_matches).transpose()?;
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let read = started.elapsed().as_secs_f64();
 
-    let inputs = Inputs {
-        field: &field,
-        matches: matches.as_ref(),
-        labels: &labels,
-        labelled: options.labels.is_some(),
-        held: &held,
-        load: &load,
-        names: &|label| names[label as usize].clone(),
-    };
-    let result = pipeline::stiffness::run(&inputs, &params, &|s, f| progress.set(s, f));
-    let mut result = result.with_context(|| format!("{} with {}", name(&options.field), name(body)))?;
+    let result = setting.run(&field, matches.as_ref(), params, &|s, f| progress.set(s, f));
+    let mut result = result.with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
     result.seconds.insert(0, ("read".into(), read));
     progress.set("write", 1.0);
-    write(&mut folder, options, body, &mut result)?;
+    let names = report::InputNames {
+        field: name(&source.field),
+        body: name(body),
+        matches: source.matches.as_deref().map(name),
+        held: options.held.clone(),
+        load: options.load.clone(),
+    };
+    write(&mut folder, &mut result)?;
+    folder.write("summary.json", |p| io::write_json(p, &report::summary(&result, &names)))?;
+    let page = report::page(&result, &names)?;
+    folder.write("report.html", |p| io::write_text(p, &page))?;
     folder.commit()?;
     drop(progress);
     result.evidence.iter().for_each(|e| console.detail(&report::evidence_line(e)));
     result.seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.2} s")));
     warn_all(console, &result.warnings);
-    console.say(&format!("{}  results      {}", report::text(&result), options.output.join("report.html").display()))
+    let used = match &source.matches {
+        Some(path) if options.matches.is_none() => {
+            format!("  data         {} beside the field; --matches none takes the field itself\n", name(path))
+        }
+        _ => String::new(),
+    };
+    let page = options.output.join("report.html");
+    console.say(&format!("{}{used}  results      {}", report::text(&result), page.display()))
+}
+
+/// Where the motion is read from.
+struct Source {
+    field: PathBuf,
+    matches: Option<PathBuf>,
+}
+
+impl Source {
+    /// The matches of the same results are taken where none are named: the field between them is smoothed, which flattens
+    /// strain and with it a contrast.
+    fn of(given: &Path, matches: Option<&Path>) -> Self {
+        let folder = given.is_dir();
+        let field = if folder { given.join("displacement.nii.gz") } else { given.to_path_buf() };
+        let beside = || {
+            let ours = folder || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
+            let [found, summary] = ["matches.csv", "summary.json"].map(|f| field.with_file_name(f));
+            (ours && found.is_file() && summary.is_file()).then_some(found)
+        };
+        let matches = match matches {
+            Some(path) if path.as_os_str() == "none" => None,
+            Some(path) => Some(path.to_path_buf()),
+            None => beside(),
+        };
+        Self { field, matches }
+    }
+}
+
+/// What holds for every field of a run.
+pub(super) struct Setting {
+    pub(super) labels: Mask,
+    labelled: bool,
+    held: Place,
+    load: Place,
+    names: Vec<String>,
+}
+
+impl Setting {
+    pub(super) fn read(options: &Options, body: &Path, grid: &Grid, reference: &Path) -> Result<Self> {
+        let mut labels = read_mask(body, grid, reference)?;
+        if options.labels.is_none() {
+            labels.as_mut_slice().iter_mut().for_each(|v| *v = u8::from(*v > 0));
+        }
+        let held = place(&options.held, grid, reference, "--held")?;
+        let load = place(&options.load, grid, reference, "--load")?;
+        let names = names(options.names.as_deref(), &labels)?;
+        Ok(Self { labels, labelled: options.labels.is_some(), held, load, names })
+    }
+
+    /// The pipeline's view of it with `field`.
+    pub(super) fn run(
+        &self,
+        field: &DenseField,
+        matches: Option<&SparseField>,
+        params: &StiffnessParams,
+        progress: pipeline::stiffness::Progress<'_>,
+    ) -> Result<StiffnessResult, StiffnessError> {
+        let inputs = Inputs {
+            field,
+            matches,
+            labels: &self.labels,
+            labelled: self.labelled,
+            held: &self.held,
+            load: &self.load,
+            names: &|label| self.names[label as usize].clone(),
+        };
+        pipeline::stiffness::run(&inputs, params, progress)
+    }
 }
 
 fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place> {
@@ -155,7 +247,7 @@ fn names(given: Option<&str>, labels: &Mask) -> Result<Vec<String>> {
     Ok(out)
 }
 
-fn write(folder: &mut OutputFolder, options: &Options, body: &Path, result: &mut StiffnessResult) -> Result<()> {
+pub(super) fn write(folder: &mut OutputFolder, result: &mut StiffnessResult) -> Result<()> {
     let started = Instant::now();
     let about = match result.absolute {
         true => "palpate: Young's modulus, kPa",
@@ -175,15 +267,5 @@ fn write(folder: &mut OutputFolder, options: &Options, body: &Path, result: &mut
     folder.write("model.feb", |p| io::write_feb(p, result))?;
     folder.write("model.inp", |p| io::write_inp(p, result))?;
     result.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
-    let inputs = report::InputNames {
-        field: name(&options.field),
-        body: name(body),
-        matches: options.matches.as_deref().map(name),
-        held: options.held.clone(),
-        load: options.load.clone(),
-    };
-    folder.write("summary.json", |p| io::write_json(p, &report::summary(result, &inputs)))?;
-    let page = report::page(result, &inputs)?;
-    folder.write("report.html", |p| io::write_text(p, &page))?;
     Ok(())
 }

@@ -121,6 +121,7 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     // The hemisphere whose force pi E d^2 is nearest: what the grasp simulator presses.
     let square: Vec<f64> = depths.iter().map(|d| 1e-3 * std::f64::consts::PI * d * d).collect();
     let hemisphere = dot(&square, &map) / dot(&square, &square).max(f64::MIN_POSITIVE);
+    let profile = profile(&depths, &map, hemisphere);
     PadReduction {
         model,
         effective_kpa: effective,
@@ -131,7 +132,67 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
         residuals,
         curve: depths.iter().zip(&map).zip(&uniform).map(|((d, m), u)| [*d, *m, *u]).collect(),
         columns: columns.len(),
+        profile_residual: residual(&depths.iter().map(|&d| profile_force(&profile, d)).collect::<Vec<_>>()),
+        profile,
     }
+}
+
+/// Knots of a profile.
+const KNOTS: usize = 7;
+/// Weight of a profile's bends over that of its misfit: enough for the steps of voxels not to show.
+const STIFF: f64 = 1e-4;
+/// Least modulus of a profile, over the mean.
+const LEAST: f64 = 0.02;
+
+/// Force (N) at `depth` (mm) of a hemisphere with moduli (kPa) by the depth at which its springs are reached:
+/// `F = int 2 pi E(s) (d - s) ds`, whatever its radius.
+pub fn profile_force(profile: &[[f64; 2]], depth: f64) -> f64 {
+    (0..profile.len()).map(|k| profile[k][1] * hat_force(profile, k, depth)).sum()
+}
+
+/// The part of knot `k` for a modulus of 1 kPa.
+fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
+    const STEPS: usize = 200;
+    let step = depth / STEPS as f64;
+    let hat = |s: f64| {
+        let at = profile[k][0];
+        match (k.checked_sub(1).map(|i| profile[i][0]), profile.get(k + 1).map(|p| p[0])) {
+            (Some(low), _) if s < at => ((s - low) / (at - low)).max(0.0),
+            (_, Some(high)) if s > at => ((high - s) / (high - at)).max(0.0),
+            _ => 1.0,
+        }
+    };
+    let all = (0..STEPS).map(|i| (i as f64 + 0.5) * step);
+    all.map(|s| 2e-3 * std::f64::consts::PI * hat(s) * (depth - s) * step).sum()
+}
+
+/// The moduli above [`LEAST`] whose forces are nearest to `force` at `depths`: least squares with a small weight on bends, by
+/// coordinate descent.
+fn profile(depths: &[f64], force: &[f64], mean: f64) -> Vec<[f64; 2]> {
+    let deepest = depths.last().copied().unwrap_or(1.0);
+    let mut out: Vec<[f64; 2]> = (0..KNOTS).map(|k| [deepest * k as f64 / (KNOTS - 1) as f64, mean]).collect();
+    let rows: Vec<Vec<f64>> = depths.iter().map(|&d| (0..KNOTS).map(|k| hat_force(&out, k, d)).collect()).collect();
+    let (mut a, mut b) = ([[0.0; KNOTS]; KNOTS], [0.0; KNOTS]);
+    for (row, f) in rows.iter().zip(force) {
+        for i in 0..KNOTS {
+            b[i] += row[i] * f;
+            (0..KNOTS).for_each(|j| a[i][j] += row[i] * row[j]);
+        }
+    }
+    let weight = STIFF * (0..KNOTS).map(|i| a[i][i]).sum::<f64>();
+    for i in 1..KNOTS - 1 {
+        let bend = [(i - 1, 1.0), (i, -2.0), (i + 1, 1.0)];
+        for (r, x) in bend {
+            bend.iter().for_each(|&(s, y)| a[r][s] += weight * x * y);
+        }
+    }
+    for _ in 0..2000 {
+        for i in 0..KNOTS {
+            let rest: f64 = (0..KNOTS).filter(|&j| j != i).map(|j| a[i][j] * out[j][1]).sum();
+            out[i][1] = ((b[i] - rest) / a[i][i].max(f64::MIN_POSITIVE)).max(LEAST * mean);
+        }
+    }
+    out
 }
 
 /// Relative residual of the forces below which a smaller model is enough.

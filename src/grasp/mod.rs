@@ -13,6 +13,8 @@
 
 pub mod models;
 
+pub mod tabulated;
+
 pub mod constraints;
 
 pub mod statics;

@@ -5,6 +5,7 @@
 //! Robotics 22(6), 2006, and S. Hirai's slides. The tilt is the angle between the back plate and the object's face, with
 //! the sign of docs/grasp.md; SI units throughout.
 
+use crate::grasp::tabulated::Tabulated;
 use crate::types::{Fingertip, FingertipModel};
 use std::f64::consts::PI;
 
@@ -211,6 +212,7 @@ pub fn tip_of(fingertip: &Fingertip, model: FingertipModel) -> Box<dyn Tip> {
         FingertipModel::ParallelNormal => Box::new(ParallelNormal { stiffness }),
         FingertipModel::Radial => Box::new(Radial { stiffness }),
         FingertipModel::Rigid => Box::new(Rigid),
+        FingertipModel::Tabulated => Box::new(Tabulated::of(fingertip)),
     }
 }
 

@@ -10,6 +10,7 @@ use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
 use crate::grasp::stepping::{self, LIMIT};
+use crate::grasp::tabulated::Tabulated;
 use crate::grasp::watch::Watch;
 use crate::types::grasp::{ConstraintDrift, Event, EventKind, GraspRun, MotionRow, Sample};
 use crate::types::scene::{Formulation, Integrator, Method};
@@ -37,6 +38,7 @@ pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, Grasp
         FingertipModel::ParallelNormal => with_tip(scene, models::ParallelNormal { stiffness }, progress),
         FingertipModel::Radial => with_tip(scene, models::Radial { stiffness }, progress),
         FingertipModel::Rigid => with_tip(scene, models::Rigid, progress),
+        FingertipModel::Tabulated => with_tip(scene, Tabulated::of(&scene.fingertip), progress),
     }
 }
 

@@ -7,6 +7,7 @@ use crate::grasp::models::{self, Tip};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::Plant;
 use crate::grasp::statics::Equilibrium;
+use crate::grasp::tabulated::Tabulated;
 use crate::numerics::dense::spectral_radius;
 use crate::types::grasp::StableStep;
 use crate::types::scene::{Formulation, Method};
@@ -102,6 +103,7 @@ pub fn growth_at(scene: &Scene, method: Method, formulation: Formulation, h: f64
         FingertipModel::ParallelNormal => growth_with(scene, models::ParallelNormal { stiffness }, case, at),
         FingertipModel::Radial => growth_with(scene, models::Radial { stiffness }, case, at),
         FingertipModel::Rigid => growth_with(scene, models::Rigid, case, at),
+        FingertipModel::Tabulated => growth_with(scene, Tabulated::of(&scene.fingertip), case, at),
     }
 }
 

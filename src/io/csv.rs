@@ -126,14 +126,14 @@ pub(super) fn write_table(
     })
 }
 
-struct Table<const N: usize> {
-    numbers: Vec<[f64; N]>,
-    other_columns: Vec<String>,
-    others: Vec<Vec<String>>,
+pub(super) struct Table<const N: usize> {
+    pub(super) numbers: Vec<[f64; N]>,
+    pub(super) other_columns: Vec<String>,
+    pub(super) others: Vec<Vec<String>>,
 }
 
 /// All rows: the named columns as finite numbers, the others as text.
-fn read_table<const N: usize>(path: &Path, names: [&str; N]) -> Result<Table<N>, IoError> {
+pub(super) fn read_table<const N: usize>(path: &Path, names: [&str; N]) -> Result<Table<N>, IoError> {
     let file = File::open(path).map_err(os(path, "read"))?;
     let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(file);
     let header = reader.headers().map_err(|e| damaged(path, e))?.clone();

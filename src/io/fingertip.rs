@@ -104,21 +104,30 @@ pub fn write_fingertip(
     let rows = |k: usize| pad.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
     let name = serde_json::to_value(pad.model).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default();
     let [uniform, layered, _] = pad.residuals;
+    let scaled =
+        |k: usize, by: f64| pad.profile.iter().map(|p| format!("{:.6e}", by * p[k])).collect::<Vec<_>>().join(", ");
+    let springs = if pad.tabulated() {
+        let (depths, moduli) = (scaled(0, 1e-3), scaled(1, 1e3 * calibration));
+        format!("model = \"tabulated\"\nprofile_depth = [{depths}]\nprofile_modulus = [{moduli}]")
+    } else {
+        "model = \"parallel\"".into()
+    };
     let text = format!(
         "# A fingertip for the grasp simulator, from {from}: [fingertip] file = \"this file\"\n\
-         # The hemisphere whose force pi E d^2 is nearest to the pad's. SI units above, mm, kPa and N under [pad].\n\
-         radius = {:.6e}\nyoungs_modulus = {:.6e}\nmodel = \"parallel\"\n\n\
+         # The hemisphere, of one modulus or of unlike springs, whose force is nearest to the pad's. SI units above, mm, kPa and N under [pad].\n\
+         radius = {:.6e}\nyoungs_modulus = {:.6e}\n{springs}\n\n\
          [pad]\n\
          model = \"{name}\"          # the smallest of uniform, layered and map whose forces are the map's to 2 %\n\
          calibration = {calibration:.6}        # measured force over the columns'; columns are free to bulge, tissue is not\n\
          effective_kpa = {:.6}      # one modulus in the pad's own shape\n\
-         residual_uniform = {uniform:.6}\nresidual_layered = {layered:.6}\nresidual_hemisphere = {:.6}\n\
+         residual_uniform = {uniform:.6}\nresidual_layered = {layered:.6}\nresidual_hemisphere = {:.6}\nresidual_profile = {:.6}\n\
          surface_radius_mm = {}\nthickness_mm = {:.6}\ncolumns = {}\n\
          indentation_mm = [{}]\nforce_n = [{}]\nforce_one_modulus_n = [{}]\n",
         1e-3 * radius_mm,
         1e3 * calibration * pad.hemisphere_kpa,
         pad.effective_kpa,
         pad.hemisphere_residual,
+        pad.profile_residual,
         if pad.radius_mm.is_finite() { format!("{:.6}", pad.radius_mm) } else { "inf".into() },
         pad.thickness_mm,
         pad.columns,

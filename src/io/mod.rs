@@ -44,9 +44,9 @@ pub use nifti::{
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use skin::{read_skin_scene, write_response};
-pub use stiffness::{write_feb, write_inp, write_regions};
+pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
 pub use text::{write_bytes, write_json, write_text};
-pub use track::{write_strain, write_trajectories};
+pub use track::{read_trajectories, write_strain, write_trajectories};
 pub use vtu::{write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;

@@ -39,7 +39,7 @@ pub struct SceneFile {
 /// Keys of each table; a test holds them against what is deserialised.
 const KEYS: [(&str, &[&str]); 10] = [
     ("", &["fingertip", "finger", "object", "initial", "gravity", "integrator", "motion", "push", "sweep"]),
-    ("fingertip", &["file", "radius", "youngs_modulus", "damping", "model"]),
+    ("fingertip", &["file", "radius", "youngs_modulus", "damping", "model", "profile_depth", "profile_modulus"]),
     ("finger", &["link", "half_span", "inertia", "gains", "fixed"]),
     ("object", &["width", "height", "mass", "inertia", "friction"]),
     ("initial", &["normal_displacement", "theta", "rest"]),
@@ -228,6 +228,8 @@ struct RawFingertip {
     youngs_modulus: f64,
     damping: Option<[f64; 2]>,
     model: Option<String>,
+    profile_depth: Option<Vec<f64>>,
+    profile_modulus: Option<Vec<f64>>,
 }
 
 #[derive(Deserialize)]
@@ -294,6 +296,16 @@ struct RawPush {
     at: Option<[f64; 2]>,
 }
 
+/// Depths (m) and moduli (Pa) of a tabulated fingertip.
+fn profile(path: &Path, depths: Option<Vec<f64>>, moduli: Option<Vec<f64>>) -> Result<Vec<[f64; 2]>, IoError> {
+    let (depths, moduli) = (depths.unwrap_or_default(), moduli.unwrap_or_default());
+    if depths.len() != moduli.len() {
+        let what = format!("fingertip.profile_depth has {} values, profile_modulus {}", depths.len(), moduli.len());
+        return Err(format(path, what, "give both with as many"));
+    }
+    Ok(depths.into_iter().zip(moduli).map(|(d, e)| [d, e]).collect())
+}
+
 /// A checked scene from its table; what the file leaves out is as in [`Scene::reference`].
 fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene, IoError> {
     let raw: RawScene = Value::Table(table).try_into().map_err(|error: toml::de::Error| {
@@ -315,6 +327,7 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
             (depth_by(depth), depth)
         }
     };
+    let profile = profile(path, tip.profile_depth, tip.profile_modulus)?;
     let model = tip.model.as_deref().map(str::parse::<FingertipModel>).transpose();
     let model = model.map_err(|e| named(e, "fingertip.model"))?.unwrap_or_default();
     let method = integrator.method.as_deref().map(str::parse::<Method>).transpose();
@@ -334,6 +347,7 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
             youngs_modulus: tip.youngs_modulus,
             damping: tip.damping.unwrap_or(default.fingertip.damping),
             model: overrides.model.unwrap_or(model),
+            profile,
         },
         finger: Finger {
             link: finger.link,

@@ -6,12 +6,40 @@
 use super::atomic::write_atomic;
 use super::csv::write_table;
 use crate::error::IoError;
-use crate::types::stiffness::{Law, Prescribed, RegionStiffness, StiffnessResult};
+use crate::types::stiffness::{Law, Prescribed, RegionStiffness, SharedStiffness, StiffnessResult};
 use std::io::{self, Write};
 use std::path::Path;
 
 /// Columns of regions.csv.
 const COLUMNS: [&str; 6] = ["label", "name", "youngs_modulus_kpa", "sd_kpa", "ratio", "identifiable"];
+
+/// Writes a row for each frame and region: frame, motion_mm (mean), residual_mm, label, name, value (kPa, or the ratio without
+/// a force), sd, identifiable; a frame that tells nothing has one row with the reason in `why`.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<(), IoError> {
+    const COLUMNS: [&str; 9] =
+        ["frame", "motion_mm", "residual_mm", "label", "name", "value", "sd", "identifiable", "why"];
+    let number = |v: f64| if v.is_finite() { format!("{v:.6}") } else { String::new() };
+    let absolute = shared.result.absolute;
+    let rows = shared.frames.iter().flat_map(|f| {
+        let start = [f.frame.to_string(), number(f.motion_mm), number(f.residual_mm)];
+        match &f.regions {
+            Err(why) => vec![[&start[..], &vec![String::new(); 5], std::slice::from_ref(why)].concat()],
+            Ok(regions) => regions
+                .iter()
+                .map(|r| {
+                    let [value, sd] = if absolute { [r.youngs_modulus, r.sd] } else { [r.ratio, r.ratio_sd] };
+                    let seen = u8::from(r.identifiable).to_string();
+                    let rest = [r.label.to_string(), r.name.clone(), number(value), number(sd), seen, String::new()];
+                    [&start[..], &rest].concat()
+                })
+                .collect(),
+        }
+    });
+    write_table(path.as_ref(), &COLUMNS, rows)
+}
 
 /// Writes label, name, Young's modulus (kPa), standard deviation (kPa; empty where not identifiable), ratio to the reference
 /// region, identifiable (1 or 0). Without a force the kPa columns are empty.

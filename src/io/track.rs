@@ -1,8 +1,9 @@
 //! Tables of a tracked sequence.
 
-use super::csv::{decimal, write_table};
+use super::csv::{decimal, read_table, write_table};
 use crate::error::IoError;
-use crate::types::{StrainRow, Trajectory};
+use crate::types::{Match, SparseField, StrainRow, Trajectory, WorldPoint};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Writes a row for each point and frame in which its place is known: point, frame, time_s (empty when not known), x, y, z
@@ -33,6 +34,37 @@ pub fn write_trajectories(
         })
     });
     write_table(path.as_ref(), &["point", "frame", "time_s", "x", "y", "z", "sigma", "state"], rows)
+}
+
+/// Reads the points that were measured in each frame, as matches from the reference frame's places.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read, a column is missing or a value is not a finite number.
+pub fn read_trajectories(path: impl AsRef<Path>, reference: usize) -> Result<BTreeMap<usize, SparseField>, IoError> {
+    let table = read_table(path.as_ref(), ["point", "frame", "x", "y", "z", "sigma"])?;
+    let state = table.other_columns.iter().position(|c| c.eq_ignore_ascii_case("state"));
+    let mut start = BTreeMap::new();
+    for &[point, frame, x, y, z, _] in &table.numbers {
+        if frame as usize == reference {
+            start.insert(point as usize, [x, y, z]);
+        }
+    }
+    let mut out: BTreeMap<usize, SparseField> = BTreeMap::new();
+    for (&[point, frame, x, y, z, sigma], rest) in table.numbers.iter().zip(&table.others) {
+        let measured = state.is_none_or(|s| rest[s] == "measured");
+        let Some(&from) = start.get(&(point as usize)).filter(|_| measured && frame as usize != reference) else {
+            continue;
+        };
+        let to = [x, y, z];
+        out.entry(frame as usize).or_default().matches.push(Match {
+            initial: WorldPoint(from),
+            displacement: std::array::from_fn(|a| to[a] - from[a]),
+            ncc: 1.0,
+            covariance: [sigma * sigma, sigma * sigma, sigma * sigma, 0.0, 0.0, 0.0],
+            kept: true,
+        });
+    }
+    Ok(out)
 }
 
 /// Writes a row for each frame and label: mean principal strains e1 (largest) to e3, the 98th percentile of e1 and the

@@ -26,6 +26,8 @@ pub mod bending;
 
 pub mod statistics;
 
+pub mod surface;
+
 pub mod random;
 
 pub mod neighbours;

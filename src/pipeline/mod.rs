@@ -19,4 +19,6 @@ pub mod track;
 
 pub mod stiffness;
 
+pub mod stiffness_sequence;
+
 mod search;

@@ -1,13 +1,14 @@
 //! A displacement field to Young's modulus, region by region.
 
 use crate::error::StiffnessError;
-use crate::mesh::tetrahedral::{Fineness, mesh_labels, pieces};
+use crate::mesh::tetrahedral::{Fineness, mesh_labels, mesh_labels_finer, pieces};
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
 use crate::stiffness::choice::{choose, release};
 use crate::stiffness::identify::State;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
+use crate::stiffness::rim::rim;
 use crate::stiffness::{geometry, maps, summary};
 use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
 use crate::types::{DenseField, Mask, QuadraticMesh, SparseField};
@@ -37,6 +38,10 @@ pub struct Inputs<'a> {
 
 /// Nodes of the coarse mesh over those of the fine one.
 pub(super) const COARSE: f64 = 0.3;
+/// Side of the mesh's cubes at the rim of a punch (voxels); nodes lie at half of it.
+const RIM: f64 = 2.0;
+/// Part of the nodes that is left for the rest of the body then.
+const ELSEWHERE: f64 = 0.6;
 /// Precision of forward solutions on the fine mesh (mm).
 const PRECISION: f64 = 1e-5;
 
@@ -71,7 +76,6 @@ fn labelled(
     let mut clock = Clock { seconds: Vec::new(), since: Instant::now() };
     progress("mesh", 0.0);
     let volume = maps::volume(inputs.labels);
-    let fine_mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, params.nodes))?;
     let coarse_nodes = (COARSE * params.nodes as f64) as usize;
     let coarse_mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, coarse_nodes))?;
     clock.book("mesh");
@@ -80,6 +84,17 @@ fn labelled(
     let level =
         |mesh: &QuadraticMesh| Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load);
     let mut coarse = level(&coarse_mesh)?;
+    let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance());
+    let meshed = |nodes: f64, size: f64| {
+        let nodes = if rim.is_empty() { nodes } else { ELSEWHERE * nodes };
+        let fineness = Fineness::for_nodes(volume, nodes as usize);
+        mesh_labels_finer(inputs.labels, &fineness, &rim, size * coarse.voxel)
+    };
+    let fine_mesh = meshed(params.nodes as f64, RIM)?;
+    if !rim.is_empty() {
+        let mesh = meshed(coarse_nodes as f64, 2.0 * RIM)?;
+        coarse = level(&mesh)?;
+    }
     let mut fine = level(&fine_mesh)?;
     let reference = fine.largest();
     clock.book("read");

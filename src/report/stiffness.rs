@@ -4,12 +4,13 @@ use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::html::{card, document, escape};
 use crate::report::panels::Panel;
+use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
 use crate::report::section::Section;
 use crate::report::statistics::quantile;
 use crate::report::tables::table;
 use crate::report::{chart, json};
-use crate::types::stiffness::{Evidence, RegionStiffness, StiffnessResult};
+use crate::types::stiffness::{Evidence, FrameStiffness, Gain, RegionStiffness, SharedStiffness, StiffnessResult};
 use crate::types::{Mask, Volume, WorldPoint};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -157,6 +158,18 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
 pub fn page(result: &StiffnessResult, inputs: &InputNames) -> Result<String, ReportError> {
+    page_with(result, inputs, "")
+}
+
+/// The page of a map that the frames of a sequence share.
+///
+/// # Errors
+/// As [`page`].
+pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames) -> Result<String, ReportError> {
+    page_with(&shared.result, inputs, &sequence_section(shared))
+}
+
+fn page_with(result: &StiffnessResult, inputs: &InputNames, extra: &str) -> Result<String, ReportError> {
     let grid = *result.map.grid();
     let inside = Mask::from_vec(grid, result.map.as_slice().iter().map(|&v| u8::from(v > 0.0)).collect());
     let Ok(inside) = inside else { return Ok(String::new()) };
@@ -217,6 +230,7 @@ pub fn page(result: &StiffnessResult, inputs: &InputNames) -> Result<String, Rep
         "<section><h2>Regions</h2><div class=\"grid\"><article class=\"wide\"><h3>Moduli</h3>{}</article></div></section>",
         region_table(result)
     );
+    out.push_str(extra);
     let _ = write!(
         out,
         "<section><h2>Maps</h2><div class=\"grid\">{}{}{}</div></section>",
@@ -314,4 +328,69 @@ fn correlation_table(result: &StiffnessResult) -> String {
         .map(|(r, c)| std::iter::once(escape(&r.name)).chain(c.iter().map(|v| format!("{v:.2}"))).collect())
         .collect();
     table(&head, &rows)
+}
+
+/// What a shared map adds to summary.json under `sequence`.
+pub fn sequence_summary(shared: &SharedStiffness) -> Value {
+    let frame = |f: &FrameStiffness| {
+        let (regions, why) = match &f.regions {
+            Ok(r) => (json!(r), Value::Null),
+            Err(why) => (Value::Null, json!(why)),
+        };
+        json!({ "frame": f.frame, "motion_mm": f.motion_mm, "residual_mm": f.residual_mm, "regions": regions, "why": why })
+    };
+    let gains: Map<String, Value> =
+        shared.result.regions.iter().zip(&shared.gains).map(|(r, g)| (r.label.to_string(), json!(g))).collect();
+    json!({ "frames": shared.frames.iter().map(frame).collect::<Vec<_>>(), "gains": gains })
+}
+
+/// The lines that a shared map adds to the text.
+pub fn sequence_text(shared: &SharedStiffness) -> String {
+    let told = shared.frames.iter().filter(|f| f.regions.is_ok()).count();
+    let mut out = format!("  frames       {told} of {} share these moduli", shared.frames.len());
+    for (r, g) in shared.result.regions.iter().zip(&shared.gains) {
+        if let [first, .., last] = g.as_slice()
+            && last.data_sd > 0.0
+        {
+            let parts = [100.0 * first.data_sd / first.value, 100.0 * last.data_sd / last.value];
+            let _ = write!(out, "; {}: noise {:.2} % -> {:.2} %", r.name, parts[0], parts[1]);
+        }
+    }
+    out.push('\n');
+    out
+}
+
+fn sequence_section(shared: &SharedStiffness) -> String {
+    let mut cards = String::new();
+    for (r, gains) in shared.result.regions.iter().zip(&shared.gains) {
+        let Some(first) = gains.first().filter(|g| g.data_sd > 1e-3 * g.value) else { continue };
+        let line = |f: &dyn Fn(&Gain) -> f64| gains.iter().map(|g| [g.frames as f64, f(g)]).collect::<Vec<_>>();
+        let lines = [
+            Line::new("standard deviation, %", 0, false, line(&|g| 100.0 * g.sd / g.value)),
+            Line::new("its part that frames lower", 1, false, line(&|g| 100.0 * g.data_sd / g.value)),
+            Line::new(
+                "first over root of frames",
+                2,
+                true,
+                line(&|g| 100.0 * first.data_sd / first.value / (g.frames as f64).sqrt()),
+            ),
+        ];
+        let plot = Plot { title: &r.name, across: "frames, those that move most first", marks: &[] };
+        let _ = write!(cards, "<article>{}</article>", plot.draw(&lines));
+    }
+    let rows: Vec<Vec<String>> = shared
+        .frames
+        .iter()
+        .map(|f| {
+            let said = match &f.regions {
+                Ok(all) => all.iter().map(|r| modulus(r, shared.result.absolute)).collect::<Vec<_>>().join("; "),
+                Err(why) => why.clone(),
+            };
+            vec![f.frame.to_string(), format!("{:.3}", f.motion_mm), format!("{:.4}", f.residual_mm), escape(&said)]
+        })
+        .collect();
+    format!(
+        "<section><h2>Frames</h2><div class=\"grid\">{cards}<article class=\"wide\"><h3>Each alone</h3>{}</article></div></section>",
+        table(&["Frame", "Mean motion, mm", "Residual, mm", "Moduli"], &rows)
+    )
 }

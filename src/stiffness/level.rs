@@ -27,6 +27,8 @@ pub struct Level {
     pub patches: [Patch; 2],
     /// Typical standard error of the motion of a surface node (mm).
     pub surface_error: f64,
+    /// The same, read from nearer voxels (mm).
+    pub sharp_error: f64,
     /// Least voxel size (mm).
     pub voxel: f64,
 }
@@ -55,7 +57,20 @@ impl Level {
         if observations.len() < NEEDED {
             return Err(StiffnessError::TooFew { found: observations.len(), needed: NEEDED });
         }
-        Ok(Self { body, observations, block, patches, surface_error: motion.error, voxel })
+        Ok(Self {
+            body,
+            observations,
+            block,
+            patches,
+            surface_error: motion.error,
+            sharp_error: motion.sharp_error,
+            voxel,
+        })
+    }
+
+    /// How near to a plate's plane counts as on it (mm).
+    pub fn tolerance(&self) -> f64 {
+        patches::on_plane(self.voxel, self.sharp_error)
     }
 
     /// The identification on this mesh.

@@ -16,6 +16,8 @@ pub mod observations;
 
 pub mod patches;
 
+pub mod rim;
+
 pub mod contact;
 
 pub mod identify;
@@ -27,6 +29,8 @@ pub mod choice;
 pub mod summary;
 
 pub mod maps;
+
+pub mod sequence;
 
 pub mod unlabelled;
 

@@ -18,6 +18,8 @@ use rayon::prelude::*;
 
 /// Voxels around a surface node that are read for its motion.
 const REACH: f64 = 3.0;
+/// Voxels that are read to tell whether a node touches the plate: fewer, as the edge of a punch is sharp.
+const NEAR: f64 = 1.8;
 
 /// Where a patch is.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,6 +47,10 @@ pub struct SurfaceMotion {
     pub displacement: Vec<Option<[f64; 3]>>,
     /// Median standard error of one component (mm).
     pub error: f64,
+    /// The displacement read from nearer voxels, where there are enough: noisier and sharper.
+    pub sharp: Vec<Option<[f64; 3]>>,
+    /// Median standard error of one component of that (mm).
+    pub sharp_error: f64,
 }
 
 impl SurfaceMotion {
@@ -53,17 +59,18 @@ impl SurfaceMotion {
         let mut nodes: Vec<u32> = body.surface.iter().flat_map(|f| f.nodes).collect();
         nodes.sort_unstable();
         nodes.dedup();
-        let read = |&n: &u32| at_surface(field, mask, body.places[n as usize], REACH);
-        let values: Vec<_> = nodes.par_iter().map(read).collect();
-        let mut displacement = vec![None; body.places.len()];
-        let mut errors = Vec::new();
-        for (&n, v) in nodes.iter().zip(&values) {
-            if let Some((u, e)) = v {
-                displacement[n as usize] = Some(*u);
-                errors.push(*e);
-            }
-        }
-        Self { displacement, error: crate::numerics::statistics::percentile(&mut errors, 50.0) }
+        let all = |reach: f64| {
+            let read = |&n: &u32| at_surface(field, mask, body.places[n as usize], reach);
+            let values: Vec<_> = nodes.par_iter().map(read).collect();
+            let mut displacement = vec![None; body.places.len()];
+            let mut errors: Vec<f64> = values.iter().flatten().map(|v| v.1).collect();
+            nodes.iter().zip(&values).for_each(|(&n, v)| displacement[n as usize] = v.map(|v| v.0));
+            (displacement, crate::numerics::statistics::percentile(&mut errors, 50.0))
+        };
+        let (displacement, error) = all(REACH);
+        let (near, sharp_error) = all(NEAR);
+        let sharp = near.into_iter().zip(&displacement).map(|(n, d)| n.or(*d)).collect();
+        Self { displacement, error, sharp, sharp_error }
     }
 }
 
@@ -100,6 +107,11 @@ impl Patch {
     /// Number of plate parameters.
     pub fn parameters(&self) -> usize {
         if self.contact == Contact::Sliding { 3 } else { 6 }
+    }
+
+    /// The plate's fitted motion (mm) at `p`.
+    pub fn motion(&self, p: [f64; 3]) -> [f64; 3] {
+        rigid_motion(&self.rigid, self.middle, self.radius, p)
     }
 
     /// The displacement (mm) at `p` for a unit of plate parameter `k`.
@@ -346,12 +358,15 @@ fn pressed_facets(
     let inward = |n: u32| against(n).map_or(f64::NEG_INFINITY, |u| -dot(u, d));
     let mut all: Vec<f64> = nodes.iter().map(|&n| inward(n)).collect();
     let most = crate::numerics::statistics::percentile(&mut all, 98.0);
-    let ended = |n: u32| ended(body, motion, n);
+    let ended = |n: u32| -> Option<[f64; 3]> {
+        let (p, u) = (body.places[n as usize], motion.sharp[n as usize]?);
+        Some(std::array::from_fn(|a| p[a] + u[a]))
+    };
     let mut chosen: Vec<u32> = nodes.iter().copied().filter(|&n| inward(n) > 0.8 * most).collect();
     if chosen.len() < 6 {
         return Some((Vec::new(), None, most));
     }
-    let tolerance = on_plane(voxel, motion.error);
+    let tolerance = on_plane(voxel, motion.sharp_error);
     let mut plane = None;
     for round in 0..8 {
         let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
@@ -372,7 +387,7 @@ fn pressed_facets(
         chosen.iter().filter_map(|&n| motion.displacement[n as usize].map(|u| (body.places[n as usize], u))).collect();
     let (plate, at) = (fit_rigid(&seen, middle, radius)?, plane?);
     for &n in &nodes {
-        let (Some(end), Some(u)) = (ended(n), motion.displacement[n as usize]) else { continue };
+        let (Some(end), Some(u)) = (ended(n), motion.sharp[n as usize]) else { continue };
         let with = sub(u, rigid_motion(&plate, middle, radius, body.places[n as usize]));
         let short = -dot(sub(end, at.0), at.1);
         if short.abs() < voxel && dot(with, at.1).abs() < tolerance {
@@ -388,7 +403,7 @@ fn pressed_facets(
 }
 
 /// How near to the plane counts as on it (mm).
-fn on_plane(voxel: f64, error: f64) -> f64 {
+pub(super) fn on_plane(voxel: f64, error: f64) -> f64 {
     (0.15 * voxel).max(3.0 * error)
 }
 

@@ -135,6 +135,7 @@ pub fn regions(
             identifiable: seen,
             bound: unseen,
             volume: body.volumes[r],
+            data_sd: [data.sqrt(), moduli.ratio_variance[r].max(0.0).sqrt()],
         }
     };
     (0..count).map(one).collect()

@@ -18,15 +18,18 @@ pub enum FingertipModel {
     Radial,
     /// No deformation: d_n = d_t = 0.
     Rigid,
+    /// As `Parallel`, with springs that are not alike: their modulus changes outwards as the profile says.
+    Tabulated,
 }
 
 impl FingertipModel {
     /// All of them, from the fullest to the simplest, by the names used in files.
-    pub const ALL: [(&'static str, Self); 4] = [
+    pub const ALL: [(&'static str, Self); 5] = [
         ("parallel", Self::Parallel),
         ("parallel-normal", Self::ParallelNormal),
         ("radial", Self::Radial),
         ("rigid", Self::Rigid),
+        ("tabulated", Self::Tabulated),
     ];
 
     /// The name used in files.
@@ -54,6 +57,10 @@ pub struct Fingertip {
     pub damping: [f64; 2],
     /// How it answers.
     pub model: FingertipModel,
+    /// Depth (m) at which a face that comes straight on reaches springs, and their modulus (Pa), by rising depth; linear
+    /// between, constant beyond. Of tabulated tips only; empty is `youngs_modulus` everywhere.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub profile: Vec<[f64; 2]>,
 }
 
 impl Fingertip {
@@ -62,7 +69,7 @@ impl Fingertip {
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn new(radius: f64, youngs_modulus: f64, damping: [f64; 2], model: FingertipModel) -> Result<Self, ParamError> {
-        let tip = Self { radius, youngs_modulus, damping, model };
+        let tip = Self { radius, youngs_modulus, damping, model, profile: Vec::new() };
         tip.check()?;
         Ok(tip)
     }
@@ -74,7 +81,24 @@ impl Fingertip {
     pub fn check(&self) -> Result<(), ParamError> {
         positive("fingertip.radius", self.radius, 1.0, "above 0 and at most 1 m")?;
         positive("fingertip.youngs_modulus", self.youngs_modulus, 1e12, "above 0 and at most 1e12 Pa")?;
-        self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))
+        self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))?;
+        for pair in self.profile.windows(2) {
+            positive("fingertip.profile_depth", pair[1][0] - pair[0][0], 1.0, "rising depths in m")?;
+        }
+        self.profile.iter().try_for_each(|p| {
+            at_least_zero("fingertip.profile_depth", p[0], "0 or more m")?;
+            positive("fingertip.profile_modulus", p[1], 1e12, "above 0 and at most 1e12 Pa")
+        })
+    }
+
+    /// Young's modulus (Pa) of the springs that a face coming straight on reaches at `depth` (m).
+    pub fn modulus_at(&self, depth: f64) -> f64 {
+        let after = self.profile.partition_point(|p| p[0] < depth);
+        match (after.checked_sub(1).map(|i| self.profile[i]), self.profile.get(after)) {
+            (Some([d0, e0]), Some([d1, e1])) => e0 + (e1 - e0) * (depth - d0) / (d1 - d0),
+            (Some([_, e]), None) | (None, Some(&[_, e])) => e,
+            (None, None) => self.youngs_modulus,
+        }
     }
 }
 
@@ -124,8 +148,19 @@ pub struct PadReduction {
     pub residuals: [f64; 3],
     /// Indentation (mm), force of the map and of one modulus (N).
     pub curve: Vec<[f64; 3]>,
+    /// Depth (mm) and Young's modulus (kPa) of unlike springs on a hemisphere whose force is nearest to the map's.
+    pub profile: Vec<[f64; 2]>,
+    /// Relative distance of that force from the map's (1).
+    pub profile_residual: f64,
     /// Columns.
     pub columns: usize,
+}
+
+impl PadReduction {
+    /// Whether a hemisphere of one modulus is not enough (forces off by more than 2 %) and unlike springs are nearer.
+    pub fn tabulated(&self) -> bool {
+        self.hemisphere_residual > 0.02 && self.profile_residual < 0.5 * self.hemisphere_residual
+    }
 }
 
 /// `value` must be a number above 0, to `most`.

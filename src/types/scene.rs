@@ -234,6 +234,7 @@ impl Scene {
                 youngs_modulus: 2.0e5,
                 damping: [20.0, 20.0],
                 model: FingertipModel::Parallel,
+                profile: Vec::new(),
             },
             finger: Finger {
                 link: 0.060,

@@ -175,6 +175,9 @@ pub struct RegionStiffness {
     pub bound: Option<&'static str>,
     /// Volume (mm^3).
     pub volume: f64,
+    /// The part of the relative standard deviation of the modulus that more data lower, and of the ratio (1).
+    #[serde(skip)]
+    pub data_sd: [f64; 2],
 }
 
 /// One model that was tried, with how well it explains the data.
@@ -281,4 +284,43 @@ pub struct Prescribed {
     pub direction: Option<[f64; 3]>,
     /// The displacement (mm, RAS), or any with the right component along the direction.
     pub displacement: [f64; 3],
+}
+
+/// What one frame of a sequence says.
+#[derive(Debug, Clone)]
+pub struct FrameStiffness {
+    /// Number of the frame.
+    pub frame: usize,
+    /// Mean length of its displacement in the body (mm).
+    pub motion_mm: f64,
+    /// Root mean square residual (mm, one component).
+    pub residual_mm: f64,
+    /// Region by region; why not, where it tells nothing.
+    pub regions: Result<Vec<RegionStiffness>, String>,
+}
+
+/// A modulus that the frames share, after the first frames (by motion, largest first) up to each.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Gain {
+    /// Frames that determine it.
+    pub frames: usize,
+    /// The modulus, or the ratio where no force is known.
+    pub value: f64,
+    /// Its standard deviation.
+    pub sd: f64,
+    /// The part of it that more frames lower.
+    pub data_sd: f64,
+    /// Root of chi^2 per degree of freedom between the frames; 1 where they agree as well as they claim.
+    pub disagreement: f64,
+}
+
+/// The stiffness map that all frames of a sequence share.
+#[derive(Debug)]
+pub struct SharedStiffness {
+    /// The result of the frame that moved most, with the shared moduli.
+    pub result: StiffnessResult,
+    /// Every frame.
+    pub frames: Vec<FrameStiffness>,
+    /// For each region, by how much each frame helped.
+    pub gains: Vec<Vec<Gain>>,
 }

@@ -82,9 +82,24 @@ pub fn pieces(labels: &Mask) -> Vec<usize> {
 /// # Errors
 /// [`MeshError::TooFew`] when no element fits into the body, [`MeshError::PartLost`] when none fits into a part.
 pub fn mesh_labels(labels: &Mask, fineness: &Fineness) -> Result<QuadraticMesh, MeshError> {
+    mesh_labels_finer(labels, fineness, &[], 0.0)
+}
+
+/// As [`mesh_labels`], with cubes of about `size` (mm) around the places `near` (grid mm: voxel index times spacing).
+///
+/// # Errors
+/// As [`mesh_labels`].
+pub fn mesh_labels_finer(
+    labels: &Mask,
+    fineness: &Fineness,
+    near: &[[f64; 3]],
+    size: f64,
+) -> Result<QuadraticMesh, MeshError> {
     let mut levels = Levels::new(labels).ok_or(MeshError::TooFew { found: 0, needed: 4 })?;
     let mut octree = lattice::Octree::new(levels.bounds(), fineness.size);
     refine(&mut octree, &levels, fineness);
+    let halvings = (octree.base() / size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
+    near.iter().for_each(|p| octree.refine(*p, halvings));
     let lattice = octree.tetrahedra();
     let mut made = build(&lattice, &levels)?;
     for _ in 0..CALIBRATIONS {

@@ -1,0 +1,97 @@
+//! The fields of a sequence to one stiffness map.
+
+use crate::error::StiffnessError;
+use crate::stiffness::maps;
+use crate::stiffness::sequence::combine;
+use crate::types::stiffness::{
+    FrameStiffness, Gain, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams, StiffnessResult,
+};
+use crate::types::{DenseField, Mask};
+
+/// Collects frames, the one that moved most first, so that a sequence is never in memory as a whole.
+#[derive(Debug, Default)]
+pub struct Sequence {
+    first: Option<StiffnessResult>,
+    frames: Vec<FrameStiffness>,
+    failure: Option<StiffnessError>,
+}
+
+impl Sequence {
+    /// Parameters for the next frame: those that move less are solved with the law of the first.
+    pub fn params(&self, wanted: &StiffnessParams) -> StiffnessParams {
+        let law = self.first.as_ref().map(|r| match r.law {
+            crate::types::stiffness::Law::Linear => LawChoice::Linear,
+            crate::types::stiffness::Law::NeoHookean => LawChoice::NeoHookean,
+        });
+        StiffnessParams { model: law.unwrap_or(wanted.model), ..wanted.clone() }
+    }
+
+    /// Takes the outcome of a frame.
+    pub fn add(&mut self, frame: usize, motion_mm: f64, outcome: Result<StiffnessResult, StiffnessError>) {
+        let (residual_mm, regions) = match outcome {
+            Ok(result) => {
+                let regions = Ok(result.regions.clone());
+                let residual = result.residual_mm;
+                self.first.get_or_insert(result);
+                (residual, regions)
+            }
+            Err(error) => {
+                let why = Err(error.to_string());
+                self.failure.get_or_insert(error);
+                (f64::NAN, why)
+            }
+        };
+        self.frames.push(FrameStiffness { frame, motion_mm, residual_mm, regions });
+    }
+
+    /// The shared map on the grid of `labels`.
+    ///
+    /// # Errors
+    /// The first frame's error when no frame could be solved.
+    pub fn finish(self, labels: &Mask) -> Result<SharedStiffness, StiffnessError> {
+        let Some(mut result) = self.first else { return Err(self.failure.unwrap_or(StiffnessError::NoEquilibrium)) };
+        let said: Vec<&Vec<RegionStiffness>> = self.frames.iter().filter_map(|f| f.regions.as_ref().ok()).collect();
+        let count = result.regions.len();
+        let of = |r: usize| said.iter().filter_map(|f| f.get(r)).collect::<Vec<_>>();
+        let ratios: Vec<Vec<Gain>> = (0..count).map(|r| combine(&of(r), 1)).collect();
+        let gains: Vec<Vec<Gain>> =
+            if result.absolute { (0..count).map(|r| combine(&of(r), 0)).collect() } else { ratios.clone() };
+        for ((region, gain), ratio) in result.regions.iter_mut().zip(&gains).zip(&ratios) {
+            let (Some(gain), Some(ratio)) = (gain.last(), ratio.last()) else { continue };
+            let scale = gain.value / region.youngs_modulus;
+            (region.identifiable, region.bound) = (true, None);
+            (region.youngs_modulus, region.sd) = (gain.value, gain.sd);
+            (region.ratio, region.ratio_sd) = (ratio.value, ratio.sd);
+            let of_region = result.mesh.labels().iter().zip(&mut result.element_modulus);
+            of_region.filter(|(l, _)| **l == region.label).for_each(|(_, e)| *e *= scale);
+        }
+        let names: Vec<u8> = result.regions.iter().map(|r| r.label).collect();
+        result.map = maps::by_label(labels, &names, &|r| result.regions[r].youngs_modulus);
+        result.map_sd = maps::by_label(labels, &names, &|r| result.regions[r].sd);
+        let lost = self.frames.iter().filter(|f| f.regions.is_err()).count();
+        if lost > 0 {
+            result.warnings.push(format!("{lost} frames tell nothing; frames.csv says why"));
+        }
+        for (region, gain) in result.regions.iter().zip(&gains) {
+            if let Some(last) = gain.last().filter(|g| g.disagreement > 2.0) {
+                result.warnings.push(format!(
+                    "{}: frames differ by {:.1} times what they claim; its standard deviation was raised by that",
+                    region.name, last.disagreement
+                ));
+            }
+        }
+        Ok(SharedStiffness { result, frames: self.frames, gains })
+    }
+}
+
+/// Mean length of the displacement in the body (mm); not finite where the field is not.
+pub fn motion(field: &DenseField, labels: &Mask) -> f64 {
+    let inside = labels.as_slice();
+    let (mut sum, mut count) = (0.0, 0.0);
+    for o in (0..inside.len()).filter(|&o| inside[o] > 0) {
+        let u = field.at(o);
+        sum += u.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        count += 1.0;
+    }
+    sum / count
+}
