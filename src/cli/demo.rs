@@ -1,17 +1,39 @@
-//! `palpate demo`: from nothing to a field, its score against truth, and a picture.
+//! `palpate demo`: the whole chain on a synthetic finger pad, every stage scored against its truth, on one page.
 
+use super::Cli;
 use super::console::Console;
-use super::field::{Tuning, explain};
-use super::inputs::warn_all;
-use super::outputs::{Measured, write_field};
-use super::phantom;
-use anyhow::Result;
-use clap::Args;
-use palpate::io::OutputFolder;
-use palpate::report::text;
-use palpate::synth::{self, PhantomKind, PhantomParams};
-use palpate::{evaluate, pipeline};
-use std::path::PathBuf;
+use super::field::Tuning;
+use super::inputs::name;
+use anyhow::{Context, Result, bail};
+use clap::{Args, Parser};
+use palpate::evaluate;
+use palpate::grasp::simulate::simulate;
+use palpate::io::{self, OutputFolder, SceneOverrides};
+use palpate::pipeline::fingertip;
+use palpate::report::chain::{Part, Row, page, text};
+use palpate::types::Volume;
+use serde_json::{Value, json};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// The grasp that the pad is put to.
+const SCENE: &str = include_str!("../../examples/finger_pad.toml");
+/// Parts of the chain, each in a folder or file of its own.
+const FILES: [&str; 9] = [
+    "phantom",
+    "field",
+    "stiffness",
+    "fingertip.toml",
+    "exact.toml",
+    "scene.toml",
+    "grasp",
+    "chain.csv",
+    "report.html",
+];
+/// How far the plate goes in (mm).
+const AMPLITUDE: &str = "1.5";
+/// Moduli above this (kPa) are bone in the phantom.
+const BONE: f32 = 1000.0;
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -21,42 +43,166 @@ pub struct Options {
     /// Write into a folder that is not empty
     #[arg(long)]
     force: bool,
+    /// Voxels of the phantom along x; the field of view stays
+    #[arg(long, value_name = "N")]
+    size: Option<usize>,
+    /// Nodes of the stiffness mesh, about
+    #[arg(long, value_name = "N", default_value_t = 8000)]
+    nodes: usize,
     #[command(flatten)]
     tuning: Tuning,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { output, force, tuning } = options;
-    let params = tuning.params()?;
-    let earlier = ["phantom.json", "summary.json"].iter().all(|f| output.join(f).is_file());
-    let mut folder = OutputFolder::create(output, *force || earlier)?;
-
-    let progress = console.progress();
-    progress.set("phantom", 0.0);
-    let pair = synth::phantom(&PhantomParams { seed: params.seed, ..PhantomParams::new(PhantomKind::Calf) })?;
-    let mask = Some(&pair.mask);
-    let mut result = pipeline::field::run(&pair.initial, &pair.deformed, mask, &params, &|s, f| progress.set(s, f))?;
-    let metrics = evaluate::metrics(&result.displacement, &pair.truth, mask, &pair.landmarks)?;
-
-    progress.set("write", 1.0);
-    phantom::write(&mut folder, &pair)?;
-    let measured = Measured {
-        command: "demo",
-        names: ["initial.nii.gz", "deformed.nii.gz", "mask.nii.gz"],
-        initial: &pair.initial,
-        deformed: pair.deformed,
-        mask,
-        params: &params,
-        truth: Some((&pair.truth, &metrics)),
+    let Options { output, force, size, nodes, tuning } = options;
+    tuning.params()?;
+    let earlier = ["phantom", "summary.json"].iter().all(|f| output.join(f).exists());
+    let used = fs::read_dir(output).is_ok_and(|mut d| d.next().is_some());
+    if used && !earlier && !force {
+        bail!("{}: is not empty; choose another folder, or write into it with --force", output.display());
+    }
+    let at = |part: &str| output.join(part).display().to_string();
+    let step = |command: &[&str]| -> Result<()> {
+        console.say(&format!("\n$ palpate {}", command.join(" ")))?;
+        let Cli { command, .. } = Cli::try_parse_from([&["palpate"], command].concat())?;
+        super::dispatch(&command, console)
     };
-    let summary = write_field(&mut folder, measured, &mut result)?;
+    let (seed, cells, nodes) = (tuning.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
+    let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--force", "-o"];
+    let phantom = at("phantom");
+    make.push(&phantom);
+    if let Some(cells) = &cells {
+        make.extend(["--size", cells]);
+    }
+    step(&make)?;
+    let told: Value = serde_json::from_str(&fs::read_to_string(output.join("phantom/phantom.json"))?)?;
+    let elastic = &told["elastic"];
+    let word = |key: &str| elastic[key].as_str().unwrap_or_default().to_string();
+    let (held, load, newton) = (word("held"), word("load"), elastic["force_n"].to_string());
+    let regions = elastic["regions"].as_array().cloned().unwrap_or_default();
+    let names: Vec<String> =
+        regions.iter().map(|r| format!("{}={}", r["label"], r["name"].as_str().unwrap_or_default())).collect();
+
+    let file = |name: &str| at(&format!("phantom/{name}"));
+    let (initial, deformed, mask, labels) =
+        (file("initial.nii.gz"), file("deformed.nii.gz"), file("mask.nii.gz"), file("labels.nii.gz"));
+    let (field, stiffness, tip, scene, grasp) =
+        (at("field"), at("stiffness"), at("fingertip.toml"), at("scene.toml"), at("grasp"));
+    let mut measure = vec!["field", &initial, &deformed, "--mask", &mask, "--force", "-o", &field];
+    let tuned = tuning.arguments();
+    measure.extend(tuned.iter().map(String::as_str));
+    step(&measure)?;
+    let names = names.join(",");
+    step(&[
+        "stiffness",
+        "--field",
+        &field,
+        "--labels",
+        &labels,
+        "--names",
+        &names,
+        "--held",
+        &held,
+        "--load",
+        &load,
+        "--force",
+        &newton,
+        "--nodes",
+        &nodes,
+        "--overwrite",
+        "-o",
+        &stiffness,
+    ])?;
+    step(&["fingertip", &stiffness, "-o", &tip])?;
+    fs::write(output.join("scene.toml"), SCENE).with_context(|| scene.clone())?;
+    step(&["grasp", &scene, "--force", "-o", &grasp])?;
+
+    let (mut rows, metrics) = field_rows(output)?;
+    rows.extend(stiffness_rows(output, &regions)?);
+    let exact = exact_fingertip(output, &told)?;
+    rows.extend(grasp_rows(output, exact)?);
+    let mut folder = OutputFolder::create(output, true)?;
+    let parts = [
+        ("Field", "field/report.html"),
+        ("Stiffness", "stiffness/report.html"),
+        ("Fingertip", "fingertip.svg"),
+        ("Grasp", "grasp/report.html"),
+    ];
+    let parts =
+        parts.map(|(title, file)| fs::read_to_string(output.join(file)).map(|content| Part { title, file, content }));
+    let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
+    let names: Vec<&str> = FILES.to_vec();
+    let summary = json!({
+        "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": names,
+    });
+    folder.write("chain.csv", |p| io::write_chain(p, &rows))?;
+    folder.write("summary.json", |p| io::write_json(p, &summary))?;
+    folder.write("report.html", |p| io::write_text(p, &page(&rows, &parts)))?;
     folder.commit()?;
-    drop(progress);
-    explain(console, &result.summary);
-    warn_all(console, &result.summary.warnings);
-    console.say(&format!(
-        "A synthetic calf, measured and scored against its exact truth.\n\n{summary}\n{}\nLook at {}",
-        text::metrics(&metrics),
-        output.join("report.html").display()
-    ))
+    console.say(&format!("\n{}\nLook at {}", text(&rows), output.join("report.html").display()))
+}
+
+/// The field against the exact displacement.
+fn field_rows(output: &Path) -> Result<(Vec<Row>, palpate::types::Metrics)> {
+    let truth = io::read_field(output.join("phantom/truth.nii.gz"))?;
+    let found = io::read_field(output.join("field/displacement.nii.gz"))?;
+    let mask = io::read_mask(output.join("phantom/mask.nii.gz"))?;
+    let landmarks = io::read_landmarks(output.join("phantom/landmarks.csv"))?;
+    let metrics = evaluate::metrics(&found, &truth, Some(&mask), &landmarks).with_context(|| name(output))?;
+    let rows = vec![Row::error("field", "mean error of the displacement", "mm", metrics.mean_mm, metrics.identity_mm)];
+    Ok((rows, metrics))
+}
+
+/// Moduli against those of the phantom.
+fn stiffness_rows(output: &Path, truth: &[Value]) -> Result<Vec<Row>> {
+    let folder = io::read_stiffness(output.join("stiffness"))?;
+    let row = |(r, t): (&io::StiffnessRegion, &Value)| {
+        let exact = t["youngs_modulus_kpa"].as_f64().unwrap_or(f64::NAN);
+        let what = format!("Young's modulus of {}", r.name);
+        Row { bound: r.bound.clone(), ..Row::value("stiffness", &what, "kPa", r.youngs_modulus, exact) }
+    };
+    Ok(folder.regions.iter().zip(truth).map(row).collect())
+}
+
+/// The fingertip of the exact map: its modulus (Pa), in a file beside the measured one.
+fn exact_fingertip(output: &Path, told: &Value) -> Result<f64> {
+    let map: Volume = io::read_volume(output.join("phantom/youngs_modulus.nii.gz"))?;
+    let elastic = &told["elastic"];
+    let number = |v: &Value| v.as_f64().unwrap_or(f64::NAN);
+    let down = if elastic["load"].as_str().is_some_and(|l| l.ends_with('-')) { -1.0 } else { 1.0 };
+    let depth = number(&told["amplitude"]);
+    let values = map.as_slice();
+    let outcome = fingertip::run(&map, |o| values[o] > BONE, [0.0, 0.0, down], Some(depth))?;
+    let calibration = outcome.at_press.map_or(1.0, |[_, force]| number(&elastic["force_n"]) / force);
+    let pad = &outcome.pad;
+    let radius = if pad.radius_mm.is_finite() { pad.radius_mm } else { pad.thickness_mm };
+    io::write_fingertip(output.join("exact.toml"), pad, radius, calibration, "the exact map")?;
+    Ok(1e3 * calibration * pad.hemisphere_kpa)
+}
+
+/// The fingertip and the grasp against those of the exact map.
+fn grasp_rows(output: &Path, exact: f64) -> Result<Vec<Row>> {
+    let read = |tip: &str| {
+        let path = output.join("scene.toml");
+        let text = SCENE.replace("fingertip.toml", tip);
+        fs::write(&path, text).with_context(|| path.display().to_string())?;
+        Ok::<_, anyhow::Error>(io::read_scene(&path, &SceneOverrides::default())?.scene)
+    };
+    let (truth, found) = (read("exact.toml")?, read("fingertip.toml")?);
+    let runs = [&found, &truth].map(|scene| simulate(scene, &|_| {}));
+    let [found_run, truth_run] = runs;
+    let (found_run, truth_run) = (found_run?, truth_run?);
+    let angle = |run: &palpate::types::grasp::GraspRun| run.samples.last().map_or(f64::NAN, |s| s.pose[2].to_degrees());
+    let whole = |run: &palpate::types::grasp::GraspRun| f64::from(u8::from(run.completed));
+    Ok(vec![
+        Row::value(
+            "fingertip",
+            "Young's modulus of the hemisphere",
+            "kPa",
+            1e-3 * found.fingertip.youngs_modulus,
+            1e-3 * exact,
+        ),
+        Row::value("grasp", "turn of the object at the end", "degrees", angle(&found_run), angle(&truth_run)),
+        Row::value("grasp", "held to the end (1)", "", whole(&found_run), whole(&truth_run)),
+    ])
 }

@@ -45,6 +45,14 @@ pub struct Tuning {
 }
 
 impl Tuning {
+    /// The same as command-line arguments.
+    pub fn arguments(&self) -> Vec<String> {
+        let mut out = vec!["--seed".into(), self.seed.to_string(), "--preset".into(), preset_name(self.preset)];
+        out.extend(self.points.iter().flat_map(|p| ["--points".into(), p.to_string()]));
+        out.extend(self.search.iter().flat_map(|s| ["--search".into(), s.to_string()]));
+        out
+    }
+
     /// Parameters in range.
     pub fn params(&self) -> Result<FieldParams> {
         let mut params = FieldParams { seed: self.seed, ..FieldParams::preset(self.preset) };
@@ -55,9 +63,15 @@ impl Tuning {
     }
 }
 
+const PRESETS: [(&str, Preset); 3] =
+    [("fast", Preset::Fast), ("balanced", Preset::Balanced), ("accurate", Preset::Accurate)];
+
+fn preset_name(preset: Preset) -> String {
+    PRESETS.iter().find(|p| p.1 == preset).map_or_else(String::new, |p| p.0.into())
+}
+
 fn preset(name: &str) -> Result<Preset, UnknownName> {
-    let known = [("fast", Preset::Fast), ("balanced", Preset::Balanced), ("accurate", Preset::Accurate)];
-    names::choose("preset", name, &known)
+    names::choose("preset", name, &PRESETS)
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {

@@ -32,6 +32,7 @@ mod skin;
 mod track;
 
 mod stiffness;
+
 mod stiffness_sequence;
 
 mod warp;
@@ -109,20 +110,7 @@ pub fn run() -> ExitCode {
     let console = Console::new(common.quiet, common.verbose);
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
-    let work = || match command {
-        Command::Field(options) => field::run(&options, &console),
-        Command::Warp(options) => warp::run(&options, &console),
-        Command::Invert(options) => invert::run(&options, &console),
-        Command::Track(options) => track::run(&options, &console),
-        Command::Stiffness(options) => stiffness::run(&options, &console),
-        Command::Fingertip(options) => fingertip::run(&options, &console),
-        Command::Grasp(options) => grasp::run(&options, &console),
-        Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
-        Command::Skin(options) => skin::run(&options, &console),
-        Command::Phantom(options) => phantom::run(&options, &console),
-        Command::Evaluate(options) => evaluate::run(&options, &console),
-        Command::Demo(options) => demo::run(&options, &console),
-    };
+    let work = || dispatch(&command, &console);
     let done = match pool {
         Ok(pool) => pool.install(work),
         Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
@@ -135,5 +123,23 @@ pub fn run() -> ExitCode {
             let usage = error.is::<Usage>() || error.is::<palpate::error::ParamError>();
             ExitCode::from(if usage { 2 } else { 1 })
         }
+    }
+}
+
+/// Runs one command.
+fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
+    match command {
+        Command::Field(options) => field::run(options, console),
+        Command::Warp(options) => warp::run(options, console),
+        Command::Invert(options) => invert::run(options, console),
+        Command::Track(options) => track::run(options, console),
+        Command::Stiffness(options) => stiffness::run(options, console),
+        Command::Fingertip(options) => fingertip::run(options, console),
+        Command::Grasp(options) => grasp::run(options, console),
+        Command::GraspAnalysis(options) => grasp_analysis::run(options, console),
+        Command::Skin(options) => skin::run(options, console),
+        Command::Phantom(options) => phantom::run(options, console),
+        Command::Evaluate(options) => evaluate::run(options, console),
+        Command::Demo(options) => demo::run(options, console),
     }
 }

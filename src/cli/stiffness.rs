@@ -7,12 +7,13 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
+use palpate::numerics::sampling::nearest;
 use palpate::pipeline;
 use palpate::pipeline::stiffness::Inputs;
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
-use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult};
+use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult, WorldPoint};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -102,7 +103,7 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
 }
 
 fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
-    let source = Source::of(field, options.matches.as_deref());
+    let mut source = Source::of(field, options.matches.as_deref());
     let patches = patch_files(options);
     let given: Vec<&Path> = [Some(source.field.as_path()), Some(body), source.matches.as_deref()]
         .into_iter()
@@ -116,7 +117,11 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     progress.set("read", 0.0);
     let field = io::read_field(&source.field)?;
     let setting = Setting::read(options, body, field.grid(), &source.field)?;
-    let matches = source.matches.as_ref().map(io::read_matches).transpose()?;
+    let mut matches = source.matches.as_ref().map(io::read_matches).transpose()?;
+    if options.matches.is_none() && matches.as_ref().is_some_and(|m| inside(m, &setting.labels) < ENOUGH) {
+        console.detail(&format!("fewer than {ENOUGH} matches in the body: the field itself is taken"));
+        (matches, source.matches) = (None, None);
+    }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let read = started.elapsed().as_secs_f64();
 
@@ -148,6 +153,19 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     };
     let page = options.output.join("report.html");
     console.say(&format!("{}{used}  results      {}", report::text(&result), page.display()))
+}
+
+/// Matches that a body must hold for them to be taken unasked: with fewer, what lies between them is not seen.
+const ENOUGH: usize = 1000;
+
+/// Kept matches in the body.
+fn inside(matches: &SparseField, labels: &Mask) -> usize {
+    let grid = labels.grid();
+    let held = |p: WorldPoint| {
+        let v = grid.affine().to_voxel(p);
+        nearest(grid.shape(), v).is_some_and(|o| labels.as_slice()[o] > 0)
+    };
+    matches.kept().filter(|m| held(m.initial)).count()
 }
 
 /// Where the motion is read from.

@@ -6,6 +6,8 @@
 
 pub mod nifti;
 
+mod chain;
+
 pub mod csv;
 
 pub mod vtu;
@@ -32,6 +34,7 @@ mod deflate;
 
 mod gzip;
 
+pub use chain::write_chain;
 pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
 pub use fingertip::{StiffnessFolder, StiffnessRegion, read_stiffness, write_fingertip};
 pub use grasp::{

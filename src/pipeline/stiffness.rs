@@ -122,6 +122,7 @@ fn labelled(
     };
     let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
     let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n);
+    let alone = summary::moduli(&setup, &estimate, None, params.force_n);
     let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
     let count = fine.body.labels.len();
     let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();
@@ -130,7 +131,7 @@ fn labelled(
         .map(|r| summary::unseen(&coarse_setup, &choice.estimate, r, moduli.ratio_variance[r]))
         .collect::<Result<Vec<_>, _>>()?;
     let changes = [mesh_change.as_slice(), &ratio_change];
-    let regions = summary::regions(&fine.body, &moduli, inputs.names, changes, &unseen, reference);
+    let regions = summary::regions(&fine.body, [&moduli, &alone], inputs.names, changes, &unseen, reference);
     clock.book("uncertainty");
 
     let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);

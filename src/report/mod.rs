@@ -18,6 +18,8 @@ pub mod drawing;
 
 pub mod nodes;
 
+pub mod chain;
+
 pub mod chart;
 
 pub mod figure;

@@ -2,7 +2,7 @@
 //!
 //! Tissue keeps its moduli while it moves, so frames are measurements of the same numbers. The noise of each frame is its own:
 //! means of ln E weighted by the inverse variance lower it, as a joint fit would to first order. What frames have in common
-//! (mesh, interfaces, surface) does not fall. Where frames differ by more than they claim, their part is raised by the root
+//! (mesh, interfaces, where the surface is) does not fall. Where frames differ by more than they claim, their part is raised by the root
 //! of chi^2 per degree of freedom (Birge 1932).
 
 use crate::types::stiffness::{Gain, RegionStiffness};

@@ -90,11 +90,12 @@ pub fn unseen(
     Ok((rise < 4.0).then_some(side))
 }
 
-/// Everything about the regions. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
+/// Everything about the regions. `alone` are the moduli as if the surface were known: the part of the uncertainty that more
+/// data of the same body lower. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
 /// counts as the error of the fine one, or all of it where it is large.
 pub fn regions(
     body: &Body,
-    moduli: &Moduli,
+    [moduli, alone]: [&Moduli; 2],
     names: &dyn Fn(u8) -> String,
     [mesh_change, ratio_change]: [&[f64]; 2],
     unseen: &[Option<&'static str>],
@@ -135,7 +136,7 @@ pub fn regions(
             identifiable: seen,
             bound: unseen,
             volume: body.volumes[r],
-            data_sd: [data.sqrt(), moduli.ratio_variance[r].max(0.0).sqrt()],
+            data_sd: [alone.covariance[r * count + r], alone.ratio_variance[r]].map(|v| v.max(0.0).sqrt()),
         }
     };
     (0..count).map(one).collect()

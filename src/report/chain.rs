@@ -1,0 +1,112 @@
+//! The page of the whole chain: one table of errors, then each part's own page.
+
+use crate::report::html::{document, escape};
+use crate::report::tables::table;
+use serde::Serialize;
+use std::fmt::Write;
+
+/// A quantity of one stage with its truth.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Row {
+    /// The stage: field, stiffness, fingertip or grasp.
+    pub stage: &'static str,
+    /// What is compared.
+    pub quantity: String,
+    /// Its unit.
+    pub unit: &'static str,
+    /// What was found.
+    pub found: f64,
+    /// The truth; for an error, what doing nothing gives.
+    pub truth: f64,
+    /// Found over truth less 1 for a value; the error itself for an error.
+    pub error: f64,
+    /// `lower` or `upper` where `found` is only a bound.
+    pub bound: Option<String>,
+}
+
+impl Row {
+    /// A value with its truth.
+    pub fn value(stage: &'static str, quantity: &str, unit: &'static str, found: f64, truth: f64) -> Self {
+        Self { stage, quantity: quantity.into(), unit, found, truth, error: found / truth - 1.0, bound: None }
+    }
+
+    /// An error, 0 at best, with that of doing nothing.
+    pub fn error(stage: &'static str, quantity: &str, unit: &'static str, found: f64, nothing: f64) -> Self {
+        Self { stage, quantity: quantity.into(), unit, found, truth: nothing, error: found, bound: None }
+    }
+
+    /// The cells of a table.
+    fn cells(&self) -> Vec<String> {
+        let is_error = self.quantity.contains("error");
+        let found = match self.bound.as_deref() {
+            Some("lower") => format!("above {}", short(self.found)),
+            Some(_) => format!("below {}", short(self.found)),
+            None => short(self.found),
+        };
+        let truth = if is_error { format!("0 (doing nothing {})", short(self.truth)) } else { short(self.truth) };
+        let error = match (&self.bound, is_error) {
+            (Some(_), _) => "a bound".into(),
+            (None, true) => format!("{} {}", short(self.error), self.unit),
+            (None, false) => format!("{:+.1} %", 100.0 * self.error),
+        };
+        vec![self.stage.into(), self.quantity.clone(), self.unit.into(), found, truth, error]
+    }
+}
+
+fn short(v: f64) -> String {
+    match v.abs() {
+        a if a >= 100.0 => format!("{v:.0}"),
+        a if a >= 1.0 => format!("{v:.2}"),
+        _ => format!("{v:.4}"),
+    }
+}
+
+/// A part of the chain: its page or picture.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// Its name.
+    pub title: &'static str,
+    /// Where it lies, from the page.
+    pub file: &'static str,
+    /// What the file holds, HTML or SVG.
+    pub content: String,
+}
+
+const HEAD: [&str; 6] = ["Stage", "Quantity", "Unit", "Found", "Truth", "Error"];
+
+/// The table as text.
+pub fn text(rows: &[Row]) -> String {
+    let all: Vec<Vec<String>> =
+        std::iter::once(HEAD.map(String::from).to_vec()).chain(rows.iter().map(Row::cells)).collect();
+    let width: Vec<usize> =
+        (0..HEAD.len()).map(|c| all.iter().map(|r| r[c].chars().count()).max().unwrap_or(0)).collect();
+    let line = |r: &Vec<String>| {
+        let cells: Vec<String> = r.iter().zip(&width).map(|(c, &w)| format!("{c:w$}")).collect();
+        format!("  {}\n", cells.join("  ").trim_end())
+    };
+    all.iter().map(line).collect()
+}
+
+/// The page; parts are embedded whole, so it needs no other file.
+pub fn page(rows: &[Row], parts: &[Part]) -> String {
+    let cells: Vec<Vec<String>> = rows.iter().map(|r| r.cells().iter().map(|c| escape(c)).collect()).collect();
+    let mut out = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>From two volumes to a grasp</h1><p class=\"verdict\">A synthetic finger pad, \
+         pressed on a plate, measured by every command in turn and scored against its exact truth.</p></header>\
+         <section><h2>Errors</h2><div class=\"grid\"><article class=\"wide\">{}</article></div></section>",
+        env!("CARGO_PKG_VERSION"),
+        table(&HEAD, &cells)
+    );
+    for Part { title, file, content } in parts {
+        let inside = match file.ends_with(".svg") {
+            true => format!("<article class=\"wide\">{content}</article>"),
+            false => format!(
+                "<iframe title=\"{title}\" style=\"width:100%;height:46rem;border:1px solid #8884;border-radius:8px\" \
+                 srcdoc=\"{}\"></iframe>",
+                escape(content)
+            ),
+        };
+        let _ = write!(out, "<section><h2>{title}</h2>{inside}<p><small>{file}</small></p></section>");
+    }
+    document("From two volumes to a grasp", &out)
+}
