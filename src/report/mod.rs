@@ -28,6 +28,8 @@ pub mod panels;
 
 pub mod views;
 
+pub mod viewer;
+
 pub mod field;
 
 pub mod tables;
@@ -41,6 +43,8 @@ pub mod json;
 pub mod plot;
 
 pub mod skin;
+
+pub mod info;
 
 pub mod film;
 
