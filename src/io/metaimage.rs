@@ -17,15 +17,19 @@ pub(super) fn header(path: &Path) -> Result<RawImage, IoError> {
 
 fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
     let (mut fields, mut from): (Vec<(String, String)>, usize) = (Vec::new(), 0);
+    let missing = || Flaw::new("its MetaImage header has no ElementDataFile", "copy or export it again");
     // The name of the file with the voxels ends the header.
     while fields.last().is_none_or(|f| f.0 != "elementdatafile") {
         let (text, next) = line(bytes, from)
             .or_else(|| Some((String::from_utf8_lossy(bytes.get(from..)?).trim().to_string(), bytes.len())))
             .filter(|(text, _)| !text.is_empty() || from < bytes.len())
-            .ok_or_else(|| Flaw::new("its MetaImage header has no ElementDataFile", "copy or export it again"))?;
+            .ok_or_else(missing)?;
         from = next;
         if text.trim().is_empty() {
             continue;
+        }
+        if text.contains(|c: char| c == char::REPLACEMENT_CHARACTER || c.is_control() && c != '\t') {
+            return Err(missing());
         }
         let (key, value) = text.split_once('=').ok_or_else(|| {
             let shown: String = text.chars().take(60).collect();
