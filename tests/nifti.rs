@@ -441,7 +441,7 @@ fn other_files_are_refused() {
     refused(&Fixture { magic: *b"n+9\0", ..fixture() }.bytes(), "magic");
     let files = Files::new();
     let folder = read_volume(files.0.path()).unwrap_err().to_string();
-    assert!(folder.contains("regular file"), "{folder}");
+    assert!(folder.contains("folder without DICOM files"), "{folder}");
     let missing = read_volume(files.path("none.nii")).unwrap_err().to_string();
     assert!(missing.contains("none.nii: cannot read") && missing.contains("check"), "{missing}");
 }

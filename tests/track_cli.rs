@@ -1,7 +1,6 @@
 //! `palpate track` and the sequences of `palpate phantom` as a user meets them.
 #![allow(clippy::unwrap_used)]
 
-#[allow(dead_code)]
 mod fixtures;
 
 use fixtures::{Nifti, palpate, text};

@@ -13,7 +13,6 @@ use palpate::pipeline::fingertip;
 use palpate::report::chain::{Part, Row, page, text};
 use palpate::types::Volume;
 use serde_json::{Value, json};
-use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The grasp that the pad is put to.
@@ -57,7 +56,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { output, force, size, nodes, tuning } = options;
     tuning.params()?;
     let earlier = ["phantom", "summary.json"].iter().all(|f| output.join(f).exists());
-    let used = fs::read_dir(output).is_ok_and(|mut d| d.next().is_some());
+    let used = io::list(output).is_ok_and(|files| !files.is_empty());
     if used && !earlier && !force {
         bail!("{}: is not empty; choose another folder, or write into it with --force", output.display());
     }
@@ -67,7 +66,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let Cli { command, .. } = Cli::try_parse_from([&["palpate"], command].concat())?;
         super::dispatch(&command, console)
     };
-    let (seed, cells, nodes) = (tuning.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
+    let (seed, cells, nodes) = (tuning.params()?.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
     let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--force", "-o"];
     let phantom = at("phantom");
     make.push(&phantom);
@@ -75,7 +74,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         make.extend(["--size", cells]);
     }
     step(&make)?;
-    let told: Value = serde_json::from_str(&fs::read_to_string(output.join("phantom/phantom.json"))?)?;
+    let told = io::read_json(output.join("phantom/phantom.json"))?;
     let elastic = &told["elastic"];
     let word = |key: &str| elastic[key].as_str().unwrap_or_default().to_string();
     let (held, load, newton) = (word("held"), word("load"), elastic["force_n"].to_string());
@@ -114,7 +113,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         &stiffness,
     ])?;
     step(&["fingertip", &stiffness, "-o", &tip])?;
-    fs::write(output.join("scene.toml"), SCENE).with_context(|| scene.clone())?;
+    io::write_text(output.join("scene.toml"), SCENE)?;
     step(&["grasp", &scene, "--force", "-o", &grasp])?;
 
     let (mut rows, metrics) = field_rows(output)?;
@@ -129,7 +128,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         ("Grasp", "grasp/report.html"),
     ];
     let parts =
-        parts.map(|(title, file)| fs::read_to_string(output.join(file)).map(|content| Part { title, file, content }));
+        parts.map(|(title, file)| io::read_text(output.join(file)).map(|content| Part { title, file, content }));
     let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
     let names: Vec<&str> = FILES.to_vec();
     let summary = json!({
@@ -185,7 +184,7 @@ fn grasp_rows(output: &Path, exact: f64) -> Result<Vec<Row>> {
     let read = |tip: &str| {
         let path = output.join("scene.toml");
         let text = SCENE.replace("fingertip.toml", tip);
-        fs::write(&path, text).with_context(|| path.display().to_string())?;
+        io::write_text(&path, &text)?;
         Ok::<_, anyhow::Error>(io::read_scene(&path, &SceneOverrides::default())?.scene)
     };
     let (truth, found) = (read("exact.toml")?, read("fingertip.toml")?);

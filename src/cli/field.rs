@@ -1,20 +1,21 @@
 //! `palpate field`: two volumes to a dense displacement field.
 
 use super::console::Console;
+use super::dry_run;
 use super::inputs::{check_distinct, name, read_mask, read_volume, same_file, warn_all};
 use super::outputs::{FIELD_FILES, Measured, Target, write_field};
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::error::UnknownName;
-use palpate::pipeline;
 use palpate::types::params::Preset;
 use palpate::types::{FieldParams, FieldSummary, names};
+use palpate::{io, pipeline};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Volume before the deformation (.nii, .nii.gz)
+    /// Volume before the deformation (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a DICOM series)
     initial: PathBuf,
     /// Volume after it, on any grid
     deformed: PathBuf,
@@ -23,31 +24,40 @@ pub struct Options {
     /// Where to measure: a mask on the initial volume's grid, 0 outside
     #[arg(long, value_name = "M")]
     mask: Option<PathBuf>,
+    /// Check everything, say what would be done, and write nothing
+    #[arg(long)]
+    dry_run: bool,
     #[command(flatten)]
     tuning: Tuning,
 }
 
-/// What `field` and `demo` share.
+/// What `field`, `track` and `demo` share.
 #[derive(Debug, Args)]
 pub struct Tuning {
-    /// Time against error: fast, balanced or accurate
-    #[arg(long, default_value = "balanced", value_parser = preset)]
-    preset: Preset,
+    /// Time against error: fast, balanced or accurate [default: balanced]
+    #[arg(long, value_parser = preset, conflicts_with = "config")]
+    preset: Option<Preset>,
     /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
     #[arg(long, value_name = "N")]
     points: Option<usize>,
     /// Largest motion to look for, up to 200 mm [default: by size]
     #[arg(long, value_name = "MM")]
     search: Option<f64>,
-    /// Seed of whatever is drawn at random
-    #[arg(long, value_name = "S", default_value_t = 1)]
-    pub seed: u64,
+    /// Seed of whatever is drawn at random [default: 1]
+    #[arg(long, value_name = "S")]
+    seed: Option<u64>,
+    /// Parameters from a file: summary.json of an earlier run, or its keys as JSON or TOML; flags go before it
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
 }
 
 impl Tuning {
     /// The same as command-line arguments.
     pub fn arguments(&self) -> Vec<String> {
-        let mut out = vec!["--seed".into(), self.seed.to_string(), "--preset".into(), preset_name(self.preset)];
+        let mut out = Vec::new();
+        out.extend(self.config.iter().flat_map(|c| ["--config".into(), c.display().to_string()]));
+        out.extend(self.preset.iter().flat_map(|p| ["--preset".into(), preset_name(*p)]));
+        out.extend(self.seed.iter().flat_map(|s| ["--seed".into(), s.to_string()]));
         out.extend(self.points.iter().flat_map(|p| ["--points".into(), p.to_string()]));
         out.extend(self.search.iter().flat_map(|s| ["--search".into(), s.to_string()]));
         out
@@ -55,7 +65,11 @@ impl Tuning {
 
     /// Parameters in range.
     pub fn params(&self) -> Result<FieldParams> {
-        let mut params = FieldParams { seed: self.seed, ..FieldParams::preset(self.preset) };
+        let mut params = match &self.config {
+            Some(file) => io::read_config(file)?,
+            None => FieldParams::preset(self.preset.unwrap_or_default()),
+        };
+        params.seed = self.seed.unwrap_or(params.seed);
         params.points = self.points.unwrap_or(params.points);
         params.search_mm = self.search.unwrap_or(params.search_mm);
         params.check()?;
@@ -75,7 +89,7 @@ fn preset(name: &str) -> Result<Preset, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, tuning } = options;
+    let Options { initial, deformed, target, mask, dry_run, tuning } = options;
     let params = tuning.params()?;
     let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FIELD_FILES))?;
@@ -92,6 +106,13 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (fixed, moving) = (fixed?, moving?);
     warnings.extend(first.into_iter().chain(second));
     let inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
+    if *dry_run {
+        drop(progress);
+        let plan = pipeline::plan::field(&fixed, &moving, inside.as_ref(), &params)?;
+        warn_all(console, &warnings);
+        let volumes = [(initial, fixed.grid()), (deformed, moving.grid())];
+        return console.say(&dry_run::field(&volumes, &plan, &params, target, &FIELD_FILES)?);
+    }
     let mut folder = target.create()?;
     let read = started.elapsed().as_secs_f64();
 

@@ -1,6 +1,7 @@
 //! `palpate invert`: the field from the deformed to the initial place.
 
 use super::console::Console;
+use super::convention::Convention;
 use super::inputs::{check_distinct, check_output_file};
 use anyhow::Result;
 use clap::Args;
@@ -18,13 +19,15 @@ pub struct Options {
     /// File to write (.nii, .nii.gz)
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    #[command(flatten)]
+    convention: Convention,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { field, output } = options;
+    let Options { field, output, convention } = options;
     check_distinct(&[field], std::slice::from_ref(output))?;
     check_output_file(output, &[".nii", ".nii.gz"])?;
-    let inverse = invert(&io::read_field(field)?, None);
+    let inverse = invert(&convention.read(field)?, None);
     io::write_field(output, &inverse.field)?;
     if inverse.max_residual_mm > RESIDUAL_MM {
         console.warn("the field folds somewhere, so it has no exact inverse there; look at its Jacobian determinant");

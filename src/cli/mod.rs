@@ -3,11 +3,19 @@
 //! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0 done, 1 failed on
 //! this input, 2 wrong usage. A closed pipe ends the program quietly.
 
+mod completions;
+
 mod console;
+
+mod convention;
 
 mod demo;
 
+mod dry_run;
+
 mod evaluate;
+
+mod examples;
 
 mod field;
 
@@ -17,9 +25,13 @@ mod grasp;
 
 mod grasp_analysis;
 
+mod info;
+
 mod inputs;
 
 mod invert;
+
+mod markups;
 
 mod outputs;
 
@@ -37,7 +49,7 @@ mod stiffness_sequence;
 
 mod warp;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use console::Console;
 use std::process::ExitCode;
 
@@ -97,6 +109,14 @@ enum Command {
     Evaluate(evaluate::Options),
     /// Make a synthetic calf, measure it, and score the result against the truth
     Demo(demo::Options),
+    /// Turn matches, landmarks or points into a point list of 3D Slicer
+    Markups(markups::Options),
+    /// Say what a file is: grid, orientation, values, and what palpate would do with it
+    Info(info::Options),
+    /// Print completions for a shell
+    Completions(completions::Options),
+    /// Print the manual, or write it as man pages
+    Man(completions::ManOptions),
 }
 
 /// The arguments do not make sense together.
@@ -104,9 +124,15 @@ enum Command {
 #[error("{0}")]
 struct Usage(String);
 
+/// The command line with an example after each help.
+fn whole() -> clap::Command {
+    examples::with_examples(Cli::command())
+}
+
 /// The whole program.
 pub fn run() -> ExitCode {
-    let Cli { common, command } = Cli::parse();
+    let Cli { common, command } =
+        Cli::from_arg_matches(&whole().get_matches()).unwrap_or_else(|e| e.format(&mut whole()).exit());
     let console = Console::new(common.quiet, common.verbose);
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
@@ -141,5 +167,9 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Phantom(options) => phantom::run(options, console),
         Command::Evaluate(options) => evaluate::run(options, console),
         Command::Demo(options) => demo::run(options, console),
+        Command::Markups(options) => markups::run(options, console),
+        Command::Info(options) => info::run(options, console),
+        Command::Completions(options) => completions::run(options, whole(), console),
+        Command::Man(options) => completions::run_man(options, whole(), console),
     }
 }

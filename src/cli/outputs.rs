@@ -41,6 +41,14 @@ impl Target {
         names.iter().map(|name| self.output.join(name)).collect()
     }
 
+    /// What would stand in the way of [`Target::create`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn check(&self) -> Result<()> {
+        Ok(OutputFolder::check(&self.output, self.force)?)
+    }
+
     /// Makes the folder ready.
     pub fn create(&self) -> Result<OutputFolder> {
         Ok(OutputFolder::create(&self.output, self.force)?)

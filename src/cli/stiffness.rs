@@ -2,6 +2,8 @@
 
 use super::Usage;
 use super::console::Console;
+use super::convention::Convention;
+use super::dry_run;
 use super::inputs::{check_distinct, name, read_mask, warn_all};
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -81,6 +83,11 @@ pub struct Options {
     /// Write into a folder that is not empty
     #[arg(long)]
     pub(super) overwrite: bool,
+    /// Check everything, say what would be done, and write nothing
+    #[arg(long, conflicts_with = "sequence")]
+    dry_run: bool,
+    #[command(flatten)]
+    convention: Convention,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
@@ -115,12 +122,19 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let started = Instant::now();
     let progress = console.progress();
     progress.set("read", 0.0);
-    let field = io::read_field(&source.field)?;
+    let field = options.convention.read(&source.field)?;
     let setting = Setting::read(options, body, field.grid(), &source.field)?;
     let mut matches = source.matches.as_ref().map(io::read_matches).transpose()?;
     if options.matches.is_none() && matches.as_ref().is_some_and(|m| inside(m, &setting.labels) < ENOUGH) {
         console.detail(&format!("fewer than {ENOUGH} matches in the body: the field itself is taken"));
         (matches, source.matches) = (None, None);
+    }
+    if options.dry_run {
+        drop(progress);
+        OutputFolder::check(&options.output, options.overwrite)?;
+        let field = (source.field.as_path(), field.grid());
+        let sides = [options.held.as_str(), &options.load];
+        return console.say(&dry_run::stiffness(field, &setting.labels, params, sides, &options.output, &FILES));
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let read = started.elapsed().as_secs_f64();
@@ -138,7 +152,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     };
     write(&mut folder, &mut result)?;
     folder.write("summary.json", |p| io::write_json(p, &report::summary(&result, &names)))?;
-    let page = report::page(&result, &names)?;
+    let page = report::page(&result, &names, Some(&field))?;
     folder.write("report.html", |p| io::write_text(p, &page))?;
     folder.commit()?;
     drop(progress);

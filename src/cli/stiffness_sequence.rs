@@ -87,9 +87,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
 fn reference(from: &Path) -> Result<usize> {
     let path = from.join("summary.json");
     let hint = "give a folder that palpate track wrote";
-    let text = std::fs::read_to_string(&path).with_context(|| format!("{}: cannot be read; {hint}", path.display()))?;
-    let summary: serde_json::Value =
-        serde_json::from_str(&text).with_context(|| format!("{}: is not JSON; {hint}", path.display()))?;
+    let summary = io::read_json(&path).context(hint)?;
     match summary["reference"].as_u64() {
         Some(frame) if summary["command"] == "track" => Ok(frame as usize),
         _ => bail!("{}: is not the summary of a track; {hint}", path.display()),
@@ -98,10 +96,9 @@ fn reference(from: &Path) -> Result<usize> {
 
 /// The fields of all frames but the reference, by frame.
 fn frames(options: &Options, from: &Path, reference: usize) -> Result<Vec<Frame>> {
-    let mut found: Vec<(usize, PathBuf)> = std::fs::read_dir(from)
-        .with_context(|| format!("{}: cannot be listed", from.display()))?
-        .filter_map(|entry| {
-            let path = entry.ok()?.path();
+    let mut found: Vec<(usize, PathBuf)> = io::list(from)?
+        .into_iter()
+        .filter_map(|path| {
             let number = path.file_name()?.to_str()?.strip_prefix("displacement_")?.strip_suffix(".nii.gz")?;
             Some((number.parse().ok()?, path))
         })

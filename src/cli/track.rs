@@ -2,6 +2,7 @@
 
 use super::Usage;
 use super::console::Console;
+use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{check_distinct, name, read_mask, usable, warn_all};
 use super::outputs::Target;
@@ -10,13 +11,20 @@ use clap::Args;
 use palpate::field::warp::warp_image;
 use palpate::io::{self, PackedField, Series};
 use palpate::numerics::sampling::Interpolation;
-use palpate::pipeline::track::{self, Frame};
+use palpate::pipeline::{
+    self,
+    track::{self, Frame},
+};
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
-use palpate::report::track::{TrackReport, page, summary, text};
+use palpate::report::track::{TrackReport, look as track_look, page, summary, text};
 use palpate::types::{DenseField, Grid, Mask, Volume};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+
+/// A frame is looked at anew when it moves so many times further than the one before.
+const WORTH_A_LOOK: f64 = 1.1;
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -34,6 +42,9 @@ pub struct Options {
     /// Regions whose strain is written to strain.csv: a label map on the reference's grid
     #[arg(long, value_name = "L")]
     labels: Option<PathBuf>,
+    /// Check everything, say what would be done, and write nothing
+    #[arg(long)]
+    dry_run: bool,
     #[command(flatten)]
     tuning: Tuning,
 }
@@ -85,7 +96,7 @@ impl<'a> Source<'a> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { volumes, target, reference: origin, mask, labels, tuning } = options;
+    let Options { volumes, target, reference: origin, mask, labels, dry_run, tuning } = options;
     let (params, origin) = (tuning.params()?, *origin);
     let mut source = Source::open(volumes)?;
     let frames = source.frames();
@@ -104,9 +115,19 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let first = &volumes[origin.min(volumes.len() - 1)];
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_mask(l, &grid, first)).transpose()?;
+    if *dry_run {
+        drop(progress);
+        let frame = source.read(if origin == 0 { 1 } else { 0 }, &mut warnings)?;
+        let plan = pipeline::plan::field(&reference, &frame, inside.as_ref(), &params)?;
+        warn_all(console, &warnings);
+        let plan = dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files(frames, origin))?;
+        return console.say(&plan);
+    }
     let mut folder = target.create()?;
     let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
     let mut film = None;
+    // The frame that moves most so far, how far (mm), and its viewer.
+    let mut look: Option<(usize, f64, String)> = None;
     let (mut reading, mut writing) = (started.elapsed(), std::time::Duration::ZERO);
 
     let range = gray_range(&reference);
@@ -133,6 +154,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         })?;
         let film = film.get_or_insert_with(|| start_film(&reference, field, shown, range));
         add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
+        let mean = result.summary.mean_mm;
+        if look.as_ref().is_none_or(|l| mean > WORTH_A_LOOK * l.1) {
+            let there = on_grid(volume, &grid);
+            let warped = warp_image(volume, field, None, Interpolation::Linear, 0.0);
+            let found = (field, &result.matches, &result.mesh);
+            let stretch = |o: usize| strain.principal(o)[0] as f32;
+            look = Some((number, mean, track_look([&reference, &there, &warped], shown, found, &stretch)));
+        }
         writing += started.elapsed();
         Ok(())
     };
@@ -173,6 +202,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params: &params,
         tracked: &tracked,
         film: &film,
+        look: look.as_ref().map(|l| (l.0, l.2.as_str())),
         warnings: &warnings,
         seconds: &seconds,
     };
@@ -206,13 +236,15 @@ fn add_to(
     strain: &(dyn Fn(usize) -> f32 + Sync),
 ) -> Result<()> {
     let grid: &Grid = field.grid();
-    let moved;
-    let image = if volume.grid() == grid {
-        volume
-    } else {
-        moved = warp_image(volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0);
-        &moved
-    };
+    let image = on_grid(volume, grid);
     let values = image.as_slice();
     Ok(film.add(number, &|o| values[o], field, strain)?)
+}
+
+/// The volume as it is, or resampled where it lies on another grid.
+fn on_grid<'a>(volume: &'a Volume, grid: &Grid) -> Cow<'a, Volume> {
+    match volume.grid() == grid {
+        true => Cow::Borrowed(volume),
+        false => Cow::Owned(warp_image(volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0)),
+    }
 }

@@ -1,6 +1,7 @@
 //! `palpate warp`: images, labels and points carried along a field.
 
 use super::console::Console;
+use super::convention::Convention;
 use super::inputs::{check_distinct, check_output_file};
 use anyhow::Result;
 use clap::Args;
@@ -18,13 +19,13 @@ use std::path::{Path, PathBuf};
                         labels and masks."
 )]
 pub struct Options {
-    /// Image, label map or mask (.nii, .nii.gz)
+    /// Image, label map or mask (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
     #[arg(required_unless_present = "points")]
     image: Option<PathBuf>,
-    /// Points to move instead: CSV with columns x,y,z (world mm, RAS); other columns are kept
+    /// Points to move instead: CSV with columns x,y,z (world mm, RAS), other columns are kept; or Slicer's .mrk.json, .fcsv
     #[arg(long, value_name = "P", conflicts_with_all = ["image", "reference", "interpolation"])]
     points: Option<PathBuf>,
-    /// Displacement field (5-D NIfTI, LPS mm, as `palpate field` writes it)
+    /// Displacement field (5-D NIfTI, .nrrd or .mha; LPS mm, as `palpate field` writes it)
     #[arg(long, value_name = "F")]
     field: PathBuf,
     /// File to write
@@ -36,21 +37,23 @@ pub struct Options {
     /// nearest, linear or cubic
     #[arg(long, default_value = "linear")]
     interpolation: Interpolation,
+    #[command(flatten)]
+    convention: Convention,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { image, points, field, output, reference, interpolation } = options;
+    let Options { image, points, field, output, reference, interpolation, convention } = options;
     let given = [image, points, reference].into_iter().flatten().chain([field]).map(PathBuf::as_path);
     check_distinct(&given.collect::<Vec<_>>(), std::slice::from_ref(output))?;
     match (image, points) {
         (_, Some(points)) => {
-            check_output_file(output, &[".csv"])?;
-            move_points(points, &io::read_field(field)?, output, console)
+            check_output_file(output, &[".csv", ".mrk.json"])?;
+            move_points(points, &convention.read(field)?, output, console)
         }
         (Some(image), None) => {
             check_output_file(output, &[".nii", ".nii.gz"])?;
             let grid = reference.as_ref().map(io::read_volume).transpose()?.map(|r| *r.grid());
-            let field = io::read_field(field)?;
+            let field = convention.read(field)?;
             let integers = (*interpolation == Interpolation::Nearest).then(|| io::read_labels(image));
             match integers {
                 Some(Ok(labels)) => {

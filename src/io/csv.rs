@@ -3,11 +3,12 @@
 //! Columns are found by name, in any order and case. Every error names the file and the line.
 
 use super::atomic::write_atomic;
-use super::{format, os};
+use super::{format, markups, os};
 use crate::error::IoError;
 use crate::types::{Landmark, Match, SparseField, WorldPoint};
 use csv::{ReaderBuilder, StringRecord, Trim, Writer};
 use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 const MATCH_COLUMNS: [&str; 9] = ["x", "y", "z", "dx", "dy", "dz", "ncc", "sigma", "kept"];
@@ -23,6 +24,40 @@ pub struct PointTable {
     pub other_columns: Vec<String>,
     /// Their text, a row for each point.
     pub others: Vec<Vec<String>>,
+}
+
+/// What a table of places holds, by its columns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TableKind {
+    /// As [`write_matches`].
+    Matches,
+    /// As [`write_landmarks`].
+    Landmarks,
+    /// As [`write_points`], or of 3D Slicer.
+    Points,
+}
+
+/// Looks at the header line of a table, or the name of a file of 3D Slicer.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or has none of the known columns.
+pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
+    let path = path.as_ref();
+    if markups::is_slicer(path) {
+        return Ok(TableKind::Points);
+    }
+    let file = File::open(path).map_err(os(path, "read"))?;
+    let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(file.take(1 << 16));
+    let header = reader.headers().map_err(|e| damaged(path, e))?.clone();
+    let has = |names: &[&str]| names.iter().all(|n| header.iter().any(|h| h.eq_ignore_ascii_case(n)));
+    match (has(&MATCH_COLUMNS), has(&LANDMARK_COLUMNS), has(&POINT_COLUMNS)) {
+        (true, ..) => Ok(TableKind::Matches),
+        (_, true, _) => Ok(TableKind::Landmarks),
+        (.., true) => Ok(TableKind::Points),
+        _ => {
+            Err(format(path, "is no table of matches, landmarks or points", "see docs/file-formats.md for the columns"))
+        }
+    }
 }
 
 /// Writes x,y,z,dx,dy,dz (mm), ncc, sigma (mm) and kept (1 or 0), all matches in order, with six decimals.
@@ -67,6 +102,31 @@ pub fn read_landmarks(path: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> 
     Ok(rows.into_iter().map(landmark).collect())
 }
 
+/// Landmarks from two files of points: the places in the initial volume and in the deformed one, paired by their labels
+/// where both files have all of them, else in order.
+///
+/// # Errors
+/// As [`read_points`]; also when there are not as many in both.
+pub fn read_landmark_pair(initial: impl AsRef<Path>, deformed: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> {
+    let (a, b) = (read_points(initial.as_ref())?, read_points(deformed.as_ref())?);
+    if a.points.len() != b.points.len() {
+        let what = format!("has {} points, {} has {}", b.points.len(), initial.as_ref().display(), a.points.len());
+        return Err(format(deformed.as_ref(), what, "give the same landmarks in both, in the same order"));
+    }
+    let labels = |t: &PointTable| {
+        let column = t.other_columns.iter().position(|c| c.eq_ignore_ascii_case("label"));
+        let names = column.map(|c| t.others.iter().map(|row| row[c].clone()).collect::<Vec<_>>());
+        let unique = |n: &Vec<String>| n.iter().collect::<std::collections::BTreeSet<_>>().len() == n.len();
+        names.filter(unique)
+    };
+    let order: Option<Vec<usize>> = labels(&a)
+        .zip(labels(&b))
+        .and_then(|(first, second)| first.iter().map(|name| second.iter().position(|other| other == name)).collect());
+    let order = order.unwrap_or_else(|| (0..a.points.len()).collect());
+    let pair = |(&initial, at): (&WorldPoint, usize)| Landmark { initial, deformed: b.points[at] };
+    Ok(a.points.iter().zip(order).map(pair).collect())
+}
+
 /// Writes what [`read_landmarks`] reads.
 ///
 /// # Errors
@@ -76,22 +136,36 @@ pub fn write_landmarks(path: impl AsRef<Path>, landmarks: &[Landmark]) -> Result
     write_table(path.as_ref(), &LANDMARK_COLUMNS, rows)
 }
 
-/// Reads points: columns x,y,z and any others.
+/// Reads points: columns x,y,z and any others; from 3D Slicer's `.mrk.json` and `.fcsv` with one column `label`.
 ///
 /// # Errors
 /// As [`read_landmarks`].
 pub fn read_points(path: impl AsRef<Path>) -> Result<PointTable, IoError> {
+    if markups::is_slicer(path.as_ref()) {
+        return markups::read(path.as_ref());
+    }
     let table = read_table(path.as_ref(), POINT_COLUMNS)?;
     some_rows(path.as_ref(), table.numbers.len())?;
     let points = table.numbers.into_iter().map(WorldPoint).collect();
     Ok(PointTable { points, other_columns: table.other_columns, others: table.others })
 }
 
-/// Writes x,y,z and the other columns.
+/// Writes x,y,z and the other columns; with a name in `.mrk.json` a point list of Slicer, without the points that are not
+/// finite.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
 pub fn write_points(path: impl AsRef<Path>, table: &PointTable) -> Result<(), IoError> {
+    if markups::is_slicer(path.as_ref()) {
+        let column = table.other_columns.iter().position(|c| c.eq_ignore_ascii_case("label"));
+        let labels: Vec<String> =
+            column.map_or(Vec::new(), |c| table.others.iter().map(|row| row[c].clone()).collect());
+        let there: Vec<usize> =
+            (0..table.points.len()).filter(|&i| table.points[i].0.iter().all(|v| v.is_finite())).collect();
+        let points: Vec<WorldPoint> = there.iter().map(|&i| table.points[i]).collect();
+        let labels: Vec<String> = there.iter().filter_map(|&i| labels.get(i).cloned()).collect();
+        return markups::write_markups(path, &points, &labels, &[]);
+    }
     let columns: Vec<&str> = POINT_COLUMNS.into_iter().chain(table.other_columns.iter().map(String::as_str)).collect();
     let rows = table.points.iter().enumerate().map(|(i, p)| {
         let others = table.others.get(i).into_iter().flatten().cloned();

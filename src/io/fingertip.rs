@@ -2,7 +2,7 @@
 
 use super::{format, os, write_text};
 use crate::error::IoError;
-use crate::io::nifti::read_volume;
+use crate::io::image::read_volume;
 use crate::types::Volume;
 use crate::types::fingertip::PadReduction;
 use serde::Deserialize;

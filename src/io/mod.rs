@@ -4,15 +4,37 @@
 //! file could hold; nothing half-written ever stands under a final name (each file is written under a temporary name
 //! in the same folder, then renamed; [`OutputFolder`] does the same for a whole folder). Nothing here prints.
 
+pub mod image;
+
+pub mod field;
+
 pub mod nifti;
 
 mod chain;
 
+mod nrrd;
+
+mod metaimage;
+
+mod dicom;
+
+mod elements;
+
+mod raw;
+
+mod voxels;
+
+mod flaw;
+
 pub mod csv;
+
+pub mod markups;
 
 pub mod vtu;
 
 pub mod scene;
+
+pub mod config;
 
 pub mod grasp;
 
@@ -35,20 +57,27 @@ mod deflate;
 mod gzip;
 
 pub use chain::write_chain;
-pub use csv::{PointTable, read_landmarks, read_matches, read_points, write_landmarks, write_matches, write_points};
+pub use config::read_config;
+pub use csv::{
+    PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, table_kind, write_landmarks,
+    write_matches, write_points,
+};
+pub use field::{FieldConvention, read_field, read_field_as};
 pub use fingertip::{StiffnessFolder, StiffnessRegion, read_stiffness, write_fingertip};
 pub use grasp::{
     write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };
+pub use image::{ImageKind, Stored, count_non_finite, read_header, read_labels, read_mask, read_volume};
+pub use markups::write_markups;
 pub use nifti::{
-    PackedField, Series, count_non_finite, read_field, read_labels, read_mask, read_volume, write_field,
-    write_field_series, write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
+    PackedField, Series, write_field, write_field_series, write_integers, write_labels, write_series_field,
+    write_steps, write_tensors, write_volume,
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use skin::{read_skin_scene, write_response};
 pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
-pub use text::{write_bytes, write_json, write_text};
+pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
 pub use vtu::{write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 

@@ -28,16 +28,7 @@ impl OutputFolder {
     /// [`IoError`] when `path` is a file, cannot be created or written, or holds files and `force` is not set.
     pub fn create(path: impl AsRef<Path>, force: bool) -> Result<Self, IoError> {
         let path = path.as_ref();
-        if path.exists() && !path.is_dir() {
-            return Err(format(path, "is a file, but a folder is needed for the results", "choose another --output"));
-        }
-        if path.is_dir() && !force {
-            let ours = |e: &fs::DirEntry| e.file_name().to_string_lossy().starts_with(TEMPORARY);
-            let mut entries = fs::read_dir(path).map_err(os(path, "read the folder"))?;
-            if entries.any(|e| !e.is_ok_and(|e| ours(&e))) {
-                return Err(format(path, "the folder is not empty", "choose another --output, or add --force"));
-            }
-        }
+        Self::check(path, force)?;
         let missing = |p: &&Path| !p.as_os_str().is_empty() && !p.exists();
         let mut folder = Self { path: path.into(), staging: None, names: Vec::new(), created: Vec::new() };
         let mut to_create: Vec<&Path> = path.ancestors().take_while(missing).collect();
@@ -48,6 +39,25 @@ impl OutputFolder {
         let staging = tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(path);
         folder.staging = Some(staging.map_err(os(path, "write into the folder"))?);
         Ok(folder)
+    }
+
+    /// Checks what can be checked without writing: that `path` is no file, and holds none unless `force` is set.
+    ///
+    /// # Errors
+    /// [`IoError`] when it is, does, or cannot be read.
+    pub fn check(path: impl AsRef<Path>, force: bool) -> Result<(), IoError> {
+        let path = path.as_ref();
+        if path.exists() && !path.is_dir() {
+            return Err(format(path, "is a file, but a folder is needed for the results", "choose another --output"));
+        }
+        if path.is_dir() && !force {
+            let ours = |e: &fs::DirEntry| e.file_name().to_string_lossy().starts_with(TEMPORARY);
+            let mut entries = fs::read_dir(path).map_err(os(path, "read the folder"))?;
+            if entries.any(|e| !e.is_ok_and(|e| ours(&e))) {
+                return Err(format(path, "the folder is not empty", "choose another --output, or add --force"));
+            }
+        }
+        Ok(())
     }
 
     /// The target folder.

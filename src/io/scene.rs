@@ -85,7 +85,10 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
 }
 
 pub(super) fn read_table(path: &Path) -> Result<Table, IoError> {
-    let text = fs::read_to_string(path).map_err(os(path, "read"))?;
+    parse_table(path, &fs::read_to_string(path).map_err(os(path, "read"))?)
+}
+
+pub(super) fn parse_table(path: &Path, text: &str) -> Result<Table, IoError> {
     text.parse().map_err(|error: toml::de::Error| {
         let line = error.span().map_or(1, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
         let what = format!("line {line}: {}", error.message().trim_end().replace('\n', ", "));
@@ -119,9 +122,18 @@ fn check_keys(path: &Path, table: &Table) -> Result<(), IoError> {
 }
 
 pub(super) fn known(path: &Path, place: &str, table: &Table, keys: &[&'static str]) -> Result<(), IoError> {
+    known_names(path, place, table.keys().map(String::as_str), keys)
+}
+
+pub(super) fn known_names<'a>(
+    path: &Path,
+    place: &str,
+    found: impl IntoIterator<Item = &'a str>,
+    keys: &[&'static str],
+) -> Result<(), IoError> {
     let choices: Vec<(&'static str, ())> = keys.iter().map(|k| (*k, ())).collect();
-    for key in table.keys() {
-        if !keys.contains(&key.as_str()) {
+    for key in found {
+        if !keys.contains(&key) {
             let found = names::choose("key", key, &choices).err();
             let hint =
                 found.as_ref().and_then(|e| e.nearest).map_or(String::new(), |n| format!("did you mean '{n}'? "));

@@ -1,10 +1,45 @@
 //! JSON, text (HTML, SVG) and bytes (PNG).
 
 use super::atomic::write_atomic;
+use super::{format, os};
 use crate::error::IoError;
 use serde::Serialize;
-use std::io::Write;
-use std::path::Path;
+use serde_json::Value;
+use std::fs::File;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+/// Reads a JSON file of at most 16 MB.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or is no JSON.
+pub fn read_json(path: impl AsRef<Path>) -> Result<Value, IoError> {
+    let (path, mut text) = (path.as_ref(), String::new());
+    File::open(path).and_then(|f| f.take(1 << 24).read_to_string(&mut text)).map_err(os(path, "read"))?;
+    serde_json::from_str(&text).map_err(|e| format(path, format!("is no JSON ({e})"), "check which file it is"))
+}
+
+/// Reads a text file of at most 256 MB.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or is no UTF-8.
+pub fn read_text(path: impl AsRef<Path>) -> Result<String, IoError> {
+    let (path, mut text) = (path.as_ref(), String::new());
+    File::open(path).and_then(|f| f.take(1 << 28).read_to_string(&mut text)).map_err(os(path, "read"))?;
+    Ok(text)
+}
+
+/// The files and folders in a folder, sorted.
+///
+/// # Errors
+/// [`IoError`] when the folder cannot be read.
+pub fn list(folder: impl AsRef<Path>) -> Result<Vec<PathBuf>, IoError> {
+    let folder = folder.as_ref();
+    let entries = std::fs::read_dir(folder).map_err(os(folder, "read the folder"))?;
+    let mut found: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
+    found.sort();
+    Ok(found)
+}
 
 /// Writes `value` as indented JSON with a newline at the end. Numbers that are not finite become `null`.
 ///

@@ -266,7 +266,7 @@ const COARSE_SHARE: usize = 24;
 const COARSE_POINTS: usize = 4000;
 
 /// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30 mm.
-fn search_mm(grid: &Grid, asked: f64) -> f64 {
+pub(super) fn search_mm(grid: &Grid, asked: f64) -> f64 {
     let (shape, spacing) = (grid.shape(), grid.spacing());
     let thick = || (0..3).filter(|&a| shape[a] > 1);
     let side = thick().map(|a| shape[a] as f64 * spacing[a]).fold(f64::INFINITY, f64::min);
@@ -278,7 +278,7 @@ fn search_mm(grid: &Grid, asked: f64) -> f64 {
 const WORKED_ON: usize = 600_000;
 
 /// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`] voxels of tissue are left.
-fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
+pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
     if asked > 0 {
         return asked;
     }

@@ -1,13 +1,15 @@
 //! The chains of stages that a library user calls.
 //!
 //! [`field`] is the page to read first: it calls the stages in order and times them. [`level`] holds what is done on one
-//! level of the pyramid, [`check`] what is refused before any work; [`grasp`] is the grasp simulator's page.
+//! level of the pyramid, [`check`] what is refused before any work, [`plan`] what a run would do; [`grasp`] is the grasp simulator's page.
 
 pub mod field;
 
 pub mod level;
 
 pub mod check;
+
+pub mod plan;
 
 pub mod grasp;
 

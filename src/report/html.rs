@@ -1,7 +1,8 @@
 //! report.html: one page that stands alone, offline, in light and dark.
 
 use crate::error::ReportError;
-use crate::report::field::FieldReport;
+use crate::report::colormap::ColorMap;
+use crate::report::field::{FieldReport, Values};
 use crate::report::nodes;
 use crate::report::panels::{Panel, length};
 use crate::report::picture::Picture;
@@ -9,6 +10,7 @@ use crate::report::scale::{Scale, short, thousands};
 use crate::report::section::Plane;
 use crate::report::statistics::{Histogram, sample};
 use crate::report::verdict::{short2, verdict};
+use crate::report::viewer::{Layer, Viewer, elements};
 use crate::report::views::Views;
 use crate::report::{chart, tables};
 use crate::types::Mesh;
@@ -29,6 +31,8 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let views = Views::of(report)?;
     let mut body = head(report);
     body.push_str(&score(report, &views));
+
+    body.push_str(&look(report, &views));
 
     let [x, y, z] = views.centre.0.map(|v| short((v * 10.0).round() / 10.0));
     let _ = write!(
@@ -96,6 +100,43 @@ pub(super) fn document(title: &str, body: &str) -> String {
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>\n"
     )
 }
+
+/// The viewer, with the scales of the pictures.
+fn look(report: &FieldReport<'_>, views: &Views) -> String {
+    let (range, [before, after]) = views.gray;
+    let scale = |gain: f32| {
+        let [low, high] = range.map(|r| r / f64::from(gain));
+        Scale { low, high, unit: "", map: ColorMap::Gray }
+    };
+    let (initial, warped) = (report.initial.as_slice(), report.warped.as_slice());
+    let (initial, warped): (Values<'_>, Values<'_>) = (&|o| initial[o], &|o| warped[o]);
+    let images = [("initial", initial, 1.0), ("deformed", report.deformed, before), ("warped", warped, after)]
+        .map(|(name, values, gain)| Layer { name, values, scale: scale(gain) });
+    let coloured =
+        |name: &'static str, panel: &Panel, values| panel.scale.clone().map(|scale| Layer { name, values, scale });
+    let overlays: Vec<Layer<'_>> = [
+        coloured("Jacobian determinant", &views.jacobian, report.jacobian),
+        coloured("Uncertainty", &views.uncertainty, report.uncertainty),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    let viewer = Viewer {
+        grid: report.initial.grid(),
+        centre: views.centre,
+        mask: report.mask,
+        images: &images,
+        overlays: &overlays,
+        shown: None,
+        displacement: views.magnitude.scale.clone().map(|scale| (report.displacement, scale)),
+        matches: Some((&report.matches.matches, views.matches.2.clone())),
+        mesh: Some(elements(report.mesh)),
+    };
+    format!("<section><h2>Look</h2>{LOOK}<article class=\"wide\">{}</article></section>", viewer.html())
+}
+
+const LOOK: &str = "<p class=\"lead\">Click or drag in a picture to move the planes, scroll to go through the slices. Numbers \
+                    are those at the cross.</p>";
 
 /// Verdict, key numbers, warnings.
 fn head(report: &FieldReport<'_>) -> String {
@@ -246,6 +287,10 @@ mod tests {
             let opened = html.matches(&format!("<{tag}>")).count() + html.matches(&format!("<{tag} ")).count();
             assert_eq!(opened, html.matches(&format!("</{tag}>")).count(), "<{tag}>");
         }
+        // What is packed may hold any letters.
+        let packed = html.find("application/json").unwrap();
+        let end = packed + html[packed..].find("</script>").unwrap();
+        let html = format!("{}{}", &html[..packed], &html[end..]);
         for outside in ["http://", "https://", "<script src", "<link", "@import"] {
             assert!(!html.contains(outside), "{outside}");
         }

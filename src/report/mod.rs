@@ -30,6 +30,8 @@ pub mod panels;
 
 pub mod views;
 
+pub mod viewer;
+
 pub mod field;
 
 pub mod tables;
@@ -43,6 +45,8 @@ pub mod json;
 pub mod plot;
 
 pub mod skin;
+
+pub mod info;
 
 pub mod film;
 

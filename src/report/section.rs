@@ -3,7 +3,7 @@
 //! The voxel axis that lies closest to each of right, front and up stands for it, with its sign, so that any affine,
 //! oblique or flipped, is shown the same way up. Pixels keep the voxels' proportions; nothing is interpolated.
 
-use crate::types::{Grid, WorldPoint};
+use crate::types::{Grid, VoxelPoint, WorldPoint};
 
 /// Pixels along the longer side at most; longer sides are averaged down.
 const PIXELS: usize = 320;
@@ -77,6 +77,84 @@ fn canonical_axes(grid: &Grid) -> [Axis; 3] {
         let voxel = best[w];
         Axis { voxel, reversed: linear[w][voxel] < 0.0, len: shape[voxel], spacing: spacing[voxel] }
     })
+}
+
+/// A grid seen along right, front and up: places are mm from its first corner along the voxel axes nearest to these.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Canonical {
+    grid: Grid,
+    axes: [Axis; 3],
+}
+
+impl Canonical {
+    /// Of `grid`.
+    pub fn of(grid: &Grid) -> Self {
+        Self { grid: *grid, axes: canonical_axes(grid) }
+    }
+
+    /// Voxels to the right, front and up.
+    pub fn shape(&self) -> [usize; 3] {
+        self.axes.map(|a| a.len)
+    }
+
+    /// Their size (mm).
+    pub fn spacing(&self) -> [f64; 3] {
+        self.axes.map(|a| a.spacing)
+    }
+
+    /// The whole extent (mm).
+    pub fn extent_mm(&self) -> [f64; 3] {
+        self.axes.map(|a| a.len as f64 * a.spacing)
+    }
+
+    /// Voxel offset (x fastest on disk) of the voxel `at` along right, front and up.
+    pub fn offset(&self, at: [usize; 3]) -> usize {
+        let mut voxel = [0; 3];
+        for (a, at) in self.axes.iter().zip(at) {
+            voxel[a.voxel] = if a.reversed { a.len - 1 - at } else { at };
+        }
+        self.grid.index(voxel[0], voxel[1], voxel[2])
+    }
+
+    /// A place (mm, RAS) as mm from the first corner.
+    pub fn place(&self, p: WorldPoint) -> [f64; 3] {
+        let voxel = self.grid.affine().to_voxel(p).0;
+        self.axes.map(|a| (a.canonical(voxel[a.voxel]) + 0.5) * a.spacing)
+    }
+
+    /// A displacement (mm, RAS) along the three axes (mm).
+    pub fn direct(&self, d: [f64; 3]) -> [f64; 3] {
+        let voxel = self.grid.affine().vector_to_voxel(d);
+        self.axes.map(|a| voxel[a.voxel] * a.spacing * if a.reversed { -1.0 } else { 1.0 })
+    }
+
+    /// Three rows of the matrix from a place to the world (mm, RAS).
+    pub fn to_world(&self) -> [[f64; 4]; 3] {
+        let affine = self.grid.affine();
+        let mut first = [0.0; 3];
+        for a in &self.axes {
+            first[a.voxel] = if a.reversed { a.len as f64 - 0.5 } else { -0.5 };
+        }
+        let corner = affine.to_world(VoxelPoint(first)).0;
+        let along = self.axes.map(|a| {
+            let mut step = [0.0; 3];
+            step[a.voxel] = if a.reversed { -1.0 } else { 1.0 } / a.spacing;
+            affine.vector_to_world(step)
+        });
+        std::array::from_fn(|r| [along[0][r], along[1][r], along[2][r], corner[r]])
+    }
+
+    /// The planes that are more than one voxel wide and high.
+    pub fn planes(&self) -> Vec<Plane> {
+        let thick = |p: &Plane| p.axes()[..2].iter().all(|&w| self.axes[w].len > 1);
+        [Plane::Axial, Plane::Coronal, Plane::Sagittal].into_iter().filter(thick).collect()
+    }
+
+    /// Extent of a plane to the right and down (mm).
+    pub fn size_mm(&self, plane: Plane) -> [f64; 2] {
+        let [h, v, _] = plane.axes();
+        [h, v].map(|w| self.extent_mm()[w])
+    }
 }
 
 /// One plane of voxels, as a picture: pixel (0, 0) is its upper left corner.

@@ -2,16 +2,18 @@
 
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
+use crate::report::field::Values;
 use crate::report::html::{card, document, escape};
-use crate::report::panels::Panel;
+use crate::report::panels::{Panel, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
 use crate::report::section::Section;
 use crate::report::statistics::quantile;
 use crate::report::tables::table;
+use crate::report::viewer::{Layer, Viewer};
 use crate::report::{chart, json};
 use crate::types::stiffness::{Evidence, FrameStiffness, Gain, RegionStiffness, SharedStiffness, StiffnessResult};
-use crate::types::{Mask, Volume, WorldPoint};
+use crate::types::{DenseField, Mask, Volume, WorldPoint};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 
@@ -153,12 +155,43 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
     })
 }
 
-/// The page.
+/// Maps, displacement and mesh in a viewer, with the scales of the pictures.
+fn look(result: &StiffnessResult, inside: &Mask, field: Option<&DenseField>, panels: [&Panel; 3]) -> String {
+    let [map, sd, rest] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
+    let (map, sd, rest): (Values<'_>, Values<'_>, Values<'_>) = (&|o| map[o], &|o| sd[o], &|o| rest[o]);
+    let names = ["Young's modulus", "Standard deviation", "Residual"];
+    let layers = names.into_iter().zip([map, sd, rest]).zip(panels);
+    let overlays: Vec<Layer<'_>> = layers
+        .filter_map(|((name, values), panel)| Some(Layer { name, values, scale: panel.scale.clone()? }))
+        .collect();
+    let body = |o: usize| f32::from(inside.as_slice()[o]);
+    let gray = Scale { low: 0.0, high: 2.0, unit: "", map: ColorMap::Gray };
+    let displacement = field.map(|field| {
+        let lengths = (0..field.grid().len()).step_by(7).filter(|&o| inside.as_slice()[o] > 0);
+        let most = quantile(lengths.map(|o| f64::from(length(field, o))), 0.998);
+        (field, Scale::from_zero(most, "mm", ColorMap::Viridis))
+    });
+    let corners: Vec<u32> = result.mesh.tetrahedra().iter().flat_map(|e| e[..4].to_vec()).collect();
+    let viewer = Viewer {
+        grid: result.map.grid(),
+        centre: centre(&result.map),
+        mask: Some(inside),
+        images: &[Layer { name: "body", values: &body, scale: gray }],
+        overlays: &overlays,
+        shown: Some(0),
+        displacement,
+        matches: None,
+        mesh: Some((result.mesh.nodes(), corners, 4)),
+    };
+    viewer.html()
+}
+
+/// The page; its viewer also shows the displacement the moduli came from (on the map's grid), where that is given.
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn page(result: &StiffnessResult, inputs: &InputNames) -> Result<String, ReportError> {
-    page_with(result, inputs, "")
+pub fn page(result: &StiffnessResult, inputs: &InputNames, field: Option<&DenseField>) -> Result<String, ReportError> {
+    page_with(result, inputs, field, "")
 }
 
 /// The page of a map that the frames of a sequence share.
@@ -166,10 +199,15 @@ pub fn page(result: &StiffnessResult, inputs: &InputNames) -> Result<String, Rep
 /// # Errors
 /// As [`page`].
 pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames) -> Result<String, ReportError> {
-    page_with(&shared.result, inputs, &sequence_section(shared))
+    page_with(&shared.result, inputs, None, &sequence_section(shared))
 }
 
-fn page_with(result: &StiffnessResult, inputs: &InputNames, extra: &str) -> Result<String, ReportError> {
+fn page_with(
+    result: &StiffnessResult,
+    inputs: &InputNames,
+    field: Option<&DenseField>,
+    extra: &str,
+) -> Result<String, ReportError> {
     let grid = *result.map.grid();
     let inside = Mask::from_vec(grid, result.map.as_slice().iter().map(|&v| u8::from(v > 0.0)).collect());
     let Ok(inside) = inside else { return Ok(String::new()) };
@@ -231,6 +269,8 @@ fn page_with(result: &StiffnessResult, inputs: &InputNames, extra: &str) -> Resu
         region_table(result)
     );
     out.push_str(extra);
+    let viewer = look(result, &inside, field, [&map, &sd, &rest]);
+    let _ = write!(out, "<section><h2>Look</h2><article class=\"wide\">{viewer}</article></section>");
     let _ = write!(
         out,
         "<section><h2>Maps</h2><div class=\"grid\">{}{}{}</div></section>",

@@ -1,14 +1,19 @@
 //! report.html, summary.json and the short summary of `palpate track`.
 
+use crate::report::colormap::ColorMap;
+use crate::report::field::Values;
 use crate::report::film::Film;
 use crate::report::grasp::tile;
 use crate::report::html::{document, escape};
 use crate::report::json::{grid, seconds};
+use crate::report::panels::{centre_of_motion, gray_range, length};
 use crate::report::plot::{Line, Plot};
-use crate::report::scale::thousands;
+use crate::report::scale::{Scale, thousands};
+use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
 use crate::report::verdict::short2;
-use crate::types::{FieldParams, Grid, PointState, StrainRow, Tracked};
+use crate::report::viewer::{Layer, Viewer, elements};
+use crate::types::{DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Volume};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -30,6 +35,8 @@ pub struct TrackReport<'a> {
     pub tracked: &'a Tracked,
     /// Sections of the frames.
     pub film: &'a Film,
+    /// The frame that moves most and its viewer, where one was made.
+    pub look: Option<(usize, &'a str)>,
     /// What the user should know.
     pub warnings: &'a [String],
     /// Stage names and wall seconds.
@@ -69,6 +76,42 @@ impl TrackReport<'_> {
             thousands(self.tracked.trajectories.len())
         )
     }
+}
+
+/// The viewer of one frame: the reference, the frame as it came and warped back (on the reference's grid), its displacement,
+/// matches, mesh and largest principal strain.
+pub fn look(
+    [reference, frame, warped]: [&Volume; 3],
+    mask: Option<&Mask>,
+    (field, matches, mesh): (&DenseField, &SparseField, &Mesh),
+    strain: Values<'_>,
+) -> String {
+    let grid = reference.grid();
+    let [low, high] = gray_range(reference);
+    let inside = sample(grid.len(), mask);
+    let most = |f: &dyn Fn(usize) -> f64, q| quantile(inside.iter().map(|&o| f(o)), q);
+    let values = [reference, frame, warped].map(Volume::as_slice);
+    let [a, b, c]: [Values<'_>; 3] = [&|o| values[0][o], &|o| values[1][o], &|o| values[2][o]];
+    let images = [("reference", a), ("frame", b), ("warped", c)].map(|(name, values)| Layer {
+        name,
+        values,
+        scale: Scale { low, high, unit: "", map: ColorMap::Gray },
+    });
+    let stretch = Scale::from_zero(most(&|o| strain(o).into(), 0.99), "", ColorMap::Magma);
+    let lengths = Scale::from_zero(most(&|o| length(field, o).into(), 0.998), "mm", ColorMap::Viridis);
+    let precision = Scale::from_zero(quantile(matches.kept().map(|m| m.sigma()), 0.95), "mm", ColorMap::Viridis);
+    Viewer {
+        grid,
+        centre: centre_of_motion(field, mask),
+        mask,
+        images: &images,
+        overlays: &[Layer { name: "Largest principal strain", values: strain, scale: stretch }],
+        shown: None,
+        displacement: Some((field, lengths)),
+        matches: Some((&matches.matches, precision)),
+        mesh: Some(elements(mesh)),
+    }
+    .html()
 }
 
 /// The keys are those of docs/file-formats.md.
@@ -148,6 +191,14 @@ pub fn page(report: &TrackReport<'_>) -> String {
          largest principal strain.</p><article class=\"wide\">{}</article></section>",
         report.film.player(&clock)
     );
+    if let Some((frame, viewer)) = report.look {
+        let clock = escape(&report.clock(frame));
+        let _ = write!(
+            body,
+            "<section><h2>Look</h2><p class=\"lead\">The frame that moves most, {clock}. Click or drag in a picture to move the \
+             planes, scroll to go through the slices.</p><article class=\"wide\">{viewer}</article></section>"
+        );
+    }
     let _ = write!(
         body,
         "<section><h2>Over time</h2><p class=\"lead\">E1 and E3 are the largest and the smallest principal strain (Green-Lagrange), peaks their \

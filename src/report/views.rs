@@ -30,6 +30,8 @@ pub struct Views {
     pub error: Option<Panel>,
     /// One SVG a plane, and how many times longer than in truth the arrows are.
     pub arrows: (Vec<String>, f64),
+    /// Black and white of the initial volume, and the gains of the deformed and the warped one to it.
+    pub gray: ([f64; 2], [f32; 2]),
     /// One SVG a plane, how thick a slab is shown (mm), and the scale of the dots.
     pub matches: (Vec<String>, f64, Scale),
 }
@@ -112,6 +114,7 @@ impl Views {
                     short(spread(0.5, uncertainty))
                 )),
             error: error.transpose()?,
+            gray: (range, [before, after]),
             arrows: (arrows, factor),
             matches: (dots, slab, precision),
         })

@@ -61,6 +61,20 @@ impl Default for FieldParams {
 }
 
 impl FieldParams {
+    /// Names of all parameters, as files have them.
+    pub const KEYS: [&str; 10] = [
+        "preset",
+        "points",
+        "voxels_per_point",
+        "search_mm",
+        "finest",
+        "node_spacing",
+        "passes",
+        "coarse_passes",
+        "interpolation",
+        "seed",
+    ];
+
     /// The values of a preset (docs/accuracy.md has the measurements behind them).
     pub fn preset(preset: Preset) -> Self {
         let balanced = Self {

@@ -3,8 +3,8 @@
 //! Formulas: nifti1.h, "3D IMAGE (VOLUME) ORIENTATION AND LOCATION IN SPACE" and `nifti_quatern_to_mat44`,
 //! `nifti_mat44_to_quatern` in nifti1_io.c.
 
-use super::flaw::Flaw;
 use super::header::Header;
+use crate::io::flaw::Flaw;
 use crate::types::Affine;
 use crate::types::space::Matrix3;
 

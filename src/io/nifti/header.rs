@@ -1,10 +1,13 @@
 //! The part of a NIfTI header that is used, from version 1 (parsed by the `nifti` crate) or 2.
 
-use super::flaw::Flaw;
+use crate::io::flaw::Flaw;
 use nifti::{Endianness, NiftiHeader};
 
 /// Bytes of the longest header, NIfTI-2's; more than NIfTI-1's 348.
 pub(super) const LONGEST: usize = 540;
+
+/// What NiftyReg writes as `intent_name` of a transformation.
+const NIFTYREG: &[u8] = b"NREG_TRANS";
 
 const CONVERT: &str = "convert it to a .nii.gz (for example with dcm2niix, nibabel or ITK-SNAP)";
 
@@ -15,6 +18,9 @@ pub(super) struct Header {
     pub dim: [i64; 8],
     pub datatype: i16,
     pub intent: i64,
+    pub intent_p1: f64,
+    /// Whether NiftyReg has put its name here.
+    pub niftyreg: bool,
     pub pixdim: [f64; 8],
     /// NaN and the like have become negative.
     pub vox_offset: i64,
@@ -62,6 +68,8 @@ impl Header {
             dim: h.dim.map(|d| i64::from(d as i16)),
             datatype: h.datatype,
             intent: h.intent_code.into(),
+            intent_p1: h.intent_p1.into(),
+            niftyreg: h.intent_name.starts_with(NIFTYREG),
             pixdim: h.pixdim.map(f64::from),
             vox_offset: if h.vox_offset.fract() == 0.0 { h.vox_offset as i64 } else { -1 },
             scl_slope: h.scl_slope.into(),
@@ -96,6 +104,8 @@ impl Header {
             dim: std::array::from_fn(|i| int(16 + 8 * i, 8)),
             datatype: int(12, 2) as i16,
             intent: int(504, 4),
+            intent_p1: float(80),
+            niftyreg: head[508..524].starts_with(NIFTYREG),
             pixdim: std::array::from_fn(|i| float(104 + 8 * i)),
             vox_offset: int(168, 8),
             scl_slope: float(176),

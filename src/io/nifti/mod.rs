@@ -13,17 +13,14 @@
 
 mod affine;
 
-mod flaw;
-
 mod header;
 
-mod read;
+pub(super) mod read;
 
 mod series;
 
 mod write;
 
-pub use read::{count_non_finite, read_field, read_labels, read_mask, read_volume};
 pub use series::Series;
 pub use write::{
     PackedField, write_field, write_field_series, write_integers, write_labels, write_series_field, write_steps,

@@ -1,70 +1,69 @@
-//! Reading volumes, label maps and displacement fields.
+//! Reading volumes and displacement fields.
 
 use super::affine::affine;
-use super::flaw::Flaw;
 use super::header::{Header, LONGEST};
 use crate::error::IoError;
+use crate::io::flaw::Flaw;
+use crate::io::image::Stored;
+use crate::io::voxels::{self, Kind};
 use crate::io::{gzip, os};
-use crate::types::{DenseField, Grid, Mask, Volume};
-use rayon::prelude::*;
+use crate::types::Grid;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// Reads a scalar volume: (nx, ny, nz), in the file's intensity unit after its scaling.
-///
-/// Axes past the third must have length 1. Values that are not finite are given as they are (see
-/// [`count_non_finite`]); float64 beyond float32 becomes infinite.
-///
-/// # Errors
-/// [`IoError`] when the file cannot be read, is cut short or damaged, or is not a scalar volume of numbers.
-pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
-    let (grid, values) = load(path.as_ref(), scalar_layout)?;
-    Volume::from_vec(grid, values).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path.as_ref()))
+/// The grid and the values of a scalar volume.
+pub(in crate::io) fn volume(path: &Path) -> Result<(Grid, Vec<f32>), IoError> {
+    load(path, scalar_layout).map(|(plan, values)| (plan.grid, values))
 }
 
-/// Reads a label map: whole numbers 0 to 255, stored as any type.
-///
-/// # Errors
-/// As [`read_volume`]; also when a value is anything else.
-pub fn read_labels(path: impl AsRef<Path>) -> Result<Mask, IoError> {
-    let path = path.as_ref();
-    let volume = read_volume(path)?;
-    let grid = *volume.grid();
-    let odd = volume.as_slice().iter().position(|&v| !(0.0..=255.0).contains(&v) || v.fract() != 0.0);
-    if let Some(at) = odd {
-        let [nx, ny, _] = grid.shape();
-        let (v, i, j, k) = (volume.as_slice()[at], at % nx, at / nx % ny, at / nx / ny);
-        let what = format!("voxel ({i}, {j}, {k}) is {v}, but labels are whole numbers from 0 to 255");
-        return Err(Flaw::new(what, "give a mask or label map, resampled with nearest neighbour").at(path));
+/// The grid and the three components of a field, one after the other, as they are stored; and who wrote it how.
+pub(in crate::io) fn field(path: &Path, flat: bool) -> Result<(Grid, Vec<f32>, Intent), IoError> {
+    let (plan, values) = load(path, if flat { flat_field_layout } else { field_layout })?;
+    Ok((plan.grid, values, plan.intent))
+}
+
+/// What the header says about the file, and its intent.
+pub(in crate::io) fn header(path: &Path) -> Result<(Stored, i64), IoError> {
+    let (mut file, size, mut head) = open(path)?;
+    let packed = gzip::is_gzip(&head);
+    if packed {
+        file.read_to_end(&mut head).map_err(os(path, "read"))?;
+        head = gzip::peek(&head, LONGEST);
     }
-    let labels = volume.into_vec().into_iter().map(|v| v as u8).collect();
-    Mask::from_vec(grid, labels).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
+    let describe = || {
+        let header = Header::parse(&head)?;
+        let axes = header.axes()?;
+        let format = match (header.first_offset, packed) {
+            (352, false) => "NIfTI-1",
+            (352, true) => "NIfTI-1, gzip",
+            (_, false) => "NIfTI-2",
+            (_, true) => "NIfTI-2, gzip",
+        };
+        let placed = match (header.sform_code, header.qform_code) {
+            (1.., _) => "sform",
+            (_, 1..) => "qform",
+            _ => "neither sform nor qform: the voxel size alone",
+        };
+        let used = header.dim[0].clamp(3, 7) as usize;
+        let datatype = kind(header.datatype)?.name();
+        let shape = [axes[0], axes[1], axes[2]];
+        let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
+        Ok((Stored { format, datatype, axes: axes[..used].to_vec(), placed, grid, bytes: size }, header.intent))
+    };
+    describe().map_err(|flaw: Flaw| flaw.at(path))
 }
 
-/// Reads a mask: 0 is outside, 1 to 255 inside (labels are kept).
-///
-/// # Errors
-/// As [`read_labels`].
-pub fn read_mask(path: impl AsRef<Path>) -> Result<Mask, IoError> {
-    read_labels(path)
-}
+const EXPORT: &str = "export it again";
 
-/// Reads a displacement field (mm): (nx, ny, nz, 1, 3), intent 1007 or 1006, LPS components on disk, RAS in memory.
-///
-/// The components are millimetres whatever `xyzt_units` says, as ITK takes them.
-///
-/// # Errors
-/// [`IoError`] when the file cannot be read, is cut short or damaged, or is not such a field.
-pub fn read_field(path: impl AsRef<Path>) -> Result<DenseField, IoError> {
-    let (grid, mut values) = load(path.as_ref(), field_layout)?;
-    values[..2 * grid.len()].iter_mut().for_each(|v| *v = -*v);
-    DenseField::from_vec(grid, values).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path.as_ref()))
-}
-
-/// Voxels that are NaN or infinite.
-pub fn count_non_finite(volume: &Volume) -> usize {
-    volume.as_slice().iter().filter(|v| !v.is_finite()).count()
+/// Who wrote a field, and what its numbers are.
+#[derive(Debug, Clone, PartialEq)]
+pub(in crate::io) struct Intent {
+    pub(in crate::io) code: i64,
+    /// Whether `intent_name` is that of NiftyReg.
+    pub(in crate::io) niftyreg: bool,
+    /// Its first parameter, NiftyReg's kind of transformation.
+    pub(in crate::io) kind: f64,
 }
 
 /// A scalar volume has one component.
@@ -84,7 +83,7 @@ fn scalar_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
 
 /// A displacement field has three.
 fn field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
-    let hint = "give a displacement field as palpate, ANTs or ITK write it";
+    let hint = "give a displacement field as palpate, ANTs or ITK write it, or say whose it is with --field-convention";
     if axes[3..] != [1, 3, 1, 1] {
         let dim = &axes[..h.dim[0] as usize];
         return Err(Flaw::new(format!("is not a displacement field: dim {dim:?} instead of (x, y, z, 1, 3)"), hint));
@@ -95,6 +94,16 @@ fn field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
     }
 }
 
+/// FNIRT's has its components on the fourth axis.
+fn flat_field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
+    let hint = "give what `fnirt --fout` or `convertwarp` writes";
+    match (axes[3..] == [3, 1, 1, 1], h.intent) {
+        (true, 0 | 1006 | 1007 | 2006) => Ok(3),
+        (true, 2007..=2016) => Err(Flaw::new("holds coefficients of a field, not the field", hint)),
+        _ => Err(Flaw::new("is not a displacement field of FSL, (x, y, z, 3)", hint)),
+    }
+}
+
 type Layout = fn(&Header, [usize; 7]) -> Result<usize, Flaw>;
 
 /// A regular file, its size and its first bytes, at most [`LONGEST`].
@@ -102,7 +111,7 @@ pub(super) fn open(path: &Path) -> Result<(File, u64, Vec<u8>), IoError> {
     let mut file = File::open(path).map_err(os(path, "read"))?;
     let metadata = file.metadata().map_err(os(path, "read"))?;
     if !metadata.is_file() {
-        return Err(Flaw::new("is not a regular file", "give a .nii or .nii.gz").at(path));
+        return Err(Flaw::new("is not a regular file", "give a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd").at(path));
     }
     let mut head = Vec::new();
     file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
@@ -110,7 +119,7 @@ pub(super) fn open(path: &Path) -> Result<(File, u64, Vec<u8>), IoError> {
 }
 
 /// The grid and all values, component after component; `layout` judges the axes and gives the number of components.
-fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
+fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
     let (mut file, size, mut head) = open(path)?;
     let packed = if gzip::is_gzip(&head) {
         file.read_to_end(&mut head).map_err(os(path, "read"))?;
@@ -141,7 +150,7 @@ fn load(path: &Path, layout: Layout) -> Result<(Grid, Vec<f32>), IoError> {
             decode(&plan, &data)
         }
     };
-    Ok((plan.grid, values))
+    Ok((plan, values))
 }
 
 /// What the header says about the voxels, checked.
@@ -153,13 +162,14 @@ pub(super) struct Plan {
     /// First byte and number of bytes.
     pub(super) start: u64,
     pub(super) bytes: u64,
+    intent: Intent,
 }
 
 impl Plan {
     pub(super) fn new(head: &[u8], layout: Layout) -> Result<Self, Flaw> {
         let header = Header::parse(head)?;
         let axes = header.axes()?;
-        let kind = Kind::from_code(header.datatype)?;
+        let kind = kind(header.datatype)?;
         let components = layout(&header, axes)?;
         let shape = [axes[0], axes[1], axes[2]];
         let grid = Grid::new(shape, affine(&header, shape)?)
@@ -171,6 +181,7 @@ impl Plan {
             scaling: header.scaling()?,
             start: header.data_offset()?,
             bytes: (grid.len() * components * kind.size()) as u64,
+            intent: Intent { code: header.intent, niftyreg: header.niftyreg, kind: header.intent_p1 },
         })
     }
 
@@ -185,85 +196,28 @@ impl Plan {
     }
 }
 
-/// How a voxel is stored.
-#[derive(Debug, Clone, Copy)]
-enum Kind {
-    U8,
-    I8,
-    U16,
-    I16,
-    U32,
-    I32,
-    U64,
-    I64,
-    F32,
-    F64,
+/// From a `NIFTI_TYPE_*` code.
+fn kind(code: i16) -> Result<Kind, Flaw> {
+    let name = match code {
+        2 => return Ok(Kind::U8),
+        4 => return Ok(Kind::I16),
+        8 => return Ok(Kind::I32),
+        16 => return Ok(Kind::F32),
+        64 => return Ok(Kind::F64),
+        256 => return Ok(Kind::I8),
+        512 => return Ok(Kind::U16),
+        768 => return Ok(Kind::U32),
+        1024 => return Ok(Kind::I64),
+        1280 => return Ok(Kind::U64),
+        32 | 1792 | 2048 => "complex numbers",
+        128 | 2304 => "RGB colours",
+        1536 => "float128",
+        _ => return Err(Flaw::new(format!("has an unknown datatype ({code})"), "export it again as float32")),
+    };
+    Err(Flaw::new(format!("holds {name} (datatype {code})"), "convert it to one real number a voxel, such as float32"))
 }
 
-impl Kind {
-    /// From a `NIFTI_TYPE_*` code.
-    fn from_code(code: i16) -> Result<Self, Flaw> {
-        let name = match code {
-            2 => return Ok(Self::U8),
-            4 => return Ok(Self::I16),
-            8 => return Ok(Self::I32),
-            16 => return Ok(Self::F32),
-            64 => return Ok(Self::F64),
-            256 => return Ok(Self::I8),
-            512 => return Ok(Self::U16),
-            768 => return Ok(Self::U32),
-            1024 => return Ok(Self::I64),
-            1280 => return Ok(Self::U64),
-            32 | 1792 | 2048 => "complex numbers",
-            128 | 2304 => "RGB colours",
-            1536 => "float128",
-            _ => return Err(Flaw::new(format!("has an unknown datatype ({code})"), "export it again as float32")),
-        };
-        Err(Flaw::new(
-            format!("holds {name} (datatype {code})"),
-            "convert it to one real number a voxel, such as float32",
-        ))
-    }
-
-    fn size(self) -> usize {
-        match self {
-            Self::U8 | Self::I8 => 1,
-            Self::U16 | Self::I16 => 2,
-            Self::U32 | Self::I32 | Self::F32 => 4,
-            Self::U64 | Self::I64 | Self::F64 => 8,
-        }
-    }
-}
-
+/// The numbers of a stretch of the file.
 pub(super) fn decode(plan: &Plan, bytes: &[u8]) -> Vec<f32> {
-    macro_rules! decode_as {
-        ($t:ty) => {
-            if plan.big_endian {
-                convert(bytes, plan.scaling, |b| <$t>::from_be_bytes(b) as f64)
-            } else {
-                convert(bytes, plan.scaling, |b| <$t>::from_le_bytes(b) as f64)
-            }
-        };
-    }
-    match plan.kind {
-        Kind::U8 => decode_as!(u8),
-        Kind::I8 => decode_as!(i8),
-        Kind::U16 => decode_as!(u16),
-        Kind::I16 => decode_as!(i16),
-        Kind::U32 => decode_as!(u32),
-        Kind::I32 => decode_as!(i32),
-        Kind::U64 => decode_as!(u64),
-        Kind::I64 => decode_as!(i64),
-        Kind::F32 => decode_as!(f32),
-        Kind::F64 => decode_as!(f64),
-    }
-}
-
-fn convert<const N: usize>(
-    bytes: &[u8],
-    (slope, intercept): (f64, f64),
-    stored: impl Fn([u8; N]) -> f64 + Sync,
-) -> Vec<f32> {
-    let voxels = bytes.as_chunks::<N>().0;
-    voxels.par_iter().with_min_len(1 << 16).map(|&b| (slope * stored(b) + intercept) as f32).collect()
+    voxels::decode(plan.kind, plan.big_endian, plan.scaling, bytes)
 }

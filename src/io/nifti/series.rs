@@ -1,9 +1,9 @@
 //! A series of volumes in one file, read one at a time.
 
-use super::flaw::Flaw;
 use super::header::{Header, LONGEST};
 use super::read::{Plan, decode, open};
 use crate::error::IoError;
+use crate::io::flaw::Flaw;
 use crate::io::{gzip, os};
 use crate::types::{Grid, Volume};
 use flate2::bufread::MultiGzDecoder;

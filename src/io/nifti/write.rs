@@ -1,9 +1,9 @@
 //! Writing volumes, label maps and displacement fields.
 
 use super::affine::quaternion;
-use super::flaw::Flaw;
 use crate::error::IoError;
 use crate::io::atomic::write_atomic;
+use crate::io::flaw::Flaw;
 use crate::io::gzip::{Chunk, Member, Run};
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};

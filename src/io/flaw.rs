@@ -1,7 +1,7 @@
-//! What is wrong with a NIfTI file, before its path is known.
+//! What is wrong with a file, before its path is known.
 
+use super::format;
 use crate::error::IoError;
-use crate::io::format;
 use std::path::Path;
 
 /// What is wrong, and what to try.

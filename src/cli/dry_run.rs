@@ -1,0 +1,120 @@
+//! `--dry-run`: the checked plan in words.
+
+use super::inputs::name;
+use super::outputs::Target;
+use anyhow::Result;
+use palpate::pipeline::plan::{FieldPlan, stiffness_memory};
+use palpate::report::scale::{short, thousands};
+use palpate::types::{FieldParams, Grid, Mask, StiffnessParams};
+use std::path::{Path, PathBuf};
+
+/// Axes as `64 x 75 x 64`.
+pub fn times(shape: [usize; 3]) -> String {
+    shape.map(|n| n.to_string()).join(" x ")
+}
+
+/// Voxels and their size.
+pub fn grid(grid: &Grid) -> String {
+    let size = grid.spacing().map(|v| short((v * 1e4).round() / 1e4)).join(" x ");
+    format!("{} voxels of {size} mm", times(grid.shape()))
+}
+
+/// Bytes as megabytes or gigabytes.
+fn bytes(n: u64) -> String {
+    match n as f64 / 1e6 {
+        mb if mb < 1000.0 => format!("{mb:.0} MB"),
+        mb => format!("{:.1} GB", mb / 1000.0),
+    }
+}
+
+fn line(out: &mut String, key: &str, value: &str) {
+    out.push_str(&format!("  {key:<12} {value}\n"));
+}
+
+fn end(out: &mut String, folder: &Path, files: &[impl AsRef<str>]) {
+    let files: Vec<&str> = files.iter().map(AsRef::as_ref).collect();
+    let shown = match &files[..] {
+        [first @ .., last] if first.len() > 12 => {
+            format!("{}, ... {last} ({} in all)", first[..6].join(", "), files.len())
+        }
+        all => all.join(", "),
+    };
+    line(out, "into", &folder.display().to_string());
+    line(out, "files", &shown);
+    out.push_str("Nothing was written.");
+}
+
+fn measuring(out: &mut String, plan: &FieldPlan, params: &FieldParams) {
+    let automatic = |given: bool| if given { "" } else { " (by size)" };
+    let preset = format!("{:?}", params.preset).to_lowercase();
+    line(out, "preset", &format!("{preset}, seed {}", params.seed));
+    line(out, "search", &format!("{} mm{}", short(plan.search_mm), automatic(params.search_mm > 0.0)));
+    line(out, "tissue", &format!("{} voxels", thousands(plan.mask_voxels)));
+    line(out, "points", &format!("{}{}", thousands(plan.points), automatic(params.points > 0)));
+    line(out, "levels", &plan.levels.iter().map(|l| times(*l)).collect::<Vec<_>>().join(", "));
+    line(out, "memory", &format!("about {}", bytes(plan.memory)));
+}
+
+/// The plan of `palpate field`.
+pub fn field(
+    volumes: &[(&PathBuf, &Grid); 2],
+    plan: &FieldPlan,
+    params: &FieldParams,
+    target: &Target,
+    files: &[&str],
+) -> Result<String> {
+    target.check()?;
+    let mut out = String::from("Would measure the displacement:\n");
+    for ((path, g), key) in volumes.iter().zip(["initial", "deformed"]) {
+        line(&mut out, key, &format!("{}: {}", name(path), grid(g)));
+    }
+    measuring(&mut out, plan, params);
+    end(&mut out, &target.output, files);
+    Ok(out)
+}
+
+/// The plan of `palpate track`.
+pub fn track(
+    first: &Path,
+    reference: &Grid,
+    frames: usize,
+    origin: usize,
+    plan: &FieldPlan,
+    params: &FieldParams,
+    target: &Target,
+    files: &[String],
+) -> Result<String> {
+    target.check()?;
+    let mut out = format!("Would measure {} volumes against number {origin}:\n", frames - 1);
+    line(&mut out, "reference", &format!("{}: {}", name(first), grid(reference)));
+    measuring(&mut out, plan, params);
+    end(&mut out, &target.output, files);
+    Ok(out)
+}
+
+/// The plan of `palpate stiffness`.
+pub fn stiffness(
+    (path, g): (&Path, &Grid),
+    labels: &Mask,
+    params: &StiffnessParams,
+    [held, load]: [&str; 2],
+    output: &Path,
+    files: &[&str],
+) -> String {
+    let mut voxels = [0usize; 256];
+    labels.as_slice().iter().for_each(|&l| voxels[usize::from(l)] += 1);
+    let regions: Vec<String> =
+        (1..256).filter(|&l| voxels[l] > 0).map(|l| format!("{l} ({} voxels)", thousands(voxels[l]))).collect();
+    let mut out = String::from("Would look for Young's modulus:\n");
+    line(&mut out, "field", &format!("{}: {}", name(path), grid(g)));
+    line(&mut out, "labels", &regions.join(", "));
+    line(&mut out, "held", held);
+    line(&mut out, "loaded", load);
+    let force = params.force_n.map_or("none: moduli as ratios".into(), |f| format!("{f} N: moduli in kPa"));
+    line(&mut out, "force", &force);
+    line(&mut out, "law", &format!("{:?}, Poisson's ratio {}", params.model, params.poisson).to_lowercase());
+    line(&mut out, "mesh", &format!("about {} nodes", thousands(params.nodes)));
+    line(&mut out, "memory", &format!("about {}", bytes(stiffness_memory(params.nodes))));
+    end(&mut out, output, files);
+    out
+}

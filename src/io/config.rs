@@ -1,0 +1,81 @@
+//! Parameters of the field pipeline from a file: `summary.json` of an earlier run, or its keys as JSON or TOML.
+
+use super::scene::{known_names, parse_table};
+use super::{format, os};
+use crate::error::IoError;
+use crate::types::FieldParams;
+use crate::types::params::Preset;
+use serde_json::{Map, Value};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// No file of parameters is longer (bytes).
+const LONGEST: u64 = 1 << 24;
+
+/// Reads parameters under the keys that `summary.json` has in `params`: there, or alone at the top of a JSON or TOML file.
+/// Keys that are left out keep the preset's value (`balanced` without one).
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or is neither, a key is unknown (with the nearest known one), or a value is of
+/// a wrong type or out of range.
+pub fn read_config(path: impl AsRef<Path>) -> Result<FieldParams, IoError> {
+    let path = path.as_ref();
+    let mut text = String::new();
+    let file = File::open(path).map_err(os(path, "read"))?;
+    file.take(LONGEST).read_to_string(&mut text).map_err(os(path, "read"))?;
+    let given = if text.trim_start().starts_with('{') { from_json(path, &text)? } else { from_toml(path, &text)? };
+    let preset = match given.get("preset") {
+        Some(value) => serde_json::from_value(value.clone())
+            .map_err(|_| format(path, format!("preset is {value}"), "give \"fast\", \"balanced\" or \"accurate\""))?,
+        None => Preset::default(),
+    };
+    let mut params = FieldParams::preset(preset);
+    for (key, value) in given {
+        params = with(&params, &key, &value).ok_or_else(|| {
+            let hint = "see docs/file-formats.md for what each key takes";
+            format(path, format!("{key} is {value}, which it cannot be"), hint)
+        })?;
+    }
+    params.check().map_err(|e| format(path, e.to_string(), "correct that key"))?;
+    Ok(params)
+}
+
+/// `params` with one value replaced; none when it is of a wrong type.
+fn with(params: &FieldParams, key: &str, value: &Value) -> Option<FieldParams> {
+    let mut all = serde_json::to_value(params).ok()?;
+    all.as_object_mut()?.insert(key.into(), value.clone());
+    serde_json::from_value(all).ok()
+}
+
+fn from_json(path: &Path, text: &str) -> Result<Map<String, Value>, IoError> {
+    let wrong = |what: String| format(path, what, "give the summary.json of a field or track run, or its params");
+    let parsed: Value = serde_json::from_str(text).map_err(|e| wrong(format!("is no JSON ({e})")))?;
+    let Value::Object(mut top) = parsed else { return Err(wrong("holds no keys".into())) };
+    let is_summary = top.contains_key("version") && top.contains_key("command");
+    let given = match top.remove("params") {
+        Some(Value::Object(params)) => params,
+        Some(_) => return Err(wrong("params is no object".into())),
+        None if is_summary => {
+            let command = top.get("command").and_then(Value::as_str).unwrap_or("another command");
+            return Err(wrong(format!("is the summary of `palpate {command}`, which has no field parameters")));
+        }
+        None => top,
+    };
+    known_names(path, "the configuration", given.keys().map(String::as_str), &FieldParams::KEYS)?;
+    Ok(given)
+}
+
+fn from_toml(path: &Path, text: &str) -> Result<Map<String, Value>, IoError> {
+    let mut table = parse_table(path, text)?;
+    if let Some(toml::Value::Table(params)) = table.remove("params") {
+        known_names(path, "the configuration", table.keys().map(String::as_str), &["params"])?;
+        table = params;
+    }
+    known_names(path, "the configuration", table.keys().map(String::as_str), &FieldParams::KEYS)?;
+    let odd = |what: String| format(path, what, "write key = value, with text in quotes");
+    match serde_json::to_value(&table).map_err(|e| odd(e.to_string()))? {
+        Value::Object(given) => Ok(given),
+        _ => Err(odd("holds no keys".into())),
+    }
+}

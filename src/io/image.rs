@@ -1,0 +1,187 @@
+//! Volumes, label maps and fields from any format that is read: NIfTI, NRRD, MetaImage, and a folder with a DICOM series.
+//!
+//! The format is known by the first bytes, and by the name only for MetaImage, which has no magic. Everything comes to
+//! RAS: NRRD says which space it is in, MetaImage and DICOM are LPS.
+
+use super::flaw::Flaw;
+use super::raw::RawImage;
+use super::{metaimage, nifti, nrrd, os};
+use crate::error::IoError;
+use crate::types::{Grid, Mask, Volume};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// Formats by their first bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Format {
+    Nifti,
+    Nrrd,
+    MetaImage,
+    Folder,
+}
+
+impl Format {
+    /// Of the file or folder at `path`.
+    pub(super) fn of(path: &Path) -> Result<Self, IoError> {
+        if path.is_dir() {
+            return Ok(Self::Folder);
+        }
+        let mut head = Vec::new();
+        let file = File::open(path).map_err(os(path, "read"))?;
+        // What is no regular file is refused by whoever reads it; a pipe must not be drained here.
+        if file.metadata().is_ok_and(|m| m.is_file()) {
+            file.take(64).read_to_end(&mut head).map_err(os(path, "read"))?;
+        }
+        let name = path.to_string_lossy().to_lowercase();
+        let text = head.iter().all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace());
+        let meta = [".mha", ".mhd"].iter().any(|e| name.ends_with(e)) && text && head.contains(&b'=');
+        Ok(match head.starts_with(b"NRRD000") {
+            true => Self::Nrrd,
+            false if meta => Self::MetaImage,
+            false => Self::Nifti,
+        })
+    }
+}
+
+/// How an image is stored.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stored {
+    /// As `NIfTI-1, gzip`.
+    pub format: &'static str,
+    /// As `int16`.
+    pub datatype: &'static str,
+    /// Lengths of all axes.
+    pub axes: Vec<usize>,
+    /// Where the position in space comes from.
+    pub placed: &'static str,
+    /// The first three axes.
+    pub grid: Grid,
+    /// Size of the file with the voxels.
+    pub bytes: u64,
+}
+
+/// What an image file holds, by its header alone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ImageKind {
+    /// One number a voxel.
+    Scalar,
+    /// Three numbers a voxel.
+    Field,
+    /// Volumes one after the other.
+    Series,
+    /// Something that palpate does not read.
+    Other,
+}
+
+/// Reads only the header of an image.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or its header is damaged.
+pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoError> {
+    let path = path.as_ref();
+    match Format::of(path)? {
+        Format::Nifti => {
+            let (stored, intent) = nifti::read::header(path)?;
+            let kind = match stored.axes.get(3..).unwrap_or(&[]) {
+                rest if rest.iter().product::<usize>() == 1 => ImageKind::Scalar,
+                [1, 3, ..] => ImageKind::Field,
+                [3] if intent == 2006 => ImageKind::Field,
+                [_] => ImageKind::Series,
+                _ => ImageKind::Other,
+            };
+            Ok((stored, kind))
+        }
+        Format::Folder => {
+            let (stored, _) = super::dicom::series(path, false)?;
+            Ok((stored, ImageKind::Scalar))
+        }
+        format => {
+            let image = raw(path, format)?;
+            let kind = match image.components {
+                1 => ImageKind::Scalar,
+                3 => ImageKind::Field,
+                _ => ImageKind::Other,
+            };
+            Ok((image.stored(), kind))
+        }
+    }
+}
+
+/// The header of a NRRD or MetaImage.
+fn raw(path: &Path, format: Format) -> Result<RawImage, IoError> {
+    match format {
+        Format::Nrrd => nrrd::header(path),
+        _ => metaimage::header(path),
+    }
+}
+
+/// Reads a scalar volume, in the file's intensity unit after its scaling: a file, or a folder with one DICOM series.
+///
+/// Axes past the third must have length 1. Values that are not finite are given as they are (see
+/// [`count_non_finite`]); float64 beyond float32 becomes infinite.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read, is cut short or damaged, or is not a scalar volume of numbers.
+pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
+    let path = path.as_ref();
+    let (grid, values) = match Format::of(path)? {
+        Format::Nifti => nifti::read::volume(path)?,
+        Format::Folder => {
+            let (stored, values) = super::dicom::series(path, true)?;
+            (stored.grid, values)
+        }
+        format => {
+            let image = raw(path, format)?;
+            if image.components != 1 {
+                let what = format!("has {} numbers a voxel, not one", image.components);
+                return Err(Flaw::new(what, "give an image here; fields go to --field or to `palpate warp`").at(path));
+            }
+            (image.grid, image.load()?)
+        }
+    };
+    Volume::from_vec(grid, values).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
+}
+
+/// Reads a label map: whole numbers 0 to 255, stored as any type.
+///
+/// # Errors
+/// As [`read_volume`]; also when a value is anything else.
+pub fn read_labels(path: impl AsRef<Path>) -> Result<Mask, IoError> {
+    let path = path.as_ref();
+    let volume = read_volume(path)?;
+    let grid = *volume.grid();
+    let odd = volume.as_slice().iter().position(|&v| !(0.0..=255.0).contains(&v) || v.fract() != 0.0);
+    if let Some(at) = odd {
+        let [nx, ny, _] = grid.shape();
+        let (v, i, j, k) = (volume.as_slice()[at], at % nx, at / nx % ny, at / nx / ny);
+        let what = format!("voxel ({i}, {j}, {k}) is {v}, but labels are whole numbers from 0 to 255");
+        return Err(Flaw::new(what, "give a mask or label map, resampled with nearest neighbour").at(path));
+    }
+    let labels = volume.into_vec().into_iter().map(|v| v as u8).collect();
+    Mask::from_vec(grid, labels).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
+}
+
+/// Reads a mask: 0 is outside, 1 to 255 inside (labels are kept).
+///
+/// # Errors
+/// As [`read_labels`].
+pub fn read_mask(path: impl AsRef<Path>) -> Result<Mask, IoError> {
+    read_labels(path)
+}
+
+/// Voxels that are NaN or infinite.
+pub fn count_non_finite(volume: &Volume) -> usize {
+    volume.as_slice().iter().filter(|v| !v.is_finite()).count()
+}
+
+/// The three components of a NRRD or MetaImage field, one after the other, as they are stored.
+pub(super) fn raw_field(path: &Path, format: Format) -> Result<(Grid, Vec<f32>), IoError> {
+    let image = raw(path, format)?;
+    if image.components != 3 {
+        let what = format!("is not a displacement field: {} numbers a voxel instead of 3", image.components);
+        return Err(Flaw::new(what, "give a displacement field as ITK, Slicer or plastimatch write it").at(path));
+    }
+    let values = image.load()?;
+    Ok((image.grid, values))
+}

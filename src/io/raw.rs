@@ -1,0 +1,153 @@
+//! Voxels that a text header describes: in the same file after it, or in one beside it.
+
+use super::flaw::Flaw;
+use super::gzip::{self, LARGEST_RATIO};
+use super::image::Stored;
+use super::os;
+use super::voxels::{Kind, decode};
+use crate::error::IoError;
+use crate::types::{Affine, Grid};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// No text header is longer (bytes).
+const LONGEST_HEADER: u64 = 1 << 20;
+
+/// How the voxels are packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Packing {
+    None,
+    Gzip,
+    Zlib,
+}
+
+/// Where the voxels begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Start {
+    At(u64),
+    /// They end the file.
+    Last,
+}
+
+/// An image by its header, checked.
+#[derive(Debug, Clone)]
+pub(super) struct RawImage {
+    pub(super) format: &'static str,
+    pub(super) placed: &'static str,
+    pub(super) grid: Grid,
+    pub(super) components: usize,
+    /// Whether a voxel's numbers lie together.
+    pub(super) interleaved: bool,
+    pub(super) kind: Kind,
+    pub(super) big_endian: bool,
+    pub(super) packing: Packing,
+    pub(super) start: Start,
+    pub(super) file: PathBuf,
+}
+
+/// The first lines of a file as far as they can belong to a header (text up to the first byte that is none, or 1 MiB).
+pub(super) fn head(path: &Path) -> Result<Vec<u8>, IoError> {
+    let file = File::open(path).map_err(os(path, "read"))?;
+    if !file.metadata().map_err(os(path, "read"))?.is_file() {
+        return Err(Flaw::new("is not a regular file", "give an image file").at(path));
+    }
+    let mut bytes = Vec::new();
+    file.take(LONGEST_HEADER).read_to_end(&mut bytes).map_err(os(path, "read"))?;
+    Ok(bytes)
+}
+
+/// A line of `bytes` from `from`, without its end, and where the next one begins; none past the end.
+pub(super) fn line(bytes: &[u8], from: usize) -> Option<(String, usize)> {
+    let rest = bytes.get(from..).filter(|r| !r.is_empty())?;
+    let end = rest.iter().position(|&b| b == b'\n')?;
+    let text = String::from_utf8_lossy(&rest[..end]).trim_end_matches('\r').to_string();
+    Some((text, from + end + 1))
+}
+
+/// `N` numbers separated by spaces or commas.
+pub(super) fn numbers(text: &str) -> Option<Vec<f64>> {
+    let parts = text.split([' ', '\t', ',', '(', ')']).filter(|p| !p.is_empty());
+    parts.map(|p| p.parse().ok().filter(|v: &f64| v.is_finite())).collect()
+}
+
+/// A grid from the step along each axis and the first voxel, both in LPS mm.
+pub(super) fn grid_from_lps(shape: [usize; 3], steps: [[f64; 3]; 3], origin: [f64; 3]) -> Result<Grid, Flaw> {
+    let sign = [-1.0, -1.0, 1.0];
+    let rows =
+        std::array::from_fn(|r| std::array::from_fn(|c| sign[r] * if c < 3 { steps[c][r] } else { origin[r] } + 0.0));
+    let hint = "write the true voxel size and orientation into the header";
+    let affine = Affine::new(rows).map_err(|e| Flaw::new(e.to_string(), hint))?;
+    Grid::new(shape, affine).map_err(|e| Flaw::new(e.to_string(), hint))
+}
+
+impl RawImage {
+    /// For `palpate info`.
+    pub(super) fn stored(&self) -> Stored {
+        let mut axes = self.grid.shape().to_vec();
+        if self.components > 1 {
+            axes.push(self.components);
+        }
+        Stored {
+            format: self.format,
+            datatype: self.kind.name(),
+            axes,
+            placed: self.placed,
+            grid: self.grid,
+            bytes: self.file.metadata().map_or(0, |m| m.len()),
+        }
+    }
+
+    /// The numbers, component after component.
+    pub(super) fn load(&self) -> Result<Vec<f32>, IoError> {
+        let path = &self.file;
+        let needed = (self.grid.len() * self.components).saturating_mul(self.kind.size()) as u64;
+        let mut file = File::open(path).map_err(os(path, "read"))?;
+        let size = file.metadata().map_err(os(path, "read"))?.len();
+        let start = match self.start {
+            Start::At(at) => at,
+            Start::Last => size.saturating_sub(needed),
+        };
+        let held = size.saturating_sub(start);
+        let most = if self.packing == Packing::None { held } else { held.saturating_mul(LARGEST_RATIO) };
+        let short = |holds: u64| {
+            let what = format!("needs {needed} bytes for its {:?} voxels but holds at most {holds}", self.grid.shape());
+            Flaw::new(what, "the file is cut short or its header is damaged: copy or export it again").at(path)
+        };
+        if needed > most {
+            return Err(short(most));
+        }
+        let damaged = |e: std::io::Error| {
+            Flaw::new(format!("its packed voxels are damaged or cut short ({e})"), "copy or export it again").at(path)
+        };
+        file.seek(SeekFrom::Start(start)).map_err(os(path, "read"))?;
+        let mut bytes = Vec::new();
+        match self.packing {
+            Packing::None => {
+                file.take(needed).read_to_end(&mut bytes).map_err(os(path, "read"))?;
+            }
+            Packing::Gzip => {
+                let mut packed = Vec::new();
+                file.read_to_end(&mut packed).map_err(os(path, "read"))?;
+                bytes = gzip::unpack(&packed, needed as usize).map_err(damaged)?;
+                bytes.truncate(needed as usize);
+            }
+            Packing::Zlib => {
+                flate2::read::ZlibDecoder::new(file).take(needed).read_to_end(&mut bytes).map_err(damaged)?;
+            }
+        }
+        if (bytes.len() as u64) < needed {
+            return Err(short(bytes.len() as u64));
+        }
+        let values = decode(self.kind, self.big_endian, (1.0, 0.0), &bytes);
+        if !self.interleaved || self.components == 1 {
+            return Ok(values);
+        }
+        let n = self.grid.len();
+        let mut apart = vec![0.0; values.len()];
+        for (at, voxel) in values.chunks_exact(self.components).enumerate() {
+            voxel.iter().enumerate().for_each(|(c, &v)| apart[c * n + at] = v);
+        }
+        Ok(apart)
+    }
+}

@@ -1,0 +1,380 @@
+//! A viewer for the page: linked orthogonal slices through whole volumes, with overlays, drawn on plain canvases.
+//!
+//! Images are thinned to about a million and a half voxels, smooth quantities to 120,000, packed with zlib, and unpacked by
+//! the browser; nothing is fetched. Values are kept in 8 bits of their scale, displacements to 0.01 mm, places in 16 bits of
+//! the extent. Thinned voxels are picked, not averaged: what is shown was measured.
+
+use crate::report::colormap::ColorMap;
+use crate::report::field::Values;
+use crate::report::html::{escape, figure};
+use crate::report::scale::Scale;
+use crate::report::section::Canonical;
+use crate::types::{DenseField, Grid, Mask, Match, Mesh, WorldPoint};
+use base64::{Engine, engine::general_purpose::STANDARD};
+use flate2::{Compression, write::ZlibEncoder};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::io::Write;
+
+/// Voxels of an image at most.
+const IMAGE_VOXELS: usize = 1_500_000;
+/// Voxels of a smooth quantity at most.
+const SMOOTH_VOXELS: usize = 120_000;
+/// Matches at most, evenly thinned.
+const MATCHES: usize = 60_000;
+/// A mesh of more elements is left out.
+const ELEMENTS: usize = 200_000;
+
+/// The tallest picture at most, on the page.
+const HEIGHT_PX: f64 = 520.0;
+
+/// A quantity with its name and range.
+pub struct Layer<'a> {
+    /// What it is called.
+    pub name: &'a str,
+    /// Its value at a voxel offset.
+    pub values: Values<'a>,
+    /// Range and colours.
+    pub scale: Scale,
+}
+
+/// What a viewer shows. All on one grid.
+pub struct Viewer<'a> {
+    /// The grid.
+    pub grid: &'a Grid,
+    /// Where the planes cross first (mm, RAS).
+    pub centre: WorldPoint,
+    /// Colours, arrows and lines are drawn inside it.
+    pub mask: Option<&'a Mask>,
+    /// In gray; the first is shown first.
+    pub images: &'a [Layer<'a>],
+    /// In colour over an image.
+    pub overlays: &'a [Layer<'a>],
+    /// The overlay that is shown first.
+    pub shown: Option<usize>,
+    /// Arrows, grid and magnitude, with the scale of its length.
+    pub displacement: Option<(&'a DenseField, Scale)>,
+    /// Dots with the scale of their precision.
+    pub matches: Option<(&'a [Match], Scale)>,
+    /// Lines where elements meet the plane: nodes (mm, RAS) and the corners of each, three or four.
+    pub mesh: Option<(&'a [WorldPoint], Vec<u32>, usize)>,
+}
+
+/// Nodes and corners of a mesh, for [`Viewer::mesh`].
+pub fn elements(mesh: &Mesh) -> (&[WorldPoint], Vec<u32>, usize) {
+    match mesh {
+        Mesh::Tetrahedra(m) => (m.nodes(), m.tetrahedra().as_flattened().to_vec(), 4),
+        Mesh::Triangles(m) => (m.nodes(), m.triangles().as_flattened().to_vec(), 3),
+    }
+}
+
+/// zlib, then base64.
+fn pack(bytes: &[u8]) -> String {
+    let mut encoder = ZlibEncoder::new(Vec::new(), Compression::new(6));
+    // Writing to memory cannot fail.
+    let _ = encoder.write_all(bytes);
+    STANDARD.encode(encoder.finish().unwrap_or_default())
+}
+
+/// Every so many voxels along each canonical axis.
+struct Thinned<'a> {
+    canonical: &'a Canonical,
+    steps: [usize; 3],
+    shape: [usize; 3],
+}
+
+impl<'a> Thinned<'a> {
+    /// So that at most `most` voxels are left, as close to cubes as can be.
+    fn new(canonical: &'a Canonical, most: usize) -> Self {
+        let (len, size) = (canonical.shape(), canonical.spacing());
+        let mut edge = size.iter().fold(f64::INFINITY, |m, &v| m.min(v));
+        loop {
+            let steps: [usize; 3] = std::array::from_fn(|a| ((edge / size[a]).round() as usize).clamp(1, len[a]));
+            let shape: [usize; 3] = std::array::from_fn(|a| (len[a] / steps[a]).max(1));
+            if shape.iter().product::<usize>() <= most {
+                return Self { canonical, steps, shape };
+            }
+            edge *= 1.1;
+        }
+    }
+
+    /// Voxel offset of each thinned voxel, x fastest.
+    fn offsets(&self) -> Vec<usize> {
+        let [nx, ny, nz] = self.shape;
+        let at = |i: usize, axis: usize| i * self.steps[axis] + (self.steps[axis] - 1) / 2;
+        let row = |r: usize| (0..nx).map(move |i| self.canonical.offset([at(i, 0), at(r % ny, 1), at(r / ny, 2)]));
+        (0..ny * nz).flat_map(row).collect()
+    }
+
+    /// Shape, first voxel's centre and step (mm from the first corner).
+    fn lattice(&self) -> Value {
+        let size = self.canonical.spacing();
+        let step: [f64; 3] = std::array::from_fn(|a| self.steps[a] as f64 * size[a]);
+        let first: [f64; 3] = std::array::from_fn(|a| (((self.steps[a] - 1) / 2) as f64 + 0.5) * size[a]);
+        json!({ "shape": self.shape, "first": first, "step": step })
+    }
+}
+
+/// `value` in 8 bits of the scale; what is not finite is at its low end.
+fn byte(scale: &Scale, value: f32) -> u8 {
+    let t = scale.position(f64::from(value));
+    if t.is_finite() { (255.0 * t.clamp(0.0, 1.0)).round() as u8 } else { 0 }
+}
+
+fn with(mut lattice: Value, more: Value) -> Value {
+    if let (Value::Object(all), Value::Object(more)) = (&mut lattice, more) {
+        all.extend(more);
+    }
+    lattice
+}
+
+fn layer(thinned: &Thinned<'_>, offsets: &[usize], layer: &Layer<'_>) -> Value {
+    let Layer { name, values, scale } = layer;
+    let bytes: Vec<u8> = offsets.par_iter().with_min_len(1 << 12).map(|&o| byte(scale, values(o))).collect();
+    let about = json!({ "name": name, "low": scale.low, "high": scale.high, "unit": scale.unit,
+        "map": map_name(scale.map), "data": pack(&bytes) });
+    with(thinned.lattice(), about)
+}
+
+fn map_name(map: ColorMap) -> String {
+    format!("{map:?}").to_lowercase()
+}
+
+fn table(map: ColorMap) -> String {
+    let rgb: Vec<u8> = (0..=255).flat_map(|i| map.rgb(f64::from(i) / 255.0)).collect();
+    STANDARD.encode(rgb)
+}
+
+impl Viewer<'_> {
+    /// Markup, data and script.
+    pub fn html(&self) -> String {
+        let canonical = Canonical::of(self.grid);
+        let (fine, coarse) = (Thinned::new(&canonical, IMAGE_VOXELS), Thinned::new(&canonical, SMOOTH_VOXELS));
+        let (fine_offsets, coarse_offsets) = (fine.offsets(), coarse.offsets());
+        let images: Vec<Value> = self.images.iter().map(|l| layer(&fine, &fine_offsets, l)).collect();
+        let mut overlays: Vec<Value> = Vec::new();
+        let mut maps: Vec<ColorMap> = Vec::new();
+        if let Some((_, scale)) = &self.displacement {
+            maps.push(scale.map);
+            overlays.push(json!({ "name": "Length of the displacement", "vector": true, "low": scale.low,
+                "high": scale.high, "unit": scale.unit, "map": map_name(scale.map) }));
+        }
+        for overlay in self.overlays {
+            maps.push(overlay.scale.map);
+            overlays.push(layer(&coarse, &coarse_offsets, overlay));
+        }
+        let field = self.displacement.as_ref().map(|(field, _)| {
+            let moved: Vec<[f64; 3]> =
+                coarse_offsets.iter().map(|&o| canonical.direct(field.at(o).map(f64::from))).collect();
+            let hundredths =
+                |v: f64| if v.is_finite() { (100.0 * v).round().clamp(-32767.0, 32767.0) as i16 } else { 0 };
+            let bytes: Vec<u8> =
+                (0..3).flat_map(|c| moved.iter().flat_map(move |d| hundredths(d[c]).to_le_bytes())).collect();
+            with(coarse.lattice(), json!({ "data": pack(&bytes) }))
+        });
+        let mask = self.mask.map(|mask| {
+            let inside: Vec<u8> = coarse_offsets.iter().map(|&o| u8::from(mask.as_slice()[o] > 0)).collect();
+            with(coarse.lattice(), json!({ "data": pack(&inside) }))
+        });
+        let extent = canonical.extent_mm();
+        let places = |points: &mut dyn Iterator<Item = WorldPoint>| -> String {
+            let short = |p: WorldPoint| {
+                let place = canonical.place(p);
+                std::array::from_fn::<_, 3, _>(|a| (65535.0 * (place[a] / extent[a]).clamp(0.0, 1.0)).round() as u16)
+            };
+            pack(&points.flat_map(short).flat_map(u16::to_le_bytes).collect::<Vec<u8>>())
+        };
+        let matches = self.matches.as_ref().map(|(all, scale)| {
+            maps.push(scale.map);
+            let some: Vec<&Match> = all.iter().step_by(all.len().div_ceil(MATCHES).max(1)).collect();
+            let sigma: Vec<u8> = some.iter().map(|m| byte(scale, m.sigma() as f32)).collect();
+            let kept: Vec<u8> = some.iter().map(|m| u8::from(m.kept)).collect();
+            json!({ "place": places(&mut some.iter().map(|m| m.initial)), "sigma": pack(&sigma), "kept": pack(&kept),
+                "low": scale.low, "high": scale.high, "map": map_name(scale.map) })
+        });
+        let mesh = self.mesh.as_ref().filter(|m| m.1.len() / m.2 <= ELEMENTS).map(|(nodes, cells, corners)| {
+            let cells: Vec<u8> = cells.iter().flat_map(|c| c.to_le_bytes()).collect();
+            json!({ "nodes": places(&mut nodes.iter().copied()), "cells": pack(&cells), "corners": corners })
+        });
+        let planes = canonical.planes();
+        let colours: serde_json::Map<String, Value> = maps.iter().map(|m| (map_name(*m), json!(table(*m)))).collect();
+        let data = json!({
+            "planes": planes.iter().map(|p| p.name()).collect::<Vec<_>>(),
+            "extent": extent,
+            "centre": canonical.place(self.centre),
+            "affine": canonical.to_world(),
+            "images": images,
+            "overlays": overlays,
+            "field": field,
+            "mask": mask.unwrap_or_else(|| json!({})),
+            "matches": matches,
+            "mesh": mesh,
+            "colours": colours,
+        });
+        let views: String = planes
+            .iter()
+            .map(|p| {
+                let size = canonical.size_mm(*p);
+                let [w, h] = size;
+                let canvas =
+                    format!("<canvas style=\"aspect-ratio:{w:.2}/{h:.2}\" aria-label=\"{}\"></canvas>", p.name());
+                format!(
+                    "<div style=\"flex:{:.2}\">{}<input type=\"range\" aria-label=\"slice of the {} plane\"></div>",
+                    size[0],
+                    figure(*p, size, &canvas),
+                    p.name()
+                )
+            })
+            .collect();
+        // As large as fits on a laptop's screen in one piece.
+        let sizes: Vec<[f64; 2]> = planes.iter().map(|p| canonical.size_mm(*p)).collect();
+        let tallest = sizes.iter().map(|s| s[1]).fold(1e-9, f64::max);
+        let most = (HEIGHT_PX * sizes.iter().map(|s| s[0]).sum::<f64>() / tallest).max(300.0);
+        let text = data.to_string().replace("</", "<\\/");
+        format!(
+            "<div class=\"viewer\">{}<div class=\"planes\" style=\"max-width:{most:.0}px\">{views}</div><p><output></output></p>{}<p class=\"state\">The \
+             viewer needs JavaScript.</p><script type=\"application/json\">{text}</script></div><script>{}</script>",
+            self.choices(mesh_is_shown(&data)),
+            "<div class=\"bar\" hidden><i></i><span></span><span></span><span></span></div>",
+            include_str!("viewer.js")
+        )
+    }
+
+    /// What can be chosen.
+    fn choices(&self, mesh: bool) -> String {
+        let options = |names: &mut dyn Iterator<Item = &str>, chosen: usize| -> String {
+            let one = |(i, n): (usize, &str)| {
+                let selected = if i == chosen { " selected" } else { "" };
+                format!("<option value=\"{i}\"{selected}>{}</option>", escape(n))
+            };
+            names.enumerate().map(one).collect()
+        };
+        let vector = self.displacement.iter().map(|_| "Length of the displacement");
+        let names: Vec<&str> = vector.chain(self.overlays.iter().map(|l| l.name)).collect();
+        let check = |name: &str, words: &str, there: bool, on: bool| match there {
+            true => {
+                let checked = if on { " checked" } else { "" };
+                format!("<label><input type=\"checkbox\" name=\"{name}\"{checked}> {words}</label>")
+            }
+            false => String::new(),
+        };
+        let images: Vec<&str> = self.images.iter().map(|l| l.name).collect();
+        let moves = self.displacement.is_some();
+        let compare = if images.len() > 1 { "" } else { " hidden" };
+        format!(
+            "<div class=\"choices\"><select name=\"image\" aria-label=\"Image\">{}</select>\
+             <select name=\"compare\" aria-label=\"Compare\"{compare}><option value=\"alone\">alone</option>\
+             <option value=\"flicker\">flicker with</option><option value=\"checkerboard\">checkerboard with</option></select>\
+             <select name=\"other\" aria-label=\"Other image\" hidden>{}</select>\
+             <select name=\"colour\" aria-label=\"Colour\"><option value=\"-1\">no colour</option>{}</select>\
+             <label>opacity <input type=\"range\" name=\"opacity\" min=\"0\" max=\"100\" value=\"60\"></label>{}{}\
+             <label{}>drawn longer <input type=\"range\" name=\"factor\" min=\"0\" max=\"9\" value=\"0\"><b></b></label>{}{}{}</div>",
+            options(&mut images.iter().copied(), 0),
+            options(&mut images.iter().copied(), images.len() - 1),
+            options(
+                &mut names.iter().copied(),
+                self.shown.map_or(usize::MAX, |n| n + names.len() - self.overlays.len())
+            ),
+            check("arrows", "arrows", moves, moves),
+            check("grid", "grid", moves, false),
+            if moves { "" } else { " hidden" },
+            check("matches", "matches", self.matches.is_some(), false),
+            check("tetrahedra", if mesh { "mesh" } else { "" }, mesh, false),
+            check("cross", "cross", true, true)
+        )
+    }
+}
+
+fn mesh_is_shown(data: &Value) -> bool {
+    !data["mesh"].is_null()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::types::Affine;
+    use std::io::Read;
+
+    fn unpack(text: &Value) -> Vec<u8> {
+        let bytes = STANDARD.decode(text.as_str().unwrap()).unwrap();
+        let mut out = Vec::new();
+        flate2::read::ZlibDecoder::new(&bytes[..]).read_to_end(&mut out).unwrap();
+        out
+    }
+
+    fn data(html: &str) -> Value {
+        let from = html.find("application/json\">").unwrap() + 18;
+        serde_json::from_str(&html[from..from + html[from..].find("</script>").unwrap()]).unwrap()
+    }
+
+    #[test]
+    fn voxels_places_and_directions_come_out_in_canonical_axes() {
+        // World x runs along -k, world y along -i, world z along +j.
+        let rows = [[0.0, 0.0, -3.0, 9.0], [-2.0, 0.0, 0.0, 6.0], [0.0, 1.0, 0.0, 0.0]];
+        let grid = Grid::new([4, 5, 4], Affine::new(rows).unwrap()).unwrap();
+        let x = |o: usize| {
+            let [i, j, k] = grid.voxel(o);
+            grid.world(i, j, k).0[0] as f32
+        };
+        let scale = Scale { low: 0.0, high: 255.0, unit: "", map: ColorMap::Gray };
+        let field = DenseField::from_fn(grid, |_| [1.0, -2.0, 0.5]);
+        let length = Scale::from_zero(3.0, "mm", ColorMap::Viridis);
+        let at = Match {
+            initial: WorldPoint([9.0, 0.0, 4.0]),
+            displacement: [0.0; 3],
+            ncc: 1.0,
+            covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
+            kept: true,
+        };
+        let viewer = Viewer {
+            grid: &grid,
+            centre: WorldPoint([3.0, 2.0, 1.0]),
+            mask: None,
+            images: &[Layer { name: "a", values: &x, scale }],
+            overlays: &[],
+            shown: None,
+            displacement: Some((&field, length.clone())),
+            matches: Some((&[at], length)),
+            mesh: None,
+        };
+        let data = data(&viewer.html());
+        assert_eq!(data["images"][0]["shape"], json!([4, 4, 5]));
+        assert_eq!(unpack(&data["images"][0]["data"])[..8], [0, 3, 6, 9, 0, 3, 6, 9]);
+        let moved: Vec<i16> =
+            unpack(&data["field"]["data"]).chunks(2).map(|b| i16::from_le_bytes([b[0], b[1]])).collect();
+        assert_eq!([moved[0], moved[80], moved[160]], [100, -200, 50]);
+        // The match lies in the voxel to the right, at the back, on top.
+        let place: Vec<f64> = unpack(&data["matches"]["place"])
+            .chunks(2)
+            .zip([12.0, 8.0, 5.0])
+            .map(|(b, e)| f64::from(u16::from_le_bytes([b[0], b[1]])) / 65535.0 * e)
+            .collect();
+        for (found, expected) in place.iter().zip([10.5, 1.0, 4.5]) {
+            assert!((found - expected).abs() < 1e-3, "{place:?}");
+        }
+        // The first corner's world place, and back.
+        let affine: Vec<Vec<f64>> = serde_json::from_value(data["affine"].clone()).unwrap();
+        let world = |p: [f64; 3]| -> Vec<f64> {
+            affine.iter().map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3]).collect()
+        };
+        assert_eq!(world([10.5, 1.0, 4.5]), [9.0, 0.0, 4.0]);
+    }
+
+    #[test]
+    fn large_volumes_are_thinned_to_the_limit_and_small_ones_are_not() {
+        let canonical = |shape: [usize; 3], size: [f64; 3]| {
+            Canonical::of(&Grid::new(shape, Affine::scaled(size, [0.0; 3]).unwrap()).unwrap())
+        };
+        let small = canonical([64, 75, 64], [1.0; 3]);
+        assert_eq!(Thinned::new(&small, IMAGE_VOXELS).steps, [1; 3]);
+        let large = canonical([600, 512, 40], [0.4, 0.4, 4.0]);
+        let thinned = Thinned::new(&large, IMAGE_VOXELS);
+        assert_eq!(thinned.steps[2], 1, "thick slices stay");
+        let n = thinned.shape.iter().product::<usize>();
+        assert!(n <= IMAGE_VOXELS && n > IMAGE_VOXELS / 3, "{n}");
+        assert!(thinned.offsets().iter().all(|&o| o < 600 * 512 * 40));
+        let flat = canonical([900, 900, 1], [0.3, 0.3, 5.0]);
+        assert_eq!(Thinned::new(&flat, SMOOTH_VOXELS).shape[2], 1);
+    }
+}

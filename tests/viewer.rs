@@ -1,0 +1,79 @@
+//! The viewer of a report in a real browser, where Chromium is installed.
+#![allow(clippy::unwrap_used)]
+
+mod fixtures;
+
+use fixtures::{palpate, small_pair, text};
+use std::path::Path;
+use std::process::Command;
+use tempfile::TempDir;
+
+/// Catches every error before anything else runs.
+const WATCH: &str = "<script>window.wrong=[];addEventListener('error',e=>wrong.push('FAILED: '+e.message));\
+    addEventListener('unhandledrejection',e=>wrong.push('FAILED: '+e.reason));\
+    console.error=(...a)=>wrong.push('FAILED: console: '+a.join(' '));</script>";
+
+fn browser() -> Option<&'static str> {
+    let found = |name: &&str| Command::new(name).arg("--version").output().is_ok_and(|o| o.status.success());
+    ["chromium", "chromium-browser", "google-chrome"].into_iter().find(found)
+}
+
+/// Opens the report, works every control, and gives a line for each check.
+fn work(report: &Path) -> Option<String> {
+    let Some(browser) = browser() else {
+        eprintln!("skipped: no Chromium is installed");
+        return None;
+    };
+    let page = std::fs::read_to_string(report).unwrap();
+    let check = format!("<script>{}</script></body>", include_str!("fixtures/viewer_check.js"));
+    let page = page.replacen("<head>", &format!("<head>{WATCH}"), 1).replacen("</body>", &check, 1);
+    let folder = TempDir::new().unwrap();
+    let file = folder.path().join("check.html");
+    std::fs::write(&file, page).unwrap();
+    let output = Command::new(browser)
+        .args(["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1366,768"])
+        .args(["--virtual-time-budget=60000", "--dump-dom"])
+        .arg(format!("--user-data-dir={}", folder.path().join("profile").display()))
+        .arg(format!("file://{}", file.display()))
+        .output()
+        .unwrap();
+    let dom = text(&output.stdout);
+    let from = dom.find("<pre id=\"said\">").unwrap_or_else(|| panic!("nothing was said: {}", text(&output.stderr)));
+    Some(dom[from + 15..from + dom[from..].find("</pre>").unwrap()].to_string())
+}
+
+fn all_is_well(report: &Path, least: usize) {
+    let Some(said) = work(report) else { return };
+    assert!(!said.contains("FAILED"), "{said}");
+    let checks = said.lines().filter(|l| l.starts_with("ok: ")).count();
+    assert!(checks >= least, "only {checks} checks:\n{said}");
+}
+
+#[test]
+fn the_field_report_loads_without_errors_and_every_control_works() {
+    let folder = small_pair();
+    let arguments = ["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--quiet", "-o", "results"];
+    palpate(folder.path()).args(arguments).assert().success();
+    let report = folder.path().join("results/report.html");
+    assert!(report.metadata().unwrap().len() < 2_000_000, "a small volume makes a small page");
+    all_is_well(&report, 35);
+}
+
+#[test]
+fn the_stiffness_report_too() {
+    let folder = TempDir::new().unwrap();
+    let phantom = ["phantom", "inclusion", "--size", "20", "--quiet", "-o", "block"];
+    palpate(folder.path()).args(phantom).assert().success();
+    let stiffness = ["stiffness", "--field", "block/truth.nii.gz", "--labels", "block/labels.nii.gz"];
+    let rest = ["--nodes", "800", "--model", "linear", "--quiet", "-o", "stiffness"];
+    palpate(folder.path()).args(stiffness).args(rest).assert().success();
+    all_is_well(&folder.path().join("stiffness/report.html"), 20);
+}
+
+#[test]
+fn the_report_of_a_sequence_too() {
+    let folder = small_pair();
+    let track = ["track", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--quiet", "-o", "tracked"];
+    palpate(folder.path()).args(track).assert().success();
+    all_is_well(&folder.path().join("tracked/report.html"), 30);
+}
