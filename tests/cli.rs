@@ -5,6 +5,7 @@ mod fixtures;
 
 use assert_cmd::Command;
 use fixtures::{Nifti, palpate, small_pair, text};
+use serde_json::Value;
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
@@ -470,12 +471,35 @@ fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
     assert_eq!(fs::read_dir(folder.path().join("one")).unwrap().count(), 8);
 }
 
+/// The chain test: a finger pad through every command, ending in a stable grasp; each stage has its truth and error.
 #[test]
-fn the_demo_can_be_run_again() {
+fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     let folder = TempDir::new().unwrap();
-    for _ in 0..2 {
-        let (out, _) = run(folder.path(), &["demo", "--preset", "fast", "--quiet"], 0);
-        assert!(out.contains("Mean error") && out.contains("palpate-demo"), "{out}");
-    }
-    assert!(folder.path().join("palpate-demo/report.html").is_file());
+    let command = ["demo", "--preset", "fast", "--nodes", "4000", "--quiet"];
+    let (out, _) = run(folder.path(), &command, 0);
+    println!("{out}");
+    let demo = folder.path().join("palpate-demo");
+    let summary: Value = serde_json::from_str(&fs::read_to_string(demo.join("summary.json")).unwrap()).unwrap();
+    let row = |quantity: &str| {
+        let all = summary["chain"].as_array().unwrap();
+        let found = all.iter().find(|r| r["quantity"].as_str().unwrap().contains(quantity)).unwrap();
+        ["found", "truth", "error"].map(|k| found[k].as_f64().unwrap())
+    };
+    let [error, nothing, _] = row("displacement");
+    assert!(error < 0.35 * nothing, "{error} mm of {nothing}");
+    assert!(row("of pulp")[2].abs() < 0.25, "{:?}", row("of pulp"));
+    let skin = summary["chain"].as_array().unwrap().iter().find(|r| r["quantity"].as_str().unwrap().contains("skin"));
+    let skin = skin.unwrap();
+    assert!(!skin["bound"].is_null() || skin["error"].as_f64().unwrap().abs() < 0.4, "{skin}");
+    assert!(row("hemisphere")[2].abs() < 0.25, "{:?}", row("hemisphere"));
+    let [turn, exact, _] = row("turn");
+    assert!((turn - exact).abs() < 0.5, "{turn} degrees, not {exact}");
+    assert_eq!(row("held to the end")[0], 1.0);
+    assert_eq!(fs::read_to_string(demo.join("chain.csv")).unwrap().lines().count(), 8);
+    let page = fs::read_to_string(demo.join("report.html")).unwrap();
+    assert!(page.matches("srcdoc").count() == 3 && page.contains("<svg"));
+    // Again into the same folder it may; into one that holds something else it may not.
+    fs::remove_file(demo.join("summary.json")).unwrap();
+    let (_, err) = run(folder.path(), &command, 1);
+    assert!(err.contains("palpate-demo") && err.contains("--force"), "{err}");
 }

@@ -27,7 +27,7 @@ pub struct Options {
 /// What replaces values of the scene file.
 #[derive(Debug, Default, Args)]
 pub struct Choices {
-    /// parallel, parallel-normal, radial or rigid [default: by the scene]
+    /// parallel, parallel-normal, radial, rigid or tabulated [default: by the scene]
     #[arg(long)]
     model: Option<FingertipModel>,
     /// minimal or multipliers [default: by the scene]
