@@ -175,6 +175,25 @@ fn a_pad_becomes_a_tip_that_a_grasp_reads() {
 }
 
 #[test]
+fn a_bone_of_which_only_a_low_bound_is_known_is_still_the_bone() {
+    let folder = stiffness_folder(true, "bone");
+    let path = folder.path().join("stiffness");
+    // Bone above 1 kPa: softer than the pulp by number, and all the same the back plate.
+    let map = io::read_volume(path.join("stiffness.nii.gz")).unwrap();
+    let low = Volume::from_voxels(*map.grid(), |o, _| {
+        map.as_slice()[o].min(41.0) - 40.0 * f32::from(map.as_slice()[o] > 100.0)
+    });
+    io::write_volume(path.join("stiffness.nii.gz"), &low, "").unwrap();
+    let summary = fs::read_to_string(path.join("summary.json")).unwrap();
+    let mut summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+    summary["regions"][1]["youngs_modulus"] = 1.0.into();
+    summary["regions"][1]["bound"] = "lower".into();
+    io::write_json(path.join("summary.json"), &summary).unwrap();
+    let (out, _) = palpate(folder.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 0);
+    assert!(out.contains("E 40.0 kPa"), "{out}");
+}
+
+#[test]
 fn bad_folders_are_refused() {
     let ratios = stiffness_folder(false, "bone");
     let (_, err) = palpate(ratios.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);

@@ -46,11 +46,12 @@ fn outward(folder: &StiffnessFolder) -> [f64; 3] {
 
 /// Moduli that stand for bone or a back plate: by name, by a lower bound, or by being far stiffer than the softest.
 fn hard(folder: &StiffnessFolder) -> Vec<f64> {
-    let softest = folder.regions.iter().map(|r| r.youngs_modulus).fold(f64::INFINITY, f64::min);
     let named = |n: &str| BONE.iter().any(|b| n.to_lowercase().contains(b));
-    let is_hard = |r: &&io::StiffnessRegion| {
-        named(&r.name) || r.bound.as_deref() == Some("lower") || r.youngs_modulus >= HARD * softest
-    };
+    let known = |r: &&io::StiffnessRegion| named(&r.name) || r.bound.as_deref() == Some("lower");
+    // A bound says nothing of how soft the softest is.
+    let tissue = folder.regions.iter().filter(|r| !known(r) && r.bound.is_none());
+    let softest = tissue.map(|r| r.youngs_modulus).fold(f64::INFINITY, f64::min);
+    let is_hard = |r: &&io::StiffnessRegion| known(r) || r.youngs_modulus >= HARD * softest;
     folder.regions.iter().filter(is_hard).map(|r| r.youngs_modulus).collect()
 }
 
