@@ -149,7 +149,7 @@ pub fn run_from(
                 progress("matching", done(0.0));
                 let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
                 let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
-                let wide = MatchParams { points, thorough: true, reach_mm: search, patch: 2, strain: 0.3 };
+                let wide = MatchParams::new(params, points, true, search, 2, 0.3);
                 let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
                 clock.book("matching");
                 let enough = report.counts.kept >= FEWEST;
@@ -173,7 +173,7 @@ pub fn run_from(
                 if params.points > 0 { params.points } else { (pair.inside / params.voxels_per_point).max(200) };
             let finest = pyramid::finest(pair.shape, pair.spacing);
             let thorough = params.points > 0;
-            let near = MatchParams { points, thorough, reach_mm: finest, patch: 3, strain: 0.05 };
+            let near = MatchParams::new(params, points, thorough, finest, 3, 0.05);
             let (matches, _, report) = level::matches(&pair, Some(&field), field.lattice.clone(), near);
             if !first || reports.is_empty() {
                 reports.push(report);

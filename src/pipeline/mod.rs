@@ -23,4 +23,10 @@ pub mod stiffness;
 
 pub mod stiffness_sequence;
 
+pub mod cpu;
+
+pub mod trials;
+
+pub mod stress;
+
 mod search;
