@@ -5,6 +5,8 @@
 
 mod completions;
 
+mod chart;
+
 mod console;
 
 mod convention;
@@ -35,6 +37,8 @@ mod markups;
 
 mod outputs;
 
+mod peers;
+
 mod phantom;
 
 mod sequence;
@@ -46,6 +50,8 @@ mod track;
 mod stiffness;
 
 mod stiffness_sequence;
+
+mod stress;
 
 mod warp;
 
@@ -107,6 +113,10 @@ enum Command {
     Phantom(phantom::Options),
     /// Score a displacement field against exact truth
     Evaluate(evaluate::Options),
+    /// Chart speed against accuracy on cases with a known answer
+    Chart(chart::Options),
+    /// Push each part until it breaks, and see whether it says so
+    Stress(stress::Options),
     /// Make a synthetic calf, measure it, and score the result against the truth
     Demo(demo::Options),
     /// Turn matches, landmarks or points into a point list of 3D Slicer
@@ -137,6 +147,22 @@ pub fn run() -> ExitCode {
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
     let work = || dispatch(&command, &console);
+    let work = || match command {
+        Command::Field(options) => field::run(&options, &console),
+        Command::Warp(options) => warp::run(&options, &console),
+        Command::Invert(options) => invert::run(&options, &console),
+        Command::Track(options) => track::run(&options, &console),
+        Command::Stiffness(options) => stiffness::run(&options, &console),
+        Command::Fingertip(options) => fingertip::run(&options, &console),
+        Command::Grasp(options) => grasp::run(&options, &console),
+        Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
+        Command::Skin(options) => skin::run(&options, &console),
+        Command::Phantom(options) => phantom::run(&options, &console),
+        Command::Evaluate(options) => evaluate::run(&options, &console),
+        Command::Chart(options) => chart::run(&options, &console),
+        Command::Stress(options) => stress::run(&options, &console),
+        Command::Demo(options) => demo::run(&options, &console),
+    };
     let done = match pool {
         Ok(pool) => pool.install(work),
         Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
