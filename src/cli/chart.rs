@@ -137,7 +137,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             let postures: Vec<f64> = exact.motions.iter().map(|m| m.reached.pose[2].to_degrees()).collect();
             runs.extend(best_mujoco(peers.mujoco(&postures)?));
         }
-        let (unit, title) = ("degrees", "Grasp: object angle after eight motions".into());
+        let (unit, title) = ("degrees", "Grasp: object angle over eight motions".into());
         groups.push(Group { part: Part::Grasp, title, unit, standings: standings(&runs) });
         trials.extend(runs);
     }

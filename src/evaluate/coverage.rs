@@ -25,9 +25,7 @@ pub fn textured(volume: &Volume, mask: &Mask) -> Mask {
     let mean = filters::gaussian(data, shape, sigma);
     let square = filters::gaussian(&squares, shape, sigma);
     let least = (STANDS_OUT * noise).powi(2);
-    Mask::from_voxels(*volume.grid(), |at, _| {
-        u8::from(inside[at] != 0 && square[at] - mean[at] * mean[at] >= least)
-    })
+    Mask::from_voxels(*volume.grid(), |at, _| u8::from(inside[at] != 0 && square[at] - mean[at] * mean[at] >= least))
 }
 
 /// The share of displacement components over `mask` whose error is inside 1.96 of `sigma` (mm, one standard deviation

@@ -92,7 +92,8 @@ mod tests {
         let places = [[2.0, 1.0], [1.0, 3.0], [3.0, 2.0], [0.5, 3.0], [f64::NAN, 0.0], [4.0, 0.5]];
         assert_eq!(pareto(&places), [3, 0, 5]);
         let dominated = |i: usize| {
-            (0..places.len()).any(|j| places[j][0] <= places[i][0] && places[j][1] <= places[i][1] && places[j] != places[i])
+            (0..places.len())
+                .any(|j| places[j][0] <= places[i][0] && places[j][1] <= places[i][1] && places[j] != places[i])
         };
         assert!(pareto(&places).into_iter().all(|i| !dominated(i)));
     }

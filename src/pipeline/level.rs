@@ -178,14 +178,7 @@ pub struct MatchParams {
 
 impl MatchParams {
     /// In the order of the fields; how matches are chosen is as `params` say.
-    pub fn new(
-        params: &FieldParams,
-        points: usize,
-        thorough: bool,
-        reach_mm: f64,
-        patch: usize,
-        strain: f64,
-    ) -> Self {
+    pub fn new(params: &FieldParams, points: usize, thorough: bool, reach_mm: f64, patch: usize, strain: f64) -> Self {
         let FieldParams { candidates, consistency, sub_voxel, .. } = *params;
         Self { points, thorough, reach_mm, patch, strain, candidates, consistency, sub_voxel }
     }

@@ -1,6 +1,6 @@
 //! Stability: each chain pushed along one axis after the other until it breaks, with what it says about itself.
 
-use crate::error::SynthError;
+use crate::error::{StiffnessError, SynthError};
 use crate::evaluate;
 use crate::evaluate::breaking::{Breaking, Spread, breaking_point};
 use crate::evaluate::coverage::{BAND, coverage, textured};
@@ -10,7 +10,7 @@ use crate::pipeline::trials::{Pressed, exact, posture_error};
 use crate::synth::severity::{disturbed, shifted_labels};
 use crate::synth::{ElasticParams, Phantom, PhantomKind, PhantomParams, Trouble, troubled};
 use crate::types::scene::{Formulation, Method};
-use crate::types::{FieldParams, Part, Scene, StiffnessParams, StressCurve, StressRun, Volume};
+use crate::types::{FieldParams, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Volume};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -43,8 +43,8 @@ impl Effort {
     pub fn new(quick: bool) -> Self {
         let body = |kind, size| PhantomParams::new(kind).sized(size);
         if quick {
-            let bodies = vec![body(PhantomKind::Block, 32)];
-            return Self { bodies, seeds: vec![1], coarse: 4, halvings: 1, side: 32, nodes: 1000 };
+            let bodies = vec![body(PhantomKind::Block, 48)];
+            return Self { bodies, seeds: vec![1], coarse: 4, halvings: 1, side: 40, nodes: 2000 };
         }
         let bodies = vec![body(PhantomKind::Block, 64), body(PhantomKind::Head, 64), body(PhantomKind::Calf, 72)];
         Self { bodies, seeds: vec![1, 2, 3], coarse: 6, halvings: 3, side: 40, nodes: 2000 }
@@ -148,11 +148,7 @@ const MODULUS: f64 = 20.0;
 ///
 /// # Errors
 /// As [`Pressed::new`].
-pub fn stiffness_curves(
-    effort: &Effort,
-    quick: bool,
-    progress: Progress<'_>,
-) -> Result<Vec<StressCurve>, SynthError> {
+pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) -> Result<Vec<StressCurve>, SynthError> {
     let base = PhantomParams::new(PhantomKind::Inclusion).sized(effort.side);
     let body = Pressed::new(&base)?;
     let motion = body.phantom.description.mean_mm;
@@ -198,11 +194,7 @@ pub fn stiffness_curves(
     Ok(out)
 }
 
-fn stiffness_run(
-    body: &Pressed,
-    severity: f64,
-    found: Result<crate::types::StiffnessResult, crate::error::StiffnessError>,
-) -> StressRun {
+fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, StiffnessError>) -> StressRun {
     let result = match found {
         Ok(result) => result,
         Err(e) => {
@@ -282,7 +274,12 @@ fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
     match simulate(scene, &|_| {}) {
         Err(e) => refused = Some(e.to_string()),
         Ok(run) => {
-            said = run.events.iter().map(|e| format!("{} at {:.2} s: {}", e.kind.name(), e.time, e.what)).take(3).collect();
+            said = run
+                .events
+                .iter()
+                .map(|e| format!("{} at {:.2} s: {}", e.kind.name(), e.time, e.what))
+                .take(3)
+                .collect();
             if friction {
                 let share = |i: usize| {
                     let used = run.samples.iter().map(move |s| (s.tangential_force[i] / s.normal_force[i]).abs());

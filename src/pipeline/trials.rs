@@ -1,16 +1,17 @@
 //! Speed against accuracy: each chain with many settings on cases with a known answer, one run at a time, timed by the
 //! CPU time of this process.
 
-use crate::error::{FieldError, StiffnessError, SynthError};
+use crate::error::{FieldError, GraspError, StiffnessError, SynthError};
 use crate::evaluate;
 use crate::grasp::simulate::simulate;
 use crate::numerics::statistics::percentile;
 use crate::pipeline::{cpu, field, stiffness};
 use crate::stiffness::patches::Place;
 use crate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom};
+use crate::types::grasp::GraspRun;
 use crate::types::params::{Interpolation, Preset};
 use crate::types::scene::{Formulation, Method};
-use crate::types::stiffness::Side;
+use crate::types::stiffness::{RegionStiffness, Side};
 use crate::types::{
     DenseField, FieldParams, Landmark, Mask, Part, Scene, StiffnessParams, StiffnessResult, Trial, Volume,
 };
@@ -57,11 +58,7 @@ impl Variant {
         let preset = |name: &str, preset| {
             Self::new("preset", name, &format!("--preset {name}"), |p| *p = FieldParams::preset(preset))
         };
-        vec![
-            preset("fast", Preset::Fast),
-            preset("balanced", Preset::Balanced),
-            preset("accurate", Preset::Accurate),
-        ]
+        vec![preset("fast", Preset::Fast), preset("balanced", Preset::Balanced), preset("accurate", Preset::Accurate)]
     }
 
     /// Presets, point budgets and changes of single stages of the balanced preset; fewer when `quick`.
@@ -72,9 +69,8 @@ impl Variant {
             let name = format!("{points} points");
             out.push(Self::new("points", &name, &format!("--points {points}"), |p| p.points = points));
         }
-        let stage = |name: &str, settings: &str, change: &dyn Fn(&mut FieldParams)| {
-            Self::new("stage", name, settings, change)
-        };
+        let stage =
+            |name: &str, settings: &str, change: &dyn Fn(&mut FieldParams)| Self::new("stage", name, settings, change);
         out.push(stage("piecewise linear", "linear in the tetrahedra of the matches", &|p| {
             p.interpolation = Interpolation::Barycentric;
         }));
@@ -264,9 +260,7 @@ impl Pressed {
 
     /// Error of each region's modulus (per cent).
     pub fn errors(&self, result: &StiffnessResult) -> Vec<f64> {
-        let error = |r: &crate::types::stiffness::RegionStiffness| {
-            100.0 * (r.youngs_modulus / self.modulus(r.label) - 1.0).abs()
-        };
+        let error = |r: &RegionStiffness| 100.0 * (r.youngs_modulus / self.modulus(r.label) - 1.0).abs();
         result.regions.iter().map(error).collect()
     }
 }
@@ -306,12 +300,12 @@ pub fn stiffness_trials(side: usize, budgets: &[usize], progress: &dyn Fn(f64)) 
     Ok(out)
 }
 
-/// Largest difference of the object's angle at the end of a hold (degrees) from `exact`; NaN where a hold is missing.
-pub fn posture_error(run: &crate::types::grasp::GraspRun, exact: &crate::types::grasp::GraspRun) -> f64 {
-    if run.motions.len() < exact.motions.len() {
+/// Largest difference of the object's angle from `exact` at any sample (degrees); NaN where samples are missing.
+pub fn posture_error(run: &GraspRun, exact: &GraspRun) -> f64 {
+    if run.samples.len() != exact.samples.len() {
         return f64::NAN;
     }
-    let off = run.motions.iter().zip(&exact.motions).map(|(a, b)| a.reached.pose[2] - b.reached.pose[2]);
+    let off = run.samples.iter().zip(&exact.samples).map(|(a, b)| a.pose[2] - b.pose[2]);
     off.fold(0.0, |e: f64, v| e.max(v.abs())).to_degrees()
 }
 
@@ -327,8 +321,8 @@ pub fn exact(scene: &Scene) -> Scene {
 /// is repeated for at least `least_s` CPU seconds. Errors are of the object's angle, in degrees, against [`exact`].
 ///
 /// # Errors
-/// [`crate::error::GraspError`] when the exact run cannot be made.
-pub fn grasp_trials(least_s: f64, progress: &dyn Fn(f64)) -> Result<Vec<Trial>, crate::error::GraspError> {
+/// [`GraspError`] when the exact run cannot be made.
+pub fn grasp_trials(least_s: f64, progress: &dyn Fn(f64)) -> Result<Vec<Trial>, GraspError> {
     let truth = simulate(&exact(&Scene::reference()), &|_| {})?;
     let steps = [4e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4];
     let fixed = [Method::Rk4, Method::SemiImplicitEuler]

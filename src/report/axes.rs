@@ -33,8 +33,7 @@ impl Axis {
     /// An axis that holds all finite (for a logarithmic one: positive) `values` with a little room.
     pub fn around(name: &str, logarithmic: bool, values: impl Iterator<Item = f64>) -> Self {
         let usable = values.filter(|v| v.is_finite() && (!logarithmic || *v > 0.0));
-        let [mut low, mut high] =
-            usable.fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)]);
+        let [mut low, mut high] = usable.fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)]);
         if low > high {
             [low, high] = [1.0, 10.0];
         }
@@ -152,11 +151,8 @@ impl Panel {
             bottom + 30.0,
             escape(&self.across.name)
         );
-        let _ = write!(
-            out,
-            r#"<text x="{right}" y="29" text-anchor="end">{}</text>{content}</g>"#,
-            escape(&self.up.name)
-        );
+        let _ =
+            write!(out, r#"<text x="{right}" y="29" text-anchor="end">{}</text>{content}</g>"#, escape(&self.up.name));
         out
     }
 }
@@ -181,9 +177,7 @@ pub fn document(width: f64, height: f64, content: &str) -> String {
 pub fn tiled(columns: usize, size: [f64; 2], panels: &[(Panel, String)]) -> String {
     let (gap, rows) = (24.0, panels.len().div_ceil(columns));
     let columns = columns.min(panels.len().max(1));
-    let at = |i: usize| {
-        [gap + (i % columns) as f64 * (size[0] + gap), gap + (i / columns) as f64 * (size[1] + gap)]
-    };
+    let at = |i: usize| [gap + (i % columns) as f64 * (size[0] + gap), gap + (i / columns) as f64 * (size[1] + gap)];
     let content: String = panels.iter().enumerate().map(|(i, (panel, inner))| panel.draw(at(i), inner)).collect();
     document(gap + columns as f64 * (size[0] + gap), gap + rows as f64 * (size[1] + gap), &content)
 }

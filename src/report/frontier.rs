@@ -202,9 +202,7 @@ pub fn page(groups: &[Group], trials: &[Trial]) -> String {
         let head = ["Method", "Settings", &error, "CPU, s", "Cases", "No result", ""];
         let _ = write!(body, "<section><h2>{}</h2>{}</section>", escape(&group.title), table(&head, &rows));
     }
-    let failed = |t: &Trial| {
-        t.failure.as_ref().map(|f| vec![escape(&t.method), escape(&t.case), escape(f)])
-    };
+    let failed = |t: &Trial| t.failure.as_ref().map(|f| vec![escape(&t.method), escape(&t.case), escape(f)]);
     let failures: Vec<_> = trials.iter().filter_map(failed).collect();
     if !failures.is_empty() {
         let _ = write!(
@@ -233,14 +231,8 @@ pub fn text(groups: &[Group]) -> String {
         let mut front: Vec<&Standing> = group.standings.iter().filter(|s| s.on_front).collect();
         front.sort_by(|a, b| a.cpu_s.total_cmp(&b.cpu_s));
         for s in front {
-            let _ = writeln!(
-                out,
-                "  {:28} {:>9} s  {:>9} {}",
-                s.method,
-                label_3(s.cpu_s),
-                label_3(s.error),
-                group.unit
-            );
+            let _ =
+                writeln!(out, "  {:28} {:>9} s  {:>9} {}", s.method, label_3(s.cpu_s), label_3(s.error), group.unit);
         }
     }
     out

@@ -101,7 +101,8 @@ fn panel(group: &[&StressCurve]) -> (Panel, String) {
 fn hover(curve: &StressCurve, runs: &[StressRun]) -> String {
     let mut out = format!("{}, {} {} {}", curve.case, curve.axis, digits(runs[0].severity), curve.unit);
     for r in runs {
-        let error = if r.error.is_nan() { "no result".into() } else { format!("{} {}", digits(r.error), curve.error_unit) };
+        let error =
+            if r.error.is_nan() { "no result".into() } else { format!("{} {}", digits(r.error), curve.error_unit) };
         let _ = write!(out, "\n{error}, limit {}", digits(r.limit));
         if let Some(inside) = r.inside {
             let _ = write!(out, ", {:.0} % inside the band", 100.0 * inside);

@@ -96,12 +96,7 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
 }
 
 /// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they lie to one side.
-fn uncertain(
-    grid: &Grid,
-    mask: Option<&Mask>,
-    uncertainty: &dyn Fn(usize) -> f32,
-    limit: f64,
-) -> (f64, String) {
+fn uncertain(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, limit: f64) -> (f64, String) {
     let picked = sample(grid.len(), mask);
     let world = |&o: &usize| {
         let [i, j, k] = grid.voxel(o);

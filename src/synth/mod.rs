@@ -26,5 +26,5 @@ pub mod severity;
 
 pub use params::{ElasticParams, MotionKind, PhantomKind, PhantomParams};
 pub use phantom::{Description, MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
-pub use severity::{Trouble, troubled};
 pub use sequence::{Sequence, SequenceKind, SequenceParams};
+pub use severity::{Trouble, troubled};
