@@ -11,6 +11,7 @@ use palpate::error::FieldError;
 use palpate::evaluate::frontier::standings;
 use palpate::grasp::simulate::simulate;
 use palpate::io;
+use palpate::pipeline::pressed;
 use palpate::pipeline::trials::{self, Case, Variant};
 use palpate::report::frontier::{self as report, Group};
 use palpate::types::{Part, Scene, Trial};
@@ -121,7 +122,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     if wanted(Part::Stiffness) {
         let (side, nodes) = if *quick { (32, &NODES[..2]) } else { (48, &NODES[..]) };
-        let found = trials::stiffness_trials(side, nodes, &|f| progress.set("stiffness", f))?;
+        let found = pressed::stiffness_trials(side, nodes, &|f| progress.set("stiffness", f))?;
         groups.push(Group {
             part: Part::Stiffness,
             title: "Stiffness".into(),

@@ -27,6 +27,8 @@ pub mod cpu;
 
 pub mod trials;
 
+pub mod pressed;
+
 pub mod stress;
 
 mod search;
