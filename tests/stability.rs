@@ -2,6 +2,7 @@
 //! by more than the seed-to-seed spread fails.
 #![allow(clippy::unwrap_used)]
 
+#[allow(dead_code)]
 mod fixtures;
 
 use fixtures::{palpate, text};

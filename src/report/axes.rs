@@ -60,6 +60,9 @@ impl Axis {
             return ticks(low, high, 5.0);
         }
         let decades = (high / low).log10();
+        if decades < 0.6 {
+            return ticks(low, high, 4.0);
+        }
         let steps: &[f64] = match decades {
             d if d < 1.4 => &[1.0, 2.0, 3.0, 5.0],
             d if d < 2.6 => &[1.0, 2.0, 5.0],

@@ -23,7 +23,7 @@ pub struct Group {
 /// Colour of what is varied.
 fn colour(varied: &str) -> usize {
     match varied {
-        "preset" | "size" => 0,
+        "preset" | "size" | "whole command" => 0,
         "points" | "nodes" => 1,
         "stage" => 2,
         "step" => 4,
