@@ -82,7 +82,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let wanted = |p: Part| if part.is_empty() { case.is_empty() || p == Part::Field } else { part.contains(&p) };
     let mut folder = target.create()?;
     let started = Instant::now();
-    let between = tempfile::tempdir().context("no folder for files in between")?;
+    let between = io::Scratch::new()?;
     let found = peers.then(|| Peers::find(between.path())).transpose()?;
     if found.as_ref().is_some_and(|f| f.methods.is_empty()) {
         console.warn("no other registration tool is installed (benches/frontier/peers.py says which are known)");

@@ -52,6 +52,8 @@ pub mod text;
 
 pub mod output;
 
+pub mod scratch;
+
 mod atomic;
 
 mod deflate;
@@ -77,6 +79,7 @@ pub use nifti::{
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
+pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
 pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};

@@ -69,7 +69,8 @@ pub fn field_curves(
             let one = |&seed: &u64| field_run(&PhantomParams { seed, ..body.clone() }, trouble, severity, judge).ok();
             effort.seeds.par_iter().map(one).collect()
         };
-        let found = breaking_point(trouble.range(), Spread::Linear, effort.coarse, effort.halvings, at, most_break);
+        let found =
+            breaking_point(trouble.range(), Spread::Linear, effort.coarse, effort.halvings, at, |r| most_break(r));
         let n = done.fetch_add(1, Ordering::Relaxed) + 1;
         progress(n as f64 / pairs.len() as f64);
         let case = format!("{:?}", body.kind).to_lowercase();
@@ -79,7 +80,7 @@ pub fn field_curves(
 }
 
 /// At least half of the runs break.
-fn most_break(runs: &Vec<StressRun>) -> bool {
+fn most_break(runs: &[StressRun]) -> bool {
     2 * runs.iter().filter(|r| r.broken()).count() >= runs.len()
 }
 
@@ -157,7 +158,7 @@ pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) ->
     let truth = base.elastic.poisson;
     let search = |axis: &str, unit, range, spread, run: &(dyn Fn(f64) -> Option<StressRun> + Sync)| {
         let [coarse, halvings] = if quick { [3, 1] } else { [5, 2] };
-        let found = breaking_point(range, spread, coarse, halvings, |s| Some(vec![run(s)?]), most_break);
+        let found = breaking_point(range, spread, coarse, halvings, |s| Some(vec![run(s)?]), |r| most_break(r));
         curve(Part::Stiffness, axis, [unit, "%"], "inclusion".into(), range, found)
     };
     let labels = body.phantom.stiffness.as_ref().map(|s| s.labels.clone()).ok_or(SynthError::NotElastic)?;
@@ -257,7 +258,8 @@ pub fn grasp_curves(effort: &Effort, progress: Progress<'_>) -> Vec<StressCurve>
             change(&mut scene, v);
             Some(vec![grasp_run(&scene, v, axis == "friction")])
         };
-        let found = breaking_point(range, Spread::Ratio, effort.coarse.max(5), effort.halvings + 2, run, most_break);
+        let found =
+            breaking_point(range, Spread::Ratio, effort.coarse.max(5), effort.halvings + 2, run, |r| most_break(r));
         let n = done.fetch_add(1, Ordering::Relaxed) + 1;
         progress(n as f64 / axes.len() as f64);
         let case = format!("{}, {}", method.name(), formulation.name());
