@@ -24,7 +24,7 @@ impl Pressed {
     /// An elastic phantom.
     ///
     /// # Errors
-    /// As [`phantom`]; [`SynthError::NotElastic`] where nothing is known of its stiffness.
+    /// As [`phantom()`]; [`SynthError::NotElastic`] where nothing is known of its stiffness.
     pub fn new(params: &PhantomParams) -> Result<Self, SynthError> {
         let phantom = phantom(params)?;
         let known = phantom.description.elastic.as_ref().map(|e| (Side::parse(e.held), Side::parse(e.load), e.force_n));
@@ -65,7 +65,7 @@ impl Pressed {
 /// Moduli from exact displacements against the nodes of the mesh: a ball in a block and layers under a punch.
 ///
 /// # Errors
-/// As [`phantom`].
+/// As [`phantom()`].
 pub fn stiffness_trials(side: usize, budgets: &[usize], progress: &dyn Fn(f64)) -> Result<Vec<Trial>, SynthError> {
     let mut out = Vec::new();
     let kinds = [PhantomKind::Inclusion, PhantomKind::Slab];

@@ -124,7 +124,7 @@ impl Case {
     /// A phantom as a case.
     ///
     /// # Errors
-    /// As [`phantom`].
+    /// As [`phantom()`].
     pub fn embedded(params: &PhantomParams) -> Result<Self, SynthError> {
         let Phantom { initial, deformed, truth, mask, landmarks, .. } = phantom(params)?;
         let words = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
@@ -193,7 +193,7 @@ pub(super) fn mean(values: &[f64]) -> f64 {
 /// The three presets on heads of the same field of view with `sides` voxels across.
 ///
 /// # Errors
-/// As [`phantom`].
+/// As [`phantom()`].
 pub fn sizes(sides: &[usize], progress: &dyn Fn(f64)) -> Result<Vec<Trial>, SynthError> {
     let mut out = Vec::new();
     for (i, &side) in sides.iter().enumerate() {
