@@ -2,7 +2,6 @@
 //! by more than the seed-to-seed spread fails.
 #![allow(clippy::unwrap_used)]
 
-#[allow(dead_code)]
 mod fixtures;
 
 use fixtures::{palpate, text};

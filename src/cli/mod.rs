@@ -3,9 +3,9 @@
 //! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0 done, 1 failed on
 //! this input, 2 wrong usage. A closed pipe ends the program quietly.
 
-mod completions;
-
 mod chart;
+
+mod completions;
 
 mod console;
 
@@ -147,22 +147,6 @@ pub fn run() -> ExitCode {
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
     let work = || dispatch(&command, &console);
-    let work = || match command {
-        Command::Field(options) => field::run(&options, &console),
-        Command::Warp(options) => warp::run(&options, &console),
-        Command::Invert(options) => invert::run(&options, &console),
-        Command::Track(options) => track::run(&options, &console),
-        Command::Stiffness(options) => stiffness::run(&options, &console),
-        Command::Fingertip(options) => fingertip::run(&options, &console),
-        Command::Grasp(options) => grasp::run(&options, &console),
-        Command::GraspAnalysis(options) => grasp_analysis::run(&options, &console),
-        Command::Skin(options) => skin::run(&options, &console),
-        Command::Phantom(options) => phantom::run(&options, &console),
-        Command::Evaluate(options) => evaluate::run(&options, &console),
-        Command::Chart(options) => chart::run(&options, &console),
-        Command::Stress(options) => stress::run(&options, &console),
-        Command::Demo(options) => demo::run(&options, &console),
-    };
     let done = match pool {
         Ok(pool) => pool.install(work),
         Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
@@ -192,6 +176,8 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Skin(options) => skin::run(options, console),
         Command::Phantom(options) => phantom::run(options, console),
         Command::Evaluate(options) => evaluate::run(options, console),
+        Command::Chart(options) => chart::run(options, console),
+        Command::Stress(options) => stress::run(options, console),
         Command::Demo(options) => demo::run(options, console),
         Command::Markups(options) => markups::run(options, console),
         Command::Info(options) => info::run(options, console),
