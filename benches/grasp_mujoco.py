@@ -8,10 +8,14 @@ friction 1, implicitfast at 1 ms, joints driven along the same quintics. Its con
 softness, the nearest it has: it knows no tangential spring and no rolling dome, so its angles are those of another model.
 Several contact settings are tried, and the one with the least
 angle error counts. The loop runs in C (mujoco.rollout); Python only prepares.
+
+With `--postures A,B,...` (degrees at the ends of rest and holds) only MuJoCo runs, and each case that keeps both contacts
+is a line: time constant, cone, impratio, CPU seconds, angle error. `palpate chart --peers` carries this file and calls it so.
 """
 
 import re
 import subprocess
+import sys
 import time
 
 import mujoco
@@ -92,6 +96,15 @@ def mujoco_run(time_constant, cone, impratio, repeats=3):
     return best, np.degrees(states[0, ends - 1, 5]), min(contacts)
 
 
+def against(wanted):
+    """Prints a line a case: settings, CPU seconds, largest angle error (degrees)."""
+    for case in CONTACTS:
+        seconds, angles, contacts = mujoco_run(*case)
+        off = np.abs(angles - wanted).max()
+        if contacts == 2 and off < 90:
+            print(*case, f"{seconds:.6f}", f"{off:.6f}")
+
+
 def main():
     print(f"MuJoCo {mujoco.__version__}, implicitfast, {STEP} s\n")
     own = subprocess.run(["cargo", "bench", "--bench", "grasp"], capture_output=True, text=True, check=True).stdout
@@ -124,4 +137,7 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) == 3 and sys.argv[1] == "--postures":
+        against(np.array([float(v) for v in sys.argv[2].split(",")]))
+    else:
+        main()

@@ -1,11 +1,15 @@
 #!/usr/bin/env python3
 """Run one registration tool on one pair and write its field: peers.py METHOD FIXED MOVING FIELD
 
+`peers.py list` prints the methods whose tools are installed here. `palpate chart --peers` carries this file and runs it.
+
 The field is NIfTI 5-D, intent 1007, LPS mm on the fixed grid. Two threads. Settings are the tools' own defaults or
 those their authors recommend; none was changed after its score was seen. Needs numpy, nibabel and the tool itself
 (pip: picsl_greedy, SimpleITK, antspyx; Debian: elastix, plastimatch).
 """
+import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -152,7 +156,29 @@ METHODS = {
     "ANTs SyNQuick": (ants, "antsRegistrationSyNQuick[so]"),
 }
 
+# What each needs: modules of Python and programs on the path, beside numpy and nibabel.
+NEEDS = {
+    greedy: (["picsl_greedy"], []),
+    elastix: ([], ["elastix", "transformix"]),
+    plastimatch: ([], ["plastimatch"]),
+    demons: (["SimpleITK"], []),
+    ants: (["ants"], []),
+}
+
+
+def installed():
+    """Names of the methods that can be run here."""
+    there = lambda modules: all(importlib.util.find_spec(m) for m in modules)
+    if not there(["numpy", "nibabel"]):
+        return []
+    needs = ((name, NEEDS[run]) for name, (run, _) in METHODS.items())
+    return [name for name, (modules, programs) in needs if there(modules) and all(map(shutil.which, programs))]
+
+
 if __name__ == "__main__":
+    if sys.argv[1:] == ["list"]:
+        print("\n".join(installed()))
+        sys.exit()
     if len(sys.argv) != 5 or sys.argv[1] not in METHODS:
         sys.exit(f"usage: peers.py METHOD FIXED MOVING FIELD\nMETHOD is one of {', '.join(METHODS)}")
     run, settings = METHODS[sys.argv[1]]

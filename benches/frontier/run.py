@@ -65,14 +65,7 @@ def run(binary, case, method, out):
         field = out.with_suffix(".nii.gz")
         command = [sys.executable, HERE / "peers.py", method, fixed, moving, field]
     # A process between this one and the tool: its children's usage is this run's alone.
-    watch = (
-        "import resource, subprocess, sys, time; t = time.time(); "
-        "p = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE); "
-        "u = resource.getrusage(resource.RUSAGE_CHILDREN); "
-        "print(p.returncode, u.ru_utime + u.ru_stime, time.time() - t, u.ru_maxrss / 1024); "
-        "sys.stderr.buffer.write(p.stderr[-300:])"
-    )
-    done = subprocess.run([sys.executable, "-c", watch, *map(str, command)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, HERE / "usage.py", *map(str, command)], capture_output=True, text=True)
     code, cpu, wall, memory = done.stdout.split()
     if int(code) != 0:
         raise RuntimeError(f"{method} on {case.name}: {done.stderr.strip()}")

@@ -57,6 +57,20 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     ("grasp-analysis", &[("energy, stability, freedom", "grasp-analysis scene.toml -o analysis")]),
     ("skin", &[("press, hold and let go", "skin scene.toml -o skin")]),
     (
+        "chart",
+        &[
+            ("on embedded cases, beside other tools", "chart -o chart --peers"),
+            ("on a case of one's own", "chart --case pair -o chart"),
+        ],
+    ),
+    (
+        "stress",
+        &[
+            ("everything", "stress -o stress"),
+            ("the field under noise and bias", "stress --part field --axis noise --axis bias -o stress"),
+        ],
+    ),
+    (
         "phantom",
         &[
             ("a calf", "phantom calf -o pair"),

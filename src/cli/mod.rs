@@ -3,6 +3,8 @@
 //! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0 done, 1 failed on
 //! this input, 2 wrong usage. A closed pipe ends the program quietly.
 
+mod chart;
+
 mod completions;
 
 mod console;
@@ -35,6 +37,8 @@ mod markups;
 
 mod outputs;
 
+mod peers;
+
 mod phantom;
 
 mod sequence;
@@ -46,6 +50,8 @@ mod track;
 mod stiffness;
 
 mod stiffness_sequence;
+
+mod stress;
 
 mod warp;
 
@@ -107,6 +113,10 @@ enum Command {
     Phantom(phantom::Options),
     /// Score a displacement field against exact truth
     Evaluate(evaluate::Options),
+    /// Chart speed against accuracy on cases with a known answer
+    Chart(chart::Options),
+    /// Push each part until it breaks, and see whether it says so
+    Stress(stress::Options),
     /// Make a synthetic calf, measure it, and score the result against the truth
     Demo(demo::Options),
     /// Turn matches, landmarks or points into a point list of 3D Slicer
@@ -166,6 +176,8 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Skin(options) => skin::run(options, console),
         Command::Phantom(options) => phantom::run(options, console),
         Command::Evaluate(options) => evaluate::run(options, console),
+        Command::Chart(options) => chart::run(options, console),
+        Command::Stress(options) => stress::run(options, console),
         Command::Demo(options) => demo::run(options, console),
         Command::Markups(options) => markups::run(options, console),
         Command::Info(options) => info::run(options, console),

@@ -39,10 +39,10 @@ pub struct Options {
     /// Seed of anatomy, motion and noise
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
-    /// none, translate, rotate, affine, smooth, press, slide or elastic [default: by kind]
+    /// none, translate, rotate, affine, smooth, press, slide, wave or elastic [default: by kind]
     #[arg(long)]
     motion: Option<MotionKind>,
-    /// Largest displacement in mm, or degrees for rotate [default: by kind]
+    /// Largest displacement in mm, degrees for rotate, largest strain in per cent for wave [default: by kind]
     #[arg(long, value_name = "MM")]
     amplitude: Option<f64>,
     /// Elastic: Young's modulus of one inclusion over the background's

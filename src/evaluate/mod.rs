@@ -4,6 +4,12 @@
 //! linearly, landmarks are read off trilinearly with the edge value beyond the grid. Nothing is compared where the
 //! mask is zero. Fails when grids differ or the mask is empty.
 
+pub mod breaking;
+
+pub mod coverage;
+
+pub mod frontier;
+
 use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::sampling::displacement;

@@ -7,7 +7,7 @@ use crate::types::scene::SweepCase;
 use std::path::Path;
 
 /// A number as short as it can be read back without loss; `NaN` where there is none.
-fn number(v: f64) -> String {
+pub(super) fn number(v: f64) -> String {
     match v {
         0.0 => "0".into(),
         v if v.abs() < 1e-4 || v.abs() >= 1e6 => format!("{v:e}"),

@@ -46,9 +46,13 @@ pub mod track;
 
 pub mod stiffness;
 
+pub mod trials;
+
 pub mod text;
 
 pub mod output;
+
+pub mod scratch;
 
 mod atomic;
 
@@ -75,10 +79,12 @@ pub use nifti::{
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
+pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
 pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
+pub use trials::{write_stress, write_trials};
 pub use vtu::{write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;

@@ -19,7 +19,7 @@ use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
 use crate::numerics::{filters, pyramid};
-use crate::types::{Counts, LevelReport};
+use crate::types::{Counts, FieldParams, LevelReport};
 use rayon::prelude::*;
 
 /// A spline field on one level, with the state of its coupling.
@@ -168,6 +168,20 @@ pub struct MatchParams {
     pub patch: usize,
     /// Strain that neighbours may show against the known field.
     pub strain: f64,
+    /// Candidates kept from each source, at most 3 about a known field.
+    pub candidates: usize,
+    /// Whether neighbours choose among candidates, and those that fit nowhere are cast out.
+    pub consistency: bool,
+    /// Whether places are refined to a fraction of a voxel.
+    pub sub_voxel: bool,
+}
+
+impl MatchParams {
+    /// In the order of the fields; how matches are chosen is as `params` say.
+    pub fn new(params: &FieldParams, points: usize, thorough: bool, reach_mm: f64, patch: usize, strain: f64) -> Self {
+        let FieldParams { candidates, consistency, sub_voxel, .. } = *params;
+        Self { points, thorough, reach_mm, patch, strain, candidates, consistency, sub_voxel }
+    }
 }
 
 /// One feature's match on a level.
@@ -229,7 +243,7 @@ pub fn matches(
         spacing,
         CandidateParams {
             reach_mm: params.reach_mm,
-            keep: if known.is_some() { 3 } else { 8 },
+            keep: if known.is_some() { params.candidates.min(3) } else { params.candidates },
             partners: 16,
             min_ncc: 0.3,
         },
@@ -237,7 +251,15 @@ pub fn matches(
     let count = list.iter().map(Vec::len).sum();
     let mm: Vec<[f64; 3]> = starts.iter().map(|p| std::array::from_fn(|a| p[a] * spacing[a])).collect();
     let energy = EnergyParams { lambda: 1.5, precision_mm: finest, strain: params.strain, neighbours: 16 };
-    let relaxed = relax(&Graph::new(&mm, energy), &list);
+    let graph = Graph::new(&mm, energy);
+    let (chosen, energy_before, energy_after) = if params.consistency {
+        let relaxed = relax(&graph, &list);
+        (relaxed.chosen, relaxed.energy_before, relaxed.energy_after)
+    } else {
+        let best = vec![0; list.len()];
+        let energy = graph.energy(&list, &best);
+        (best, energy, energy)
+    };
 
     // Sub-voxel position and covariance of each choice.
     let template = Template {
@@ -250,11 +272,11 @@ pub fn matches(
     let refined: Vec<Option<(usize, [f64; 3], Refined)>> = (0..initial.len())
         .into_par_iter()
         .map(|i| {
-            let start = list[i].get(relaxed.chosen[i])?.displacement;
+            let start = list[i].get(chosen[i])?.displacement;
             let voxels: [f64; 3] = std::array::from_fn(|a| start[a] / spacing[a]);
             let at: [f64; 3] = std::array::from_fn(|a| initial[i].centre[a] as f64 + voxels[a] - origin[a]);
             let place = |o: [f32; 3]| -> [f32; 3] { std::array::from_fn(|a| at[a] as f32 + o[a]) };
-            let found = match &warped {
+            let mut found = match &warped {
                 Some(w) => {
                     let patch = |shift, out: &mut [f32]| trilinear_patch(w, shape, place(shift), radius, out);
                     lsm::refine(&template, initial[i].centre, patch, 3, 2.0)
@@ -264,6 +286,9 @@ pub fn matches(
                     lsm::refine(&template, initial[i].centre, patch, 6, 2.0)
                 }
             }?;
+            if !params.sub_voxel {
+                found.shift = [0.0; 3];
+            }
             Some((i, start, found))
         })
         .collect();
@@ -287,7 +312,7 @@ pub fn matches(
             }
         })
         .collect();
-    let kept = prune(&measured, 0.2 * finest, GATE);
+    let kept = if params.consistency { prune(&measured, 0.2 * finest, GATE) } else { vec![true; measured.len()] };
     calibrate(&mut measured, &kept);
     let mut residual: Vec<f32> = measured
         .iter()
@@ -304,8 +329,8 @@ pub fn matches(
             kept: residual.len(),
             ..Counts::default()
         },
-        energy_before: relaxed.energy_before,
-        energy_after: relaxed.energy_after,
+        energy_before,
+        energy_after,
         residual_mm: if residual.is_empty() { 0.0 } else { f64::from(median(&mut residual)) },
     };
     let matches = refined

@@ -23,4 +23,12 @@ pub mod stiffness;
 
 pub mod stiffness_sequence;
 
+pub mod cpu;
+
+pub mod trials;
+
+pub mod pressed;
+
+pub mod stress;
+
 mod search;

@@ -62,5 +62,11 @@ pub mod grasp_analysis;
 
 pub mod stiffness;
 
+pub mod axes;
+
+pub mod frontier;
+
+pub mod stress;
+
 pub use field::FieldReport;
 pub use grasp::GraspReport;

@@ -3,7 +3,7 @@
 use crate::report::field::FieldReport;
 use crate::report::scale::{short, thousands};
 use crate::report::statistics::sample;
-use crate::types::MotionModel;
+use crate::types::{FieldSummary, Grid, Mask, MotionModel};
 
 /// How far to rely on a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,8 +43,12 @@ pub struct Verdict {
 /// high when nothing folds, the median uncertainty is under half an edge, and under a tenth of the voxels are uncertain by
 /// more than an edge.
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
-    let s = report.summary;
-    let edge = report.initial.grid().spacing().iter().product::<f64>().cbrt();
+    judge(report.initial.grid(), report.mask, report.uncertainty, report.summary)
+}
+
+/// As [`verdict`], from the initial volume's grid, the mask, the uncertainty by voxel (mm) and the summary alone.
+pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
+    let edge = grid.spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
         MotionModel::Identity => "Nothing moved beyond the noise".to_string(),
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
@@ -57,7 +61,7 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
         s.levels.last().map(|l| format!(", median residual {} mm", short2(l.residual_mm))).unwrap_or_default();
     let headline = format!("{motion}: {} matches{residual}.", thousands(s.counts.kept));
 
-    let (share, side) = uncertain(report, edge);
+    let (share, side) = uncertain(grid, mask, uncertainty, edge);
     let mut low = Vec::new();
     if s.counts.kept < 100 {
         low.push(format!("only {} matches carry the field", s.counts.kept));
@@ -92,14 +96,13 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
 }
 
 /// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they lie to one side.
-fn uncertain(report: &FieldReport<'_>, limit: f64) -> (f64, String) {
-    let grid = report.initial.grid();
-    let picked = sample(grid.len(), report.mask);
+fn uncertain(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, limit: f64) -> (f64, String) {
+    let picked = sample(grid.len(), mask);
     let world = |&o: &usize| {
         let [i, j, k] = grid.voxel(o);
         grid.world(i, j, k).0
     };
-    let weak: Vec<usize> = picked.iter().copied().filter(|&o| f64::from((report.uncertainty)(o)) > limit).collect();
+    let weak: Vec<usize> = picked.iter().copied().filter(|&o| f64::from(uncertainty(o)) > limit).collect();
     if weak.is_empty() {
         return (0.0, String::new());
     }

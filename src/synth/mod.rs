@@ -22,6 +22,9 @@ pub mod phantom;
 
 pub mod sequence;
 
+pub mod severity;
+
 pub use params::{ElasticParams, MotionKind, PhantomKind, PhantomParams};
 pub use phantom::{Description, MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
 pub use sequence::{Sequence, SequenceKind, SequenceParams};
+pub use severity::{Trouble, troubled};

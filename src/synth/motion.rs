@@ -19,6 +19,8 @@ enum Law {
     /// A flat plate moving up (+z) by `travel` into a body whose lowest point is `contact` and whose outline there
     /// rises by half `curvature` (a mm) times the squared offset along x and y.
     Plate { contact: [f64; 3], curvature: [f64; 2], travel: f64, depth: f64 },
+    /// A displacement along `axis` that goes as the sine of the place along it; `wave` is 2 pi over the wavelength.
+    Wave { axis: [f64; 3], wave: f64 },
     /// Half a jump along `along` on each side of the plane with `normal`, fading over `radius` across both.
     Slide { normal: [f64; 3], along: [f64; 3], across: [f64; 3], offset: f64, radius: f64, smooth: SmoothNoise<4> },
 }
@@ -98,6 +100,18 @@ impl Motion {
         let contact = [c[0], c[1] - 0.45 * e[1], c[2] - radii[2]];
         let curvature = [radii[2] / radii[0].powi(2), radii[2] / radii[1].powi(2)];
         Self::new(Law::Plate { contact, curvature, travel, depth: 0.9 * radii[2] }, grid)
+    }
+
+    /// A standing wave along a random axis with a largest strain of `percent`: two wavelengths in the shortest side.
+    pub fn wave(grid: &Grid, percent: f64, mut random: Random) -> Self {
+        let (sides, shape) = (extent(grid), grid.shape());
+        let shortest = (0..3).filter(|&a| shape[a] > 1).map(|a| sides[a]).fold(f64::INFINITY, f64::min);
+        let wave = 2.0 * std::f64::consts::TAU / shortest;
+        let axis = random.direction();
+        let axis = slice_normal(grid).map_or(axis, |n| unit(add(axis, n, -dot(axis, n))));
+        let mut motion = Self::new(Law::Wave { axis, wave }, grid);
+        motion.scale = percent / 100.0 / wave;
+        motion
     }
 
     /// Two half spaces that glide along a random plane, fading far from the middle; to be scaled.
@@ -185,6 +199,7 @@ impl Law {
                 let decay = |s: f64| (-0.5 * (s / depth).powi(2)).exp();
                 [0.0, 0.0, push * decay(d[2]) / decay(surface.min(*depth))]
             }
+            Law::Wave { axis, wave } => axis.map(|v| v * (wave * dot(add(p, centre, -1.0), *axis)).sin()),
             Law::Slide { normal, along, across, offset, radius, smooth } => {
                 let d = add(p, centre, -1.0);
                 let side = if dot(d, *normal) > *offset { 0.5 } else { -0.5 };

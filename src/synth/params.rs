@@ -46,6 +46,8 @@ pub enum MotionKind {
     Elastic,
     /// The two sides of a plane glide in opposite directions, with a little smooth motion on top.
     Slide,
+    /// Bands compressed and stretched in turn along a random axis; the amplitude is the largest strain in per cent.
+    Wave,
 }
 
 impl PhantomKind {
@@ -68,9 +70,10 @@ impl PhantomKind {
         }
     }
 
-    /// The amplitude that is taken if none is asked for (mm, or degrees for a rotation).
+    /// The amplitude that is taken if none is asked for (mm, degrees for a rotation, per cent for a wave).
     fn usual_amplitude(self, motion: MotionKind) -> f64 {
         match (self, motion) {
+            (_, MotionKind::Wave) => 20.0,
             (Self::Fingertip, MotionKind::Elastic) => 0.8,
             (Self::Fingertip, _) => 1.5,
             (Self::Calf | Self::Slice, _) => 6.0,
@@ -84,7 +87,7 @@ impl PhantomKind {
 
 impl MotionKind {
     /// Names and motions.
-    pub const KNOWN: [(&'static str, Self); 8] = [
+    pub const KNOWN: [(&'static str, Self); 9] = [
         ("none", Self::None),
         ("translate", Self::Translate),
         ("rotate", Self::Rotate),
@@ -93,6 +96,7 @@ impl MotionKind {
         ("press", Self::Press),
         ("slide", Self::Slide),
         ("elastic", Self::Elastic),
+        ("wave", Self::Wave),
     ];
 }
 
@@ -130,7 +134,8 @@ pub struct PhantomParams {
     pub kind: PhantomKind,
     /// How it moves.
     pub motion: MotionKind,
-    /// Largest displacement over the body's outline at rest (mm); for a rotation its angle (degrees).
+    /// Largest displacement over the body's outline at rest (mm); for a rotation its angle (degrees), for a wave its
+    /// largest strain (per cent).
     pub amplitude: f64,
     /// Voxels along x, y, z; each 1 or at least 8, at most one of them 1.
     pub size: [usize; 3],
@@ -212,7 +217,7 @@ impl PhantomParams {
             true => Ok(()),
             false => Err(ParamError { name, value, range }),
         };
-        within("amplitude", self.amplitude, 0.0, 1000.0, "0 to 1000 (mm, or degrees for rotate)")?;
+        within("amplitude", self.amplitude, 0.0, 1000.0, "0 to 1000 (mm, degrees for rotate, per cent for wave)")?;
         within("noise", self.noise, 0.0, 1.0, "0 to 1")?;
         within("bias", self.bias, 0.0, 2.0, "0 to 2")?;
         if self.motion == MotionKind::Elastic {

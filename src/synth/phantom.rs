@@ -97,7 +97,38 @@ pub fn phantom(params: &PhantomParams) -> Result<Phantom, SynthError> {
 /// As [`phantom`].
 pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Phantom, SynthError> {
     params.check()?;
-    let pair = pair(params, initial, deformed)?;
+    Ok(imaged(params, pair(params, initial, deformed)?, initial, deformed))
+}
+
+/// What a body shows: from a place in it, its intensity there and whether it is tissue, to what is imaged.
+pub(super) type Paint<'a> = &'a (dyn Fn(WorldPoint, (f64, bool)) -> f64 + Sync);
+
+/// As [`phantom_on`] for a motion in closed form, with the body painted over: by `both` in either volume, then by
+/// `after` in the deformed one alone.
+///
+/// # Errors
+/// As [`phantom`]; [`SynthError::NotElastic`] for an elastic motion.
+pub(super) fn painted(
+    params: &PhantomParams,
+    [initial, deformed]: [Grid; 2],
+    both: Paint<'_>,
+    after: Paint<'_>,
+) -> Result<Phantom, SynthError> {
+    params.check()?;
+    if params.motion == MotionKind::Elastic {
+        return Err(SynthError::NotElastic);
+    }
+    let body = body(params.kind, &initial, params.seed);
+    let sample = |p| {
+        let seen = body.sample(p);
+        (both(p, seen), seen.1)
+    };
+    let pair = moved_pair(params, initial, deformed, &sample, &|p| body.contains(p), after)?;
+    Ok(imaged(params, pair, initial, deformed))
+}
+
+/// Both volumes with bias and noise, and what is known of them.
+fn imaged(params: &PhantomParams, pair: Pair, initial: Grid, deformed: Grid) -> Phantom {
     let Pair { before, after, truth, displacements, .. } = &pair;
     let clean = intensities(before);
     let mut values: Vec<f64> = after.as_slice().iter().map(|v| v.0).collect();
@@ -120,7 +151,7 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
         elastic: pair.elastic.clone(),
     };
     let biased = biased(after, params);
-    Ok(Phantom {
+    Phantom {
         initial: rician(&clean, noise_sigma, params.seed, 60),
         deformed: rician(&biased, noise_sigma, params.seed, 61),
         truth: pair.truth,
@@ -128,7 +159,7 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
         landmarks,
         stiffness: pair.stiffness,
         description,
-    })
+    }
 }
 
 /// Both images without noise and bias, and what is known of them.
@@ -154,25 +185,30 @@ fn pair(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Pair, S
     if stiffness_known {
         let tissue = Tissue::new(params, &initial);
         let inside = |p| tissue.region(p).is_some();
-        return moved_pair(params, initial, deformed, &|p| tissue.sample(p), &inside);
+        return moved_pair(params, initial, deformed, &|p| tissue.sample(p), &inside, &|_, seen| seen.0);
     }
     let body = body(params.kind, &initial, params.seed);
-    moved_pair(params, initial, deformed, &|p| body.sample(p), &|p| body.contains(p))
+    moved_pair(params, initial, deformed, &|p| body.sample(p), &|p| body.contains(p), &|_, seen| seen.0)
 }
 
-/// A motion in closed form.
+/// A motion in closed form; `paint` goes over the deformed volume.
 fn moved_pair(
     params: &PhantomParams,
     initial: Grid,
     deformed: Grid,
     sample: &(dyn Fn(WorldPoint) -> (f64, bool) + Sync),
     inside: &(dyn Fn(WorldPoint) -> bool + Sync),
+    paint: Paint<'_>,
 ) -> Result<Pair, SynthError> {
     let (motion, truth, control_spacing_mm) = motion(params, inside, initial)?;
     let rest_first = params.motion == MotionKind::Press;
     let before =
         Volume::from_voxels(initial, |at, x| sample(if rest_first { x } else { x.moved(truth.at(at).map(f64::from)) }));
-    let after = Volume::from_voxels(deformed, |_, y| sample(if rest_first { motion.origin_of(y) } else { y }));
+    let after = Volume::from_voxels(deformed, |_, y| {
+        let p = if rest_first { motion.origin_of(y) } else { y };
+        let seen = sample(p);
+        (paint(p, seen), seen.1)
+    });
     let displacements = Box::new(move |points: &[WorldPoint]| points.iter().map(|&p| motion.at(p)).collect());
     Ok(Pair { before, after, truth, displacements, control_spacing_mm, stiffness: None, elastic: None })
 }
@@ -257,6 +293,7 @@ fn motion(
         MotionKind::None | MotionKind::Smooth | MotionKind::Elastic => Motion::none(&grid),
         MotionKind::Translate => Motion::translate(&grid, amplitude, random),
         MotionKind::Rotate => Motion::rotate(&grid, amplitude, random),
+        MotionKind::Wave => Motion::wave(&grid, amplitude, random),
         MotionKind::Affine => Motion::affine(&grid, random).scaled(amplitude, &tissue),
         MotionKind::Press if params.kind == PhantomKind::Fingertip => {
             Motion::plate(&grid, std::array::from_fn(|a| half[a] * FINGERTIP_RADII[a]), amplitude)

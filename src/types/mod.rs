@@ -34,6 +34,8 @@ pub mod grasp;
 
 pub mod skin;
 
+pub mod trial;
+
 pub use field::DenseField;
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
@@ -45,4 +47,5 @@ pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Tracked, Trajectory};
+pub use trial::{Part, Standing, StressCurve, StressRun, Trial};
 pub use volume::{Mask, Volume};

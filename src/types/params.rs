@@ -50,6 +50,13 @@ pub struct FieldParams {
     pub coarse_passes: usize,
     /// How the dense field is made.
     pub interpolation: Interpolation,
+    /// Candidates kept from each source of matches on the coarsest level, at most 3 on the finest; 1 to 20.
+    pub candidates: usize,
+    /// Whether neighbours choose among the candidates and cast out those that fit nowhere; without, the best
+    /// correlation counts. Only for comparisons.
+    pub consistency: bool,
+    /// Whether matches are refined to a fraction of a voxel. Only for comparisons.
+    pub sub_voxel: bool,
     /// Seed of whatever is drawn at random.
     pub seed: u64,
 }
@@ -87,6 +94,9 @@ impl FieldParams {
             passes: 6,
             coarse_passes: 12,
             interpolation: Interpolation::Spline,
+            candidates: 8,
+            consistency: true,
+            sub_voxel: true,
             seed: 1,
         };
         match preset {
@@ -117,6 +127,7 @@ impl FieldParams {
             ("node_spacing", self.node_spacing, 2, 16, "2 to 16 voxels"),
             ("passes", self.passes, 1, 100, "1 to 100"),
             ("coarse_passes", self.coarse_passes, 1, 100, "1 to 100"),
+            ("candidates", self.candidates, 1, 20, "1 to 20"),
         ];
         for (name, value, low, high, range) in whole {
             if !(low..=high).contains(&value) {

@@ -1,0 +1,298 @@
+//! Stability: each chain pushed along one axis after the other until it breaks, with what it says about itself.
+
+use crate::error::{StiffnessError, SynthError};
+use crate::evaluate;
+use crate::evaluate::breaking::{Breaking, Spread, breaking_point};
+use crate::evaluate::coverage::{BAND, coverage, textured};
+use crate::grasp::simulate::simulate;
+use crate::pipeline::field::{self, FieldResult};
+use crate::pipeline::pressed::Pressed;
+use crate::pipeline::trials::{exact, posture_error};
+use crate::synth::severity::{disturbed, shifted_labels};
+use crate::synth::{ElasticParams, Phantom, PhantomKind, PhantomParams, Trouble, troubled};
+use crate::types::scene::{Formulation, Method};
+use crate::types::{FieldParams, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Volume};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Called with the fraction that is done (0 to 1); may be called from any thread.
+pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
+
+/// What the program says against a field that it measured on this initial volume without a mask; nothing when it has
+/// nothing to say.
+pub type Judge<'a> = &'a (dyn Fn(&Volume, &FieldResult) -> Vec<String> + Sync);
+
+/// How thorough a search is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Effort {
+    /// Bodies for the field.
+    pub bodies: Vec<PhantomParams>,
+    /// Seeds of each body.
+    pub seeds: Vec<u64>,
+    /// Severities over the range.
+    pub coarse: usize,
+    /// Halvings before the first that breaks.
+    pub halvings: usize,
+    /// Voxels across the body for the stiffness.
+    pub side: usize,
+    /// Nodes of its mesh.
+    pub nodes: usize,
+}
+
+impl Effort {
+    /// Three bodies with three seeds, or one small one.
+    pub fn new(quick: bool) -> Self {
+        let body = |kind, size| PhantomParams::new(kind).sized(size);
+        if quick {
+            let bodies = vec![body(PhantomKind::Block, 48)];
+            return Self { bodies, seeds: vec![1], coarse: 4, halvings: 1, side: 40, nodes: 2000 };
+        }
+        let bodies = vec![body(PhantomKind::Block, 64), body(PhantomKind::Head, 64), body(PhantomKind::Calf, 72)];
+        Self { bodies, seeds: vec![1, 2, 3], coarse: 6, halvings: 3, side: 40, nodes: 2000 }
+    }
+}
+
+/// Mean error beyond which a field is of no use: this part of the motion, or the finest voxel edge where that is less.
+const USEFUL: f64 = 0.5;
+
+/// The field on every body along every axis of `troubles`.
+pub fn field_curves(
+    effort: &Effort,
+    troubles: &[Trouble],
+    judge: Judge<'_>,
+    progress: Progress<'_>,
+) -> Vec<StressCurve> {
+    let pairs: Vec<_> = effort.bodies.iter().flat_map(|b| troubles.iter().map(move |t| (*t, b))).collect();
+    let done = AtomicUsize::new(0);
+    let one = |&(trouble, body): &(Trouble, &PhantomParams)| {
+        let at = |severity: f64| -> Option<Vec<StressRun>> {
+            let one = |&seed: &u64| field_run(&PhantomParams { seed, ..body.clone() }, trouble, severity, judge).ok();
+            effort.seeds.par_iter().map(one).collect()
+        };
+        let found =
+            breaking_point(trouble.range(), Spread::Linear, effort.coarse, effort.halvings, at, |r| most_break(r));
+        let n = done.fetch_add(1, Ordering::Relaxed) + 1;
+        progress(n as f64 / pairs.len() as f64);
+        let case = format!("{:?}", body.kind).to_lowercase();
+        curve(Part::Field, trouble.name(), [trouble.unit(), "mm"], case, trouble.range(), found)
+    };
+    pairs.par_iter().map(one).collect()
+}
+
+/// At least half of the runs break.
+fn most_break(runs: &[StressRun]) -> bool {
+    2 * runs.iter().filter(|r| r.broken()).count() >= runs.len()
+}
+
+/// A curve from what a search has found.
+fn curve(
+    part: Part,
+    axis: &str,
+    [unit, error_unit]: [&'static str; 2],
+    case: String,
+    range: [f64; 2],
+    found: Breaking<Vec<StressRun>>,
+) -> StressCurve {
+    let told = |runs: &[StressRun]| 2 * runs.iter().filter(|r| r.told()).count() >= runs.len();
+    let told_at = found.tried.iter().find(|t| told(&t.1)).map(|t| t.0);
+    let Breaking { tried, breaks_at, holds_at } = found;
+    let runs = tried.into_iter().flat_map(|t| t.1).collect();
+    StressCurve { part, axis: axis.into(), unit, error_unit, case, range, runs, breaks_at, holds_at, told_at }
+}
+
+/// One phantom in trouble, measured without a mask and scored over the tissue that both volumes show.
+///
+/// # Errors
+/// [`SynthError`] when there is no such phantom.
+pub fn field_run(
+    body: &PhantomParams,
+    trouble: Trouble,
+    severity: f64,
+    judge: Judge<'_>,
+) -> Result<StressRun, SynthError> {
+    let p = troubled(body, trouble, severity)?;
+    let measured = field::run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {});
+    Ok(match measured {
+        Err(e) => StressRun {
+            severity,
+            error: f64::NAN,
+            limit: limit(&p, p.description.mean_mm),
+            refused: Some(e.to_string()),
+            said: Vec::new(),
+            inside: None,
+        },
+        Ok(result) => {
+            let scored = evaluate::metrics(&result.displacement, &p.truth, Some(&p.mask), &[]).ok();
+            let texture = textured(&p.initial, &p.mask);
+            let sigma = |at: usize| result.uncertainty.at(at);
+            StressRun {
+                severity,
+                error: scored.as_ref().map_or(f64::NAN, |m| m.mean_mm),
+                limit: limit(&p, scored.as_ref().map_or(0.0, |m| m.identity_mm)),
+                refused: None,
+                said: judge(&p.initial, &result),
+                inside: coverage(&result.displacement, &p.truth, &sigma, &texture),
+            }
+        }
+    })
+}
+
+fn limit(phantom: &Phantom, motion: f64) -> f64 {
+    let edge = phantom.initial.grid().spacing().iter().fold(f64::INFINITY, |m: f64, &s| m.min(s));
+    (USEFUL * motion).min(edge)
+}
+
+/// Error of a modulus beyond which it is of no use (per cent).
+const MODULUS: f64 = 20.0;
+
+/// The stiffness of a ball in a block from exact displacements, made worse along each axis: noise (per cent of the mean
+/// motion), contrast, Poisson's ratio that is assumed, labels beside their place (voxels), nodes. Quick: noise alone.
+///
+/// # Errors
+/// As [`Pressed::new`].
+pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) -> Result<Vec<StressCurve>, SynthError> {
+    let base = PhantomParams::new(PhantomKind::Inclusion).sized(effort.side);
+    let body = Pressed::new(&base)?;
+    let motion = body.phantom.description.mean_mm;
+    let usual = StiffnessParams { nodes: effort.nodes, force_n: Some(body.force_n), ..StiffnessParams::default() };
+    let truth = base.elastic.poisson;
+    let search = |axis: &str, unit, range, spread, run: &(dyn Fn(f64) -> Option<StressRun> + Sync)| {
+        let [coarse, halvings] = if quick { [3, 1] } else { [5, 2] };
+        let found = breaking_point(range, spread, coarse, halvings, |s| Some(vec![run(s)?]), |r| most_break(r));
+        curve(Part::Stiffness, axis, [unit, "%"], "inclusion".into(), range, found)
+    };
+    let labels = body.phantom.stiffness.as_ref().map(|s| s.labels.clone()).ok_or(SynthError::NotElastic)?;
+    let mut out = vec![search("noise", "%", [0.0, 20.0], Spread::Linear, &|s| {
+        let field = disturbed(&body.phantom.truth, s / 100.0 * motion, base.seed);
+        Some(stiffness_run(&body, s, body.measure(&field, &labels, &usual)))
+    })];
+    progress(0.2);
+    if quick {
+        return Ok(out);
+    }
+    out.push(search("contrast", "ratio", [2.0, 100.0], Spread::Ratio, &|s| {
+        let elastic = ElasticParams { contrast: s, ..base.elastic };
+        let body = Pressed::new(&PhantomParams { elastic, ..base.clone() }).ok()?;
+        let labels = &body.phantom.stiffness.as_ref()?.labels;
+        let params = StiffnessParams { force_n: Some(body.force_n), ..usual.clone() };
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, labels, &params)))
+    }));
+    progress(0.4);
+    out.push(search("Poisson's ratio assumed", "of 0.49", [truth, 0.2], Spread::Linear, &|s| {
+        let params = StiffnessParams { poisson: s, ..usual.clone() };
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, &labels, &params)))
+    }));
+    progress(0.6);
+    out.push(search("labels beside their place", "voxels", [0.0, 8.0], Spread::Linear, &|s| {
+        let beside = shifted_labels(&labels, s.round() as usize);
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, &beside, &usual)))
+    }));
+    progress(0.8);
+    out.push(search("mesh", "nodes", [8000.0, 500.0], Spread::Ratio, &|s| {
+        let params = StiffnessParams { nodes: s.round() as usize, ..usual.clone() };
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, &labels, &params)))
+    }));
+    progress(1.0);
+    Ok(out)
+}
+
+fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, StiffnessError>) -> StressRun {
+    let result = match found {
+        Ok(result) => result,
+        Err(e) => {
+            let refused = Some(e.to_string());
+            return StressRun { severity, error: f64::NAN, limit: MODULUS, refused, said: Vec::new(), inside: None };
+        }
+    };
+    let errors = body.errors(&result);
+    let mut said = result.warnings.clone();
+    for r in &result.regions {
+        let band = 100.0 * BAND * r.sd / r.youngs_modulus;
+        if !r.identifiable {
+            said.push(format!("{} is not identifiable", r.name));
+        } else if band > MODULUS {
+            said.push(format!("the 95 % band of {} is {band:.0} % wide to either side", r.name));
+        }
+    }
+    let inside = result.regions.iter().filter(|r| (r.youngs_modulus - body.modulus(r.label)).abs() <= BAND * r.sd);
+    StressRun {
+        severity,
+        error: errors.iter().copied().fold(0.0, f64::max),
+        limit: MODULUS,
+        refused: None,
+        inside: Some(inside.count() as f64 / result.regions.len() as f64),
+        said,
+    }
+}
+
+/// Error of a posture beyond which it is of no use (degrees).
+const POSTURE: f64 = 0.5;
+
+/// The reference scene's eight motions made worse along each axis: step, stiffness and mass, width, friction.
+pub fn grasp_curves(effort: &Effort, progress: Progress<'_>) -> Vec<StressCurve> {
+    type Change = fn(&mut Scene, f64);
+    let forms: Vec<(Method, Formulation)> = [Method::Rk4, Method::SemiImplicitEuler]
+        .into_iter()
+        .flat_map(|m| Formulation::ALL.map(|(_, f)| (m, f)))
+        .collect();
+    let step: Change = |s, v| {
+        (s.integrator.step, s.integrator.output_every) = (v, s.integrator.output_every.max(v));
+    };
+    let mut axes: Vec<(&str, &'static str, [f64; 2], Change, (Method, Formulation))> =
+        forms.iter().map(|&form| ("step", "s", [1e-4, 0.05], step, form)).collect();
+    let usual = (Method::Rk4, Formulation::Minimal);
+    let others: [(&str, &'static str, [f64; 2], Change); 4] = [
+        ("tip stiffness", "Pa", [2e5, 2e3], |s, v| s.fingertip.youngs_modulus = v),
+        ("mass", "kg", [0.1, 50.0], |s, v| {
+            (s.object.inertia, s.object.mass) = (s.object.inertia * v / s.object.mass, v);
+        }),
+        ("width", "m", [0.06, 0.006], |s, v| *s = s.clone().with_width(v)),
+        ("friction", "", [1.0, 0.02], |s, v| s.object.friction = Some(v)),
+    ];
+    axes.extend(others.map(|(name, unit, range, change)| (name, unit, range, change, usual)));
+    let done = AtomicUsize::new(0);
+    let one = |&(axis, unit, range, change, (method, formulation)): &(_, _, _, Change, _)| {
+        let run = |v: f64| {
+            let mut scene = Scene::reference();
+            (scene.integrator.method, scene.integrator.formulation) = (method, formulation);
+            change(&mut scene, v);
+            Some(vec![grasp_run(&scene, v, axis == "friction")])
+        };
+        let found =
+            breaking_point(range, Spread::Ratio, effort.coarse.max(5), effort.halvings + 2, run, |r| most_break(r));
+        let n = done.fetch_add(1, Ordering::Relaxed) + 1;
+        progress(n as f64 / axes.len() as f64);
+        let case = format!("{}, {}", method.name(), formulation.name());
+        let error = if axis == "friction" { "of the friction there is" } else { "degrees" };
+        curve(Part::Grasp, axis, [unit, error], case, range, found)
+    };
+    axes.par_iter().map(one).collect()
+}
+
+/// One scene against the same scene by the adaptive integrator. With `friction` the error is the largest share of the
+/// friction that the contacts ask for.
+fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
+    let limit = if friction { 1.0 } else { POSTURE };
+    let (mut error, mut refused, mut said) = (f64::NAN, None, Vec::new());
+    match simulate(scene, &|_| {}) {
+        Err(e) => refused = Some(e.to_string()),
+        Ok(run) => {
+            said = run
+                .events
+                .iter()
+                .map(|e| format!("{} at {:.2} s: {}", e.kind.name(), e.time, e.what))
+                .take(3)
+                .collect();
+            if friction {
+                let share = |i: usize| {
+                    let used = run.samples.iter().map(move |s| (s.tangential_force[i] / s.normal_force[i]).abs());
+                    used.fold(0.0, f64::max)
+                };
+                error = share(0).max(share(1)) / scene.object.friction.unwrap_or(f64::INFINITY);
+            } else if run.completed {
+                error = simulate(&exact(scene), &|_| {}).map_or(f64::NAN, |e| posture_error(&run, &e));
+            }
+        }
+    }
+    StressRun { severity, error, limit, refused, said, inside: None }
+}

@@ -1,0 +1,191 @@
+//! Small versions of `palpate chart` and `palpate stress` on synthetic data, held against stored figures: worse than those
+//! by more than the seed-to-seed spread fails.
+#![allow(clippy::unwrap_used)]
+
+mod fixtures;
+
+use fixtures::{palpate, text};
+use palpate::pipeline::field::FieldResult;
+use palpate::pipeline::stress::{Effort, field_curves, field_run, grasp_curves};
+use palpate::pipeline::trials::{Case, Variant, posture_error};
+use palpate::report::verdict::{Trust, judge};
+use palpate::synth::{PhantomKind, PhantomParams, Trouble};
+use palpate::types::{Part, StressRun, Volume};
+use rayon::prelude::*;
+use std::fs;
+use tempfile::TempDir;
+
+fn said(initial: &Volume, result: &FieldResult) -> Vec<String> {
+    let verdict = judge(initial.grid(), None, &|at| result.uncertainty.at(at), &result.summary);
+    let low = (verdict.trust == Trust::Low).then(|| "trust is low".to_string());
+    result.summary.warnings.iter().cloned().chain(low).collect()
+}
+
+/// The small bodies: which, voxels across.
+const BODIES: [(PhantomKind, usize); 2] = [(PhantomKind::Block, 40), (PhantomKind::Head, 40)];
+const SEEDS: u64 = 3;
+
+fn runs(kind: PhantomKind, size: usize, trouble: Trouble, severity: f64) -> Vec<StressRun> {
+    let run = |seed| {
+        let body = PhantomParams { seed, ..PhantomParams::new(kind).sized(size) };
+        field_run(&body, trouble, severity, &said).unwrap()
+    };
+    (1..=SEEDS).into_par_iter().map(run).collect()
+}
+
+/// Mean and standard deviation.
+fn spread(values: &[f64]) -> [f64; 2] {
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (values.len() - 1) as f64;
+    [mean, square.sqrt()]
+}
+
+/// Trouble, severity, then for each body the mean error (mm) and its spread over the seeds, as measured.
+const STORED: [(Trouble, f64, [[f64; 2]; 2]); 7] = [
+    (Trouble::Noise, 3.0, [[0.432, 0.078], [1.715, 0.211]]),
+    (Trouble::Noise, 10.0, [[0.538, 0.085], [2.050, 0.180]]),
+    (Trouble::Motion, 6.0, [[0.806, 0.103], [1.337, 0.204]]),
+    (Trouble::Rotation, 15.0, [[0.037, 0.044], [0.848, 0.481]]),
+    (Trouble::Bias, 40.0, [[0.560, 0.090], [2.243, 0.433]]),
+    (Trouble::NoTexture, 30.0, [[0.584, 0.075], [2.093, 0.107]]),
+    (Trouble::MissingTissue, 15.0, [[0.806, 0.247], [2.818, 0.105]]),
+];
+
+#[test]
+fn errors_in_trouble_are_no_worse_than_stored() {
+    let (mut worse, mut measured) = (Vec::new(), String::new());
+    for (trouble, severity, stored) in STORED {
+        let now = BODIES.map(|(kind, size)| {
+            let errors: Vec<f64> = runs(kind, size, trouble, severity).iter().map(|r| r.error).collect();
+            spread(&errors)
+        });
+        measured += &format!("    (Trouble::{trouble:?}, {severity:?}, {now:.3?}),\n");
+        for ((body, now), stored) in BODIES.iter().zip(now).zip(stored) {
+            // A refusal has no error: NaN.
+            if now[0].is_nan() || now[0] > stored[0] + stored[1] {
+                worse.push(format!("{trouble:?} {severity} {:?}: {now:.3?}, stored {stored:.3?}", body.0));
+            }
+        }
+    }
+    assert!(worse.is_empty(), "{worse:#?}\nmeasured:\n{measured}");
+}
+
+#[test]
+fn what_cannot_be_measured_is_not_passed_over_in_silence() {
+    let hopeless = [
+        (Trouble::NoOverlap, 110.0),
+        (Trouble::ContrastInversion, 100.0),
+        (Trouble::Motion, 20.0),
+        (Trouble::Crop, 90.0),
+        (Trouble::NoTexture, 95.0),
+    ];
+    for (trouble, severity) in hopeless {
+        for (kind, size) in BODIES {
+            let runs = runs(kind, size, trouble, severity);
+            let silent: Vec<_> = runs.iter().filter(|r| r.silent()).collect();
+            assert!(silent.is_empty(), "{trouble:?} {severity} {kind:?}: {silent:#?}");
+        }
+    }
+}
+
+#[test]
+fn the_stated_band_holds_most_errors_where_there_is_texture() {
+    let mut inside = Vec::new();
+    for (trouble, severity) in [(Trouble::Noise, 3.0), (Trouble::Bias, 30.0), (Trouble::Sliding, 1.0)] {
+        for (kind, size) in BODIES {
+            inside.extend(runs(kind, size, trouble, severity).iter().filter_map(|r| r.inside));
+        }
+    }
+    let mean = inside.iter().sum::<f64>() / inside.len() as f64;
+    assert!(mean >= 0.9 && inside.len() == 18, "{mean}: {inside:.2?}");
+}
+
+#[test]
+fn grasps_break_where_they_should_and_say_so() {
+    let curves = grasp_curves(&Effort::new(true), &|_| {});
+    assert_eq!(curves.iter().flat_map(|c| c.silent()).count(), 0);
+    let of = |axis: &str, case: &str| {
+        let curve = curves.iter().find(|c| c.axis == axis && c.case.starts_with(case)).unwrap();
+        (curve.holds_at.unwrap(), curve.breaks_at.unwrap())
+    };
+    // Runge and Kutta's method is stable to 2.785 over the largest eigenvalue, the semi-implicit one to about 2 over it.
+    let (rk4, euler) = (of("step", "rk4, minimal"), of("step", "semi-implicit-euler, minimal"));
+    assert!(rk4.0 > euler.0 && rk4.0 > 1.5e-3 && rk4.1 < 5e-3, "{rk4:?} {euler:?}");
+    let friction = of("friction", "rk4");
+    assert!(friction.0 > friction.1 && friction.1 > 0.3, "{friction:?}");
+}
+
+#[test]
+fn dearer_presets_are_no_worse_and_a_still_field_does_nothing() {
+    let params = PhantomParams::new(PhantomKind::Calf).sized(56);
+    let case = Case::embedded(&params).unwrap();
+    let [fast, balanced, accurate]: [_; 3] =
+        Variant::presets().iter().map(|v| case.run(v)).collect::<Vec<_>>().try_into().unwrap();
+    assert!(balanced.error < 0.6 * balanced.nothing.unwrap(), "{balanced:?}");
+    assert!(accurate.error <= 1.1 * balanced.error && balanced.error <= 1.1 * fast.error, "{fast:?} {accurate:?}");
+    // Other tests run in this process, so that its CPU time cannot be compared here.
+    assert!(fast.cpu_s > 0.0 && accurate.cpu_s > 0.0);
+    let still = palpate::types::DenseField::zeros(*case.initial.grid());
+    let nothing = case.score(&Variant::presets()[0], &still, 1.0).unwrap();
+    assert!((nothing.error - nothing.nothing.unwrap()).abs() < 1e-9 && nothing.part == Part::Field);
+    // Without a true field, landmarks are the truth.
+    let real = Case { truth: None, ..case };
+    let by_landmarks = real.score(&Variant::presets()[0], &still, 1.0).unwrap();
+    assert!((by_landmarks.error - by_landmarks.nothing.unwrap()).abs() < 1e-9 && by_landmarks.error > 0.0);
+}
+
+#[test]
+fn a_run_that_ends_early_has_no_posture_error() {
+    use palpate::{grasp::simulate::simulate, types::Scene};
+    let run = simulate(&Scene::reference(), &|_| {}).unwrap();
+    let mut short = run.clone();
+    short.samples.pop();
+    assert_eq!(posture_error(&run, &run), 0.0);
+    assert!(posture_error(&short, &run).is_nan());
+}
+
+#[test]
+fn the_commands_write_their_files_and_results_do_not_depend_on_threads() {
+    let folder = TempDir::new().unwrap();
+    let stress = |threads: &str, out: &str| {
+        let arguments = ["stress", "--quick", "--part", "field", "--axis", "no-overlap", "--axis", "noise"];
+        let done = palpate(folder.path()).args(arguments).args(["--threads", threads, "-o", out]).assert().success();
+        assert!(text(&done.get_output().stdout).contains("no overlap"));
+        fs::read_to_string(folder.path().join(out).join("stress.csv")).unwrap()
+    };
+    let table = stress("1", "one");
+    assert_eq!(table, stress("2", "two"));
+    assert!(table.lines().count() >= 9 && table.contains(",1,1,,"), "{table}");
+    for file in ["stress.svg", "stress.html", "summary.json"] {
+        assert!(folder.path().join("one").join(file).is_file(), "{file}");
+    }
+    let chart = ["chart", "--quick", "--part", "grasp", "-o", "chart"];
+    let done = palpate(folder.path()).args(chart).assert().success();
+    assert!(text(&done.get_output().stdout).contains("what no other setting beats"));
+    let page = fs::read_to_string(folder.path().join("chart/chart.html")).unwrap();
+    let table = fs::read_to_string(folder.path().join("chart/chart.csv")).unwrap();
+    assert_eq!(table.lines().count(), 29);
+    assert!(page.contains("method rk4, formulation minimal, step") && page.contains("on the front"));
+    // A case folder without truth and landmarks cannot be scored.
+    palpate(folder.path()).args(["phantom", "block", "--size", "24", "-o", "case"]).assert().success();
+    fs::remove_file(folder.path().join("case/truth.nii.gz")).unwrap();
+    let real = ["chart", "--quick", "--case", "case", "-o", "real"];
+    palpate(folder.path()).args(real).assert().success();
+    let table = fs::read_to_string(folder.path().join("real/chart.csv")).unwrap();
+    assert!(table.lines().skip(1).all(|l| l.starts_with("field,")), "{table}");
+    fs::remove_file(folder.path().join("case/landmarks.csv")).unwrap();
+    let failed = palpate(folder.path()).args(["chart", "--case", "case", "-o", "none"]).assert().code(1);
+    assert!(text(&failed.get_output().stderr).contains("neither truth.nii.gz nor landmarks.csv"));
+    assert!(!folder.path().join("none").exists());
+}
+
+#[test]
+fn curves_come_in_order_and_bracket_the_break() {
+    let effort = Effort::new(true);
+    let curves = field_curves(&effort, &[Trouble::NoOverlap], &said, &|_| {});
+    let curve = &curves[0];
+    assert!(curve.runs.windows(2).all(|w| w[0].severity <= w[1].severity));
+    let (low, high) = (curve.holds_at.unwrap(), curve.breaks_at.unwrap());
+    assert!(low < high && high <= 100.0, "{low} {high}");
+    assert!(curve.runs.iter().filter(|r| r.severity <= low).all(|r| !r.broken()));
+}
