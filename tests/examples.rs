@@ -30,7 +30,10 @@ fn every_example_has_a_test() {
         .map(|e| e.unwrap().path().file_stem().unwrap().to_string_lossy().into_owned())
         .collect();
     names.sort();
-    assert_eq!(names, ["eight_motions", "grasp", "own_pair", "seed", "sequence", "skin", "stability_map"]);
+    assert_eq!(
+        names,
+        ["eight_motions", "finger_pad", "grasp", "own_pair", "seed", "sequence", "skin", "stability_map"]
+    );
 }
 
 #[test]

@@ -92,8 +92,14 @@ fn calculix_solves_our_model_to_our_displacements() {
 }
 
 /// The block of [`folder`] in `frames` noisy frames as `palpate track` leaves them; frame 1 is the reference, the last is at rest.
+///
+/// Its halves lie one on the other here: side by side between plates that slide they would strain alike whatever their moduli.
 fn tracked(frames: usize) -> TempDir {
     let folder = folder();
+    let g = grid([16, 16, 16]);
+    let inside = |i: usize| (2..14).contains(&i);
+    let label = |at: [usize; 3]| if at.into_iter().all(inside) { 1 + u8::from(at[2] > 7) } else { 0 };
+    io::write_labels(folder.path().join("labels.nii.gz"), &Mask::from_voxels(g, |o, _| label(g.voxel(o))), "").unwrap();
     let field = io::read_field(folder.path().join("field.nii.gz")).unwrap();
     let mut random = palpate::numerics::random::Random::new(3, 1);
     for frame in (0..frames).filter(|&f| f != 1) {

@@ -68,7 +68,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let bone = |o: usize| bones.iter().any(|b| (f64::from(values[o]) / b - 1.0).abs() < 1e-4);
     let side = outward(&folder);
     let [moved, held] = folder.translation;
-    let indentation = -(0..3).map(|a| (moved[a] - held[a]) * side[a]).sum::<f64>();
+    let along = |u: [f64; 3]| (0..3).map(|a| u[a] * side[a]).sum::<f64>();
+    // Of a curved pad that is pressed flat the middle goes less far than the plate.
+    let indentation = folder.travel_mm.unwrap_or(-along(moved)) + along(held);
     let outcome =
         reduce(&folder.map, bone, side, Some(indentation)).with_context(|| stiffness.display().to_string())?;
     let PadOutcome { pad, at_press } = &outcome;

@@ -22,6 +22,8 @@ pub struct StiffnessFolder {
     pub load: String,
     /// Force on it (N), where it was given.
     pub force_n: Option<f64>,
+    /// How far inwards the pressed patch went (mm), where the folder says so.
+    pub travel_mm: Option<f64>,
     /// How the pressed and the held patch moved (mm, RAS).
     pub translation: [[f64; 3]; 2],
 }
@@ -60,6 +62,7 @@ struct RawPatches {
 #[derive(Deserialize)]
 struct RawPatch {
     translation: [f64; 3],
+    travel_mm: Option<f64>,
 }
 
 /// Reads `stiffness.nii.gz` and `summary.json` of a folder that `palpate stiffness` wrote.
@@ -84,6 +87,7 @@ pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoErr
         regions: raw.regions,
         load: raw.inputs.load,
         force_n: raw.force_n,
+        travel_mm: raw.patches.loaded.travel_mm,
         translation: [raw.patches.loaded.translation, raw.patches.held.translation],
     })
 }

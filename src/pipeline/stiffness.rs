@@ -149,6 +149,7 @@ fn labelled(
             nodes: p.nodes.len(),
             contact: p.contact,
             translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
+            travel_mm: p.travelled(&fine.body),
             residual_mm: p.residual[0].hypot(p.residual[1]),
         }
     });

@@ -31,7 +31,7 @@ pub fn bic(squares: f64, samples: f64, parameters: usize) -> f64 {
     samples * (squares.max(1e-300) / samples).ln() + parameters as f64 * samples.max(2.0).ln()
 }
 
-/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or guided.
+/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or guided, or either where noise hides it.
 fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     let [held, load] = &level.patches;
     let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
@@ -40,10 +40,12 @@ fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     let one = |patch: &Patch| {
         // Free sliding spreads a flat face by half the strain.
         let free = 0.5 * strain * patch.radius;
-        let limit = (0.25 * free).max(2.0 * level.surface_error);
         let flat = patch.bend() == 0.0;
-        if patch.residual[1] < limit && flat {
+        if flat && patch.residual[1] < 0.25 * free {
             vec![Contact::Sticking]
+        } else if flat && patch.residual[1] < 2.0 * level.surface_error {
+            // Noise hides whether it slides; what is inside tells.
+            vec![Contact::Sticking, Contact::Sliding]
         } else {
             vec![Contact::Sliding, Contact::Guided]
         }

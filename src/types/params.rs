@@ -69,7 +69,7 @@ impl Default for FieldParams {
 
 impl FieldParams {
     /// Names of all parameters, as files have them.
-    pub const KEYS: [&str; 10] = [
+    pub const KEYS: [&str; 13] = [
         "preset",
         "points",
         "voxels_per_point",
@@ -79,6 +79,9 @@ impl FieldParams {
         "passes",
         "coarse_passes",
         "interpolation",
+        "candidates",
+        "consistency",
+        "sub_voxel",
         "seed",
     ];
 

@@ -212,6 +212,8 @@ pub struct PatchReport {
     pub contact: Contact,
     /// Translation of the patch's middle (mm, RAS).
     pub translation: [f64; 3],
+    /// How far inwards its foremost place went (mm), which is the plate's travel also where a curved surface is pressed flat.
+    pub travel_mm: f64,
     /// Root mean square distance of the measured displacement from that of the plate (mm).
     pub residual_mm: f64,
 }
