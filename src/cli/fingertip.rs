@@ -128,9 +128,9 @@ fn picture(outcome: &PadOutcome, force_n: Option<f64>) -> String {
     let square = |c: &[f64; 3]| 1e-3 * std::f64::consts::PI * pad.hemisphere_kpa * c[0] * c[0];
     let mut lines = vec![
         line("columns", 0, false, &|c| c[1]),
-        line("one modulus", 1, true, &|c| c[2]),
+        line("one E", 1, true, &|c| c[2]),
         line("hemisphere", 2, true, &square),
-        line("unlike springs", 3, false, &|c| profile_force(&pad.profile, c[0])),
+        line("table", 3, false, &|c| profile_force(&pad.profile, c[0])),
     ];
     let marks: Vec<(f64, bool)> = outcome.at_press.iter().map(|p| (p[0], false)).collect();
     if let (Some([depth, _]), Some(force)) = (outcome.at_press, force_n) {
