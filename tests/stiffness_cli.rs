@@ -1,7 +1,9 @@
 //! `palpate stiffness` as a user meets it: files, exit codes, what it says to bad input, and other programs on its models.
 #![allow(clippy::unwrap_used)]
 
-use assert_cmd::Command;
+mod fixtures;
+
+use fixtures::run;
 use palpate::io;
 use palpate::types::{Affine, DenseField, Grid, Mask};
 use std::fs;
@@ -28,15 +30,6 @@ fn folder() -> TempDir {
     io::write_field(at("field.nii.gz"), &field).unwrap();
     io::write_labels(at("labels.nii.gz"), &labels, "").unwrap();
     folder
-}
-
-fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("palpate"));
-    let output = command.current_dir(folder).args(arguments).output().unwrap();
-    let [out, err] = [output.stdout, output.stderr].map(|b| String::from_utf8_lossy(&b).into_owned());
-    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
-    assert!(!err.contains("panicked"), "{err}");
-    (out, err)
 }
 
 const BASE: [&str; 9] =
@@ -148,6 +141,14 @@ fn what_is_no_sequence_is_refused() {
     assert!(err.contains("1 forces for 2 frames"), "{err}");
     let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1,-1"]].concat(), 2);
     assert!(err.contains("-1") && err.contains("above 0 N"), "{err}");
+    // Each frame would find regions of its own, and their moduli would be averaged as if they were the same ones.
+    for body in [&["--mask", "labels.nii.gz"][..], &[]] {
+        let (_, err) = run(folder.path(), &[&["stiffness", "--sequence", ".", "-o", "results"], body].concat(), 2);
+        assert!(
+            err.contains("--sequence") && err.contains(if body.is_empty() { "--labels" } else { "--mask" }),
+            "{err}"
+        );
+    }
     fs::write(folder.path().join("summary.json"), r#"{"command": "field"}"#).unwrap();
     let (_, err) = run(folder.path(), &base, 1);
     assert!(err.contains("summary.json") && err.contains("palpate track"), "{err}");

@@ -38,7 +38,7 @@ pub struct Options {
     #[arg(long, value_name = "F", required_unless_present = "sequence")]
     field: Option<PathBuf>,
     /// A folder of palpate track: one stiffness map for all its frames
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["field", "matches", "force"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["field", "matches", "force", "mask"])]
     sequence: Option<PathBuf>,
     /// Sequence: total force in each frame but the reference, in order, in N; without, moduli are ratios
     #[arg(long, value_name = "N,N,...", requires = "sequence", value_delimiter = ',')]
@@ -48,7 +48,7 @@ pub struct Options {
     #[arg(long, value_name = "M.csv|none")]
     matches: Option<PathBuf>,
     /// The body: a mask on the field's grid; regions are then looked for
-    #[arg(long, value_name = "M", conflicts_with = "labels", required_unless_present = "labels")]
+    #[arg(long, value_name = "M", conflicts_with = "labels", required_unless_present_any = ["labels", "sequence"])]
     mask: Option<PathBuf>,
     /// Regions: a label map on the field's grid, 0 outside
     #[arg(long, value_name = "L")]
@@ -94,6 +94,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { poisson, model, force, nodes, regions, .. } = *options;
     let params = StiffnessParams { poisson, model, force_n: force, nodes, regions };
     params.check()?;
+    if options.sequence.is_some() && options.labels.is_none() {
+        bail!(Usage(
+            "--sequence needs --labels: regions that each frame found for itself would not be the same ones".into()
+        ));
+    }
     let body = options.labels.as_ref().or(options.mask.as_ref());
     let Some(body) = body else { bail!(Usage("give --labels or --mask".into())) };
     match (&options.sequence, &options.field) {

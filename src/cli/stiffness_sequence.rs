@@ -32,7 +32,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let mut order = Vec::new();
     for (at, (_, path, _)) in frames.iter().enumerate() {
         let field = io::read_field(path)?;
-        if field.grid().shape() != grid.shape() {
+        if !field.grid().same_as(&grid) {
             bail!("{}: lies on another grid than {}; take fields of one track", path.display(), frames[0].1.display());
         }
         order.push((at, motion(&field, &setting.labels)));
@@ -57,10 +57,9 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         }
         sequence.add(*frame, moved, outcome);
     }
-    let shared = sequence.finish(&setting.labels).with_context(|| format!("{} with {}", name(from), name(body)))?;
+    let mut shared = sequence.finish(&setting.labels).with_context(|| format!("{} with {}", name(from), name(body)))?;
 
     progress.set("write", 1.0);
-    let mut shared = shared;
     write(&mut folder, &mut shared.result)?;
     folder.write("frames.csv", |p| io::write_frames(p, &shared))?;
     let names = report::InputNames {

@@ -19,11 +19,8 @@ pub struct Sequence {
 impl Sequence {
     /// Parameters for the next frame: those that move less are solved with the law of the first.
     pub fn params(&self, wanted: &StiffnessParams) -> StiffnessParams {
-        let law = self.first.as_ref().map(|r| match r.law {
-            crate::types::stiffness::Law::Linear => LawChoice::Linear,
-            crate::types::stiffness::Law::NeoHookean => LawChoice::NeoHookean,
-        });
-        StiffnessParams { model: law.unwrap_or(wanted.model), ..wanted.clone() }
+        let model = self.first.as_ref().map_or(wanted.model, |r| LawChoice::from(r.law));
+        StiffnessParams { model, ..wanted.clone() }
     }
 
     /// Takes the outcome of a frame.

@@ -39,6 +39,15 @@ pub enum LawChoice {
     NeoHookean,
 }
 
+impl From<Law> for LawChoice {
+    fn from(law: Law) -> Self {
+        match law {
+            Law::Linear => Self::Linear,
+            Law::NeoHookean => Self::NeoHookean,
+        }
+    }
+}
+
 impl FromStr for LawChoice {
     type Err = UnknownName;
 
