@@ -4,20 +4,10 @@
 mod fixtures;
 
 use assert_cmd::Command;
-use fixtures::{Nifti, palpate, small_pair, text};
+use fixtures::{Nifti, run, small_pair, text};
 use serde_json::Value;
 use std::fs;
-use std::path::Path;
 use tempfile::TempDir;
-
-/// Runs, and checks the exit code; stdout and stderr come back.
-fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
-    let output = palpate(folder).args(arguments).output().unwrap();
-    let (out, err) = (text(&output.stdout), text(&output.stderr));
-    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
-    assert!(!err.contains("panicked"), "{err}");
-    (out, err)
-}
 
 #[test]
 fn help_names_every_subcommand_and_exits_with_0() {

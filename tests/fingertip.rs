@@ -1,6 +1,9 @@
 //! Finger pads reduced to springs, against closed forms, and the command.
 #![allow(clippy::unwrap_used)]
 
+mod fixtures;
+
+use fixtures::run as palpate;
 use palpate::error::FingertipError;
 use palpate::fingertip::{columns, force, profile_force, reduce};
 use palpate::io;
@@ -8,7 +11,6 @@ use palpate::pipeline::fingertip::run;
 use palpate::types::fingertip::PadModel;
 use palpate::types::{Affine, Grid, Volume};
 use std::fs;
-use std::path::Path;
 use tempfile::TempDir;
 
 const BONE: f32 = 15_000.0;
@@ -139,14 +141,6 @@ fn stiffness_folder(absolute: bool, bone_name: &str) -> TempDir {
     });
     io::write_json(out.join("summary.json"), &summary).unwrap();
     folder
-}
-
-fn palpate(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
-    let mut command = assert_cmd::Command::new(assert_cmd::cargo::cargo_bin!("palpate"));
-    let output = command.current_dir(folder).args(arguments).output().unwrap();
-    let [out, err] = [output.stdout, output.stderr].map(|b| String::from_utf8_lossy(&b).into_owned());
-    assert_eq!(output.status.code(), Some(code), "{out}{err}");
-    (out, err)
 }
 
 #[test]

@@ -1,7 +1,9 @@
 //! `palpate grasp` and `palpate grasp-analysis` as a user meets them: files, exit codes, and what they say to bad scenes.
 #![allow(clippy::unwrap_used)]
 
-use assert_cmd::Command;
+mod fixtures;
+
+use fixtures::run;
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
@@ -13,16 +15,6 @@ fn folder(change: impl Fn(&str) -> String) -> TempDir {
     let folder = TempDir::new().unwrap();
     fs::write(folder.path().join("scene.toml"), change(SCENE)).unwrap();
     folder
-}
-
-/// Runs, and checks the exit code; stdout and stderr come back.
-fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin!("palpate"));
-    let output = command.current_dir(folder).args(arguments).output().unwrap();
-    let [out, err] = [output.stdout, output.stderr].map(|b| String::from_utf8_lossy(&b).into_owned());
-    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
-    assert!(!err.contains("panicked"), "{err}");
-    (out, err)
 }
 
 fn json(folder: &Path, name: &str) -> serde_json::Value {

@@ -3,17 +3,9 @@
 
 mod fixtures;
 
-use fixtures::{palpate, small_pair, text};
+use fixtures::{run, small_pair};
 use std::fs;
 use std::path::Path;
-
-fn run(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
-    let output = palpate(folder).args(arguments).output().unwrap();
-    let (out, err) = (text(&output.stdout), text(&output.stderr));
-    assert_eq!(output.status.code(), Some(code), "palpate {}\n{out}{err}", arguments.join(" "));
-    assert!(!err.contains("panicked"), "{err}");
-    (out, err)
-}
 
 fn json(folder: &Path, arguments: &[&str]) -> serde_json::Value {
     serde_json::from_str(&run(folder, arguments, 0).0).unwrap()

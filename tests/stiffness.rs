@@ -36,7 +36,7 @@ fn straight(map: &Mask, nodes: usize) -> Body {
     let mesh = mesh_labels(map, &Fineness::for_nodes(volume, nodes)).unwrap();
     let mut places = mesh.nodes().to_vec();
     for t in mesh.tetrahedra() {
-        for (k, [i, j]) in palpate::stiffness::elements::EDGES.into_iter().enumerate() {
+        for (k, [i, j]) in palpate::numerics::tetrahedron::EDGES.into_iter().enumerate() {
             let (p, q) = (places[t[i] as usize].0, places[t[j] as usize].0);
             places[t[4 + k] as usize] = WorldPoint(std::array::from_fn(|a| 0.5 * (p[a] + q[a])));
         }

@@ -18,13 +18,14 @@ use std::path::{Path, PathBuf};
 /// The grasp that the pad is put to.
 const SCENE: &str = include_str!("../../examples/finger_pad.toml");
 /// Parts of the chain, each in a folder or file of its own.
-const FILES: [&str; 9] = [
+const FILES: [&str; 10] = [
     "phantom",
     "field",
     "stiffness",
     "fingertip.toml",
-    "exact.toml",
     "scene.toml",
+    "exact.toml",
+    "exact-scene.toml",
     "grasp",
     "chain.csv",
     "report.html",
@@ -54,7 +55,7 @@ pub struct Options {
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { output, force, size, nodes, tuning } = options;
-    tuning.params()?;
+    let params = tuning.params()?;
     let earlier = ["phantom", "summary.json"].iter().all(|f| output.join(f).exists());
     let used = io::list(output).is_ok_and(|files| !files.is_empty());
     if used && !earlier && !force {
@@ -66,7 +67,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let Cli { command, .. } = Cli::try_parse_from([&["palpate"], command].concat())?;
         super::dispatch(&command, console)
     };
-    let (seed, cells, nodes) = (tuning.params()?.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
+    let (seed, cells, nodes) = (params.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
     let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--force", "-o"];
     let phantom = at("phantom");
     make.push(&phantom);
@@ -118,8 +119,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
     let (mut rows, metrics) = field_rows(output)?;
     rows.extend(stiffness_rows(output, &regions)?);
-    let exact = exact_fingertip(output, &told)?;
-    rows.extend(grasp_rows(output, exact)?);
+    exact_fingertip(output, &told)?;
+    rows.extend(grasp_rows(output)?);
     let mut folder = OutputFolder::create(output, true)?;
     let parts = [
         ("Field", "field/report.html"),
@@ -130,9 +131,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let parts =
         parts.map(|(title, file)| io::read_text(output.join(file)).map(|content| Part { title, file, content }));
     let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
-    let names: Vec<&str> = FILES.to_vec();
     let summary = json!({
-        "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": names,
+        "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": FILES,
     });
     folder.write("chain.csv", |p| io::write_chain(p, &rows))?;
     folder.write("summary.json", |p| io::write_json(p, &summary))?;
@@ -158,13 +158,13 @@ fn stiffness_rows(output: &Path, truth: &[Value]) -> Result<Vec<Row>> {
     let row = |(r, t): (&io::StiffnessRegion, &Value)| {
         let exact = t["youngs_modulus_kpa"].as_f64().unwrap_or(f64::NAN);
         let what = format!("Young's modulus of {}", r.name);
-        Row { bound: r.bound.clone(), ..Row::value("stiffness", &what, "kPa", r.youngs_modulus, exact) }
+        Row::value("stiffness", &what, "kPa", r.youngs_modulus, exact).bounded(r.bound.clone())
     };
     Ok(folder.regions.iter().zip(truth).map(row).collect())
 }
 
-/// The fingertip of the exact map: its modulus (Pa), in a file beside the measured one.
-fn exact_fingertip(output: &Path, told: &Value) -> Result<f64> {
+/// The fingertip of the exact map and the scene with it, in files beside the measured ones.
+fn exact_fingertip(output: &Path, told: &Value) -> Result<()> {
     let map: Volume = io::read_volume(output.join("phantom/youngs_modulus.nii.gz"))?;
     let elastic = &told["elastic"];
     let number = |v: &Value| v.as_f64().unwrap_or(f64::NAN);
@@ -172,36 +172,27 @@ fn exact_fingertip(output: &Path, told: &Value) -> Result<f64> {
     let depth = number(&told["amplitude"]);
     let values = map.as_slice();
     let outcome = fingertip::run(&map, |o| values[o] > BONE, [0.0, 0.0, down], Some(depth))?;
-    let calibration = outcome.at_press.map_or(1.0, |[_, force]| number(&elastic["force_n"]) / force);
-    let pad = &outcome.pad;
-    let radius = if pad.radius_mm.is_finite() { pad.radius_mm } else { pad.thickness_mm };
-    io::write_fingertip(output.join("exact.toml"), pad, radius, calibration, "the exact map")?;
-    Ok(1e3 * calibration * pad.hemisphere_kpa)
+    let calibration = outcome.calibration(elastic["force_n"].as_f64());
+    io::write_fingertip(output.join("exact.toml"), &outcome.pad, outcome.radius_mm(), calibration, "the exact map")?;
+    Ok(io::write_text(output.join("exact-scene.toml"), &SCENE.replace("fingertip.toml", "exact.toml"))?)
 }
 
 /// The fingertip and the grasp against those of the exact map.
-fn grasp_rows(output: &Path, exact: f64) -> Result<Vec<Row>> {
-    let read = |tip: &str| {
-        let path = output.join("scene.toml");
-        let text = SCENE.replace("fingertip.toml", tip);
-        io::write_text(&path, &text)?;
-        Ok::<_, anyhow::Error>(io::read_scene(&path, &SceneOverrides::default())?.scene)
+fn grasp_rows(output: &Path) -> Result<Vec<Row>> {
+    let run = |scene: &str| {
+        let scene = io::read_scene(output.join(scene), &SceneOverrides::default())?.scene;
+        let run = simulate(&scene, &|_| {})?;
+        let turn = run.samples.last().map_or(f64::NAN, |s| s.pose[2].to_degrees());
+        Ok::<_, anyhow::Error>([1e-3 * scene.fingertip.youngs_modulus, turn, f64::from(u8::from(run.completed))])
     };
-    let (truth, found) = (read("exact.toml")?, read("fingertip.toml")?);
-    let runs = [&found, &truth].map(|scene| simulate(scene, &|_| {}));
-    let [found_run, truth_run] = runs;
-    let (found_run, truth_run) = (found_run?, truth_run?);
-    let angle = |run: &palpate::types::grasp::GraspRun| run.samples.last().map_or(f64::NAN, |s| s.pose[2].to_degrees());
-    let whole = |run: &palpate::types::grasp::GraspRun| f64::from(u8::from(run.completed));
-    Ok(vec![
-        Row::value(
-            "fingertip",
-            "Young's modulus of the hemisphere",
-            "kPa",
-            1e-3 * found.fingertip.youngs_modulus,
-            1e-3 * exact,
-        ),
-        Row::value("grasp", "turn of the object at the end", "degrees", angle(&found_run), angle(&truth_run)),
-        Row::value("grasp", "held to the end (1)", "", whole(&found_run), whole(&truth_run)),
-    ])
+    let (found, truth) = (run("scene.toml")?, run("exact-scene.toml")?);
+    let rows = [
+        ("fingertip", "Young's modulus of the hemisphere", "kPa"),
+        ("grasp", "turn of the object at the end", "degrees"),
+        ("grasp", "held to the end (1)", ""),
+    ];
+    let row = |(k, (stage, what, unit)): (usize, (&'static str, &str, &'static str))| {
+        Row::value(stage, what, unit, found[k], truth[k])
+    };
+    Ok(rows.into_iter().enumerate().map(row).collect())
 }

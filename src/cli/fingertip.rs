@@ -74,11 +74,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let outcome =
         reduce(&folder.map, bone, side, Some(indentation)).with_context(|| stiffness.display().to_string())?;
     let PadOutcome { pad, at_press } = &outcome;
-    let radius = if pad.radius_mm.is_finite() { pad.radius_mm } else { pad.thickness_mm };
-    let calibration = match (at_press, folder.force_n) {
-        (Some([_, force]), Some(measured)) => measured / force,
-        _ => 1.0,
-    };
+    let (radius, calibration) = (outcome.radius_mm(), outcome.calibration(folder.force_n));
     io::write_fingertip(output, pad, radius, calibration, &from)?;
     io::write_text(output.with_extension("svg"), &picture(&outcome, folder.force_n))?;
 

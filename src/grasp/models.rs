@@ -61,6 +61,28 @@ pub trait Tip: std::fmt::Debug + Sync {
     fn curvature(&self, d: f64, d_t: f64, tilt: Tilt) -> Curvature;
 }
 
+impl<T: Tip + ?Sized> Tip for &T {
+    fn holds_normal(&self) -> bool {
+        (**self).holds_normal()
+    }
+
+    fn holds_tangent(&self) -> bool {
+        (**self).holds_tangent()
+    }
+
+    fn energy(&self, d: f64, d_t: f64, tilt: Tilt) -> f64 {
+        (**self).energy(d, d_t, tilt)
+    }
+
+    fn gradient(&self, d: f64, d_t: f64, tilt: Tilt) -> Gradient {
+        (**self).gradient(d, d_t, tilt)
+    }
+
+    fn curvature(&self, d: f64, d_t: f64, tilt: Tilt) -> Curvature {
+        (**self).curvature(d, d_t, tilt)
+    }
+}
+
 /// Parallel distributed springs with tangential deformation:
 /// U = pi E (d^3 / (3 cos^2) + d^2 d_t tan + d d_t^2).
 ///

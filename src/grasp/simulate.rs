@@ -155,7 +155,8 @@ impl<const N: usize, S: System<N>> Run<'_, N, S> {
             return None;
         }
         let here = Equilibrium { q: std::array::from_fn(|k| state[k]), ..Equilibrium::default() };
-        let minimal = stepping::growth_at(self.scene, method, Formulation::Minimal, step, 0.0, &here);
+        let tip = models::tip(&self.scene.fingertip);
+        let minimal = stepping::growth_at(self.scene, tip.as_ref(), method, Formulation::Minimal, [step, 0.0], &here);
         let gain = self.scene.integrator.formulation == Formulation::Multipliers && minimal <= LIMIT;
         Some(if gain { EventKind::BadGain } else { EventKind::BadStep })
     }

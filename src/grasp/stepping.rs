@@ -3,16 +3,14 @@
 use crate::grasp::control::Phase;
 use crate::grasp::integrators::{Rk4, SemiImplicitEuler, Stepper, System};
 use crate::grasp::minimal::Minimal;
-use crate::grasp::models::{self, Tip};
+use crate::grasp::models::{Tip, tip};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::Plant;
 use crate::grasp::statics::Equilibrium;
-use crate::grasp::tabulated::Tabulated;
 use crate::numerics::dense::spectral_radius;
+use crate::types::Scene;
 use crate::types::grasp::StableStep;
 use crate::types::scene::{Formulation, Method};
-use crate::types::{FingertipModel, Scene};
-use std::f64::consts::PI;
 
 /// Growth of a step that still counts as stable: rounding of the derivatives is far below, and it means a factor e in
 /// 100,000 steps.
@@ -84,33 +82,25 @@ pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
 
 /// Largest stable step (s) at all of the equilibria `at`, to 1 %, with the scene's gains.
 pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: &[Equilibrium]) -> f64 {
-    let gain = scene.integrator.baumgarte;
-    largest(1e-7, 1.0, |h| at.iter().all(|e| growth_at(scene, method, formulation, h, gain, e) <= LIMIT))
+    let (gain, tip) = (scene.integrator.baumgarte, tip(&scene.fingertip));
+    let stable = |h, e| growth_at(scene, tip.as_ref(), method, formulation, [h, gain], e) <= LIMIT;
+    largest(1e-7, 1.0, |h| at.iter().all(|e| stable(h, e)))
 }
 
 /// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's step, to 1 %.
 pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
-    let (method, step) = (scene.integrator.method, scene.integrator.step);
-    largest(1e-3, 1e9, |g| growth_at(scene, method, Formulation::Multipliers, step, g, at) <= LIMIT)
+    let (method, step, tip) = (scene.integrator.method, scene.integrator.step, tip(&scene.fingertip));
+    largest(1e-3, 1e9, |g| growth_at(scene, tip.as_ref(), method, Formulation::Multipliers, [step, g], at) <= LIMIT)
 }
 
-/// Spectral radius of one step of `h` seconds about an equilibrium, with the gain `gain` (1/s) in the multiplier form.
-pub fn growth_at(scene: &Scene, method: Method, formulation: Formulation, h: f64, gain: f64, at: &Equilibrium) -> f64 {
-    let case = (method, formulation, h, gain);
-    let stiffness = PI * scene.fingertip.youngs_modulus;
-    match scene.fingertip.model {
-        FingertipModel::Parallel => growth_with(scene, models::Parallel { stiffness }, case, at),
-        FingertipModel::ParallelNormal => growth_with(scene, models::ParallelNormal { stiffness }, case, at),
-        FingertipModel::Radial => growth_with(scene, models::Radial { stiffness }, case, at),
-        FingertipModel::Rigid => growth_with(scene, models::Rigid, case, at),
-        FingertipModel::Tabulated => growth_with(scene, Tabulated::of(&scene.fingertip), case, at),
-    }
-}
-
-fn growth_with<T: Tip + Clone>(
+/// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tip`, with the gain `gain` (1/s) in the
+/// multiplier form.
+pub fn growth_at(
     scene: &Scene,
-    tip: T,
-    (method, formulation, h, gain): (Method, Formulation, f64, f64),
+    tip: &dyn Tip,
+    method: Method,
+    formulation: Formulation,
+    [h, gain]: [f64; 2],
     at: &Equilibrium,
 ) -> f64 {
     let plant = Plant::new(scene, tip, at);

@@ -28,6 +28,8 @@ pub mod statistics;
 
 pub mod surface;
 
+pub mod tetrahedron;
+
 pub mod random;
 
 pub mod neighbours;

@@ -20,6 +20,18 @@ pub struct PadOutcome {
     pub at_press: Option<[f64; 2]>,
 }
 
+impl PadOutcome {
+    /// Radius of the hemisphere (mm): the surface's, or the tissue's thickness where that is flat.
+    pub fn radius_mm(&self) -> f64 {
+        if self.pad.radius_mm.is_finite() { self.pad.radius_mm } else { self.pad.thickness_mm }
+    }
+
+    /// The measured force (N) over the columns' at the same press (1); 1 where one of them is not known.
+    pub fn calibration(&self, force_n: Option<f64>) -> f64 {
+        self.at_press.zip(force_n).map_or(1.0, |([_, columns], measured)| measured / columns)
+    }
+}
+
 /// Reduces a map (kPa; 0 outside) that was pressed against `outward` (unit vector of the pressed side, RAS), by
 /// `indentation` mm where that is known.
 ///

@@ -22,29 +22,54 @@ pub struct Row {
     pub error: f64,
     /// `lower` or `upper` where `found` is only a bound.
     pub bound: Option<String>,
+    /// Whether it is an error, 0 at best, and not a value.
+    #[serde(skip)]
+    is_error: bool,
 }
 
 impl Row {
     /// A value with its truth.
     pub fn value(stage: &'static str, quantity: &str, unit: &'static str, found: f64, truth: f64) -> Self {
-        Self { stage, quantity: quantity.into(), unit, found, truth, error: found / truth - 1.0, bound: None }
+        Self {
+            stage,
+            quantity: quantity.into(),
+            unit,
+            found,
+            truth,
+            error: found / truth - 1.0,
+            bound: None,
+            is_error: false,
+        }
+    }
+
+    /// The same where it is only a bound, if it is one.
+    pub fn bounded(self, bound: Option<String>) -> Self {
+        Self { bound, ..self }
     }
 
     /// An error, 0 at best, with that of doing nothing.
     pub fn error(stage: &'static str, quantity: &str, unit: &'static str, found: f64, nothing: f64) -> Self {
-        Self { stage, quantity: quantity.into(), unit, found, truth: nothing, error: found, bound: None }
+        Self {
+            stage,
+            quantity: quantity.into(),
+            unit,
+            found,
+            truth: nothing,
+            error: found,
+            bound: None,
+            is_error: true,
+        }
     }
 
     /// The cells of a table.
     fn cells(&self) -> Vec<String> {
-        let is_error = self.quantity.contains("error");
         let found = match self.bound.as_deref() {
             Some("lower") => format!("above {}", short(self.found)),
             Some(_) => format!("below {}", short(self.found)),
             None => short(self.found),
         };
-        let truth = if is_error { format!("0 (doing nothing {})", short(self.truth)) } else { short(self.truth) };
-        let error = match (&self.bound, is_error) {
+        let truth = if self.is_error { format!("0 (doing nothing {})", short(self.truth)) } else { short(self.truth) };
+        let error = match (&self.bound, self.is_error) {
             (Some(_), _) => "a bound".into(),
             (None, true) => format!("{} {}", short(self.error), self.unit),
             (None, false) => format!("{:+.1} %", 100.0 * self.error),

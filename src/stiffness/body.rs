@@ -2,7 +2,8 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::sparse::Pattern;
-use crate::stiffness::elements::{EDGES, Point, points};
+use crate::numerics::tetrahedron::EDGES;
+use crate::stiffness::elements::{Point, points};
 use crate::types::QuadraticMesh;
 use crate::types::space::cross;
 use rayon::prelude::*;

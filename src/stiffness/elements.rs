@@ -4,10 +4,8 @@
 //! Poisson's ratio nears 0.5. The pressure is continuous within a region and jumps between regions, as it does where the
 //! shear modulus jumps.
 
+use crate::numerics::tetrahedron::{self, shapes, slopes};
 use crate::types::space::determinant;
-
-/// The edges between the corners, in the order of nodes 4 to 9.
-pub const EDGES: [[usize; 2]; 6] = [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]];
 
 const A: f64 = 0.585_410_196_624_968_5;
 const B: f64 = 0.138_196_601_125_010_5;
@@ -16,44 +14,10 @@ const B: f64 = 0.138_196_601_125_010_5;
 pub const RULE: [([f64; 4], f64); 4] =
     [([A, B, B, B], 0.25), ([B, A, B, B], 0.25), ([B, B, A, B], 0.25), ([B, B, B, A], 0.25)];
 
-/// The ten shape functions at barycentric coordinates `l`.
-pub fn shapes(l: [f64; 4]) -> [f64; 10] {
-    std::array::from_fn(|k| {
-        if k < 4 {
-            l[k] * (2.0 * l[k] - 1.0)
-        } else {
-            let [i, j] = EDGES[k - 4];
-            4.0 * l[i] * l[j]
-        }
-    })
-}
-
-/// Derivatives of the shape functions with respect to the barycentric coordinates 1, 2 and 3.
-fn slopes(l: [f64; 4]) -> [[f64; 3]; 10] {
-    let d = |i: usize, b: usize| if i == 0 { -1.0 } else { f64::from(u8::from(i == b + 1)) };
-    std::array::from_fn(|k| {
-        std::array::from_fn(|b| {
-            if k < 4 {
-                (4.0 * l[k] - 1.0) * d(k, b)
-            } else {
-                let [i, j] = EDGES[k - 4];
-                4.0 * (l[i] * d(j, b) + l[j] * d(i, b))
-            }
-        })
-    })
-}
-
 /// Gradients of the ten shape functions (1/mm) and the Jacobian determinant (mm^3) at `l` in the element of nodes `p` (mm).
 pub fn jacobian(p: &[[f64; 3]; 10], l: [f64; 4]) -> ([[f64; 3]; 10], f64) {
     let slopes = slopes(l);
-    let mut j = [[0.0; 3]; 3];
-    for (q, s) in p.iter().zip(&slopes) {
-        for a in 0..3 {
-            for b in 0..3 {
-                j[a][b] += q[a] * s[b];
-            }
-        }
-    }
+    let j = tetrahedron::jacobian(p, &slopes);
     let det = determinant(&j);
     // inverse[b][a] = d(barycentric b)/d(x a)
     let inverse: [[f64; 3]; 3] = std::array::from_fn(|r| {
@@ -92,15 +56,7 @@ pub fn locate(p: &[[f64; 3]; 10], x: [f64; 3]) -> Option<[f64; 4]> {
     for _ in 0..12 {
         let n = shapes(l);
         let rest: [f64; 3] = std::array::from_fn(|a| x[a] - (0..10).map(|k| n[k] * p[k][a]).sum::<f64>());
-        let s = slopes(l);
-        let mut j = [[0.0; 3]; 3];
-        for k in 0..10 {
-            for a in 0..3 {
-                for b in 0..3 {
-                    j[a][b] += p[k][a] * s[k][b];
-                }
-            }
-        }
+        let j = tetrahedron::jacobian(p, &slopes(l));
         let step = crate::numerics::dense::solve(&j, &rest)?;
         for b in 0..3 {
             l[b + 1] += step[b];

@@ -1,7 +1,8 @@
 //! What was measured inside the body: places with a displacement, and how a solution is read there.
 
+use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
-use crate::stiffness::elements::{locate, shapes};
+use crate::stiffness::elements::locate;
 use crate::types::space::{Matrix3, determinant};
 use crate::types::{DenseField, Mask, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;

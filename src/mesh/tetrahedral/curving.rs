@@ -3,10 +3,10 @@
 use super::cutting::{Cut, distance};
 use super::faces;
 use super::levels::Levels;
+use crate::numerics::tetrahedron::{EDGES, jacobian, slopes};
+use crate::types::space::determinant;
 use std::collections::HashMap;
 
-/// The edges of a quadratic tetrahedron, in the order of its nodes 4 to 9 (VTK).
-pub const EDGES: [[usize; 2]; 6] = [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]];
 /// Edges bend at most by this part of their length.
 const REACH: f64 = 0.2;
 /// Least Jacobian determinant over that of the straight element.
@@ -161,29 +161,5 @@ pub fn volume(p: [[f64; 3]; 10]) -> f64 {
 }
 
 fn determinant_at(p: &[[f64; 3]; 10], l: [f64; 4]) -> f64 {
-    let slopes = shape_slopes(l);
-    let mut j = [[0.0; 3]; 3];
-    for (k, q) in p.iter().enumerate() {
-        for a in 0..3 {
-            for b in 0..3 {
-                j[a][b] += q[a] * slopes[k][b];
-            }
-        }
-    }
-    crate::types::space::determinant(&j)
-}
-
-/// Derivatives of the ten shape functions with respect to the barycentric coordinates 1, 2 and 3, at `l`.
-fn shape_slopes(l: [f64; 4]) -> [[f64; 3]; 10] {
-    let d = |i: usize, b: usize| if i == 0 { -1.0 } else { f64::from(u8::from(i == b + 1)) };
-    std::array::from_fn(|k| {
-        std::array::from_fn(|b| {
-            if k < 4 {
-                (4.0 * l[k] - 1.0) * d(k, b)
-            } else {
-                let [i, j] = EDGES[k - 4];
-                4.0 * (l[i] * d(j, b) + l[j] * d(i, b))
-            }
-        })
-    })
+    determinant(&jacobian(p, &slopes(l)))
 }
