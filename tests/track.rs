@@ -11,7 +11,7 @@ use palpate::numerics::small::eigenvalues;
 use palpate::pipeline::field::run as pair;
 use palpate::pipeline::track::{Tracker, run};
 use palpate::synth::{Sequence, SequenceKind, SequenceParams};
-use palpate::types::{DenseField, FieldParams, Mask, PointState, Volume};
+use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, PointState, Volume};
 
 fn sequence(kind: SequenceKind, frames: usize) -> Sequence {
     Sequence::new(&SequenceParams { frames, ..SequenceParams::new(kind).sized(40) }).unwrap()
@@ -59,6 +59,33 @@ fn following_is_no_worse_than_pairs_and_far_better_than_a_chain() {
         }
         assert!(last[0] <= 0.5 * last[1], "{kind:?}: {:.4} mm, chained {:.4} mm", last[0], last[1]);
     }
+}
+
+#[test]
+fn steady_frames_are_followed_and_a_jump_is_searched() {
+    let s =
+        Sequence::new(&SequenceParams { frames: 16, ..SequenceParams::new(SequenceKind::Pinch).sized(64) }).unwrap();
+    let (params, reference) = (FieldParams::default(), s.frame(0));
+    let mut tracker = Tracker::new(&reference, Some(&s.mask), &params);
+    let mut next = |t: usize| {
+        let found = tracker.next(&s.frame(t), &|_, _| {}).unwrap();
+        assert!(!found.summary.warnings.iter().any(|w| w.contains("--search")), "{:?}", found.summary.warnings);
+        (found.spline.searched_all(), error(&found.displacement, &s.truth(t), &s.mask))
+    };
+    let steady: Vec<bool> = (1..6).map(|t| next(t).0).collect();
+    assert!(steady[0] && steady[1], "no course is known yet");
+    assert!(!steady[2] && !steady[3] && !steady[4], "{steady:?}");
+    // The sixth frame, with all of it 2 mm (6 voxels) further along.
+    let (still, [mut x, y, z]) = (s.frame(6), s.frame(6).grid().affine().rows());
+    x[3] += 2.0;
+    let grid = Grid::new(still.grid().shape(), Affine::new([x, y, z]).unwrap()).unwrap();
+    let jumped = Volume::from_vec(grid, still.into_vec()).unwrap();
+    let found = tracker.next(&jumped, &|_, _| {}).unwrap();
+    assert!(found.spline.searched_all());
+    let mut truth = s.truth(6);
+    let n = truth.grid().len();
+    truth.as_mut_slice()[..n].iter_mut().for_each(|v| *v += 2.0);
+    assert!(error(&found.displacement, &truth, &s.mask) < 0.1);
 }
 
 #[test]

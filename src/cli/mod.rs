@@ -117,7 +117,7 @@ enum Command {
     Chart(chart::Options),
     /// Push each part until it breaks, and see whether it says so
     Stress(stress::Options),
-    /// Make a synthetic calf, measure it, and score the result against the truth
+    /// Take a synthetic finger pad through every command, from images to a grasp, and score each step
     Demo(demo::Options),
     /// Turn matches, landmarks or points into a point list of 3D Slicer
     Markups(markups::Options),

@@ -2,7 +2,8 @@
 //!
 //! [`correlation`] searches by normalised cross-correlation, [`candidates`] joins searches and feature pairs into
 //! many-to-many candidates, [`lsm`] brings a candidate to sub-voxel precision with a covariance, and [`residual`] turns
-//! the whole remaining difference of the two volumes into normal equations for a spline field.
+//! the whole remaining difference of the two volumes into normal equations for a spline field; [`agreement`] says where
+//! that difference has grown.
 //!
 //! Positions are voxels of one common lattice (the initial volume's axes on the level at hand); displacements are
 //! millimetres along those axes unless a name says voxels. Fails quietly where there is no texture: the information
@@ -21,3 +22,5 @@ pub mod lsm;
 pub mod gain;
 
 pub mod residual;
+
+pub mod agreement;

@@ -14,7 +14,7 @@ use crate::numerics::statistics::median;
 use rayon::prelude::*;
 
 /// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
-const CAUCHY: f32 = 2.385;
+pub(super) const CAUCHY: f32 = 2.385;
 
 /// Normal equations of one pass.
 #[derive(Debug, Clone)]

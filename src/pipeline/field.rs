@@ -13,10 +13,12 @@ use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+pub use crate::pipeline::start::Start;
+use crate::pipeline::start::begin;
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
@@ -55,33 +57,20 @@ impl Clock {
     fn book(&mut self, stage: &str) {
         let seconds = self.1.elapsed().as_secs_f64();
         self.1 = Instant::now();
+        self.add(stage, seconds);
+    }
+
+    /// Books `seconds` that passed before now to `stage`, and leaves them out of what is booked next.
+    fn skip(&mut self, stage: &str, seconds: f64) {
+        self.1 += Duration::from_secs_f64(seconds);
+        self.add(stage, seconds);
+    }
+
+    fn add(&mut self, stage: &str, seconds: f64) {
         match self.0.iter_mut().find(|s| s.0 == stage) {
             Some(s) => s.1 += seconds,
             None => self.0.push((stage.into(), seconds)),
         }
-    }
-}
-
-/// A field where another search may start.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Start {
-    field: SplineField,
-    /// Voxels that a voxel of its level stands for.
-    factor: [usize; 3],
-}
-
-impl Start {
-    /// As far again as from `before` to here: where steady motion would be next. None when the two do not lie on one
-    /// lattice.
-    pub fn extrapolated(&self, before: &Self) -> Option<Self> {
-        if self.factor != before.factor || self.field.lattice != before.field.lattice {
-            return None;
-        }
-        let mut next = self.clone();
-        for (n, b) in next.field.coefficients.iter_mut().zip(&before.field.coefficients) {
-            *n += *n - b;
-        }
-        Some(next)
     }
 }
 
@@ -131,6 +120,7 @@ pub fn run_from(
     let mut reports = Vec::new();
     let mut state: Option<(SplineField, [usize; 3])> = None;
     let mut fine = None;
+    let mut searched = None;
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let pair = aligned.level(factor);
@@ -146,24 +136,25 @@ pub fn run_from(
                 field
             }
             None => {
-                progress("matching", done(0.0));
                 let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
                 let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
-                let wide = MatchParams::new(params, points, true, search, 2, 0.3);
-                let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
-                clock.book("matching");
-                let enough = report.counts.kept >= FEWEST;
-                reports.push(report);
-                let given = starts
-                    .iter()
-                    .map(|s| level::carry(&s.field, lattice.clone(), |p| to_level(from_level(p, factor), s.factor)));
-                let own = [fitted.filter(|_| enough), Some(SplineField::still(lattice.clone()))];
-                let refined = own.into_iter().flatten().chain(given).map(|mut start| {
+                let refine = |mut start| {
                     level::refine(&pair, &mut start, passes, params.seed, tick);
                     start
-                });
-                // The matches' field, stillness, what is given: the one that ends at the better agreement goes on.
-                refined.reduce(|a, b| level::better(&pair, a, b)).ok_or_else(|| too_few(0, search))?
+                };
+                let seek = || {
+                    progress("matching", done(0.0));
+                    let wide = MatchParams::new(params, points, true, search, 2, 0.3);
+                    let started = Instant::now();
+                    let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
+                    clock.skip("matching", started.elapsed().as_secs_f64());
+                    (fitted.filter(|_| report.counts.kept >= FEWEST), report)
+                };
+                let begun = begin(&pair, &lattice, factor, starts, refine, seek);
+                let begun = begun.ok_or_else(|| too_few(0, search))?;
+                reports.extend(begun.report);
+                searched = Some(begun.searched);
+                begun.field
             }
         };
         clock.book("residual");
@@ -253,13 +244,15 @@ pub fn run_from(
         max_mm: length.1,
         uncertainty_median_mm,
         seconds: clock.0,
-        warnings: warnings(counts, folds, not_finite, length.1, search)
+        // A known field takes the search as far as it goes itself.
+        warnings: warnings(counts, folds, not_finite, length.1, if starts.is_empty() { search } else { f64::INFINITY })
             .into_iter()
             .chain(vague(choice.model, uncertainty_mean_mm, length.0, &grid))
             .collect(),
     };
     progress("done", 1.0);
-    let spline = Start { field, factor };
+    let sigma = uncertainty_median_mm / pyramid::finest(grid.shape(), grid.spacing());
+    let spline = Start { field, factor, searched: searched.map(|s| s.uncertain_by(sigma)) };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 

@@ -32,3 +32,4 @@ pub mod pressed;
 pub mod stress;
 
 mod search;
+mod start;

@@ -6,7 +6,7 @@ use crate::pipeline::{cpu, stiffness};
 use crate::stiffness::patches::Place;
 use crate::synth::{Phantom, PhantomKind, PhantomParams, phantom};
 use crate::types::stiffness::{RegionStiffness, Side};
-use crate::types::{DenseField, Mask, Part, StiffnessParams, StiffnessResult, Trial};
+use crate::types::{DenseField, Mask, Part, SparseField, StiffnessParams, StiffnessResult, Trial};
 
 /// A pressed body whose moduli are known, as the stiffness takes it.
 pub struct Pressed {
@@ -33,19 +33,26 @@ impl Pressed {
         Ok(Self { name, phantom, held: Place::Side(held), load: Place::Side(load), force_n: force.abs() })
     }
 
-    /// Region by region from `field` on the phantom's grid, by `labels`.
+    /// Takes the body to be held on the patch that `mask` covers.
+    pub fn hold_at(&mut self, mask: Mask, name: &str) {
+        self.held = Place::Mask(Box::new(mask), name.into());
+    }
+
+    /// Region by region from `field` on the phantom's grid, by `labels`; with `matches`, they count in place of the field
+    /// inside the body.
     ///
     /// # Errors
     /// As [`stiffness::run`].
     pub fn measure(
         &self,
         field: &DenseField,
+        matches: Option<&SparseField>,
         labels: &Mask,
         params: &StiffnessParams,
     ) -> Result<StiffnessResult, StiffnessError> {
         let names = |label: u8| format!("region {label}");
         let (held, load) = (&self.held, &self.load);
-        let inputs = stiffness::Inputs { field, matches: None, labels, labelled: true, held, load, names: &names };
+        let inputs = stiffness::Inputs { field, matches, labels, labelled: true, held, load, names: &names };
         stiffness::run(&inputs, params, &|_, _| {})
     }
 
@@ -74,7 +81,7 @@ pub fn stiffness_trials(side: usize, budgets: &[usize], progress: &dyn Fn(f64)) 
         let Some(known) = &body.phantom.stiffness else { continue };
         for (i, &nodes) in budgets.iter().enumerate() {
             let params = StiffnessParams { nodes, force_n: Some(body.force_n), ..StiffnessParams::default() };
-            let (result, cpu_s) = cpu::timed(|| body.measure(&body.phantom.truth, &known.labels, &params));
+            let (result, cpu_s) = cpu::timed(|| body.measure(&body.phantom.truth, None, &known.labels, &params));
             let found = result.as_ref().map(|r| mean(&body.errors(r)));
             out.push(Trial {
                 part: Part::Stiffness,

@@ -164,7 +164,7 @@ pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) ->
     let labels = body.phantom.stiffness.as_ref().map(|s| s.labels.clone()).ok_or(SynthError::NotElastic)?;
     let mut out = vec![search("noise", "%", [0.0, 20.0], Spread::Linear, &|s| {
         let field = disturbed(&body.phantom.truth, s / 100.0 * motion, base.seed);
-        Some(stiffness_run(&body, s, body.measure(&field, &labels, &usual)))
+        Some(stiffness_run(&body, s, body.measure(&field, None, &labels, &usual)))
     })];
     progress(0.2);
     if quick {
@@ -175,22 +175,22 @@ pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) ->
         let body = Pressed::new(&PhantomParams { elastic, ..base.clone() }).ok()?;
         let labels = &body.phantom.stiffness.as_ref()?.labels;
         let params = StiffnessParams { force_n: Some(body.force_n), ..usual.clone() };
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, labels, &params)))
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, labels, &params)))
     }));
     progress(0.4);
     out.push(search("Poisson's ratio assumed", "of 0.49", [truth, 0.2], Spread::Linear, &|s| {
         let params = StiffnessParams { poisson: s, ..usual.clone() };
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, &labels, &params)))
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &labels, &params)))
     }));
     progress(0.6);
     out.push(search("labels beside their place", "voxels", [0.0, 8.0], Spread::Linear, &|s| {
         let beside = shifted_labels(&labels, s.round() as usize);
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, &beside, &usual)))
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &beside, &usual)))
     }));
     progress(0.8);
     out.push(search("mesh", "nodes", [8000.0, 500.0], Spread::Ratio, &|s| {
         let params = StiffnessParams { nodes: s.round() as usize, ..usual.clone() };
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, &labels, &params)))
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &labels, &params)))
     }));
     progress(1.0);
     Ok(out)

@@ -108,7 +108,7 @@ pub fn run<E: From<FieldError>>(
                         volume_change,
                     });
                 }
-                tracked.frames.push(summary(number, &result.summary, started.elapsed().as_secs_f64()));
+                tracked.frames.push(summary(number, &result, started.elapsed().as_secs_f64()));
                 keep(Frame { number, volume: &volume, result: &result, strain: &strain })?;
             }
             Err(error) => {
@@ -136,10 +136,12 @@ fn regions(reference: &Volume, mask: Option<&Mask>, labels: Option<&Mask>) -> Ve
     by_label.into_iter().skip(1).filter(|(_, offsets)| !offsets.is_empty()).collect()
 }
 
-fn summary(frame: usize, s: &FieldSummary, seconds: f64) -> FrameSummary {
+fn summary(frame: usize, result: &FieldResult, seconds: f64) -> FrameSummary {
+    let s = &result.summary;
     FrameSummary {
         frame,
         lost: None,
+        searched: result.spline.searched_all(),
         counts: s.counts,
         model: Some(s.model),
         mean_mm: s.mean_mm,
@@ -156,6 +158,7 @@ fn lost(frame: usize, error: &FieldError) -> FrameSummary {
     FrameSummary {
         frame,
         lost: Some(error.to_string()),
+        searched: true,
         counts: Counts::default(),
         model: None,
         mean_mm: 0.0,

@@ -64,12 +64,14 @@ impl TrackReport<'_> {
     fn headline(&self) -> String {
         let all = self.tracked.frames.len();
         let largest = self.tracked.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max);
+        let searched = self.tracked.frames.iter().filter(|f| f.searched).count();
         let lost = match all - self.measured() {
             0 => String::new(),
             n => format!("; {n} lost"),
         };
         format!(
-            "{} of {all} frames measured against frame {}{lost}: tissue moved {} mm at most, {} points followed.",
+            "{} of {all} frames measured against frame {}{lost} ({searched} by a search of all, the others by the frames \
+             before): tissue moved {} mm at most, {} points followed.",
             self.measured(),
             self.reference,
             short2(largest),

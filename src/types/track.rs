@@ -73,6 +73,8 @@ pub struct FrameSummary {
     pub frame: usize,
     /// Why it could not be measured; then all else is empty.
     pub lost: Option<String>,
+    /// Whether the whole volume was searched, rather than the frames before followed.
+    pub searched: bool,
     /// Counts at full resolution.
     pub counts: Counts,
     /// The smallest motion that explains the matches.
