@@ -13,6 +13,8 @@ use rayon::prelude::*;
 const REACH: f64 = 1.8;
 /// Voxels on both sides of the rim, and below it, where the mesh is fine.
 const AROUND: i32 = 1;
+/// Columns of a patch beside a punch at least.
+const WIDE: usize = 25;
 
 /// Places (grid mm: voxel index times spacing) around the rim of `patch`; empty for a patch on a curved surface, and where the
 /// whole side is pressed.
@@ -37,7 +39,7 @@ pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64) -> 
         at
     };
     let width = shape[u];
-    // For each column the outermost voxel of the body, and whether it moved with the plate.
+    // For each column the outermost voxel of the body, and by how much it moved otherwise than the plate (mm).
     let column = |c: usize| {
         let (i, j) = (c % width, c / width);
         let mut all = 0..shape[axis];
@@ -51,22 +53,17 @@ pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64) -> 
         let (moved, _) = at_surface(field, labels, place, REACH)?;
         let plate = patch.motion(place);
         let short: f64 = dot(std::array::from_fn(|a| moved[a] - plate[a]), patch.normal);
-        Some((top, short.abs() < tolerance))
+        Some((top, short.abs()))
     };
-    let columns: Vec<Option<(usize, bool)>> = (0..width * shape[v]).into_par_iter().map(column).collect();
-    let columns: Vec<Option<(usize, bool)>> = (0..columns.len()).map(|c| voted(&columns, c, width)).collect();
+    let short: Vec<Option<(usize, f64)>> = (0..width * shape[v]).into_par_iter().map(column).collect();
+    let columns: Vec<Option<(usize, bool)>> = (0..short.len()).map(|c| voted(&short, c, width, tolerance)).collect();
+    let beside = clear_of(&columns, &short, width, tolerance);
     let mut found = Vec::new();
     for (c, here) in columns.iter().enumerate() {
         let Some((top, true)) = *here else { continue };
         let (i, j) = ((c % width) as i32, (c / width) as i32);
-        let beside = [(-1, 0), (1, 0), (0, -1), (0, 1)].iter().any(|&(di, dj)| {
-            let (i, j) = (i + di, j + dj);
-            let within = (0..width as i32).contains(&i) && (0..shape[v] as i32).contains(&j);
-            let next = within.then(|| columns[(i + width as i32 * j) as usize]).flatten();
-            // A face that ends there has no rim on it.
-            next.is_some_and(|(other, with)| !with && other.abs_diff(top) < 3)
-        });
-        if !beside {
+        let next = |n: usize| columns[n].is_some_and(|(other, _)| beside[n] && other.abs_diff(top) < 3);
+        if !around(c, columns.len(), width, 1).any(next) {
             continue;
         }
         for (di, dj) in (-AROUND..=AROUND).flat_map(|di| (-AROUND..=AROUND).map(move |dj| (di, dj))) {
@@ -81,17 +78,84 @@ pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64) -> 
     found
 }
 
-/// A column with what most of the 25 around it say: noise makes no rim.
-fn voted(columns: &[Option<(usize, bool)>], c: usize, width: usize) -> Option<(usize, bool)> {
-    let (top, _) = columns[c]?;
+/// Columns within `reach` along both axes, with the one itself.
+fn around(c: usize, all: usize, width: usize, reach: i32) -> impl Iterator<Item = usize> {
     let (i, j) = ((c % width) as i32, (c / width) as i32);
+    let (wide, high) = (width as i32, (all / width) as i32);
+    let steps = (-reach..=reach).flat_map(move |di| (-reach..=reach).map(move |dj| (i + di, j + dj)));
+    steps
+        .filter(move |(i, j)| (0..wide).contains(i) && (0..high).contains(j))
+        .map(move |(i, j)| (i + wide * j) as usize)
+}
+
+/// Whether a column moved with the plate, as most of the 25 around it say: noise makes no rim.
+fn voted(short: &[Option<(usize, f64)>], c: usize, width: usize, tolerance: f64) -> Option<(usize, bool)> {
+    let (top, _) = short[c]?;
     let (mut with, mut all) = (0, 0);
-    for (i, j) in (-2..=2).flat_map(|di| (-2..=2).map(move |dj| (i + di, j + dj))) {
-        let within = (0..width as i32).contains(&i) && (0..(columns.len() / width) as i32).contains(&j);
-        if let Some((_, moved)) = within.then(|| columns[(i + width as i32 * j) as usize]).flatten() {
-            with += u32::from(moved);
-            all += 1;
-        }
+    for (_, short) in around(c, short.len(), width, 2).filter_map(|n| short[n]) {
+        with += u32::from(short < tolerance);
+        all += 1;
     }
     Some((top, 2 * with > all))
+}
+
+/// Columns that a punch leaves free: in patches that are wide and stay well behind it. A corner that is badly read, or noise
+/// that hangs together, is neither.
+fn clear_of(
+    columns: &[Option<(usize, bool)>],
+    short: &[Option<(usize, f64)>],
+    width: usize,
+    tolerance: f64,
+) -> Vec<bool> {
+    let mut clear = vec![false; columns.len()];
+    let mut seen = vec![false; columns.len()];
+    let free = |c: usize| columns[c].is_some_and(|(_, with)| !with);
+    for first in 0..columns.len() {
+        if seen[first] || !free(first) {
+            continue;
+        }
+        let mut patch = vec![first];
+        seen[first] = true;
+        for at in 0.. {
+            let Some(&c) = patch.get(at) else { break };
+            for n in around(c, columns.len(), width, 1) {
+                if free(n) && !std::mem::replace(&mut seen[n], true) {
+                    patch.push(n);
+                }
+            }
+        }
+        let mean = patch.iter().filter_map(|&c| short[c]).map(|s| s.1).sum::<f64>() / patch.len() as f64;
+        if patch.len() >= WIDE && mean > 2.0 * tolerance {
+            patch.iter().for_each(|&c| clear[c] = true);
+        }
+    }
+    clear
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is clear of the punch on a face of 20 by 20 columns.
+    fn clear(short: impl Fn(usize, usize) -> f64) -> usize {
+        let width = 20;
+        let short: Vec<_> = (0..400).map(|c| Some((9, short(c % width, c / width)))).collect();
+        let columns: Vec<_> = (0..400).map(|c| voted(&short, c, width, 0.075)).collect();
+        clear_of(&columns, &short, width, 0.075).iter().filter(|c| **c).count()
+    }
+
+    #[test]
+    fn a_badly_read_corner_is_no_rim() {
+        assert_eq!(clear(|i, j| if i < 3 && j < 3 { 0.5 } else { 0.0 }), 0);
+    }
+
+    #[test]
+    fn noise_that_hangs_together_is_no_rim() {
+        assert_eq!(clear(|i, _| if i < 8 { 0.09 } else { 0.01 }), 0);
+    }
+
+    #[test]
+    fn the_face_beside_a_punch_is_clear_of_it() {
+        assert_eq!(clear(|i, _| if i < 8 { 0.3 } else { 0.0 }), 160);
+    }
 }
