@@ -1,6 +1,7 @@
 //! A spline lattice as a dense field.
 
 use crate::numerics::bspline::Lattice;
+use crate::numerics::orientation::Orientation;
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Volume};
 use rayon::prelude::*;
@@ -47,16 +48,27 @@ pub struct ScalarSpline {
     grid: Grid,
     lattice: Lattice,
     values: Vec<f32>,
+    /// The grid it is asked for on, where that one's axes run otherwise.
+    stored: Option<(Grid, Orientation)>,
 }
 
 impl ScalarSpline {
     /// From coefficients on the nodes of a lattice that lies over `grid`'s shape.
     pub fn new(grid: Grid, lattice: Lattice, values: Vec<f32>) -> Self {
-        Self { grid, lattice, values }
+        Self { grid, lattice, values, stored: None }
+    }
+
+    /// The same, to be asked for on the grid `stored` of the same voxels.
+    pub fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
+        Self { stored: Some((stored, orientation)), ..self }
     }
 
     /// The value at a voxel offset (x fastest).
     pub fn at(&self, offset: usize) -> f32 {
+        let offset = match &self.stored {
+            Some((grid, orientation)) => orientation.offset(grid.shape(), grid.voxel(offset)),
+            None => offset,
+        };
         let mut sum = 0.0;
         self.lattice.for_each_tap(self.grid.voxel(offset).map(|i| i as f64), |node, w| sum += w * self.values[node]);
         sum
@@ -64,7 +76,7 @@ impl ScalarSpline {
 
     /// The value at every voxel.
     pub fn volume(&self) -> Volume {
-        let Self { grid, lattice, values } = self;
+        let Self { grid, lattice, values, stored } = self;
         let [nx, ny, _] = grid.shape();
         let three: Vec<f32> = [&values[..]; 3].concat();
         let mut out = Volume::filled(*grid, 0.0);
@@ -80,6 +92,9 @@ impl ScalarSpline {
                 },
             );
         });
-        out
+        match stored {
+            Some((grid, orientation)) => orientation.stored(&out, grid),
+            None => out,
+        }
     }
 }

@@ -12,6 +12,8 @@ pub mod differences;
 
 pub mod sampling;
 
+pub mod orientation;
+
 pub mod pyramid;
 
 pub mod small;

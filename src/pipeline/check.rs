@@ -30,15 +30,8 @@ pub fn inputs<'a>(
             return refuse("is constant, so nothing can be matched", "check that it is the right file");
         }
     }
+    mask_grid(initial, mask)?;
     if let Some(m) = mask {
-        if !m.grid().same_as(initial.grid()) {
-            return Err(FieldError::GridMismatch {
-                what: "the mask".into(),
-                found: m.grid().shape(),
-                reference: "the initial volume".into(),
-                expected: initial.grid().shape(),
-            });
-        }
         if m.as_slice().iter().all(|&v| v == 0) {
             let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
             return Err(FieldError::Volume { volume: "mask", what, hint });
@@ -58,4 +51,20 @@ pub fn inputs<'a>(
         }
     }
     Ok((mask, clean, bad))
+}
+
+/// The mask must lie on the initial volume's grid.
+///
+/// # Errors
+/// [`FieldError::GridMismatch`] when it does not.
+pub fn mask_grid(initial: &Volume, mask: Option<&Mask>) -> Result<(), FieldError> {
+    match mask {
+        Some(m) if !m.grid().same_as(initial.grid()) => Err(FieldError::GridMismatch {
+            what: "the mask".into(),
+            found: m.grid().shape(),
+            reference: "the initial volume".into(),
+            expected: initial.grid().shape(),
+        }),
+        _ => Ok(()),
+    }
 }

@@ -9,6 +9,7 @@ use crate::matching::levels::{Aligned, factors, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::bspline::Lattice;
+use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check;
@@ -18,6 +19,7 @@ use crate::pipeline::start::begin;
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::time::{Duration, Instant};
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -98,6 +100,34 @@ pub fn run(
 /// # Errors
 /// As [`run`].
 pub fn run_from(
+    initial: &Volume,
+    deformed: &Volume,
+    mask: Option<&Mask>,
+    params: &FieldParams,
+    starts: &[Start],
+    progress: Progress<'_>,
+) -> Result<FieldResult, FieldError> {
+    let [here, there] = [initial, deformed].map(|v| Orientation::of(v.grid()));
+    let turned = |v, o: Orientation| if o.is_canonical() { Cow::Borrowed(v) } else { Cow::Owned(o.turned(v)) };
+    let (first, second) = (turned(initial, here), turned(deformed, there));
+    if here.is_canonical() {
+        return canonical(&first, &second, mask, params, starts, progress);
+    }
+    check::mask_grid(initial, mask)?;
+    let mask = mask.map(|m| here.turned(m));
+    let found = canonical(&first, &second, mask.as_ref(), params, starts, progress)?;
+    drop((first, second));
+    let grid = initial.grid();
+    Ok(FieldResult {
+        displacement: here.stored_field(&found.displacement, grid),
+        uncertainty: found.uncertainty.stored_on(*grid, here),
+        ..found
+    })
+}
+
+/// As [`run_from`], for volumes whose axes run right, anterior and superior, nearly: then the way in which voxels are
+/// stored changes nothing.
+fn canonical(
     initial: &Volume,
     deformed: &Volume,
     mask: Option<&Mask>,
