@@ -4,6 +4,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use std::io::{ErrorKind, Write, stderr, stdout};
 
 /// How much to say.
+#[derive(Debug, Clone)]
 pub struct Console {
     quiet: bool,
     verbose: bool,

@@ -1,6 +1,7 @@
 //! `--dry-run`: the checked plan in words.
 
 use super::inputs::name;
+use super::limits::bytes;
 use super::outputs::Target;
 use anyhow::Result;
 use palpate::pipeline::plan::{FieldPlan, stiffness_memory};
@@ -20,13 +21,6 @@ pub fn grid(grid: &Grid) -> String {
 }
 
 /// Bytes as megabytes or gigabytes.
-fn bytes(n: u64) -> String {
-    match n as f64 / 1e6 {
-        mb if mb < 1000.0 => format!("{mb:.0} MB"),
-        mb => format!("{:.1} GB", mb / 1000.0),
-    }
-}
-
 fn line(out: &mut String, key: &str, value: &str) {
     out.push_str(&format!("  {key:<12} {value}\n"));
 }

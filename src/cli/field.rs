@@ -3,6 +3,7 @@
 use super::console::Console;
 use super::dry_run;
 use super::inputs::{check_distinct, name, read_mask, read_volume, same_file, warn_all};
+use super::limits::field_fits;
 use super::outputs::{FIELD_FILES, Measured, Target, write_field};
 use anyhow::{Context, Result};
 use clap::Args;
@@ -93,6 +94,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let params = tuning.params()?;
     let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FIELD_FILES))?;
+
+    field_fits(initial, deformed)?;
 
     let started = Instant::now();
     let mut warnings = Vec::new();

@@ -33,6 +33,8 @@ mod inputs;
 
 mod invert;
 
+mod limits;
+
 mod markups;
 
 mod outputs;
@@ -58,6 +60,7 @@ mod warp;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use console::Console;
 use std::process::ExitCode;
+use std::time::Duration;
 
 /// Measures how soft tissue deforms inside, from a pair of MR volumes.
 #[derive(Debug, Parser)]
@@ -81,6 +84,9 @@ struct Common {
     /// Threads to use [default: all cores]
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
+    /// Stop after so many seconds, with nothing half-written left [default: no limit]
+    #[arg(long, global = true, value_name = "SECONDS", value_parser = seconds)]
+    timeout: Option<Duration>,
     /// No progress and no warnings on stderr
     #[arg(long, global = true)]
     quiet: bool,
@@ -129,6 +135,12 @@ enum Command {
     Man(completions::ManOptions),
 }
 
+/// A time of more than 0 and at most 10 million seconds.
+fn seconds(text: &str) -> Result<Duration, String> {
+    let found = text.parse::<f64>().ok().filter(|s| *s > 0.0 && *s <= 1e7);
+    found.map(Duration::from_secs_f64).ok_or_else(|| format!("{text} is not a number of seconds over 0"))
+}
+
 /// The arguments do not make sense together.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
@@ -144,6 +156,7 @@ pub fn run() -> ExitCode {
     let Cli { common, command } =
         Cli::from_arg_matches(&whole().get_matches()).unwrap_or_else(|e| e.format(&mut whole()).exit());
     let console = Console::new(common.quiet, common.verbose);
+    limits::watch(console.clone(), common.timeout);
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
     let work = || dispatch(&command, &console);

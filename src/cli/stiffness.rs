@@ -5,6 +5,7 @@ use super::console::Console;
 use super::convention::Convention;
 use super::dry_run;
 use super::inputs::{check_distinct, name, read_mask, warn_all};
+use super::limits::mesh_fits;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::StiffnessError;
@@ -94,6 +95,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { poisson, model, force, nodes, regions, .. } = *options;
     let params = StiffnessParams { poisson, model, force_n: force, nodes, regions };
     params.check()?;
+    mesh_fits(params.nodes)?;
     if options.sequence.is_some() && options.labels.is_none() {
         bail!(Usage(
             "--sequence needs --labels: regions that each frame found for itself would not be the same ones".into()

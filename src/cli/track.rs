@@ -5,6 +5,7 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{check_distinct, name, read_mask, usable, warn_all};
+use super::limits::field_fits;
 use super::outputs::Target;
 use anyhow::{Result, bail};
 use clap::Args;
@@ -106,13 +107,16 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let given: Vec<&Path> = volumes.iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&files(frames, origin)))?;
 
+    let named = |number: usize| &volumes[number.min(volumes.len() - 1)];
+    field_fits(named(origin), named(usize::from(origin == 0)))?;
+
     let started = Instant::now();
     let progress = console.progress();
     progress.set("read", 0.0);
     let mut warnings = Vec::new();
     let reference = source.read(origin, &mut warnings)?;
     let grid = *reference.grid();
-    let first = &volumes[origin.min(volumes.len() - 1)];
+    let first = named(origin);
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_mask(l, &grid, first)).transpose()?;
     if *dry_run {

@@ -3,6 +3,7 @@
 //! The temporary file stands in the same folder, so that the rename cannot cross file systems; it is removed when
 //! anything fails. There is no fsync: a power cut may lose the file, a full disk or a crash cannot tear it.
 
+use super::live::{Live, as_a_whole};
 use super::{format, os};
 use crate::error::IoError;
 use std::io::{self, BufWriter, Write};
@@ -26,11 +27,14 @@ pub(super) fn write_atomic(
     // Without this a temporary file is readable by its owner only, and keeps that after the rename.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let mut file = builder.tempfile_in(folder).map_err(os(path, "create"))?;
+    let (mut file, live) =
+        Live::temporary(|| builder.tempfile_in(folder), |file| file.path()).map_err(os(path, "create"))?;
     let mut buffer = BufWriter::with_capacity(1 << 18, file.as_file_mut());
     write(&mut buffer).and_then(|()| buffer.flush()).map_err(os(path, "write"))?;
     drop(buffer);
-    file.persist(path).map(drop).map_err(|e| os(path, "create")(e.error))
+    let moved = as_a_whole(|| file.persist(path).map(drop));
+    drop(live);
+    moved.map_err(|e| os(path, "create")(e.error))
 }
 
 #[cfg(test)]

@@ -54,6 +54,10 @@ pub mod output;
 
 pub mod scratch;
 
+mod live;
+
+pub mod memory;
+
 mod atomic;
 
 mod deflate;
@@ -72,7 +76,9 @@ pub use grasp::{
     write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };
 pub use image::{ImageKind, Stored, count_non_finite, read_header, read_labels, read_mask, read_volume};
+pub use live::abandon;
 pub use markups::write_markups;
+pub use memory::memory_left;
 pub use nifti::{
     PackedField, Series, write_field, write_field_series, write_integers, write_labels, write_series_field,
     write_steps, write_tensors, write_volume,

@@ -1,6 +1,7 @@
 //! A folder of results that appears as a whole or not at all.
 
 use super::atomic::TEMPORARY;
+use super::live::{Live, as_a_whole};
 use super::{format, os};
 use crate::error::IoError;
 use std::fs;
@@ -15,10 +16,10 @@ use tempfile::TempDir;
 #[derive(Debug)]
 pub struct OutputFolder {
     path: PathBuf,
-    staging: Option<TempDir>,
+    staging: Option<(TempDir, Live)>,
     names: Vec<String>,
     /// Folders made here, outermost first.
-    created: Vec<PathBuf>,
+    created: Vec<(PathBuf, Live)>,
 }
 
 impl OutputFolder {
@@ -33,10 +34,11 @@ impl OutputFolder {
         let mut folder = Self { path: path.into(), staging: None, names: Vec::new(), created: Vec::new() };
         let mut to_create: Vec<&Path> = path.ancestors().take_while(missing).collect();
         while let Some(next) = to_create.pop() {
-            fs::create_dir(next).map_err(os(next, "create the folder"))?;
-            folder.created.push(next.into());
+            let live = Live::folder(next).map_err(os(next, "create the folder"))?;
+            folder.created.push((next.into(), live));
         }
-        let staging = tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(path);
+        let staging = || tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(path);
+        let staging = Live::temporary(staging, |made| made.path());
         folder.staging = Some(staging.map_err(os(path, "write into the folder"))?);
         Ok(folder)
     }
@@ -78,7 +80,7 @@ impl OutputFolder {
                 "remove it or choose another --output",
             ));
         }
-        let Some(staging) = &self.staging else { return Ok(()) };
+        let Some((staging, _)) = &self.staging else { return Ok(()) };
         write(&staging.path().join(name)).map_err(|error| match error {
             IoError::Os { action, source, .. } => IoError::Os { path: target, action, source },
             IoError::Format { what, hint, .. } => IoError::Format { path: target, what, hint },
@@ -89,31 +91,50 @@ impl OutputFolder {
         Ok(())
     }
 
-    /// Moves all files to their final names, and returns these in the order of writing.
+    /// Moves all files to their final names, and returns these in the order of writing. What stood under them goes only
+    /// when all are there.
     ///
     /// # Errors
-    /// [`IoError`] when a rename is refused; files moved before that are removed.
+    /// [`IoError`] when a rename is refused; then all stands as it did before.
     pub fn commit(mut self) -> Result<Vec<PathBuf>, IoError> {
-        let mut done = Vec::with_capacity(self.names.len());
-        if let Some(staging) = &self.staging {
-            for name in &self.names {
-                let target = self.path.join(name);
-                if let Err(error) = fs::rename(staging.path().join(name), &target) {
-                    done.iter().for_each(|moved| drop(fs::remove_file(moved)));
-                    return Err(os(&target, "create")(error));
+        let Some((staging, _)) = &self.staging else { return Ok(Vec::new()) };
+        let targets: Vec<PathBuf> = self.names.iter().map(|name| self.path.join(name)).collect();
+        let earlier = staging.path().join("earlier");
+        as_a_whole(|| {
+            let mut back = Vec::new();
+            for (name, target) in self.names.iter().zip(&targets) {
+                if let Err(error) = replace(&staging.path().join(name), target, &earlier.join(name), &mut back) {
+                    for (from, to) in back.iter().rev() {
+                        let _ = fs::rename(from, to);
+                    }
+                    return Err(os(target, "create")(error));
                 }
-                done.push(target);
             }
-        }
+            Ok(())
+        })?;
         self.created.clear();
-        Ok(done)
+        Ok(targets)
     }
+}
+
+/// Moves `new` to `target`, what stands there to `earlier` first; `back` gets the renames that undo it, in order.
+fn replace(new: &Path, target: &Path, earlier: &Path, back: &mut Vec<(PathBuf, PathBuf)>) -> std::io::Result<()> {
+    if target.exists() {
+        if let Some(folder) = earlier.parent() {
+            fs::create_dir_all(folder)?;
+        }
+        fs::rename(target, earlier)?;
+        back.push((earlier.into(), target.into()));
+    }
+    fs::rename(new, target)?;
+    back.push((target.into(), new.into()));
+    Ok(())
 }
 
 impl Drop for OutputFolder {
     fn drop(&mut self) {
         self.staging = None; // removes the hidden folder
-        for folder in self.created.iter().rev() {
+        for (folder, _) in self.created.iter().rev() {
             let _ = fs::remove_dir(folder); // refused when someone else has put something there
         }
     }

@@ -31,11 +31,9 @@ pub fn inputs<'a>(
         }
     }
     mask_grid(initial, mask)?;
-    if let Some(m) = mask {
-        if m.as_slice().iter().all(|&v| v == 0) {
-            let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
-            return Err(FieldError::Volume { volume: "mask", what, hint });
-        }
+    if mask.is_some_and(|m| m.as_slice().iter().all(|&v| v == 0)) {
+        let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
+        return Err(FieldError::Volume { volume: "mask", what, hint });
     }
     let bad = initial.as_slice().iter().filter(|v| !v.is_finite()).count();
     let mut clean = Cow::Borrowed(initial);

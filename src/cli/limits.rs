@@ -1,0 +1,82 @@
+//! What ends a run before its time: too little memory, Ctrl-C, a time limit.
+
+use super::console::Console;
+use anyhow::{Result, bail};
+use palpate::io;
+use palpate::pipeline::plan::{memory, stiffness_memory};
+use palpate::types::Grid;
+use std::path::Path;
+use std::process::exit;
+use std::time::Duration;
+
+/// Bytes in words.
+pub fn bytes(n: u64) -> String {
+    match n as f64 / 1e6 {
+        mb if mb < 1000.0 => format!("{mb:.0} MB"),
+        mb => format!("{:.1} GB", mb / 1000.0),
+    }
+}
+
+/// Refuses a field run on two volumes that needs more memory than is left, before their voxels are read.
+pub fn field_fits(initial: &Path, deformed: &Path) -> Result<()> {
+    // A header that cannot be read is reported by who reads the whole.
+    let (Ok((a, _)), Ok((b, _))) = (io::read_header(initial), io::read_header(deformed)) else { return Ok(()) };
+    let (needed, left) = (memory(&a.grid, &b.grid), io::memory_left().unwrap_or(u64::MAX));
+    if needed <= left {
+        return Ok(());
+    }
+    let half = |g: &Grid| Grid::new(g.shape().map(|n| n.div_ceil(2)), *g.affine());
+    let halved = half(&a.grid).and_then(|a| Ok(memory(&a, &half(&b.grid)?))).map(bytes).unwrap_or_default();
+    bail!(
+        "{} and {}: a field needs about {} of memory, but only {} are left; close other programs, crop both to the tissue, \
+         or halve their resolution, which needs {halved} (the presets need the same)",
+        initial.display(),
+        deformed.display(),
+        bytes(needed),
+        bytes(left)
+    );
+}
+
+/// Refuses a mesh that needs more memory than is left.
+pub fn mesh_fits(nodes: usize) -> Result<()> {
+    let (needed, left) = (stiffness_memory(nodes), io::memory_left().unwrap_or(u64::MAX));
+    if needed <= left {
+        return Ok(());
+    }
+    let most = (1..).map(|n| 500 * n).take_while(|&n| stiffness_memory(n) <= left).last();
+    let instead = most.map_or_else(String::new, |n| format!(", or take --nodes {n}, which fits"));
+    bail!(
+        "{nodes} nodes need about {} of memory, but only {} are left; close other programs{instead}",
+        bytes(needed),
+        bytes(left)
+    );
+}
+
+/// Ends the program at once, with nothing half-written left behind.
+fn stop(console: &Console, why: &str, code: i32) -> ! {
+    io::abandon();
+    console.error(&anyhow::anyhow!("{why}; nothing half-written is left"));
+    exit(code)
+}
+
+/// Watches for Ctrl-C and the like (exit code 128 + the signal's number, as shells have it), and for the end of `limit`
+/// (exit code 1).
+pub fn watch(console: Console, limit: Option<Duration>) {
+    let run_out = console.clone();
+    // Without a thread for it a signal ends the program in the system's own way.
+    #[cfg(unix)]
+    let _ = std::thread::Builder::new().name("signals".into()).spawn(move || {
+        use signal_hook::consts::{SIGINT, SIGTERM};
+        let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM]) else { return };
+        if let Some(signal) = signals.forever().next() {
+            stop(&console, if signal == SIGINT { "stopped by Ctrl-C" } else { "stopped by a signal" }, 128 + signal);
+        }
+    });
+    if let Some(limit) = limit {
+        let _ = std::thread::Builder::new().name("timeout".into()).spawn(move || {
+            std::thread::sleep(limit);
+            let seconds = limit.as_secs_f64();
+            stop(&run_out, &format!("not done after {seconds} s, which --timeout allows"), 1);
+        });
+    }
+}
