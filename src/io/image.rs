@@ -8,7 +8,7 @@ use super::raw::RawImage;
 use super::{metaimage, nifti, nrrd, os};
 use crate::error::IoError;
 use crate::types::{Grid, Mask, Volume};
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
 
@@ -28,10 +28,9 @@ impl Format {
             return Ok(Self::Folder);
         }
         let mut head = Vec::new();
-        let file = File::open(path).map_err(os(path, "read"))?;
-        // What is no regular file is refused by whoever reads it; a pipe must not be drained here.
-        if file.metadata().is_ok_and(|m| m.is_file()) {
-            file.take(64).read_to_end(&mut head).map_err(os(path, "read"))?;
+        // What is no regular file is refused by whoever reads it; a pipe must not be opened (that waits) or drained here.
+        if fs::metadata(path).map_err(os(path, "read"))?.is_file() {
+            File::open(path).and_then(|f| f.take(64).read_to_end(&mut head)).map_err(os(path, "read"))?;
         }
         let name = path.to_string_lossy().to_lowercase();
         let text = head.iter().all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace());

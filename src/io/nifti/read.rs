@@ -8,7 +8,7 @@ use crate::io::image::Stored;
 use crate::io::voxels::{self, Kind};
 use crate::io::{gzip, os};
 use crate::types::Grid;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -108,11 +108,12 @@ type Layout = fn(&Header, [usize; 7]) -> Result<usize, Flaw>;
 
 /// A regular file, its size and its first bytes, at most [`LONGEST`].
 pub(super) fn open(path: &Path) -> Result<(File, u64, Vec<u8>), IoError> {
-    let mut file = File::open(path).map_err(os(path, "read"))?;
-    let metadata = file.metadata().map_err(os(path, "read"))?;
+    // Before it is opened: opening a pipe waits for who writes into it.
+    let metadata = fs::metadata(path).map_err(os(path, "read"))?;
     if !metadata.is_file() {
         return Err(Flaw::new("is not a regular file", "give a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd").at(path));
     }
+    let mut file = File::open(path).map_err(os(path, "read"))?;
     let mut head = Vec::new();
     file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
     Ok((file, metadata.len(), head))
