@@ -2,20 +2,32 @@
 
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
+use crate::numerics::statistics::quantile;
 use crate::types::{Mask, Volume};
 use std::borrow::Cow;
 
-/// The mask to work in: the given one or the foreground, less the voxels that are not finite.
+/// What a measurement works on.
+pub struct Checked<'a> {
+    /// The given mask or the foreground, less the voxels that are not finite.
+    pub mask: Mask,
+    /// The initial volume with numbers everywhere, in a range that can be squared.
+    pub initial: Cow<'a, Volume>,
+    /// The deformed volume, as far as it has numbers, in such a range.
+    pub deformed: Cow<'a, Volume>,
+    /// Voxels of the two that are not finite.
+    pub not_finite: [usize; 2],
+}
+
+/// Checks the two volumes and the mask, and makes them fit to work on.
 ///
-/// Returns the mask, the initial volume with those voxels set to zero, and how many there were.
+/// A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
+/// initial volume and stay unseen in the deformed one. Volumes whose intensities are so large, so small or so far from 0 that
+/// single precision loses them are shifted and scaled by a power of two, and so is a deformed volume whose spread is another than the
+/// initial one's.
 ///
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
-pub fn inputs<'a>(
-    initial: &'a Volume,
-    deformed: &Volume,
-    mask: Option<&Mask>,
-) -> Result<(Mask, Cow<'a, Volume>, usize), FieldError> {
+pub fn inputs<'a>(initial: &'a Volume, deformed: &'a Volume, mask: Option<&Mask>) -> Result<Checked<'a>, FieldError> {
     for (volume, v) in [("initial", initial), ("deformed", deformed)] {
         let refuse = |what: &str, hint: &str| Err(FieldError::Volume { volume, what: what.into(), hint: hint.into() });
         if v.grid().shape().iter().filter(|&&n| n < 2).count() > 1 {
@@ -35,20 +47,79 @@ pub fn inputs<'a>(
         let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
         return Err(FieldError::Volume { volume: "mask", what, hint });
     }
-    let bad = initial.as_slice().iter().filter(|v| !v.is_finite()).count();
-    let mut clean = Cow::Borrowed(initial);
-    if bad > 0 {
-        clean.to_mut().as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
-    }
-    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&clean));
-    if bad > 0 {
+    let (mut first, second) = (filled(initial), filled(deformed));
+    let not_finite = [initial, deformed].map(|v| v.as_slice().iter().filter(|x| !x.is_finite()).count());
+    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
+    if not_finite[0] > 0 {
+        first.to_mut().as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
         for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
             if !v.is_finite() {
                 *m = 0;
             }
         }
     }
-    Ok((mask, clean, bad))
+    let (initial, spread) = in_range(first, None);
+    let (deformed, _) = in_range(second, Some(spread));
+    Ok(Checked { mask, initial, deformed, not_finite })
+}
+
+/// Finite neighbours that a voxel without a number needs to get one.
+const AROUND: usize = 13;
+
+/// With numbers in single voxels that have none, from the finite ones around them.
+fn filled(volume: &Volume) -> Cow<'_, Volume> {
+    let values = volume.as_slice();
+    if values.iter().all(|v| v.is_finite()) {
+        return Cow::Borrowed(volume);
+    }
+    let (grid, mut out) = (*volume.grid(), volume.clone());
+    let shape = grid.shape();
+    // In one slice there are 8 around a voxel, not 26.
+    let least = if shape.contains(&1) { AROUND / 3 } else { AROUND };
+    for at in (0..values.len()).filter(|&at| !values[at].is_finite()) {
+        let v = grid.voxel(at);
+        let near = |a: usize| v[a].saturating_sub(1)..(v[a] + 2).min(shape[a]);
+        let (mut sum, mut count) = (0.0, 0);
+        for (j, k) in near(2).flat_map(|k| near(1).map(move |j| (j, k))) {
+            for x in near(0).map(|i| values[grid.index(i, j, k)]).filter(|x| x.is_finite()) {
+                (sum, count) = (sum + f64::from(x), count + 1);
+            }
+        }
+        out.as_mut_slice()[at] = if count >= least { (sum / count as f64) as f32 } else { f32::NAN };
+    }
+    Cow::Owned(out)
+}
+
+/// Spreads of the intensities that are worked on as they are.
+const RANGE: std::ops::Range<f64> = 1e-3..1e7;
+/// Distance from 0, in spreads, up to which they are.
+const FAR: f64 = 100.0;
+
+/// With intensities that can be squared and summed in single precision, and with their spread, which comes near to `like`:
+/// gains between the volumes are bounded, and noise is measured in the initial one alone.
+fn in_range(volume: Cow<'_, Volume>, like: Option<f64>) -> (Cow<'_, Volume>, f64) {
+    let values = volume.as_slice();
+    let finite = || values.iter().copied().filter(|v| v.is_finite());
+    let (low, high) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+    let mut sample: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
+    sample.retain(|v| v.is_finite());
+    let [a, b] = [0.001, 0.999].map(|q| f64::from(quantile(&mut sample, q)));
+    let whole = f64::from(high) - f64::from(low);
+    let spread = if b > a { b - a } else { whole };
+    let furthest = f64::from(low).abs().max(f64::from(high).abs());
+    let alike = like.is_none_or(|l| (l / spread).log2().abs() < 0.5);
+    if RANGE.contains(&spread) && furthest <= FAR * spread && alike {
+        return (volume, spread);
+    }
+    // Far outliers are drawn in, so that their squares stay finite.
+    let aim = like.unwrap_or(1000.0);
+    let scale = (aim / spread).log2().round().exp2();
+    let limit = 2.0 * aim * FAR;
+    let mut out = volume.into_owned();
+    for v in out.as_mut_slice().iter_mut().filter(|v| v.is_finite()) {
+        *v = ((f64::from(*v) - a) * scale).clamp(-limit, limit) as f32;
+    }
+    (Cow::Owned(out), spread * scale)
 }
 
 /// The mask must lie on the initial volume's grid.

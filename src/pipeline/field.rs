@@ -12,7 +12,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
-use crate::pipeline::check;
+use crate::pipeline::check::{self, Checked};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 pub use crate::pipeline::start::Start;
 use crate::pipeline::start::begin;
@@ -138,10 +138,10 @@ fn canonical(
     params.check()?;
     progress("pyramid", 0.0);
     let mut clock = Clock(Vec::new(), Instant::now());
-    let (mask, clean, not_finite) = check::inputs(initial, deformed, mask)?;
+    let Checked { mask, initial: clean, deformed: seen, not_finite } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
-    let aligned = Aligned::new(&clean, deformed, &mask, search)?;
+    let aligned = Aligned::new(&clean, &seen, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
     clock.book("pyramid");
@@ -486,10 +486,12 @@ fn vague(model: MotionModel, sigma: f64, motion: f64, grid: &Grid) -> Option<Str
 }
 
 /// What a user should know.
-fn warnings(counts: Counts, folds: usize, not_finite: usize, max_mm: f64, search: f64) -> Vec<String> {
+fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max_mm: f64, search: f64) -> Vec<String> {
     let mut out = Vec::new();
-    if not_finite > 0 {
-        out.push(format!("{not_finite} voxels of the initial volume are not finite; they were left out"));
+    for (count, volume) in not_finite.into_iter().zip(["initial", "deformed"]) {
+        if count > 0 {
+            out.push(format!("{count} voxels of the {volume} volume are not finite; they were left out"));
+        }
     }
     if folds > 0 {
         out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));

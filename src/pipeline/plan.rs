@@ -3,7 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::{Aligned, factors};
 use crate::numerics::orientation::Orientation;
-use crate::pipeline::check;
+use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{finest_level, search_mm};
 use crate::types::{FieldParams, Grid, Mask, Volume};
 
@@ -33,7 +33,7 @@ pub fn field(
     params: &FieldParams,
 ) -> Result<FieldPlan, FieldError> {
     params.check()?;
-    let (mask, clean, _) = check::inputs(initial, deformed, mask)?;
+    let Checked { mask, initial: clean, .. } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     Aligned::new(&clean, deformed, &mask, search)?;
