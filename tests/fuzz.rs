@@ -1,0 +1,183 @@
+//! Readers against changed bytes: no panic, no more memory than the file could honestly need, no wrong voxels from a file
+//! that checks itself.
+//!
+//! Two seconds for all in a usual run; `PALPATE_FUZZ_SECONDS=600 cargo test --release --test fuzz -- --nocapture` takes that
+//! long for each reader and prints the number of cases.
+#![allow(clippy::unwrap_used)]
+
+use flate2::{Compression, write::GzEncoder};
+use palpate::io::{self, SceneOverrides};
+use palpate::numerics::random::Random;
+
+use palpate::types::{Affine, DenseField, FieldParams, Grid, Volume};
+use peak_alloc::PeakAlloc;
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;
+
+/// What a reader may take whatever the file: buffers, tables of the unpacker, messages (bytes).
+const SLACK: usize = 3 << 20;
+
+/// One kind of file: its name, a good one, and a reader that says how many numbers it gave.
+struct Kind {
+    name: &'static str,
+    good: Vec<u8>,
+    read: fn(&Path) -> Option<Vec<f32>>,
+    /// Bytes of memory for a byte of the file.
+    ratio: usize,
+    /// Whether a change that is not noticed must not change what is read.
+    checked: bool,
+}
+
+fn volume(path: &Path) -> Option<Vec<f32>> {
+    io::read_volume(path).ok().map(Volume::into_vec)
+}
+
+fn nothing<T>(found: Result<T, impl std::fmt::Display>) -> Option<Vec<f32>> {
+    // A message must come without a panic too.
+    found.map_err(|e| e.to_string()).ok().map(|_| Vec::new())
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut out = GzEncoder::new(Vec::new(), Compression::default());
+    out.write_all(bytes).unwrap();
+    out.finish().unwrap()
+}
+
+fn kinds() -> Vec<Kind> {
+    let folder = TempDir::new().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let rows = [[0.9, 0.1, 0.0, 3.0], [-0.1, 0.9, 0.0, -4.0], [0.0, 0.0, 2.0, 5.0]];
+    let grid = Grid::new([7, 6, 5], Affine::new(rows).unwrap()).unwrap();
+    let small = Volume::from_voxels(grid, |n, _| (n * 37 % 101) as f32);
+    io::write_volume(at("v.nii"), &small, "").unwrap();
+    io::write_field(at("f.nii"), &DenseField::from_fn(grid, |p| p.0.map(|x| 0.01 * x))).unwrap();
+    let [nifti, field] = ["v.nii", "f.nii"].map(|n| fs::read(at(n)).unwrap());
+    let raw: Vec<u8> = small.as_slice().iter().flat_map(|v| v.to_le_bytes()).collect();
+    // NIfTI-2 by hand: sizes, type, shape, spacing, offset, codes.
+    let mut second = vec![0u8; 544];
+    let mut put = |at: usize, bytes: &[u8]| second[at..at + bytes.len()].copy_from_slice(bytes);
+    put(0, &540i32.to_le_bytes());
+    put(4, b"n+2\0\r\n\x1a\n");
+    put(12, &16i16.to_le_bytes());
+    put(14, &32i16.to_le_bytes());
+    [3i64, 7, 6, 5, 1, 1, 1, 1].iter().enumerate().for_each(|(i, d)| put(16 + 8 * i, &d.to_le_bytes()));
+    (0..8).for_each(|i| put(104 + 8 * i, &1f64.to_le_bytes()));
+    put(168, &544i64.to_le_bytes());
+    second.extend(&raw);
+    let nrrd = b"NRRD0004\ntype: float\ndimension: 3\nspace: left-posterior-superior\nsizes: 7 6 5\n\
+        space directions: (1,0,0) (0,1,0) (0,0,2)\nkinds: domain domain domain\nendian: little\nencoding: raw\n\
+        space origin: (1,2,3)\n\n";
+    let meta = b"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nOffset = 1 2 3\n\
+        ElementSpacing = 1 1 2\nDimSize = 7 6 5\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n";
+    let points = "x,y,z\n1,2,3\n-4.5,5e1,6\n7,8,9\n";
+    let landmarks = "fx,fy,fz,mx,my,mz\n1,2,3,1.5,2,3\n4,5,6,4,5,7\n";
+    let markups = r#"{"markups":[{"type":"Fiducial","coordinateSystem":"LPS","controlPoints":[{"label":"a","position":[1,2,3]}]}]}"#;
+    let fcsv = "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n# columns = id,x,y,z\n1,2,3,4\n";
+    let config = serde_json::to_vec(&serde_json::json!({ "params": FieldParams::default() })).unwrap();
+    let scene = include_bytes!("../examples/eight_motions.toml").to_vec();
+    let skin = include_bytes!("../examples/skin.toml").to_vec();
+    let kind = |name, good, read, ratio, checked| Kind { name, good, read, ratio, checked };
+    vec![
+        kind("v.nii", nifti.clone(), volume as fn(&Path) -> Option<Vec<f32>>, 2, false),
+        kind("v.nii.gz", gzip(&nifti), volume, 2 * 1032, true),
+        kind("second.nii", second.clone(), volume, 2, false),
+        kind("second.nii.gz", gzip(&second), volume, 2 * 1032, true),
+        kind("field.nii.gz", gzip(&field), |p| io::read_field(p).ok().map(|f| f.as_slice().to_vec()), 2 * 1032, true),
+        kind("v.nrrd", [&nrrd[..], &raw].concat(), volume, 2, false),
+        kind("v.mha", [&meta[..], &raw].concat(), volume, 2, false),
+        kind("points.csv", points.into(), |p| nothing(io::read_points(p)), 64, false),
+        kind("landmarks.csv", landmarks.into(), |p| nothing(io::read_landmarks(p)), 64, false),
+        kind("points.mrk.json", markups.into(), |p| nothing(io::read_points(p)), 64, false),
+        kind("points.fcsv", fcsv.into(), |p| nothing(io::read_points(p)), 64, false),
+        kind("config.json", config, |p| nothing(io::read_config(p)), 64, false),
+        kind("scene.toml", scene, |p| nothing(io::read_scene(p, &SceneOverrides::default())), 64, false),
+        kind("skin.toml", skin, |p| nothing(io::read_skin_scene(p)), 64, false),
+    ]
+}
+
+/// Numbers that break things.
+const EDGES: [u64; 10] = [0, 1, 0x7f, 0x80, 0xff, 0x7fff, 0x8000_0000, 0x7f80_0000, 0x7fff_ffff_ffff_ffff, u64::MAX];
+
+/// A few changes: bytes, edges, cuts, repeats, pieces moved.
+fn changed(good: &[u8], random: &mut Random) -> Vec<u8> {
+    let mut out = good.to_vec();
+    let below = |random: &mut Random, n: usize| (random.bits() % n.max(1) as u64) as usize;
+    for _ in 0..=below(random, 4) {
+        let at = below(random, out.len());
+        match below(random, 8) {
+            0 => out.truncate(at),
+            1 => out.insert(at, random.bits() as u8),
+            2 => {
+                let to = (at + below(random, 40)).min(out.len());
+                let piece = out[at.min(to)..to].to_vec();
+                let there = below(random, out.len() + 1);
+                out.splice(there..there, piece);
+            }
+            3 => drop(out.splice(at..(at + below(random, 9)).min(out.len()), [])),
+            4 => {
+                let edge = EDGES[below(random, EDGES.len())];
+                let width = [1, 2, 4, 8][below(random, 4)];
+                let bytes =
+                    if random.bits() & 1 == 0 { edge.to_le_bytes() } else { edge.rotate_right(8).to_be_bytes() };
+                for (o, b) in out.iter_mut().skip(at).take(width).zip(bytes) {
+                    *o = b;
+                }
+            }
+            5 => out.extend_from_slice(&random.bits().to_le_bytes()),
+            _ => {
+                if let Some(o) = out.get_mut(at) {
+                    *o ^= 1 << (random.bits() & 7);
+                }
+            }
+        }
+        if out.is_empty() {
+            break;
+        }
+    }
+    out
+}
+
+// One test: the memory of all threads is counted.
+#[test]
+fn changed_files_are_read_right_or_refused() {
+    let seconds = std::env::var("PALPATE_FUZZ_SECONDS").ok().and_then(|s| s.parse().ok());
+    let each = Duration::from_secs_f64(seconds.unwrap_or(2.0 / 14.0));
+    let memory = Path::new("/dev/shm");
+    let folder = if memory.is_dir() { TempDir::new_in(memory) } else { TempDir::new() }.unwrap();
+    for Kind { name, good, read, ratio, checked } in kinds() {
+        let path = folder.path().join(name);
+        fs::write(&path, &good).unwrap();
+        let Some(truth) = read(&path) else { panic!("{name}: the good file is refused") };
+        let mut random = Random::new(u64::from(std::process::id()) * u64::from(seconds.is_some()), 3);
+        let started = Instant::now();
+        let (mut cases, mut accepted) = (0u64, 0u64);
+        while started.elapsed() < each {
+            let bytes = changed(&good, &mut random);
+            fs::write(&path, &bytes).unwrap();
+            let keep = || {
+                let kept = std::env::temp_dir().join(format!("palpate-fuzz-{name}"));
+                fs::write(&kept, &bytes).unwrap();
+                kept
+            };
+            let before = MEMORY.current_usage();
+            MEMORY.reset_peak_usage();
+            let found = std::panic::catch_unwind(|| read(&path)).unwrap_or_else(|_| panic!("panic, see {:?}", keep()));
+            let taken = MEMORY.peak_usage() - before;
+            let most = ratio * bytes.len() + SLACK;
+            assert!(taken <= most, "{taken} bytes of memory for {} of a file, see {:?}", bytes.len(), keep());
+            if let Some(found) = found {
+                accepted += 1;
+                let same = found.iter().map(|v| v.to_bits()).eq(truth.iter().map(|v| v.to_bits()));
+                assert!(!checked || same, "wrong numbers in silence, see {:?}", keep());
+            }
+            cases += 1;
+        }
+        println!("{name}: {cases} cases, {accepted} read");
+    }
+}
