@@ -1,0 +1,96 @@
+//! What the program is built from: licences that may be passed on, no system libraries, one place for each crate.
+#![allow(clippy::unwrap_used)]
+
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::process::Command;
+
+/// Licences under which a part may be passed on with the program.
+const PERMISSIVE: [&str; 10] = [
+    "MIT",
+    "Apache-2.0",
+    "Apache-2.0 WITH LLVM-exception",
+    "BSD-2-Clause",
+    "BSD-3-Clause",
+    "ISC",
+    "Zlib",
+    "Unlicense",
+    "Unicode-3.0",
+    "CC0-1.0",
+];
+
+/// Crates that carry C or a linked library: libdeflate brings its source with it.
+const NATIVE: [&str; 1] = ["libdeflate-sys"];
+
+/// The packages that the program is built from (not those of its tests), as `cargo metadata` tells.
+fn packages() -> Vec<Value> {
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.args(["metadata", "--format-version", "1", "--locked", "--offline"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+    let output = cargo.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let all: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let nodes = all["resolve"]["nodes"].as_array().unwrap();
+    let id = |name: &Value| name.as_str().unwrap().to_string();
+    let mut wanted = vec![id(&all["resolve"]["root"])];
+    let mut seen = BTreeSet::new();
+    while let Some(next) = wanted.pop() {
+        if !seen.insert(next.clone()) {
+            continue;
+        }
+        let node = nodes.iter().find(|n| n["id"] == next.as_str()).unwrap();
+        for dependency in node["deps"].as_array().unwrap() {
+            // Neither for tests alone nor for other systems.
+            let counts = dependency["dep_kinds"].as_array().unwrap().iter().any(|k| {
+                k["kind"] != "dev"
+                    && !["windows", "wasm"].iter().any(|t| k["target"].as_str().unwrap_or_default().contains(t))
+            });
+            if counts {
+                wanted.push(id(&dependency["pkg"]));
+            }
+        }
+    }
+    all["packages"].as_array().unwrap().iter().filter(|p| seen.contains(p["id"].as_str().unwrap())).cloned().collect()
+}
+
+/// Whether an SPDX expression allows one of the permissive licences (`a OR b`, `a AND b`, brackets, `a/b` of old).
+fn allowed(expression: &str) -> bool {
+    let expression = expression.replace('/', " OR ").replace(['(', ')'], "");
+    let one = |name: &str| PERMISSIVE.contains(&name.trim());
+    let each = |part: &str| part.split(" AND ").all(one);
+    // `a AND (b OR c)` reads as `a AND b OR c` without brackets: then each name must be allowed.
+    match expression.contains(" AND ") && expression.contains(" OR ") {
+        true => expression.split(" OR ").all(each),
+        false => expression.split(" OR ").any(each),
+    }
+}
+
+#[test]
+fn every_part_may_be_passed_on() {
+    assert!(
+        allowed("MIT OR GPL-3.0") && allowed("MIT/Apache-2.0") && !allowed("GPL-3.0") && !allowed("MIT AND GPL-3.0")
+    );
+    let packages = packages();
+    assert!(packages.len() > 40, "{}", packages.len());
+    for p in &packages {
+        let licence = p["license"].as_str().unwrap_or_default();
+        assert!(allowed(licence), "{} {}: {licence:?}", p["name"], p["version"]);
+    }
+}
+
+#[test]
+fn no_library_of_the_system_is_linked() {
+    let linked: Vec<String> =
+        packages().iter().filter(|p| !p["links"].is_null()).map(|p| p["name"].as_str().unwrap().to_string()).collect();
+    // Crates that only keep themselves from being built in twice name a library of their own.
+    let own = ["rayon-core", "prettyplease"];
+    let native: Vec<&String> = linked.iter().filter(|l| !own.contains(&l.as_str())).collect();
+    assert_eq!(native, NATIVE);
+}
+
+#[test]
+fn every_part_comes_from_the_registry() {
+    for p in packages().iter().filter(|p| p["name"] != "palpate") {
+        let source = p["source"].as_str().unwrap_or_default();
+        assert!(source.starts_with("registry+"), "{}: {source:?}", p["name"]);
+    }
+}
