@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::io::{
-    count_non_finite, read_field, read_labels, read_mask, read_volume, write_field, write_integers, write_labels,
-    write_volume,
+    count_non_finite, read_field, read_header, read_labels, read_mask, read_volume, write_field, write_integers,
+    write_labels, write_volume,
 };
 use palpate::types::{Affine, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
 use proptest::prelude::*;
@@ -203,6 +203,18 @@ fn the_sform_wins_over_the_qform() {
     let file = Fixture { codes: [1, 2], srow, quatern: [0.0, 0.0, 0.0, 1.0, 2.0, 3.0], ..fixture() };
     assert_affine(&read(&file.bytes()).unwrap(), srow.map(|r| r.map(f64::from)), 0.0);
     let qform = [[1.5, 0.0, 0.0, 1.0], [0.0, 2.0, 0.0, 2.0], [0.0, 0.0, 2.5, 3.0]];
+    // How far the two place the corner that is furthest apart.
+    let files = Files::new();
+    let apart =
+        |codes, name| read_header(files.put(name, &Fixture { codes, ..file.clone() }.bytes())).unwrap().0.apart_mm;
+    let truth = (0..12).map(|n| {
+        let v = [n % 2, n / 2 % 3, n / 6].map(|i| i as f64);
+        let at = |rows: [[f64; 4]; 3], r: usize| rows[r][3] + (0..3).map(|c| rows[r][c] * v[c]).sum::<f64>();
+        let srow = srow.map(|r| r.map(f64::from));
+        (0..3).map(|r| (at(srow, r) - at(qform, r)).powi(2)).sum::<f64>().sqrt()
+    });
+    assert!((apart([1, 2], "both.nii").unwrap() - truth.fold(0.0, f64::max)).abs() < 1e-9);
+    assert_eq!((apart([1, 0], "qform.nii"), apart([0, 2], "sform.nii")), (None, None));
     assert_affine(&read(&Fixture { codes: [1, 0], ..file }.bytes()).unwrap(), qform, 0.0);
 }
 

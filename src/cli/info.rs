@@ -2,7 +2,7 @@
 
 use super::console::Console;
 use super::dry_run::times;
-use super::inputs::name;
+use super::inputs::{name, two_places};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::io::{self, ImageKind, SceneOverrides, Series, TableKind};
@@ -152,6 +152,9 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
         facts.add("axes", axes.join(" x "), stored.axes.clone().into());
     }
     facts.grid(&stored.grid, stored.placed);
+    if let Some(note) = two_places(&stored) {
+        facts.add("note", note.clone(), note.into());
+    }
     match kind {
         ImageKind::Scalar => {
             let volume = io::read_volume(path)?;

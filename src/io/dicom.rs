@@ -158,6 +158,7 @@ pub(super) fn series(path: &Path, values: bool) -> Result<(Stored, Vec<f32>), Io
         datatype: slices[0].kind.name(),
         axes: shape.to_vec(),
         placed: "ImagePositionPatient and ImageOrientationPatient",
+        apart_mm: None,
         grid,
         bytes,
     };

@@ -54,6 +54,8 @@ pub struct Stored {
     pub axes: Vec<usize>,
     /// Where the position in space comes from.
     pub placed: &'static str,
+    /// How far two placements in one header are apart at a corner of the volume, where there are two (mm).
+    pub apart_mm: Option<f64>,
     /// The first three axes.
     pub grid: Grid,
     /// Size of the file with the voxels.

@@ -93,6 +93,7 @@ impl RawImage {
             datatype: self.kind.name(),
             axes,
             placed: self.placed,
+            apart_mm: None,
             grid: self.grid,
             bytes: self.file.metadata().map_or(0, |m| m.len()),
         }

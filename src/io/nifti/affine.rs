@@ -5,8 +5,8 @@
 
 use super::header::Header;
 use crate::io::flaw::Flaw;
-use crate::types::Affine;
 use crate::types::space::Matrix3;
+use crate::types::{Affine, VoxelPoint};
 
 /// Largest cosine between two axes that still counts as a right angle; 200 mm away it moves a voxel by 2 um.
 const SHEAR: f64 = 1e-5;
@@ -14,18 +14,34 @@ const SHEAR: f64 = 1e-5;
 /// The affine (mm, RAS): the sform where its code is positive, else the qform where its code is, else the voxel size
 /// with the first voxel at the origin. `axes` are the first three, to excuse an unset size along an axis of one voxel.
 pub(super) fn affine(h: &Header, axes: [usize; 3]) -> Result<Affine, Flaw> {
-    let rows = if h.sform_code > 0 {
-        h.srow
-    } else {
-        let size = voxel_size(h, axes)?;
-        let (rotation, at) = match h.qform_code > 0 {
-            true => (rotation(h.quatern), [h.quatern[3], h.quatern[4], h.quatern[5]]),
-            false => ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [0.0; 3]),
-        };
-        let qfac = if h.qform_code > 0 && h.pixdim[0] < 0.0 { -1.0 } else { 1.0 };
-        let column = [size[0], size[1], qfac * size[2]];
-        std::array::from_fn(|r| std::array::from_fn(|c| if c < 3 { rotation[r][c] * column[c] } else { at[r] }))
+    if h.sform_code > 0 { in_mm(h, h.srow) } else { in_mm(h, quatern_rows(h, axes)?) }
+}
+
+/// The largest distance between where the sform and the qform of a header place a corner of its volume (mm); None where it
+/// has not both.
+pub(super) fn disagreement(h: &Header, axes: [usize; 3]) -> Option<f64> {
+    if h.sform_code <= 0 || h.qform_code <= 0 {
+        return None;
+    }
+    let [a, b] = [in_mm(h, h.srow).ok()?, in_mm(h, quatern_rows(h, axes).ok()?).ok()?];
+    let corner = |n: usize| VoxelPoint([0, 1, 2].map(|d| ((n >> d & 1) * (axes[d] - 1)) as f64));
+    let apart = |n: usize| a.to_world(corner(n)).minus(b.to_world(corner(n))).iter().map(|d| d * d).sum::<f64>().sqrt();
+    Some((0..8).map(apart).fold(0.0, f64::max))
+}
+
+/// By the qform, or by the voxel size alone, in the header's unit.
+fn quatern_rows(h: &Header, axes: [usize; 3]) -> Result<[[f64; 4]; 3], Flaw> {
+    let size = voxel_size(h, axes)?;
+    let (rotation, at) = match h.qform_code > 0 {
+        true => (rotation(h.quatern), [h.quatern[3], h.quatern[4], h.quatern[5]]),
+        false => ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [0.0; 3]),
     };
+    let qfac = if h.qform_code > 0 && h.pixdim[0] < 0.0 { -1.0 } else { 1.0 };
+    let column = [size[0], size[1], qfac * size[2]];
+    Ok(std::array::from_fn(|r| std::array::from_fn(|c| if c < 3 { rotation[r][c] * column[c] } else { at[r] })))
+}
+
+fn in_mm(h: &Header, rows: [[f64; 4]; 3]) -> Result<Affine, Flaw> {
     // NIFTI_UNITS_METER 1, _MM 2, _MICRON 3.
     let unit = match h.xyzt_units & 7 {
         1 => 1e3,

@@ -1,6 +1,6 @@
 //! Reading volumes and displacement fields.
 
-use super::affine::affine;
+use super::affine::{affine, disagreement};
 use super::header::{Header, LONGEST};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
@@ -49,7 +49,9 @@ pub(in crate::io) fn header(path: &Path) -> Result<(Stored, i64), IoError> {
         let datatype = kind(header.datatype)?.name();
         let shape = [axes[0], axes[1], axes[2]];
         let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
-        Ok((Stored { format, datatype, axes: axes[..used].to_vec(), placed, grid, bytes: size }, header.intent))
+        let apart_mm = disagreement(&header, shape);
+        let axes = axes[..used].to_vec();
+        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, bytes: size }, header.intent))
     };
     describe().map_err(|flaw: Flaw| flaw.at(path))
 }
