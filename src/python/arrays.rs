@@ -106,10 +106,7 @@ pub fn match_rows<'py>(py: Python<'py>, field: &SparseField) -> Bound<'py, PyArr
 }
 
 /// A volume as an (nx, ny, nz) array, without a copy.
-pub fn array3<'py, T: numpy::Element>(py: Python<'py>, volume: Volume<T>) -> PyResult<Bound<'py, PyArray3<T>>>
-where
-    T: Clone,
-{
+pub fn array3<'py, T: numpy::Element + Clone>(py: Python<'py>, volume: Volume<T>) -> PyResult<Bound<'py, PyArray3<T>>> {
     let [x, y, z] = volume.grid().shape();
     Ok(Array3::from_shape_vec((x, y, z).f(), volume.into_vec()).map_err(told)?.into_pyarray(py))
 }
