@@ -4,7 +4,7 @@ A volume is given as ``(array, affine)``, as an image of nibabel (anything with 
 ``get_fdata()``), or as the path of a file. Arrays have shape (nx, ny, nz); affines are 4 x 4, voxels to world mm (RAS).
 
 Results are rounded as the files of the command line are, so that both give the same bits. Work is done without holding
-the interpreter. A volume in float32 and Fortran order is taken without a conversion.
+the interpreter. A volume in float32 and Fortran order is taken as it is, by one copy; results are handed over without any.
 """
 
 from __future__ import annotations
