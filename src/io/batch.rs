@@ -98,18 +98,19 @@ pub fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String
     write_table(path.as_ref(), columns, rows.into_iter())
 }
 
-/// Bytes and the time of the last change (s since 1970) of a file, or of all files in a folder together.
+/// Bytes and the time of the last change (whole ns since 1970) of a file, or of all files in a folder together.
 ///
 /// # Errors
 /// [`IoError`] when it is not there or cannot be read.
-pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, f64), IoError> {
+pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
     let path = path.as_ref();
     let files: Vec<PathBuf> = if path.is_dir() { super::list(path)? } else { vec![path.to_path_buf()] };
-    let mut whole = (0, 0.0f64);
+    let mut whole = (0, 0);
     for file in files {
         let meta = fs::metadata(&file).map_err(os(&file, "read"))?;
         let changed = meta.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok());
-        whole = (whole.0 + meta.len(), whole.1.max(changed.map_or(0.0, |d| d.as_secs_f64())));
+        whole =
+            (whole.0 + meta.len(), whole.1.max(changed.map_or(0, |d| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX))));
     }
     Ok(whole)
 }
