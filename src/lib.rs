@@ -35,3 +35,6 @@ pub mod evaluate;
 pub mod report;
 
 pub mod pipeline;
+
+#[cfg(feature = "python")]
+mod python;

@@ -30,9 +30,10 @@ fn every_example_has_a_test() {
         .map(|e| e.unwrap().path().file_stem().unwrap().to_string_lossy().into_owned())
         .collect();
     names.sort();
+    // The cohort is run by tests/python/test_cohort.py.
     assert_eq!(
         names,
-        ["eight_motions", "finger_pad", "grasp", "own_pair", "seed", "sequence", "skin", "stability_map"]
+        ["cohort", "eight_motions", "finger_pad", "grasp", "own_pair", "seed", "sequence", "skin", "stability_map"]
     );
 }
 

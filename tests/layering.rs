@@ -29,6 +29,7 @@ fn allowed(part: &str) -> Vec<&'static str> {
         "types" | "report" => vec!["types", "error"],
         "numerics" | "io" => BASE.to_vec(),
         "pipeline" => [&BASE[..], &STAGES].concat(),
+        "python" => [&BASE[..], &STAGES, &["io", "report", "pipeline"]].concat(),
         "cli" | "main" => [&BASE[..], &STAGES, &["io", "report", "pipeline", "cli"]].concat(),
         stage if STAGES.contains(&stage) => BASE.to_vec(),
         _ => panic!("src/{part} is not in the layer table"),
@@ -227,6 +228,8 @@ fn the_checker_sees_what_is_forbidden() {
         ("cli", "let f = std::fs::File::open(p)?;", "opens files"),
         ("synth", "fn f() { println!(\"x\"); }", "prints"),
         ("pipeline", "use crate::io;", "imports io"),
+        ("python", "use crate::cli::x;", "imports cli"),
+        ("pipeline", "use crate::python::x;", "imports python"),
         ("features", "#[cfg(test)]\nmod tests { fn f() {} }\nfn g() { eprintln!() }", "prints"),
     ];
     for (part, source, what) in bad {

@@ -12,6 +12,7 @@ use palpate::io::{self, OutputFolder, SceneOverrides};
 use palpate::pipeline::fingertip;
 use palpate::report::chain::{Part, Row, page, text};
 use palpate::types::Volume;
+use palpate::types::fingertip::StiffnessRegion;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -155,7 +156,7 @@ fn field_rows(output: &Path) -> Result<(Vec<Row>, palpate::types::Metrics)> {
 /// Moduli against those of the phantom.
 fn stiffness_rows(output: &Path, truth: &[Value]) -> Result<Vec<Row>> {
     let folder = io::read_stiffness(output.join("stiffness"))?;
-    let row = |(r, t): (&io::StiffnessRegion, &Value)| {
+    let row = |(r, t): (&StiffnessRegion, &Value)| {
         let exact = t["youngs_modulus_kpa"].as_f64().unwrap_or(f64::NAN);
         let what = format!("Young's modulus of {}", r.name);
         Row::value("stiffness", &what, "kPa", r.youngs_modulus, exact).bounded(r.bound.clone())

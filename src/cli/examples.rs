@@ -48,6 +48,13 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     ),
     ("fingertip", &[("for a grasp scene", "fingertip stiffness -o fingertip.toml")]),
     (
+        "batch",
+        &[
+            ("every pair of a table", "batch pairs.csv -o cohort"),
+            ("two at a time, in 8 GB, quickly", "batch pairs.csv -o cohort --jobs 2 --memory 8 --preset fast"),
+        ],
+    ),
+    (
         "grasp",
         &[
             ("simulate", "grasp scene.toml -o grasp"),

@@ -2,12 +2,11 @@
 
 use super::console::Console;
 use super::inputs::{check_output_file, name};
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::Args;
-use palpate::error::FingertipError;
 use palpate::fingertip::profile_force;
-use palpate::io::{self, StiffnessFolder};
-use palpate::pipeline::fingertip::{PadOutcome, run as reduce};
+use palpate::io;
+use palpate::pipeline::fingertip::{PadOutcome, of_map};
 use palpate::report::figure::sheet;
 use palpate::report::plot::{Line, Plot};
 use palpate::types::fingertip::PadModel;
@@ -22,57 +21,12 @@ pub struct Options {
     output: PathBuf,
 }
 
-/// A region that is so many times stiffer than the softest holds as a back plate.
-const HARD: f64 = 20.0;
-
-/// Names of hard parts.
-const BONE: [&str; 4] = ["bone", "plate", "phalanx", "nail"];
-
-/// The unit vector out of the pressed side.
-fn outward(folder: &StiffnessFolder) -> [f64; 3] {
-    let mut out = [0.0; 3];
-    if let Some((axis, sign)) = folder.load.split_at_checked(1)
-        && let (Some(axis), "+" | "-") = (["x", "y", "z"].iter().position(|a| *a == axis), sign)
-    {
-        out[axis] = if sign == "+" { 1.0 } else { -1.0 };
-        return out;
-    }
-    // A patch given as a mask: against the way it went.
-    let [moved, held] = folder.translation;
-    let d: [f64; 3] = std::array::from_fn(|a| held[a] - moved[a]);
-    let length = d.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-12);
-    d.map(|v| v / length)
-}
-
-/// Moduli that stand for bone or a back plate: by name, by a lower bound, or by being far stiffer than the softest.
-fn hard(folder: &StiffnessFolder) -> Vec<f64> {
-    let named = |n: &str| BONE.iter().any(|b| n.to_lowercase().contains(b));
-    let known = |r: &&io::StiffnessRegion| named(&r.name) || r.bound.as_deref() == Some("lower");
-    // A bound says nothing of how soft the softest is.
-    let tissue = folder.regions.iter().filter(|r| !known(r) && r.bound.is_none());
-    let softest = tissue.map(|r| r.youngs_modulus).fold(f64::INFINITY, f64::min);
-    let is_hard = |r: &&io::StiffnessRegion| known(r) || r.youngs_modulus >= HARD * softest;
-    folder.regions.iter().filter(is_hard).map(|r| r.youngs_modulus).collect()
-}
-
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { stiffness, output } = options;
     check_output_file(output, &[".toml"])?;
     let folder = io::read_stiffness(stiffness)?;
     let from = name(stiffness);
-    if !folder.absolute {
-        bail!(anyhow::Error::new(FingertipError::NotAbsolute).context(stiffness.display().to_string()));
-    }
-    let (bones, values) = (hard(&folder), folder.map.as_slice());
-    // Files keep 16 bits of a number.
-    let bone = |o: usize| bones.iter().any(|b| (f64::from(values[o]) / b - 1.0).abs() < 1e-4);
-    let side = outward(&folder);
-    let [moved, held] = folder.translation;
-    let along = |u: [f64; 3]| (0..3).map(|a| u[a] * side[a]).sum::<f64>();
-    // Of a curved pad that is pressed flat the middle goes less far than the plate.
-    let indentation = folder.travel_mm.unwrap_or(-along(moved)) + along(held);
-    let outcome =
-        reduce(&folder.map, bone, side, Some(indentation)).with_context(|| stiffness.display().to_string())?;
+    let outcome = of_map(&folder).with_context(|| stiffness.display().to_string())?;
     let PadOutcome { pad, at_press } = &outcome;
     let (radius, calibration) = (outcome.radius_mm(), outcome.calibration(folder.force_n));
     io::write_fingertip(output, pad, radius, calibration, &from)?;

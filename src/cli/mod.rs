@@ -3,6 +3,8 @@
 //! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0 done, 1 failed on
 //! this input, 2 wrong usage. A closed pipe ends the program quietly.
 
+mod batch;
+
 mod chart;
 
 mod completions;
@@ -109,6 +111,8 @@ enum Command {
     Stiffness(stiffness::Options),
     /// Reduce a stiffness map of a finger pad to a fingertip for grasps
     Fingertip(fingertip::Options),
+    /// Take a table of pairs through field, stiffness, fingertip and grasp, in parallel and resumable
+    Batch(batch::Options),
     /// Simulate a soft-finger grasp from a scene file
     Grasp(grasp::Options),
     /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
@@ -184,6 +188,7 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Track(options) => track::run(options, console),
         Command::Stiffness(options) => stiffness::run(options, console),
         Command::Fingertip(options) => fingertip::run(options, console),
+        Command::Batch(options) => batch::run(options, console),
         Command::Grasp(options) => grasp::run(options, console),
         Command::GraspAnalysis(options) => grasp_analysis::run(options, console),
         Command::Skin(options) => skin::run(options, console),

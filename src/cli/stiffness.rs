@@ -10,13 +10,12 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
-use palpate::numerics::sampling::nearest;
 use palpate::pipeline;
-use palpate::pipeline::stiffness::Inputs;
+use palpate::pipeline::stiffness::{ENOUGH, Inputs, inside};
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
-use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult, WorldPoint};
+use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -174,19 +173,6 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     };
     let page = options.output.join("report.html");
     console.say(&format!("{}{used}  results      {}", report::text(&result), page.display()))
-}
-
-/// Matches that a body must hold for them to be taken unasked: with fewer, what lies between them is not seen.
-const ENOUGH: usize = 1000;
-
-/// Kept matches in the body.
-fn inside(matches: &SparseField, labels: &Mask) -> usize {
-    let grid = labels.grid();
-    let held = |p: WorldPoint| {
-        let v = grid.affine().to_voxel(p);
-        nearest(grid.shape(), v).is_some_and(|o| labels.as_slice()[o] > 0)
-    };
-    matches.kept().filter(|m| held(m.initial)).count()
 }
 
 /// Where the motion is read from.

@@ -90,6 +90,22 @@ pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
     Ok(SparseField { matches: matches.collect() })
 }
 
+/// What [`read_matches`] would read after [`write_matches`]: six decimals, one precision along all axes.
+pub fn stored_matches(field: &SparseField) -> SparseField {
+    let kept = |v: f64| decimal(v).parse().unwrap_or(v);
+    let one = |m: &Match| {
+        let sigma = kept(m.sigma());
+        Match {
+            initial: WorldPoint(m.initial.0.map(kept)),
+            displacement: m.displacement.map(kept),
+            ncc: kept(f64::from(m.ncc)) as f32,
+            covariance: [sigma * sigma, sigma * sigma, sigma * sigma, 0.0, 0.0, 0.0],
+            kept: m.kept,
+        }
+    };
+    SparseField { matches: field.matches.iter().map(one).collect() }
+}
+
 /// Reads landmarks: fx,fy,fz in the initial (fixed) volume, mx,my,mz in the deformed (moving) one.
 ///
 /// # Errors
@@ -240,7 +256,7 @@ pub(super) fn read_table<const N: usize>(path: &Path, names: [&str; N]) -> Resul
 }
 
 /// The `csv` crate's messages name the line themselves.
-fn damaged(path: &Path, error: csv::Error) -> IoError {
+pub(super) fn damaged(path: &Path, error: csv::Error) -> IoError {
     match error.into_kind() {
         csv::ErrorKind::Io(source) => os(path, "read")(source),
         csv::ErrorKind::UnequalLengths { pos, expected_len, len } => {

@@ -4,40 +4,10 @@ use super::{format, os, write_text};
 use crate::error::IoError;
 use crate::io::image::read_volume;
 use crate::types::Volume;
-use crate::types::fingertip::PadReduction;
+use crate::types::fingertip::{PadReduction, StiffnessFolder, StiffnessRegion};
 use serde::Deserialize;
 use std::fs;
 use std::path::Path;
-
-/// What a stiffness folder says.
-#[derive(Debug, Clone)]
-pub struct StiffnessFolder {
-    /// Young's modulus (kPa where absolute; 0 outside).
-    pub map: Volume,
-    /// Whether it is in kPa.
-    pub absolute: bool,
-    /// Name, modulus and bound (`lower`, `upper` or none) of each region.
-    pub regions: Vec<StiffnessRegion>,
-    /// The pressed side as it was called, `z-` say.
-    pub load: String,
-    /// Force on it (N), where it was given.
-    pub force_n: Option<f64>,
-    /// How far inwards the pressed patch went (mm), where the folder says so.
-    pub travel_mm: Option<f64>,
-    /// How the pressed and the held patch moved (mm, RAS).
-    pub translation: [[f64; 3]; 2],
-}
-
-/// One region of a stiffness folder.
-#[derive(Debug, Clone, Deserialize)]
-pub struct StiffnessRegion {
-    /// Its name.
-    pub name: String,
-    /// Young's modulus, or the bound.
-    pub youngs_modulus: f64,
-    /// `lower` or `upper` where it is not identifiable.
-    pub bound: Option<String>,
-}
 
 #[derive(Deserialize)]
 struct RawSummary {
@@ -73,16 +43,28 @@ pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoErr
     let folder = folder.as_ref();
     let path = folder.join("summary.json");
     let text = fs::read_to_string(&path).map_err(os(&path, "read"))?;
+    told(&path, &text, || read_volume(folder.join("stiffness.nii.gz")))
+}
+
+/// The same from what is in memory: the map and the text of the summary.
+///
+/// # Errors
+/// [`IoError`] when the summary is of another command.
+pub fn stiffness_folder(map: Volume, summary: &str) -> Result<StiffnessFolder, IoError> {
+    told(Path::new("summary"), summary, || Ok(map))
+}
+
+fn told(path: &Path, text: &str, map: impl FnOnce() -> Result<Volume, IoError>) -> Result<StiffnessFolder, IoError> {
     let hint = "give the folder that `palpate stiffness` wrote";
-    let command: Option<String> = serde_json::from_str::<serde_json::Value>(&text)
+    let command: Option<String> = serde_json::from_str::<serde_json::Value>(text)
         .ok()
         .and_then(|v| v.get("command").and_then(|c| c.as_str().map(String::from)));
     if let Some(other) = command.filter(|c| c != "stiffness") {
-        return Err(format(&path, format!("is of `palpate {other}`"), hint));
+        return Err(format(path, format!("is of `palpate {other}`"), hint));
     }
-    let raw: RawSummary = serde_json::from_str(&text).map_err(|e| format(&path, e.to_string(), hint))?;
+    let raw: RawSummary = serde_json::from_str(text).map_err(|e| format(path, e.to_string(), hint))?;
     Ok(StiffnessFolder {
-        map: read_volume(folder.join("stiffness.nii.gz"))?,
+        map: map()?,
         absolute: raw.absolute,
         regions: raw.regions,
         load: raw.inputs.load,
@@ -90,6 +72,18 @@ pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoErr
         travel_mm: raw.patches.loaded.travel_mm,
         translation: [raw.patches.loaded.translation, raw.patches.held.translation],
     })
+}
+
+/// Young's modulus (Pa) of a fingertip file.
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or has none.
+pub fn read_fingertip_modulus(path: impl AsRef<Path>) -> Result<f64, IoError> {
+    let path = path.as_ref();
+    let text = fs::read_to_string(path).map_err(os(path, "read"))?;
+    let table = super::scene::parse_table(path, &text)?;
+    let found = table.get("youngs_modulus").and_then(toml::Value::as_float);
+    found.ok_or_else(|| format(path, "has no youngs_modulus", "give a file that `palpate fingertip` wrote"))
 }
 
 /// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of the hemisphere that

@@ -149,8 +149,14 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
 /// # Errors
 /// As [`read_volume`]; also when a value is anything else.
 pub fn read_labels(path: impl AsRef<Path>) -> Result<Mask, IoError> {
-    let path = path.as_ref();
-    let volume = read_volume(path)?;
+    labels_of(read_volume(path.as_ref())?, path.as_ref())
+}
+
+/// `volume`, called `path` in errors, as a label map.
+///
+/// # Errors
+/// [`IoError`] when a value is no whole number from 0 to 255.
+pub fn labels_of(volume: Volume, path: &Path) -> Result<Mask, IoError> {
     let grid = *volume.grid();
     let odd = volume.as_slice().iter().position(|&v| !(0.0..=255.0).contains(&v) || v.fract() != 0.0);
     if let Some(at) = odd {

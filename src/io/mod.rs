@@ -48,6 +48,8 @@ pub mod stiffness;
 
 pub mod trials;
 
+pub mod batch;
+
 pub mod text;
 
 pub mod output;
@@ -64,24 +66,25 @@ mod deflate;
 
 mod gzip;
 
+pub use batch::{free_memory, make_folder, read_pairs, stamp, write_rows};
 pub use chain::write_chain;
 pub use config::read_config;
 pub use csv::{
-    PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, table_kind, write_landmarks,
-    write_matches, write_points,
+    PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches, table_kind,
+    write_landmarks, write_matches, write_points,
 };
 pub use field::{FieldConvention, read_field, read_field_as};
-pub use fingertip::{StiffnessFolder, StiffnessRegion, read_stiffness, write_fingertip};
+pub use fingertip::{read_fingertip_modulus, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
     write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };
-pub use image::{ImageKind, Stored, count_non_finite, read_header, read_labels, read_mask, read_volume};
+pub use image::{ImageKind, Stored, count_non_finite, labels_of, read_header, read_labels, read_mask, read_volume};
 pub use live::abandon;
 pub use markups::write_markups;
 pub use memory::memory_left;
 pub use nifti::{
-    PackedField, Series, write_field, write_field_series, write_integers, write_labels, write_series_field,
-    write_steps, write_tensors, write_volume,
+    PackedField, Series, stored, stored_displacement, stored_steps, write_field, write_field_series, write_integers,
+    write_labels, write_series_field, write_steps, write_tensors, write_volume,
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};

@@ -2,6 +2,7 @@
 
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Fineness, mesh_labels, mesh_labels_finer, pieces};
+use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
 use crate::stiffness::choice::{choose, release};
@@ -11,7 +12,7 @@ use crate::stiffness::patches::Place;
 use crate::stiffness::rim::rim;
 use crate::stiffness::{geometry, maps, summary};
 use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
-use crate::types::{DenseField, Mask, QuadraticMesh, SparseField};
+use crate::types::{DenseField, Mask, QuadraticMesh, SparseField, WorldPoint};
 use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -34,6 +35,19 @@ pub struct Inputs<'a> {
     pub load: &'a Place,
     /// A name for each label.
     pub names: &'a dyn Fn(u8) -> String,
+}
+
+/// Matches that a body must hold for them to be taken unasked: with fewer, what lies between them is not seen.
+pub const ENOUGH: usize = 1000;
+
+/// Kept matches in the body.
+pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
+    let grid = labels.grid();
+    let held = |p: WorldPoint| {
+        let v = grid.affine().to_voxel(p);
+        nearest(grid.shape(), v).is_some_and(|o| labels.as_slice()[o] > 0)
+    };
+    matches.kept().filter(|m| held(m.initial)).count()
 }
 
 /// Nodes of the coarse mesh over those of the fine one.

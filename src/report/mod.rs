@@ -18,6 +18,8 @@ pub mod drawing;
 
 pub mod nodes;
 
+pub mod batch;
+
 pub mod chain;
 
 pub mod chart;

@@ -1,7 +1,7 @@
 //! A soft fingertip: a hemisphere on a hard back plate.
 
 use crate::error::{ParamError, UnknownName};
-use crate::types::names;
+use crate::types::{Volume, names};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
@@ -100,6 +100,36 @@ impl Fingertip {
             (None, None) => self.youngs_modulus,
         }
     }
+}
+
+/// What a fingertip is made from: a stiffness map with what its summary says.
+#[derive(Debug, Clone)]
+pub struct StiffnessFolder {
+    /// Young's modulus (kPa where absolute; 0 outside).
+    pub map: Volume,
+    /// Whether it is in kPa.
+    pub absolute: bool,
+    /// Name, modulus and bound (`lower`, `upper` or none) of each region.
+    pub regions: Vec<StiffnessRegion>,
+    /// The pressed side as it was called, `z-` say.
+    pub load: String,
+    /// Force on it (N), where it was given.
+    pub force_n: Option<f64>,
+    /// How far inwards the pressed patch went (mm), where the folder says so.
+    pub travel_mm: Option<f64>,
+    /// How the pressed and the held patch moved (mm, RAS).
+    pub translation: [[f64; 3]; 2],
+}
+
+/// One region of a stiffness folder.
+#[derive(Debug, Clone, Deserialize)]
+pub struct StiffnessRegion {
+    /// Its name.
+    pub name: String,
+    /// Young's modulus, or the bound.
+    pub youngs_modulus: f64,
+    /// `lower` or `upper` where it is not identifiable.
+    pub bound: Option<String>,
 }
 
 /// A column of tissue between a pad's surface and its back plate.

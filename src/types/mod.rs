@@ -36,6 +36,8 @@ pub mod skin;
 
 pub mod trial;
 
+pub mod batch;
+
 pub use field::DenseField;
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};

@@ -31,7 +31,7 @@ const STEPS_PER_MM: f32 = 4096.0;
 /// cannot be written.
 pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) -> Result<(), IoError> {
     let form = Form { description, ..Form::FLOATS };
-    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| shortened(v).to_le_bytes()).map(drop)
+    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| stored(v).to_le_bytes()).map(drop)
 }
 
 /// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it packs well.
@@ -40,11 +40,8 @@ pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) 
 /// As [`write_volume`].
 pub fn write_steps(path: impl AsRef<Path>, volume: &Volume, description: &str, bits: i32) -> Result<(), IoError> {
     let form = Form { description, ..Form::FLOATS };
-    let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
-    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| {
-        ((v * up).round_ties_even() * down + 0.0).to_le_bytes()
-    })
-    .map(drop)
+    let step = stored_steps(bits);
+    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| step(v).to_le_bytes()).map(drop)
 }
 
 /// Writes a volume as int16, each value rounded to the nearest whole number: half the size of [`write_volume`].
@@ -90,8 +87,7 @@ pub fn write_series_field(path: impl AsRef<Path>, field: &DenseField) -> Result<
     let components = [field.component(0), field.component(1), field.component(2)];
     let runs = write(path.as_ref(), field.grid(), form, &components, |c, v| {
         let lps = if c < 2 { -v } else { v };
-        // Adding 0 turns -0 into 0.
-        ((lps * STEPS_PER_MM).round_ties_even() / STEPS_PER_MM + 0.0).to_le_bytes()
+        stored_displacement(lps).to_le_bytes()
     })?;
     Ok(PackedField { path: path.as_ref().into(), runs })
 }
@@ -162,8 +158,20 @@ pub fn write_tensors(
     .map(drop)
 }
 
-/// The nearest number with [`MANTISSA_BITS`] bits, ties to even; NaN and infinity stay.
-fn shortened(v: f32) -> f32 {
+/// A component of a displacement (mm) as [`write_field`] keeps it.
+pub fn stored_displacement(v: f32) -> f32 {
+    // Adding 0 turns -0 into 0.
+    (v * STEPS_PER_MM).round_ties_even() / STEPS_PER_MM + 0.0
+}
+
+/// A value as [`write_steps`] keeps it.
+pub fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
+    let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
+    move |v| (v * up).round_ties_even() * down + 0.0
+}
+
+/// A value as [`write_volume`] keeps it: the nearest number with 16 significant bits, ties to even; NaN and infinity stay.
+pub fn stored(v: f32) -> f32 {
     if !v.is_finite() {
         return v;
     }

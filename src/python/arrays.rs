@@ -1,0 +1,181 @@
+//! Arrays in and out, errors, progress and threads.
+
+use crate::error::FieldError;
+use crate::io;
+use crate::python::PalpateError;
+use crate::types::{Affine, DenseField, Grid, Mask, Match, Mesh, SparseField, Volume, WorldPoint};
+use ndarray::{Array2, Array3, Array4, ShapeBuilder};
+use numpy::{
+    IntoPyArray, PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
+    PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+use serde_json::Value;
+use std::path::Path;
+use std::sync::Mutex;
+
+/// The upper rows of a voxel-to-world matrix (mm, RAS).
+pub type Rows = [[f64; 4]; 3];
+/// A scalar volume and its affine.
+pub type Image<'py> = (PyReadonlyArray3<'py, f32>, Rows);
+/// A callable of a stage's name and the part that is done (0 to 1).
+pub type Callback = Option<Py<PyAny>>;
+
+/// The message of an error with its causes, each once, as the command line says it.
+pub fn told(error: impl std::fmt::Display) -> PyErr {
+    PalpateError::new_err(error.to_string())
+}
+
+/// `shape` placed by `rows`.
+pub fn grid(shape: &[usize], rows: Rows) -> PyResult<Grid> {
+    let [x, y, z] = shape[..3] else { return Err(told("a volume has three axes")) };
+    Grid::new([x, y, z], Affine::new(rows).map_err(told)?).map_err(told)
+}
+
+/// The values of an array in Fortran order, x fastest.
+macro_rules! values {
+    ($array:expr) => {{
+        let array = $array;
+        if !array.is_fortran_contiguous() {
+            return Err(told("an array must lie in Fortran order"));
+        }
+        array.as_slice().map_err(told)?.to_vec()
+    }};
+}
+
+/// A volume from its array and affine.
+pub fn volume((array, rows): &Image<'_>) -> PyResult<Volume> {
+    Volume::from_vec(grid(array.shape(), *rows)?, values!(array)).map_err(told)
+}
+
+/// A label map or mask, called `name`.
+pub fn labels(image: &Image<'_>, name: &str) -> PyResult<Mask> {
+    io::labels_of(volume(image)?, Path::new(name)).map_err(told)
+}
+
+/// The same if it is there, on the grid of `reference`, which is called `of`.
+pub fn mask(image: Option<&Image<'_>>, name: &str, reference: &Grid, of: &str) -> PyResult<Option<Mask>> {
+    let Some(image) = image else { return Ok(None) };
+    let mask = labels(image, name)?;
+    if !reference.same_as(mask.grid()) {
+        return Err(told(FieldError::GridMismatch {
+            what: name.into(),
+            found: mask.grid().shape(),
+            reference: of.into(),
+            expected: reference.shape(),
+        }));
+    }
+    Ok(Some(mask))
+}
+
+/// A displacement, (nx, ny, nz, 3), mm, RAS.
+pub fn displacement(array: &PyReadonlyArray4<'_, f32>, rows: Rows) -> PyResult<DenseField> {
+    if array.shape()[3] != 3 {
+        return Err(told("a displacement has three components, on the last axis"));
+    }
+    DenseField::from_vec(grid(array.shape(), rows)?, values!(array)).map_err(told)
+}
+
+/// Matches from the columns of matches.csv.
+pub fn matches(array: &PyReadonlyArray2<'_, f64>) -> PyResult<SparseField> {
+    let rows = array.as_array();
+    if rows.ncols() != 9 {
+        return Err(told("matches have the nine columns x, y, z, dx, dy, dz, ncc, sigma, kept"));
+    }
+    let one = |r: ndarray::ArrayView1<'_, f64>| Match {
+        initial: WorldPoint([r[0], r[1], r[2]]),
+        displacement: [r[3], r[4], r[5]],
+        ncc: r[6] as f32,
+        covariance: [r[7] * r[7], r[7] * r[7], r[7] * r[7], 0.0, 0.0, 0.0],
+        kept: r[8] != 0.0,
+    };
+    Ok(SparseField { matches: rows.rows().into_iter().map(one).collect() })
+}
+
+/// The columns of matches.csv.
+pub fn match_rows<'py>(py: Python<'py>, field: &SparseField) -> Bound<'py, PyArray2<f64>> {
+    let all = &field.matches;
+    let rows = Array2::from_shape_fn((all.len(), 9), |(i, c)| match c {
+        0..3 => all[i].initial.0[c],
+        3..6 => all[i].displacement[c - 3],
+        6 => f64::from(all[i].ncc),
+        7 => all[i].sigma(),
+        _ => f64::from(u8::from(all[i].kept)),
+    });
+    rows.into_pyarray(py)
+}
+
+/// A volume as an (nx, ny, nz) array, without a copy.
+pub fn array3<'py, T: numpy::Element + Clone>(py: Python<'py>, volume: Volume<T>) -> PyResult<Bound<'py, PyArray3<T>>> {
+    let [x, y, z] = volume.grid().shape();
+    Ok(Array3::from_shape_vec((x, y, z).f(), volume.into_vec()).map_err(told)?.into_pyarray(py))
+}
+
+/// A displacement as an (nx, ny, nz, 3) array, mm, RAS.
+pub fn array4<'py>(py: Python<'py>, field: &DenseField) -> PyResult<Bound<'py, PyArray4<f32>>> {
+    let [x, y, z] = field.grid().shape();
+    let values = [0, 1, 2].map(|c| field.component(c)).concat();
+    Ok(Array4::from_shape_vec((x, y, z, 3).f(), values).map_err(told)?.into_pyarray(py))
+}
+
+/// Rows of `N` numbers.
+pub fn table<'py, T: numpy::Element + Copy, const N: usize>(
+    py: Python<'py>,
+    rows: &[[T; N]],
+) -> Bound<'py, PyArray2<T>> {
+    Array2::from_shape_fn((rows.len(), N), |(i, c)| rows[i][c]).into_pyarray(py)
+}
+
+/// Nodes (mm, RAS) and elements of a mesh.
+pub fn mesh<'py>(py: Python<'py>, mesh: &Mesh) -> (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>) {
+    let nodes = |nodes: &[WorldPoint]| table(py, &nodes.iter().map(|p| p.0).collect::<Vec<_>>());
+    match mesh {
+        Mesh::Tetrahedra(m) => (nodes(m.nodes()), table(py, m.tetrahedra())),
+        Mesh::Triangles(m) => (nodes(m.nodes()), table(py, m.triangles())),
+    }
+}
+
+/// The affine as files keep it, in single precision.
+pub fn stored_rows(grid: &Grid) -> Rows {
+    grid.affine().rows().map(|row| row.map(|v| f64::from(v as f32)))
+}
+
+/// JSON as Python's own dict and list.
+pub fn python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
+    py.import("json")?.call_method1("loads", (value.to_string(),))
+}
+
+/// Runs `work` without the interpreter, on `threads` threads (all cores without a number), and tells `callback` how far it is.
+/// What the callback raises is raised when the work is done.
+pub fn run<R: Send>(
+    py: Python<'_>,
+    callback: Callback,
+    threads: Option<usize>,
+    work: impl FnOnce(&(dyn Fn(&str, f64) + Sync)) -> R + Send,
+) -> PyResult<R> {
+    let raised: Mutex<Option<PyErr>> = Mutex::new(None);
+    let tell = |stage: &str, part: f64| {
+        let Some(callback) = &callback else { return };
+        Python::attach(|py| {
+            if let Err(error) = callback.call1(py, (stage, part))
+                && let Ok(mut first) = raised.lock()
+            {
+                first.get_or_insert(error);
+            }
+        });
+    };
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(0)).build().map_err(told)?;
+    let result = py.detach(|| pool.install(|| work(&tell)));
+    match raised.into_inner() {
+        Ok(Some(error)) => Err(error),
+        _ => Ok(result),
+    }
+}
+
+/// A volume from a file of any format that is read, as an array and its affine.
+#[pyfunction]
+pub fn read_volume<'py>(py: Python<'py>, path: std::path::PathBuf) -> PyResult<(Bound<'py, PyArray3<f32>>, Rows)> {
+    let volume = py.detach(|| io::read_volume(&path)).map_err(told)?;
+    let rows = volume.grid().affine().rows();
+    Ok((array3(py, volume)?, rows))
+}

@@ -1,0 +1,314 @@
+//! Many pairs as tables and one page: what failed and why, moduli over all, and what to look at twice.
+
+use crate::report::html::{document, escape};
+use crate::report::plot::ticks;
+use crate::report::scale::short;
+use crate::report::statistics::quantile;
+use crate::report::tables::table;
+use crate::types::batch::{PairOutcome, Status};
+use serde_json::{Value, json};
+use std::fmt::Write;
+
+/// Columns of batch.csv.
+pub const COLUMNS: [&str; 18] = [
+    "name",
+    "subject",
+    "session",
+    "status",
+    "stage",
+    "reason",
+    "seconds",
+    "voxels",
+    "kept",
+    "model",
+    "displacement_mean_mm",
+    "displacement_max_mm",
+    "uncertainty_median_mm",
+    "folds",
+    "verdict",
+    "fingertip_kpa",
+    "grasp_completed",
+    "flags",
+];
+
+/// Columns of regions.csv over all pairs.
+pub const REGION_COLUMNS: [&str; 10] =
+    ["name", "subject", "session", "label", "region", "youngs_modulus", "sd", "unit", "identifiable", "bound"];
+
+/// A value as text; nothing where there is none.
+fn text(v: &Value) -> String {
+    match v {
+        Value::Null => String::new(),
+        Value::String(s) => s.clone(),
+        other => other.to_string(),
+    }
+}
+
+fn list(v: &Value) -> &[Value] {
+    v.as_array().map_or(&[], Vec::as_slice)
+}
+
+/// What to look at twice in a pair's results.
+pub fn flags(o: &PairOutcome) -> Vec<String> {
+    let mut out = Vec::new();
+    let folds = o.field["folds"].as_u64().unwrap_or(0);
+    if folds > 0 {
+        out.push(format!("{folds} voxels folded"));
+    }
+    for (stage, summary) in [("field", &o.field), ("stiffness", &o.stiffness)] {
+        out.extend(list(&summary["warnings"]).iter().map(|w| format!("{stage}: {}", text(w))));
+    }
+    let unseen = list(&o.stiffness["regions"]).iter().filter(|r| r["identifiable"] == false);
+    out.extend(unseen.map(|r| format!("{} is only a bound", text(&r["name"]))));
+    if o.grasp["completed"] == false {
+        out.push("the grasp ended early".into());
+    }
+    out
+}
+
+/// The line of batch.csv.
+pub fn row(o: &PairOutcome) -> Vec<String> {
+    let f = &o.field;
+    let keys = ["model", "displacement_mean_mm", "displacement_max_mm", "uncertainty_median_mm", "folds"];
+    let mut out = vec![
+        o.name.clone(),
+        o.subject.clone(),
+        o.session.clone(),
+        o.status.name().into(),
+        o.stage.into(),
+        o.reason.clone(),
+        format!("{:.2}", o.seconds),
+        text(&f["mask_voxels"]),
+        text(&f["counts"]["kept"]),
+    ];
+    out.extend(keys.map(|k| text(&f[k])));
+    out.push(text(&o.stiffness["verdict"]));
+    out.push(o.fingertip_kpa.map_or_else(String::new, |e| e.to_string()));
+    out.extend([text(&o.grasp["completed"]), flags(o).join("; ")]);
+    out
+}
+
+/// Its lines of regions.csv.
+pub fn region_rows(o: &PairOutcome) -> Vec<Vec<String>> {
+    let one = |r: &Value| {
+        let mut row = vec![o.name.clone(), o.subject.clone(), o.session.clone()];
+        row.extend(["label", "name", "youngs_modulus", "sd"].map(|k| text(&r[k])));
+        row.push(if o.stiffness["absolute"] == true { "kPa".into() } else { "ratio".into() });
+        row.extend([u8::from(r["identifiable"] == true).to_string(), text(&r["bound"])]);
+        row
+    };
+    list(&o.stiffness["regions"]).iter().map(one).collect()
+}
+
+/// How many ended how.
+fn count(outcomes: &[PairOutcome], status: Status) -> usize {
+    outcomes.iter().filter(|o| o.status == status).count()
+}
+
+/// In a sentence.
+pub fn verdict(outcomes: &[PairOutcome]) -> String {
+    let [done, skipped, failed] = [Status::Done, Status::Skipped, Status::Failed].map(|s| count(outcomes, s));
+    let of = outcomes.len();
+    let earlier = if skipped > 0 { format!(", {skipped} were there already") } else { String::new() };
+    match failed {
+        0 => format!("All of {of} pairs have results: {done} measured{earlier}."),
+        n => format!("{n} of {of} pairs failed; {done} measured{earlier}."),
+    }
+}
+
+/// A region over all pairs that see it.
+struct Spread {
+    region: String,
+    unit: &'static str,
+    /// Modulus and whether it is determined.
+    values: Vec<(f64, bool)>,
+}
+
+fn spreads(outcomes: &[PairOutcome]) -> Vec<Spread> {
+    let mut out: Vec<Spread> = Vec::new();
+    for o in outcomes {
+        let unit = if o.stiffness["absolute"] == true { "kPa" } else { "ratio" };
+        for r in list(&o.stiffness["regions"]) {
+            let Some(value) = r["youngs_modulus"].as_f64().filter(|v| *v > 0.0) else { continue };
+            let (region, value) = (text(&r["name"]), (value, r["identifiable"] == true));
+            match out.iter_mut().find(|s| s.region == region && s.unit == unit) {
+                Some(spread) => spread.values.push(value),
+                None => out.push(Spread { region, unit, values: vec![value] }),
+            }
+        }
+    }
+    out
+}
+
+impl Spread {
+    /// Quantile of the determined values.
+    fn at(&self, q: f64) -> f64 {
+        quantile(self.values.iter().filter(|v| v.1).map(|v| v.0), q)
+    }
+
+    fn seen(&self) -> usize {
+        self.values.iter().filter(|v| v.1).count()
+    }
+}
+
+/// Number of pairs, and counts, medians and quartiles of each region; the keys are those of docs/file-formats.md.
+pub fn summary(outcomes: &[PairOutcome]) -> Value {
+    let number = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
+    let spread = |s: &Spread| {
+        json!({
+            "region": s.region, "unit": s.unit, "pairs": s.values.len(), "identifiable": s.seen(),
+            "quartile_1": number(s.at(0.25)), "median": number(s.at(0.5)), "quartile_3": number(s.at(0.75)),
+        })
+    };
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "batch",
+        "verdict": verdict(outcomes),
+        "pairs": outcomes.len(),
+        "done": count(outcomes, Status::Done),
+        "skipped": count(outcomes, Status::Skipped),
+        "failed": count(outcomes, Status::Failed),
+        "regions": spreads(outcomes).iter().map(spread).collect::<Vec<_>>(),
+        "seconds": outcomes.iter().map(|o| o.seconds).sum::<f64>(),
+    })
+}
+
+/// A row a region: a dot a pair over a logarithmic axis, full where determined, hollow for a bound; a bar at the median.
+fn strips(spreads: &[&Spread]) -> String {
+    let logs = || spreads.iter().flat_map(|s| &s.values).map(|v| v.0.log10());
+    let (low, high) = (logs().fold(f64::INFINITY, f64::min) - 0.1, logs().fold(f64::NEG_INFINITY, f64::max) + 0.1);
+    let (width, left, step) = (760.0, 130.0, 34.0);
+    let x = |log: f64| left + (log - low) / (high - low) * (width - left - 20.0);
+    let height = step * spreads.len() as f64 + 40.0;
+    let mut svg = format!(
+        r#"<svg class="chart" viewBox="0 0 {width} {height:.0}" role="img" aria-label="Young's modulus of each region over all pairs">"#
+    );
+    for tick in ticks(low, high, 6.0) {
+        let at = x(tick);
+        let _ = write!(
+            svg,
+            r#"<path class="rule" d="M{at:.1} 4V{:.0}"/><text x="{at:.1}" y="{:.0}" text-anchor="middle">{}</text>"#,
+            height - 30.0,
+            height - 12.0,
+            short((10f64.powf(tick) * 100.0).round() / 100.0)
+        );
+    }
+    for (row, s) in spreads.iter().enumerate() {
+        let y = step * row as f64 + 20.0;
+        let _ = write!(svg, r#"<text x="0" y="{:.1}">{}</text>"#, y + 4.0, escape(&s.region));
+        for (i, &(value, determined)) in s.values.iter().enumerate() {
+            // Spread over a few heights so that equal values can be told apart.
+            let dy = (i % 5) as f64 * 4.0 - 8.0;
+            let fill = if determined { "#3b6fb6" } else { "none" };
+            let _ = write!(
+                svg,
+                r##"<circle cx="{:.1}" cy="{:.1}" r="3.5" fill="{fill}" fill-opacity=".55" stroke="#3b6fb6"/>"##,
+                x(value.log10()),
+                y + dy
+            );
+        }
+        let middle = s.at(0.5);
+        if middle.is_finite() {
+            let at = x(middle.log10());
+            let _ = write!(svg, r##"<path stroke="#c7672b" stroke-width="2.5" d="M{at:.1} {:.1}v26"/>"##, y - 13.0);
+        }
+    }
+    svg + "</svg>"
+}
+
+/// The group report.
+pub fn page(outcomes: &[PairOutcome]) -> String {
+    let mut body = format!("<header><h1>Cohort</h1><p class=\"lead\">{}</p></header>", verdict(outcomes));
+    let failed: Vec<Vec<String>> = outcomes
+        .iter()
+        .filter(|o| o.status == Status::Failed)
+        .map(|o| vec![escape(&o.name), o.stage.into(), escape(&o.reason)])
+        .collect();
+    if !failed.is_empty() {
+        let rows = table(&["Pair", "Stage", "Reason"], &failed);
+        let _ = write!(body, "<section><h2>What failed</h2><article class=\"wide\">{rows}</article></section>");
+    }
+    let spreads = spreads(outcomes);
+    for unit in ["kPa", "ratio"] {
+        let these: Vec<&Spread> = spreads.iter().filter(|s| s.unit == unit).collect();
+        if these.is_empty() {
+            continue;
+        }
+        let digits = |v: f64| if v.is_finite() { format!("{v:.3}") } else { "none".into() };
+        let rows: Vec<Vec<String>> = these
+            .iter()
+            .map(|s| {
+                let quartiles = [0.25, 0.5, 0.75].map(|q| digits(s.at(q)));
+                let mut row = vec![escape(&s.region), s.values.len().to_string(), s.seen().to_string()];
+                row.extend(quartiles);
+                row
+            })
+            .collect();
+        let head = ["Region", "Pairs", "Determined", "First quartile", "Median", "Third quartile"];
+        let _ = write!(
+            body,
+            "<section><h2>Young's modulus, {unit}</h2><article class=\"wide\">{}<p>A dot a pair; hollow where the data give only \
+             a bound. The bar is the median of those determined.</p>{}</article></section>",
+            strips(&these),
+            table(&head, &rows)
+        );
+    }
+    let with_field: Vec<&PairOutcome> = outcomes.iter().filter(|o| !o.field.is_null()).collect();
+    let rows: Vec<Vec<String>> = with_field
+        .iter()
+        .map(|o| {
+            let mm = |key: &str| o.field[key].as_f64().map_or_else(String::new, |v| format!("{v:.3}"));
+            let mut row = vec![format!("<a href=\"{0}/field/report.html\">{0}</a>", escape(&o.name))];
+            row.extend(["displacement_mean_mm", "displacement_max_mm", "uncertainty_median_mm"].map(mm));
+            row.push(text(&o.field["counts"]["kept"]));
+            row.push(flags(o).iter().map(|f| escape(f)).collect::<Vec<_>>().join("<br>"));
+            row
+        })
+        .collect();
+    let head = ["Pair", "Mean, mm", "Largest, mm", "Uncertainty, mm", "Matches kept", "To look at"];
+    let rows = table(&head, &rows);
+    let _ = write!(body, "<section><h2>Pairs</h2><article class=\"wide\">{rows}</article></section>");
+    document("Cohort", &body)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outcome(name: &str, modulus: f64) -> PairOutcome {
+        let region =
+            json!({ "label": 1, "name": "pulp <b>", "youngs_modulus": modulus, "sd": 1.0, "identifiable": true });
+        PairOutcome {
+            name: name.into(),
+            subject: String::new(),
+            session: String::new(),
+            status: Status::Done,
+            stage: "",
+            reason: String::new(),
+            seconds: 1.0,
+            field: json!({ "folds": 2, "warnings": ["noisy"], "counts": { "kept": 7 } }),
+            stiffness: json!({ "absolute": true, "regions": [region], "warnings": [] }),
+            fingertip_kpa: None,
+            grasp: Value::Null,
+        }
+    }
+
+    #[test]
+    fn quartiles_are_over_all_pairs_and_names_are_escaped() {
+        let all: Vec<PairOutcome> = (1..=5).map(|i| outcome(&format!("p{i}"), f64::from(10 * i))).collect();
+        let found = summary(&all);
+        assert_eq!(found["regions"][0]["median"], 30.0);
+        assert_eq!(found["regions"][0]["identifiable"], 5);
+        let page = page(&all);
+        assert_eq!(page.matches("<circle").count(), 5);
+        assert!(page.contains("pulp &lt;b&gt;") && !page.contains("NaN") && page.contains("2 voxels folded"));
+    }
+
+    #[test]
+    fn every_row_is_as_long_as_its_header() {
+        let one = outcome("p", 3.0);
+        assert_eq!(row(&one).len(), COLUMNS.len());
+        assert!(region_rows(&one).iter().all(|r| r.len() == REGION_COLUMNS.len()));
+        assert_eq!(row(&one)[17], "2 voxels folded; field: noisy");
+    }
+}

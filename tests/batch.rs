@@ -1,0 +1,212 @@
+//! `palpate batch`: tables with flaws, pairs that fail beside pairs that do not, and taking up where a run ended.
+#![allow(clippy::unwrap_used)]
+
+mod fixtures;
+
+use fixtures::{palpate, run, small_pair};
+use serde_json::Value;
+use std::fs;
+use std::path::Path;
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+/// A folder with a small pair and a table of these lines.
+fn folder(lines: &[&str]) -> TempDir {
+    let folder = small_pair();
+    table(folder.path(), lines);
+    folder
+}
+
+fn table(folder: &Path, lines: &[&str]) {
+    fs::write(folder.join("pairs.csv"), lines.join("\n") + "\n").unwrap();
+}
+
+const FAST: [&str; 6] = ["batch", "pairs.csv", "-o", "out", "--preset", "fast"];
+
+/// The rows of a table in `folder` by column name.
+fn rows(folder: &Path, name: &str) -> Vec<std::collections::HashMap<String, String>> {
+    let text = fs::read_to_string(folder.join(name)).unwrap();
+    csv::Reader::from_reader(text.as_bytes()).deserialize().map(|r| r.unwrap()).collect()
+}
+
+fn statuses(folder: &Path) -> Vec<String> {
+    rows(folder, "out/batch.csv").iter().map(|r| format!("{} {}", r["name"], r["status"])).collect()
+}
+
+#[test]
+fn a_pair_that_fails_stops_no_other_and_a_second_run_only_does_what_is_left() {
+    let folder = folder(&[
+        "name,initial,deformed,mask",
+        "good,initial.nii.gz,deformed.nii.gz,mask.nii.gz",
+        "lost,initial.nii.gz,nowhere.nii.gz,",
+        "broken,initial.nii.gz,broken.nii.gz,",
+        "plain,initial.nii.gz,deformed.nii.gz,",
+    ]);
+    fs::write(folder.path().join("broken.nii.gz"), "no volume").unwrap();
+    let (_, err) = run(folder.path(), &FAST, 1);
+    assert!(err.contains("2 of 4 pairs failed") && err.contains("nowhere.nii.gz"), "{err}");
+    assert_eq!(statuses(folder.path()), ["good done", "lost failed", "broken failed", "plain done"]);
+    let found = rows(folder.path(), "out/batch.csv");
+    assert!(found[1]["reason"].contains("nowhere.nii.gz") && found[1]["reason"].contains("No such file"), "{found:?}");
+    assert!(found[2]["reason"].contains("broken.nii.gz"), "{found:?}");
+    let summary: Value =
+        serde_json::from_slice(&fs::read(folder.path().join("out/good/field/summary.json")).unwrap()).unwrap();
+    assert_eq!(found[0]["displacement_mean_mm"], summary["displacement_mean_mm"].to_string());
+    assert_eq!(found[0]["kept"], summary["counts"]["kept"].to_string());
+    let page = fs::read_to_string(folder.path().join("out/report.html")).unwrap();
+    assert!(page.contains("What failed") && page.contains("nowhere.nii.gz"));
+
+    // The same alone, bit for bit.
+    let alone =
+        ["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--preset", "fast", "-o", "alone"];
+    run(folder.path(), &alone, 0);
+    let bytes = |path: &str| fs::read(folder.path().join(path)).unwrap();
+    assert!(bytes("alone/displacement.nii.gz") == bytes("out/good/field/displacement.nii.gz"));
+
+    // What is done stays; what was missing is there now.
+    fs::copy(folder.path().join("deformed.nii.gz"), folder.path().join("nowhere.nii.gz")).unwrap();
+    fs::copy(folder.path().join("deformed.nii.gz"), folder.path().join("broken.nii.gz")).unwrap();
+    let before = fs::metadata(folder.path().join("out/good/field/displacement.nii.gz")).unwrap().modified().unwrap();
+    run(folder.path(), &FAST, 0);
+    assert_eq!(statuses(folder.path()), ["good skipped", "lost done", "broken done", "plain skipped"]);
+    let after = fs::metadata(folder.path().join("out/good/field/displacement.nii.gz")).unwrap().modified().unwrap();
+    assert_eq!(before, after);
+
+    // Another mask is another pair, other parameters make all of them anew.
+    fs::copy(folder.path().join("truth.nii.gz"), folder.path().join("old.nii.gz")).unwrap();
+    let mask = palpate::io::read_mask(folder.path().join("mask.nii.gz")).unwrap();
+    let less = palpate::types::Mask::from_voxels(*mask.grid(), |o, _| mask.as_slice()[o] * u8::from(o % 31 < 28));
+    palpate::io::write_labels(folder.path().join("mask.nii.gz"), &less, "").unwrap();
+    run(folder.path(), &FAST, 0);
+    assert_eq!(statuses(folder.path()), ["good done", "lost skipped", "broken skipped", "plain skipped"]);
+    run(folder.path(), &[&FAST[..], &["--seed", "7"]].concat(), 0);
+    assert!(statuses(folder.path()).iter().all(|s| s.ends_with(" done")));
+}
+
+#[test]
+fn flaws_of_a_table_are_named_with_their_line() {
+    let good = "initial.nii.gz,deformed.nii.gz";
+    let cases: [(&[&str], &str); 8] = [
+        (&["initial,deformd", good], "did you mean 'deformed'"),
+        (&["initial,deformed,colour", &format!("{good},red")], "unknown key 'colour'"),
+        (&["initial,deformed"], "no pair"),
+        (&["initial,deformed,name", &format!("{good},a"), &format!("{good},a")], "line 3: a is the name of line 2 too"),
+        (&["initial,deformed,force_n", &format!("{good},-3")], "line 2: force_n is \"-3\""),
+        (&["initial,deformed,name", &format!("{good},a/b")], "cannot name a folder"),
+        (&["initial,deformed", ",deformed.nii.gz"], "line 2: there is no initial volume"),
+        (&["initial,deformed,mask", good], "line 2: 2 values"),
+    ];
+    for (lines, message) in cases {
+        let folder = folder(lines);
+        let (_, err) = run(folder.path(), &FAST, 1);
+        assert!(err.contains("pairs.csv") && err.contains(message), "{lines:?}: {err}");
+        assert!(!folder.path().join("out").exists());
+    }
+}
+
+#[test]
+fn names_come_from_subject_and_session_and_paths_count_from_the_table() {
+    let folder = small_pair();
+    fs::create_dir(folder.path().join("lists")).unwrap();
+    let lines = "subject,session,initial,deformed\n01,pre,../initial.nii.gz,../deformed.nii.gz\nsub-02,,../initial.nii.gz,../deformed.nii.gz\n";
+    fs::write(folder.path().join("lists/pairs.csv"), lines).unwrap();
+    run(folder.path(), &["batch", "lists/pairs.csv", "-o", "out", "--preset", "fast", "--jobs", "1"], 0);
+    assert_eq!(statuses(folder.path()), ["sub-01_ses-pre done", "sub-02 done"]);
+    assert_eq!(rows(folder.path(), "out/batch.csv")[0]["session"], "pre");
+}
+
+#[test]
+fn a_pair_past_the_memory_is_refused_and_the_others_run() {
+    let folder = folder(&["initial,deformed,name", "initial.nii.gz,deformed.nii.gz,small", "big.nii,big.nii,big"]);
+    let mut big = fixtures::Nifti::ramp([100, 100, 60]);
+    big.datatype = 16;
+    fs::write(folder.path().join("big.nii"), big.bytes()).unwrap();
+    let (_, err) = run(folder.path(), &[&FAST[..], &["--memory", "0.02"]].concat(), 1);
+    assert!(err.contains("big failed at check: needs about"), "{err}");
+    assert_eq!(statuses(folder.path()), ["small done", "big failed"]);
+    run(folder.path(), &[&FAST[..], &["--memory", "-1"]].concat(), 2);
+}
+
+#[test]
+fn a_folder_with_something_else_is_left_alone() {
+    let folder = folder(&["initial,deformed", "initial.nii.gz,deformed.nii.gz"]);
+    fs::create_dir(folder.path().join("out")).unwrap();
+    fs::write(folder.path().join("out/mine.txt"), "mine").unwrap();
+    let (_, err) = run(folder.path(), &FAST, 1);
+    assert!(err.contains("not a batch") && err.contains("--force"), "{err}");
+    assert_eq!(fs::read_dir(folder.path().join("out")).unwrap().count(), 1);
+    run(folder.path(), &[&FAST[..], &["--force"]].concat(), 0);
+}
+
+#[test]
+fn a_killed_run_is_taken_up() {
+    let lines: Vec<String> = (0..4).map(|i| format!("p{i},initial.nii.gz,deformed.nii.gz")).collect();
+    let lines: Vec<&str> = std::iter::once("name,initial,deformed").chain(lines.iter().map(String::as_str)).collect();
+    let folder = folder(&lines);
+    let arguments = ["batch", "pairs.csv", "-o", "out", "--jobs", "1", "--quiet"];
+    let program = assert_cmd::cargo::cargo_bin!("palpate");
+    let mut child = std::process::Command::new(program).current_dir(folder.path()).args(arguments).spawn().unwrap();
+    // After the first pair's record, before the last one's.
+    let (first, last) =
+        (folder.path().join("out/p0/field/summary.json"), folder.path().join("out/p3/field/summary.json"));
+    let started = Instant::now();
+    while !folder.path().join("out/p1").exists() && started.elapsed() < Duration::from_secs(120) {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(first.exists() && !last.exists(), "the run was killed too early or too late");
+    assert!(statuses(folder.path()).contains(&"p3 waiting".into()));
+    // A stage of the killed run may still be writing; its results count only where they are on record.
+    palpate(folder.path()).args(arguments).assert().success();
+    let found = statuses(folder.path());
+    assert_eq!((found[0].as_str(), found[3].as_str()), ("p0 skipped", "p3 done"));
+    assert!(found.iter().all(|s| s.ends_with("done") || s.ends_with("skipped")), "{found:?}");
+}
+
+#[test]
+fn the_whole_chain_runs_and_is_gathered() {
+    let folder = TempDir::new().unwrap();
+    run(folder.path(), &["phantom", "fingertip", "--size", "28", "--seed", "2", "--amplitude", "1.5", "-o", "pad"], 0);
+    let told: Value = serde_json::from_slice(&fs::read(folder.path().join("pad/phantom.json")).unwrap()).unwrap();
+    let elastic = &told["elastic"];
+    let names: Vec<String> = elastic["regions"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|r| format!("{}={}", r["label"], r["name"].as_str().unwrap()))
+        .collect();
+    let scene = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/finger_pad.toml");
+    let line = |s: &str| {
+        format!(
+            "{s},pad/initial.nii.gz,pad/deformed.nii.gz,pad/mask.nii.gz,pad/labels.nii.gz,{},{},{},{},{}",
+            names.join(";"),
+            elastic["held"].as_str().unwrap(),
+            elastic["load"].as_str().unwrap(),
+            elastic["force_n"],
+            scene.display()
+        )
+    };
+    let header = "subject,initial,deformed,mask,labels,names,held,load,force_n,scene";
+    table(folder.path(), &[header, &line("1"), &line("2")]);
+    run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--nodes", "1500"], 0);
+    let found = rows(folder.path(), "out/batch.csv");
+    assert!(
+        found.iter().all(|r| r["status"] == "done" && r["fingertip_kpa"].parse::<f64>().unwrap() > 0.0),
+        "{found:?}"
+    );
+    let regions = rows(folder.path(), "out/regions.csv");
+    assert_eq!(regions.len(), 2 * names.len());
+    assert!(regions.iter().all(|r| r["unit"] == "kPa"));
+    let page = fs::read_to_string(folder.path().join("out/report.html")).unwrap();
+    assert_eq!(page.matches("<circle").count(), regions.len());
+    let tables = |name: &str| fs::read_to_string(folder.path().join("out").join(name)).unwrap();
+    let before = tables("regions.csv");
+    run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--nodes", "1500", "--collect"], 0);
+    assert_eq!(before, tables("regions.csv"));
+    fs::remove_file(folder.path().join("out/sub-2/grasp/summary.json")).unwrap();
+    let (_, err) = run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--nodes", "1500", "--collect"], 1);
+    assert!(err.contains("sub-2 failed at grasp: there is no "), "{err}");
+    run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--nodes", "1500"], 0);
+    assert_eq!(statuses(folder.path()), ["sub-1 skipped", "sub-2 done"]);
+}

@@ -1,0 +1,209 @@
+"""The Python package gives the bits of the command line, and its words."""
+
+import csv
+import threading
+import time
+
+import nibabel
+import numpy as np
+import pytest
+
+import palpate
+from conftest import ROOT
+
+TIMES = ("seconds",)
+
+
+def same(found, expected):
+    """Equal in every bit, but for the sign of zero."""
+    assert found.dtype == expected.dtype and found.shape == expected.shape
+    assert np.array_equal(found, expected, equal_nan=True)
+
+
+def volume(path):
+    return np.asarray(nibabel.load(path).dataobj)
+
+
+def lps(array):
+    return array * np.array([-1, -1, 1], np.float32)
+
+
+def check_field(found, folder, summary):
+    same(lps(found.displacement), volume(folder / "displacement.nii.gz")[:, :, :, 0, :])
+    same(found.warped, volume(folder / "warped.nii.gz"))
+    same(found.jacobian, volume(folder / "jacobian.nii.gz"))
+    same(found.uncertainty, volume(folder / "uncertainty.nii.gz"))
+    same(found.affine, nibabel.load(folder / "displacement.nii.gz").affine)
+    table = list(csv.reader(open(folder / "matches.csv")))
+    assert table[0] == "x y z dx dy dz ncc sigma kept".split()
+    expected = np.array(table[1:], float)
+    expected[:, 6] = expected[:, 6].astype(np.float32)
+    assert np.allclose(found.matches, expected, rtol=0, atol=1e-12)
+    for key in summary.keys() - set(TIMES):
+        assert found.summary[key] == summary[key], key
+
+
+def images(folder, *names):
+    return [nibabel.load(folder / f"{n}.nii.gz") for n in names]
+
+
+def test_field_equals_the_command_line_for_images_arrays_and_paths(shell, pair):
+    summary = shell.summary("field")
+    given = images(pair, "initial", "deformed", "mask")
+    check_field(palpate.field(*given), shell.folder / "field", summary)
+    check_field(palpate.field(*[pair / f"{n}.nii.gz" for n in ("initial", "deformed", "mask")]), shell.folder / "field", summary)
+    arrays = palpate.field(*[(np.asarray(i.dataobj), i.affine) for i in given], threads=1)
+    same(lps(arrays.displacement), volume(shell.folder / "field/displacement.nii.gz")[:, :, :, 0, :])
+    assert arrays.inputs == {"initial": "initial", "deformed": "deformed", "mask": "mask"}
+
+
+def test_summary_is_had_by_name(shell, pair):
+    found = palpate.field(*images(pair, "initial", "deformed", "mask"), preset="fast", seed=3)
+    assert found.params["preset"] == "fast" and found.params["seed"] == 3
+    assert found.counts["kept"] == int(found.matches[:, 8].sum())
+    with pytest.raises(AttributeError, match="displacement_mean_mm"):
+        found.no_such_key
+
+
+def test_arrays_are_taken_as_they_come(pair):
+    initial, deformed = images(pair, "initial", "deformed")
+    kinds = [np.float64, np.int16, np.float32]
+    order = [np.ascontiguousarray, np.asfortranarray, np.asfortranarray]
+    found = [
+        palpate.field(*[(o(np.asarray(i.dataobj, k)), i.affine) for i in (initial, deformed)], preset="fast").displacement
+        for k, o in zip(kinds, order)
+    ]
+    same(found[0], found[1])
+    same(found[0], found[2])
+    given = np.asfortranarray(initial.dataobj, np.float32)
+    before = given.copy()
+    palpate.field((given, initial.affine), deformed, preset="fast")
+    same(given, before)
+
+
+def test_stiffness_fingertip_and_grasp_equal_the_command_line(shell, pad, tmp_path):
+    folder, elastic = pad
+    field = palpate.field(*images(folder, "initial", "deformed", "mask"))
+    check_field(field, shell.folder / "pad-field", shell.summary("pad-field"))
+    found = palpate.stiffness(
+        field,
+        labels=folder / "labels.nii.gz",
+        names=elastic["names"],
+        held=elastic["held"],
+        load=elastic["load"],
+        force=elastic["force_n"],
+        nodes=1500,
+    )
+    results = shell.folder / "pad-stiffness"
+    for name in ("stiffness", "stiffness_sd", "residual"):
+        same(getattr(found, name), volume(results / f"{name}.nii.gz"))
+    summary = shell.summary("pad-stiffness")
+    for key in summary.keys() - {"seconds", "inputs"}:
+        assert found.summary[key] == summary[key], key
+
+    tip = palpate.fingertip(found)
+    tip.save(tmp_path / "fingertip.toml", source="pad-stiffness")
+    assert (tmp_path / "fingertip.toml").read_bytes() == (shell.folder / "fingertip.toml").read_bytes()
+    assert tip.youngs_modulus > 0 and tip.radius > 0
+
+    scene = tmp_path / "scene.toml"
+    scene.write_text((ROOT / "examples/finger_pad.toml").read_text())
+    grasp = palpate.grasp(scene)
+    shell("grasp", scene, "-o", "grasp")
+    expected = shell.summary("grasp")
+    for key in ("completed", "events", "energy_drift", "constraint_drift", "stable_steps", "steps"):
+        assert grasp.summary[key] == expected[key], key
+    with open(shell.folder / "grasp/trajectory.csv") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == grasp.trajectory_columns and len(rows) - 1 == len(grasp.trajectory)
+
+
+def test_track_equals_the_command_line(shell):
+    shell("phantom", "pinch", "--frames", 3, "--size", 24, "-o", "pinch")
+    frames = [shell.folder / f"pinch/frame_{t:03}.nii.gz" for t in range(3)]
+    mask, labels = (shell.folder / f"pinch/{n}.nii.gz" for n in ("mask", "labels"))
+    shell("track", *frames, "--mask", mask, "--labels", labels, "-o", "tracked")
+    found = palpate.track([nibabel.load(f) for f in frames], mask=mask, labels=labels)
+    for t in range(3):
+        same(lps(found.displacement[t]), volume(shell.folder / f"tracked/displacement_{t:03}.nii.gz")[:, :, :, 0, :])
+    rows = list(csv.DictReader(open(shell.folder / "tracked/strain.csv")))
+    assert [f"{r['volume_change']:.6f}" for r in found.strain] == [r["volume_change"] for r in rows]
+    assert found.points == shell.summary("tracked")["points"]
+
+
+def test_errors_are_those_of_the_command_line(shell, pair):
+    initial, deformed = images(pair, "initial", "deformed")
+    far = initial.affine.copy()
+    far[0, 3] += 5000
+    nibabel.save(nibabel.Nifti1Image(np.asarray(deformed.dataobj), far), shell.folder / "far.nii.gz")
+    said = shell("field", pair / "initial.nii.gz", "far.nii.gz", "-o", "none", code=1).stderr
+    with pytest.raises(palpate.PalpateError) as caught:
+        palpate.field(initial, (np.asarray(deformed.dataobj), far))
+    assert str(caught.value) in said and "overlap" in str(caught.value)
+    said = shell("field", pair / "initial.nii.gz", "nowhere.nii.gz", "-o", "none", code=1).stderr
+    with pytest.raises(palpate.PalpateError) as caught:
+        palpate.field(initial, "nowhere.nii.gz")
+    assert str(caught.value) in said
+    cases = [
+        (lambda: palpate.field(initial, deformed, points=5), "points is 5"),
+        (lambda: palpate.field(initial, deformed, params={"pases": 3}), "pases"),
+        (lambda: palpate.field(initial, deformed, preset="quick"), "balanced"),
+        (lambda: palpate.field(initial, deformed, mask=(np.ones((4, 4, 4)), np.eye(4))), "mask"),
+        (lambda: palpate.field(initial, 3), "deformed: is no volume"),
+        (lambda: palpate.field((np.ones((4, 4)), np.eye(4)), deformed), "3 axes"),
+        (lambda: palpate.field((np.ones((4, 4, 4)), np.eye(2)), deformed), "4 x 4"),
+        (lambda: palpate.stiffness((np.zeros((4, 4, 4, 3)), np.eye(4))), "either labels or mask"),
+        (lambda: palpate.grasp("nowhere.toml"), "nowhere.toml"),
+        (lambda: palpate.track([initial]), "two at least"),
+    ]
+    for call, message in cases:
+        with pytest.raises(palpate.PalpateError, match=message):
+            call()
+
+
+def test_progress_is_told_and_what_it_raises_is_raised(pair):
+    given = images(pair, "initial", "deformed")
+    told = []
+    palpate.field(*given, preset="fast", progress=lambda stage, part: told.append((stage, part)))
+    assert len(told) > 3 and all(isinstance(s, str) and 0 <= p <= 1 for s, p in told)
+
+    def stop(stage, part):
+        raise RuntimeError("enough")
+
+    with pytest.raises(RuntimeError, match="enough"):
+        palpate.field(*given, preset="fast", progress=stop)
+
+
+def test_the_interpreter_is_free_meanwhile(pair):
+    given = images(pair, "initial", "deformed")
+    ended, beats = threading.Event(), []
+
+    def beat():
+        while not ended.is_set():
+            beats.append(time.monotonic())
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=beat)
+    thread.start()
+    start = time.monotonic()
+    palpate.field(*given, preset="accurate", threads=1)
+    end = time.monotonic()
+    ended.set()
+    thread.join()
+    inside = [b for b in beats if start <= b <= end]
+    assert len(inside) > 0.1 * (end - start) / 0.001, f"{len(inside)} beats in {end - start:.2f} s"
+
+
+def test_the_tutorial_runs(pad, tmp_path, monkeypatch, capsys):
+    folder, elastic = pad
+    for name, source in (("before", "initial"), ("after", "deformed"), ("mask", "mask"), ("labels", "labels")):
+        (tmp_path / f"{name}.nii.gz").write_bytes((folder / f"{source}.nii.gz").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    known = {"NAMES": elastic["names"], "HELD": elastic["held"], "LOAD": elastic["load"], "FORCE": elastic["force_n"]}
+    known["EXAMPLES"] = str(ROOT / "examples")
+    blocks = (ROOT / "docs/tutorial-python.md").read_text().split("```python\n")[1:]
+    assert len(blocks) == 8
+    for number, block in enumerate(blocks):
+        exec(compile(block.split("```")[0], f"tutorial block {number}", "exec"), known)
+    said = capsys.readouterr().out
+    assert "kPa" in said and "degrees" in said and (tmp_path / "displacement.nii.gz").exists()
