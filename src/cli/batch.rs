@@ -80,7 +80,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let outcomes: Vec<PairOutcome> = match collect {
         true => pairs.iter().map(|pair| collected(pair, output)).collect(),
         false => {
-            let free = io::free_memory();
+            let free = io::memory_left();
             let budget = memory.map(|gb| (1e9 * gb) as u64).or(free.map(|b| (SHARE * b as f64) as u64));
             // Where memory is not known, one at a time.
             let jobs = if budget.is_none() { 1 } else { jobs.map_or(rayon::current_num_threads(), usize::from) };

@@ -122,15 +122,3 @@ pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
 pub fn make_folder(path: impl AsRef<Path>) -> Result<(), IoError> {
     fs::create_dir_all(path.as_ref()).map_err(os(path.as_ref(), "create the folder"))
 }
-
-/// Memory that this process may still take (bytes): what the system has free, or its control group's limit if that is less.
-/// None where the system does not say.
-pub fn free_memory() -> Option<u64> {
-    let text = fs::read_to_string("/proc/meminfo").ok()?;
-    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
-    let free = line.split_whitespace().next()?.parse::<u64>().ok()? * 1024;
-    let number = |file: &str| fs::read_to_string(file).ok()?.trim().parse::<u64>().ok();
-    let limit = number("/sys/fs/cgroup/memory.max");
-    let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
-    Some(limit.map_or(free, |l| free.min(l.saturating_sub(used))))
-}

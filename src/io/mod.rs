@@ -66,7 +66,7 @@ mod deflate;
 
 mod gzip;
 
-pub use batch::{free_memory, make_folder, read_pairs, stamp, write_rows};
+pub use batch::{make_folder, read_pairs, stamp, write_rows};
 pub use chain::write_chain;
 pub use config::read_config;
 pub use csv::{

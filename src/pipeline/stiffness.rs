@@ -153,7 +153,7 @@ fn labelled(
     let map_sd = of_region(&|r| regions[r].sd);
     let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
     let noise = maps::noise(inputs.field, inputs.labels, |data, shape, keep| f64::from(noise_sigma(data, shape, keep)));
-    let mut warnings = maps::warnings(&fine, &regions, &mesh_change, params);
+    let mut warnings = maps::warnings(&fine, inputs.labels, &regions, &mesh_change, params);
     warnings.dedup();
     let patches = [0, 1].map(|i| {
         let p = &fine.patches[i];

@@ -1,6 +1,6 @@
 //! The Python module `palpate._palpate` (feature `python`): the pipelines on arrays.
 //!
-//! What a user imports is the package in `python/palpate`, which turns images into arrays and results into objects. Arrays
+//! What a user imports is the package in `src/python/palpate`, which turns images into arrays and results into objects. Arrays
 //! come in Fortran order (x fastest) and are read while the interpreter is held; all work is done without it. Numbers are
 //! rounded as the files of the command line keep them, so that both give the same bits.
 

@@ -81,11 +81,21 @@ pub fn prescribed(level: &Level, state: &State) -> Vec<Prescribed> {
 /// What to know before trusting the moduli.
 pub fn warnings(
     level: &Level,
+    labels: &Mask,
     regions: &[RegionStiffness],
     mesh_change: &[f64],
     params: &StiffnessParams,
 ) -> Vec<String> {
     let mut out = Vec::new();
+    for (r, voxels) in regions.iter().filter(|r| r.identifiable).map(|r| (r, thickness(labels, r.label))) {
+        if voxels < RESOLVED {
+            out.push(format!(
+                "{} is {voxels} voxels thick: a displacement measured from images does not resolve its strain, and its \
+                 modulus may be off by far more than stated; trust it only where the displacement is known better",
+                r.name
+            ));
+        }
+    }
     for r in regions.iter().filter(|r| !r.identifiable) {
         let bound = r.bound.unwrap_or("lower");
         out.push(format!("the data do not determine the modulus of {}: its value is a {bound} bound", r.name));
@@ -102,4 +112,44 @@ pub fn warnings(
         out.push(format!("Poisson's ratio {} is low for soft tissue, which is nearly incompressible", params.poisson));
     }
     out
+}
+
+/// Thickness (voxels) from which a field measured from images resolves a region: two of its lattice's steps.
+const RESOLVED: usize = 8;
+
+/// Thickness of a region where it is thickest (voxels), along the grid's axes: twice the largest number of steps to its border.
+fn thickness(labels: &Mask, label: u8) -> usize {
+    let (shape, inside) = (labels.grid().shape(), labels.as_slice());
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let thick: Vec<usize> = (0..3).filter(|&a| shape[a] > 1).collect();
+    let mut steps = vec![0u16; inside.len()];
+    let at = |index: usize, a: usize| index / stride[a] % shape[a];
+    // There and back over the volume: the city-block distance.
+    for index in (0..inside.len()).filter(|&i| inside[i] == label) {
+        let before = |a: &usize| if at(index, *a) > 0 { steps[index - stride[*a]] } else { 0 };
+        steps[index] = 1 + thick.iter().map(before).min().unwrap_or(0);
+    }
+    for index in (0..inside.len()).rev().filter(|&i| inside[i] == label) {
+        let after = |a: &usize| if at(index, *a) + 1 < shape[*a] { steps[index + stride[*a]] } else { 0 };
+        steps[index] = steps[index].min(1 + thick.iter().map(after).min().unwrap_or(0));
+    }
+    2 * usize::from(steps.into_iter().max().unwrap_or(0))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::types::{Affine, Grid};
+
+    #[test]
+    fn a_layer_is_as_thick_as_it_is() {
+        let grid = Grid::new([20, 18, 16], Affine::scaled([0.5; 3], [0.0; 3]).unwrap()).unwrap();
+        let layers = Mask::from_voxels(grid, |at, _| match grid.voxel(at) {
+            [3..17, 3..15, 2..6] => 1,
+            [3..17, 3..15, 6..14] => 2,
+            _ => 0,
+        });
+        assert_eq!([1, 2, 3].map(|label| thickness(&layers, label)), [4, 8, 0]);
+    }
 }
