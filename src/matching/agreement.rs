@@ -16,8 +16,8 @@ const FEWEST: f32 = 64.0;
 pub struct Agreement {
     /// Robust standard deviation of the residual (intensity), the unit of the misfit.
     sigma: f32,
-    /// Mean of `c^2 ln(1 + r^2 / (c sigma)^2)` over each block's voxels inside the mask; NaN where there are too few.
-    blocks: Vec<f32>,
+    /// Mean of `c^2 ln(1 + r^2 / (c sigma)^2)` over each block's voxels inside the mask; none where there are too few.
+    blocks: Vec<Option<f32>>,
 }
 
 impl Agreement {
@@ -29,7 +29,7 @@ impl Agreement {
         let [nx, ny, nz] = pair.shape;
         let [bx, by, bz] = pair.shape.map(|n| n.div_ceil(BLOCK));
         let cut = 1.0 / (CAUCHY * sigma);
-        let mut blocks = vec![f32::NAN; bx * by * bz];
+        let mut blocks = vec![None; bx * by * bz];
         blocks.par_chunks_mut(bx).enumerate().for_each(|(row, blocks)| {
             let [from_j, from_k] = [row % by, row / by].map(|b| b * BLOCK);
             let (mut a, mut b) = (vec![0.0; nx], vec![0.0; nx]);
@@ -50,7 +50,7 @@ impl Agreement {
             }
             for (block, [cost, count]) in blocks.iter_mut().zip(sums) {
                 if count >= FEWEST {
-                    *block = cost / count;
+                    *block = Some(cost / count);
                 }
             }
         });
@@ -65,6 +65,7 @@ impl Agreement {
     /// By how much the misfit of the worst block has grown since `before` (in that one's unit, squared), NaN without any
     /// block.
     pub fn worsened(&self, before: &Self) -> f32 {
-        self.blocks.iter().zip(&before.blocks).map(|(now, then)| now - then).fold(f32::NAN, f32::max)
+        let grown = |(now, then): (&Option<f32>, &Option<f32>)| Some((*now)? - (*then)?);
+        self.blocks.iter().zip(&before.blocks).filter_map(grown).fold(f32::NAN, f32::max)
     }
 }

@@ -281,8 +281,9 @@ fn canonical(
             .collect(),
     };
     progress("done", 1.0);
-    let sigma = uncertainty_median_mm / pyramid::finest(grid.shape(), grid.spacing());
-    let spline = Start { field, factor, searched: searched.map(|s| s.uncertain_by(sigma)) };
+    let voxel = pyramid::finest(grid.shape(), grid.spacing());
+    let searched = searched.map(|s| s.judged(uncertainty_median_mm, length.0, voxel));
+    let spline = Start { field, factor, searched };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 

@@ -226,7 +226,7 @@ pub fn page(outcomes: &[PairOutcome]) -> String {
         .collect();
     if !failed.is_empty() {
         let rows = table(&["Pair", "Stage", "Reason"], &failed);
-        let _ = write!(body, "<section><h2>What failed</h2><article class=\"wide\">{rows}</article></section>");
+        let _ = write!(body, "<section><h2>What failed</h2><article class=\"wide words\">{rows}</article></section>");
     }
     let spreads = spreads(outcomes);
     for unit in ["kPa", "ratio"] {
@@ -267,7 +267,7 @@ pub fn page(outcomes: &[PairOutcome]) -> String {
         .collect();
     let head = ["Pair", "Mean, mm", "Largest, mm", "Uncertainty, mm", "Matches kept", "To look at"];
     let rows = table(&head, &rows);
-    let _ = write!(body, "<section><h2>Pairs</h2><article class=\"wide\">{rows}</article></section>");
+    let _ = write!(body, "<section><h2>Pairs</h2><article class=\"wide words\">{rows}</article></section>");
     document("Cohort", &body)
 }
 
