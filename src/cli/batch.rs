@@ -14,7 +14,6 @@ use palpate::pipeline::plan;
 use palpate::report::batch as report;
 use palpate::types::batch::{Pair, PairOutcome, Status};
 use serde_json::{Value, json};
-use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -197,8 +196,7 @@ fn stages(pair: &Pair, folder: &Path, tuning: &[String], nodes: usize) -> Vec<St
 
 /// What may run at a time.
 struct Free {
-    waiting: VecDeque<usize>,
-    running: usize,
+    waiting: Vec<usize>,
     memory: u64,
 }
 
@@ -230,7 +228,7 @@ impl Batch<'_> {
             self.budget as f64 / 1e9,
             most as f64 / 1e9
         ));
-        let free = Mutex::new(Free { waiting: (0..self.pairs.len()).collect(), running: 0, memory: self.budget });
+        let free = Mutex::new(Free { waiting: (0..self.pairs.len()).collect(), memory: self.budget });
         let (ended, progress) = (Condvar::new(), self.console.progress());
         std::thread::scope(|scope| {
             for _ in 0..jobs {
@@ -247,7 +245,6 @@ impl Batch<'_> {
                             io::write_rows(output.join(TABLE), &report::COLUMNS, all.iter().map(report::row).collect());
                         drop(all);
                         let mut state = locked(&free);
-                        state.running -= 1;
                         state.memory += need;
                         ended.notify_all();
                     }
@@ -267,9 +264,8 @@ impl Batch<'_> {
             // What cannot run is told at once and takes nothing.
             let need = |i: usize| needs[i].as_ref().ok().copied().filter(|n| *n <= self.budget).unwrap_or(0);
             if let Some(at) = state.waiting.iter().position(|&i| need(i) <= state.memory) {
-                let index = state.waiting.remove(at)?;
+                let index = state.waiting.remove(at);
                 state.memory -= need(index);
-                state.running += 1;
                 return Some((index, need(index)));
             }
             state = ended.wait(state).unwrap_or_else(PoisonError::into_inner);

@@ -20,7 +20,6 @@ pub fn grid(grid: &Grid) -> String {
     format!("{} voxels of {size} mm", times(grid.shape()))
 }
 
-/// Bytes as megabytes or gigabytes.
 fn line(out: &mut String, key: &str, value: &str) {
     out.push_str(&format!("  {key:<12} {value}\n"));
 }

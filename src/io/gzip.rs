@@ -6,7 +6,7 @@
 use super::deflate::{FINISH, deflate};
 use flate2::Crc;
 use flate2::bufread::GzDecoder;
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, BufRead, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 
 /// No DEFLATE stream unpacks to more than this many times its size.
@@ -94,7 +94,7 @@ impl<'a, W: Write> Member<'a, W> {
 }
 
 /// The first `length` bytes, or fewer when there are no more or the stream is damaged.
-pub(super) fn peek(packed: &[u8], length: usize) -> Vec<u8> {
+pub(super) fn peek(packed: impl BufRead, length: usize) -> Vec<u8> {
     let mut head = Vec::new();
     // A damaged stream is reported by `unpack`; what came before the damage may already say what the file is.
     let _ = flate2::bufread::MultiGzDecoder::new(packed).take(length as u64).read_to_end(&mut head);

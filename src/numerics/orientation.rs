@@ -33,10 +33,8 @@ impl Orientation {
     /// The grid of the same voxels with canonical axes.
     pub fn canonical(&self, stored: &Grid) -> Grid {
         let shape = stored.shape();
-        let first = std::array::from_fn(|s| {
-            let a = self.axis.iter().position(|&x| x == s).unwrap_or(s);
-            if self.backwards[a] { (shape[s] - 1) as f64 } else { 0.0 }
-        });
+        let backwards = self.inverse().backwards;
+        let first = [0, 1, 2].map(|s| if backwards[s] { (shape[s] - 1) as f64 } else { 0.0 });
         let (linear, origin) = (stored.affine().linear(), stored.affine().to_world(VoxelPoint(first)).0);
         let rows = std::array::from_fn(|r| {
             let column = |a: usize| linear[r][self.axis[a]] * if self.backwards[a] { -1.0 } else { 1.0 };
@@ -47,8 +45,15 @@ impl Orientation {
         Grid::new(self.axis.map(|s| shape[s]), affine).unwrap_or(*stored)
     }
 
-    /// Where the canonical voxel 0 lies among the stored ones, and the steps between them along canonical axes.
-    fn stored_steps(&self, stored: [usize; 3]) -> (isize, [isize; 3]) {
+    /// What takes the canonical grid for the stored one and back.
+    fn inverse(&self) -> Self {
+        let from = |s| self.axis.iter().position(|&x| x == s).unwrap_or(s);
+        let axis = [0, 1, 2].map(from);
+        Self { axis, backwards: axis.map(|a| self.backwards[a]) }
+    }
+
+    /// Where the canonical voxel 0 lies among those of the `stored` shape, and the steps between them along canonical axes.
+    fn steps(&self, stored: [usize; 3]) -> (isize, [isize; 3]) {
         let stride = [1, stored[0], stored[0] * stored[1]].map(|s| s as isize);
         let mut first = 0;
         let steps = std::array::from_fn(|a| {
@@ -64,30 +69,22 @@ impl Orientation {
     }
 
     /// Where the stored voxel 0 lies among the canonical ones, and the steps between them along stored axes.
-    fn canonical_steps(&self, stored: [usize; 3]) -> (isize, [isize; 3]) {
-        let shape = self.axis.map(|s| stored[s]);
-        let stride = [1, shape[0], shape[0] * shape[1]].map(|s| s as isize);
-        let (mut first, mut steps) = (0, [0; 3]);
-        for a in 0..3 {
-            let s = self.axis[a];
-            steps[s] = if self.backwards[a] { -stride[a] } else { stride[a] };
-            first += if self.backwards[a] { stride[a] * (shape[a] as isize - 1) } else { 0 };
-        }
-        (first, steps)
+    fn back(&self, stored: [usize; 3]) -> (isize, [isize; 3]) {
+        self.inverse().steps(self.axis.map(|s| stored[s]))
     }
 
     /// The same voxels on the canonical grid.
     pub fn turned<T: Copy + Default + Send + Sync>(&self, stored: &Volume<T>) -> Volume<T> {
         let grid = self.canonical(stored.grid());
         let mut out = Volume::filled(grid, T::default());
-        gather(stored.as_slice(), out.as_mut_slice(), grid.shape(), self.stored_steps(stored.grid().shape()));
+        gather(stored.as_slice(), out.as_mut_slice(), grid.shape(), self.steps(stored.grid().shape()));
         out
     }
 
     /// Voxels of the canonical grid, as they are stored on `grid`.
     pub fn stored<T: Copy + Default + Send + Sync>(&self, canonical: &Volume<T>, grid: &Grid) -> Volume<T> {
         let mut out = Volume::filled(*grid, T::default());
-        gather(canonical.as_slice(), out.as_mut_slice(), grid.shape(), self.canonical_steps(grid.shape()));
+        gather(canonical.as_slice(), out.as_mut_slice(), grid.shape(), self.back(grid.shape()));
         out
     }
 
@@ -95,14 +92,14 @@ impl Orientation {
     pub fn stored_field(&self, canonical: &DenseField, grid: &Grid) -> DenseField {
         let mut out = DenseField::zeros(*grid);
         for (c, part) in out.as_mut_slice().chunks_exact_mut(grid.len()).enumerate() {
-            gather(canonical.component(c), part, grid.shape(), self.canonical_steps(grid.shape()));
+            gather(canonical.component(c), part, grid.shape(), self.back(grid.shape()));
         }
         out
     }
 
     /// The canonical offset of a stored voxel.
     pub fn offset(&self, stored: [usize; 3], voxel: [usize; 3]) -> usize {
-        let (first, steps) = self.canonical_steps(stored);
+        let (first, steps) = self.back(stored);
         (first + (0..3).map(|a| voxel[a] as isize * steps[a]).sum::<isize>()) as usize
     }
 }

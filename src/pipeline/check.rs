@@ -4,6 +4,7 @@ use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::quantile;
 use crate::types::{Mask, Volume};
+use rayon::prelude::*;
 use std::borrow::Cow;
 
 /// What a measurement works on.
@@ -28,17 +29,16 @@ pub struct Checked<'a> {
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
 pub fn inputs<'a>(initial: &'a Volume, deformed: &'a Volume, mask: Option<&Mask>) -> Result<Checked<'a>, FieldError> {
-    for (volume, v) in [("initial", initial), ("deformed", deformed)] {
+    let ranges = [initial, deformed].map(Range::of);
+    for ((volume, v), range) in [("initial", initial), ("deformed", deformed)].into_iter().zip(&ranges) {
         let refuse = |what: &str, hint: &str| Err(FieldError::Volume { volume, what: what.into(), hint: hint.into() });
         if v.grid().shape().iter().filter(|&&n| n < 2).count() > 1 {
             return refuse("is a line of voxels", "give a volume or one slice");
         }
-        let finite = || v.as_slice().iter().copied().filter(|x| x.is_finite());
-        let (lo, hi) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), x| (lo.min(x), hi.max(x)));
-        if lo > hi {
+        if range.low > range.high {
             return refuse("has no finite voxel", "check how it was exported");
         }
-        if lo == hi {
+        if range.low == range.high {
             return refuse("is constant, so nothing can be matched", "check that it is the right file");
         }
     }
@@ -47,8 +47,9 @@ pub fn inputs<'a>(initial: &'a Volume, deformed: &'a Volume, mask: Option<&Mask>
         let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
         return Err(FieldError::Volume { volume: "mask", what, hint });
     }
-    let (mut first, second) = (filled(initial), filled(deformed));
-    let not_finite = [initial, deformed].map(|v| v.as_slice().iter().filter(|x| !x.is_finite()).count());
+    let not_finite = ranges.each_ref().map(|r| r.not_finite);
+    let fill = |volume, bad| if bad == 0 { Cow::Borrowed(volume) } else { Cow::Owned(filled(volume)) };
+    let (mut first, second) = (fill(initial, not_finite[0]), fill(deformed, not_finite[1]));
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
     if not_finite[0] > 0 {
         first.to_mut().as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
@@ -58,20 +59,42 @@ pub fn inputs<'a>(initial: &'a Volume, deformed: &'a Volume, mask: Option<&Mask>
             }
         }
     }
-    let (initial, spread) = in_range(first, None);
-    let (deformed, _) = in_range(second, Some(spread));
+    let (initial, spread) = in_range(first, &ranges[0], None);
+    let (deformed, _) = in_range(second, &ranges[1], Some(spread));
     Ok(Checked { mask, initial, deformed, not_finite })
+}
+
+/// What a volume's voxels reach.
+struct Range {
+    /// Of the finite voxels.
+    low: f32,
+    high: f32,
+    not_finite: usize,
+}
+
+impl Range {
+    fn of(volume: &Volume) -> Self {
+        let none = || Self { low: f32::INFINITY, high: f32::NEG_INFINITY, not_finite: 0 };
+        let with = |r: Self, &v: &f32| match v.is_finite() {
+            true => Self { low: r.low.min(v), high: r.high.max(v), ..r },
+            false => Self { not_finite: r.not_finite + 1, ..r },
+        };
+        let both = |a: Self, b: Self| Self {
+            low: a.low.min(b.low),
+            high: a.high.max(b.high),
+            not_finite: a.not_finite + b.not_finite,
+        };
+        let parts = volume.as_slice().par_chunks(1 << 16);
+        parts.map(|part| part.iter().fold(none(), with)).reduce(none, both)
+    }
 }
 
 /// Finite neighbours that a voxel without a number needs to get one.
 const AROUND: usize = 13;
 
 /// With numbers in single voxels that have none, from the finite ones around them.
-fn filled(volume: &Volume) -> Cow<'_, Volume> {
+fn filled(volume: &Volume) -> Volume {
     let values = volume.as_slice();
-    if values.iter().all(|v| v.is_finite()) {
-        return Cow::Borrowed(volume);
-    }
     let (grid, mut out) = (*volume.grid(), volume.clone());
     let shape = grid.shape();
     // In one slice there are 8 around a voxel, not 26.
@@ -87,28 +110,27 @@ fn filled(volume: &Volume) -> Cow<'_, Volume> {
         }
         out.as_mut_slice()[at] = if count >= least { (sum / count as f64) as f32 } else { f32::NAN };
     }
-    Cow::Owned(out)
+    out
 }
 
 /// Spreads of the intensities that are worked on as they are.
-const RANGE: std::ops::Range<f64> = 1e-3..1e7;
+const SPREADS: std::ops::Range<f64> = 1e-3..1e7;
 /// Distance from 0, in spreads, up to which they are.
 const FAR: f64 = 100.0;
 
 /// With intensities that can be squared and summed in single precision, and with their spread, which comes near to `like`:
 /// gains between the volumes are bounded, and noise is measured in the initial one alone.
-fn in_range(volume: Cow<'_, Volume>, like: Option<f64>) -> (Cow<'_, Volume>, f64) {
+fn in_range<'a>(volume: Cow<'a, Volume>, range: &Range, like: Option<f64>) -> (Cow<'a, Volume>, f64) {
     let values = volume.as_slice();
-    let finite = || values.iter().copied().filter(|v| v.is_finite());
-    let (low, high) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
     let mut sample: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
     sample.retain(|v| v.is_finite());
     let [a, b] = [0.001, 0.999].map(|q| f64::from(quantile(&mut sample, q)));
-    let whole = f64::from(high) - f64::from(low);
+    let [low, high] = [range.low, range.high].map(f64::from);
+    let whole = high - low;
     let spread = if b > a { b - a } else { whole };
-    let furthest = f64::from(low).abs().max(f64::from(high).abs());
+    let furthest = low.abs().max(high.abs());
     let alike = like.is_none_or(|l| (l / spread).log2().abs() < 0.5);
-    if RANGE.contains(&spread) && furthest <= FAR * spread && alike {
+    if SPREADS.contains(&spread) && furthest <= FAR * spread && alike {
         return (volume, spread);
     }
     // Far outliers are drawn in, so that their squares stay finite.

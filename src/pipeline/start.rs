@@ -86,9 +86,10 @@ pub(super) struct Begun {
 /// The coarsest level of a search that may start from `known` fields.
 ///
 /// `refine` brings a start to the residual, `search` matches the whole volume.
+///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
-/// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field, stillness and the known fields compete, and
-/// the one that ends at the better agreement goes on; None when there is none.
+/// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
+/// stillness and the known fields compete, and the one that ends at the better agreement goes on; None when there is none.
 pub(super) fn begin(
     pair: &Pair<'_>,
     lattice: &Lattice,

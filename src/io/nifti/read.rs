@@ -9,7 +9,7 @@ use crate::io::voxels::{self, Kind};
 use crate::io::{gzip, os};
 use crate::types::Grid;
 use std::fs::{self, File};
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// The grid and the values of a scalar volume.
@@ -25,12 +25,7 @@ pub(in crate::io) fn field(path: &Path, flat: bool) -> Result<(Grid, Vec<f32>, I
 
 /// What the header says about the file, and its intent.
 pub(in crate::io) fn header(path: &Path) -> Result<(Stored, i64), IoError> {
-    let (mut file, size, mut head) = open(path)?;
-    let packed = gzip::is_gzip(&head);
-    if packed {
-        file.read_to_end(&mut head).map_err(os(path, "read"))?;
-        head = gzip::peek(&head, LONGEST);
-    }
+    let Opened { size, head, packed, .. } = open(path)?;
     let describe = || {
         let header = Header::parse(&head)?;
         let axes = header.axes()?;
@@ -108,8 +103,17 @@ fn flat_field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
 
 type Layout = fn(&Header, [usize; 7]) -> Result<usize, Flaw>;
 
-/// A regular file, its size and its first bytes, at most [`LONGEST`].
-pub(super) fn open(path: &Path) -> Result<(File, u64, Vec<u8>), IoError> {
+/// A regular file, to be read from its start.
+pub(super) struct Opened {
+    pub(super) file: File,
+    /// As it is stored.
+    pub(super) size: u64,
+    /// The first bytes, unpacked, at most [`LONGEST`].
+    pub(super) head: Vec<u8>,
+    pub(super) packed: bool,
+}
+
+pub(super) fn open(path: &Path) -> Result<Opened, IoError> {
     // Before it is opened: opening a pipe waits for who writes into it.
     let metadata = fs::metadata(path).map_err(os(path, "read"))?;
     if !metadata.is_file() {
@@ -118,33 +122,31 @@ pub(super) fn open(path: &Path) -> Result<(File, u64, Vec<u8>), IoError> {
     let mut file = File::open(path).map_err(os(path, "read"))?;
     let mut head = Vec::new();
     file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
-    Ok((file, metadata.len(), head))
+    let packed = gzip::is_gzip(&head);
+    if packed {
+        head = gzip::peek(head.chain(BufReader::new(&mut file)), LONGEST);
+    }
+    file.rewind().map_err(os(path, "read"))?;
+    Ok(Opened { file, size: metadata.len(), head, packed })
 }
 
 /// The grid and all values, component after component; `layout` judges the axes and gives the number of components.
 fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
-    let (mut file, size, mut head) = open(path)?;
-    let packed = if gzip::is_gzip(&head) {
-        file.read_to_end(&mut head).map_err(os(path, "read"))?;
-        let packed = std::mem::take(&mut head);
-        head = gzip::peek(&packed, LONGEST);
-        Some(packed)
-    } else {
-        None
-    };
-
+    let Opened { mut file, size, head, packed } = open(path)?;
     let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
     let values = match packed {
-        Some(packed) => {
-            let most = (packed.len() as u64).saturating_mul(gzip::LARGEST_RATIO);
+        true => {
+            let most = size.saturating_mul(gzip::LARGEST_RATIO);
             let end = plan.end_within(most).map_err(|flaw| flaw.at(path))?;
+            let mut packed = Vec::new();
+            file.read_to_end(&mut packed).map_err(os(path, "read"))?;
             let data = gzip::unpack(&packed, end).map_err(|e| {
                 Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again").at(path)
             })?;
             plan.end_within(data.len() as u64).map_err(|flaw| flaw.at(path))?;
             decode(&plan, &data[plan.start as usize..end])
         }
-        None => {
+        false => {
             let end = plan.end_within(size).map_err(|flaw| flaw.at(path))?;
             let mut data = vec![0; end - plan.start as usize];
             file.seek(SeekFrom::Start(plan.start))

@@ -1,7 +1,7 @@
 //! A series of volumes in one file, read one at a time.
 
-use super::header::{Header, LONGEST};
-use super::read::{Plan, decode, open};
+use super::header::Header;
+use super::read::{Opened, Plan, decode, open};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
 use crate::io::{gzip, os};
@@ -28,8 +28,9 @@ enum Source {
 }
 
 impl Source {
-    fn packed(path: &Path) -> io::Result<Self> {
-        Ok(Self::Packed(Box::new(MultiGzDecoder::new(BufReader::with_capacity(1 << 18, File::open(path)?))), 0))
+    /// From the file's start.
+    fn packed(file: File) -> Self {
+        Self::Packed(Box::new(MultiGzDecoder::new(BufReader::with_capacity(1 << 18, file))), 0)
     }
 }
 
@@ -40,18 +41,10 @@ impl Series {
     /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of these.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, IoError> {
         let path = path.as_ref();
-        let (file, size, mut head) = open(path)?;
-        let (source, most) = if gzip::is_gzip(&head) {
-            head.clear();
-            let mut start = Source::packed(path).map_err(os(path, "read"))?;
-            if let Source::Packed(unpacked, _) = &mut start {
-                // A damaged stream is reported when it is read; what came before may already say what the file is.
-                let _ = unpacked.take(LONGEST as u64).read_to_end(&mut head);
-            }
-            let fresh = Source::packed(path).map_err(os(path, "read"))?;
-            (fresh, size.saturating_mul(gzip::LARGEST_RATIO))
-        } else {
-            (Source::Plain(file), size)
+        let Opened { file, size, head, packed } = open(path)?;
+        let (source, most) = match packed {
+            true => (Source::packed(file), size.saturating_mul(gzip::LARGEST_RATIO)),
+            false => (Source::Plain(file), size),
         };
         let header = Header::parse(&head).map_err(|flaw| flaw.at(path))?;
         let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
@@ -99,7 +92,7 @@ impl Series {
             Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again").at(path)
         };
         if matches!(self.source, Source::Packed(_, done) if done > from) {
-            self.source = Source::packed(path).map_err(os(path, "read"))?;
+            self.source = Source::packed(File::open(path).map_err(os(path, "read"))?);
         }
         match &mut self.source {
             Source::Plain(file) => {
