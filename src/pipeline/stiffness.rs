@@ -54,8 +54,10 @@ pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
 pub(super) const COARSE: f64 = 0.3;
 /// Side of the mesh's cubes at the rim of a punch (voxels); nodes lie at half of it.
 const RIM: f64 = 2.0;
-/// Part of the nodes that is left for the rest of the body then.
-const ELSEWHERE: f64 = 0.6;
+/// Parts of the nodes that are tried for the rest of the body then.
+const ELSEWHERE: [f64; 5] = [0.7, 0.4, 0.25, 0.15, 0.08];
+/// Nodes over the limit at most, where a mesh can be had.
+const OVER: f64 = 1.1;
 /// Precision of forward solutions on the fine mesh (mm).
 const PRECISION: f64 = 1e-5;
 
@@ -100,9 +102,21 @@ fn labelled(
     let mut coarse = level(&coarse_mesh)?;
     let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance());
     let meshed = |nodes: f64, size: f64| {
-        let nodes = if rim.is_empty() { nodes } else { ELSEWHERE * nodes };
-        let fineness = Fineness::for_nodes(volume, nodes as usize);
-        mesh_labels_finer(inputs.labels, &fineness, &rim, size * coarse.voxel)
+        if rim.is_empty() {
+            return mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize));
+        }
+        // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
+        let mut best = None;
+        for elsewhere in ELSEWHERE {
+            let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
+            let mesh = mesh_labels_finer(inputs.labels, &fineness, &rim, size * coarse.voxel)?;
+            let count = mesh.nodes().len() as f64 / nodes;
+            let rank = if count <= OVER { -count } else { count };
+            if best.as_ref().is_none_or(|(least, _)| rank < *least) {
+                best = Some((rank, mesh));
+            }
+        }
+        best.map_or_else(|| mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize)), |b| Ok(b.1))
     };
     let fine_mesh = meshed(params.nodes as f64, RIM)?;
     if !rim.is_empty() {
@@ -121,6 +135,7 @@ fn labelled(
     for i in 0..2 {
         fine.patches[i].contact = coarse.patches[i].contact;
     }
+    fine.edge_like(&coarse);
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
     let estimate = release(&mut fine, choice.law, params.poisson, reference, estimate, 3, PRECISION)?;
@@ -197,7 +212,7 @@ fn labelled(
         samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
         labelled: inputs.labelled,
         regions,
-        mesh: fine_mesh,
+        mesh: fine.moved(fine_mesh)?,
     })
 }
 

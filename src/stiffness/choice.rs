@@ -2,7 +2,8 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::contact::released;
-use crate::stiffness::identify::{Estimate, State};
+use crate::stiffness::geometry::edge_step;
+use crate::stiffness::identify::Estimate;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
@@ -14,6 +15,13 @@ pub const MARGIN: f64 = 10.0;
 const COARSE: f64 = 1e-4;
 /// Iterations at most on the coarse mesh.
 const ITERATIONS: usize = 12;
+
+/// Moves of a punch's edge at most.
+const MOVES: usize = 4;
+/// Length of one at most (voxels): the difference that it is taken from is linear about as far.
+const LONGEST: f64 = 2.0;
+/// Shorter ones are left to the last step with all offsets (voxels).
+const SETTLED: f64 = 0.1;
 
 /// What was chosen on the coarse mesh.
 #[derive(Debug)]
@@ -106,9 +114,12 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
     }
     let mut law = first;
     estimate = release(level, law, poisson, reference, estimate, ITERATIONS, COARSE)?;
+    estimate = settle(level, law, poisson, reference, estimate)?;
     if wanted != LawChoice::Linear && first == Law::Linear {
-        let start = State { x: None, ..estimate.state.clone() };
+        let start = estimate.state.clone();
+        let edge = level.edge.map_or(0.0, |e| e.1);
         let large = level.setup(Law::NeoHookean, poisson, reference).run(start, ITERATIONS, COARSE)?;
+        let large = settle(level, Law::NeoHookean, poisson, reference, large)?;
         let samples = estimate.effective.min(large.effective);
         let scores = [&estimate, &large].map(|e| bic(e.squares, samples, e.parameters));
         let better = scores[1] + MARGIN < scores[0];
@@ -131,6 +142,8 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         if better {
             law = Law::NeoHookean;
             estimate = release(level, law, poisson, reference, large, ITERATIONS, COARSE)?;
+        } else {
+            level.move_edge(edge);
         }
     } else {
         evidence.push(Evidence {
@@ -144,6 +157,27 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         });
     }
     Ok(Choice { law, estimate, evidence })
+}
+
+/// Moves the edge of a punch to where the data put it, and identifies again, until it stays.
+///
+/// # Errors
+/// As [`crate::stiffness::identify::Setup::run`].
+fn settle(
+    level: &mut Level,
+    law: Law,
+    poisson: f64,
+    reference: usize,
+    mut estimate: Estimate,
+) -> Result<Estimate, StiffnessError> {
+    for _ in 0..MOVES {
+        let step = edge_step(&level.setup(law, poisson, reference), &estimate, &level.grid)?;
+        let Some((step, (_, moved))) = step.zip(level.edge).filter(|(step, _)| step.abs() > SETTLED) else { break };
+        level.move_edge(moved + step.clamp(-LONGEST, LONGEST));
+        let start = estimate.state.clone();
+        estimate = level.setup(law, poisson, reference).run(start, ITERATIONS, COARSE)?;
+    }
+    Ok(estimate)
 }
 
 /// Lets go what a curved body's plate would have to pull, and identifies again, a few times.

@@ -15,6 +15,10 @@ use rayon::prelude::*;
 const TIE: f64 = 1e8;
 /// Newton steps at most for one load.
 const STEPS: usize = 25;
+/// A tangent is kept while a step is at most this part of the one before.
+const CONTRACTS: f64 = 0.2;
+/// A tangent serves for derivatives at a solution this part of the largest displacement away: about their relative error.
+const STALE: f64 = 0.01;
 /// Elements computed together.
 const CHUNK: usize = 256;
 
@@ -38,8 +42,8 @@ pub struct Solution<'a> {
     pub x: Vec<f64>,
     /// The factorised tangent.
     pub factor: Factor<'a>,
-    /// Newton steps taken.
-    pub steps: usize,
+    /// Factorisations that it took.
+    pub factorisations: usize,
 }
 
 /// One forward problem.
@@ -167,7 +171,7 @@ impl<'a> Problem<'a> {
             x.iter_mut().for_each(|v| *v = -*v);
             let factor = self.factorise(&zero)?;
             factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
-            return Ok(Solution { x, factor, steps: 1 });
+            return Ok(Solution { x, factor, factorisations: 1 });
         }
         if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision).ok()) {
             return Ok(done);
@@ -217,15 +221,17 @@ impl<'a> Problem<'a> {
         all.fold(0.0, |m: f64, v| m.max(v.abs()))
     }
 
+    /// Newton's method that keeps a factorised tangent as long as it contracts.
     fn newton(&self, mut x: Vec<f64>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
-        let mut last = f64::INFINITY;
+        let mut factor = Some(self.factorise(&x)?);
+        let (mut factorisations, mut last, mut moved, mut fresh) = (1, f64::INFINITY, 0.0, true);
         for steps in 1..=STEPS {
-            let factor = self.factorise(&x)?;
+            let Some(tangent) = &factor else { break };
             let mut step = self.residual(&x).ok_or(StiffnessError::InsideOut)?;
             step.iter_mut().for_each(|v| *v = -*v);
-            factor.solve(&mut step).map_err(|_| StiffnessError::Unsolvable)?;
+            tangent.solve(&mut step).map_err(|_| StiffnessError::Unsolvable)?;
             let mut part = 1.0;
-            let moved = loop {
+            x = loop {
                 let trial: Vec<f64> = x.iter().zip(&step).map(|(a, b)| a + part * b).collect();
                 if self.residual(&trial).is_some() {
                     break trial;
@@ -235,13 +241,23 @@ impl<'a> Problem<'a> {
                     return Err(StiffnessError::InsideOut);
                 }
             };
-            x = moved;
             let size = self.size(&step);
-            if part == 1.0 && (size < precision || (size < 1e-3 && size * size / last.max(1e-300) < 0.1 * precision)) {
-                return Ok(Solution { x, factor, steps });
-            }
+            moved += part * size;
+            let done =
+                part == 1.0 && (size < precision || (size < 1e-3 && size * size / last.max(1e-300) < 0.1 * precision));
             if steps > 4 && size > 2.0 * last {
                 break;
+            }
+            let slow = part < 1.0 || (!fresh && size > CONTRACTS * last);
+            let stale = moved > STALE * self.size(&x);
+            fresh = if done { stale } else { slow };
+            if fresh {
+                drop(factor.take()); // its memory is the next one's
+                factor = Some(self.factorise(&x)?);
+                (factorisations, moved) = (factorisations + 1, 0.0);
+            }
+            if let Some(factor) = factor.take_if(|_| done) {
+                return Ok(Solution { x, factor, factorisations });
             }
             last = size;
         }

@@ -1,18 +1,28 @@
-//! Flat faces that a voxel map tells to half a voxel only.
+//! What a voxel map or a field tells of the body's shape to a part of a voxel only: flat faces, and the edge of a punch.
 //!
 //! A flat face along the voxels' axes lies anywhere within one voxel: 0.29 voxel, one standard deviation (a curved one crosses
 //! the voxels at all heights, and is known much better). A plate half a voxel away from where the mesh has it changes strain
 //! and modulus by a percent or two. So each such face gets an offset of its own, with that prior, and is fitted together
 //! with moduli and plates in one Gauss-Newton step on the coarse mesh; its columns are differences of two solutions.
+//!
+//! Where the surface beside a flat punch is free, strain under its edge is singular, and a thin layer there hangs on where
+//! the edge is. A field tells that to half a voxel at best, and rounds it where it was measured from images. So the edge has an
+//! offset as well, all around.
 
 use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
 use crate::stiffness::observations::find;
+use crate::stiffness::patches::Patch;
+use crate::types::space::dot;
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
 /// One standard deviation of a flat face (voxels): uniform over one voxel.
 const FACE: f64 = 0.288_675;
+/// One standard deviation of the edge of a punch (voxels).
+const EDGE: f64 = 3.0;
+/// Free surface beside a punch at least (voxels).
+const BESIDE: f64 = 3.0;
 /// Least part of the box's face that a flat face fills.
 const FLAT: f64 = 0.2;
 /// Samples (components) for each independent one, at least: on a body of a few hundred cubic voxels' size the errors of a
@@ -23,10 +33,100 @@ const FADE: i32 = 4;
 /// Precision of the solutions (mm).
 const PRECISION: f64 = 1e-6;
 
-/// What the faces' offsets change.
+/// What has an offset.
+#[derive(Debug, Clone, Copy)]
+enum Part {
+    /// A flat face: voxel axis, and whether it is the upper one.
+    Face(usize, bool),
+    /// The edge of the loaded patch.
+    Edge(Edge),
+}
+
+impl Part {
+    /// One standard deviation (voxels).
+    fn sigma(self) -> f64 {
+        match self {
+            Part::Face(..) => FACE,
+            Part::Edge(_) => EDGE,
+        }
+    }
+
+    fn name(self) -> String {
+        match self {
+            Part::Face(axis, upper) => format!("{}{axis}", if upper { '+' } else { '-' }),
+            Part::Edge(_) => "edge".into(),
+        }
+    }
+
+    /// The body with this part moved outwards by `offset` voxels.
+    fn moved(self, body: &Body, grid: &Grid, offset: f64) -> Body {
+        match self {
+            Part::Face(axis, upper) => shifted(body, grid, axis, upper, offset),
+            Part::Edge(edge) => {
+                let voxel = grid.spacing().into_iter().fold(f64::INFINITY, f64::min);
+                body.with_places(body.places.iter().map(|p| edge.widened(*p, offset * voxel)).collect())
+            }
+        }
+    }
+}
+
+/// The edge of a flat punch.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Edge {
+    middle: [f64; 3],
+    normal: [f64; 3],
+    /// Of the punch (mm): of a round one, or between the half side and the half diagonal of a square one.
+    radius: f64,
+    /// Distance from the edge over which the surface beside it gives way (mm).
+    beside: f64,
+}
+
+impl Edge {
+    /// None where a patch is curved, or reaches to the end of its side. `voxel` is the least voxel size (mm).
+    pub fn of(patch: &Patch, body: &Body, voxel: f64) -> Option<Self> {
+        if patch.bend() > 0.0 {
+            return None;
+        }
+        let mut edge =
+            Self { middle: patch.middle, normal: patch.normal, radius: 2f64.sqrt() * patch.radius, beside: 0.0 };
+        let upright = body.surface.iter().filter(|f| dot(f.normal, patch.normal).abs() < 0.5);
+        let near = |p: &[f64; 3]| edge.apart(*p).1.abs() < edge.radius;
+        let places = upright.flat_map(|f| f.nodes).map(|n| body.places[n as usize]).filter(near);
+        let end = places.map(|p| length(edge.apart(p).0)).fold(f64::INFINITY, f64::min);
+        edge.beside = (end - edge.radius).min(edge.radius);
+        (edge.beside > BESIDE * voxel).then_some(edge)
+    }
+
+    /// Of the punch (mm).
+    pub fn radius(&self) -> f64 {
+        self.radius
+    }
+
+    /// Across and along the normal from the middle of the patch (mm).
+    fn apart(&self, p: [f64; 3]) -> ([f64; 3], f64) {
+        let d: [f64; 3] = std::array::from_fn(|a| p[a] - self.middle[a]);
+        let height = dot(d, self.normal);
+        (std::array::from_fn(|a| d[a] - height * self.normal[a]), height)
+    }
+
+    /// Where `p` comes to lie when the punch is wider by `offset` (mm) all around: what is below moves less and less.
+    pub fn widened(&self, p: [f64; 3], offset: f64) -> [f64; 3] {
+        let (across, height) = self.apart(p);
+        let beyond = ((length(across) - self.radius) / self.beside).clamp(0.0, 1.0);
+        let below = (height.abs() / self.radius).min(1.0);
+        let part = (1.0 - beyond).powi(2) * (1.0 + 2.0 * beyond) * (1.0 - below).powi(2);
+        std::array::from_fn(|a| p[a] + offset * part * across[a] / self.radius)
+    }
+}
+
+fn length(v: [f64; 3]) -> f64 {
+    dot(v, v).sqrt()
+}
+
+/// What the offsets change.
 #[derive(Debug, Clone, Default)]
 pub struct Geometry {
-    /// The faces, as `+0` ... by voxel axis, and their offsets outwards (voxels).
+    /// Faces, as `+0` ... by voxel axis, and `edge`, and their offsets outwards (voxels).
     pub faces: Vec<(String, f64)>,
     /// Change of all parameters, then the offsets (voxels).
     pub step: Vec<f64>,
@@ -36,19 +136,39 @@ pub struct Geometry {
     pub force_slope: Vec<f64>,
 }
 
-/// Fits the faces' offsets about an estimate; none when the body has no flat face.
+/// Fits the offsets about an estimate; none when the body has no flat face and no punch.
 ///
 /// # Errors
 /// As [`Setup::run`].
 pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option<Geometry>, StiffnessError> {
-    let faces = flat_faces(setup.body, grid);
-    let Some(x) = estimate.state.x.as_deref().filter(|_| !faces.is_empty()) else { return Ok(None) };
+    let mut parts = flat_faces(setup.body, grid);
+    parts.extend(setup.edge.map(|(edge, _)| Part::Edge(edge)));
+    offsets(setup, estimate, grid, &parts)
+}
+
+/// How much further outwards the edge of the punch lies (voxels), for all that the data say; none where there is no such edge.
+///
+/// # Errors
+/// As [`Setup::run`].
+pub fn edge_step(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option<f64>, StiffnessError> {
+    let Some((edge, _)) = setup.edge else { return Ok(None) };
+    Ok(offsets(setup, estimate, grid, &[Part::Edge(edge)])?.map(|g| g.faces[0].1))
+}
+
+/// Fits the offsets of some parts about an estimate.
+fn offsets(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    grid: &Grid,
+    parts: &[Part],
+) -> Result<Option<Geometry>, StiffnessError> {
+    let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
     let mut rows = estimate.rows.clone();
     let factor = setup.problem(&estimate.state).factorise(x)?;
     let mut force_slope = Vec::new();
-    for &(axis, positive) in &faces {
-        let body = shifted(setup.body, grid, axis, positive, FACE);
+    for part in parts {
+        let body = part.moved(setup.body, grid, FACE);
         let found = find(&body, &places);
         let moved = Setup { body: &body, ..setup.clone() };
         let problem = moved.problem(&estimate.state);
@@ -69,7 +189,9 @@ pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option
     }
     let p = rows.len();
     let mut prior = setup.prior_terms(&estimate.state);
-    prior.extend(faces.iter().map(|_| (FACE.powi(-2), 0.0)));
+    // The edge has been moved already.
+    let moved = |part: &Part| if matches!(part, Part::Edge(_)) { setup.edge.map_or(0.0, |e| e.1) } else { 0.0 };
+    prior.extend(parts.iter().map(|part| (part.sigma().powi(-2), moved(part))));
     let scale = setup.scale(&estimate.residuals);
     let weights = setup.weights(&estimate.residuals, scale);
     // Residuals hang together: as many independent samples as the estimate found, and no more than a model that knows the
@@ -97,18 +219,17 @@ pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option
     let blocks = grouped_normal(setup.observations, &rows, &rest, &weights);
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
     let (covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
-    let first = p - faces.len();
-    if step[first..].iter().any(|v| v.abs() > 1.0) {
-        // Beyond a voxel it is not the face that is wrong.
+    let first = p - parts.len();
+    if step[first..].iter().zip(parts).any(|(v, part)| (v + moved(part)).abs() > 3.5 * part.sigma()) {
+        // So far beyond what a voxel map leaves open it is not the shape that is wrong.
         return Ok(None);
     }
-    let name = |k: usize| format!("{}{}", if faces[k].1 { '+' } else { '-' }, faces[k].0);
-    let faces = (0..faces.len()).map(|k| (name(k), step[first + k])).collect();
+    let faces = parts.iter().zip(&step[first..]).map(|(part, offset)| (part.name(), *offset)).collect();
     Ok(Some(Geometry { faces, step, covariance, force_slope }))
 }
 
 /// Box faces (voxel axis, positive side) that the surface fills by [`FLAT`] or more.
-fn flat_faces(body: &Body, grid: &Grid) -> Vec<(usize, bool)> {
+fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part> {
     let voxel = |p: [f64; 3]| grid.affine().to_voxel(WorldPoint(p)).0;
     let [low, high] = bounds(body, grid);
     let spacing = grid.spacing();
@@ -121,7 +242,7 @@ fn flat_faces(body: &Body, grid: &Grid) -> Vec<(usize, bool)> {
             let on = |n: &u32| (voxel(body.places[*n as usize])[axis] - end).abs() < 0.3;
             let flat: f64 = body.surface.iter().filter(|f| f.nodes[..3].iter().all(on)).map(|f| f.area).sum();
             if flat > FLAT * area {
-                out.push((axis, positive));
+                out.push(Part::Face(axis, positive));
             }
         }
     }

@@ -9,6 +9,7 @@ use crate::numerics::cholesky::Cholesky;
 use crate::numerics::statistics::percentile;
 use crate::stiffness::body::Body;
 use crate::stiffness::forward::{Problem, Solution, Tie};
+use crate::stiffness::geometry::Edge;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::Patch;
@@ -49,6 +50,8 @@ pub struct Setup<'a> {
     pub plate_prior: f64,
     /// The model's own error (in units of the observations' sigma): no residual is taken to be smaller.
     pub floor: f64,
+    /// The edge of a punch, and how far it has been moved outwards (voxels).
+    pub edge: Option<(Edge, f64)>,
     /// A region whose ln(mu / mu_reference) is not free, and its value.
     pub pinned: Option<(usize, f64)>,
 }
@@ -226,7 +229,7 @@ impl Setup<'_> {
         }
         let mut factorisations = 0;
         let (mut problem, mut solution) = self.solve(&state, precision)?;
-        factorisations += solution.steps;
+        factorisations += solution.factorisations;
         let mut residuals = self.residuals(&solution.x);
         let mut iterations = 0;
         loop {
@@ -234,6 +237,8 @@ impl Setup<'_> {
             let scale = self.scale(&residuals);
             let weights = self.weights(&residuals, scale);
             let columns = self.sensitivities(&problem, &solution)?;
+            let Solution { x, factor, .. } = solution;
+            drop(factor); // before the next one
             let (normal, right) = self.normal(&columns, &residuals, &weights);
             let (variance, prior) = (scale * scale, self.prior_terms(&state));
             let mut a: Vec<f64> = normal.iter().map(|v| v / variance).collect();
@@ -248,7 +253,7 @@ impl Setup<'_> {
             let mut part = if longest > LONGEST { LONGEST / longest } else { 1.0 };
             let plates = step[free.len()..].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
             if longest < FIRST_ORDER && plates < FIRST_ORDER * self.travel() {
-                let end = self.advanced(&state, &solution.x, &columns, &step);
+                let end = self.advanced(&state, &x, &columns, &step);
                 let rows = self.rows(&columns);
                 let rest = (0..residuals.len()).map(|i| {
                     let fell = |a: usize| (0..parameters).map(|k| step[k] * rows[k][i][a]).sum::<f64>();
@@ -258,16 +263,16 @@ impl Setup<'_> {
                 return self.finish(end, &problem, columns, rest, iterations, factorisations);
             }
             if iterations > most {
-                state.x = Some(solution.x);
+                state.x = Some(x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             }
             let before = self.squares(&residuals, &weights) / variance + self.prior(&state);
             let mut best = None;
             for _ in 0..4 {
                 let shorter: Vec<f64> = step.iter().map(|s| part * s).collect();
-                let trial = self.advanced(&state, &solution.x, &columns, &shorter);
+                let trial = self.advanced(&state, &x, &columns, &shorter);
                 if let Ok((p, s)) = self.solve(&trial, precision) {
-                    factorisations += s.steps;
+                    factorisations += s.factorisations;
                     let rest = self.residuals(&s.x);
                     let after = self.squares(&rest, &weights) / variance + self.prior(&trial);
                     if after <= before * (1.0 + 1e-9) || part < 0.2 {
@@ -278,7 +283,7 @@ impl Setup<'_> {
                 part *= 0.4;
             }
             let Some((trial, p, s, rest, after)) = best else {
-                state.x = Some(solution.x);
+                state.x = Some(x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             };
             let stalled = after > before * (1.0 - 1e-7);

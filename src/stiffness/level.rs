@@ -2,12 +2,15 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::neighbours::Neighbours;
+use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
+use crate::stiffness::elements::locate;
+use crate::stiffness::geometry::Edge;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::{Observation, find, from_field, from_matches};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
 use crate::types::stiffness::Law;
-use crate::types::{DenseField, Mask, QuadraticMesh, SparseField};
+use crate::types::{DenseField, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
 
 /// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
 const FLOOR: f64 = 0.005;
@@ -31,6 +34,12 @@ pub struct Level {
     pub sharp_error: f64,
     /// Least voxel size (mm).
     pub voxel: f64,
+    /// The voxels.
+    pub grid: Grid,
+    /// The edge of a punch, and how far it has been moved outwards (voxels).
+    pub edge: Option<(Edge, f64)>,
+    /// Node places before that (mm, RAS).
+    unmoved: Vec<[f64; 3]>,
 }
 
 impl Level {
@@ -57,7 +66,11 @@ impl Level {
         if observations.len() < NEEDED {
             return Err(StiffnessError::TooFew { found: observations.len(), needed: NEEDED });
         }
+        let edge = Edge::of(&patches[1], &body, voxel).map(|edge| (edge, 0.0));
         Ok(Self {
+            unmoved: body.places.clone(),
+            grid: *field.grid(),
+            edge,
             body,
             observations,
             block,
@@ -73,6 +86,38 @@ impl Level {
         patches::on_plane(self.voxel, self.sharp_error)
     }
 
+    /// Moves the edge of the punch: `outwards` voxels from where the surface's motion put it.
+    pub fn move_edge(&mut self, outwards: f64) {
+        let Some((edge, moved)) = &mut self.edge else { return };
+        *moved = outwards;
+        let place = |p: &[f64; 3]| edge.widened(*p, outwards * self.voxel);
+        self.body = self.body.with_places(self.unmoved.iter().map(place).collect());
+        let places: Vec<[f64; 3]> = self.observations.iter().map(|o| o.place).collect();
+        for (o, found) in self.observations.iter_mut().zip(find(&self.body, &places)) {
+            // What is within rounding of the surface stays in its element.
+            (o.element, o.weights) = found.unwrap_or((o.element, o.weights));
+        }
+    }
+
+    /// Moves the edge of the punch so that it is as large as on another mesh, whose facets end elsewhere.
+    pub fn edge_like(&mut self, other: &Level) {
+        let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
+        if let Some((edge, _)) = self.edge {
+            self.move_edge(edge.radius() / self.voxel * ((asked / own).sqrt() - 1.0));
+        }
+    }
+
+    /// The mesh as the edge was moved.
+    pub fn moved(&self, mesh: QuadraticMesh) -> Result<QuadraticMesh, StiffnessError> {
+        match self.edge {
+            Some((_, moved)) if moved != 0.0 => {
+                let nodes = self.body.places.iter().map(|p| WorldPoint(*p)).collect();
+                Ok(QuadraticMesh::new(nodes, mesh.tetrahedra().to_vec(), mesh.labels().to_vec())?)
+            }
+            _ => Ok(mesh),
+        }
+    }
+
     /// The identification on this mesh.
     pub fn setup(&self, law: Law, poisson: f64, reference: usize) -> Setup<'_> {
         Setup {
@@ -85,6 +130,7 @@ impl Level {
             // The surface motion is extrapolated by half a voxel; the plate may be off by as much of the motion's change.
             plate_prior: 0.25 * self.voxel + 3.0 * self.surface_error,
             floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
+            edge: self.edge,
             pinned: None,
         }
     }
@@ -105,23 +151,25 @@ impl Level {
         let x = state.x.as_ref().map(|old| {
             let found = find(&from.body, &self.body.places);
             let near = Neighbours::new(&from.body.places);
+            let mut holder = vec![0u32; from.body.places.len()];
+            for (e, nodes) in from.body.cells.iter().enumerate() {
+                nodes.iter().for_each(|&m| holder[m as usize] = e as u32);
+            }
+            // Beside the body an element at the nearest node is carried on.
+            let beside = |p: [f64; 3]| {
+                let &m = near.within(p, f64::INFINITY, 1).first()?;
+                let nodes = &from.body.cells[holder[m] as usize];
+                let l = locate(&nodes.map(|n| from.body.places[n as usize]), p)?;
+                Some((holder[m], shapes(l))).filter(|_| l.iter().all(|v| *v > -1.0))
+            };
             let mut x = vec![0.0; self.body.pattern.unknowns()];
             for (n, f) in found.into_iter().enumerate() {
-                let u = match f {
-                    Some((e, w)) => {
-                        let nodes = &from.body.cells[e as usize];
-                        let mut u = [0.0; 3];
-                        for (&m, w) in nodes.iter().zip(w) {
-                            let v = from.body.displacement(old, m);
-                            (0..3).for_each(|a| u[a] += w * v[a]);
-                        }
-                        u
-                    }
-                    None => near
-                        .within(self.body.places[n], f64::INFINITY, 1)
-                        .first()
-                        .map_or([0.0; 3], |&m| from.body.displacement(old, m as u32)),
-                };
+                let Some((e, w)) = f.or_else(|| beside(self.body.places[n])) else { continue };
+                let mut u = [0.0; 3];
+                for (&m, w) in from.body.cells[e as usize].iter().zip(w) {
+                    let v = from.body.displacement(old, m);
+                    (0..3).for_each(|a| u[a] += w * v[a]);
+                }
                 let at = self.body.pattern.first(n as u32);
                 x[at..at + 3].copy_from_slice(&u);
             }
