@@ -5,7 +5,7 @@ use crate::mesh::tetrahedral::{Fineness, mesh_labels, mesh_labels_finer, pieces}
 use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
-use crate::stiffness::choice::{choose, release};
+use crate::stiffness::choice::{choose, touch};
 use crate::stiffness::identify::State;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
@@ -38,7 +38,7 @@ pub struct Inputs<'a> {
 }
 
 /// Matches that a body must hold for them to be taken unasked: with fewer, what lies between them is not seen.
-pub const ENOUGH: usize = 1000;
+pub const ENOUGH: usize = 120;
 
 /// Kept matches in the body.
 pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
@@ -138,7 +138,7 @@ fn labelled(
     fine.edge_like(&coarse);
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
-    let estimate = release(&mut fine, choice.law, params.poisson, reference, estimate, 3, PRECISION)?;
+    let estimate = touch(&mut fine, choice.law, params.poisson, reference, estimate, 3, PRECISION)?;
     clock.book("fine");
 
     progress("uncertainty", 0.9);

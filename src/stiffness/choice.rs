@@ -1,7 +1,7 @@
 //! No more model than the data ask for: contact, law and number of regions by evidence.
 
 use crate::error::StiffnessError;
-use crate::stiffness::contact::released;
+use crate::stiffness::contact::adjusted;
 use crate::stiffness::geometry::edge_step;
 use crate::stiffness::identify::Estimate;
 use crate::stiffness::level::Level;
@@ -16,6 +16,8 @@ const COARSE: f64 = 1e-4;
 /// Iterations at most on the coarse mesh.
 const ITERATIONS: usize = 12;
 
+/// Contacts of a curved body with the plate that are tried at most.
+const CONTACTS: usize = 20;
 /// Moves of a punch's edge at most.
 const MOVES: usize = 4;
 /// Length of one at most (voxels): the difference that it is taken from is linear about as far.
@@ -113,7 +115,7 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         level.patches[i].contact = contact[i];
     }
     let mut law = first;
-    estimate = release(level, law, poisson, reference, estimate, ITERATIONS, COARSE)?;
+    estimate = touch(level, law, poisson, reference, estimate, ITERATIONS, COARSE)?;
     estimate = settle(level, law, poisson, reference, estimate)?;
     if wanted != LawChoice::Linear && first == Law::Linear {
         let start = estimate.state.clone();
@@ -141,7 +143,7 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         }
         if better {
             law = Law::NeoHookean;
-            estimate = release(level, law, poisson, reference, large, ITERATIONS, COARSE)?;
+            estimate = touch(level, law, poisson, reference, large, ITERATIONS, COARSE)?;
         } else {
             level.move_edge(edge);
         }
@@ -180,11 +182,12 @@ fn settle(
     Ok(estimate)
 }
 
-/// Lets go what a curved body's plate would have to pull, and identifies again, a few times.
+/// Finds where a curved body touches the plate, and identifies again, until neither changes: at fixed moduli, what the plate
+/// would pull is let go, and what goes through it touches it.
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-pub fn release(
+pub fn touch(
     level: &mut Level,
     law: Law,
     poisson: f64,
@@ -193,21 +196,25 @@ pub fn release(
     iterations: usize,
     precision: f64,
 ) -> Result<Estimate, StiffnessError> {
-    let flat = level.patches[1].bend() == 0.0;
-    for _ in 0..4 {
-        if flat {
+    let mut seen = vec![level.patches[1].facets.clone()];
+    while level.patches[1].bend() > 0.0 && seen.len() < CONTACTS {
+        let before = seen.len();
+        let mut state = estimate.state.clone();
+        while seen.len() < CONTACTS {
+            let setup = level.setup(law, poisson, reference);
+            let x = state.x.as_deref().unwrap_or_default();
+            let next = adjusted(&setup.problem(&state), &level.patches[1], &state.plates[1], x, level.voxel);
+            // Facets on the edge that come and go are as well on either side.
+            let Some(patch) = next.filter(|p| !seen.contains(&p.facets)) else { break };
+            seen.push(patch.facets.clone());
+            level.patches[1] = patch;
+            let solved = level.setup(law, poisson, reference).solve(&state, precision)?.1.x;
+            state.x = Some(solved);
+        }
+        if seen.len() == before {
             break;
         }
-        let next = {
-            let setup = level.setup(law, poisson, reference);
-            let problem = setup.problem(&estimate.state);
-            let x = estimate.state.x.clone().unwrap_or_default();
-            released(&problem, &level.patches[1], &x)
-        };
-        let Some(patch) = next else { break };
-        level.patches[1] = patch;
-        let start = estimate.state.clone();
-        estimate = level.setup(law, poisson, reference).run(start, iterations, precision)?;
+        estimate = level.setup(law, poisson, reference).run(state, iterations, precision)?;
     }
     Ok(estimate)
 }

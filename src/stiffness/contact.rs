@@ -6,6 +6,7 @@ use crate::stiffness::elements::jacobian;
 use crate::stiffness::forward::Problem;
 use crate::stiffness::law::stress;
 use crate::stiffness::patches::Patch;
+use crate::types::space::dot;
 
 /// Normal stress (kPa, tension positive) of the solution `x` on each facet of a patch, from the element behind it.
 pub fn normal_stress(problem: &Problem<'_>, patch: &Patch, x: &[f64]) -> Vec<f64> {
@@ -29,9 +30,9 @@ pub fn normal_stress(problem: &Problem<'_>, patch: &Patch, x: &[f64]) -> Vec<f64
     patch.facets.iter().map(one).collect()
 }
 
-/// The patch without facets under tension beyond 5 % of the mean pressure that share no edge with one under pressure
-/// only; none when nothing changes or too little would be left.
-pub fn released(problem: &Problem<'_>, patch: &Patch, x: &[f64]) -> Option<Patch> {
+/// The patch without facets under tension beyond 5 % of the mean pressure, and with those around it that went through the
+/// plate; none when nothing changes or too little would be left. `change` are the plate's parameters, `voxel` in mm.
+pub fn adjusted(problem: &Problem<'_>, patch: &Patch, change: &[f64], x: &[f64], voxel: f64) -> Option<Patch> {
     let body = problem.body;
     let stress = normal_stress(problem, patch, x);
     let area = |i: usize| body.surface[patch.facets[i]].area;
@@ -39,8 +40,28 @@ pub fn released(problem: &Problem<'_>, patch: &Patch, x: &[f64]) -> Option<Patch
     let mean: f64 = (0..stress.len()).map(|i| -stress[i] * area(i)).sum::<f64>() / total;
     let pulled: Vec<usize> =
         (0..stress.len()).filter(|&i| stress[i] > 0.05 * mean.abs()).map(|i| patch.facets[i]).collect();
-    if pulled.is_empty() || 4 * pulled.len() > 3 * stress.len() {
+    if 4 * pulled.len() > 3 * stress.len() {
         return None;
     }
-    Some(patch.restricted(body, |f| pulled.binary_search(&f).is_err()))
+    let through = |f: &usize| {
+        let facet = &body.surface[*f];
+        let beyond = |n: &u32| {
+            patch.beyond(body.places[*n as usize], body.displacement(x, *n), change) > THROUGH * voxel
+        };
+        patch.facets.binary_search(f).is_err()
+            && dot(facet.normal, patch.normal) > 0.3
+            && facet.nodes.iter().filter(|n| beyond(n)).count() >= 3
+    };
+    let added: Vec<usize> = (0..body.surface.len()).filter(through).collect();
+    if std::env::var("EDGE").is_ok() { eprintln!("contact: {} facets, {} pulled, {} through", patch.facets.len(), pulled.len(), added.len()); }
+    if pulled.is_empty() && added.is_empty() {
+        return None;
+    }
+    let mut facets: Vec<usize> = patch.facets.iter().copied().filter(|f| pulled.binary_search(f).is_err()).collect();
+    facets.extend(added);
+    facets.sort_unstable();
+    Some(patch.on_facets(body, facets))
 }
+
+/// A node this far (voxels) beyond the plate went through it.
+const THROUGH: f64 = 0.02;

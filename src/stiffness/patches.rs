@@ -101,6 +101,8 @@ pub struct Patch {
     rim: Vec<[f64; 3]>,
     /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
     pub residual: [f64; 2],
+    /// The plane onto which a curved patch comes: a point (mm) and its outward unit normal.
+    plane: Option<Plane>,
 }
 
 impl Patch {
@@ -175,19 +177,42 @@ impl Patch {
         self.facets.iter().map(|&f| body.surface[f].area).sum()
     }
 
-    /// The patch with only the facets of which `keep` holds.
-    pub fn restricted(&self, body: &Body, keep: impl Fn(usize) -> bool) -> Patch {
-        let mut out = self.clone();
-        out.facets.retain(|&f| keep(f));
-        let mut nodes: Vec<u32> = out.facets.iter().flat_map(|&f| body.surface[f].nodes).collect();
+    /// The patch on other facets (ascending). Nodes that it did not have come onto its plane.
+    pub fn on_facets(&self, body: &Body, facets: Vec<usize>) -> Patch {
+        let mut nodes: Vec<u32> = facets.iter().flat_map(|&f| body.surface[f].nodes).collect();
         nodes.sort_unstable();
         nodes.dedup();
-        let pick: Vec<usize> = nodes.iter().map(|n| self.nodes.partition_point(|m| m < n)).collect();
-        out.rim = pick.iter().map(|&i| self.rim[i]).collect();
-        out.guided = pick.iter().map(|&i| self.guided[i]).collect();
-        out.onto_plane = pick.iter().map(|&i| self.onto_plane[i]).collect();
-        out.nodes = nodes;
-        out
+        let known: Vec<Option<usize>> = nodes.iter().map(|n| self.nodes.binary_search(n).ok()).collect();
+        let pick = |values: &[[f64; 3]]| known.iter().map(|k| k.map_or([0.0; 3], |i| values[i])).collect();
+        let onto = |(n, k): (&u32, &Option<usize>)| match k {
+            Some(i) => self.onto_plane[*i],
+            None => self.to_plane(body.places[*n as usize]),
+        };
+        Patch {
+            rim: pick(&self.rim),
+            guided: pick(&self.guided),
+            onto_plane: nodes.iter().zip(&known).map(onto).collect(),
+            nodes,
+            facets,
+            ..self.clone()
+        }
+    }
+
+    /// The motion along the normal besides the plate's (mm) that brings a place onto the plane; 0 on a flat patch.
+    fn to_plane(&self, p: [f64; 3]) -> f64 {
+        match self.plane {
+            Some((q, normal)) if self.bend() > 0.0 => dot(sub(q, p), normal) - dot(self.motion(p), normal),
+            _ => 0.0,
+        }
+    }
+
+    /// How far beyond the plate a place is that moves by `u` (mm), with plate parameters `change`.
+    pub fn beyond(&self, p: [f64; 3], u: [f64; 3], change: &[f64]) -> f64 {
+        let mut plate = dot(self.motion(p), self.normal) + self.to_plane(p);
+        for (k, c) in change.iter().enumerate() {
+            plate += c * dot(self.basis(k, p), self.normal);
+        }
+        dot(u, self.normal) - plate
     }
 }
 
@@ -511,7 +536,7 @@ fn build(
         onto_plane.fill(0.0);
     }
     let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
-    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, onto_plane, rim, residual })
+    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, onto_plane, rim, residual, plane })
 }
 
 /// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.
