@@ -103,7 +103,13 @@ fn labelled(
     let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance());
     let meshed = |nodes: f64, size: f64| {
         if rim.is_empty() {
-            return mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize));
+            let mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize))?;
+            let count = mesh.nodes().len() as f64;
+            // Thin layers and a rough surface take more than a block does.
+            return match count <= OVER * nodes {
+                true => Ok(mesh),
+                false => mesh_labels(inputs.labels, &Fineness::for_nodes(volume, (nodes * nodes / count) as usize)),
+            };
         }
         // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
         let mut best = None;
@@ -132,10 +138,7 @@ fn labelled(
     clock.book("coarse");
 
     progress("fine", 0.4);
-    for i in 0..2 {
-        fine.patches[i].contact = coarse.patches[i].contact;
-    }
-    fine.edge_like(&coarse);
+    fine.touch_like(&coarse);
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
     let estimate = touch(&mut fine, choice.law, params.poisson, reference, estimate, 3, PRECISION)?;

@@ -16,6 +16,8 @@ const COARSE: f64 = 1e-4;
 /// Iterations at most on the coarse mesh.
 const ITERATIONS: usize = 12;
 
+/// Precision of the solutions that tell a contact (mm).
+const CONTACT: f64 = 1e-3;
 /// Contacts of a curved body with the plate that are tried at most.
 const CONTACTS: usize = 20;
 /// Moves of a punch's edge at most.
@@ -208,8 +210,8 @@ pub fn touch(
             let Some(patch) = next.filter(|p| !seen.contains(&p.facets)) else { break };
             seen.push(patch.facets.clone());
             level.patches[1] = patch;
-            let solved = level.setup(law, poisson, reference).solve(&state, precision)?.1.x;
-            state.x = Some(solved);
+            let setup = level.setup(law, poisson, reference);
+            state.x = Some(setup.problem(&state).displaced(state.x.as_deref(), CONTACT)?);
         }
         if seen.len() == before {
             break;

@@ -45,15 +45,13 @@ pub fn adjusted(problem: &Problem<'_>, patch: &Patch, change: &[f64], x: &[f64],
     }
     let through = |f: &usize| {
         let facet = &body.surface[*f];
-        let beyond = |n: &u32| {
-            patch.beyond(body.places[*n as usize], body.displacement(x, *n), change) > THROUGH * voxel
-        };
+        let beyond =
+            |n: &u32| patch.beyond(body.places[*n as usize], body.displacement(x, *n), change) > THROUGH * voxel;
         patch.facets.binary_search(f).is_err()
             && dot(facet.normal, patch.normal) > 0.3
             && facet.nodes.iter().filter(|n| beyond(n)).count() >= 3
     };
     let added: Vec<usize> = (0..body.surface.len()).filter(through).collect();
-    if std::env::var("EDGE").is_ok() { eprintln!("contact: {} facets, {} pulled, {} through", patch.facets.len(), pulled.len(), added.len()); }
     if pulled.is_empty() && added.is_empty() {
         return None;
     }

@@ -165,6 +165,18 @@ impl<'a> Problem<'a> {
     /// # Errors
     /// [`StiffnessError`] when no equilibrium is found.
     pub fn solve(&self, start: Option<&[f64]>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
+        self.reach(start, precision, STALE)
+    }
+
+    /// As [`Self::solve`], without a tangent for derivatives.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn displaced(&self, start: Option<&[f64]>, precision: f64) -> Result<Vec<f64>, StiffnessError> {
+        Ok(self.reach(start, precision, f64::INFINITY)?.x)
+    }
+
+    fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         let zero = vec![0.0; self.body.pattern.unknowns()];
         if self.law == Law::Linear {
             let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
@@ -173,7 +185,7 @@ impl<'a> Problem<'a> {
             factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
             return Ok(Solution { x, factor, factorisations: 1 });
         }
-        if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision).ok()) {
+        if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision, stale).ok()) {
             return Ok(done);
         }
         let mut x = zero;
@@ -182,7 +194,7 @@ impl<'a> Problem<'a> {
             let next = (reached + step).min(1.0);
             let mut part = self.clone();
             part.ties.iter_mut().for_each(|t| t.target = t.target.map(|v| v * next));
-            match part.newton(x.clone(), if next < 1.0 { 1e-3 } else { precision }) {
+            match part.newton(x.clone(), if next < 1.0 { 1e-3 } else { precision }, stale) {
                 Ok(done) if next >= 1.0 => return Ok(done),
                 Ok(done) => {
                     x = done.x;
@@ -221,8 +233,9 @@ impl<'a> Problem<'a> {
         all.fold(0.0, |m: f64, v| m.max(v.abs()))
     }
 
-    /// Newton's method that keeps a factorised tangent as long as it contracts.
-    fn newton(&self, mut x: Vec<f64>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
+    /// Newton's method that keeps a factorised tangent as long as it contracts. One that is further than `stale` (of the
+    /// largest displacement) from the solution is factorised again at the end.
+    fn newton(&self, mut x: Vec<f64>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         let mut factor = Some(self.factorise(&x)?);
         let (mut factorisations, mut last, mut moved, mut fresh) = (1, f64::INFINITY, 0.0, true);
         for steps in 1..=STEPS {
@@ -249,7 +262,7 @@ impl<'a> Problem<'a> {
                 break;
             }
             let slow = part < 1.0 || (!fresh && size > CONTRACTS * last);
-            let stale = moved > STALE * self.size(&x);
+            let stale = moved > stale * self.size(&x);
             fresh = if done { stale } else { slow };
             if fresh {
                 drop(factor.take()); // its memory is the next one's

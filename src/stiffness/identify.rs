@@ -6,6 +6,7 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::Cholesky;
+use crate::numerics::sparse::Factor;
 use crate::numerics::statistics::percentile;
 use crate::stiffness::body::Body;
 use crate::stiffness::forward::{Problem, Solution, Tie};
@@ -18,6 +19,8 @@ use crate::types::stiffness::Law;
 
 /// Steps below this (in ln E, and of the plates over their travel) are taken to first order: what that leaves out is 0.1 %.
 const FIRST_ORDER: f64 = 0.03;
+/// A tangent serves while no ln mu changes by more than this: about the relative error of the sensitivities.
+const SAME_TANGENT: f64 = 0.05;
 /// Largest change of ln mu in one step (1.5 converged from contrasts of 100).
 const LONGEST: f64 = 1.5;
 /// Bound of |ln(mu / mu_reference)|.
@@ -232,13 +235,15 @@ impl Setup<'_> {
         factorisations += solution.factorisations;
         let mut residuals = self.residuals(&solution.x);
         let mut iterations = 0;
+        // The moduli whose tangent is factorised.
+        let mut factorised = state.theta.clone();
         loop {
             iterations += 1;
             let scale = self.scale(&residuals);
             let weights = self.weights(&residuals, scale);
             let columns = self.sensitivities(&problem, &solution)?;
-            let Solution { x, factor, .. } = solution;
-            drop(factor); // before the next one
+            let Solution { x, factor: tangent, .. } = solution;
+            let mut tangent = Some(tangent);
             let (normal, right) = self.normal(&columns, &residuals, &weights);
             let (variance, prior) = (scale * scale, self.prior_terms(&state));
             let mut a: Vec<f64> = normal.iter().map(|v| v / variance).collect();
@@ -271,8 +276,14 @@ impl Setup<'_> {
             for _ in 0..4 {
                 let shorter: Vec<f64> = step.iter().map(|s| part * s).collect();
                 let trial = self.advanced(&state, &x, &columns, &shorter);
-                if let Ok((p, s)) = self.solve(&trial, precision) {
+                let change = trial.theta.iter().zip(&factorised).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                // A factor that is not good enough goes before the next one is made: two take twice the memory.
+                tangent.take_if(|_| change > SAME_TANGENT);
+                if let Ok((p, s)) = self.follow(&trial, tangent.take(), problem.spring, precision) {
                     factorisations += s.factorisations;
+                    if s.factorisations > 0 {
+                        factorised.clone_from(&trial.theta);
+                    }
                     let rest = self.residuals(&s.x);
                     let after = self.squares(&rest, &weights) / variance + self.prior(&trial);
                     if after <= before * (1.0 + 1e-9) || part < 0.2 {
@@ -294,6 +305,24 @@ impl Setup<'_> {
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             }
         }
+    }
+
+    /// Solves from a state nearby, with its tangent where one is given and leads there. The ties keep the tangent's `spring`:
+    /// the force is that times a gap which no step would close that is measured in mm.
+    fn follow<'a>(
+        &'a self,
+        state: &State,
+        tangent: Option<Factor<'a>>,
+        spring: f64,
+        precision: f64,
+    ) -> Result<(Problem<'a>, Solution<'a>), StiffnessError> {
+        if let (Some(factor), Some(x)) = (tangent, &state.x) {
+            let problem = Problem { spring, ..self.problem(state) };
+            if let Some(x) = problem.solve_near(x, &factor, precision) {
+                return Ok((problem, Solution { x, factor, factorisations: 0 }));
+            }
+        }
+        self.solve(state, precision)
     }
 
     fn sensitivities(&self, problem: &Problem<'_>, solution: &Solution<'_>) -> Result<Vec<f64>, StiffnessError> {

@@ -536,7 +536,21 @@ fn build(
         onto_plane.fill(0.0);
     }
     let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
-    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, onto_plane, rim, residual, plane })
+    Some(Patch {
+        name,
+        facets,
+        nodes,
+        normal,
+        middle,
+        radius,
+        rigid,
+        contact,
+        guided,
+        onto_plane,
+        rim,
+        residual,
+        plane,
+    })
 }
 
 /// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.

@@ -4,7 +4,7 @@ use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
 use crate::stiffness::choice::bic;
 use crate::stiffness::geometry::Geometry;
-use crate::stiffness::identify::{BOUND, Estimate, Setup, State};
+use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::law::stress;
 use crate::types::stiffness::RegionStiffness;
 
@@ -17,6 +17,8 @@ const INTERFACE: [f64; 2] = [0.006, 0.005];
 const RESOLVED: f64 = 0.1;
 /// Contrasts beyond e^this are checked against a rigid region (12).
 const HIGH: f64 = 2.5;
+/// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and labels leave open.
+const SEEN: f64 = 3.9;
 
 /// ln E of each region with gradient and covariance.
 #[derive(Debug, Clone)]
@@ -76,7 +78,7 @@ pub fn unseen(
         return Ok(None);
     }
     let side = if theta >= 0.0 { "lower" } else { "upper" };
-    if variance.sqrt() > VAGUE || theta.abs() > BOUND - 0.1 {
+    if variance.sqrt() > VAGUE || theta.abs() > SEEN {
         return Ok(Some(side));
     }
     // Far enough to be as good as rigid, near enough to be solved.
