@@ -16,7 +16,7 @@ const TIE: f64 = 1e8;
 /// Newton steps at most for one load.
 const STEPS: usize = 25;
 /// A tangent is kept while a step is at most this part of the one before.
-const CONTRACTS: f64 = 0.2;
+const CONTRACTS: f64 = 0.4;
 /// A tangent serves for derivatives at a solution this part of the largest displacement away: about their relative error.
 const STALE: f64 = 0.01;
 /// Elements computed together.

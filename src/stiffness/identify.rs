@@ -21,10 +21,13 @@ use crate::types::stiffness::Law;
 const FIRST_ORDER: f64 = 0.03;
 /// A tangent serves while no ln mu changes by more than this: about the relative error of the sensitivities.
 const SAME_TANGENT: f64 = 0.05;
+/// Steps that would lower the squares by less than this part of them are not worth a solution: about a third of a standard
+/// deviation. What the data hardly see (a rigid region) would else wander on.
+const SPENT: f64 = 1e-4;
 /// Largest change of ln mu in one step (1.5 converged from contrasts of 100).
 const LONGEST: f64 = 1.5;
-/// Bound of |ln(mu / mu_reference)|.
-pub const BOUND: f64 = 7.6;
+/// Bound of |ln(mu / mu_reference)| (200): beyond, a region is as good as rigid or empty.
+const BOUND: f64 = 5.3;
 /// Huber's constant (Huber 1981: 95 % efficiency for normal errors), times the root mean square length of three components.
 const HUBER: f64 = 1.345;
 /// Standard deviation of the prior of ln mu: weak, it only keeps what the data do not see from wandering.
@@ -252,7 +255,15 @@ impl Setup<'_> {
                 a[k * parameters + k] += prior[k].0;
                 step[k] -= prior[k].0 * prior[k].1;
             }
+            // What is at its bound and would go beyond stays there.
+            for (k, &r) in free.iter().enumerate() {
+                if state.theta[r] * step[k].signum() >= BOUND {
+                    (0..parameters).for_each(|j| (a[k * parameters + j], a[j * parameters + k]) = (0.0, 0.0));
+                    (a[k * parameters + k], step[k]) = (1.0, 0.0);
+                }
+            }
             let Some(factor) = Cholesky::new(a, parameters) else { return Err(StiffnessError::Unsolvable) };
+            let slope = step.clone();
             factor.solve(&mut step);
             let longest = step[..free.len()].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
             let mut part = if longest > LONGEST { LONGEST / longest } else { 1.0 };
@@ -267,7 +278,9 @@ impl Setup<'_> {
                 let rest = rest.collect();
                 return self.finish(end, &problem, columns, rest, iterations, factorisations);
             }
-            if iterations > most {
+            // What the step would still gain, to first order.
+            let gain = (0..parameters).map(|k| step[k] * slope[k]).sum::<f64>();
+            if iterations > most || gain < SPENT * self.squares(&residuals, &weights) / variance {
                 state.x = Some(x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             }
