@@ -2,11 +2,13 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::mesh::tetrahedral::{Fineness, mesh_labels};
+use palpate::pipeline::pressed::Pressed;
 use palpate::pipeline::stiffness::{Inputs, run};
 use palpate::stiffness::body::Body;
 use palpate::stiffness::forward::{Problem, Tie};
 use palpate::stiffness::law::Material;
 use palpate::stiffness::patches::Place;
+use palpate::synth::{PhantomKind, PhantomParams};
 use palpate::types::stiffness::{Contact, Law, LawChoice, Side};
 use palpate::types::{Affine, DenseField, Grid, Mask, QuadraticMesh, StiffnessParams, StiffnessResult, WorldPoint};
 use std::collections::HashSet;
@@ -336,4 +338,41 @@ fn results_do_not_depend_on_the_number_of_threads() {
     });
     assert_eq!(one.regions, two.regions);
     assert_eq!(one.displacement, two.displacement);
+}
+
+/// A phantom and its moduli from the exact displacement on a coarse mesh.
+fn phantom_moduli(kind: PhantomKind, size: usize, nodes: usize) -> (Pressed, StiffnessResult) {
+    let mut params = PhantomParams { seed: 21, ..PhantomParams::new(kind) };
+    let from = params.size;
+    params.size = from.map(|n| n * size / from[0]);
+    params.spacing = params.spacing.map(|s| s * from[0] as f64 / size as f64);
+    let body = Pressed::new(&params).unwrap();
+    let labels = body.phantom.stiffness.as_ref().unwrap().labels.clone();
+    let params = StiffnessParams { force_n: Some(body.force_n), nodes, ..Default::default() };
+    let result = body.measure(&body.phantom.truth, None, &labels, &params).unwrap();
+    (body, result)
+}
+
+#[test]
+fn layers_under_a_punch_are_told_though_the_edge_is_known_to_a_voxel_only() {
+    // With the edge where the surface's motion puts it the skin was 13 to 50 % off.
+    let (body, result) = phantom_moduli(PhantomKind::Slab, 72, 10_000);
+    assert_eq!(result.law, Law::NeoHookean, "{:?}", result.evidence);
+    for (r, bar) in result.regions.iter().zip([0.15, 0.05, 0.03]) {
+        let off = r.youngs_modulus / body.modulus(r.label) - 1.0;
+        assert!(r.identifiable && off.abs() < bar, "{} {off}", r.name);
+    }
+}
+
+#[test]
+fn a_fingertip_touches_the_plate_where_it_would_go_through_it() {
+    // With the contact as the field shows it the skin was 21 % off and the pulp 5.
+    let (body, result) = phantom_moduli(PhantomKind::Fingertip, 64, 15_000);
+    for (r, bar) in result.regions.iter().zip([0.12, 0.08]) {
+        let off = r.youngs_modulus / body.modulus(r.label) - 1.0;
+        assert!(r.identifiable && off.abs() < bar, "{} {off}", r.name);
+    }
+    let bone = &result.regions[2];
+    assert_eq!(bone.bound, Some("lower"), "{bone:?}");
+    assert!(bone.youngs_modulus < body.modulus(bone.label));
 }

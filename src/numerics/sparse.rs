@@ -461,4 +461,52 @@ mod tests {
         pattern.factorise(&values).unwrap().solve(&mut b).unwrap();
         assert!(b.iter().zip(&x).all(|(p, q)| (p - q).abs() < 1e-10));
     }
+
+    /// Elements of three nodes along a chain with some that reach far.
+    fn chain() -> (Vec<u32>, Vec<[f64; 3]>) {
+        let places: Vec<[f64; 3]> = (0..40).map(|i| [f64::from(i), f64::from(i * 7 % 5), 0.0]).collect();
+        let mut random = Random::new(3, 9);
+        let far = |i: u32, random: &mut Random| (i + 2 + random.uniform(0.0, 12.0) as u32).min(39);
+        let elements = (0..38).flat_map(|i| [i, i + 1, far(i, &mut random)]).collect();
+        (elements, places)
+    }
+
+    #[test]
+    fn a_cut_leaves_the_unknowns_of_nodes_on_both_sides() {
+        let (elements, places) = chain();
+        let width: Vec<u8> = (0..40).map(|n| 1 + n % 3).collect();
+        let centres = vec![[0.0; 3]; elements.len() / 3];
+        let spans = vec![[0; 2]; places.len()];
+        let mut dissection =
+            Dissection { elements: &elements, per: 3, centres, width: &width, spans, order: Vec::new() };
+        let part: Vec<u32> = (0..elements.len() as u32 / 3).collect();
+        let nodes: Vec<u32> = (0..40).filter(|n| elements.contains(n)).collect();
+        let sizes = dissection.cuts(&part, &nodes);
+        for c in 1..part.len() {
+            let on = |n: u32, range: std::ops::Range<usize>| elements[3 * range.start..3 * range.end].contains(&n);
+            let both = nodes.iter().filter(|&&n| on(n, 0..c) && on(n, c..part.len()));
+            let brute: i64 = both.map(|&n| i64::from(width[n as usize])).sum();
+            assert_eq!(sizes[c], brute, "{c}");
+        }
+    }
+
+    #[test]
+    fn a_factor_in_memory_used_before_is_as_good_as_the_first() {
+        let (elements, places) = chain();
+        let pattern = Pattern::new(elements, 3, &places, vec![1; 40]).unwrap();
+        let solved = |scale: f64| {
+            let mut values = pattern.zeros();
+            for e in 0..38 {
+                let m = [4.0, 1.0, 0.5, 1.0, 5.0, 0.2, 0.5, 0.2, 3.0].map(|v| scale * v);
+                pattern.add(&mut values, e, &m, 3);
+            }
+            let mut x = vec![1.0; pattern.unknowns()];
+            pattern.factorise(&values).unwrap().solve(&mut x).unwrap();
+            x
+        };
+        let first = solved(1.0);
+        let second = solved(3.0);
+        assert_eq!(solved(1.0), first);
+        assert!(first.iter().zip(&second).all(|(a, b)| (a - 3.0 * b).abs() < 1e-12));
+    }
 }

@@ -56,8 +56,10 @@ pub(super) const COARSE: f64 = 0.3;
 const RIM: f64 = 2.0;
 /// Parts of the nodes that are tried for the rest of the body then.
 const ELSEWHERE: [f64; 5] = [0.7, 0.4, 0.25, 0.15, 0.08];
+/// Times that side, where so many nodes are not to be had.
+const COARSER: [f64; 3] = [1.0, 1.5, 2.5];
 /// Nodes over the limit at most, where a mesh can be had.
-const OVER: f64 = 1.1;
+const OVER: f64 = 1.15;
 /// Precision of forward solutions on the fine mesh (mm).
 const PRECISION: f64 = 1e-5;
 
@@ -112,14 +114,19 @@ fn labelled(
             };
         }
         // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
-        let mut best = None;
-        for elsewhere in ELSEWHERE {
-            let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
-            let mesh = mesh_labels_finer(inputs.labels, &fineness, &rim, size * coarse.voxel)?;
-            let count = mesh.nodes().len() as f64 / nodes;
-            let rank = if count <= OVER { -count } else { count };
-            if best.as_ref().is_none_or(|(least, _)| rank < *least) {
-                best = Some((rank, mesh));
+        let mut best: Option<(f64, QuadraticMesh)> = None;
+        for coarser in COARSER {
+            for elsewhere in ELSEWHERE {
+                let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
+                let mesh = mesh_labels_finer(inputs.labels, &fineness, &rim, coarser * size * coarse.voxel)?;
+                let count = mesh.nodes().len() as f64 / nodes;
+                let rank = if count <= OVER { -count } else { count };
+                if best.as_ref().is_none_or(|(least, _)| rank < *least) {
+                    best = Some((rank, mesh));
+                }
+            }
+            if best.as_ref().is_some_and(|(rank, _)| *rank < 0.0) {
+                break;
             }
         }
         best.map_or_else(|| mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize)), |b| Ok(b.1))

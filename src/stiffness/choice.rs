@@ -27,6 +27,9 @@ const LONGEST: f64 = 2.0;
 /// Shorter ones are left to the last step with all offsets (voxels).
 const SETTLED: f64 = 0.1;
 
+/// A guided patch takes over what the field says along the plate, with its errors: the squares must fall by so much (in ln).
+const DECISIVE: f64 = 0.2;
+
 /// What was chosen on the coarse mesh.
 #[derive(Debug)]
 pub struct Choice {
@@ -74,26 +77,31 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
     let mut evidence = Vec::new();
     let names = candidates(level);
     let first = if wanted == LawChoice::NeoHookean { Law::NeoHookean } else { Law::Linear };
-    let mut tried: Vec<([Contact; 2], Estimate)> = Vec::new();
-    let mut failure = None;
+    let mut tried: Vec<([Contact; 2], Estimate, Patch)> = Vec::new();
+    let (mut failure, given) = (None, level.patches[1].clone());
     for &a in &names[0] {
         for &b in &names[1] {
             level.patches[0].contact = a;
+            level.patches[1] = given.clone();
             level.patches[1].contact = b;
             let setup = level.setup(first, poisson, reference);
-            match setup.run(setup.start(), ITERATIONS, COARSE) {
-                Ok(e) => tried.push(([a, b], e)),
+            let run = setup.run(setup.start(), ITERATIONS, COARSE);
+            match run.and_then(|e| touch(level, first, poisson, reference, e, ITERATIONS, COARSE)) {
+                Ok(e) => tried.push(([a, b], e, level.patches[1].clone())),
                 Err(e) => failure = Some(e),
             }
         }
     }
     let samples = tried.iter().map(|t| t.1.effective).fold(f64::INFINITY, f64::min);
     // A guided patch is given twelve numbers of its own.
-    let count =
-        |t: &([Contact; 2], Estimate)| t.1.parameters + 12 * t.0.iter().filter(|c| **c == Contact::Guided).count();
-    let score = |t: &([Contact; 2], Estimate)| bic(t.1.squares, samples, count(t));
+    let count = |t: &([Contact; 2], Estimate, Patch)| {
+        t.1.parameters + 12 * t.0.iter().filter(|c| **c == Contact::Guided).count()
+    };
+    let score = |t: &([Contact; 2], Estimate, Patch)| bic(t.1.squares, samples, count(t));
+    let guided = |t: &([Contact; 2], Estimate, Patch)| t.0.contains(&Contact::Guided);
+    let rank = |t| score(t) + if guided(t) { DECISIVE * samples } else { 0.0 };
     let best = (0..tried.len()).fold(None, |m: Option<usize>, i| match m {
-        Some(k) if score(&tried[k]) <= score(&tried[i]) => Some(k),
+        Some(k) if rank(&tried[k]) <= rank(&tried[i]) => Some(k),
         _ => Some(i),
     });
     let Some(best) = best else { return Err(failure.unwrap_or(StiffnessError::NoEquilibrium)) };
@@ -108,16 +116,17 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
             reason: match tried.len() {
                 1 => "both patches move as rigid bodies".into(),
                 _ if i == best => "explains the field best".into(),
+                _ if score(t) < score(&tried[best]) => {
+                    "hardly better, and takes the motion along the plate as given".into()
+                }
                 _ => "explains it less".into(),
             },
         });
     }
-    let (contact, mut estimate) = tried.swap_remove(best);
-    for i in 0..2 {
-        level.patches[i].contact = contact[i];
-    }
+    let (contact, mut estimate, loaded) = tried.swap_remove(best);
+    level.patches[0].contact = contact[0];
+    level.patches[1] = loaded;
     let mut law = first;
-    estimate = touch(level, law, poisson, reference, estimate, ITERATIONS, COARSE)?;
     estimate = settle(level, law, poisson, reference, estimate)?;
     if wanted != LawChoice::Linear && first == Law::Linear {
         let start = estimate.state.clone();
