@@ -102,7 +102,7 @@ fn labelled(
     let level =
         |mesh: &QuadraticMesh| Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load);
     let mut coarse = level(&coarse_mesh)?;
-    let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance());
+    let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
     let meshed = |nodes: f64, size: f64| {
         if rim.is_empty() {
             let mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize))?;

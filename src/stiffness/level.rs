@@ -33,6 +33,8 @@ pub struct Level {
     pub surface_error: f64,
     /// The same, read from nearer voxels (mm).
     pub sharp_error: f64,
+    /// Voxels around a surface node that are read for it.
+    pub near: f64,
     /// Least voxel size (mm).
     pub voxel: f64,
     /// The voxels.
@@ -78,6 +80,7 @@ impl Level {
             patches,
             surface_error: motion.error,
             sharp_error: motion.sharp_error,
+            near: motion.near,
             voxel,
         })
     }

@@ -21,6 +21,9 @@ const REACH: f64 = 3.0;
 /// Voxels that are read to tell whether a node touches the plate: fewer, as the edge of a punch is sharp.
 const NEAR: f64 = 1.8;
 
+/// Noise of that (voxels) beyond which it tells a touch worse than a reading from further around.
+const NOISY: f64 = 0.1;
+
 /// Where a patch is.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Place {
@@ -51,6 +54,8 @@ pub struct SurfaceMotion {
     pub sharp: Vec<Option<[f64; 3]>>,
     /// Median standard error of one component of that (mm).
     pub sharp_error: f64,
+    /// Voxels around a node that are read for it.
+    pub near: f64,
 }
 
 impl SurfaceMotion {
@@ -68,9 +73,12 @@ impl SurfaceMotion {
             (displacement, crate::numerics::statistics::percentile(&mut errors, 50.0))
         };
         let (displacement, error) = all(REACH);
-        let (near, sharp_error) = all(NEAR);
-        let sharp = near.into_iter().zip(&displacement).map(|(n, d)| n.or(*d)).collect();
-        Self { displacement, error, sharp, sharp_error }
+        let (read, sharp_error) = all(NEAR);
+        if sharp_error > NOISY * field.grid().spacing().into_iter().fold(f64::INFINITY, f64::min) {
+            return Self { sharp: displacement.clone(), displacement, error, sharp_error: error, near: REACH };
+        }
+        let sharp = read.into_iter().zip(&displacement).map(|(n, d)| n.or(*d)).collect();
+        Self { displacement, error, sharp, sharp_error, near: NEAR }
     }
 }
 

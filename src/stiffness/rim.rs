@@ -9,8 +9,6 @@ use crate::types::space::dot;
 use crate::types::{DenseField, Mask, VoxelPoint};
 use rayon::prelude::*;
 
-/// Voxels around a surface voxel that are read for its motion.
-const REACH: f64 = 1.8;
 /// Voxels on both sides of the rim, and below it, where the mesh is fine.
 const AROUND: i32 = 1;
 /// Columns of a patch beside a punch at least.
@@ -18,7 +16,9 @@ const WIDE: usize = 25;
 
 /// Places (grid mm: voxel index times spacing) around the rim of `patch`; empty for a patch on a curved surface, and where the
 /// whole side is pressed.
-pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64) -> Vec<[f64; 3]> {
+///
+/// A voxel's motion is read from those within `reach` (voxels), and is that of the plate within `tolerance` (mm).
+pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64, reach: f64) -> Vec<[f64; 3]> {
     if patch.bend() > 0.0 {
         return Vec::new();
     }
@@ -50,7 +50,7 @@ pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64) -> 
         let top = if up { all.rev().find(tissue) } else { all.find(tissue) }?;
         let at = index(top, i, j);
         let place = grid.world(at[0], at[1], at[2]).0;
-        let (moved, _) = at_surface(field, labels, place, REACH)?;
+        let (moved, _) = at_surface(field, labels, place, reach)?;
         let plate = patch.motion(place);
         let short: f64 = dot(std::array::from_fn(|a| moved[a] - plate[a]), patch.normal);
         Some((top, short.abs()))
