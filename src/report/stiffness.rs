@@ -237,11 +237,15 @@ fn page_with(
         Scale::from_zero(top(&result.map_sd, 1.0), unit, ColorMap::Magma),
         "From the residuals, counted by blocks of the body, and the change with the mesh. Black: not identifiable.",
     )?;
+    // Matches leave most voxels without one.
+    let residuals = body.iter().map(|&o| f64::from(result.residual.as_slice()[o]));
+    let largest = quantile(residuals.filter(|v| v.is_finite() && *v > 0.0), 0.995);
     let rest = panel(
         "Residual",
         &result.residual,
-        Scale::from_zero(top(&result.residual, 0.995), "mm", ColorMap::Magma),
-        "Length of measured less modelled displacement. Structure here means that the model misses something.",
+        Scale::from_zero(largest.max(1e-9), "mm", ColorMap::Magma),
+        "Length of measured less modelled displacement, where one was taken. Structure here means that the model misses \
+         something.",
     )?;
     let total: f64 = result.seconds.iter().map(|s| s.1).sum();
     let tile = |value: String, unit: &str, name: &str| {
