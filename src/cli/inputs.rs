@@ -50,7 +50,7 @@ pub fn check_output_file(path: &Path, endings: &[&str]) -> Result<()> {
 
 /// Says so where a header places its volume in two ways that are a tenth of a voxel apart or more.
 pub fn two_places(stored: &Stored) -> Option<String> {
-    let edge = stored.grid.spacing().into_iter().fold(f64::INFINITY, f64::min);
+    let edge = stored.grid.least_spacing();
     let apart = stored.apart_mm.filter(|a| *a > 0.1 * edge)?;
     Some(format!("its sform and qform disagree by up to {apart:.2} mm; the sform is used"))
 }

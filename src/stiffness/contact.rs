@@ -1,4 +1,5 @@
-//! A plate pushes, it does not pull: facets of a loaded patch under tension are let go.
+//! A plate pushes, it does not pull, and nothing goes through it: facets of a loaded patch under tension are let go, and those
+//! beyond the plate touch it.
 
 use crate::stiffness::body::Body;
 use crate::stiffness::elements::Point;

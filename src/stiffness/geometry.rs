@@ -63,8 +63,8 @@ impl Part {
         match self {
             Part::Face(axis, upper) => shifted(body, grid, axis, upper, offset),
             Part::Edge(edge) => {
-                let voxel = grid.spacing().into_iter().fold(f64::INFINITY, f64::min);
-                body.with_places(body.places.iter().map(|p| edge.widened(*p, offset * voxel)).collect())
+                let wider = offset * grid.least_spacing();
+                body.with_places(body.places.iter().map(|p| edge.widened(*p, wider)).collect())
             }
         }
     }

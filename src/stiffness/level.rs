@@ -59,7 +59,7 @@ impl Level {
         load: &Place,
     ) -> Result<Self, StiffnessError> {
         let body = Body::new(mesh)?;
-        let voxel = field.grid().spacing().iter().fold(f64::INFINITY, |m: f64, &v| m.min(v));
+        let voxel = field.grid().least_spacing();
         let motion = SurfaceMotion::new(&body, field, labels);
         let patches = patches::find(&body, &motion, held, load, voxel)?;
         let (observations, block) = match matches {

@@ -2,8 +2,8 @@
 //!
 //! A **held** base is the flat end of the undeformed body on that side. A **loaded** patch is what comes to lie on one plane:
 //! the surface that is pushed in the furthest gives the plane, by least squares on its deformed places, and the patch is
-//! the surface that ends within a tolerance of it. Facets that the plate would have to pull are let go later
-//! ([`crate::stiffness::contact`]). The displacement of a patch is that of a plate, six numbers fitted to all its nodes, and
+//! the surface that ends within a tolerance of it. Facets that the plate would have to pull are let go later, and
+//! those that go through it are added ([`crate::stiffness::contact`]). The displacement of a patch is that of a plate, six numbers fitted to all its nodes, and
 //! these are fitted again with the moduli: no node's own noise is imposed on the solution.
 
 use crate::error::StiffnessError;
@@ -74,7 +74,7 @@ impl SurfaceMotion {
         };
         let (displacement, error) = all(REACH);
         let (read, sharp_error) = all(NEAR);
-        if sharp_error > NOISY * field.grid().spacing().into_iter().fold(f64::INFINITY, f64::min) {
+        if sharp_error > NOISY * field.grid().least_spacing() {
             return Self { sharp: displacement.clone(), displacement, error, sharp_error: error, near: REACH };
         }
         let sharp = read.into_iter().zip(&displacement).map(|(n, d)| n.or(*d)).collect();
@@ -209,8 +209,8 @@ impl Patch {
     /// The motion along the normal besides the plate's (mm) that brings a place onto the plane; 0 on a flat patch.
     fn to_plane(&self, p: [f64; 3]) -> f64 {
         match self.plane {
-            Some((q, normal)) if self.bend() > 0.0 => dot(sub(q, p), normal) - dot(self.motion(p), normal),
-            _ => 0.0,
+            Some((q, normal)) => dot(sub(q, p), normal) - dot(self.motion(p), normal),
+            None => 0.0,
         }
     }
 
@@ -362,7 +362,7 @@ fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
 /// Facets whose middle, or a place just inside of it, lies in a mask.
 fn masked_facets(body: &Body, mask: &Mask) -> Vec<usize> {
     let grid = mask.grid();
-    let step = grid.spacing().iter().fold(f64::INFINITY, |m, &v| m.min(v));
+    let step = grid.least_spacing();
     let inside = |p: [f64; 3]| {
         let v = grid.affine().to_voxel(WorldPoint(p));
         crate::numerics::sampling::nearest(grid.shape(), VoxelPoint(v.0)).is_some_and(|o| mask.as_slice()[o] > 0)
@@ -543,6 +543,7 @@ fn build(
     if crate::numerics::statistics::percentile(&mut sizes, 75.0) < (0.1 * voxel).max(2.0 * motion.error) {
         onto_plane.fill(0.0);
     }
+    let curved = onto_plane.iter().any(|v| *v != 0.0);
     let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
     Some(Patch {
         name,
@@ -557,7 +558,7 @@ fn build(
         onto_plane,
         rim,
         residual,
-        plane,
+        plane: plane.filter(|_| curved),
     })
 }
 

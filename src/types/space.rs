@@ -181,6 +181,11 @@ impl Grid {
         self.affine.spacing()
     }
 
+    /// Shortest voxel edge (mm).
+    pub fn least_spacing(&self) -> f64 {
+        self.spacing().into_iter().fold(f64::INFINITY, f64::min)
+    }
+
     /// Number of voxels.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
@@ -221,7 +226,7 @@ impl Grid {
             let at = |a: usize| if c >> a & 1 == 1 { (s[a] - 1) as f64 } else { 0.0 };
             g.affine.to_world(VoxelPoint([at(0), at(1), at(2)]))
         };
-        let tolerance = 1e-3 * self.spacing().iter().fold(f64::INFINITY, |m, &v| m.min(v));
+        let tolerance = 1e-3 * self.least_spacing();
         self.shape == other.shape
             && (0..8).all(|c| far(self, c).minus(far(other, c)).iter().all(|d| d.abs() <= tolerance))
     }
