@@ -7,8 +7,9 @@ use fixtures::run as palpate;
 use palpate::error::FingertipError;
 use palpate::fingertip::{columns, force, profile_force, reduce};
 use palpate::io;
-use palpate::pipeline::fingertip::run;
-use palpate::types::fingertip::PadModel;
+use palpate::pipeline::fingertip::{of_map, run};
+use palpate::synth::{PhantomKind, PhantomParams, phantom};
+use palpate::types::fingertip::{PadModel, StiffnessFolder, StiffnessRegion};
 use palpate::types::{Affine, Grid, Volume};
 use std::fs;
 use tempfile::TempDir;
@@ -166,6 +167,82 @@ fn a_pad_becomes_a_tip_that_a_grasp_reads() {
     fs::write(folder.path().join("scene.toml"), scene).unwrap();
     let (out, err) = palpate(folder.path(), &["grasp", "scene.toml", "-o", "grasp"], 0);
     assert!(out.contains("grasp/report.html"), "{out}{err}");
+}
+
+/// A map as `palpate stiffness` leaves it: tissue of `modulus` by position (mm) under bone from z = `top` up, pressed from z-.
+fn pad_folder(map: Volume, poisson: f64, travel: f64, force: Option<f64>) -> StiffnessFolder {
+    let known = |name: &str, youngs_modulus| StiffnessRegion { name: name.into(), youngs_modulus, bound: None };
+    StiffnessFolder {
+        map,
+        absolute: true,
+        poisson,
+        regions: vec![known("pulp", 40.0), known("bone", f64::from(BONE))],
+        load: "z-".into(),
+        held: "z+".into(),
+        force_n: force,
+        travel_mm: Some(travel),
+        translation: [[0.0; 3]; 2],
+    }
+}
+
+#[test]
+fn a_plate_presses_the_elements_of_a_block_by_the_neo_hookean_law() {
+    // Without a Poisson's ratio a block stays as wide as it is: P = mu (l - 1 / l), mu = E / 2.
+    let (e, height, side) = (40.0f32, 6.0, 10.0);
+    let map = pad([40, 40, 32], 0.25, height, |_| e);
+    let out = of_map(&pad_folder(map, 0.0, 1.5, None), 1500, &|_, _| ()).unwrap();
+    assert_eq!(out.failure, None);
+    let plate = out.pad.plate.as_ref().unwrap();
+    assert_eq!(plate.curve.len(), 12);
+    for [d, f] in &plate.curve {
+        let l = 1.0 - d / height;
+        let truth = 1e-3 * side * side * 0.5 * f64::from(e) * (1.0 / l - l);
+        // The mesh rounds the block's edges by part of a voxel: 5 % of its face, less as they come into touch.
+        let bound = if *d < 1.0 { 0.06 } else { 0.03 };
+        assert!((f / truth - 1.0).abs() < bound, "{d} mm: {f} N, not {truth}");
+    }
+    // Columns without Poisson's ratio are the linear law of the same springs.
+    assert!((plate.factor - 1.0).abs() < 0.2, "{}", plate.factor);
+    assert!((out.at_press.unwrap()[1] / plate.at(1.5).unwrap() - 1.0).abs() < 1e-12);
+    assert!(plate.at(3.0).is_none());
+}
+
+#[test]
+fn elements_of_a_finger_pad_press_as_the_phantom_does() {
+    // The phantom's forces come from another solver, on hexahedra fitted to the exact shape. A voxel map tells where the
+    // foremost place lies to half a voxel, so the press goes by what it adds from one depth to another.
+    let params = PhantomParams { amplitude: 1.5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(36);
+    let body = phantom(&params).unwrap();
+    let (known, told) = (body.stiffness.as_ref().unwrap(), body.description.elastic.as_ref().unwrap());
+    let values = known.youngs_modulus_kpa.as_slice();
+    let map = Volume::from_voxels(*body.initial.grid(), |o, _| values[o]);
+    let half = 0.5 * body.initial.grid().least_spacing();
+    let mut folder = pad_folder(map, told.poisson, 1.5 + half, Some(told.force_n));
+    folder.regions = vec![StiffnessRegion { name: "bone".into(), youngs_modulus: 15_000.0, bound: None }];
+    let out = of_map(&folder, 2000, &|_, _| ()).unwrap();
+    let plate = out.pad.plate.as_ref().unwrap();
+    let [low, high] = [1.5 - half, 1.5 + half].map(|d| plate.at(d).unwrap());
+    assert!(low < 1.05 * told.force_n && told.force_n < 1.05 * high, "{low} to {high} N, not {}", told.force_n);
+    // Columns are free to bulge: they give half.
+    assert!(out.columns_at_press().unwrap() < 0.7 * told.force_n);
+    // Bone that is known by a low bound only is a back plate all the same.
+    let soft = Volume::from_voxels(*body.initial.grid(), |o, _| if values[o] > 1000.0 { 23.0 } else { values[o] });
+    folder.map = soft;
+    folder.regions[0] = StiffnessRegion { name: "bone".into(), youngs_modulus: 23.0, bound: Some("lower".into()) };
+    let again = of_map(&folder, 2000, &|_, _| ()).unwrap();
+    assert_eq!(again.pad.plate.unwrap().curve, plate.curve);
+}
+
+#[test]
+fn without_elements_the_columns_stand_alone() {
+    let folder = stiffness_folder(true, "bone");
+    let args = ["fingertip", "stiffness", "-o", "tip.toml", "--nodes", "0"];
+    let (out, err) = palpate(folder.path(), &args, 0);
+    assert!(!out.contains("elements") && out.contains("press        1.20 mm: columns") && err.is_empty(), "{out}{err}");
+    let file: toml::Table = fs::read_to_string(folder.path().join("tip.toml")).unwrap().parse().unwrap();
+    assert!(!file["pad"].as_table().unwrap().contains_key("finite_element_nodes"));
+    let (_, err) = palpate(folder.path(), &["fingertip", "stiffness", "-o", "tip.toml", "--nodes", "20"], 2);
+    assert!(err.contains("500 to 200,000"), "{err}");
 }
 
 #[test]

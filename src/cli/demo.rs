@@ -12,7 +12,7 @@ use palpate::io::{self, OutputFolder, SceneOverrides};
 use palpate::pipeline::fingertip;
 use palpate::report::chain::{Part, Row, page, text};
 use palpate::types::Volume;
-use palpate::types::fingertip::StiffnessRegion;
+use palpate::types::fingertip::{StiffnessFolder, StiffnessRegion};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -33,8 +33,6 @@ const FILES: [&str; 10] = [
 ];
 /// How far the plate goes in (mm).
 const AMPLITUDE: &str = "1.5";
-/// Moduli above this (kPa) are bone in the phantom.
-const BONE: f32 = 1000.0;
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -120,6 +118,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
     let (mut rows, metrics) = field_rows(output)?;
     rows.extend(stiffness_rows(output, &regions)?);
+    rows.extend(press_row(output, &told)?);
     exact_fingertip(output, &told)?;
     rows.extend(grasp_rows(output)?);
     let mut folder = OutputFolder::create(output, true)?;
@@ -169,13 +168,35 @@ fn exact_fingertip(output: &Path, told: &Value) -> Result<()> {
     let map: Volume = io::read_volume(output.join("phantom/youngs_modulus.nii.gz"))?;
     let elastic = &told["elastic"];
     let number = |v: &Value| v.as_f64().unwrap_or(f64::NAN);
-    let down = if elastic["load"].as_str().is_some_and(|l| l.ends_with('-')) { -1.0 } else { 1.0 };
-    let depth = number(&told["amplitude"]);
-    let values = map.as_slice();
-    let outcome = fingertip::run(&map, |o| values[o] > BONE, [0.0, 0.0, down], Some(depth))?;
-    let calibration = outcome.calibration(elastic["force_n"].as_f64());
+    let word = |key: &str| elastic[key].as_str().unwrap_or_default().to_string();
+    let regions = elastic["regions"].as_array().cloned().unwrap_or_default();
+    let region = |r: &Value| StiffnessRegion {
+        name: r["name"].as_str().unwrap_or_default().into(),
+        youngs_modulus: number(&r["youngs_modulus_kpa"]),
+        bound: None,
+    };
+    let exact = StiffnessFolder {
+        map,
+        absolute: true,
+        poisson: number(&elastic["poisson"]),
+        regions: regions.iter().map(region).collect(),
+        load: word("load"),
+        held: word("held"),
+        force_n: elastic["force_n"].as_f64(),
+        travel_mm: told["amplitude"].as_f64(),
+        translation: [[0.0; 3]; 2],
+    };
+    let outcome = fingertip::of_map(&exact, fingertip::NODES, &|_, _| ())?;
+    let calibration = outcome.calibration(exact.force_n);
     io::write_fingertip(output.join("exact.toml"), &outcome.pad, outcome.radius_mm(), calibration, "the exact map")?;
     Ok(io::write_text(output.join("exact-scene.toml"), &SCENE.replace("fingertip.toml", "exact.toml"))?)
+}
+
+/// The plate's force by the finite elements of the measured map, against the phantom's.
+fn press_row(output: &Path, told: &Value) -> Result<Option<Row>> {
+    let (elements, calibration) = io::read_fingertip_press(output.join("fingertip.toml"))?;
+    let force = told["elastic"]["force_n"].as_f64().filter(|_| elements);
+    Ok(force.map(|f| Row::value("fingertip", "force of the plate by finite elements", "N", f / calibration, f)))
 }
 
 /// The fingertip and the grasp against those of the exact map.

@@ -85,12 +85,13 @@ pub fn track(
     Ok(out)
 }
 
-/// The plan of `palpate stiffness`.
+/// The plan of `palpate stiffness`; `frames` are the forces of a sequence, whose first field `path` is.
 pub fn stiffness(
-    (path, g): (&Path, &Grid),
+    path: &Path,
     labels: &Mask,
     params: &StiffnessParams,
     [held, load]: [&str; 2],
+    frames: &[Option<f64>],
     output: &Path,
     files: &[&str],
 ) -> String {
@@ -99,11 +100,19 @@ pub fn stiffness(
     let regions: Vec<String> =
         (1..256).filter(|&l| voxels[l] > 0).map(|l| format!("{l} ({} voxels)", thousands(voxels[l]))).collect();
     let mut out = String::from("Would look for Young's modulus:\n");
-    line(&mut out, "field", &format!("{}: {}", name(path), grid(g)));
+    let field = format!("{}: {}", name(path), grid(labels.grid()));
+    match frames.len() {
+        0 => line(&mut out, "field", &field),
+        n => line(&mut out, "fields", &format!("{field}, and {} more; one map for all", n - 1)),
+    }
     line(&mut out, "labels", &regions.join(", "));
     line(&mut out, "held", held);
     line(&mut out, "loaded", load);
-    let force = params.force_n.map_or("none: moduli as ratios".into(), |f| format!("{f} N: moduli in kPa"));
+    let known: Vec<f64> = frames.iter().flatten().copied().collect();
+    let (least, most) = known.iter().fold((f64::INFINITY, 0.0f64), |(a, b), f| (a.min(*f), b.max(*f)));
+    let each = (!known.is_empty()).then(|| format!("{least} to {most} N over the frames: moduli in kPa"));
+    let force = each
+        .unwrap_or_else(|| params.force_n.map_or("none: moduli as ratios".into(), |f| format!("{f} N: moduli in kPa")));
     line(&mut out, "force", &force);
     line(&mut out, "law", &format!("{:?}, Poisson's ratio {}", params.model, params.poisson).to_lowercase());
     line(&mut out, "mesh", &format!("about {} nodes", thousands(params.nodes)));

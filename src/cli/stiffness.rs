@@ -84,8 +84,8 @@ pub struct Options {
     #[arg(long)]
     pub(super) overwrite: bool,
     /// Check everything, say what would be done, and write nothing
-    #[arg(long, conflicts_with = "sequence")]
-    dry_run: bool,
+    #[arg(long)]
+    pub(super) dry_run: bool,
     #[command(flatten)]
     convention: Convention,
 }
@@ -115,6 +115,22 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
     named.map(PathBuf::from).collect()
 }
 
+/// Says what would be done with a field, or with the first of a sequence, whose forces are given.
+pub(super) fn plan(
+    options: &Options,
+    params: &StiffnessParams,
+    field: &Path,
+    setting: &Setting,
+    frames: &[Option<f64>],
+    console: &Console,
+) -> Result<()> {
+    OutputFolder::check(&options.output, options.overwrite)?;
+    let sides = [options.held.as_str(), &options.load];
+    let more: &[&str] = if frames.is_empty() { &[] } else { &["frames.csv"] };
+    let files = [&FILES[..], more].concat();
+    console.say(&dry_run::stiffness(field, &setting.labels, params, sides, frames, &options.output, &files))
+}
+
 fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
     let mut source = Source::of(field, options.matches.as_deref());
     let patches = patch_files(options);
@@ -137,10 +153,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     }
     if options.dry_run {
         drop(progress);
-        OutputFolder::check(&options.output, options.overwrite)?;
-        let field = (source.field.as_path(), field.grid());
-        let sides = [options.held.as_str(), &options.load];
-        return console.say(&dry_run::stiffness(field, &setting.labels, params, sides, &options.output, &FILES));
+        return plan(options, params, &source.field, &setting, &[], console);
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let read = started.elapsed().as_secs_f64();

@@ -3,7 +3,7 @@
 use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
-use super::stiffness::{FILES, Options, Setting, patch_files, write};
+use super::stiffness::{FILES, Options, Setting, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
@@ -28,6 +28,11 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     progress.set("read", 0.0);
     let grid = *io::read_field(&frames[0].1)?.grid();
     let setting = Setting::read(options, body, &grid, &frames[0].1)?;
+    if options.dry_run {
+        drop(progress);
+        let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
+        return plan(options, params, &frames[0].1, &setting, &forces, console);
+    }
     let points = trajectories.is_file().then(|| io::read_trajectories(&trajectories, reference)).transpose()?;
     let mut order = Vec::new();
     for (at, (_, path, _)) in frames.iter().enumerate() {

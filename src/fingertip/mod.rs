@@ -7,7 +7,7 @@
 
 use crate::error::FingertipError;
 use crate::types::Volume;
-use crate::types::fingertip::{Column, PadModel, PadReduction};
+use crate::types::fingertip::{Column, PadModel, PadReduction, PlateCurve};
 
 /// Columns that a pad must have.
 const FEWEST: usize = 20;
@@ -83,12 +83,7 @@ fn uniform_force(columns: &[Column], modulus: f64, depth: f64) -> f64 {
 pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     let depths: Vec<f64> = (1..=24).map(|i| deepest * f64::from(i) / 24.0).collect();
     let map: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let size = dot(&map, &map).max(f64::MIN_POSITIVE);
-    let residual = |model: &[f64]| {
-        let off: Vec<f64> = model.iter().zip(&map).map(|(m, f)| m - f).collect();
-        (dot(&off, &off) / size).sqrt()
-    };
+    let residual = |model: &[f64]| distance(model, &map);
     let one: Vec<f64> = depths.iter().map(|&d| uniform_force(columns, 1.0, d)).collect();
     let effective = dot(&one, &map) / dot(&one, &one).max(f64::MIN_POSITIVE);
     let uniform: Vec<f64> = one.iter().map(|f| effective * f).collect();
@@ -118,23 +113,64 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
         [_, r, _] if r <= ENOUGH => PadModel::Layered,
         _ => PadModel::Map,
     };
-    // The hemisphere whose force pi E d^2 is nearest: what the grasp simulator presses.
-    let square: Vec<f64> = depths.iter().map(|d| 1e-3 * std::f64::consts::PI * d * d).collect();
-    let hemisphere = dot(&square, &map) / dot(&square, &square).max(f64::MIN_POSITIVE);
-    let profile = profile(&depths, &map, hemisphere);
+    let tip = tip(&depths, &map);
     PadReduction {
         model,
         effective_kpa: effective,
-        hemisphere_kpa: hemisphere,
-        hemisphere_residual: residual(&square.iter().map(|f| hemisphere * f).collect::<Vec<_>>()),
+        hemisphere_kpa: tip.hemisphere_kpa,
+        hemisphere_residual: tip.hemisphere_residual,
         radius_mm: radius(columns, deepest),
         thickness_mm: columns.iter().filter(|c| c.gap == 0.0).map(|c| c.length).fold(0.0, f64::max),
         residuals,
         curve: depths.iter().zip(&map).zip(&uniform).map(|((d, m), u)| [*d, *m, *u]).collect(),
         columns: columns.len(),
-        profile_residual: residual(&depths.iter().map(|&d| profile_force(&profile, d)).collect::<Vec<_>>()),
+        profile: tip.profile,
+        profile_residual: tip.profile_residual,
+        plate: None,
+    }
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Relative distance of the forces of a model from `truth` (1).
+fn distance(model: &[f64], truth: &[f64]) -> f64 {
+    let off: Vec<f64> = model.iter().zip(truth).map(|(m, f)| m - f).collect();
+    (dot(&off, &off) / dot(truth, truth).max(f64::MIN_POSITIVE)).sqrt()
+}
+
+/// The hemispheres, of one modulus and of unlike springs, whose force is nearest to `force` (N) at `depths` (mm).
+struct Tip {
+    hemisphere_kpa: f64,
+    hemisphere_residual: f64,
+    profile: Vec<[f64; 2]>,
+    profile_residual: f64,
+}
+
+fn tip(depths: &[f64], force: &[f64]) -> Tip {
+    let square: Vec<f64> = depths.iter().map(|d| 1e-3 * std::f64::consts::PI * d * d).collect();
+    let hemisphere_kpa = dot(&square, force) / dot(&square, &square).max(f64::MIN_POSITIVE);
+    let profile = profile(depths, force, hemisphere_kpa);
+    let unlike: Vec<f64> = depths.iter().map(|&d| profile_force(&profile, d)).collect();
+    Tip {
+        hemisphere_kpa,
+        hemisphere_residual: distance(&square.iter().map(|f| hemisphere_kpa * f).collect::<Vec<_>>(), force),
+        profile_residual: distance(&unlike, force),
         profile,
     }
+}
+
+/// The reduction of `columns` with its hemispheres fitted to the finite element forces `curve` (mm, N) of the same map, which
+/// was solved on `nodes` nodes.
+pub fn against_plate(mut pad: PadReduction, columns: &[Column], curve: Vec<[f64; 2]>, nodes: usize) -> PadReduction {
+    let (depths, forces): (Vec<f64>, Vec<f64>) = curve.iter().map(|c| (c[0], c[1])).unzip();
+    let springs: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
+    let factor = dot(&springs, &forces) / dot(&springs, &springs).max(f64::MIN_POSITIVE);
+    let scaled: Vec<f64> = springs.iter().map(|f| factor * f).collect();
+    let Tip { hemisphere_kpa, hemisphere_residual, profile, profile_residual } = tip(&depths, &forces);
+    pad.plate = Some(PlateCurve { residual: distance(&scaled, &forces), factor, nodes, curve });
+    PadReduction { hemisphere_kpa, hemisphere_residual, profile, profile_residual, ..pad }
 }
 
 /// Knots of a profile.

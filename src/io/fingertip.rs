@@ -3,6 +3,7 @@
 use super::{format, os, write_text};
 use crate::error::IoError;
 use crate::io::image::read_volume;
+use crate::types::StiffnessParams;
 use crate::types::Volume;
 use crate::types::fingertip::{PadReduction, StiffnessFolder, StiffnessRegion};
 use serde::Deserialize;
@@ -12,6 +13,8 @@ use std::path::Path;
 #[derive(Deserialize)]
 struct RawSummary {
     absolute: bool,
+    #[serde(default = "nearly_incompressible")]
+    poisson: f64,
     regions: Vec<StiffnessRegion>,
     inputs: RawInputs,
     force_n: Option<f64>,
@@ -21,6 +24,13 @@ struct RawSummary {
 #[derive(Deserialize)]
 struct RawInputs {
     load: String,
+    #[serde(default)]
+    held: String,
+}
+
+/// As `palpate stiffness` takes it unasked.
+fn nearly_incompressible() -> f64 {
+    StiffnessParams::default().poisson
 }
 
 #[derive(Deserialize)]
@@ -67,7 +77,9 @@ fn told(path: &Path, text: &str, map: impl FnOnce() -> Result<Volume, IoError>) 
         map: map()?,
         absolute: raw.absolute,
         regions: raw.regions,
+        poisson: raw.poisson,
         load: raw.inputs.load,
+        held: raw.inputs.held,
         force_n: raw.force_n,
         travel_mm: raw.patches.loaded.travel_mm,
         translation: [raw.patches.loaded.translation, raw.patches.held.translation],
@@ -86,8 +98,21 @@ pub fn read_fingertip_modulus(path: impl AsRef<Path>) -> Result<f64, IoError> {
     found.ok_or_else(|| format(path, "has no youngs_modulus", "give a file that `palpate fingertip` wrote"))
 }
 
+/// Whether a fingertip file was made with finite elements, and the measured force over theirs (1).
+///
+/// # Errors
+/// [`IoError`] when the file cannot be read or is no such file.
+pub fn read_fingertip_press(path: impl AsRef<Path>) -> Result<(bool, f64), IoError> {
+    let path = path.as_ref();
+    let text = fs::read_to_string(path).map_err(os(path, "read"))?;
+    let table = super::scene::parse_table(path, &text)?;
+    let pad = table.get("pad").and_then(toml::Value::as_table);
+    let found = pad.and_then(|p| Some((p.contains_key("finite_element_nodes"), p.get("calibration")?.as_float()?)));
+    found.ok_or_else(|| format(path, "has no calibration under [pad]", "give a file that `palpate fingertip` wrote"))
+}
+
 /// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of the hemisphere that
-/// presses like the pad, and how it was found under `[pad]`. `calibration` is the measured force over the columns' (1 where
+/// presses like the pad, and how it was found under `[pad]`. `calibration` is the measured force over the model's (1 where
 /// none was measured); the hemisphere's modulus is multiplied by it.
 ///
 /// # Errors
@@ -116,7 +141,7 @@ pub fn write_fingertip(
          radius = {:.6e}\nyoungs_modulus = {:.6e}\n{springs}\n\n\
          [pad]\n\
          model = \"{name}\"          # the smallest of uniform, layered and map whose forces are the map's to 2 %\n\
-         calibration = {calibration:.6}        # measured force over the columns'; columns are free to bulge, tissue is not\n\
+         calibration = {calibration:.6}        # measured force over the model's, which is the finite elements' where they are below\n\
          effective_kpa = {:.6}      # one modulus in the pad's own shape\n\
          residual_uniform = {uniform:.6}\nresidual_layered = {layered:.6}\nresidual_hemisphere = {:.6}\nresidual_profile = {:.6}\n\
          surface_radius_mm = {}\nthickness_mm = {:.6}\ncolumns = {}\n\
@@ -133,5 +158,18 @@ pub fn write_fingertip(
         rows(1),
         rows(2),
     );
-    write_text(path, &text)
+    let plate = pad.plate.as_ref().map_or_else(String::new, |plate| {
+        let row = |k: usize| plate.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
+        format!(
+            "finite_element_nodes = {}\nfinite_element_indentation_mm = [{}]\nfinite_element_force_n = [{}]\n\
+             columns_factor = {:.6}     # columns are free to bulge, tissue is not: their forces times this are nearest to it\n\
+             residual_columns = {:.6}\n",
+            plate.nodes,
+            row(0),
+            row(1),
+            plate.factor,
+            plate.residual,
+        )
+    });
+    write_text(path, &(text + &plate))
 }

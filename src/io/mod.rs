@@ -74,7 +74,7 @@ pub use csv::{
     write_landmarks, write_matches, write_points,
 };
 pub use field::{FieldConvention, read_field, read_field_as};
-pub use fingertip::{read_fingertip_modulus, read_stiffness, stiffness_folder, write_fingertip};
+pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
     write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
 };

@@ -1,9 +1,15 @@
 //! A stiffness map of a finger pad to a fingertip model.
 
-use crate::error::FingertipError;
-use crate::fingertip::{columns, force, reduce};
-use crate::types::Volume;
-use crate::types::fingertip::{PadReduction, StiffnessFolder, StiffnessRegion};
+use crate::error::{FingertipError, StiffnessError};
+use crate::fingertip::{against_plate, columns, force, reduce};
+use crate::mesh::tetrahedral::{Fineness, mesh_labels};
+use crate::pipeline::stiffness::Progress;
+use crate::stiffness::body::Body;
+use crate::stiffness::maps;
+use crate::stiffness::plate::{Press, base, nodes_of};
+use crate::types::fingertip::{Column, PadReduction, StiffnessFolder, StiffnessRegion};
+use crate::types::stiffness::Side;
+use crate::types::{Mask, Volume};
 
 /// Largest angle between the pressed side and a voxel axis (degrees).
 const ASKEW: f64 = 10.0;
@@ -11,13 +17,28 @@ const ASKEW: f64 = 10.0;
 /// Part of the tissue's thickness to which forces are compared, where the press is not known to have gone further.
 const DEPTH: f64 = 0.2;
 
+/// Depths at which the finite elements are solved.
+const DEPTHS: u32 = 12;
+
+/// Nodes of the finite elements of a map, about: forces on a fingertip change by 1 % up to eight times as many.
+pub const NODES: usize = 2500;
+
+/// Classes of modulus that the finite elements tell apart at most.
+const CLASSES: usize = 48;
+
+/// Modulus of bone over that of the stiffest tissue in the finite elements.
+const HARDER: f64 = 100.0;
+
 /// What a pad was reduced to, and its force at the press that was measured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PadOutcome {
     /// The model.
     pub pad: PadReduction,
-    /// Indentation that was measured (mm), and force of the columns there (N).
+    /// Indentation that was measured (mm), and there the force (N) of the finite elements, or of the columns without them.
     pub at_press: Option<[f64; 2]>,
+    /// Why there are no finite elements, where they were asked for.
+    pub failure: Option<StiffnessError>,
+    columns: Vec<Column>,
 }
 
 impl PadOutcome {
@@ -26,10 +47,91 @@ impl PadOutcome {
         if self.pad.radius_mm.is_finite() { self.pad.radius_mm } else { self.pad.thickness_mm }
     }
 
-    /// The measured force (N) over the columns' at the same press (1); 1 where one of them is not known.
+    /// The measured force (N) over the model's at the same press (1); 1 where one of them is not known.
     pub fn calibration(&self, force_n: Option<f64>) -> f64 {
-        self.at_press.zip(force_n).map_or(1.0, |([_, columns], measured)| measured / columns)
+        self.at_press.zip(force_n).map_or(1.0, |([_, model], measured)| measured / model)
     }
+
+    /// Force of the columns at the press that was measured (N).
+    pub fn columns_at_press(&self) -> Option<f64> {
+        self.at_press.map(|[depth, _]| force(&self.columns, depth))
+    }
+
+    /// The hemispheres fitted to the forces on a flat plate that presses the finite elements of the map; as it is where
+    /// these cannot be solved, with the reason.
+    fn pressed(mut self, plate: &Plate<'_>, progress: Progress<'_>) -> Self {
+        let deepest = self.pad.curve.last().map_or(0.0, |c| c[0]);
+        let depths: Vec<f64> = (1..=DEPTHS).map(|i| deepest * f64::from(i) / f64::from(DEPTHS)).collect();
+        match plate.forces(&depths, progress) {
+            Ok((curve, nodes)) => {
+                self.pad = against_plate(self.pad, &self.columns, curve, nodes);
+                let found = self.pad.plate.as_ref().zip(self.at_press).and_then(|(p, [d, _])| Some([d, p.at(d)?]));
+                self.at_press = found.or(self.at_press);
+            }
+            Err(why) => self.failure = Some(why),
+        }
+        self
+    }
+}
+
+/// A map and the flat plate that presses it.
+struct Plate<'a> {
+    map: &'a Volume,
+    poisson: f64,
+    bone: &'a (dyn Fn(usize) -> bool + Sync),
+    /// What is held; the bone where it is not a side.
+    held: Option<Side>,
+    outward: [f64; 3],
+    nodes: usize,
+}
+
+impl Plate<'_> {
+    /// Indentation (mm) and force (N) at about each depth (mm), and nodes of the mesh.
+    fn forces(&self, depths: &[f64], progress: Progress<'_>) -> Result<(Vec<[f64; 2]>, usize), StiffnessError> {
+        progress("mesh", 0.0);
+        let (labels, moduli) = classes(self.map, self.bone);
+        let mesh = mesh_labels(&labels, &Fineness::for_nodes(maps::volume(&labels), self.nodes))?;
+        let body = Body::new(&mesh)?;
+        let of_class: Vec<f64> = body.labels.iter().map(|&l| moduli[l as usize - 1]).collect();
+        let side = self.held.map(|side| base(&body, side, self.map.grid().least_spacing()));
+        let hard = || nodes_of(&body, |r| usize::from(body.labels[r]) == moduli.len());
+        let held = side.filter(|nodes| !nodes.is_empty()).unwrap_or_else(hard);
+        let press = Press { body: &body, moduli: &of_class, poisson: self.poisson, held, outward: self.outward };
+        let forces = press.forces(depths, &|f| progress("press", f))?;
+        Ok((forces, mesh.nodes().len()))
+    }
+}
+
+/// Labels from 1 of the values of a map's tissue, and the modulus of each: a class a value, or of like logarithm where these
+/// are too many. The last is the bone, a hard back plate whatever bound of its modulus is known.
+fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f64>) {
+    let tissue = map.as_slice().iter().enumerate().filter(|(o, v)| **v > 0.0 && !bone(*o));
+    let mut values: Vec<f32> = tissue.map(|(_, v)| *v).collect();
+    values.sort_unstable_by(f32::total_cmp);
+    values.dedup();
+    let mut moduli: Vec<f64> = values.iter().map(|v| f64::from(*v)).collect();
+    if let [low, .., high] = moduli[..]
+        && moduli.len() > CLASSES
+    {
+        let step = (high / low).ln() / CLASSES as f64;
+        moduli = (0..CLASSES).map(|k| low * ((k as f64 + 0.5) * step).exp()).collect();
+    }
+    let (values, hard) = (map.as_slice(), moduli.len() as u8 + 1);
+    let apart = |k: usize, v: f32| (moduli[k] / f64::from(v)).ln().abs();
+    let class = |v: f32| {
+        let after = moduli.partition_point(|m| *m < f64::from(v));
+        let around = [after.saturating_sub(1), after.min(moduli.len() - 1)];
+        1 + if apart(around[0], v) < apart(around[1], v) { around[0] } else { around[1] } as u8
+    };
+    let label = |o: usize, _| match values[o] > 0.0 {
+        false => 0,
+        true if bone(o) => hard,
+        true => class(values[o]),
+    };
+    let labels = Mask::from_voxels(*map.grid(), label);
+    let stiffest = moduli.last().copied().unwrap_or(1.0);
+    moduli.push(HARDER * stiffest);
+    (labels, moduli)
 }
 
 /// Reduces a map (kPa; 0 outside) that was pressed against `outward` (unit vector of the pressed side, RAS), by
@@ -54,7 +156,7 @@ pub fn run(
     let thickness = columns.iter().filter(|c| c.gap == 0.0).map(|c| c.length).fold(0.0, f64::max);
     let known = indentation.filter(|d| *d > 0.0 && *d < thickness);
     let pad = reduce(&columns, known.unwrap_or(0.0).max(DEPTH * thickness));
-    Ok(PadOutcome { at_press: known.map(|d| [d, force(&columns, d)]), pad })
+    Ok(PadOutcome { at_press: known.map(|d| [d, force(&columns, d)]), pad, failure: None, columns })
 }
 
 /// A region that is so many times stiffer than the softest holds as a back plate.
@@ -90,11 +192,12 @@ fn hard(folder: &StiffnessFolder) -> Vec<f64> {
     folder.regions.iter().filter(is_hard).map(|r| r.youngs_modulus).collect()
 }
 
-/// Reduces what `palpate stiffness` found to a fingertip, bone and pressed side as it names them.
+/// Reduces what `palpate stiffness` found to a fingertip, bone and pressed side as it names them. Its hemispheres press as the
+/// map's finite elements do, on about `nodes` nodes; as the columns do where that is 0.
 ///
 /// # Errors
 /// [`FingertipError`] when the moduli are ratios, and as [`run`].
-pub fn of_map(folder: &StiffnessFolder) -> Result<PadOutcome, FingertipError> {
+pub fn of_map(folder: &StiffnessFolder, nodes: usize, progress: Progress<'_>) -> Result<PadOutcome, FingertipError> {
     if !folder.absolute {
         return Err(FingertipError::NotAbsolute);
     }
@@ -106,5 +209,10 @@ pub fn of_map(folder: &StiffnessFolder) -> Result<PadOutcome, FingertipError> {
     let along = |u: [f64; 3]| (0..3).map(|a| u[a] * side[a]).sum::<f64>();
     // Of a curved pad that is pressed flat the middle goes less far than the plate.
     let indentation = folder.travel_mm.unwrap_or(-along(moved)) + along(held);
-    run(&folder.map, bone, side, Some(indentation))
+    let out = run(&folder.map, bone, side, Some(indentation))?;
+    if nodes == 0 {
+        return Ok(out);
+    }
+    let (poisson, held) = (folder.poisson, Side::parse(&folder.held));
+    Ok(out.pressed(&Plate { map: &folder.map, poisson, bone: &bone, held, outward: side, nodes }, progress))
 }

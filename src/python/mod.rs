@@ -34,7 +34,6 @@ fn _palpate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(field::field, module)?)?;
     module.add_function(wrap_pyfunction!(stiffness::stiffness, module)?)?;
     module.add_function(wrap_pyfunction!(pad::fingertip, module)?)?;
-    module.add_function(wrap_pyfunction!(pad::write_fingertip, module)?)?;
     module.add_function(wrap_pyfunction!(grasp::grasp, module)?)?;
     module.add_function(wrap_pyfunction!(track::track, module)?)
 }

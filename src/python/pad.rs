@@ -2,40 +2,45 @@
 
 use super::arrays::{self, Image, told};
 use crate::io;
-use crate::pipeline::fingertip::{PadOutcome, of_map};
-use crate::types::fingertip::StiffnessFolder;
+use crate::pipeline::fingertip::{NODES, PadOutcome, of_map};
 use pyo3::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// What a stiffness result says, from its map (kPa) and its summary as JSON.
-fn folder(map: &Image<'_>, summary: &str) -> PyResult<StiffnessFolder> {
-    io::stiffness_folder(arrays::volume(map)?, summary).map_err(told)
+/// A stiffness map reduced to a fingertip.
+#[pyclass(frozen)]
+pub struct Pad {
+    outcome: PadOutcome,
+    force_n: Option<f64>,
 }
 
-fn reduced(py: Python<'_>, map: &Image<'_>, summary: &str) -> PyResult<(PadOutcome, Option<f64>)> {
-    let folder = folder(map, summary)?;
-    let outcome = py.detach(|| of_map(&folder)).map_err(told)?;
-    Ok((outcome, folder.force_n))
+#[pymethods]
+impl Pad {
+    /// What the fingertip file says, as a dict.
+    fn summary<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let pad = &self.outcome.pad;
+        let calibration = self.outcome.calibration(self.force_n);
+        let mut out: Value = json!(pad);
+        out["radius"] = json!(1e-3 * self.outcome.radius_mm());
+        out["youngs_modulus"] = json!(1e3 * calibration * pad.hemisphere_kpa);
+        out["calibration"] = json!(calibration);
+        out["tabulated"] = json!(pad.tabulated());
+        out["warnings"] = json!(self.outcome.failure.iter().map(ToString::to_string).collect::<Vec<_>>());
+        arrays::python(py, &out)
+    }
+
+    /// Writes the fingertip file that `palpate fingertip` would write.
+    fn write(&self, path: PathBuf, source: &str) -> PyResult<()> {
+        let (radius, calibration) = (self.outcome.radius_mm(), self.outcome.calibration(self.force_n));
+        io::write_fingertip(path, &self.outcome.pad, radius, calibration, source).map_err(told)
+    }
 }
 
-/// A stiffness map reduced to a fingertip: a dict of what the fingertip file says.
+/// Reduces a stiffness result, its map (kPa) and its summary as JSON, to a fingertip.
 #[pyfunction]
-pub fn fingertip<'py>(py: Python<'py>, map: Image<'py>, summary: &str) -> PyResult<Bound<'py, PyAny>> {
-    let (outcome, force) = reduced(py, &map, summary)?;
-    let calibration = outcome.calibration(force);
-    let mut out: Value = json!(outcome.pad);
-    out["radius"] = json!(1e-3 * outcome.radius_mm());
-    out["youngs_modulus"] = json!(1e3 * calibration * outcome.pad.hemisphere_kpa);
-    out["calibration"] = json!(calibration);
-    out["tabulated"] = json!(outcome.pad.tabulated());
-    arrays::python(py, &out)
-}
-
-/// Writes the fingertip file that `palpate fingertip` would write.
-#[pyfunction]
-pub fn write_fingertip(py: Python<'_>, path: PathBuf, map: Image<'_>, summary: &str, source: &str) -> PyResult<()> {
-    let (outcome, force) = reduced(py, &map, summary)?;
-    let (radius, calibration) = (outcome.radius_mm(), outcome.calibration(force));
-    io::write_fingertip(path, &outcome.pad, radius, calibration, source).map_err(told)
+#[pyo3(signature = (map, summary, nodes=NODES))]
+pub fn fingertip(py: Python<'_>, map: Image<'_>, summary: &str, nodes: usize) -> PyResult<Pad> {
+    let folder = io::stiffness_folder(arrays::volume(&map)?, summary).map_err(told)?;
+    let outcome = py.detach(|| of_map(&folder, nodes, &|_, _| ())).map_err(told)?;
+    Ok(Pad { outcome, force_n: folder.force_n })
 }

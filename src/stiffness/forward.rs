@@ -8,6 +8,7 @@ use crate::error::StiffnessError;
 use crate::numerics::sparse::Factor;
 use crate::stiffness::body::{Body, SIDE};
 use crate::stiffness::law::{Material, residual, residual_by_modulus, tangent};
+use crate::stiffness::plate::Plate;
 use crate::types::stiffness::Law;
 use rayon::prelude::*;
 
@@ -59,6 +60,8 @@ pub struct Problem<'a> {
     pub ties: Vec<Tie>,
     /// Spring constant of a firm tie (kPa mm).
     pub spring: f64,
+    /// A plate that nothing goes through.
+    pub plate: Option<Plate>,
 }
 
 impl<'a> Problem<'a> {
@@ -67,7 +70,18 @@ impl<'a> Problem<'a> {
         let volume: f64 = body.volumes.iter().sum();
         let size = (volume / body.cells.len() as f64).cbrt();
         let stiffest = materials.iter().fold(0.0, |m: f64, v| m.max(v.mu));
-        Self { body, law, materials, ties, spring: TIE * stiffest * size }
+        Self { body, law, materials, ties, spring: TIE * stiffest * size, plate: None }
+    }
+
+    /// The same under a plate.
+    pub fn under(self, plate: Plate) -> Self {
+        Self { plate: Some(plate), ..self }
+    }
+
+    /// Brings its plate to a height (mm).
+    pub fn lowered(&mut self, height: f64) -> &Self {
+        self.plate.iter_mut().for_each(|p| p.height = height);
+        self
     }
 
     /// Force (kPa mm^2) with which a tie pulls its node.
@@ -99,6 +113,9 @@ impl<'a> Problem<'a> {
         for tie in &self.ties {
             let (at, pull) = (body.pattern.first(tie.node), self.pull(tie, x));
             (0..3).for_each(|a| out[at + a] -= pull[a]);
+        }
+        if let Some(plate) = &self.plate {
+            plate.push(body, x, &mut out);
         }
         Some(out)
     }
@@ -148,6 +165,9 @@ impl<'a> Problem<'a> {
                 }
             }
         }
+        if let Some(plate) = &self.plate {
+            plate.stiffen(body, x, &mut values);
+        }
         Some(values)
     }
 
@@ -174,6 +194,14 @@ impl<'a> Problem<'a> {
     /// As [`Self::solve`].
     pub fn displaced(&self, start: Option<&[f64]>, precision: f64) -> Result<Vec<f64>, StiffnessError> {
         Ok(self.reach(start, precision, f64::INFINITY)?.x)
+    }
+
+    /// Solves by Newton's method from a solution nearby. `precision` (mm) ends it.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when it does not converge.
+    pub fn near(&self, start: &[f64], precision: f64) -> Result<Vec<f64>, StiffnessError> {
+        Ok(self.newton(start.to_vec(), precision, f64::INFINITY)?.x)
     }
 
     fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
@@ -243,7 +271,10 @@ impl<'a> Problem<'a> {
             let mut step = self.residual(&x).ok_or(StiffnessError::InsideOut)?;
             step.iter_mut().for_each(|v| *v = -*v);
             tangent.solve(&mut step).map_err(|_| StiffnessError::Unsolvable)?;
-            let mut part = 1.0;
+            let size = self.size(&step);
+            // What comes into touch and goes out of it by turns is met halfway.
+            let swings = self.plate.is_some() && steps > 3 && size > (0.7 * last).max(precision);
+            let mut part = if swings { 0.5 } else { 1.0 };
             x = loop {
                 let trial: Vec<f64> = x.iter().zip(&step).map(|(a, b)| a + part * b).collect();
                 if self.residual(&trial).is_some() {
@@ -254,14 +285,14 @@ impl<'a> Problem<'a> {
                     return Err(StiffnessError::InsideOut);
                 }
             };
-            let size = self.size(&step);
             moved += part * size;
             let done =
                 part == 1.0 && (size < precision || (size < 1e-3 && size * size / last.max(1e-300) < 0.1 * precision));
             if steps > 4 && size > 2.0 * last {
                 break;
             }
-            let slow = part < 1.0 || (!fresh && size > CONTRACTS * last);
+            // Where a contact changes, yesterday's tangent leads astray.
+            let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > CONTRACTS * last);
             let stale = moved > stale * self.size(&x);
             fresh = if done { stale } else { slow };
             if fresh {

@@ -16,6 +16,8 @@ pub mod observations;
 
 pub mod patches;
 
+pub mod plate;
+
 pub mod rim;
 
 pub mod contact;

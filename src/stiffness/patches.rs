@@ -344,7 +344,7 @@ fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
 }
 
 /// Facets whose nodes lie within a voxel of the end of the undeformed body.
-fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
+pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
     let d = side.direction();
     let facing = |f: &usize| dot(body.surface[*f].normal, d) > 0.7;
     let height = |n: u32| dot(body.places[n as usize], d);

@@ -109,10 +109,14 @@ pub struct StiffnessFolder {
     pub map: Volume,
     /// Whether it is in kPa.
     pub absolute: bool,
+    /// Poisson's ratio.
+    pub poisson: f64,
     /// Name, modulus and bound (`lower`, `upper` or none) of each region.
     pub regions: Vec<StiffnessRegion>,
     /// The pressed side as it was called, `z-` say.
     pub load: String,
+    /// The held side, so called; empty where it is not known.
+    pub held: String,
     /// Force on it (N), where it was given.
     pub force_n: Option<f64>,
     /// How far inwards the pressed patch went (mm), where the folder says so.
@@ -184,6 +188,36 @@ pub struct PadReduction {
     pub profile_residual: f64,
     /// Columns.
     pub columns: usize,
+    /// The forces of the map's finite elements, where they were solved; the hemispheres are then fitted to these.
+    pub plate: Option<PlateCurve>,
+}
+
+/// Forces on a flat plate that presses the finite elements of a pad's map.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PlateCurve {
+    /// Indentation (mm) and force (N), by rising indentation.
+    pub curve: Vec<[f64; 2]>,
+    /// The factor that brings the columns' forces nearest to these (1).
+    pub factor: f64,
+    /// Relative distance of the columns' forces from these, times that factor (1).
+    pub residual: f64,
+    /// Nodes of the mesh.
+    pub nodes: usize,
+}
+
+impl PlateCurve {
+    /// Force (N) at an indentation (mm): as a power of it between the points around, and for a twentieth beyond the last.
+    pub fn at(&self, depth: f64) -> Option<f64> {
+        let last = self.curve.len().checked_sub(1)?;
+        let after = self.curve.partition_point(|p| p[0] < depth);
+        if after > last && depth > 1.05 * self.curve[last][0] {
+            return None;
+        }
+        let [d1, f1] = self.curve[after.min(last)];
+        // From nothing at the surface with the square, as a hemisphere.
+        let [d0, f0] = after.min(last).checked_sub(1).map_or([0.5 * d1, 0.25 * f1], |i| self.curve[i]);
+        Some(f0 * (depth / d0).powf((f1 / f0).ln() / (d1 / d0).ln()))
+    }
 }
 
 impl PadReduction {

@@ -158,12 +158,12 @@ class Stiffness(_Result):
 class Fingertip(_Result):
     """A finger pad as a fingertip of the grasp simulator; ``radius`` (m), ``youngs_modulus`` (Pa), ``hemisphere_kpa`` ..."""
 
-    def __init__(self, summary: Dict[str, Any], source: Stiffness) -> None:
-        super().__init__({"summary": summary, "_source": source})
+    def __init__(self, pad: _palpate.Pad) -> None:
+        super().__init__({"summary": pad.summary(), "_pad": pad})
 
     def save(self, path: Union[str, "_os.PathLike[str]"], source: str = "stiffness") -> None:
         """Writes the file that ``palpate fingertip`` would write, for ``fingertip.file`` of a scene."""
-        _palpate.write_fingertip(path, *_pad(self.__dict__["_source"]), source)
+        self.__dict__["_pad"].write(path, source)
 
 
 class Grasp(_Result):
@@ -291,13 +291,13 @@ def stiffness(
     )
 
 
-def _pad(source: Stiffness) -> Tuple[Tuple[np.ndarray, List[List[float]]], str]:
-    return (np.asfortranarray(source.stiffness), _rows(source.affine)), _json.dumps(source.summary)
+def fingertip(source: Stiffness, nodes: int = 2500) -> Fingertip:
+    """Reduces a stiffness map with bone under the pad to a fingertip; it must be in kPa, that is made with a force.
 
-
-def fingertip(source: Stiffness) -> Fingertip:
-    """Reduces a stiffness map with bone under the pad to a fingertip; it must be in kPa, that is made with a force."""
-    return Fingertip(_palpate.fingertip(*_pad(source)), source)
+    ``nodes`` is about how many the finite elements of the map have that are pressed by a flat plate; 0 leaves them out.
+    """
+    image = (np.asfortranarray(source.stiffness), _rows(source.affine))
+    return Fingertip(_palpate.fingertip(image, _json.dumps(source.summary), nodes))
 
 
 def grasp(

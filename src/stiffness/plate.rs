@@ -1,0 +1,224 @@
+//! A body of known moduli under a flat plate without friction: force over depth.
+//!
+//! Where the surface would go through the plate, a pressure that grows with how far it does holds it back (Wriggers,
+//! Computational Contact Mechanics, 2006, ch. 6), at points within each facet, so that the contact grows evenly. The plate is
+//! as soft as Newton's method needs it, and its own squeeze, the mean penetration by force, is taken off the depth.
+//! The curve ends where no equilibrium is found.
+
+use crate::error::StiffnessError;
+use crate::stiffness::body::{Body, Facet, SIDE};
+use crate::stiffness::forward::{Problem, Tie};
+use crate::stiffness::law::Material;
+use crate::stiffness::patches::base_facets;
+use crate::types::space::dot;
+use crate::types::stiffness::{Law, Side};
+
+/// Pressure for a penetration of one element's size, over the shear modulus of the softest part.
+const STIFF: f64 = 50.0;
+/// Penetration over which the plate comes to that stiffness (parts of an element's size).
+const ONSET: f64 = 0.02;
+/// Precision of a solution (mm).
+const PRECISION: f64 = 1e-4;
+/// Times the softest modulus, beyond which a part is as good as rigid.
+const RIGID: f64 = 500.0;
+/// Part of the way between two depths below which no shorter step is tried.
+const SHORTEST: f64 = 0.05;
+
+/// Points in a facet: three in each of its quarters.
+const POINTS: usize = 12;
+
+/// A facet that the plate may touch.
+#[derive(Debug, Clone)]
+struct Spot {
+    element: usize,
+    /// Its nodes among the element's.
+    local: [usize; 6],
+    nodes: [u32; 6],
+    /// Area of a point (mm^2).
+    area: f64,
+}
+
+/// A plate at a height, and what of a body's surface faces it.
+#[derive(Debug, Clone)]
+pub struct Plate {
+    /// Unit normal, out of the body (RAS).
+    pub outward: [f64; 3],
+    /// Height of its plane along that (mm).
+    pub height: f64,
+    /// Pressure over penetration (kPa/mm), from `onset` on.
+    pub stiffness: f64,
+    /// Penetration up to which that rises (mm).
+    pub onset: f64,
+    spots: Vec<Spot>,
+}
+
+/// The six shape functions at the points of a facet.
+fn shapes() -> [[f64; 6]; POINTS] {
+    // Corners of the quarters.
+    const H: f64 = 0.5;
+    const E: [[f64; 3]; 6] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [H, H, 0.0], [0.0, H, H], [H, 0.0, H]];
+    const QUARTERS: [[usize; 3]; 4] = [[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]];
+    std::array::from_fn(|p| {
+        let corners = QUARTERS[p / 3];
+        let weight = |i: usize| if i == p % 3 { 2.0 / 3.0 } else { 1.0 / 6.0 };
+        let l: [f64; 3] = std::array::from_fn(|a| (0..3).map(|i| weight(i) * E[corners[i]][a]).sum());
+        let corner = |a: usize| l[a] * (2.0 * l[a] - 1.0);
+        [corner(0), corner(1), corner(2), 4.0 * l[0] * l[1], 4.0 * l[1] * l[2], 4.0 * l[2] * l[0]]
+    })
+}
+
+impl Plate {
+    /// A plate that just touches the body.
+    fn touching(body: &Body, outward: [f64; 3], stiffness: f64, onset: f64) -> Self {
+        let heights = body.surface.iter().flat_map(|f| f.nodes).map(|n| dot(body.places[n as usize], outward));
+        let spot = |f: &Facet| {
+            let cell = &body.cells[f.element as usize];
+            let local = f.nodes.map(|n| cell.iter().position(|c| *c == n).unwrap_or(0));
+            Spot { element: f.element as usize, local, nodes: f.nodes, area: f.area / POINTS as f64 }
+        };
+        Self {
+            outward,
+            height: heights.fold(f64::NEG_INFINITY, f64::max),
+            stiffness,
+            onset,
+            spots: body.surface.iter().filter(|f| dot(f.normal, outward) > 0.0).map(spot).collect(),
+        }
+    }
+
+    /// Calls `pushed` with each facet that touches: its element, its nodes among the element's, and of each point in touch the
+    /// shape functions, the penetration (mm), the pressure times its area (kPa mm^2) and the derivative of that (kPa mm).
+    fn touched(&self, body: &Body, x: &[f64], mut pushed: impl FnMut(&Spot, &[f64; 6], [f64; 3])) {
+        let shapes = shapes();
+        for spot in &self.spots {
+            let heights = spot.nodes.map(|n| {
+                let (p, u) = (body.places[n as usize], body.displacement(x, n));
+                dot(p, self.outward) + dot(u, self.outward) - self.height
+            });
+            // A quadratic lies at most by the spread of its nodes above them.
+            let (low, high) =
+                heights.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), h| (a.min(*h), b.max(*h)));
+            if high + (high - low) < 0.0 {
+                continue;
+            }
+            for shape in &shapes {
+                let beyond: f64 = (0..6).map(|k| shape[k] * heights[k]).sum();
+                if beyond > 0.0 {
+                    let (k, rise) = (self.stiffness * spot.area, beyond / self.onset);
+                    let [force, slope] =
+                        if rise < 1.0 { [0.5 * rise * beyond, rise] } else { [beyond - 0.5 * self.onset, 1.0] };
+                    pushed(spot, shape, [beyond, k * force, k * slope]);
+                }
+            }
+        }
+    }
+
+    /// Adds what the plate pushes with to the residual.
+    pub(super) fn push(&self, body: &Body, x: &[f64], residual: &mut [f64]) {
+        self.touched(body, x, |spot, shape, [_, force, _]| {
+            let mut out = [0.0; SIDE];
+            for k in 0..6 {
+                (0..3).for_each(|a| out[3 * spot.local[k] + a] += force * shape[k] * self.outward[a]);
+            }
+            body.scatter(residual, spot.element, &out);
+        });
+    }
+
+    /// Adds its derivative to the tangent.
+    pub(super) fn stiffen(&self, body: &Body, x: &[f64], tangent: &mut [f64]) {
+        self.touched(body, x, |spot, shape, [_, _, slope]| {
+            let mut out = [0.0; SIDE * SIDE];
+            for (k, a) in (0..6).flat_map(|k| (0..3).map(move |a| (k, a))) {
+                for (m, b) in (0..6).flat_map(|m| (0..3).map(move |b| (m, b))) {
+                    out[(3 * spot.local[k] + a) * SIDE + 3 * spot.local[m] + b] +=
+                        slope * shape[k] * shape[m] * self.outward[a] * self.outward[b];
+                }
+            }
+            body.pattern.add(tangent, spot.element, &out, SIDE);
+        });
+    }
+
+    /// Force of the plate (kPa mm^2), and its squeeze: the mean penetration by force (mm).
+    fn force(&self, body: &Body, x: &[f64]) -> [f64; 2] {
+        let (mut sum, mut work) = (0.0, 0.0);
+        self.touched(body, x, |_, _, [beyond, force, _]| {
+            sum += force;
+            work += force * beyond;
+        });
+        [sum, work / sum.max(f64::MIN_POSITIVE)]
+    }
+}
+
+/// What is pressed.
+#[derive(Debug, Clone)]
+pub struct Press<'a> {
+    /// The body.
+    pub body: &'a Body,
+    /// Young's modulus of each region of the body (kPa).
+    pub moduli: &'a [f64],
+    /// Poisson's ratio.
+    pub poisson: f64,
+    /// Nodes that do not move.
+    pub held: Vec<u32>,
+    /// Unit normal of the plate, out of the body (RAS).
+    pub outward: [f64; 3],
+}
+
+/// Nodes of the flat end of a body on a side; `voxel` (mm) is the least of what it was meshed from.
+pub fn base(body: &Body, side: Side, voxel: f64) -> Vec<u32> {
+    sorted(base_facets(body, side, voxel).iter().flat_map(|&f| body.surface[f].nodes))
+}
+
+/// Nodes of the elements of some regions.
+pub fn nodes_of(body: &Body, region: impl Fn(usize) -> bool) -> Vec<u32> {
+    let inside = body.cells.iter().zip(&body.region).filter(|(_, r)| region(**r as usize));
+    sorted(inside.flat_map(|(c, _)| *c))
+}
+
+fn sorted(nodes: impl Iterator<Item = u32>) -> Vec<u32> {
+    let mut nodes: Vec<u32> = nodes.collect();
+    nodes.sort_unstable();
+    nodes.dedup();
+    nodes
+}
+
+impl Press<'_> {
+    /// Indentation (mm) and force (N) of the plate at about each of `depths` (mm, rising) beyond its first touch, by the
+    /// neo-Hookean law; fewer where the body is pressed further than an equilibrium is found.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when not even the first depth can be solved.
+    pub fn forces(&self, depths: &[f64], progress: &dyn Fn(f64)) -> Result<Vec<[f64; 2]>, StiffnessError> {
+        let body = self.body;
+        let softest = self.moduli.iter().copied().filter(|e| *e > 0.0).fold(f64::INFINITY, f64::min);
+        let of = |e: f64| Material::of_youngs_modulus(e.clamp(softest, RIGID * softest), self.poisson);
+        let still = |&node: &u32| Tie { node, direction: None, target: [0.0; 3], strength: 1.0 };
+        let materials: Vec<Material> = body.region.iter().map(|&r| of(self.moduli[r as usize])).collect();
+        let size = (body.volumes.iter().sum::<f64>() / body.cells.len() as f64).cbrt();
+        let plate = Plate::touching(body, self.outward, STIFF * of(softest).mu / size, ONSET * size);
+        let top = plate.height;
+        let mut problem =
+            Problem::new(body, Law::NeoHookean, materials, self.held.iter().map(still).collect()).under(plate);
+        let (mut x, mut out) = (vec![0.0; body.pattern.unknowns()], Vec::new());
+        let (mut reached, mut squeeze) = (0.0, 0.0);
+        for (k, &depth) in depths.iter().enumerate() {
+            progress(k as f64 / depths.len() as f64);
+            let goal = depth + squeeze;
+            let whole = goal - reached;
+            let mut step = whole;
+            while reached < goal {
+                let next = if reached + 1.5 * step < goal { reached + step } else { goal };
+                match problem.lowered(top - next).near(&x, PRECISION) {
+                    Ok(found) => (x, reached) = (found, next),
+                    Err(error) if step < SHORTEST * whole => {
+                        return if out.is_empty() { Err(error) } else { Ok(out) };
+                    }
+                    Err(_) => step *= 0.5,
+                }
+            }
+            let force;
+            [force, squeeze] = problem.plate.as_ref().map_or([0.0; 2], |p| p.force(body, &x));
+            out.push([reached - squeeze, 1e-3 * force]);
+        }
+        Ok(out)
+    }
+}
