@@ -113,6 +113,9 @@ fn frames_share_a_map_and_lower_its_noise() {
     let folder = tracked(8);
     let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1000", "--model", "linear"];
     let forces = ["--forces", "0.1,0.1,0.1,0.1,0.1,0.1,0.1", "-o", "shared"];
+    let (plan, _) = run(folder.path(), &[&base[..], &forces, &["--dry-run"]].concat(), 0);
+    assert!(plan.contains("and 6 more") && plan.contains("0.1 to 0.1 N") && plan.contains("frames.csv"), "{plan}");
+    assert!(!folder.path().join("shared").exists());
     let (out, _) = run(folder.path(), &[&base[..], &forces].concat(), 0);
     assert!(out.contains("6 of 7 share these moduli"), "{out}");
     let read = |file: &str| fs::read_to_string(folder.path().join("shared").join(file)).unwrap();

@@ -165,6 +165,20 @@ fn what_cannot_be_tracked_is_refused() {
 }
 
 #[test]
+fn a_series_in_two_places_is_said_to_be() {
+    let folder = TempDir::new().unwrap();
+    let (path, out) = (folder.path().join("twice.nii"), folder.path().join("out").display().to_string());
+    let mut bytes = series(false);
+    bytes[252..254].copy_from_slice(&1i16.to_le_bytes()); // a qform too: unturned
+    bytes[268..272].copy_from_slice(&50f32.to_le_bytes()); // and 50 mm off along x
+    fs::write(&path, bytes).unwrap();
+    let (plan, err) = run(&["track", path.to_str().unwrap(), "-o", &out, "--dry-run"], 0);
+    assert!(plan.contains("Nothing was written"), "{plan}");
+    assert!(err.contains("twice.nii") && err.contains("sform and qform disagree"), "{err}");
+    assert_eq!(err.matches("disagree").count(), 1, "{err}");
+}
+
+#[test]
 fn a_sequence_takes_no_motion_of_a_pair() {
     let (_, err) = run(&["phantom", "pinch", "--motion", "press", "-o", "never"], 2);
     assert!(err.contains("--motion"), "{err}");

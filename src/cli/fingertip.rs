@@ -2,6 +2,7 @@
 
 use super::console::Console;
 use super::inputs::{check_output_file, name};
+use super::limits::mesh_fits;
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::fingertip::profile_force;
@@ -32,6 +33,7 @@ fn nodes(text: &str) -> Result<usize, String> {
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { stiffness, output, nodes } = options;
     check_output_file(output, &[".toml"])?;
+    mesh_fits(*nodes)?;
     let folder = io::read_stiffness(stiffness)?;
     let from = name(stiffness);
     let progress = console.progress();

@@ -55,11 +55,16 @@ pub fn two_places(stored: &Stored) -> Option<String> {
     Some(format!("its sform and qform disagree by up to {apart:.2} mm; the sform is used"))
 }
 
-/// A volume to measure on; warns of two placements and about single voxels without a number and refuses a volume without any.
-pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
+/// The same of a file or a folder, as a warning that names it.
+pub fn warn_of_two_places(path: &Path, warnings: &mut Vec<String>) {
     if let Ok((stored, _)) = io::read_header(path) {
         warnings.extend(two_places(&stored).map(|w| format!("{}: {w}", path.display())));
     }
+}
+
+/// A volume to measure on; warns of two placements and about single voxels without a number and refuses a volume without any.
+pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
+    warn_of_two_places(path, warnings);
     usable(io::read_volume(path)?, &path.display().to_string(), warnings)
 }
 

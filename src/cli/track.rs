@@ -4,7 +4,7 @@ use super::Usage;
 use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
-use super::inputs::{check_distinct, name, read_mask, usable, warn_all};
+use super::inputs::{check_distinct, name, read_mask, read_volume, usable, warn_all, warn_of_two_places};
 use super::limits::field_fits;
 use super::outputs::Target;
 use anyhow::{Result, bail};
@@ -88,11 +88,13 @@ impl<'a> Source<'a> {
     }
 
     fn read(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<Volume> {
-        let volume = match self {
-            Self::Files(files) => io::read_volume(&files[frame])?,
-            Self::Series(_, series) => series.read(frame)?,
-        };
-        usable(volume, &self.name(frame), warnings)
+        match self {
+            Self::Files(files) => read_volume(&files[frame], warnings),
+            Self::Series(_, series) => {
+                let volume = series.read(frame)?;
+                usable(volume, &self.name(frame), warnings)
+            }
+        }
     }
 }
 
@@ -114,6 +116,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let progress = console.progress();
     progress.set("read", 0.0);
     let mut warnings = Vec::new();
+    if let [series] = &volumes[..] {
+        warn_of_two_places(series, &mut warnings);
+    }
     let reference = source.read(origin, &mut warnings)?;
     let grid = *reference.grid();
     let first = named(origin);
