@@ -265,6 +265,17 @@ fn a_bone_of_which_only_a_low_bound_is_known_is_still_the_bone() {
 }
 
 #[test]
+fn skin_of_which_only_a_low_bound_is_known_is_no_bone() {
+    let folder = stiffness_folder(true, "bone");
+    let path = folder.path().join("stiffness/summary.json");
+    let mut summary: serde_json::Value = serde_json::from_str(&fs::read_to_string(&path).unwrap()).unwrap();
+    summary["regions"][0]["bound"] = "lower".into();
+    io::write_json(&path, &summary).unwrap();
+    let (out, err) = palpate(folder.path(), &["fingertip", "stiffness", "-o", "tip.toml", "--nodes", "0"], 0);
+    assert!(out.contains("E 40.0 kPa") && err.contains("only a bound of pulp's modulus"), "{out}{err}");
+}
+
+#[test]
 fn bad_folders_are_refused() {
     let ratios = stiffness_folder(false, "bone");
     let (_, err) = palpate(ratios.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);

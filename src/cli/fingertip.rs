@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use palpate::fingertip::profile_force;
 use palpate::io;
-use palpate::pipeline::fingertip::{NODES, PadOutcome, of_map};
+use palpate::pipeline::fingertip::{NODES, PadOutcome, of_map, vague};
 use palpate::report::figure::sheet;
 use palpate::report::plot::{Line, Plot};
 use palpate::types::fingertip::PadModel;
@@ -88,6 +88,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         ),
         false => "  grasp        the hemisphere of one modulus\n".into(),
     };
+    for name in vague(&folder) {
+        console.warn(&format!(
+            "only a bound of {name}'s modulus is known, and the tip is made with that: press it further"
+        ));
+    }
     if let Some(why) = &outcome.failure {
         console.warn(&format!("no finite elements of the map, the columns stand alone: {why}"));
     }

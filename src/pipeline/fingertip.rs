@@ -181,15 +181,24 @@ fn outward(folder: &StiffnessFolder) -> [f64; 3] {
     d.map(|v| v / length)
 }
 
-/// Moduli that stand for bone or a back plate: by name, by a lower bound, or by being far stiffer than the softest.
-fn hard(folder: &StiffnessFolder) -> Vec<f64> {
-    let named = |n: &str| BONE.iter().any(|b| n.to_lowercase().contains(b));
-    let known = |r: &&StiffnessRegion| named(&r.name) || r.bound.as_deref() == Some("lower");
+/// Regions that stand for bone or a back plate: by name; where none is so named, those known by a lower bound; and those far
+/// stiffer than the softest.
+fn hard(folder: &StiffnessFolder) -> Vec<&StiffnessRegion> {
+    let named = |r: &StiffnessRegion| BONE.iter().any(|b| r.name.to_lowercase().contains(b));
+    let some_named = folder.regions.iter().any(named);
+    // Thin skin is often known by a bound alone, and is no bone for that.
+    let known = |r: &StiffnessRegion| named(r) || (!some_named && r.bound.as_deref() == Some("lower"));
     // A bound says nothing of how soft the softest is.
     let tissue = folder.regions.iter().filter(|r| !known(r) && r.bound.is_none());
     let softest = tissue.map(|r| r.youngs_modulus).fold(f64::INFINITY, f64::min);
-    let is_hard = |r: &&StiffnessRegion| known(r) || r.youngs_modulus >= HARD * softest;
-    folder.regions.iter().filter(is_hard).map(|r| r.youngs_modulus).collect()
+    folder.regions.iter().filter(|r| known(r) || r.youngs_modulus >= HARD * softest).collect()
+}
+
+/// Names of the tissue of which only a bound is known: the map has that in place of its modulus.
+pub fn vague(folder: &StiffnessFolder) -> Vec<&str> {
+    let bones: Vec<&str> = hard(folder).iter().map(|r| r.name.as_str()).collect();
+    let tissue = folder.regions.iter().filter(|r| r.bound.is_some() && !bones.contains(&r.name.as_str()));
+    tissue.map(|r| r.name.as_str()).collect()
 }
 
 /// Reduces what `palpate stiffness` found to a fingertip, bone and pressed side as it names them. Its hemispheres press as the
@@ -203,7 +212,7 @@ pub fn of_map(folder: &StiffnessFolder, nodes: usize, progress: Progress<'_>) ->
     }
     let (bones, values) = (hard(folder), folder.map.as_slice());
     // Files keep 16 bits of a number.
-    let bone = |o: usize| bones.iter().any(|b| (f64::from(values[o]) / b - 1.0).abs() < 1e-4);
+    let bone = |o: usize| bones.iter().any(|b| (f64::from(values[o]) / b.youngs_modulus - 1.0).abs() < 1e-4);
     let side = outward(folder);
     let [moved, held] = folder.translation;
     let along = |u: [f64; 3]| (0..3).map(|a| u[a] * side[a]).sum::<f64>();

@@ -160,8 +160,11 @@ fn labelled(
         setup.advanced(&estimate.state, x, &estimate.columns, step)
     };
     let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
-    let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n);
+    let noise = maps::noise(inputs.field, inputs.labels, |data, shape, keep| f64::from(noise_sigma(data, shape, keep)));
     let alone = summary::moduli(&setup, &estimate, None, params.force_n);
+    let own = noise / (fine.block.max(1) as f64).powf(1.5);
+    let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n)
+        .widened(&alone, summary::coherent(&estimate, own));
     let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
     let count = fine.body.labels.len();
     let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();
@@ -177,7 +180,6 @@ fn labelled(
     let map = of_region(&|r| regions[r].youngs_modulus);
     let map_sd = of_region(&|r| regions[r].sd);
     let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
-    let noise = maps::noise(inputs.field, inputs.labels, |data, shape, keep| f64::from(noise_sigma(data, shape, keep)));
     let mut warnings = maps::warnings(&fine, inputs.labels, &regions, &mesh_change, params);
     warnings.dedup();
     let patches = [0, 1].map(|i| {

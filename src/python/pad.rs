@@ -2,7 +2,7 @@
 
 use super::arrays::{self, Image, told};
 use crate::io;
-use crate::pipeline::fingertip::{NODES, PadOutcome, of_map};
+use crate::pipeline::fingertip::{NODES, PadOutcome, of_map, vague};
 use pyo3::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -12,6 +12,7 @@ use std::path::PathBuf;
 pub struct Pad {
     outcome: PadOutcome,
     force_n: Option<f64>,
+    warnings: Vec<String>,
 }
 
 #[pymethods]
@@ -25,7 +26,7 @@ impl Pad {
         out["youngs_modulus"] = json!(1e3 * calibration * pad.hemisphere_kpa);
         out["calibration"] = json!(calibration);
         out["tabulated"] = json!(pad.tabulated());
-        out["warnings"] = json!(self.outcome.failure.iter().map(ToString::to_string).collect::<Vec<_>>());
+        out["warnings"] = json!(self.warnings);
         arrays::python(py, &out)
     }
 
@@ -42,5 +43,7 @@ impl Pad {
 pub fn fingertip(py: Python<'_>, map: Image<'_>, summary: &str, nodes: usize) -> PyResult<Pad> {
     let folder = io::stiffness_folder(arrays::volume(&map)?, summary).map_err(told)?;
     let outcome = py.detach(|| of_map(&folder, nodes, &|_, _| ())).map_err(told)?;
-    Ok(Pad { outcome, force_n: folder.force_n })
+    let bounds = vague(&folder).into_iter().map(|name| format!("only a bound of {name}'s modulus is known"));
+    let warnings = bounds.chain(outcome.failure.iter().map(ToString::to_string)).collect();
+    Ok(Pad { outcome, force_n: folder.force_n, warnings })
 }

@@ -90,6 +90,8 @@ pub struct Estimate {
     pub rms: f64,
     /// Sum of the weighted squares (in units of the observations' sigma).
     pub squares: f64,
+    /// The squares as they were over these: less than 1 where no residual was taken to be smaller than the model's own error.
+    pub raw: f64,
     /// How many independent samples (components) the data are worth.
     pub effective: f64,
     /// Force on the loaded and on the held plate for a reference shear modulus of 1 kPa (kPa mm^2).
@@ -407,7 +409,8 @@ impl Setup<'_> {
         let weights = self.weights(&residuals, self.scale(&residuals));
         let blocks = grouped_normal(self.observations, &rows, &residuals, &weights);
         let samples = 3.0 * residuals.len() as f64;
-        let squares = self.squares(&residuals, &weights).max(samples * self.floor * self.floor);
+        let raw = self.squares(&residuals, &weights);
+        let squares = raw.max(samples * self.floor * self.floor);
         let (covariance, information, inflation) = covariance(&blocks, &self.prior_terms(&state), squares, samples)?;
         let force = self.forces(problem, &state, state.x.as_deref().unwrap_or_default());
         let force_slope = self.force_slope(problem, &columns, force[0]);
@@ -420,6 +423,7 @@ impl Setup<'_> {
             residuals,
             rms,
             squares,
+            raw: raw / squares.max(f64::MIN_POSITIVE),
             effective: samples / inflation,
             force,
             force_slope,

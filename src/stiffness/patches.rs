@@ -436,8 +436,12 @@ fn pressed_facets(
     chosen.sort_unstable();
     chosen.dedup();
     let on = |n: &u32| chosen.binary_search(n).is_ok();
-    let facets: Vec<usize> =
-        facing.into_iter().filter(|&f| body.surface[f].nodes.iter().filter(|n| on(n)).count() >= 5).collect();
+    // On a coarse mesh hardly a facet of a small contact lies on the plane as a whole; what to add and to let go is told later.
+    let with = |least: usize| -> Vec<usize> {
+        let enough = |f: &usize| body.surface[*f].nodes.iter().filter(|n| on(n)).count() >= least;
+        facing.iter().copied().filter(enough).collect()
+    };
+    let facets = [5, 4, 3].into_iter().map(with).find(|f| !f.is_empty()).unwrap_or_default();
     Some((facets, plane, most))
 }
 
