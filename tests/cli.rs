@@ -483,8 +483,10 @@ fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     assert!(!skin["bound"].is_null() || skin["error"].as_f64().unwrap().abs() < 0.4, "{skin}");
     // The field shows the plate's travel 10 % short, and force goes with its square.
     assert!(row("hemisphere")[2].abs() < 0.4, "{:?}", row("hemisphere"));
-    // The force is what the moduli were scaled by: their elements must give it back.
-    assert!(row("finite elements")[2].abs() < 0.1, "{:?}", row("finite elements"));
+    // The force is what the moduli were scaled by: their elements must give it back. A low bound in place of the skin's
+    // modulus makes the map softer, never stiffer.
+    let softer = if skin["bound"].is_null() { 0.1 } else { 0.25 };
+    assert!((-softer..0.1).contains(&row("finite elements")[2]), "{:?}", row("finite elements"));
     let [turn, exact, _] = row("turn");
     assert!((turn - exact).abs() < 0.5, "{turn} degrees, not {exact}");
     assert_eq!(row("held to the end")[0], 1.0);
