@@ -399,6 +399,9 @@ pub enum FingertipError {
     /// Moduli without unit.
     #[error("the stiffness map holds ratios; run palpate stiffness with --force, so that it is in kPa")]
     NotAbsolute,
+    /// A number out of range.
+    #[error(transparent)]
+    Param(#[from] ParamError),
 }
 
 /// The grasp simulator.

@@ -234,6 +234,18 @@ fn elements_of_a_finger_pad_press_as_the_phantom_does() {
 }
 
 #[test]
+fn elements_that_give_way_before_the_press_leave_the_columns_alone() {
+    // A ball of 8 mm squeezed to a twentieth: the elements' forces end on the way, and a modulus fitted to what there is of them
+    // must not be scaled by what the columns give at the press.
+    let inside = |p: [f64; 3]| (p[0] - 9.0).powi(2) + (p[1] - 9.0).powi(2) + (p[2] - 9.0).powi(2) < 64.0;
+    let map = pad([46, 46, 30], 0.4, 9.0, |p| if inside(p) { 40.0 } else { 0.0 });
+    let folder = pad_folder(map, 0.49, 7.6, Some(3.0));
+    let [alone, found] = [0, 500].map(|nodes| of_map(&folder, nodes, &|_, _| ()).unwrap());
+    assert!(found.failure.is_some() && found.pad == alone.pad && found.at_press == alone.at_press);
+    assert!(found.warnings(&folder)[0].contains("the columns stand alone"), "{:?}", found.warnings(&folder));
+}
+
+#[test]
 fn without_elements_the_columns_stand_alone() {
     let folder = stiffness_folder(true, "bone");
     let args = ["fingertip", "stiffness", "-o", "tip.toml", "--nodes", "0"];

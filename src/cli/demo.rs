@@ -119,7 +119,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (mut rows, metrics) = field_rows(output)?;
     rows.extend(stiffness_rows(output, &regions)?);
     rows.extend(press_row(output, &told)?);
-    exact_fingertip(output, &told)?;
+    exact_fingertip(output, &told, &regions)?;
     rows.extend(grasp_rows(output)?);
     let mut folder = OutputFolder::create(output, true)?;
     let parts = [
@@ -164,12 +164,11 @@ fn stiffness_rows(output: &Path, truth: &[Value]) -> Result<Vec<Row>> {
 }
 
 /// The fingertip of the exact map and the scene with it, in files beside the measured ones.
-fn exact_fingertip(output: &Path, told: &Value) -> Result<()> {
+fn exact_fingertip(output: &Path, told: &Value, regions: &[Value]) -> Result<()> {
     let map: Volume = io::read_volume(output.join("phantom/youngs_modulus.nii.gz"))?;
     let elastic = &told["elastic"];
     let number = |v: &Value| v.as_f64().unwrap_or(f64::NAN);
     let word = |key: &str| elastic[key].as_str().unwrap_or_default().to_string();
-    let regions = elastic["regions"].as_array().cloned().unwrap_or_default();
     let region = |r: &Value| StiffnessRegion {
         name: r["name"].as_str().unwrap_or_default().into(),
         youngs_modulus: number(&r["youngs_modulus_kpa"]),

@@ -110,9 +110,11 @@ pub fn stiffness(
     line(&mut out, "loaded", load);
     let known: Vec<f64> = frames.iter().flatten().copied().collect();
     let (least, most) = known.iter().fold((f64::INFINITY, 0.0f64), |(a, b), f| (a.min(*f), b.max(*f)));
-    let each = (!known.is_empty()).then(|| format!("{least} to {most} N over the frames: moduli in kPa"));
-    let force = each
-        .unwrap_or_else(|| params.force_n.map_or("none: moduli as ratios".into(), |f| format!("{f} N: moduli in kPa")));
+    let force = match params.force_n {
+        _ if !known.is_empty() => format!("{least} to {most} N over the frames: moduli in kPa"),
+        Some(force) => format!("{force} N: moduli in kPa"),
+        None => "none: moduli as ratios".into(),
+    };
     line(&mut out, "force", &force);
     line(&mut out, "law", &format!("{:?}, Poisson's ratio {}", params.model, params.poisson).to_lowercase());
     line(&mut out, "mesh", &format!("about {} nodes", thousands(params.nodes)));

@@ -1,13 +1,13 @@
 //! `palpate fingertip`: a stiffness map of a finger pad to a fingertip file for grasps.
 
 use super::console::Console;
-use super::inputs::{check_output_file, name};
+use super::inputs::{check_output_file, name, warn_all};
 use super::limits::mesh_fits;
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::fingertip::profile_force;
 use palpate::io;
-use palpate::pipeline::fingertip::{NODES, PadOutcome, of_map, vague};
+use palpate::pipeline::fingertip::{NODES, PadOutcome, check_nodes, of_map};
 use palpate::report::figure::sheet;
 use palpate::report::plot::{Line, Plot};
 use palpate::types::fingertip::PadModel;
@@ -21,18 +21,14 @@ pub struct Options {
     #[arg(short, long, value_name = "FINGERTIP.toml")]
     output: PathBuf,
     /// Nodes of the finite elements of the map, about; 0 for the columns alone
-    #[arg(long, value_name = "N", default_value_t = NODES, value_parser = nodes)]
+    #[arg(long, value_name = "N", default_value_t = NODES)]
     nodes: usize,
-}
-
-fn nodes(text: &str) -> Result<usize, String> {
-    let found = text.parse().ok().filter(|n| *n == 0 || (500..=200_000).contains(n));
-    found.ok_or_else(|| "give 0, or 500 to 200,000".into())
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { stiffness, output, nodes } = options;
     check_output_file(output, &[".toml"])?;
+    check_nodes(*nodes)?;
     mesh_fits(*nodes)?;
     let folder = io::read_stiffness(stiffness)?;
     let from = name(stiffness);
@@ -88,17 +84,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         ),
         false => "  grasp        the hemisphere of one modulus\n".into(),
     };
-    for name in vague(&folder) {
-        console.warn(&format!(
-            "only a bound of {name}'s modulus is known, and the tip is made with that: press it further"
-        ));
-    }
-    if let Some(why) = &outcome.failure {
-        console.warn(&format!("no finite elements of the map, the columns stand alone: {why}"));
-    }
-    if radius > 2.0 * pad.thickness_mm {
-        console.warn("the pad is flat: a hemisphere is a poor picture of it");
-    }
+    warn_all(console, &outcome.warnings(&folder));
     console.say(&format!("{text}  results      {}", output.display()))
 }
 
@@ -131,7 +117,7 @@ fn picture(outcome: &PadOutcome, force_n: Option<f64>) -> String {
     let draw = |title, lines: &[Line]| Plot { title, across: "mm", marks: &marks }.draw(lines);
     let plots = [
         draw("Force of a flat plate on the map, N, over indentation", &map),
-        draw("The tip that a grasp is given, N, over indentation", &tip),
+        draw("Hemispheres fitted to that, N, over indentation", &tip),
     ];
     sheet("Finger pad as a fingertip", &plots, 2)
 }

@@ -116,8 +116,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let progress = console.progress();
     progress.set("read", 0.0);
     let mut warnings = Vec::new();
-    if let [series] = &volumes[..] {
-        warn_of_two_places(series, &mut warnings);
+    if let Source::Series(file, _) = &source {
+        warn_of_two_places(file, &mut warnings);
     }
     let reference = source.read(origin, &mut warnings)?;
     let grid = *reference.grid();

@@ -91,11 +91,7 @@ fn told(path: &Path, text: &str, map: impl FnOnce() -> Result<Volume, IoError>) 
 /// # Errors
 /// [`IoError`] when the file cannot be read or has none.
 pub fn read_fingertip_modulus(path: impl AsRef<Path>) -> Result<f64, IoError> {
-    let path = path.as_ref();
-    let text = fs::read_to_string(path).map_err(os(path, "read"))?;
-    let table = super::scene::parse_table(path, &text)?;
-    let found = table.get("youngs_modulus").and_then(toml::Value::as_float);
-    found.ok_or_else(|| format(path, "has no youngs_modulus", "give a file that `palpate fingertip` wrote"))
+    found_in(path.as_ref(), "youngs_modulus", |table| table.get("youngs_modulus")?.as_float())
 }
 
 /// Whether a fingertip file was made with finite elements, and the measured force over theirs (1).
@@ -103,12 +99,17 @@ pub fn read_fingertip_modulus(path: impl AsRef<Path>) -> Result<f64, IoError> {
 /// # Errors
 /// [`IoError`] when the file cannot be read or is no such file.
 pub fn read_fingertip_press(path: impl AsRef<Path>) -> Result<(bool, f64), IoError> {
-    let path = path.as_ref();
+    found_in(path.as_ref(), "calibration under [pad]", |table| {
+        let pad = table.get("pad")?.as_table()?;
+        Some((pad.contains_key("finite_element_nodes"), pad.get("calibration")?.as_float()?))
+    })
+}
+
+/// What `find` finds in a fingertip file; `what` it is called where it is missing.
+fn found_in<T>(path: &Path, what: &str, find: impl Fn(&toml::Table) -> Option<T>) -> Result<T, IoError> {
     let text = fs::read_to_string(path).map_err(os(path, "read"))?;
     let table = super::scene::parse_table(path, &text)?;
-    let pad = table.get("pad").and_then(toml::Value::as_table);
-    let found = pad.and_then(|p| Some((p.contains_key("finite_element_nodes"), p.get("calibration")?.as_float()?)));
-    found.ok_or_else(|| format(path, "has no calibration under [pad]", "give a file that `palpate fingertip` wrote"))
+    find(&table).ok_or_else(|| format(path, format!("has no {what}"), "give a file that `palpate fingertip` wrote"))
 }
 
 /// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of the hemisphere that
@@ -124,11 +125,10 @@ pub fn write_fingertip(
     calibration: f64,
     from: &str,
 ) -> Result<(), IoError> {
-    let rows = |k: usize| pad.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
+    let rows = |k: usize| list(pad.curve.iter().map(|c| c[k]));
     let name = serde_json::to_value(pad.model).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default();
     let [uniform, layered, _] = pad.residuals;
-    let scaled =
-        |k: usize, by: f64| pad.profile.iter().map(|p| format!("{:.6e}", by * p[k])).collect::<Vec<_>>().join(", ");
+    let scaled = |k: usize, by: f64| list(pad.profile.iter().map(|p| by * p[k]));
     let springs = if pad.tabulated() {
         let (depths, moduli) = (scaled(0, 1e-3), scaled(1, 1e3 * calibration));
         format!("model = \"tabulated\"\nprofile_depth = [{depths}]\nprofile_modulus = [{moduli}]")
@@ -159,7 +159,7 @@ pub fn write_fingertip(
         rows(2),
     );
     let plate = pad.plate.as_ref().map_or_else(String::new, |plate| {
-        let row = |k: usize| plate.curve.iter().map(|c| format!("{:.6e}", c[k])).collect::<Vec<_>>().join(", ");
+        let row = |k: usize| list(plate.curve.iter().map(|c| c[k]));
         format!(
             "finite_element_nodes = {}\nfinite_element_indentation_mm = [{}]\nfinite_element_force_n = [{}]\n\
              columns_factor = {:.6}     # columns are free to bulge, tissue is not: their forces times this are nearest to it\n\
@@ -172,4 +172,9 @@ pub fn write_fingertip(
         )
     });
     write_text(path, &(text + &plate))
+}
+
+/// Numbers as they stand between brackets.
+fn list(values: impl Iterator<Item = f64>) -> String {
+    values.map(|v| format!("{v:.6e}")).collect::<Vec<_>>().join(", ")
 }

@@ -1,12 +1,12 @@
 //! A stiffness map of a finger pad to a fingertip model.
 
-use crate::error::{FingertipError, StiffnessError};
+use crate::error::{FingertipError, ParamError, StiffnessError};
 use crate::fingertip::{against_plate, columns, force, reduce};
 use crate::mesh::tetrahedral::{Fineness, mesh_labels};
 use crate::pipeline::stiffness::Progress;
 use crate::stiffness::body::Body;
 use crate::stiffness::maps;
-use crate::stiffness::plate::{Press, base, nodes_of};
+use crate::stiffness::plate::{Press, base};
 use crate::types::fingertip::{Column, PadReduction, StiffnessFolder, StiffnessRegion};
 use crate::types::stiffness::Side;
 use crate::types::{Mask, Volume};
@@ -22,6 +22,17 @@ const DEPTHS: u32 = 12;
 
 /// Nodes of the finite elements of a map, about: forces on a fingertip change by 1 % up to eight times as many.
 pub const NODES: usize = 2500;
+
+/// Checks a number of nodes for the finite elements: 0 for none.
+///
+/// # Errors
+/// [`ParamError`] where it is out of range.
+pub fn check_nodes(nodes: usize) -> Result<(), ParamError> {
+    match nodes {
+        0 | 500..=200_000 => Ok(()),
+        _ => Err(ParamError { name: "nodes", value: nodes as f64, range: "0, or 500 to 200,000" }),
+    }
+}
 
 /// Classes of modulus that the finite elements tell apart at most.
 const CLASSES: usize = 48;
@@ -57,16 +68,32 @@ impl PadOutcome {
         self.at_press.map(|[depth, _]| force(&self.columns, depth))
     }
 
+    /// What is to be said of it: tissue of `folder` that is known by a bound alone, and elements that could not be solved.
+    pub fn warnings(&self, folder: &StiffnessFolder) -> Vec<String> {
+        let vague = vague(folder).into_iter().map(|name| {
+            format!("only a bound of {name}'s modulus is known, and the tip is made with that: press it further")
+        });
+        let alone = |why: &StiffnessError| format!("no finite elements of the map, the columns stand alone: {why}");
+        let flat = (self.radius_mm() > 2.0 * self.pad.thickness_mm)
+            .then(|| "the pad is flat: a hemisphere is a poor picture of it".into());
+        vague.chain(self.failure.iter().map(alone)).chain(flat).collect()
+    }
+
     /// The hemispheres fitted to the forces on a flat plate that presses the finite elements of the map; as it is where
     /// these cannot be solved, with the reason.
-    fn pressed(mut self, plate: &Plate<'_>, progress: Progress<'_>) -> Self {
+    fn pressed(mut self, elements: &Elements<'_>, progress: Progress<'_>) -> Self {
         let deepest = self.pad.curve.last().map_or(0.0, |c| c[0]);
         let depths: Vec<f64> = (1..=DEPTHS).map(|i| deepest * f64::from(i) / f64::from(DEPTHS)).collect();
-        match plate.forces(&depths, progress) {
+        match elements.forces(&depths, progress) {
             Ok((curve, nodes)) => {
-                self.pad = against_plate(self.pad, &self.columns, curve, nodes);
-                let found = self.pad.plate.as_ref().zip(self.at_press).and_then(|(p, [d, _])| Some([d, p.at(d)?]));
-                self.at_press = found.or(self.at_press);
+                let pad = against_plate(self.pad.clone(), &self.columns, curve, nodes);
+                let press = self.at_press.map(|[depth, _]| (depth, pad.plate.as_ref().and_then(|p| p.at(depth))));
+                match press {
+                    // What ends before the press cannot be held against the force that was measured there.
+                    Some((_, None)) => self.failure = Some(StiffnessError::NoEquilibrium),
+                    Some((depth, Some(force))) => (self.at_press, self.pad) = (Some([depth, force]), pad),
+                    None => self.pad = pad,
+                }
             }
             Err(why) => self.failure = Some(why),
         }
@@ -74,8 +101,8 @@ impl PadOutcome {
     }
 }
 
-/// A map and the flat plate that presses it.
-struct Plate<'a> {
+/// The finite elements of a map and the flat plate that presses them.
+struct Elements<'a> {
     map: &'a Volume,
     poisson: f64,
     bone: &'a (dyn Fn(usize) -> bool + Sync),
@@ -85,7 +112,7 @@ struct Plate<'a> {
     nodes: usize,
 }
 
-impl Plate<'_> {
+impl Elements<'_> {
     /// Indentation (mm) and force (N) at about each depth (mm), and nodes of the mesh.
     fn forces(&self, depths: &[f64], progress: Progress<'_>) -> Result<(Vec<[f64; 2]>, usize), StiffnessError> {
         progress("mesh", 0.0);
@@ -94,7 +121,7 @@ impl Plate<'_> {
         let body = Body::new(&mesh)?;
         let of_class: Vec<f64> = body.labels.iter().map(|&l| moduli[l as usize - 1]).collect();
         let side = self.held.map(|side| base(&body, side, self.map.grid().least_spacing()));
-        let hard = || nodes_of(&body, |r| usize::from(body.labels[r]) == moduli.len());
+        let hard = || body.nodes_in(|r| usize::from(body.labels[r]) == moduli.len());
         let held = side.filter(|nodes| !nodes.is_empty()).unwrap_or_else(hard);
         let press = Press { body: &body, moduli: &of_class, poisson: self.poisson, held, outward: self.outward };
         let forces = press.forces(depths, &|f| progress("press", f))?;
@@ -195,7 +222,7 @@ fn hard(folder: &StiffnessFolder) -> Vec<&StiffnessRegion> {
 }
 
 /// Names of the tissue of which only a bound is known: the map has that in place of its modulus.
-pub fn vague(folder: &StiffnessFolder) -> Vec<&str> {
+fn vague(folder: &StiffnessFolder) -> Vec<&str> {
     let bones: Vec<&str> = hard(folder).iter().map(|r| r.name.as_str()).collect();
     let tissue = folder.regions.iter().filter(|r| r.bound.is_some() && !bones.contains(&r.name.as_str()));
     tissue.map(|r| r.name.as_str()).collect()
@@ -205,8 +232,9 @@ pub fn vague(folder: &StiffnessFolder) -> Vec<&str> {
 /// map's finite elements do, on about `nodes` nodes; as the columns do where that is 0.
 ///
 /// # Errors
-/// [`FingertipError`] when the moduli are ratios, and as [`run`].
+/// [`FingertipError`] when `nodes` is out of range or the moduli are ratios, and as [`run`].
 pub fn of_map(folder: &StiffnessFolder, nodes: usize, progress: Progress<'_>) -> Result<PadOutcome, FingertipError> {
+    check_nodes(nodes)?;
     if !folder.absolute {
         return Err(FingertipError::NotAbsolute);
     }
@@ -223,5 +251,5 @@ pub fn of_map(folder: &StiffnessFolder, nodes: usize, progress: Progress<'_>) ->
         return Ok(out);
     }
     let (poisson, held) = (folder.poisson, Side::parse(&folder.held));
-    Ok(out.pressed(&Plate { map: &folder.map, poisson, bone: &bone, held, outward: side, nodes }, progress))
+    Ok(out.pressed(&Elements { map: &folder.map, poisson, bone: &bone, held, outward: side, nodes }, progress))
 }

@@ -162,9 +162,8 @@ fn labelled(
     let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
     let noise = maps::noise(inputs.field, inputs.labels, |data, shape, keep| f64::from(noise_sigma(data, shape, keep)));
     let alone = summary::moduli(&setup, &estimate, None, params.force_n);
-    let own = noise / (fine.block.max(1) as f64).powf(1.5);
     let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n)
-        .widened(&alone, summary::coherent(&estimate, own));
+        .widened(&alone, summary::coherent(&estimate, fine.sample_noise(noise)));
     let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
     let count = fine.body.labels.len();
     let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();

@@ -2,7 +2,7 @@
 
 use super::arrays::{self, Image, told};
 use crate::io;
-use crate::pipeline::fingertip::{NODES, PadOutcome, of_map, vague};
+use crate::pipeline::fingertip::{NODES, PadOutcome, of_map};
 use pyo3::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -43,7 +43,6 @@ impl Pad {
 pub fn fingertip(py: Python<'_>, map: Image<'_>, summary: &str, nodes: usize) -> PyResult<Pad> {
     let folder = io::stiffness_folder(arrays::volume(&map)?, summary).map_err(told)?;
     let outcome = py.detach(|| of_map(&folder, nodes, &|_, _| ())).map_err(told)?;
-    let bounds = vague(&folder).into_iter().map(|name| format!("only a bound of {name}'s modulus is known"));
-    let warnings = bounds.chain(outcome.failure.iter().map(ToString::to_string)).collect();
+    let warnings = outcome.warnings(&folder);
     Ok(Pad { outcome, force_n: folder.force_n, warnings })
 }

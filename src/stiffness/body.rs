@@ -100,6 +100,22 @@ impl Body {
         Self { places, quadrature, surface, ..self.clone() }
     }
 
+    /// Mean side of an element (mm).
+    pub fn element_size(&self) -> f64 {
+        (self.volumes.iter().sum::<f64>() / self.cells.len() as f64).cbrt()
+    }
+
+    /// Nodes of some facets, ascending.
+    pub fn nodes_on(&self, facets: impl IntoIterator<Item = usize>) -> Vec<u32> {
+        sorted(facets.into_iter().flat_map(|f| self.surface[f].nodes))
+    }
+
+    /// Nodes of the elements of some regions, ascending.
+    pub fn nodes_in(&self, region: impl Fn(usize) -> bool) -> Vec<u32> {
+        let inside = self.cells.iter().zip(&self.region).filter(|(_, r)| region(**r as usize));
+        sorted(inside.flat_map(|(c, _)| *c))
+    }
+
     /// The displacement (mm) of a node in a vector of unknowns.
     #[inline]
     pub fn displacement(&self, x: &[f64], node: u32) -> [f64; 3] {
@@ -132,6 +148,13 @@ impl Body {
             x[self.pattern.first(n)] += values[30 + i];
         }
     }
+}
+
+fn sorted(nodes: impl Iterator<Item = u32>) -> Vec<u32> {
+    let mut nodes: Vec<u32> = nodes.collect();
+    nodes.sort_unstable();
+    nodes.dedup();
+    nodes
 }
 
 fn surface(cells: &[[u32; 10]], places: &[[f64; 3]]) -> Vec<Facet> {

@@ -67,15 +67,8 @@ pub struct Problem<'a> {
 impl<'a> Problem<'a> {
     /// A problem with the spring constant that goes with the body's stiffness and element size.
     pub fn new(body: &'a Body, law: Law, materials: Vec<Material>, ties: Vec<Tie>) -> Self {
-        let volume: f64 = body.volumes.iter().sum();
-        let size = (volume / body.cells.len() as f64).cbrt();
         let stiffest = materials.iter().fold(0.0, |m: f64, v| m.max(v.mu));
-        Self { body, law, materials, ties, spring: TIE * stiffest * size, plate: None }
-    }
-
-    /// The same under a plate.
-    pub fn under(self, plate: Plate) -> Self {
-        Self { plate: Some(plate), ..self }
+        Self { body, law, materials, ties, spring: TIE * stiffest * body.element_size(), plate: None }
     }
 
     /// Brings its plate to a height (mm).

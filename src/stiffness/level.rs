@@ -46,6 +46,11 @@ pub struct Level {
 }
 
 impl Level {
+    /// Noise of a sample, a mean over its block, in a field that is rough by `noise` a voxel (mm, one component).
+    pub fn sample_noise(&self, noise: f64) -> f64 {
+        noise / (self.block.max(1) as f64).powf(1.5)
+    }
+
     /// Reads field (and matches, where given) onto a mesh of `labels`.
     ///
     /// # Errors

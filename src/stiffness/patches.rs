@@ -61,9 +61,7 @@ pub struct SurfaceMotion {
 impl SurfaceMotion {
     /// Reads the field at the surface of a body.
     pub fn new(body: &Body, field: &DenseField, mask: &Mask) -> Self {
-        let mut nodes: Vec<u32> = body.surface.iter().flat_map(|f| f.nodes).collect();
-        nodes.sort_unstable();
-        nodes.dedup();
+        let nodes = body.nodes_on(0..body.surface.len());
         let all = |reach: f64| {
             let read = |&n: &u32| at_surface(field, mask, body.places[n as usize], reach);
             let values: Vec<_> = nodes.par_iter().map(read).collect();
@@ -187,9 +185,7 @@ impl Patch {
 
     /// The patch on other facets (ascending). Nodes that it did not have come onto its plane.
     pub fn on_facets(&self, body: &Body, facets: Vec<usize>) -> Patch {
-        let mut nodes: Vec<u32> = facets.iter().flat_map(|&f| body.surface[f].nodes).collect();
-        nodes.sort_unstable();
-        nodes.dedup();
+        let nodes = body.nodes_on(facets.iter().copied());
         let known: Vec<Option<usize>> = nodes.iter().map(|n| self.nodes.binary_search(n).ok()).collect();
         let pick = |values: &[[f64; 3]]| known.iter().map(|k| k.map_or([0.0; 3], |i| values[i])).collect();
         let onto = |(n, k): (&u32, &Option<usize>)| match k {
@@ -387,9 +383,7 @@ fn pressed_facets(
 ) -> Option<(Vec<usize>, Option<Plane>, f64)> {
     let d = side.direction();
     let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > 0.3).collect();
-    let mut nodes: Vec<u32> = facing.iter().flat_map(|&f| body.surface[f].nodes).collect();
-    nodes.sort_unstable();
-    nodes.dedup();
+    let mut nodes = body.nodes_on(facing.iter().copied());
     nodes.retain(|&n| against(n).is_some());
     if nodes.len() < 6 {
         return None;
@@ -503,9 +497,7 @@ fn build(
     plane: Option<Plane>,
     voxel: f64,
 ) -> Option<Patch> {
-    let mut nodes: Vec<u32> = facets.iter().flat_map(|&f| body.surface[f].nodes).collect();
-    nodes.sort_unstable();
-    nodes.dedup();
+    let nodes = body.nodes_on(facets.iter().copied());
     let middle = mean_place(body, &nodes);
     let spread: f64 = nodes.iter().map(|&n| square(sub(body.places[n as usize], middle))).sum();
     let radius = (spread / nodes.len() as f64).sqrt().max(voxel);

@@ -165,20 +165,7 @@ pub struct Press<'a> {
 
 /// Nodes of the flat end of a body on a side; `voxel` (mm) is the least of what it was meshed from.
 pub fn base(body: &Body, side: Side, voxel: f64) -> Vec<u32> {
-    sorted(base_facets(body, side, voxel).iter().flat_map(|&f| body.surface[f].nodes))
-}
-
-/// Nodes of the elements of some regions.
-pub fn nodes_of(body: &Body, region: impl Fn(usize) -> bool) -> Vec<u32> {
-    let inside = body.cells.iter().zip(&body.region).filter(|(_, r)| region(**r as usize));
-    sorted(inside.flat_map(|(c, _)| *c))
-}
-
-fn sorted(nodes: impl Iterator<Item = u32>) -> Vec<u32> {
-    let mut nodes: Vec<u32> = nodes.collect();
-    nodes.sort_unstable();
-    nodes.dedup();
-    nodes
+    body.nodes_on(base_facets(body, side, voxel))
 }
 
 impl Press<'_> {
@@ -193,11 +180,11 @@ impl Press<'_> {
         let of = |e: f64| Material::of_youngs_modulus(e.clamp(softest, RIGID * softest), self.poisson);
         let still = |&node: &u32| Tie { node, direction: None, target: [0.0; 3], strength: 1.0 };
         let materials: Vec<Material> = body.region.iter().map(|&r| of(self.moduli[r as usize])).collect();
-        let size = (body.volumes.iter().sum::<f64>() / body.cells.len() as f64).cbrt();
+        let size = body.element_size();
         let plate = Plate::touching(body, self.outward, STIFF * of(softest).mu / size, ONSET * size);
         let top = plate.height;
-        let mut problem =
-            Problem::new(body, Law::NeoHookean, materials, self.held.iter().map(still).collect()).under(plate);
+        let held = self.held.iter().map(still).collect();
+        let mut problem = Problem { plate: Some(plate), ..Problem::new(body, Law::NeoHookean, materials, held) };
         let (mut x, mut out) = (vec![0.0; body.pattern.unknowns()], Vec::new());
         let (mut reached, mut squeeze) = (0.0, 0.0);
         for (k, &depth) in depths.iter().enumerate() {

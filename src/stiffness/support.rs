@@ -51,9 +51,8 @@ impl Support {
         let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
         let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
         let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
-        let block = level.block.max(1) as f64;
         let e = &choice.estimate;
-        let sample = noise / block.powf(1.5);
+        let sample = level.sample_noise(noise);
         let misfit = (e.rms * e.rms - sample * sample).max(0.0).sqrt();
         let mut out = Self {
             noise: [noise, sample],
