@@ -6,7 +6,9 @@ use palpate::pipeline::pressed::Pressed;
 use palpate::pipeline::stiffness::{Inputs, run};
 use palpate::stiffness::body::Body;
 use palpate::stiffness::forward::{Problem, Tie};
+use palpate::stiffness::identify::State;
 use palpate::stiffness::law::Material;
+use palpate::stiffness::level::Level;
 use palpate::stiffness::patches::Place;
 use palpate::synth::{PhantomKind, PhantomParams};
 use palpate::types::stiffness::{Contact, Law, LawChoice, Side};
@@ -279,6 +281,52 @@ fn sensitivities_are_those_of_finite_differences() {
             let difference = (high[i] - low[i]) / (2.0 * h);
             assert!((difference - y[i]).abs() < 1e-4 * size, "{law:?}: {} for {difference}", y[i]);
         }
+    }
+}
+
+#[test]
+fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
+    let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
+    let body = Pressed::new(&params).unwrap();
+    let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
+    let volume = palpate::stiffness::maps::volume(&map);
+    let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, 2500)).unwrap();
+    let [held, load] = ["z+", "z-"].map(|side| Place::Side(Side::parse(side).unwrap()));
+    let mut level = Level::new(&mesh, &body.phantom.truth, None, &map, &held, &load).unwrap();
+    assert!(level.patches[1].curved());
+    level.patches[1].contact = Contact::Sliding;
+    let setup = level.setup(Law::NeoHookean, 0.49, level.largest());
+    // Far from what the data say, so that the run ends where it starts, with the derivatives there.
+    let here = setup.run(setup.start(), 0, 1e-9).unwrap();
+    assert_eq!(here.state.theta, setup.start().theta);
+    assert!((here.force[0] / here.force[1] - 1.0).abs() < 1e-3, "{:?}", here.force);
+    // A modulus, how far the plate goes in, and how it is tilted.
+    let (first, h) = (setup.free().len() + setup.patches[0].parameters(), 1e-4);
+    for k in [0, first, first + 1, first + 2] {
+        let moved = |by: f64| {
+            let mut state = State { x: None, ..here.state.clone() };
+            match k.checked_sub(first) {
+                None => state.theta[setup.free()[k]] += by,
+                Some(own) => state.plates[1][own] += by,
+            }
+            let problem = setup.problem(&state);
+            let x = problem.solve(here.state.x.as_deref(), 1e-10).unwrap().x;
+            let ties = setup.patches[0].ties(&level.body, &state.plates[0]);
+            let along = |t: &Tie| (0..3).map(|a| problem.pull(t, &x)[a] * setup.patches[1].normal[a]).sum::<f64>();
+            (ties.iter().map(along).sum::<f64>(), x)
+        };
+        let [(least, low), (most, high)] = [-h, h].map(moved);
+        let column = &here.columns[k * low.len()..(k + 1) * low.len()];
+        let of_node = |n: usize| level.body.pattern.first(n as u32)..level.body.pattern.first(n as u32) + 3;
+        let all: Vec<usize> = (0..level.body.places.len()).flat_map(of_node).collect();
+        let size = all.iter().fold(0.0, |m: f64, &i| m.max(column[i].abs()));
+        for &i in &all {
+            let difference = (high[i] - low[i]) / (2.0 * h);
+            assert!((difference - column[i]).abs() < 5e-3 * size, "{k}: {} for {difference} of {size}", column[i]);
+        }
+        let slope = (most / least).ln() / (2.0 * h);
+        let bound = 5e-3 * here.force_slope[k].abs().max(0.1);
+        assert!((slope - here.force_slope[k]).abs() < bound, "{k}: {} for {slope}", here.force_slope[k]);
     }
 }
 

@@ -1,11 +1,11 @@
 //! A displacement field to Young's modulus, region by region.
 
 use crate::error::StiffnessError;
-use crate::mesh::tetrahedral::{Fineness, mesh_labels, mesh_labels_finer, pieces};
+use crate::mesh::tetrahedral::{Fineness, Mesher, pieces};
 use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
-use crate::stiffness::choice::{choose, touch};
+use crate::stiffness::choice::choose;
 use crate::stiffness::identify::State;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
@@ -95,7 +95,8 @@ fn labelled(
     progress("mesh", 0.0);
     let volume = maps::volume(inputs.labels);
     let coarse_nodes = (COARSE * params.nodes as f64) as usize;
-    let coarse_mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, coarse_nodes))?;
+    let mesher = Mesher::new(inputs.labels)?;
+    let coarse_mesh = mesher.mesh(&Fineness::for_nodes(volume, coarse_nodes))?;
     clock.book("mesh");
 
     progress("read", 0.05);
@@ -105,12 +106,12 @@ fn labelled(
     let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
     let meshed = |nodes: f64, size: f64| {
         if rim.is_empty() {
-            let mesh = mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize))?;
+            let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
             let count = mesh.nodes().len() as f64;
             // Thin layers and a rough surface take more than a block does.
             return match count <= OVER * nodes {
                 true => Ok(mesh),
-                false => mesh_labels(inputs.labels, &Fineness::for_nodes(volume, (nodes * nodes / count) as usize)),
+                false => mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize)),
             };
         }
         // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
@@ -118,7 +119,7 @@ fn labelled(
         for coarser in COARSER {
             for elsewhere in ELSEWHERE {
                 let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
-                let mesh = mesh_labels_finer(inputs.labels, &fineness, &rim, coarser * size * coarse.voxel)?;
+                let mesh = mesher.mesh_finer(&fineness, &rim, coarser * size * coarse.voxel)?;
                 let count = mesh.nodes().len() as f64 / nodes;
                 let rank = if count <= OVER { -count } else { count };
                 if best.as_ref().is_none_or(|(least, _)| rank < *least) {
@@ -129,7 +130,7 @@ fn labelled(
                 break;
             }
         }
-        best.map_or_else(|| mesh_labels(inputs.labels, &Fineness::for_nodes(volume, nodes as usize)), |b| Ok(b.1))
+        best.map_or_else(|| mesher.mesh(&Fineness::for_nodes(volume, nodes as usize)), |b| Ok(b.1))
     };
     let fine_mesh = meshed(params.nodes as f64, RIM)?;
     if !rim.is_empty() {
@@ -148,7 +149,6 @@ fn labelled(
     fine.touch_like(&coarse);
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
-    let estimate = touch(&mut fine, choice.law, params.poisson, reference, estimate, 3, PRECISION)?;
     clock.book("fine");
 
     progress("uncertainty", 0.9);
@@ -179,14 +179,19 @@ fn labelled(
     let map = of_region(&|r| regions[r].youngs_modulus);
     let map_sd = of_region(&|r| regions[r].sd);
     let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
-    let mut warnings = maps::warnings(&fine, inputs.labels, &regions, &mesh_change, params);
+    let touching = setup.touching(&state);
+    let area = |i: usize| match &touching {
+        Some((_, area)) if i == 1 => *area,
+        _ => fine.patches[i].area(&fine.body),
+    };
+    let mut warnings = maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params);
     warnings.dedup();
     let patches = [0, 1].map(|i| {
         let p = &fine.patches[i];
         PatchReport {
             name: p.name.clone(),
-            area: p.area(&fine.body),
-            nodes: p.nodes.len(),
+            area: area(i),
+            nodes: touching.as_ref().filter(|_| i == 1).map_or(p.nodes.len(), |t| t.0.len()),
             contact: p.contact,
             translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
             travel_mm: p.travelled(&fine.body),
@@ -213,7 +218,7 @@ fn labelled(
         residual,
         element_modulus,
         displacement: maps::node_displacement(&fine.body, &state),
-        prescribed: maps::prescribed(&fine, &state),
+        prescribed: maps::prescribed(&setup, &state),
         faces: geometry.map(|g| g.faces).unwrap_or_default(),
         model_force: estimate.force[0] * scale / 1000.0,
         mesh_change,

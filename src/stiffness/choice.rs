@@ -1,7 +1,6 @@
 //! No more model than the data ask for: contact, law and number of regions by evidence.
 
 use crate::error::StiffnessError;
-use crate::stiffness::contact::adjusted;
 use crate::stiffness::geometry::edge_step;
 use crate::stiffness::identify::Estimate;
 use crate::stiffness::level::Level;
@@ -16,10 +15,6 @@ const COARSE: f64 = 1e-4;
 /// Iterations at most on the coarse mesh.
 const ITERATIONS: usize = 12;
 
-/// Precision of the solutions that tell a contact (mm).
-const CONTACT: f64 = 1e-3;
-/// Contacts of a curved body with the plate that are tried at most.
-const CONTACTS: usize = 20;
 /// Moves of a punch's edge at most.
 const MOVES: usize = 4;
 /// Length of one at most (voxels): the difference that it is taken from is linear about as far.
@@ -55,7 +50,7 @@ fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     let one = |patch: &Patch| {
         // Free sliding spreads a flat face by half the strain.
         let free = 0.5 * strain * patch.radius;
-        let flat = patch.bend() == 0.0;
+        let flat = !patch.curved();
         if flat && patch.residual[1] < 0.25 * free {
             vec![Contact::Sticking]
         } else if flat && patch.residual[1] < 2.0 * level.surface_error {
@@ -68,8 +63,7 @@ fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     [one(held), one(load)]
 }
 
-/// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the contact chosen, without the
-/// facets that a plate would have to pull.
+/// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the contact chosen.
 ///
 /// # Errors
 /// [`StiffnessError`] where no candidate can be solved.
@@ -77,28 +71,25 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
     let mut evidence = Vec::new();
     let names = candidates(level);
     let first = if wanted == LawChoice::NeoHookean { Law::NeoHookean } else { Law::Linear };
-    let mut tried: Vec<([Contact; 2], Estimate, Patch)> = Vec::new();
-    let (mut failure, given) = (None, level.patches[1].clone());
+    let mut tried: Vec<([Contact; 2], Estimate)> = Vec::new();
+    let mut failure = None;
     for &a in &names[0] {
         for &b in &names[1] {
             level.patches[0].contact = a;
-            level.patches[1] = given.clone();
             level.patches[1].contact = b;
             let setup = level.setup(first, poisson, reference);
-            let run = setup.run(setup.start(), ITERATIONS, COARSE);
-            match run.and_then(|e| touch(level, first, poisson, reference, e, ITERATIONS, COARSE)) {
-                Ok(e) => tried.push(([a, b], e, level.patches[1].clone())),
+            match setup.run(setup.start(), ITERATIONS, COARSE) {
+                Ok(e) => tried.push(([a, b], e)),
                 Err(e) => failure = Some(e),
             }
         }
     }
     let samples = tried.iter().map(|t| t.1.effective).fold(f64::INFINITY, f64::min);
     // A guided patch is given twelve numbers of its own.
-    let count = |t: &([Contact; 2], Estimate, Patch)| {
-        t.1.parameters + 12 * t.0.iter().filter(|c| **c == Contact::Guided).count()
-    };
-    let score = |t: &([Contact; 2], Estimate, Patch)| bic(t.1.squares, samples, count(t));
-    let guided = |t: &([Contact; 2], Estimate, Patch)| t.0.contains(&Contact::Guided);
+    let count =
+        |t: &([Contact; 2], Estimate)| t.1.parameters + 12 * t.0.iter().filter(|c| **c == Contact::Guided).count();
+    let score = |t: &([Contact; 2], Estimate)| bic(t.1.squares, samples, count(t));
+    let guided = |t: &([Contact; 2], Estimate)| t.0.contains(&Contact::Guided);
     let rank = |t| score(t) + if guided(t) { DECISIVE * samples } else { 0.0 };
     let best = (0..tried.len()).fold(None, |m: Option<usize>, i| match m {
         Some(k) if rank(&tried[k]) <= rank(&tried[i]) => Some(k),
@@ -123,9 +114,8 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
             },
         });
     }
-    let (contact, mut estimate, loaded) = tried.swap_remove(best);
-    level.patches[0].contact = contact[0];
-    level.patches[1] = loaded;
+    let (contact, mut estimate) = tried.swap_remove(best);
+    (level.patches[0].contact, level.patches[1].contact) = (contact[0], contact[1]);
     let mut law = first;
     estimate = settle(level, law, poisson, reference, estimate)?;
     if wanted != LawChoice::Linear && first == Law::Linear {
@@ -154,7 +144,7 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         }
         if better {
             law = Law::NeoHookean;
-            estimate = touch(level, law, poisson, reference, large, ITERATIONS, COARSE)?;
+            estimate = large;
         } else {
             level.move_edge(edge);
         }
@@ -189,43 +179,6 @@ fn settle(
         level.move_edge(moved + step.clamp(-LONGEST, LONGEST));
         let start = estimate.state.clone();
         estimate = level.setup(law, poisson, reference).run(start, ITERATIONS, COARSE)?;
-    }
-    Ok(estimate)
-}
-
-/// Finds where a curved body touches the plate, and identifies again, until neither changes: at fixed moduli, what the plate
-/// would pull is let go, and what goes through it touches it.
-///
-/// # Errors
-/// As [`crate::stiffness::identify::Setup::run`].
-pub fn touch(
-    level: &mut Level,
-    law: Law,
-    poisson: f64,
-    reference: usize,
-    mut estimate: Estimate,
-    iterations: usize,
-    precision: f64,
-) -> Result<Estimate, StiffnessError> {
-    let mut seen = vec![level.patches[1].facets.clone()];
-    while level.patches[1].bend() > 0.0 && seen.len() < CONTACTS {
-        let before = seen.len();
-        let mut state = estimate.state.clone();
-        while seen.len() < CONTACTS {
-            let setup = level.setup(law, poisson, reference);
-            let x = state.x.as_deref().unwrap_or_default();
-            let next = adjusted(&setup.problem(&state), &level.patches[1], &state.plates[1], x, level.voxel);
-            // Facets on the edge that come and go are as well on either side.
-            let Some(patch) = next.filter(|p| !seen.contains(&p.facets)) else { break };
-            seen.push(patch.facets.clone());
-            level.patches[1] = patch;
-            let setup = level.setup(law, poisson, reference);
-            state.x = Some(setup.problem(&state).displaced(state.x.as_deref(), CONTACT)?);
-        }
-        if seen.len() == before {
-            break;
-        }
-        estimate = level.setup(law, poisson, reference).run(state, iterations, precision)?;
     }
     Ok(estimate)
 }

@@ -199,7 +199,7 @@ impl<'a> Problem<'a> {
 
     fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         let zero = vec![0.0; self.body.pattern.unknowns()];
-        if self.law == Law::Linear {
+        if self.law == Law::Linear && self.plate.is_none() {
             let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
             x.iter_mut().for_each(|v| *v = -*v);
             let factor = self.factorise(&zero)?;
@@ -215,6 +215,7 @@ impl<'a> Problem<'a> {
             let next = (reached + step).min(1.0);
             let mut part = self.clone();
             part.ties.iter_mut().for_each(|t| t.target = t.target.map(|v| v * next));
+            part.plate = self.plate.as_ref().map(|p| p.approaching(self.body, next));
             match part.newton(x.clone(), if next < 1.0 { 1e-3 } else { precision }, stale) {
                 Ok(done) if next >= 1.0 => return Ok(done),
                 Ok(done) => {

@@ -84,7 +84,7 @@ pub struct Edge {
 impl Edge {
     /// None where a patch is curved, or reaches to the end of its side. `voxel` is the least voxel size (mm).
     pub fn of(patch: &Patch, body: &Body, voxel: f64) -> Option<Self> {
-        if patch.bend() > 0.0 {
+        if patch.curved() {
             return None;
         }
         let mut edge =

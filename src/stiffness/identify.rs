@@ -15,7 +15,7 @@ use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
-use crate::types::stiffness::Law;
+use crate::types::stiffness::{Contact, Law};
 
 /// Steps below this (in ln E, and of the plates over their travel) are taken to first order: what that leaves out is 0.1 %.
 const FIRST_ORDER: f64 = 0.03;
@@ -123,17 +123,26 @@ impl Setup<'_> {
         for (patch, change) in self.patches.iter().zip(&state.plates) {
             ties.extend(patch.ties(self.body, change));
         }
-        let slides = |p: &Patch| p.contact == crate::types::stiffness::Contact::Sliding;
+        let slides = |p: &Patch| p.contact == Contact::Sliding;
         if self.patches.iter().all(slides) {
             // Two frictionless plates leave the body free to move along them: springs as soft as the tissue, to where the
             // surface was measured to go, hold it and pull next to nothing.
             for patch in &self.patches {
                 let mut guided = patch.clone();
-                guided.contact = crate::types::stiffness::Contact::Guided;
+                guided.contact = Contact::Guided;
                 ties.extend(guided.ties(self.body, &[]).into_iter().map(|t| Tie { strength: 1e-9, ..t }));
             }
         }
-        Problem::new(self.body, self.law, materials, ties)
+        let [_, loaded] = &self.patches;
+        let plate = loaded.plate(self.body, &state.plates[1], |e| materials[e].mu);
+        Problem { plate, ..Problem::new(self.body, self.law, materials, ties) }
+    }
+
+    /// Nodes of the facets with which a curved body touches its plate, ascending, and the area of the contact (mm^2); none
+    /// where the patch is flat or sticks.
+    pub fn touching(&self, state: &State) -> Option<(Vec<u32>, f64)> {
+        let x = state.x.as_deref()?;
+        Some(self.problem(state).plate?.contact(self.body, x))
     }
 
     /// A state with equal moduli and the plates as fitted.
@@ -153,20 +162,33 @@ impl Setup<'_> {
         let body = self.body;
         let mut out = Vec::new();
         for r in self.free() {
-            let part = problem.residual_by_modulus(x, |e| body.region[e] as usize == r)?;
+            let mut part = problem.residual_by_modulus(x, |e| body.region[e] as usize == r)?;
+            if let Some(plate) = &problem.plate {
+                // The plate is as stiff as what it touches.
+                let stiffness = |e: usize| problem.materials[e].mu;
+                let own = |e: usize| if body.region[e] as usize == r { stiffness(e) } else { 0.0 };
+                let loaded = &self.patches[1];
+                let share = loaded.backing(body, own) / loaded.backing(body, stiffness);
+                let mut pushed = vec![0.0; part.len()];
+                plate.push(body, x, &mut pushed);
+                part.iter_mut().zip(&pushed).for_each(|(v, p)| *v += share * p);
+            }
             out.extend(part.into_iter().map(|v| -v));
         }
-        out.extend(self.plate_sides(problem));
+        out.extend(self.plate_sides(problem, x));
         Ok(out)
     }
 
     /// Right-hand sides for the plates' parameters, one after the other.
-    pub fn plate_sides(&self, problem: &Problem<'_>) -> Vec<f64> {
+    pub fn plate_sides(&self, problem: &Problem<'_>, x: &[f64]) -> Vec<f64> {
         let (body, n) = (self.body, self.body.pattern.unknowns());
         let (mut out, zero) = (Vec::new(), vec![0.0; n]);
-        for patch in &self.patches {
+        for (i, patch) in self.patches.iter().enumerate() {
             for k in 0..patch.parameters() {
-                let mut column = vec![0.0; n];
+                let mut column = match &problem.plate {
+                    Some(plate) if i == 1 => plate.moved(body, x, |p| dot(patch.basis(k, p), patch.normal)),
+                    _ => vec![0.0; n],
+                };
                 for tie in patch.ties(body, &[]) {
                     let push = Tie { target: patch.basis(k, body.places[tie.node as usize]), ..tie };
                     let force = problem.pull(&push, &zero);
@@ -179,13 +201,14 @@ impl Setup<'_> {
         out
     }
 
-    /// Force (kPa mm^2) with which each plate pushes the body (loaded, held).
+    /// Force (kPa mm^2) with which each plate pushes the body (loaded, held). That of a plate on a curved body is what the ties
+    /// hold against it: linear in `x`, so it needs no better solution than that.
     pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
-        [1, 0].map(|i| {
-            let patch = &self.patches[i];
-            let ties = patch.ties(self.body, &state.plates[i]);
-            -ties.iter().map(|t| dot(problem.pull(t, x), patch.normal)).sum::<f64>()
-        })
+        let [held, loaded] = [0, 1].map(|i| self.patches[i].ties(self.body, &state.plates[i]));
+        let along = |ties: &[Tie], normal| ties.iter().map(|t| dot(problem.pull(t, x), normal)).sum::<f64>();
+        let n = self.patches[1].normal;
+        let counter = if problem.plate.is_some() { along(&held, n) } else { -along(&loaded, n) };
+        [counter, -along(&held, self.patches[0].normal)]
     }
 
     /// Residuals (mm) and Huber weights times 1 / sigma^2; `scale` is the robust standard deviation in units of sigma.
@@ -272,6 +295,14 @@ impl Setup<'_> {
             let plates = step[free.len()..].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
             if longest < FIRST_ORDER && plates < FIRST_ORDER * self.travel() {
                 let end = self.advanced(&state, &x, &columns, &step);
+                if problem.plate.is_some() {
+                    // A contact is stiff: what is left out would show as a force.
+                    let (problem, solution) = self.follow(&end, tangent, problem.spring, precision)?;
+                    let rest = self.residuals(&solution.x);
+                    let end = State { x: Some(solution.x), ..end };
+                    factorisations += solution.factorisations;
+                    return self.finish(end, &problem, columns, rest, iterations, factorisations);
+                }
                 let rows = self.rows(&columns);
                 let rest = (0..residuals.len()).map(|i| {
                     let fell = |a: usize| (0..parameters).map(|k| step[k] * rows[k][i][a]).sum::<f64>();
@@ -437,16 +468,19 @@ impl Setup<'_> {
     /// Derivatives of ln(force on the loaded plate).
     fn force_slope(&self, problem: &Problem<'_>, columns: &[f64], force: f64) -> Vec<f64> {
         let n = self.body.pattern.unknowns();
-        let first = self.free().len() + self.patches[0].parameters();
-        let patch = &self.patches[1];
+        // As in `forces`.
+        let own = usize::from(problem.plate.is_none());
+        let sign = if own == 1 { -1.0 } else { 1.0 };
+        let first = self.free().len() + own * self.patches[0].parameters();
+        let (patch, normal) = (&self.patches[own], self.patches[1].normal);
         let ties = patch.ties(self.body, &[]);
         let slope = |(k, y): (usize, &[f64])| {
             let push = |tie: &Tie| {
                 let target = match k.checked_sub(first) {
-                    Some(own) => patch.basis(own, self.body.places[tie.node as usize]),
-                    None => [0.0; 3],
+                    Some(k) if k < patch.parameters() => patch.basis(k, self.body.places[tie.node as usize]),
+                    _ => [0.0; 3],
                 };
-                -dot(problem.pull(&Tie { target, ..*tie }, y), patch.normal)
+                sign * dot(problem.pull(&Tie { target, ..*tie }, y), normal)
             };
             ties.iter().map(push).sum::<f64>() / force
         };

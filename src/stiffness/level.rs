@@ -9,7 +9,6 @@ use crate::stiffness::geometry::Edge;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::{Observation, find, from_field, from_matches};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
-use crate::types::space::dot;
 use crate::types::stiffness::Law;
 use crate::types::{DenseField, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
 
@@ -108,27 +107,11 @@ impl Level {
         }
     }
 
-    /// Takes over where the body touches the plates from another mesh: how, with which facets of a curved patch, and, as facets
-    /// end elsewhere, with an edge of the punch that makes the patch as large.
+    /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere, an edge of the punch that
+    /// makes the patch as large.
     pub fn touch_like(&mut self, other: &Level) {
         for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
             own.contact = theirs.contact;
-        }
-        let [_, loaded] = &other.patches;
-        if loaded.bend() > 0.0 && self.patches[1].bend() > 0.0 {
-            let middles: Vec<[f64; 3]> = other.body.surface.iter().map(|f| f.centre).collect();
-            let near = Neighbours::new(&middles);
-            let touches = |f: &usize| {
-                let facet = &self.body.surface[*f];
-                let nearest = near.within(facet.centre, f64::INFINITY, 1).first().copied();
-                dot(facet.normal, loaded.normal) > 0.3
-                    && nearest.is_some_and(|n| loaded.facets.binary_search(&n).is_ok())
-            };
-            let facets: Vec<usize> = (0..self.body.surface.len()).filter(touches).collect();
-            if !facets.is_empty() {
-                self.patches[1] = self.patches[1].on_facets(&self.body, facets);
-            }
-            return;
         }
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
         if let Some((edge, _)) = self.edge {

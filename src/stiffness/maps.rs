@@ -1,10 +1,10 @@
 //! Results back on voxels and nodes.
 
 use crate::stiffness::body::Body;
-use crate::stiffness::identify::State;
+use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
-use crate::types::stiffness::{Prescribed, RegionStiffness, StiffnessParams};
+use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{DenseField, Mask, Volume, WorldPoint};
 
 /// Volume of the voxels that are not 0 (mm^3).
@@ -67,23 +67,43 @@ pub fn node_displacement(body: &Body, state: &State) -> Vec<[f64; 3]> {
     (0..body.places.len() as u32).map(|n| body.displacement(x, n)).collect()
 }
 
-/// What the patches prescribe.
-pub fn prescribed(level: &Level, state: &State) -> Vec<Prescribed> {
+/// What the patches prescribe; where a curved patch touches its plate, the solution.
+pub fn prescribed(setup: &Setup<'_>, state: &State) -> Vec<Prescribed> {
     let mut out = Vec::new();
-    for (i, patch) in level.patches.iter().enumerate() {
-        for tie in patch.ties(&level.body, &state.plates[i]) {
-            out.push(Prescribed { node: tie.node, patch: i as u8, direction: tie.direction, displacement: tie.target });
+    for (i, patch) in setup.patches.iter().enumerate() {
+        let patch_number = i as u8;
+        if let Some((mut nodes, _)) = setup.touching(state).filter(|_| i == 1) {
+            let guided = patch.contact == Contact::Guided;
+            if guided {
+                nodes.extend(&patch.nodes);
+                nodes.sort_unstable();
+                nodes.dedup();
+            }
+            let direction = (!guided).then_some(patch.normal);
+            let moved = |n| state.x.as_ref().map_or([0.0; 3], |x| setup.body.displacement(x, n));
+            let one = |node| Prescribed { node, patch: patch_number, direction, displacement: moved(node) };
+            out.extend(nodes.into_iter().map(one));
+            continue;
+        }
+        for tie in patch.ties(setup.body, &state.plates[i]) {
+            out.push(Prescribed {
+                node: tie.node,
+                patch: patch_number,
+                direction: tie.direction,
+                displacement: tie.target,
+            });
         }
     }
     out
 }
 
-/// What to know before trusting the moduli.
+/// What to know before trusting the moduli. `area` is that of the loaded patch (mm^2).
 pub fn warnings(
     level: &Level,
     labels: &Mask,
     regions: &[RegionStiffness],
     mesh_change: &[f64],
+    area: f64,
     params: &StiffnessParams,
 ) -> Vec<String> {
     let mut out = Vec::new();
@@ -104,7 +124,6 @@ pub fn warnings(
         let percent = 100.0 * change.exp_m1();
         out.push(format!("the modulus of {} changes by {percent:.0} % with the mesh; try more --nodes", r.name));
     }
-    let area = level.patches[1].area(&level.body);
     if area < 100.0 * level.voxel * level.voxel {
         out.push(format!("the loaded patch is small ({area:.1} mm^2), so absolute moduli hang on its edge"));
     }

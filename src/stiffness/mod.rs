@@ -20,8 +20,6 @@ pub mod plate;
 
 pub mod rim;
 
-pub mod contact;
-
 pub mod identify;
 
 pub mod level;

@@ -2,15 +2,17 @@
 //!
 //! A **held** base is the flat end of the undeformed body on that side. A **loaded** patch is what comes to lie on one plane:
 //! the surface that is pushed in the furthest gives the plane, by least squares on its deformed places, and the patch is
-//! the surface that ends within a tolerance of it. Facets that the plate would have to pull are let go later, and
-//! those that go through it are added ([`crate::stiffness::contact`]). The displacement of a patch is that of a plate, six numbers fitted to all its nodes, and
-//! these are fitted again with the moduli: no node's own noise is imposed on the solution.
+//! the surface that ends within a tolerance of it. On a curved body that is where the contact is looked for first only: a
+//! plate that nothing goes through, and that pulls nothing, finds it with the solution ([`crate::stiffness::plate`]). The
+//! displacement of a patch is that of a plate, six numbers fitted to all its nodes, and these are fitted again with the moduli:
+//! no node's own noise is imposed on the solution.
 
 use crate::error::StiffnessError;
 use crate::numerics::dense::{solve, symmetric_eigen};
 use crate::stiffness::body::Body;
 use crate::stiffness::forward::Tie;
 use crate::stiffness::observations::at_surface;
+use crate::stiffness::plate;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Contact, Side};
 use crate::types::{DenseField, Mask, VoxelPoint, WorldPoint};
@@ -23,6 +25,11 @@ const NEAR: f64 = 1.8;
 
 /// Noise of that (voxels) beyond which it tells a touch worse than a reading from further around.
 const NOISY: f64 = 0.1;
+
+/// What ends further beyond the plane of a plate (voxels) passes beside it.
+const BESIDE: f64 = 1.0;
+/// Pressure of a plate for a penetration of one element's size, over the shear modulus of what it touches.
+const STIFF: f64 = 50.0;
 
 /// Where a patch is.
 #[derive(Debug, Clone, PartialEq)]
@@ -101,14 +108,21 @@ pub struct Patch {
     pub contact: Contact,
     /// For each node the tangential motion besides the rigid one (mm), a quadratic fit; used by [`Contact::Guided`].
     guided: Vec<[f64; 3]>,
-    /// For each node the motion along the normal besides the rigid one (mm) that brings it onto the plane.
-    onto_plane: Vec<f64>,
     /// For each node the motion besides the plate's (mm) of one that lies a little inside of a flat face, on its rounded rim.
     rim: Vec<[f64; 3]>,
     /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
     pub residual: [f64; 2],
-    /// The plane onto which a curved patch comes: a point (mm) and its outward unit normal.
-    plane: Option<Plane>,
+    /// What a curved patch comes to lie on.
+    flat: Option<Flat>,
+}
+
+/// The plane onto which a curved patch comes.
+#[derive(Debug, Clone)]
+struct Flat {
+    /// Where it is.
+    plane: Plane,
+    /// Facets that may touch it (numbers in [`Body::surface`]): what was not seen to pass beside it.
+    facets: Vec<usize>,
 }
 
 impl Patch {
@@ -138,85 +152,70 @@ impl Patch {
         if k < 3 { e } else { cross(e, r) }
     }
 
-    /// The ties for plate parameters `change` from the fitted motion.
+    /// The ties for plate parameters `change` from the fitted motion: where the patch is curved, what holds it along the
+    /// [plate](Self::plate) only.
     pub fn ties(&self, body: &Body, change: &[f64]) -> Vec<Tie> {
+        let directions: &[Option<[f64; 3]>] = match (self.contact, &self.flat) {
+            (Contact::Sticking, _) | (Contact::Guided, None) => &[None],
+            (Contact::Sliding, None) => &[Some(self.normal)],
+            (Contact::Sliding, Some(_)) => &[],
+            (Contact::Guided, Some(_)) => &tangents(self.normal).map(Some),
+        };
         let one = |(i, &node): (usize, &u32)| {
             let p = body.places[node as usize];
-            let mut u = rigid_motion(&self.rigid, self.middle, self.radius, p);
+            let mut u = self.motion(p);
             for (k, c) in change.iter().enumerate() {
                 let b = self.basis(k, p);
                 (0..3).for_each(|a| u[a] += c * b[a]);
             }
-            let direction = match self.contact {
-                Contact::Sticking => None,
-                Contact::Sliding => Some(self.normal),
-                Contact::Guided => None,
-            };
-            if self.contact != Contact::Sticking {
-                for a in 0..3 {
-                    u[a] += self.onto_plane[i] * self.normal[a];
-                    if self.contact == Contact::Guided {
-                        u[a] += self.guided[i][a];
-                    }
-                }
+            if self.contact == Contact::Guided {
+                (0..3).for_each(|a| u[a] += self.guided[i][a]);
             }
             (0..3).for_each(|a| u[a] += self.rim[i][a]);
-            Tie { node, direction, target: u, strength: 1.0 }
+            directions.iter().map(move |&direction| Tie { node, direction, target: u, strength: 1.0 })
         };
-        self.nodes.iter().enumerate().map(one).collect()
+        self.nodes.iter().enumerate().flat_map(one).collect()
     }
 
-    /// Root mean square motion along the normal, besides the rigid one, that brings the nodes onto the plane (mm): how
-    /// far the patch is from flat before it is pressed.
-    pub fn bend(&self) -> f64 {
-        (self.onto_plane.iter().map(|v| v * v).sum::<f64>() / self.onto_plane.len().max(1) as f64).sqrt()
+    /// The plate that a curved patch slides along, for plate parameters `change` from the fitted motion; none where the patch
+    /// is flat or sticks. `modulus` (kPa) is the shear modulus of an element.
+    pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<plate::Plate> {
+        let Flat { plane: (q, _), facets } = self.flat.as_ref().filter(|_| self.contact != Contact::Sticking)?;
+        let stiffness = STIFF * self.backing(body, modulus) / self.area(body);
+        let facing = facets.iter().map(|&f| &body.surface[f]);
+        let mut out = plate::Plate::touching(body, facing, self.normal, stiffness);
+        let height = |p: [f64; 3]| {
+            let moved = change.iter().enumerate().map(|(k, c)| c * dot(self.basis(k, p), self.normal));
+            dot(*q, self.normal) + moved.sum::<f64>()
+        };
+        out.height = height([0.0; 3]);
+        out.tilt = std::array::from_fn(|a| height(std::array::from_fn(|b| f64::from(u8::from(a == b)))) - out.height);
+        Some(out)
+    }
+
+    /// Sum over its facets of their area (mm^2) times a value of the element behind.
+    pub fn backing(&self, body: &Body, value: impl Fn(usize) -> f64) -> f64 {
+        self.facets.iter().map(|&f| value(body.surface[f].element as usize) * body.surface[f].area).sum()
+    }
+
+    /// Whether it is curved before it is pressed.
+    pub fn curved(&self) -> bool {
+        self.flat.is_some()
     }
 
     /// How far inwards its foremost place goes (mm): the largest motion of its nodes against the normal.
     pub fn travelled(&self, body: &Body) -> f64 {
-        let inward = self.ties(body, &[]).into_iter().map(|t| -dot(t.target, self.normal));
-        inward.fold(f64::NEG_INFINITY, f64::max)
+        let inward = |p: [f64; 3]| match &self.flat {
+            Some(Flat { plane: (q, normal), .. }) => dot(sub(p, *q), *normal),
+            None => -dot(self.motion(p), self.normal),
+        };
+        let all = self.nodes.iter().map(|&n| inward(body.places[n as usize]));
+        all.fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Area of the facets in contact (mm^2).
+    /// Area of its facets (mm^2).
     pub fn area(&self, body: &Body) -> f64 {
         self.facets.iter().map(|&f| body.surface[f].area).sum()
-    }
-
-    /// The patch on other facets (ascending). Nodes that it did not have come onto its plane.
-    pub fn on_facets(&self, body: &Body, facets: Vec<usize>) -> Patch {
-        let nodes = body.nodes_on(facets.iter().copied());
-        let known: Vec<Option<usize>> = nodes.iter().map(|n| self.nodes.binary_search(n).ok()).collect();
-        let pick = |values: &[[f64; 3]]| known.iter().map(|k| k.map_or([0.0; 3], |i| values[i])).collect();
-        let onto = |(n, k): (&u32, &Option<usize>)| match k {
-            Some(i) => self.onto_plane[*i],
-            None => self.to_plane(body.places[*n as usize]),
-        };
-        Patch {
-            rim: pick(&self.rim),
-            guided: pick(&self.guided),
-            onto_plane: nodes.iter().zip(&known).map(onto).collect(),
-            nodes,
-            facets,
-            ..self.clone()
-        }
-    }
-
-    /// The motion along the normal besides the plate's (mm) that brings a place onto the plane; 0 on a flat patch.
-    fn to_plane(&self, p: [f64; 3]) -> f64 {
-        match self.plane {
-            Some((q, normal)) => dot(sub(q, p), normal) - dot(self.motion(p), normal),
-            None => 0.0,
-        }
-    }
-
-    /// How far beyond the plate a place is that moves by `u` (mm), with plate parameters `change`.
-    pub fn beyond(&self, p: [f64; 3], u: [f64; 3], change: &[f64]) -> f64 {
-        let mut plate = dot(self.motion(p), self.normal) + self.to_plane(p);
-        for (k, c) in change.iter().enumerate() {
-            plate += c * dot(self.basis(k, p), self.normal);
-        }
-        dot(u, self.normal) - plate
     }
 }
 
@@ -319,7 +318,7 @@ pub fn find(
 /// The mesh rounds the rim of a flat face by a part of a voxel, so its nodes lie inside of the plate's plane. They do not move
 /// as the plate but as tissue at that depth, to first order: between the two plates in proportion.
 fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
-    if patch.bend() > 0.0 {
+    if patch.curved() {
         return;
     }
     let height = |p: [f64; 3]| dot(sub(p, patch.middle), patch.normal);
@@ -525,37 +524,34 @@ fn build(
     let residual = [part(true), part(false)];
     let quadratic = fit_quadratic(&rest, middle, radius, normal);
     let guided = nodes.iter().map(|&n| quadratic(body.places[n as usize])).collect();
+    let flat = plane
+        .and_then(|plane| flattened(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
+    let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
+    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, rim, residual, flat })
+}
+
+/// The plane that a patch comes to lie on, where it takes more than the plate's motion to bring it there.
+fn flattened(
+    body: &Body,
+    motion: &SurfaceMotion,
+    nodes: &[u32],
+    rigid: impl Fn([f64; 3]) -> [f64; 3],
+    plane: Plane,
+    voxel: f64,
+) -> Option<Flat> {
+    let (q, normal) = plane;
+    let beyond = |n: u32| ended(body, motion, n).map(|end| dot(sub(end, q), normal));
     let tolerance = on_plane(voxel, motion.error);
-    let onto = |&n: &u32| {
-        let (Some((q, normal)), Some(end)) = (plane, ended(body, motion, n)) else { return 0.0 };
+    let bend = |&n: &u32| {
         let p = body.places[n as usize];
         // The rim of a flat face is rounded in the mesh: it ends short of the plane and moves with the plate as it is.
-        let on = dot(sub(end, q), normal).abs() < tolerance;
-        let u = rigid_motion(&rigid, middle, radius, p);
-        if on { dot(sub(q, p), normal) - dot(u, normal) } else { 0.0 }
+        let on = beyond(n).is_some_and(|h| h.abs() < tolerance);
+        if on { dot(sub(sub(q, p), rigid(p)), normal).abs() } else { 0.0 }
     };
-    let mut onto_plane: Vec<f64> = nodes.iter().map(onto).collect();
-    let mut sizes: Vec<f64> = onto_plane.iter().map(|v| v.abs()).collect();
-    if crate::numerics::statistics::percentile(&mut sizes, 75.0) < (0.1 * voxel).max(2.0 * motion.error) {
-        onto_plane.fill(0.0);
-    }
-    let curved = onto_plane.iter().any(|v| *v != 0.0);
-    let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
-    Some(Patch {
-        name,
-        facets,
-        nodes,
-        normal,
-        middle,
-        radius,
-        rigid,
-        contact,
-        guided,
-        onto_plane,
-        rim,
-        residual,
-        plane: plane.filter(|_| curved),
-    })
+    let mut bends: Vec<f64> = nodes.iter().map(bend).collect();
+    let curved = crate::numerics::statistics::percentile(&mut bends, 75.0) >= (0.1 * voxel).max(2.0 * motion.error);
+    let before = |f: &usize| body.surface[*f].nodes.iter().all(|&n| beyond(n).is_none_or(|h| h < BESIDE * voxel));
+    curved.then(|| Flat { plane, facets: (0..body.surface.len()).filter(before).collect() })
 }
 
 /// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.

@@ -1,4 +1,4 @@
-//! A body of known moduli under a flat plate without friction: force over depth.
+//! A flat plate without friction against a surface, and force over depth of a body of known moduli under one.
 //!
 //! Where the surface would go through the plate, a pressure that grows with how far it does holds it back (Wriggers,
 //! Computational Contact Mechanics, 2006, ch. 6), at points within each facet, so that the contact grows evenly. The plate is
@@ -15,7 +15,7 @@ use crate::types::stiffness::{Law, Side};
 
 /// Pressure for a penetration of one element's size, over the shear modulus of the softest part.
 const STIFF: f64 = 50.0;
-/// Penetration over which the plate comes to that stiffness (parts of an element's size).
+/// Penetration over which a plate comes to its stiffness (parts of an element's size).
 const ONSET: f64 = 0.02;
 /// Precision of a solution (mm).
 const PRECISION: f64 = 1e-4;
@@ -43,8 +43,10 @@ struct Spot {
 pub struct Plate {
     /// Unit normal, out of the body (RAS).
     pub outward: [f64; 3],
-    /// Height of its plane along that (mm).
+    /// Height of its plane along that (mm), at the origin.
     pub height: f64,
+    /// How that rises with the place before (1).
+    pub tilt: [f64; 3],
     /// Pressure over penetration (kPa/mm), from `onset` on.
     pub stiffness: f64,
     /// Penetration up to which that rises (mm).
@@ -68,21 +70,37 @@ fn shapes() -> [[f64; 6]; POINTS] {
 }
 
 impl Plate {
-    /// A plate that just touches the body.
-    fn touching(body: &Body, outward: [f64; 3], stiffness: f64, onset: f64) -> Self {
-        let heights = body.surface.iter().flat_map(|f| f.nodes).map(|n| dot(body.places[n as usize], outward));
+    /// A plate that just touches those facets of the body that face it. `stiffness`: pressure for a penetration of one
+    /// element's size (kPa).
+    pub fn touching<'a>(
+        body: &'a Body,
+        facets: impl Iterator<Item = &'a Facet>,
+        outward: [f64; 3],
+        stiffness: f64,
+    ) -> Self {
         let spot = |f: &Facet| {
             let cell = &body.cells[f.element as usize];
             let local = f.nodes.map(|n| cell.iter().position(|c| *c == n).unwrap_or(0));
             Spot { element: f.element as usize, local, nodes: f.nodes, area: f.area / POINTS as f64 }
         };
-        Self {
-            outward,
-            height: heights.fold(f64::NEG_INFINITY, f64::max),
-            stiffness,
-            onset,
-            spots: body.surface.iter().filter(|f| dot(f.normal, outward) > 0.0).map(spot).collect(),
-        }
+        let spots = facets.filter(|f| dot(f.normal, outward) > 0.0).map(spot).collect();
+        let size = body.element_size();
+        let mut out =
+            Self { outward, height: 0.0, tilt: [0.0; 3], stiffness: stiffness / size, onset: ONSET * size, spots };
+        out.height = out.first_touch(body);
+        out
+    }
+
+    /// Height at which it touches the body as it was (mm).
+    fn first_touch(&self, body: &Body) -> f64 {
+        let heights = self.spots.iter().flat_map(|s| s.nodes).map(|n| dot(body.places[n as usize], self.outward));
+        heights.fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// The plate `part` of the way from its first touch.
+    pub(super) fn approaching(&self, body: &Body, part: f64) -> Self {
+        let height = self.first_touch(body);
+        Self { height: height + part * (self.height - height), tilt: self.tilt.map(|t| part * t), ..self.clone() }
     }
 
     /// Calls `pushed` with each facet that touches: its element, its nodes among the element's, and of each point in touch the
@@ -92,7 +110,7 @@ impl Plate {
         for spot in &self.spots {
             let heights = spot.nodes.map(|n| {
                 let (p, u) = (body.places[n as usize], body.displacement(x, n));
-                dot(p, self.outward) + dot(u, self.outward) - self.height
+                dot(p, self.outward) + dot(u, self.outward) - self.height - dot(self.tilt, p)
             });
             // A quadratic lies at most by the spread of its nodes above them.
             let (low, high) =
@@ -135,6 +153,31 @@ impl Plate {
             }
             body.pattern.add(tangent, spot.element, &out, SIDE);
         });
+    }
+
+    /// Forces on the body's nodes for a plate that moves along its normal by `motion` (mm) of the place.
+    pub(super) fn moved(&self, body: &Body, x: &[f64], motion: impl Fn([f64; 3]) -> f64) -> Vec<f64> {
+        let mut out = vec![0.0; body.pattern.unknowns()];
+        self.touched(body, x, |spot, shape, [_, _, slope]| {
+            let moved: f64 = (0..6).map(|k| shape[k] * motion(body.places[spot.nodes[k] as usize])).sum();
+            for (n, s) in spot.nodes.iter().zip(shape) {
+                let at = body.pattern.first(*n);
+                (0..3).for_each(|a| out[at + a] += slope * s * moved * self.outward[a]);
+            }
+        });
+        out
+    }
+
+    /// Nodes of the facets that touch, ascending, and the area of the contact (mm^2).
+    pub fn contact(&self, body: &Body, x: &[f64]) -> (Vec<u32>, f64) {
+        let (mut nodes, mut area) = (Vec::new(), 0.0);
+        self.touched(body, x, |spot, _, _| {
+            nodes.extend(spot.nodes);
+            area += spot.area;
+        });
+        nodes.sort_unstable();
+        nodes.dedup();
+        (nodes, area)
     }
 
     /// Force of the plate (kPa mm^2), and its squeeze: the mean penetration by force (mm).
@@ -180,8 +223,7 @@ impl Press<'_> {
         let of = |e: f64| Material::of_youngs_modulus(e.clamp(softest, RIGID * softest), self.poisson);
         let still = |&node: &u32| Tie { node, direction: None, target: [0.0; 3], strength: 1.0 };
         let materials: Vec<Material> = body.region.iter().map(|&r| of(self.moduli[r as usize])).collect();
-        let size = body.element_size();
-        let plate = Plate::touching(body, self.outward, STIFF * of(softest).mu / size, ONSET * size);
+        let plate = Plate::touching(body, body.surface.iter(), self.outward, STIFF * of(softest).mu);
         let top = plate.height;
         let held = self.held.iter().map(still).collect();
         let mut problem = Problem { plate: Some(plate), ..Problem::new(body, Law::NeoHookean, materials, held) };

@@ -19,7 +19,7 @@ const WIDE: usize = 25;
 ///
 /// A voxel's motion is read from those within `reach` (voxels), and is that of the plate within `tolerance` (mm).
 pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64, reach: f64) -> Vec<[f64; 3]> {
-    if patch.bend() > 0.0 {
+    if patch.curved() {
         return Vec::new();
     }
     let grid = labels.grid();

@@ -256,7 +256,7 @@ fn jacobian(
             body.scatter(&mut sides[node as usize * n..(node as usize + 1) * n], e, &part);
         }
     }
-    sides.extend(setup.plate_sides(problem));
+    sides.extend(setup.plate_sides(problem, &solution.x));
     sides
         .par_chunks_mut(32 * n)
         .map(|part| solution.factor.solve(part).map_err(|_| StiffnessError::Unsolvable))

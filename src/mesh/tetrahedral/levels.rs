@@ -1,16 +1,14 @@
 //! Smooth level functions of a label map: where the body and each of its parts ends, to a fraction of a voxel.
 //!
-//! A voxel map has stairs. Each indicator (1 inside, 0 outside) is smoothed with the fourth-order kernel 2 G - G * G of a
-//! Gaussian G, which keeps flat faces where they are and, unlike G alone, does not pull curved ones inwards: the shift of
-//! a sphere of radius R falls from sigma^2 / R to the order of sigma^4 / R^3.
+//! A voxel map has stairs; [`rounding`](super::rounding) takes them out of the body and of each part.
 //!
 //! All positions here are in *grid millimetres*: voxel index times voxel size.
 
-use crate::numerics::filters::gaussian;
+use super::rounding::signed_distance;
 use crate::types::Mask;
 
-/// Standard deviation of G (voxels): the least that takes the stairs out of spheres of 4 voxels' radius and more.
-const SMOOTHING: f64 = 1.0;
+/// Surfaces are moved by so much at most (voxels) so that volumes come out right.
+const MOST: f64 = 0.5;
 /// Voxels around the body's box.
 const PAD: usize = 6;
 
@@ -22,7 +20,7 @@ pub struct Levels {
     /// Voxel index of the first voxel kept.
     first: [i64; 3],
     body: Vec<f32>,
-    /// The labels, ascending, and the smoothed indicator of each (none for a body of one part).
+    /// The labels, ascending, and the signed distance of each (none for a body of one part).
     labels: Vec<u8>,
     parts: Vec<Vec<f32>>,
     /// Added to the body's level.
@@ -64,12 +62,12 @@ impl Levels {
         let mut seen = [false; 256];
         map.iter().for_each(|&v| seen[v as usize] = true);
         let present: Vec<u8> = (1..=255).filter(|&v| seen[v as usize]).collect();
-        let body = smooth(&map.iter().map(|&v| f32::from(u8::from(v > 0))).collect::<Vec<_>>(), shape);
+        let body = signed_distance(&map.iter().map(|&v| v > 0).collect::<Vec<_>>(), shape);
         let mut parts = Vec::new();
         if present.len() > 1 {
             let filled = fill(&map, shape);
             for &label in &present {
-                parts.push(smooth(&filled.iter().map(|&v| f32::from(u8::from(v == label))).collect::<Vec<_>>(), shape));
+                parts.push(signed_distance(&filled.iter().map(|&v| v == label).collect::<Vec<_>>(), shape));
             }
         }
         let shifts = vec![0.0; present.len()];
@@ -97,11 +95,10 @@ impl Levels {
 
     /// Moves the surfaces outwards: that of the body by `body` mm, that of each part by `parts` mm.
     pub fn grow(&mut self, body: f64, parts: &[f64]) {
-        // Slope of a smoothed step, 2 G - G * G, at its middle.
-        let slope = (2.0 - 0.5f64.sqrt()) / (SMOOTHING * std::f64::consts::TAU.sqrt() * self.voxel());
-        self.shift = (self.shift + slope * body).clamp(-0.3, 0.3);
+        let voxel = self.voxel();
+        self.shift = (self.shift + body / voxel).clamp(-MOST, MOST);
         for (s, d) in self.shifts.iter_mut().zip(parts) {
-            *s = (*s + slope * d).clamp(-0.3, 0.3);
+            *s = (*s + d / voxel).clamp(-MOST, MOST);
         }
     }
 
@@ -138,9 +135,9 @@ impl Levels {
         face(0) + t[2] * (face(sxy) - face(0))
     }
 
-    /// Positive inside the body, -0.5 to 0.5.
+    /// Positive inside the body.
     pub fn body(&self, p: [f64; 3]) -> f64 {
-        self.sample(&self.body, p) - 0.5 + self.shift
+        self.sample(&self.body, p) + self.shift
     }
 
     /// Positive in part `k` (by the order of [`Levels::labels`]), negative in the others.
@@ -203,13 +200,6 @@ impl Levels {
             })
             .collect()
     }
-}
-
-/// 2 G - G * G of an indicator.
-fn smooth(values: &[f32], shape: [usize; 3]) -> Vec<f32> {
-    let once = gaussian(values, shape, [SMOOTHING; 3]);
-    let twice = gaussian(&once, shape, [SMOOTHING; 3]);
-    once.iter().zip(&twice).map(|(a, b)| 2.0 * a - b).collect()
 }
 
 /// Labels carried outwards over the whole box, nearest first.

@@ -1,8 +1,8 @@
 //! A quality tetrahedral mesh of a label map, for elasticity: quadratic, graded, with faces on the body's surface and on
 //! the interfaces between its parts.
 //!
-//! A graded body-centred cubic lattice ([`lattice`]) is cut along the smoothed surface of the body and then along that of
-//! each part ([`levels`], [`cutting`]), its inner vertices are moved where that makes the worst shapes better
+//! A graded body-centred cubic lattice ([`lattice`]) is cut along the smooth surface of the body and then along that of
+//! each part ([`levels`], [`rounding`], [`cutting`]), its inner vertices are moved where that makes the worst shapes better
 //! ([`smoothing`]), and edges on surfaces are bent onto them ([`curving`]).
 //!
 //! Promises: neighbours share whole faces; every element lies in one part and has a positive Jacobian determinant at its
@@ -11,6 +11,8 @@
 //! cell, elements go to the part that holds their centre.
 
 pub mod levels;
+
+pub mod rounding;
 
 pub mod lattice;
 
@@ -21,7 +23,7 @@ pub mod smoothing;
 pub mod curving;
 
 use crate::error::MeshError;
-use crate::types::{Mask, QuadraticMesh, VoxelPoint, WorldPoint};
+use crate::types::{Grid, Mask, QuadraticMesh, VoxelPoint, WorldPoint};
 use cutting::Cut;
 use levels::Levels;
 use std::collections::{BTreeMap, HashMap};
@@ -82,41 +84,79 @@ pub fn pieces(labels: &Mask) -> Vec<usize> {
 /// # Errors
 /// [`MeshError::TooFew`] when no element fits into the body, [`MeshError::PartLost`] when none fits into a part.
 pub fn mesh_labels(labels: &Mask, fineness: &Fineness) -> Result<QuadraticMesh, MeshError> {
-    mesh_labels_finer(labels, fineness, &[], 0.0)
+    Mesher::new(labels)?.mesh(fineness)
 }
 
-/// As [`mesh_labels`], with cubes of about `size` (mm) around the places `near` (grid mm: voxel index times spacing).
-///
-/// # Errors
-/// As [`mesh_labels`].
-pub fn mesh_labels_finer(
-    labels: &Mask,
-    fineness: &Fineness,
-    near: &[[f64; 3]],
-    size: f64,
-) -> Result<QuadraticMesh, MeshError> {
-    let mut levels = Levels::new(labels).ok_or(MeshError::TooFew { found: 0, needed: 4 })?;
-    let mut octree = lattice::Octree::new(levels.bounds(), fineness.size);
-    refine(&mut octree, &levels, fineness);
-    let halvings = (octree.base() / size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
-    near.iter().for_each(|p| octree.refine(*p, halvings));
-    let lattice = octree.tetrahedra();
-    let mut made = build(&lattice, &levels)?;
-    for _ in 0..CALIBRATIONS {
-        calibrate(&made, &mut levels);
-        made = build(&lattice, &levels)?;
-    }
-    let Made { places, mut tetrahedra, part } = made;
-    let (affine, spacing) = (labels.grid().affine(), labels.grid().spacing());
-    let world = |p: &[f64; 3]| affine.to_world(VoxelPoint(std::array::from_fn(|a| p[a] / spacing[a])));
-    if crate::types::space::determinant(affine.linear()) < 0.0 {
-        tetrahedra.iter_mut().for_each(mirror);
-    }
-    let nodes: Vec<WorldPoint> = places.iter().map(world).collect();
-    let labels = part.iter().map(|&k| levels.labels()[k as usize]).collect();
-    QuadraticMesh::new(nodes, tetrahedra, labels)
+/// A label map with its smooth surfaces, to be meshed more than once.
+#[derive(Debug, Clone)]
+pub struct Mesher {
+    grid: Grid,
+    levels: Levels,
 }
 
+impl Mesher {
+    /// Finds the surfaces of `labels`.
+    ///
+    /// # Errors
+    /// [`MeshError::TooFew`] when all are 0.
+    pub fn new(labels: &Mask) -> Result<Self, MeshError> {
+        let levels = Levels::new(labels).ok_or(MeshError::TooFew { found: 0, needed: 4 })?;
+        Ok(Self { grid: *labels.grid(), levels })
+    }
+
+    /// As [`mesh_labels`].
+    ///
+    /// # Errors
+    /// As [`mesh_labels`].
+    pub fn mesh(&self, fineness: &Fineness) -> Result<QuadraticMesh, MeshError> {
+        self.mesh_finer(fineness, &[], 0.0)
+    }
+
+    /// With cubes of about `size` (mm) around the places `near` (grid mm: voxel index times spacing). Where a part gets no
+    /// element, smaller cubes are tried, down to a third of the side.
+    ///
+    /// # Errors
+    /// As [`mesh_labels`].
+    pub fn mesh_finer(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64) -> Result<QuadraticMesh, MeshError> {
+        let mut fineness = *fineness;
+        for _ in 0..FINER {
+            match self.meshed(&fineness, near, size) {
+                Err(MeshError::PartLost { .. }) => {
+                    fineness.size *= 0.8;
+                    fineness.nodes *= 2;
+                }
+                done => return done,
+            }
+        }
+        self.meshed(&fineness, near, size)
+    }
+
+    fn meshed(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64) -> Result<QuadraticMesh, MeshError> {
+        let mut levels = self.levels.clone();
+        let mut octree = lattice::Octree::new(levels.bounds(), fineness.size);
+        refine(&mut octree, &levels, fineness);
+        let halvings = (octree.base() / size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
+        near.iter().for_each(|p| octree.refine(*p, halvings));
+        let lattice = octree.tetrahedra();
+        let mut made = build(&lattice, &levels)?;
+        for _ in 0..CALIBRATIONS {
+            calibrate(&made, &mut levels);
+            made = build(&lattice, &levels)?;
+        }
+        let Made { places, mut tetrahedra, part } = made;
+        let (affine, spacing) = (self.grid.affine(), self.grid.spacing());
+        let world = |p: &[f64; 3]| affine.to_world(VoxelPoint(std::array::from_fn(|a| p[a] / spacing[a])));
+        if crate::types::space::determinant(affine.linear()) < 0.0 {
+            tetrahedra.iter_mut().for_each(mirror);
+        }
+        let nodes: Vec<WorldPoint> = places.iter().map(world).collect();
+        let labels = part.iter().map(|&k| levels.labels()[k as usize]).collect();
+        QuadraticMesh::new(nodes, tetrahedra, labels)
+    }
+}
+
+/// Times that smaller cubes are tried.
+const FINER: usize = 5;
 /// Times that surfaces are moved so that volumes come out right.
 const CALIBRATIONS: usize = 2;
 
