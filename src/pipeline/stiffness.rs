@@ -179,11 +179,8 @@ fn labelled(
     let map = of_region(&|r| regions[r].youngs_modulus);
     let map_sd = of_region(&|r| regions[r].sd);
     let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
-    let touching = setup.touching(&state);
-    let area = |i: usize| match &touching {
-        Some((_, area)) if i == 1 => *area,
-        _ => fine.patches[i].area(&fine.body),
-    };
+    let touching = [None, setup.touching(&state)];
+    let area = |i: usize| touching[i].as_ref().map_or_else(|| fine.patches[i].area(&fine.body), |t| t.1);
     let mut warnings = maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params);
     warnings.dedup();
     let patches = [0, 1].map(|i| {
@@ -191,7 +188,7 @@ fn labelled(
         PatchReport {
             name: p.name.clone(),
             area: area(i),
-            nodes: touching.as_ref().filter(|_| i == 1).map_or(p.nodes.len(), |t| t.0.len()),
+            nodes: touching[i].as_ref().map_or(p.nodes.len(), |t| t.0.len()),
             contact: p.contact,
             translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
             travel_mm: p.travelled(&fine.body),
@@ -218,7 +215,7 @@ fn labelled(
         residual,
         element_modulus,
         displacement: maps::node_displacement(&fine.body, &state),
-        prescribed: maps::prescribed(&setup, &state),
+        prescribed: maps::prescribed(&setup, &state, touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice()))),
         faces: geometry.map(|g| g.faces).unwrap_or_default(),
         model_force: estimate.force[0] * scale / 1000.0,
         mesh_change,

@@ -150,7 +150,8 @@ impl Body {
     }
 }
 
-fn sorted(nodes: impl Iterator<Item = u32>) -> Vec<u32> {
+/// Each once, ascending.
+pub(super) fn sorted(nodes: impl Iterator<Item = u32>) -> Vec<u32> {
     let mut nodes: Vec<u32> = nodes.collect();
     nodes.sort_unstable();
     nodes.dedup();

@@ -161,17 +161,21 @@ impl Setup<'_> {
     fn right_sides(&self, problem: &Problem<'_>, x: &[f64]) -> Result<Vec<f64>, StiffnessError> {
         let body = self.body;
         let mut out = Vec::new();
+        let pushed = problem.plate.as_ref().map(|plate| {
+            let mut pushed = vec![0.0; body.pattern.unknowns()];
+            plate.push(body, x, &mut pushed);
+            pushed
+        });
+        let modulus = |e: usize| problem.materials[e].mu;
         for r in self.free() {
-            let mut part = problem.residual_by_modulus(x, |e| body.region[e] as usize == r)?;
-            if let Some(plate) = &problem.plate {
+            let within = |e: usize| body.region[e] as usize == r;
+            let mut part = problem.residual_by_modulus(x, within)?;
+            if let Some(pushed) = &pushed {
                 // The plate is as stiff as what it touches.
-                let stiffness = |e: usize| problem.materials[e].mu;
-                let own = |e: usize| if body.region[e] as usize == r { stiffness(e) } else { 0.0 };
                 let loaded = &self.patches[1];
-                let share = loaded.backing(body, own) / loaded.backing(body, stiffness);
-                let mut pushed = vec![0.0; part.len()];
-                plate.push(body, x, &mut pushed);
-                part.iter_mut().zip(&pushed).for_each(|(v, p)| *v += share * p);
+                let own = loaded.backing(body, |e| if within(e) { modulus(e) } else { 0.0 });
+                let share = own / loaded.backing(body, modulus);
+                part.iter_mut().zip(pushed).for_each(|(v, p)| *v += share * p);
             }
             out.extend(part.into_iter().map(|v| -v));
         }

@@ -1,6 +1,7 @@
 //! Results back on voxels and nodes.
 
-use crate::stiffness::body::Body;
+use crate::stiffness::body::{Body, sorted};
+use crate::stiffness::forward::Tie;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
@@ -67,32 +68,23 @@ pub fn node_displacement(body: &Body, state: &State) -> Vec<[f64; 3]> {
     (0..body.places.len() as u32).map(|n| body.displacement(x, n)).collect()
 }
 
-/// What the patches prescribe; where a curved patch touches its plate, the solution.
-pub fn prescribed(setup: &Setup<'_>, state: &State) -> Vec<Prescribed> {
+/// What the patches prescribe: the ties, and of the nodes with which a curved patch touches its plate the solution.
+/// `touching` are these for each patch.
+pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2]) -> Vec<Prescribed> {
     let mut out = Vec::new();
-    for (i, patch) in setup.patches.iter().enumerate() {
-        let patch_number = i as u8;
-        if let Some((mut nodes, _)) = setup.touching(state).filter(|_| i == 1) {
-            let guided = patch.contact == Contact::Guided;
-            if guided {
-                nodes.extend(&patch.nodes);
-                nodes.sort_unstable();
-                nodes.dedup();
-            }
-            let direction = (!guided).then_some(patch.normal);
-            let moved = |n| state.x.as_ref().map_or([0.0; 3], |x| setup.body.displacement(x, n));
-            let one = |node| Prescribed { node, patch: patch_number, direction, displacement: moved(node) };
-            out.extend(nodes.into_iter().map(one));
+    for (number, (patch, touching)) in (0u8..).zip(setup.patches.iter().zip(touching)) {
+        let Some(nodes) = touching else {
+            let tied = patch.ties(setup.body, &state.plates[number as usize]);
+            let one =
+                |t: Tie| Prescribed { node: t.node, patch: number, direction: t.direction, displacement: t.target };
+            out.extend(tied.into_iter().map(one));
             continue;
-        }
-        for tie in patch.ties(setup.body, &state.plates[i]) {
-            out.push(Prescribed {
-                node: tie.node,
-                patch: patch_number,
-                direction: tie.direction,
-                displacement: tie.target,
-            });
-        }
+        };
+        let guided: &[u32] = if patch.contact == Contact::Guided { &patch.nodes } else { &[] };
+        let direction = guided.is_empty().then_some(patch.normal);
+        let moved = |n| state.x.as_ref().map_or([0.0; 3], |x| setup.body.displacement(x, n));
+        let one = |node| Prescribed { node, patch: number, direction, displacement: moved(node) };
+        out.extend(sorted(nodes.iter().chain(guided).copied()).into_iter().map(one));
     }
     out
 }

@@ -28,8 +28,6 @@ const NOISY: f64 = 0.1;
 
 /// What ends further beyond the plane of a plate (voxels) passes beside it.
 const BESIDE: f64 = 1.0;
-/// Pressure of a plate for a penetration of one element's size, over the shear modulus of what it touches.
-const STIFF: f64 = 50.0;
 
 /// Where a patch is.
 #[derive(Debug, Clone, PartialEq)]
@@ -113,12 +111,12 @@ pub struct Patch {
     /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
     pub residual: [f64; 2],
     /// What a curved patch comes to lie on.
-    flat: Option<Flat>,
+    landing: Option<Landing>,
 }
 
 /// The plane onto which a curved patch comes.
 #[derive(Debug, Clone)]
-struct Flat {
+struct Landing {
     /// Where it is.
     plane: Plane,
     /// Facets that may touch it (numbers in [`Body::surface`]): what was not seen to pass beside it.
@@ -155,7 +153,7 @@ impl Patch {
     /// The ties for plate parameters `change` from the fitted motion: where the patch is curved, what holds it along the
     /// [plate](Self::plate) only.
     pub fn ties(&self, body: &Body, change: &[f64]) -> Vec<Tie> {
-        let directions: &[Option<[f64; 3]>] = match (self.contact, &self.flat) {
+        let directions: &[Option<[f64; 3]>] = match (self.contact, &self.landing) {
             (Contact::Sticking, _) | (Contact::Guided, None) => &[None],
             (Contact::Sliding, None) => &[Some(self.normal)],
             (Contact::Sliding, Some(_)) => &[],
@@ -180,8 +178,8 @@ impl Patch {
     /// The plate that a curved patch slides along, for plate parameters `change` from the fitted motion; none where the patch
     /// is flat or sticks. `modulus` (kPa) is the shear modulus of an element.
     pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<plate::Plate> {
-        let Flat { plane: (q, _), facets } = self.flat.as_ref().filter(|_| self.contact != Contact::Sticking)?;
-        let stiffness = STIFF * self.backing(body, modulus) / self.area(body);
+        let Landing { plane: (q, _), facets } = self.landing.as_ref().filter(|_| self.contact != Contact::Sticking)?;
+        let stiffness = plate::STIFF * self.backing(body, modulus) / self.area(body);
         let facing = facets.iter().map(|&f| &body.surface[f]);
         let mut out = plate::Plate::touching(body, facing, self.normal, stiffness);
         let height = |p: [f64; 3]| {
@@ -200,13 +198,13 @@ impl Patch {
 
     /// Whether it is curved before it is pressed.
     pub fn curved(&self) -> bool {
-        self.flat.is_some()
+        self.landing.is_some()
     }
 
     /// How far inwards its foremost place goes (mm): the largest motion of its nodes against the normal.
     pub fn travelled(&self, body: &Body) -> f64 {
-        let inward = |p: [f64; 3]| match &self.flat {
-            Some(Flat { plane: (q, normal), .. }) => dot(sub(p, *q), *normal),
+        let inward = |p: [f64; 3]| match &self.landing {
+            Some(Landing { plane: (q, normal), .. }) => dot(sub(p, *q), *normal),
             None => -dot(self.motion(p), self.normal),
         };
         let all = self.nodes.iter().map(|&n| inward(body.places[n as usize]));
@@ -524,21 +522,21 @@ fn build(
     let residual = [part(true), part(false)];
     let quadratic = fit_quadratic(&rest, middle, radius, normal);
     let guided = nodes.iter().map(|&n| quadratic(body.places[n as usize])).collect();
-    let flat = plane
-        .and_then(|plane| flattened(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
+    let landing = plane
+        .and_then(|plane| landing_on(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
     let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
-    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, rim, residual, flat })
+    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, rim, residual, landing })
 }
 
 /// The plane that a patch comes to lie on, where it takes more than the plate's motion to bring it there.
-fn flattened(
+fn landing_on(
     body: &Body,
     motion: &SurfaceMotion,
     nodes: &[u32],
     rigid: impl Fn([f64; 3]) -> [f64; 3],
     plane: Plane,
     voxel: f64,
-) -> Option<Flat> {
+) -> Option<Landing> {
     let (q, normal) = plane;
     let beyond = |n: u32| ended(body, motion, n).map(|end| dot(sub(end, q), normal));
     let tolerance = on_plane(voxel, motion.error);
@@ -551,7 +549,7 @@ fn flattened(
     let mut bends: Vec<f64> = nodes.iter().map(bend).collect();
     let curved = crate::numerics::statistics::percentile(&mut bends, 75.0) >= (0.1 * voxel).max(2.0 * motion.error);
     let before = |f: &usize| body.surface[*f].nodes.iter().all(|&n| beyond(n).is_none_or(|h| h < BESIDE * voxel));
-    curved.then(|| Flat { plane, facets: (0..body.surface.len()).filter(before).collect() })
+    curved.then(|| Landing { plane, facets: (0..body.surface.len()).filter(before).collect() })
 }
 
 /// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.

@@ -6,15 +6,15 @@
 //! The curve ends where no equilibrium is found.
 
 use crate::error::StiffnessError;
-use crate::stiffness::body::{Body, Facet, SIDE};
+use crate::stiffness::body::{Body, Facet, SIDE, sorted};
 use crate::stiffness::forward::{Problem, Tie};
 use crate::stiffness::law::Material;
 use crate::stiffness::patches::base_facets;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, Side};
 
-/// Pressure for a penetration of one element's size, over the shear modulus of the softest part.
-const STIFF: f64 = 50.0;
+/// Pressure for a penetration of one element's size, over the shear modulus of what is touched (of a press: the softest part).
+pub const STIFF: f64 = 50.0;
 /// Penetration over which a plate comes to its stiffness (parts of an element's size).
 const ONSET: f64 = 0.02;
 /// Precision of a solution (mm).
@@ -175,9 +175,7 @@ impl Plate {
             nodes.extend(spot.nodes);
             area += spot.area;
         });
-        nodes.sort_unstable();
-        nodes.dedup();
-        (nodes, area)
+        (sorted(nodes.into_iter()), area)
     }
 
     /// Force of the plate (kPa mm^2), and its squeeze: the mean penetration by force (mm).

@@ -54,24 +54,24 @@ pub fn signed_distance(inside: &[bool], shape: [usize; 3]) -> Vec<f32> {
     let laplacian = |v: &[f32], o: usize| stride.iter().map(|s| v[o - s] + v[o + s]).sum::<f32>() - 6.0 * v[o];
     let pull = LENGTH.powi(-4);
     let rate = 1.0 / (144.0 + pull);
-    let smoothed = gaussian(&x, shape, [SMOOTHED; 3]);
-    let all: Vec<f32> =
-        ring.par_iter().with_min_len(CHUNK).map(|&o| curvature(&smoothed, o as usize, stride)).collect();
+    // Of the voxels in the ring: their curvature first, then their bending.
     let mut bent = vec![0.0f32; x.len()];
-    ring.iter().zip(&all).for_each(|(&o, v)| bent[o as usize] = *v);
+    let put = |all: Vec<f32>, bent: &mut [f32]| ring.iter().zip(all).for_each(|(&o, v)| bent[o as usize] = v);
+    let smoothed = gaussian(&x, shape, [SMOOTHED; 3]);
+    let curved = |&o: &u32| curvature(&smoothed, o as usize, stride);
+    put(ring.par_iter().with_min_len(CHUNK).map(curved).collect(), &mut bent);
     // An edge is as wide as the voxels next to it.
+    let corner: usize = stride.iter().sum();
+    let rows: [usize; 9] = std::array::from_fn(|k| k % 3 * stride[1] + k / 3 * stride[2]);
     let count = |&o: &u32| {
-        let rows =
-            stride[1..].iter().fold(vec![o as usize], |all, s| all.iter().flat_map(|o| [o - s, *o, o + s]).collect());
-        let most = rows.iter().flat_map(|o| &bent[o - 1..=o + 1]).fold(0.0, |m: f32, v| m.max(*v));
-        1.0 / (1.0 + (most / CREASE).powi(SHARPNESS))
+        let around = rows.iter().flat_map(|row| &bent[o as usize - corner + row..][..3]);
+        1.0 / (1.0 + (around.fold(0.0, |m: f32, v| m.max(*v)) / CREASE).powi(SHARPNESS))
     };
     let counts: Vec<f32> = ring.par_iter().with_min_len(CHUNK).map(count).collect();
     let (mut y, mut time) = (x.clone(), 1.0f32);
     for _ in 0..STEPS {
         let bending = |(&o, c): (&u32, &f32)| c * laplacian(&y, o as usize);
-        let all: Vec<f32> = ring.par_iter().zip(&counts).with_min_len(CHUNK).map(bending).collect();
-        ring.iter().zip(&all).for_each(|(&o, v)| bent[o as usize] = *v);
+        put(ring.par_iter().zip(&counts).with_min_len(CHUNK).map(bending).collect(), &mut bent);
         let moved = |&o: &u32| {
             let o = o as usize;
             let [low, high] = if inside[o] { [CLEAR, within[o]] } else { [-without[o], -CLEAR] };
