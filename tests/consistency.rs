@@ -196,6 +196,20 @@ fn coupling_withstands_outliers() {
     assert!(error < 0.1, "{error} mm");
 }
 
+/// Tissue that moves along one axis is held loosely along it alone, and no axis is given up.
+#[test]
+fn each_axis_is_held_as_its_own_data_ask() {
+    let weights = coupling::supported([40.0, 30.0, 50.0], [1e-6, 0.01, 10.0]);
+    assert!((weights[2] - 2.5).abs() < 0.03, "{weights:?}");
+    assert!(weights[0] > weights[1] && weights[1] > 100.0 * weights[2]);
+    let together = 0.5 * 120.0 / 10.01;
+    assert!(weights[0] < 340.0 * together, "{weights:?}");
+    let alike = coupling::supported([30.0; 3], [2.0; 3]);
+    assert!(alike.iter().all(|w| (w - 7.5).abs() < 1e-9), "{alike:?}");
+    // What was not worked out to the end may come out negative.
+    assert!(coupling::supported([-50.0, 0.0, 20.0], [0.0; 3]).iter().all(|w| w.is_finite() && *w > 0.0));
+}
+
 /// A small lattice's nodes, smoothness and dense smoothness matrix.
 fn small() -> ([usize; 3], Smoothness, Dense) {
     let nodes = [5, 4, 4];
@@ -208,14 +222,14 @@ fn small() -> ([usize; 3], Smoothness, Dense) {
     (nodes, smoothness, matrix)
 }
 
-/// `A + lambda L`, planar.
-fn system(l: &Dense, lambda: f64, blocks: &[[f32; 6]]) -> Dense {
+/// `A + lambda L`, planar; a weight for each component.
+fn system(l: &Dense, lambda: [f32; 3], blocks: &[[f32; 6]]) -> Dense {
     let n = blocks.len();
     (0..3 * n)
         .map(|r| {
             let of = |c: usize| {
                 let (i, j) = (r % n, c % n);
-                let smooth = if r / n == c / n { lambda * l[i][j] } else { 0.0 };
+                let smooth = if r / n == c / n { f64::from(lambda[r / n]) * l[i][j] } else { 0.0 };
                 smooth + if i == j { entry(&blocks[i], r / n, c / n) } else { 0.0 }
             };
             (0..3 * n).map(of).collect()
@@ -227,14 +241,15 @@ fn system(l: &Dense, lambda: f64, blocks: &[[f32; 6]]) -> Dense {
 fn a_step_reaches_the_minimum() {
     let (_, smoothness, l) = small();
     let (blocks, rhs, start) = (random_blocks(80, 1), normals(240, 2), normals(240, 3));
-    let lambda = 5.0;
+    let lambda = [5.0, 0.7, 20.0];
     let mut c = start.clone();
     let (report, moved) = coupling::step(&smoothness, lambda, &blocks, &rhs, &mut c, 1e-7, 500);
     assert!(report.residual <= 1e-7, "{report:?}");
-    let m = system(&l, f64::from(lambda), &blocks);
+    let m = system(&l, lambda, &blocks);
     // The gradient `A d - b + lambda L (c + d)` vanishes.
     for r in 0..240 {
-        let smooth: f64 = (0..80).map(|j| f64::from(lambda) * l[r % 80][j] * f64::from(start[r / 80 * 80 + j])).sum();
+        let weight = f64::from(lambda[r / 80]);
+        let smooth: f64 = (0..80).map(|j| weight * l[r % 80][j] * f64::from(start[r / 80 * 80 + j])).sum();
         let d: f64 = (0..240).map(|k| m[r][k] * f64::from(c[k] - start[k])).sum();
         assert!((d + smooth - f64::from(rhs[r])).abs() < 1e-4, "{r}: {}", d + smooth - f64::from(rhs[r]));
     }
@@ -246,23 +261,22 @@ fn a_step_reaches_the_minimum() {
 fn determined_degrees_of_freedom_are_the_trace() {
     let (_, smoothness, l) = small();
     let blocks = random_blocks(80, 4);
-    for lambda in [0.1f32, 10.0, 1000.0] {
-        let inverse = invert(&system(&l, f64::from(lambda), &blocks));
-        let trace: f64 = (0..3)
-            .map(|a| {
-                (0..80)
-                    .flat_map(|i| (0..80).map(move |j| (i, j)))
-                    .map(|(i, j)| inverse[80 * a + i][80 * a + j] * l[j][i])
-                    .sum::<f64>()
-            })
-            .sum();
-        let exact = 240.0 - f64::from(lambda) * trace;
-        let seeds = 30;
-        let mean =
-            (0..seeds).map(|s| coupling::determined(&smoothness, lambda, &blocks, s, 200)).sum::<f64>() / seeds as f64;
-        assert!((mean - exact).abs() < 0.02 * 240.0, "lambda {lambda}: {mean} is not {exact}");
-        // An affine field, four numbers a component, costs nothing and is always determined.
-        assert!(exact > 12.0 && exact < 240.0);
+    for lambda in [[0.1f32; 3], [10.0, 1.0, 100.0], [1000.0; 3]] {
+        let inverse = invert(&system(&l, lambda, &blocks));
+        let seeds = 60;
+        let all: Vec<[f64; 3]> =
+            (0..seeds).map(|s| coupling::determined(&smoothness, lambda, &blocks, s, 200)).collect();
+        for a in 0..3 {
+            let trace: f64 = (0..80)
+                .flat_map(|i| (0..80).map(move |j| (i, j)))
+                .map(|(i, j)| inverse[80 * a + i][80 * a + j] * l[j][i])
+                .sum();
+            let exact = 80.0 - f64::from(lambda[a]) * trace;
+            let mean = all.iter().map(|d| d[a]).sum::<f64>() / seeds as f64;
+            assert!((mean - exact).abs() < 0.02 * 80.0, "lambda {lambda:?}, axis {a}: {mean} is not {exact}");
+            // An affine field, four numbers a component, costs nothing and is always determined.
+            assert!(exact > 4.0 && exact < 80.0);
+        }
     }
 }
 
@@ -276,8 +290,8 @@ fn deviation_is_the_root_of_the_inverse() {
             *b = b.map(|v| 1e-3 * v);
         }
     }
-    let lambda = 2.0;
-    let inverse = invert(&system(&l, f64::from(lambda), &blocks));
+    let lambda = [2.0, 0.5, 8.0];
+    let inverse = invert(&system(&l, lambda, &blocks));
     let variance: Vec<f32> =
         (0..80).map(|i| ((0..3).map(|a| inverse[80 * a + i][80 * a + i]).sum::<f64>() / 3.0) as f32).collect();
     let exact = filters::gaussian(&variance, nodes, [1.0; 3]);

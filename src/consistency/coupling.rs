@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// `1/2 d.A d - b.d + lambda/2 (c + d).L (c + d)`.
 pub fn step(
     smoothness: &Smoothness,
-    lambda: f32,
+    lambda: [f32; 3],
     blocks: &[[f32; 6]],
     rhs: &[f32],
     coefficients: &mut [f32],
@@ -22,7 +22,7 @@ pub fn step(
     let n = blocks.len();
     let mut b = rhs.to_vec();
     let mut lc = vec![0.0f32; n];
-    for (c, b) in coefficients.chunks_exact(n).zip(b.chunks_exact_mut(n)) {
+    for ((c, b), lambda) in coefficients.chunks_exact(n).zip(b.chunks_exact_mut(n)).zip(lambda) {
         smoothness.apply(c, &mut lc);
         for (b, l) in b.iter_mut().zip(&lc) {
             *b -= lambda * l;
@@ -38,12 +38,26 @@ pub fn step(
     (report, (moved / n as f64).sqrt() as f32)
 }
 
-/// How many degrees of freedom the data determine: `3 n - lambda tr((A + lambda L)^-1 L)` with a free rank of the
-/// energy (`L` costs nothing for an affine field) counted as determined.
+/// How much the axes share their weights: an axis along which nothing moves is held at most about 300 times as stiffly as all
+/// of them together would be, so that motion along it that only a finer level shows can still come up.
+const SHARED: f64 = 0.003;
+
+/// The weights of the bending energy that the data support, one an axis (MacKay 1992): `determined / (2 energy)`.
+///
+/// Tissue that is pressed or contracts moves far more along one axis than across, and one weight for all would hold back the
+/// one and let the others follow noise.
+pub fn supported(determined: [f64; 3], energy: [f64; 3]) -> [f64; 3] {
+    let determined = determined.map(|v| v.max(0.3));
+    let [shared, bent] = [determined, energy].map(|v| SHARED * v.iter().sum::<f64>() / 3.0);
+    std::array::from_fn(|c| 0.5 * (determined[c] + shared) / (energy[c] + bent).max(1e-12))
+}
+
+/// How many degrees of freedom the data determine along each axis: `n - lambda tr((A + lambda L)^-1 L)` of its component, with
+/// a free rank of the energy (`L` costs nothing for an affine field) counted as determined.
 ///
 /// The trace is estimated with one random sign vector (Hutchinson 1990), which is exact to about one part in the root
 /// of the number of nodes.
-pub fn determined(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], seed: u64, limit: usize) -> f64 {
+pub fn determined(smoothness: &Smoothness, lambda: [f32; 3], blocks: &[[f32; 6]], seed: u64, limit: usize) -> [f64; 3] {
     Probe::new(blocks.len(), seed).determined(smoothness, lambda, blocks, limit, false)
 }
 
@@ -67,21 +81,21 @@ impl Probe {
     pub fn determined(
         &mut self,
         smoothness: &Smoothness,
-        lambda: f32,
+        lambda: [f32; 3],
         blocks: &[[f32; 6]],
         limit: usize,
         multilevel: bool,
-    ) -> f64 {
+    ) -> [f64; 3] {
         let n = blocks.len();
         let (signs, solution) = (&self.signs, &mut self.solution);
         solve(smoothness, lambda, blocks, Data::Blocks, multilevel, signs, solution, 1e-2, limit);
         let mut lx = vec![0.0f32; n];
-        let mut trace = 0.0;
-        for (x, z) in self.solution.chunks_exact(n).zip(self.signs.chunks_exact(n)) {
-            smoothness.apply(x, &mut lx);
-            trace += lx.iter().zip(z).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
-        }
-        3.0 * n as f64 - f64::from(lambda) * trace
+        std::array::from_fn(|c| {
+            smoothness.apply(&self.solution[c * n..(c + 1) * n], &mut lx);
+            let z = &self.signs[c * n..(c + 1) * n];
+            let trace: f64 = lx.iter().zip(z).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum();
+            n as f64 - f64::from(lambda[c]) * trace
+        })
     }
 }
 
@@ -101,7 +115,8 @@ pub struct Evidence {
 /// Minimises `sum_i rho(e_i . A_i e_i) + lambda c . L c` with `e_i = u(x_i) - d_i` by reweighted conjugate gradients:
 /// every place pulls only along the directions that its patch determines, so a match that slid along an edge does no
 /// harm (aperture). `rho` is Geman & McClure's, its scale falling from `start` to 3 standard deviations.
-/// `lambda` (per mm^3 of lattice cell) is set in each round from the evidence as in [`determined`].
+/// `lambda` (per mm^3 of lattice cell) is set in each round from the evidence as in [`determined`], one for all axes: of an
+/// axis alone a few dozen matches tell too little.
 pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], rounds: usize) -> (Vec<f32>, f32) {
     let n = lattice.len();
     let mut c = vec![0.0f32; 3 * n];
@@ -152,11 +167,11 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         };
         // Early rounds only sort the evidence; the last two settle the field.
         let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-3, 60) };
-        solve(smoothness, lambda, &blocks, Data::Operator(&operator), true, &rhs, &mut c, tolerance, limit);
-        let gamma = probe.determined(smoothness, lambda, &blocks, if round < 2 { 30 } else { 15 }, true).max(1.0);
-        let energy = smoothness.energy(&c).max(1e-9);
+        solve(smoothness, [lambda; 3], &blocks, Data::Operator(&operator), true, &rhs, &mut c, tolerance, limit);
+        let gamma = probe.determined(smoothness, [lambda; 3], &blocks, if round < 2 { 30 } else { 15 }, true);
+        let [gamma, energy] = [gamma, smoothness.energy(&c)].map(|v| v.iter().sum::<f64>());
         // Half way on the logarithm: whole steps swing to and fro.
-        let target = (lambda * (0.5 * gamma / energy) as f32).sqrt();
+        let target = (lambda * (0.5 * gamma.max(1.0) / energy.max(1e-9)) as f32).sqrt();
         lambda = target.clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
         scale = (scale * 0.5f64).max(9.0);
     }
@@ -170,7 +185,7 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
 /// averaged over `draws` and over neighbouring nodes.
 pub fn deviation(
     smoothness: &Smoothness,
-    lambda: f32,
+    lambda: [f32; 3],
     blocks: &[[f32; 6]],
     nodes: [usize; 3],
     draws: usize,
@@ -181,7 +196,7 @@ pub fn deviation(
     for draw in 0..draws {
         let mut random = Random::new(seed, 1000 + draw as u64);
         let mut b = vec![0.0f32; 3 * n];
-        for component in b.chunks_exact_mut(n) {
+        for (component, lambda) in b.chunks_exact_mut(n).zip(lambda) {
             let l = smoothness.sample(&mut random);
             for (b, l) in component.iter_mut().zip(l) {
                 *b = lambda.sqrt() * l;

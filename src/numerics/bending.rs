@@ -154,16 +154,13 @@ impl Smoothness {
         out
     }
 
-    /// The energy of a planar three-component vector field.
-    pub fn energy(&self, x: &[f32]) -> f64 {
-        let n = x.len() / 3;
-        let mut lx = vec![0.0; n];
-        x.chunks_exact(n)
-            .map(|x| {
-                self.apply(x, &mut lx);
-                x.iter().zip(&lx).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>()
-            })
-            .sum()
+    /// The energy of each component of a planar vector field.
+    pub fn energy(&self, x: &[f32]) -> [f64; 3] {
+        let mut lx = vec![0.0; x.len() / 3];
+        thirds(x).map(|x| {
+            self.apply(x, &mut lx);
+            x.iter().zip(&lx).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+        })
     }
 }
 
@@ -285,7 +282,7 @@ pub enum Data<'a> {
 /// coarser lattices take them. Stops at `tolerance` (relative residual) or after `limit` iterations.
 pub fn solve(
     smoothness: &Smoothness,
-    lambda: f32,
+    lambda: [f32; 3],
     blocks: &[[f32; 6]],
     data: Data<'_>,
     multilevel: bool,
@@ -310,7 +307,7 @@ pub fn solve(
 /// The matrix `D + lambda L` with its preconditioner, in slabs of node planes.
 struct System {
     bands: Bands,
-    lambda: f32,
+    lambda: [f32; 3],
     /// Nodes of a plane.
     plane: usize,
     /// Diagonal blocks of `D`, planar: xx, yy, zz, xy, xz, yz.
@@ -322,7 +319,7 @@ struct System {
 }
 
 impl System {
-    fn new(smoothness: &Smoothness, lambda: f32, blocks: &[[f32; 6]], multilevel: bool) -> Self {
+    fn new(smoothness: &Smoothness, lambda: [f32; 3], blocks: &[[f32; 6]], multilevel: bool) -> Self {
         let n = blocks.len();
         let diagonal = smoothness.diagonal();
         let inverses: Vec<[f32; 6]> = blocks
@@ -330,9 +327,8 @@ impl System {
             .zip(&diagonal)
             .map(|(a, &l)| {
                 let mut m = a.map(f64::from);
-                let l = f64::from(lambda * l) + 1e-12;
-                for v in &mut m[..3] {
-                    *v += l;
+                for (v, lambda) in m.iter_mut().zip(lambda) {
+                    *v += f64::from(lambda * l) + 1e-12;
                 }
                 inverse(&m).unwrap_or([1.0 / m[0], 1.0 / m[1], 1.0 / m[2], 0.0, 0.0, 0.0]).map(|v| v as f32)
             })
@@ -345,7 +341,7 @@ impl System {
             out
         };
         let blocks = planar(blocks);
-        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.into(), &blocks);
+        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.map(f64::from), &blocks);
         Self {
             bands: smoothness.bands(),
             lambda,
@@ -371,21 +367,22 @@ impl System {
                     self.bands.plane(x1, k, o1, &mut cross);
                     self.bands.plane(x2, k, o2, &mut cross);
                     let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
+                    let [l0, l1, l2] = self.lambda;
                     match data {
                         Some(d) => {
                             let [d0, d1, d2] = thirds(d).map(|d| &d[at.clone()]);
                             for i in 0..x.len() {
-                                o0[i] = self.lambda * o0[i] + d0[i];
-                                o1[i] = self.lambda * o1[i] + d1[i];
-                                o2[i] = self.lambda * o2[i] + d2[i];
+                                o0[i] = l0 * o0[i] + d0[i];
+                                o1[i] = l1 * o1[i] + d1[i];
+                                o2[i] = l2 * o2[i] + d2[i];
                             }
                         }
                         None => {
                             let [xx, yy, zz, xy, xz, yz] = sixths(&self.blocks, n, &at);
                             for i in 0..x.len() {
-                                o0[i] = self.lambda * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
-                                o1[i] = self.lambda * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
-                                o2[i] = self.lambda * o2[i] + (xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i]);
+                                o0[i] = l0 * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
+                                o1[i] = l1 * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
+                                o2[i] = l2 * o2[i] + (xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i]);
                             }
                         }
                     }

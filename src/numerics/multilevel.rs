@@ -28,7 +28,7 @@ pub(super) struct Coarse {
 impl Coarse {
     /// For `D + lambda L` on `fine` nodes `step_mm` apart, with `blocks` the planar diagonal blocks of `D`; none where the
     /// lattice is too small.
-    pub(super) fn new(fine: [usize; 3], step_mm: [f64; 3], lambda: f64, blocks: &[f32]) -> Option<Box<Self>> {
+    pub(super) fn new(fine: [usize; 3], step_mm: [f64; 3], lambda: [f64; 3], blocks: &[f32]) -> Option<Box<Self>> {
         let shape = fine.map(|n| if n > 1 { vec![1.0] } else { Vec::new() });
         Self::below(fine, step_mm, lambda, blocks, &shape)
     }
@@ -37,7 +37,7 @@ impl Coarse {
     fn below(
         fine: [usize; 3],
         step_mm: [f64; 3],
-        lambda: f64,
+        lambda: [f64; 3],
         blocks: &[f32],
         shape: &[Vec<f64>; 3],
     ) -> Option<Box<Self>> {
@@ -53,11 +53,12 @@ impl Coarse {
         for (from, to) in blocks.chunks_exact(m).zip(coarse.chunks_exact_mut(n)) {
             restrict(from, fine, nodes, &squares, to);
         }
-        let bending = (lambda * energy(&shape, step_mm)).max(1e-12);
+        let energy = energy(&shape, step_mm);
+        let bending = lambda.map(|l| (l * energy).max(1e-12));
         let mut inverses = vec![0.0f32; 6 * n];
         for i in 0..n {
             let mut b: [f64; 6] = std::array::from_fn(|q| f64::from(coarse[q * n + i]));
-            b[..3].iter_mut().for_each(|v| *v += bending);
+            b.iter_mut().zip(bending).for_each(|(v, l)| *v += l);
             let inverse = inverse(&b).unwrap_or([1.0 / b[0], 1.0 / b[1], 1.0 / b[2], 0.0, 0.0, 0.0]);
             (0..6).for_each(|q| inverses[q * n + i] = inverse[q] as f32);
         }

@@ -424,7 +424,8 @@ fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -
     }
     let energy = level::smoothness(&coarse, spacing);
     let cell: f64 = (0..3).filter(|&a| coarse.shape[a] > 1).map(|a| coarse.step[a] as f64 * spacing[a]).product();
-    let mut deviation = coupling::deviation(&energy, (field.lambda * cell) as f32, &blocks, coarse.nodes, 6, seed);
+    let mut deviation =
+        coupling::deviation(&energy, field.lambda.map(|l| (l * cell) as f32), &blocks, coarse.nodes, 6, seed);
     deviation.iter_mut().for_each(|v| *v *= CALIBRATION);
     let factor: [usize; 3] = std::array::from_fn(|a| (spacing[a] / grid.spacing()[a]).round() as usize);
     let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));

@@ -29,19 +29,19 @@ pub struct SplineField {
     pub lattice: Lattice,
     /// Displacement (mm along the lattice's axes), planar.
     pub coefficients: Vec<f32>,
-    /// Weight of the bending energy, per mm^3 of lattice cell.
-    pub lambda: f64,
+    /// Weight of the bending energy along each axis, per mm^3 of lattice cell.
+    pub lambda: [f64; 3],
     /// Information of the last pass (1/mm^2), one block a node.
     pub blocks: Vec<[f32; 6]>,
-    /// Weight of the bending energy in the last pass, per lattice cell.
-    pub coupled_at: f32,
+    /// Weight of the bending energy along each axis in the last pass, per lattice cell.
+    pub coupled_at: [f32; 3],
 }
 
 impl SplineField {
     /// No motion, with a bending energy to start from.
     pub fn still(lattice: Lattice) -> Self {
         let coefficients = vec![0.0; 3 * lattice.len()];
-        Self { lattice, coefficients, lambda: 30.0, blocks: Vec::new(), coupled_at: 0.0 }
+        Self { lattice, coefficients, lambda: [30.0; 3], blocks: Vec::new(), coupled_at: [0.0; 3] }
     }
 }
 
@@ -82,7 +82,7 @@ const SETTLED: f64 = 0.004;
 const ITERATIONS: usize = 15;
 
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence (MacKay 1992):
-/// `lambda = determined / (2 energy)`. Calls `tick` after each pass.
+/// `lambda = determined / (2 energy)` along each axis. Calls `tick` after each pass.
 pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
     let energy = smoothness(&field.lattice, pair.spacing);
     let cell = cell_volume(&field.lattice, pair.spacing);
@@ -98,7 +98,7 @@ pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64
         for v in equations.blocks.iter_mut().flatten().chain(&mut equations.rhs) {
             *v *= weight;
         }
-        let lambda = (field.lambda * cell) as f32;
+        let lambda = field.lambda.map(|l| (l * cell) as f32);
         let base = field.coefficients.clone();
         let (_, moved) = coupling::step(
             &energy,
@@ -117,10 +117,11 @@ pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64
         if pass % 2 == 1 || pass + 1 == passes {
             let limit = if pass < 2 { 20 } else { 10 };
             // A warm start saves iterations; where little is determined it can miss by more than there is.
-            let determined = probe.determined(&energy, lambda, &field.blocks, limit, false).max(1.0);
-            let bent = energy.energy(&field.coefficients).max(1e-12);
-            let target = 0.5 * determined / bent / cell;
-            field.lambda = target.clamp(field.lambda / 5.0, field.lambda * 5.0).clamp(1e-6, 1e9);
+            let determined = probe.determined(&energy, lambda, &field.blocks, limit, false);
+            let target = coupling::supported(determined, energy.energy(&field.coefficients));
+            for (lambda, target) in field.lambda.iter_mut().zip(target) {
+                *lambda = (target / cell).clamp(*lambda / 5.0, *lambda * 5.0).clamp(1e-6, 1e9);
+            }
         }
         field.coupled_at = lambda;
         tick(pass);
@@ -133,7 +134,7 @@ pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64
 /// Degrees of freedom that the data of the last pass determine.
 pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
     let energy = smoothness(&field.lattice, pair.spacing);
-    coupling::determined(&energy, field.coupled_at, &field.blocks, seed, 30).max(12.0)
+    coupling::determined(&energy, field.coupled_at, &field.blocks, seed, 30).iter().sum::<f64>().max(12.0)
 }
 
 /// The excess misfit of a map against the free field, from every fourth slice of a thick volume, with the information
@@ -152,7 +153,7 @@ pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&Affine
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
 pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> SplineField {
     let coefficients = lattice.fit(|p| coarse.lattice.at(&coarse.coefficients, from_here(p)));
-    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Vec::new(), coupled_at: 0.0 }
+    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Vec::new(), coupled_at: [0.0; 3] }
 }
 
 /// What the feature stages need to know.
@@ -445,8 +446,8 @@ fn fit(
         .collect();
     let energy = smoothness(&lattice, pair.spacing);
     let (coefficients, lambda) = coupling::fit(&lattice, &energy, &evidence, ROUNDS);
-    let lambda = STIFF * f64::from(lambda) / cell_volume(&lattice, pair.spacing);
-    SplineField { lattice, coefficients, lambda, blocks: Vec::new(), coupled_at: 0.0 }
+    let lambda = [STIFF * f64::from(lambda) / cell_volume(&lattice, pair.spacing); 3];
+    SplineField { lattice, coefficients, lambda, blocks: Vec::new(), coupled_at: [0.0; 3] }
 }
 
 /// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it leaves the volume.
