@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::error::MeshError;
+use palpate::field::interpolation::interpolate_tetrahedra;
 use palpate::mesh::delaunay2::delaunay2;
 use palpate::mesh::delaunay3::delaunay3;
 use palpate::mesh::locate::{TetrahedronLocator, TriangleLocator};
@@ -9,7 +10,7 @@ use palpate::mesh::plane::Plane;
 use palpate::mesh::predicates::{insphere, orient3d};
 use palpate::mesh::quality::{hull_volume, qualities, quality, total_volume};
 use palpate::mesh::{Delaunay, NO_NEIGHBOUR};
-use palpate::types::{TetMesh, TriMesh, WorldPoint};
+use palpate::types::{Affine, Grid, TetMesh, TriMesh, WorldPoint};
 use proptest::prelude::*;
 use robust::{Coord, Coord3D};
 use std::collections::{HashMap, HashSet};
@@ -299,6 +300,34 @@ proptest! {
                 }
             }
         }
+    }
+
+    /// A linear displacement of the nodes comes back at every voxel in the hull, however the nodes lie.
+    #[test]
+    fn linear_fields_come_back_on_all_families(kind in 0..FAMILIES, n in 60usize..300, seed: u64) {
+        let points = family(kind, n, seed);
+        let Ok(d) = delaunay3(&world(&points)) else { return Ok(()) };
+        let box_of = |f: fn(f64, f64) -> f64| points.iter().copied().reduce(|a, b| [0, 1, 2].map(|k| f(a[k], b[k]))).unwrap();
+        let (low, high) = (box_of(f64::min), box_of(f64::max));
+        let shape = [11, 10, 9];
+        let spacing = [0, 1, 2].map(|k| (high[k] - low[k]) / (shape[k] as f64 - 1.7));
+        let grid = Grid::new(shape, Affine::scaled(spacing, [0, 1, 2].map(|k| low[k] - 0.3 * spacing[k])).unwrap()).unwrap();
+        let linear = |p: WorldPoint| {
+            let [x, y, z] = [0, 1, 2].map(|k| (p.0[k] - low[k]) / (high[k] - low[k]));
+            [x - 0.5 * y + 1.0, 0.3 * z - y, 0.1 * x + 0.7 * z]
+        };
+        let u: Vec<[f64; 3]> = d.mesh.nodes().iter().map(|&p| linear(p)).collect();
+        let result = interpolate_tetrahedra(&d.mesh, &u, &grid).unwrap();
+        let mut inside = 0;
+        for v in (0..grid.len()).filter(|&v| result.inside.as_slice()[v] == 1) {
+            inside += 1;
+            let (found, truth) = (result.displacement.at(v), linear(grid.world(v % 11, v / 11 % 10, v / 110)));
+            for c in 0..3 {
+                prop_assert!((f64::from(found[c]) - truth[c]).abs() < 1e-5, "{found:?} for {truth:?}");
+            }
+        }
+        // In a slab of rounding's thickness no voxel need lie.
+        prop_assert!(inside > 0 || kind == 7 || kind == 9);
     }
 
     /// Triangles in a plane anywhere: exact on axis-aligned ones, tiling the hull on all.

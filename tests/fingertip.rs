@@ -287,6 +287,22 @@ fn skin_of_which_only_a_low_bound_is_known_is_no_bone() {
     assert!(out.contains("E 40.0 kPa") && err.contains("only a bound of pulp's modulus"), "{out}{err}");
 }
 
+/// A changed summary: a body that no modulus makes stiff.
+#[test]
+fn a_forged_poissons_ratio_is_refused() {
+    let folder = stiffness_folder(true, "bone");
+    let path = folder.path().join("stiffness/summary.json");
+    let good: serde_json::Value = serde_json::from_str(&fs::read_to_string(&path).unwrap()).unwrap();
+    for forged in [0.5, 0.0, -0.3, 7.0] {
+        let mut summary = good.clone();
+        summary["poisson"] = forged.into();
+        io::write_json(&path, &summary).unwrap();
+        let (_, err) = palpate(folder.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);
+        assert!(err.contains("summary.json") && err.contains("poisson"), "{err}");
+        assert!(!folder.path().join("tip.toml").exists());
+    }
+}
+
 #[test]
 fn bad_folders_are_refused() {
     let ratios = stiffness_folder(false, "bone");

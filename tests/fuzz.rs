@@ -1,11 +1,15 @@
 //! Readers against changed bytes: no panic, no more memory than the file could honestly need, no wrong voxels from a file
 //! that checks itself.
 //!
-//! Two seconds for all in a usual run; `PALPATE_FUZZ_SECONDS=600 cargo test --release --test fuzz -- --nocapture` takes that
-//! long for each reader and prints the number of cases.
+//! Two seconds for all in a usual run; `PALPATE_FUZZ_SECONDS=3600 cargo test --release --test fuzz -- --nocapture` takes that
+//! long for each reader, or ten million cases where they come first, and prints their number. `PALPATE_FUZZ_KINDS=v.nii,v.mha`
+//! takes those files alone.
 #![allow(clippy::unwrap_used)]
 
-use flate2::{Compression, write::GzEncoder};
+#[path = "fixtures/slices.rs"]
+mod slices;
+
+use flate2::{Compression, write::GzEncoder, write::ZlibEncoder};
 use palpate::io::{self, SceneOverrides};
 use palpate::numerics::random::Random;
 
@@ -22,6 +26,8 @@ static MEMORY: PeakAlloc = PeakAlloc;
 
 /// What a reader may take whatever the file: buffers, tables of the unpacker, messages (bytes).
 const SLACK: usize = 3 << 20;
+/// Cases after which a reader has been tried enough.
+const ENOUGH: u64 = 10_000_000;
 
 /// One kind of file: its name, a good one, and a reader that says how many numbers it gave.
 struct Kind {
@@ -32,6 +38,8 @@ struct Kind {
     ratio: usize,
     /// Whether a change that is not noticed must not change what is read.
     checked: bool,
+    /// Files that lie in the same folder.
+    beside: Vec<(&'static str, Vec<u8>)>,
 }
 
 fn volume(path: &Path) -> Option<Vec<f32>> {
@@ -82,7 +90,23 @@ fn kinds() -> Vec<Kind> {
     let config = serde_json::to_vec(&serde_json::json!({ "params": FieldParams::default() })).unwrap();
     let scene = include_bytes!("../examples/eight_motions.toml").to_vec();
     let skin = include_bytes!("../examples/skin.toml").to_vec();
-    let kind = |name, good, read, ratio, checked| Kind { name, good, read, ratio, checked };
+    let mut zlib = ZlibEncoder::new(Vec::new(), Compression::default());
+    zlib.write_all(&raw).unwrap();
+    let zlib = zlib.finish().unwrap();
+    let text = |v: &[u8]| String::from_utf8(v.to_vec()).unwrap();
+    let packed_nrrd = text(nrrd).replace("encoding: raw", "encoding: gzip").into_bytes();
+    let packed_meta = format!("CompressedData = True\nCompressedDataSize = {}\nElementDataFile", zlib.len());
+    let packed_meta = text(meta).replace("ElementDataFile", &packed_meta).into_bytes();
+    let matches = "x,y,z,dx,dy,dz,ncc,sigma,kept\n1,2,3,0.5,0,0,0.9,0.1,1\n4,5,6,0,0.25,0,0.8,0.2,1\n";
+    let table = "initial,deformed,mask,force_n,subject\na.nii,b.nii,,2.5,01\nc.nii,d.nii,m.nii,,02\n";
+    let paths = "point,frame,time_s,x,y,z,sigma,state\n0,0,0,1,2,3,0.1,measured\n0,1,0.1,1.5,2,3,0.1,measured\n";
+    let told =
+        br#"{"command":"stiffness","absolute":true,"poisson":0.49,"force_n":2.5,"inputs":{"load":"z-","held":"z+"},
+        "regions":[{"id":1,"name":"pulp","youngs_modulus":30,"sd":2,"identifiable":true,"voxels":9,"bound":null}],
+        "patches":{"held":{"translation":[0,0,0]},"loaded":{"translation":[0,0,1],"travel_mm":1}}}"#;
+    let fingertip = b"youngs_modulus = 1e4\n[pad]\ncalibration = 1.02\nfinite_element_nodes = 2500\n";
+    let slices = [0, 1, 2].map(|n| slices::Slice::new(n).bytes());
+    let kind = |name, good, read, ratio, checked| Kind { name, good, read, ratio, checked, beside: Vec::new() };
     vec![
         kind("v.nii", nifti.clone(), volume as fn(&Path) -> Option<Vec<f32>>, 2, false),
         kind("v.nii.gz", gzip(&nifti), volume, 2 * 1032, true),
@@ -98,6 +122,20 @@ fn kinds() -> Vec<Kind> {
         kind("config.json", config, |p| nothing(io::read_config(p)), 64, false),
         kind("scene.toml", scene, |p| nothing(io::read_scene(p, &SceneOverrides::default())), 64, false),
         kind("skin.toml", skin, |p| nothing(io::read_skin_scene(p)), 64, false),
+        kind("packed.nrrd", [packed_nrrd, gzip(&raw)].concat(), volume, 2 * 1032, false),
+        kind("packed.mha", [packed_meta, zlib].concat(), volume, 2 * 1032, false),
+        kind("matches.csv", matches.into(), |p| nothing(io::read_matches(p)), 64, false),
+        kind("pairs.csv", table.into(), |p| nothing(io::read_pairs(p)), 64, false),
+        kind("trajectories.csv", paths.into(), |p| nothing(io::read_trajectories(p, 0)), 64, false),
+        kind("fingertip.toml", fingertip.to_vec(), |p| nothing(io::read_fingertip_press(p)), 64, false),
+        Kind {
+            beside: vec![("stiffness.nii.gz", gzip(&nifti))],
+            ..kind("summary.json", told.to_vec(), |p| nothing(io::read_stiffness(p.parent()?)), 64, false)
+        },
+        Kind {
+            beside: vec![("0", slices[0].clone()), ("2", slices[2].clone())],
+            ..kind("slice.dcm", slices[1].clone(), |p| volume(p.parent()?), 64, false)
+        },
     ]
 }
 
@@ -147,17 +185,23 @@ fn changed(good: &[u8], random: &mut Random) -> Vec<u8> {
 #[test]
 fn changed_files_are_read_right_or_refused() {
     let seconds = std::env::var("PALPATE_FUZZ_SECONDS").ok().and_then(|s| s.parse().ok());
-    let each = Duration::from_secs_f64(seconds.unwrap_or(2.0 / 14.0));
+    let only = std::env::var("PALPATE_FUZZ_KINDS").ok();
+    let kinds: Vec<Kind> =
+        kinds().into_iter().filter(|k| only.as_ref().is_none_or(|o| o.split(',').any(|n| n == k.name))).collect();
+    let each = Duration::from_secs_f64(seconds.unwrap_or(2.0 / kinds.len() as f64));
     let memory = Path::new("/dev/shm");
     let folder = if memory.is_dir() { TempDir::new_in(memory) } else { TempDir::new() }.unwrap();
-    for Kind { name, good, read, ratio, checked } in kinds() {
-        let path = folder.path().join(name);
+    for Kind { name, good, read, ratio, checked, beside } in kinds {
+        let own = folder.path().join(format!("of-{name}"));
+        fs::create_dir(&own).unwrap();
+        let path = own.join(name);
+        beside.iter().for_each(|(other, bytes)| fs::write(own.join(other), bytes).unwrap());
         fs::write(&path, &good).unwrap();
         let Some(truth) = read(&path) else { panic!("{name}: the good file is refused") };
         let mut random = Random::new(u64::from(std::process::id()) * u64::from(seconds.is_some()), 3);
         let started = Instant::now();
         let (mut cases, mut accepted) = (0u64, 0u64);
-        while started.elapsed() < each {
+        while started.elapsed() < each && cases < ENOUGH {
             let bytes = changed(&good, &mut random);
             fs::write(&path, &bytes).unwrap();
             let keep = || {

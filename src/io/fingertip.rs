@@ -73,6 +73,9 @@ fn told(path: &Path, text: &str, map: impl FnOnce() -> Result<Volume, IoError>) 
         return Err(format(path, format!("is of `palpate {other}`"), hint));
     }
     let raw: RawSummary = serde_json::from_str(text).map_err(|e| format(path, e.to_string(), hint))?;
+    if !(raw.poisson > 0.0 && raw.poisson < 0.5) {
+        return Err(format(path, format!("\"poisson\" is {}, not between 0 and 0.5", raw.poisson), hint));
+    }
     Ok(StiffnessFolder {
         map: map()?,
         absolute: raw.absolute,
