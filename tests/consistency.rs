@@ -200,10 +200,10 @@ fn coupling_withstands_outliers() {
 #[test]
 fn each_axis_is_held_as_its_own_data_ask() {
     let weights = coupling::supported([40.0, 30.0, 50.0], [1e-6, 0.01, 10.0]);
-    assert!((weights[2] - 2.6).abs() < 0.03, "{weights:?}");
-    assert!(weights[0] > weights[1] && weights[1] > 10.0 * weights[2]);
+    assert!((weights[2] - 2.8).abs() < 0.03, "{weights:?}");
+    assert!(weights[0] > weights[1] && weights[1] > 5.0 * weights[2]);
     let together = 0.5 * 120.0 / 10.01;
-    assert!(weights[0] < 11.1 * together, "{weights:?}");
+    assert!(weights[0] < 4.4 * together, "{weights:?}");
     let alike = coupling::supported([30.0; 3], [2.0; 3]);
     assert!(alike.iter().all(|w| (w - 7.5).abs() < 1e-9), "{alike:?}");
     // What was not worked out to the end may come out negative.

@@ -38,9 +38,9 @@ pub fn step(
     (report, (moved / n as f64).sqrt() as f32)
 }
 
-/// How much the axes share their weights: an axis along which nothing moves is held at most about ten times as stiffly as all
+/// How much the axes share their weights: an axis along which nothing moves is held at most about four times as stiffly as all
 /// of them together would be, so that motion along it that only a finer level shows can still come up.
-const SHARED: f64 = 0.1;
+const SHARED: f64 = 0.3;
 
 /// The weights of the bending energy that the data support, one an axis (MacKay 1992): `determined / (2 energy)`.
 ///

@@ -227,7 +227,7 @@ mod tests {
     fn restriction_is_the_transpose_of_prolongation() {
         for fine in [[9, 12, 7], [13, 8, 1], [10, 5, 11]] {
             let n: usize = fine.iter().product();
-            let Some(c) = Coarse::new(fine, [1.0; 3], 1.0, &vec![0.0; 6 * n]) else { panic!("{fine:?}") };
+            let Some(c) = Coarse::new(fine, [1.0; 3], [1.0; 3], &vec![0.0; 6 * n]) else { panic!("{fine:?}") };
             let m: usize = c.nodes.iter().product();
             let number = |i: usize| ((i * 7919 + 13) % 101) as f32 / 50.0 - 1.0;
             let (x, y): (Vec<f32>, Vec<f32>) = ((0..n).map(number).collect(), (0..m).map(|i| number(3 * i)).collect());
