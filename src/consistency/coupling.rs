@@ -86,16 +86,10 @@ impl Probe {
         limit: usize,
         multilevel: bool,
     ) -> [f64; 3] {
-        let n = blocks.len();
         let (signs, solution) = (&self.signs, &mut self.solution);
         solve(smoothness, lambda, blocks, Data::Blocks, multilevel, signs, solution, 1e-2, limit);
-        let mut lx = vec![0.0f32; n];
-        std::array::from_fn(|c| {
-            smoothness.apply(&self.solution[c * n..(c + 1) * n], &mut lx);
-            let z = &self.signs[c * n..(c + 1) * n];
-            let trace: f64 = lx.iter().zip(z).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum();
-            n as f64 - f64::from(lambda[c]) * trace
-        })
+        let trace = smoothness.between(signs, solution);
+        std::array::from_fn(|c| blocks.len() as f64 - f64::from(lambda[c]) * trace[c])
     }
 }
 

@@ -213,7 +213,7 @@ impl Patch {
 
     /// Area of its facets (mm^2).
     pub fn area(&self, body: &Body) -> f64 {
-        self.facets.iter().map(|&f| body.surface[f].area).sum()
+        self.backing(body, |_| 1.0)
     }
 }
 
