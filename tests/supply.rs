@@ -3,7 +3,7 @@
 
 use serde_json::Value;
 use std::collections::BTreeSet;
-use std::process::Command;
+use std::process::{Command, Output};
 
 /// Licences under which a part may be passed on with the program.
 const PERMISSIVE: [&str; 10] = [
@@ -22,11 +22,17 @@ const PERMISSIVE: [&str; 10] = [
 /// Crates that carry C or a linked library: libdeflate brings its source with it.
 const NATIVE: [&str; 1] = ["libdeflate-sys"];
 
-/// The packages that the program is built from (not those of its tests), as `cargo metadata` tells.
+/// What cargo prints.
+fn cargo(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO")).args(arguments).current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap()
+}
+
+/// The packages that the program is built from on this system (not those of its tests), as `cargo metadata` tells.
 fn packages() -> Vec<Value> {
-    let mut cargo = Command::new(env!("CARGO"));
-    cargo.args(["metadata", "--format-version", "1", "--locked", "--offline"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-    let output = cargo.output().unwrap();
+    let version = String::from_utf8(cargo(&["-vV"]).stdout).unwrap();
+    let host = version.lines().find_map(|l| l.strip_prefix("host: ")).unwrap();
+    // Where this is the first build, those of other systems are not there: nothing had asked for them.
+    let output = cargo(&["metadata", "--format-version", "1", "--locked", "--offline", "--filter-platform", host]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let all: Value = serde_json::from_slice(&output.stdout).unwrap();
     let nodes = all["resolve"]["nodes"].as_array().unwrap();
@@ -39,12 +45,7 @@ fn packages() -> Vec<Value> {
         }
         let node = nodes.iter().find(|n| n["id"] == next.as_str()).unwrap();
         for dependency in node["deps"].as_array().unwrap() {
-            // Neither for tests alone nor for other systems.
-            let counts = dependency["dep_kinds"].as_array().unwrap().iter().any(|k| {
-                k["kind"] != "dev"
-                    && !["windows", "wasm"].iter().any(|t| k["target"].as_str().unwrap_or_default().contains(t))
-            });
-            if counts {
+            if dependency["dep_kinds"].as_array().unwrap().iter().any(|k| k["kind"] != "dev") {
                 wanted.push(id(&dependency["pkg"]));
             }
         }

@@ -5,7 +5,7 @@
 
 The field is NIfTI 5-D, intent 1007, LPS mm on the fixed grid. Two threads. Settings are the tools' own defaults or
 those their authors recommend; none was changed after its score was seen. Needs numpy, nibabel and the tool itself
-(pip: picsl_greedy, SimpleITK, antspyx; Debian: elastix, plastimatch).
+(pip: picsl_greedy, SimpleITK, antspyx; Debian: elastix, plastimatch; from source: NiftyReg, deedsBCV).
 """
 import importlib.util
 import os
@@ -137,6 +137,44 @@ def ants(kind, fixed, moving, out):
     save(load(warp), fixed, out)
 
 
+def niftyreg(options, fixed, moving, out):
+    with tempfile.TemporaryDirectory() as folder:
+        grid, field = (os.path.join(folder, n) for n in ("grid.nii.gz", "field.nii.gz"))
+        quiet = {"check": True, "stdout": subprocess.DEVNULL}
+        result = ["-res", os.path.join(folder, "result.nii.gz")]
+        common = ["-ref", fixed, "-omp", THREADS]
+        subprocess.run(["reg_f3d", *common, "-flo", moving, "-cpp", grid, *result, *options], **quiet)
+        subprocess.run(["reg_transform", *common, "-disp", grid, field], **quiet)
+        save(load(field) * [-1, -1, 1], fixed, out)
+
+
+def deeds(_, fixed, moving, out):
+    """deedsBCV as it comes; its field lies on every fourth voxel, components along y, x, z, in voxels."""
+    import nibabel as nib
+    import numpy as np
+
+    # Its threads wait in a loop else, which would be booked as work.
+    os.environ["OMP_WAIT_POLICY"] = "passive"
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [os.path.join(folder, n) for n in ("f.nii.gz", "m.nii.gz")]
+        for given, path in zip((fixed, moving), paths):
+            image = nib.load(given)
+            nib.save(nib.Nifti1Image(np.asarray(image.dataobj, np.float32), image.affine), path)
+        result = os.path.join(folder, "out")
+        command = ["deedsBCV", "-F", paths[0], "-M", paths[1], "-O", result]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        image = nib.load(fixed)
+        coarse = [n // 4 for n in image.shape]
+        flow = np.fromfile(result + "_displacements.dat", "<f4").reshape((*coarse, 3), order="F")
+    for axis, (n, m) in enumerate(zip(image.shape, coarse)):
+        # Its own way of making a grid finer: linear, the first nodes at the first voxels.
+        at = np.arange(n) * (m / n)
+        low = np.minimum(at.astype(int), m - 1)
+        t = (at - low).reshape([-1 if a == axis else 1 for a in range(4)])
+        flow = flow.take(low, axis) * (1 - t) + flow.take(np.minimum(low + 1, m - 1), axis) * t
+    save(flow[..., [1, 0, 2]] @ image.affine[:3, :3].T * [-1, -1, 1], fixed, out)
+
+
 METHODS = {
     "greedy half": (greedy, "100x50x0"),
     "greedy full": (greedy, "100x50x10"),
@@ -153,6 +191,9 @@ METHODS = {
     ),
     "plastimatch": (plastimatch, None),
     "demons": (demons, None),
+    "NiftyReg": (niftyreg, []),
+    "NiftyReg half": (niftyreg, ["-lp", "2"]),
+    "deeds": (deeds, None),
     "ANTs SyNQuick": (ants, "antsRegistrationSyNQuick[so]"),
 }
 
@@ -162,6 +203,8 @@ NEEDS = {
     elastix: ([], ["elastix", "transformix"]),
     plastimatch: ([], ["plastimatch"]),
     demons: (["SimpleITK"], []),
+    niftyreg: ([], ["reg_f3d", "reg_transform"]),
+    deeds: ([], ["deedsBCV"]),
     ants: (["ants"], []),
 }
 
