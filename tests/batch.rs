@@ -138,6 +138,13 @@ fn a_folder_with_something_else_is_left_alone() {
     run(folder.path(), &[&FAST[..], &["--force"]].concat(), 0);
 }
 
+/// Whether a process works in `folder`, as far as the system tells.
+fn worked_in(folder: &Path) -> bool {
+    let Ok(processes) = fs::read_dir("/proc") else { return false };
+    let folder = folder.canonicalize().unwrap();
+    processes.flatten().any(|p| fs::read_link(p.path().join("cwd")).is_ok_and(|at| at == folder))
+}
+
 #[test]
 fn a_killed_run_is_taken_up() {
     let lines: Vec<String> = (0..4).map(|i| format!("p{i},initial.nii.gz,deformed.nii.gz")).collect();
@@ -157,7 +164,14 @@ fn a_killed_run_is_taken_up() {
     child.wait().unwrap();
     assert!(first.exists() && !last.exists(), "the run was killed too early or too late");
     assert!(statuses(folder.path()).contains(&"p3 waiting".into()));
-    // A stage of the killed run may still be writing; its results count only where they are on record.
+    // Its stages end with it, and leave nothing half-written.
+    let killed = Instant::now();
+    while worked_in(folder.path()) {
+        assert!(killed.elapsed() < Duration::from_secs(2), "a stage goes on");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let left: Vec<_> = fs::read_dir(folder.path().join("out/p1")).unwrap().map(|f| f.unwrap().file_name()).collect();
+    assert!(left.iter().all(|name| !name.to_string_lossy().starts_with('.')), "{left:?}");
     palpate(folder.path()).args(arguments).assert().success();
     let found = statuses(folder.path());
     assert_eq!((found[0].as_str(), found[3].as_str()), ("p0 skipped", "p3 done"));

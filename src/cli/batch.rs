@@ -7,6 +7,7 @@ use super::Usage;
 use super::console::Console;
 use super::field::Tuning;
 use super::inputs::name;
+use super::limits::ATTENDED;
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::io::{self, read_header};
@@ -354,11 +355,13 @@ fn record(stage: &Stage) -> Result<Value> {
     Ok(json!({ "stage": stage.name, "version": version, "arguments": stage.arguments, "inputs": inputs }))
 }
 
-/// Runs a stage as a process of its own; its words go to `<stage>.log` in `folder`.
+/// Runs a stage as a process of its own, which ends with this one; its words go to `<stage>.log` in `folder`.
 fn execute(stage: &Stage, folder: &Path, threads: usize) -> Result<()> {
     let mut command = Command::new(std::env::current_exe()?);
-    command.args(&stage.arguments).args(["--threads", &threads.to_string()]);
-    let done = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).output()?;
+    command.args(&stage.arguments).args(["--threads", &threads.to_string()]).env(ATTENDED, "1");
+    let mut process = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
+    let _open = process.stdin.take();
+    let done = process.wait_with_output()?;
     let said = String::from_utf8_lossy(&done.stderr);
     io::write_text(folder.join(format!("{}.log", stage.name)), &said)?;
     if done.status.success() {

@@ -1,4 +1,4 @@
-//! What ends a run before its time: too little memory, Ctrl-C, a time limit.
+//! What ends a run before its time: too little memory, Ctrl-C, a time limit, the end of the batch that it is a part of.
 
 use super::console::Console;
 use anyhow::{Result, bail};
@@ -59,10 +59,15 @@ fn stop(console: &Console, why: &str, code: i32) -> ! {
     exit(code)
 }
 
-/// Watches for Ctrl-C and the like (exit code 128 + the signal's number, as shells have it), and for the end of `limit`
-/// (exit code 1).
+/// In the environment of a process that is to end when its standard input does: whoever started it holds the other end,
+/// however that one ends.
+pub const ATTENDED: &str = "PALPATE_ATTENDED";
+
+/// Watches for Ctrl-C and the like (exit code 128 + the signal's number, as shells have it), for the end of `limit` and for
+/// that of whoever attends to this process (exit code 1).
 pub fn watch(console: Console, limit: Option<Duration>) {
     let run_out = console.clone();
+    let attended = console.clone();
     // Without a thread for it a signal ends the program in the system's own way.
     #[cfg(unix)]
     let _ = std::thread::Builder::new().name("signals".into()).spawn(move || {
@@ -72,6 +77,12 @@ pub fn watch(console: Console, limit: Option<Duration>) {
             stop(&console, if signal == SIGINT { "stopped by Ctrl-C" } else { "stopped by a signal" }, 128 + signal);
         }
     });
+    if std::env::var_os(ATTENDED).is_some() {
+        let _ = std::thread::Builder::new().name("attended".into()).spawn(move || {
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            stop(&attended, "the run that this is a part of has ended", 1);
+        });
+    }
     if let Some(limit) = limit {
         let _ = std::thread::Builder::new().name("timeout".into()).spawn(move || {
             std::thread::sleep(limit);

@@ -18,7 +18,7 @@ use palpate::pipeline::{
 };
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
-use palpate::report::track::{TrackReport, look as track_look, page, summary, text};
+use palpate::report::track::{TrackReport, look as track_look, page, summary, text, warnings as frame_warnings};
 use palpate::types::{DenseField, Grid, Mask, Volume};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -192,10 +192,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
     let mut film = film.unwrap_or_else(|| start_film(&reference, &still, shown, range));
     add_to(&mut film, origin, &reference, &still, &|_| 0.0)?;
-    for f in &tracked.frames {
-        let said = f.warnings.iter().map(String::as_str).chain(f.lost.as_deref());
-        warnings.extend(said.map(|w| format!("frame {}: {w}", f.frame)));
-    }
+    warnings.extend(frame_warnings(&tracked));
     writing += started.elapsed();
     let measuring = tracked.frames.iter().map(|f| f.seconds).sum();
     let seconds = [("read", reading.as_secs_f64()), ("measure", measuring), ("write", writing.as_secs_f64())]

@@ -4,14 +4,17 @@ use super::arrays::{self, Callback, Image, told};
 use super::field::{kept_field, params};
 use crate::error::FieldError;
 use crate::pipeline::track::{Frame, run};
+use crate::report::film::Film;
+use crate::report::track::{TrackReport, summary, warnings};
 use crate::types::{DenseField, Volume};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use serde_json::json;
+use std::time::Instant;
 
 /// The displacement from one volume of a sequence to each other, with strain and trajectories.
 #[pyfunction]
-#[pyo3(signature = (volumes, reference, mask, labels, params, progress=None, threads=None))]
+#[pyo3(signature = (volumes, reference, mask, labels, params, names, regions, progress=None, threads=None))]
 pub fn track<'py>(
     py: Python<'py>,
     volumes: Vec<Image<'py>>,
@@ -19,6 +22,8 @@ pub fn track<'py>(
     mask: Option<Image<'py>>,
     labels: Option<Image<'py>>,
     params: &str,
+    names: Vec<String>,
+    regions: [String; 2],
     progress: Callback,
     threads: Option<usize>,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -29,10 +34,12 @@ pub fn track<'py>(
             "reference is {reference}, but there are {frames} volumes (counted from 0, two at least)"
         )));
     }
+    let started = Instant::now();
     let all = volumes.iter().map(arrays::volume).collect::<PyResult<Vec<Volume>>>()?;
     let grid = *all[reference].grid();
-    let mask = arrays::mask(mask.as_ref(), "mask", &grid, "the reference")?;
-    let labels = arrays::mask(labels.as_ref(), "labels", &grid, "the reference")?;
+    let mask = arrays::mask(mask.as_ref(), &regions[0], &grid, &names[reference])?;
+    let labels = arrays::mask(labels.as_ref(), &regions[1], &grid, &names[reference])?;
+    let reading = started.elapsed().as_secs_f64();
     let mut fields: Vec<Option<DenseField>> = vec![None; frames];
     fields[reference] = Some(DenseField::zeros(grid));
     let tracked = arrays::run(py, progress, threads, |tell| {
@@ -65,10 +72,21 @@ pub fn track<'py>(
     });
     out.set_item("trajectories", arrays::python(py, &points.collect())?)?;
     out.set_item("strain", arrays::python(py, &json!(tracked.strain))?)?;
-    let summary = json!({
-        "version": env!("CARGO_PKG_VERSION"), "command": "track", "reference": reference, "frames": tracked.frames,
-        "points": tracked.trajectories.len(), "params": params,
-    });
+    let measuring = tracked.frames.iter().map(|f| f.seconds).sum();
+    let report = TrackReport {
+        names: &names,
+        reference,
+        step_s: None,
+        grid: &grid,
+        regions: regions.each_ref().map(String::as_str),
+        params: &params,
+        tracked: &tracked,
+        film: &Film::new(&grid, grid.world(0, 0, 0), None, [0.0, 1.0]),
+        look: None,
+        warnings: &warnings(&tracked).collect::<Vec<_>>(),
+        seconds: &[("read", reading), ("measure", measuring)].map(|(stage, s)| (stage.to_string(), s)),
+    };
+    let summary = summary(&report);
     out.set_item("summary", arrays::python(py, &summary)?)?;
     Ok(out)
 }

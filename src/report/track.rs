@@ -156,6 +156,14 @@ pub fn text(report: &TrackReport<'_>) -> String {
     out
 }
 
+/// What each frame was warned of or lost for, with its number.
+pub fn warnings(tracked: &Tracked) -> impl Iterator<Item = String> + '_ {
+    tracked.frames.iter().flat_map(|f| {
+        let said = f.warnings.iter().map(String::as_str).chain(f.lost.as_deref());
+        said.map(|w| format!("frame {}: {w}", f.frame))
+    })
+}
+
 /// The page.
 pub fn page(report: &TrackReport<'_>) -> String {
     let t = report.tracked;

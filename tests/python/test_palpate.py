@@ -128,7 +128,10 @@ def test_track_equals_the_command_line(shell):
         same(lps(found.displacement[t]), volume(shell.folder / f"tracked/displacement_{t:03}.nii.gz")[:, :, :, 0, :])
     rows = list(csv.DictReader(open(shell.folder / "tracked/strain.csv")))
     assert [f"{r['volume_change']:.6f}" for r in found.strain] == [r["volume_change"] for r in rows]
-    assert found.points == shell.summary("tracked")["points"]
+    told = shell.summary("tracked")
+    assert found.points == told["points"] and set(found.summary) == set(told)
+    for key in ("inputs", "grid", "reference", "step_s", "params", "warnings"):
+        assert found.summary[key] == told[key], key
 
 
 def test_errors_are_those_of_the_command_line(shell, pair):

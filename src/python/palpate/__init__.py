@@ -330,7 +330,17 @@ def track(
     """The displacement from one of ``volumes`` to each other, in the order in which they were taken."""
     images = [_image(v, f"volume {i}") for i, v in enumerate(volumes)]
     asked = _params(preset, points, search, seed, params)
+    names = [_called(v, f"volume {i}") for i, v in enumerate(volumes)]
+    regions = ["" if given is None else _called(given, what) for given, what in ((mask, "mask"), (labels, "labels"))]
     parts = _palpate.track(
-        images, reference, _optional(mask, "mask"), _optional(labels, "labels"), asked, progress, threads
+        images,
+        reference,
+        _optional(mask, "mask"),
+        _optional(labels, "labels"),
+        asked,
+        names,
+        regions,
+        progress,
+        threads,
     )
     return Track(_square(parts))

@@ -63,6 +63,8 @@ def track(
     mask: Optional[_Image],
     labels: Optional[_Image],
     params: str,
+    names: Sequence[str],
+    regions: Sequence[str],
     progress: _Progress = None,
     threads: Optional[int] = None,
 ) -> Dict[str, Any]: ...
