@@ -343,6 +343,30 @@ pub fn matches(
     (matches, fitted, report)
 }
 
+/// The field that matches suggest once the deformed volume is warped by `field`: where that one is right their patches are
+/// no longer sheared, and where it is wrong what is missing has neighbours that are in place.
+pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) -> (Option<SplineField>, LevelReport) {
+    let finest = pyramid::finest(pair.shape, pair.spacing);
+    let around = pair.spans.grown((params.reach_mm / finest).ceil() as usize + params.patch);
+    let rest = Pair {
+        moving: pair.warp(&field.lattice, &field.coefficients, &around).into(),
+        moving_shape: pair.shape,
+        moving_origin: [0.0; 3],
+        ..pair.clone()
+    };
+    let lattice = &field.lattice;
+    let (_, more, report) = matches(&rest, None, lattice.clone(), params);
+    let joined = more.map(|more| {
+        let coefficients = lattice.fit(|p| {
+            let step = lattice.at(&more.coefficients, p);
+            let known = lattice.at(&field.coefficients, std::array::from_fn(|a| p[a] + step[a] / pair.spacing[a]));
+            std::array::from_fn(|a| step[a] + known[a])
+        });
+        SplineField { coefficients, ..field.clone() }
+    });
+    (joined, report)
+}
+
 /// 99.9 % point of chi-square with 3 degrees of freedom.
 const GATE: f64 = 16.27;
 

@@ -103,7 +103,7 @@ impl FieldParams {
             seed: 1,
         };
         match preset {
-            Preset::Fast => Self { finest: 0, passes: 5, coarse_passes: 6, voxels_per_point: 1000, ..balanced },
+            Preset::Fast => Self { finest: 0, passes: 5, coarse_passes: 10, voxels_per_point: 1000, ..balanced },
             Preset::Balanced => balanced,
             Preset::Accurate => Self { passes: 12, coarse_passes: 16, voxels_per_point: 64, ..balanced },
         }

@@ -43,6 +43,13 @@ pub struct Counts {
     pub tetrahedra: usize,
 }
 
+impl Counts {
+    /// The share of the initial volume's features whose matches were kept.
+    pub fn kept_share(&self) -> f64 {
+        self.kept as f64 / self.features_initial.max(1) as f64
+    }
+}
+
 /// One level of the coarse-to-fine pyramid.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct LevelReport {
