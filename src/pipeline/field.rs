@@ -162,8 +162,8 @@ fn canonical(
         let passes = match (first, last) {
             (_, false) => params.coarse_passes,
             (false, true) => params.passes,
-            // A single level has to do the work of both.
-            (true, true) => params.coarse_passes + params.passes,
+            // A single level starts as far off as a coarse one.
+            (true, true) => params.coarse_passes.max(params.passes),
         };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
         let field = match &state {
