@@ -42,13 +42,13 @@ fn spread(values: &[f64]) -> [f64; 2] {
 
 /// Trouble, severity, then for each body the mean error (mm) and its spread over the seeds, as measured.
 const STORED: [(Trouble, f64, [[f64; 2]; 2]); 7] = [
-    (Trouble::Noise, 3.0, [[0.372, 0.057], [1.478, 0.268]]),
-    (Trouble::Noise, 10.0, [[0.535, 0.067], [1.815, 0.193]]),
-    (Trouble::Motion, 6.0, [[0.572, 0.085], [1.249, 0.231]]),
-    (Trouble::Rotation, 15.0, [[0.015, 0.002], [0.451, 0.208]]),
-    (Trouble::Bias, 40.0, [[0.533, 0.087], [2.219, 0.542]]),
-    (Trouble::NoTexture, 30.0, [[0.544, 0.058], [2.026, 0.178]]),
-    (Trouble::MissingTissue, 15.0, [[0.663, 0.236], [2.931, 0.466]]),
+    (Trouble::Noise, 3.0, [[0.432, 0.078], [1.715, 0.211]]),
+    (Trouble::Noise, 10.0, [[0.538, 0.085], [2.050, 0.180]]),
+    (Trouble::Motion, 6.0, [[0.806, 0.103], [1.337, 0.204]]),
+    (Trouble::Rotation, 15.0, [[0.037, 0.044], [0.848, 0.481]]),
+    (Trouble::Bias, 40.0, [[0.560, 0.090], [2.243, 0.433]]),
+    (Trouble::NoTexture, 30.0, [[0.584, 0.075], [2.093, 0.107]]),
+    (Trouble::MissingTissue, 15.0, [[0.806, 0.247], [2.818, 0.105]]),
 ];
 
 #[test]

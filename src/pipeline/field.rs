@@ -159,12 +159,7 @@ fn canonical(
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
         let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
-        let passes = match (first, last) {
-            (_, false) => params.coarse_passes,
-            (false, true) => params.passes,
-            // A single level starts as far off as a coarse one.
-            (true, true) => params.coarse_passes.max(params.passes),
-        };
+        let passes = if last { params.passes } else { params.coarse_passes };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
         let field = match &state {
             Some((coarse, from)) => {
