@@ -81,6 +81,22 @@ def means(rows, key):
     return {m: float(np.mean([v[c] for c in sorted(common)])) for m, v in by.items()}, len(common)
 
 
+def label(axis, points, colour):
+    """Names each point where nothing is written yet, to the right of it if there is room."""
+    places = axis.transData.transform([p[:2] for p in points]) * 72 / axis.figure.dpi
+    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    for (c, e, m), (x, y) in zip(points, places):
+        width, tried = 5.4 * len(m), []
+        for side, dx, dy in (("left", 7, 4), ("left", 7, -13), ("right", -7, 4), ("right", -7, -13), ("center", 0, 9), ("center", 0, -18), ("left", 7, 16), ("left", 7, -25)):
+            start = x + dx - {"left": 0, "right": width, "center": width / 2}[side]
+            box = (start, y + dy, start + width, y + dy + 10)
+            hits = 9 * (box[0] < axis.bbox.x0 * 72 / axis.figure.dpi) + sum(box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken)
+            tried.append((hits, len(tried), side, (dx, dy), box))
+        _, _, side, offset, box = min(tried)
+        taken.append(box)
+        axis.annotate(m, (c, e), xytext=offset, textcoords="offset points", ha=side, color=colour(m))
+
+
 def chart(rows, groups, path):
     """Error against CPU time, log-log, one point a method, the Pareto front drawn."""
     import matplotlib
@@ -90,6 +106,8 @@ def chart(rows, groups, path):
     import matplotlib.pyplot as plt
     import matplotlib.ticker
 
+    colour = lambda m: "#c0392b" if m.startswith("palpate") else "#34495e"
+    panels = []
     figure, axes = plt.subplots(1, len(groups), figsize=(5.6 * len(groups), 4.6), squeeze=False)
     for axis, (title, inside) in zip(axes[0], groups):
         some = [r for r in rows if inside(r["case"])]
@@ -102,18 +120,14 @@ def chart(rows, groups, path):
                 front.append((c, e))
                 best = e
         axis.plot(*zip(*front), color="0.6", lw=1.2, zorder=1)
-        for n, (c, e, m) in enumerate(points):
-            ours = m.startswith("palpate")
-            axis.scatter(c, e, s=46, color="#c0392b" if ours else "#34495e", zorder=2)
-            # Below where the point before would be written over.
-            crowded = n > 0 and c / points[n - 1][0] < 2 and abs(np.log(e / points[n - 1][1])) < 0.25
-            axis.annotate(m, (c, e), xytext=(5, -13) if crowded else (7, 4), textcoords="offset points", color="#c0392b" if ours else "0.2")
+        for c, e, m in points:
+            axis.scatter(c, e, s=46, color=colour(m), zorder=2)
         axis.axhline(still, color="0.75", ls=":", lw=1)
         axis.annotate("doing nothing", (1, still), xycoords=("axes fraction", "data"), xytext=(-4, 3), textcoords="offset points", ha="right", color="0.5")
         axis.set(xscale="log", yscale="log", xlabel="CPU time (s), files included", ylabel="mean error (mm)")
         axis.set_title(f"{title} ({count} cases)", fontsize=11)
         low, high = axis.get_xlim()
-        axis.set_xlim(low, high * 2.5)
+        axis.set_xlim(low / 2.2, high * 2.5)
         axis.set_ylim(axis.get_ylim()[0] / 1.15, None)
         for which in (axis.xaxis, axis.yaxis):
             which.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
@@ -122,7 +136,10 @@ def chart(rows, groups, path):
         axis.grid(which="both", color="0.92", lw=0.6)
         for side in ("top", "right"):
             axis.spines[side].set_visible(False)
+        panels.append((axis, points))
     figure.tight_layout()
+    for axis, points in panels:
+        label(axis, points, colour)
     figure.savefig(path, metadata={"Date": None})
     plt.close(figure)
 
