@@ -127,7 +127,7 @@ def chart(rows, groups, path):
         axis.set(xscale="log", yscale="log", xlabel="CPU time (s), files included", ylabel="mean error (mm)")
         axis.set_title(f"{title} ({count} cases)", fontsize=11)
         low, high = axis.get_xlim()
-        axis.set_xlim(low / 2.2, high * 2.5)
+        axis.set_xlim(low / 3, high * 2.5)
         axis.set_ylim(axis.get_ylim()[0] / 1.15, None)
         for which in (axis.xaxis, axis.yaxis):
             which.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
