@@ -193,6 +193,48 @@ fn check_volume(d: &Delaunay<TetMesh, 4>) {
     assert!((sum - hull).abs() <= 1e-10 * hull, "{sum} is not {hull}");
 }
 
+fn linear_field_comes_back(kind: usize, n: usize, seed: u64) {
+    let points = family(kind, n, seed);
+    let Ok(d) = delaunay3(&world(&points)) else { return };
+    let box_of =
+        |f: fn(f64, f64) -> f64| points.iter().copied().reduce(|a, b| [0, 1, 2].map(|k| f(a[k], b[k]))).unwrap();
+    let (low, high) = (box_of(f64::min), box_of(f64::max));
+    let shape = [11, 10, 9];
+    let spacing = [0, 1, 2].map(|k| (high[k] - low[k]) / (shape[k] as f64 - 1.7));
+    let grid =
+        Grid::new(shape, Affine::scaled(spacing, [0, 1, 2].map(|k| low[k] - 0.3 * spacing[k])).unwrap()).unwrap();
+    let linear = |p: WorldPoint| {
+        let [x, y, z] = [0, 1, 2].map(|k| (p.0[k] - low[k]) / (high[k] - low[k]));
+        [x - 0.5 * y + 1.0, 0.3 * z - y, 0.1 * x + 0.7 * z]
+    };
+    let u: Vec<[f64; 3]> = d.mesh.nodes().iter().map(|&p| linear(p)).collect();
+    let result = interpolate_tetrahedra(&d.mesh, &u, &grid).unwrap();
+    let locator = TetrahedronLocator::new(&d);
+    let mut inside = 0;
+    for v in 0..grid.len() {
+        let centre = grid.world(v % 11, v / 11 % 10, v / 110);
+        if result.inside.as_slice()[v] == 0 {
+            // All of the seventh family is as thin as rounding.
+            assert!(kind == 7 || locator.locate(centre, 0).is_none(), "nothing at {centre:?}");
+            continue;
+        }
+        inside += 1;
+        let (found, truth) = (result.displacement.at(v), linear(centre));
+        for c in 0..3 {
+            assert!((f64::from(found[c]) - truth[c]).abs() < 1e-5, "{found:?} for {truth:?}");
+        }
+    }
+    // In a slab of rounding's thickness no voxel need lie.
+    assert!(inside > 0 || kind == 7 || kind == 9);
+}
+
+/// Elements far smaller than a voxel, some with a height of rounding, were once taken for stout by their volume.
+#[test]
+fn small_elements_give_a_linear_field_too() {
+    linear_field_comes_back(8, 241, 4_913_549_611_782_285_617);
+    linear_field_comes_back(11, 233, 6_590_404_653_985_852_895);
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 160, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -302,41 +344,10 @@ proptest! {
         }
     }
 
-    /// A linear displacement of the nodes comes back in the hull, however the nodes lie. Where the hull of an oblique lattice or
-    /// of crossing lines passes through a voxel's centre, an element as thin as rounding may be all that holds it: the value
-    /// there is one between those of the nodes only (kind 8, n 241, seed 4913549611782285617: off by a tenth).
+    /// A linear displacement of the nodes comes back at every voxel in the hull, however the nodes lie.
     #[test]
     fn linear_fields_come_back_on_all_families(kind in 0..FAMILIES, n in 60usize..300, seed: u64) {
-        let points = family(kind, n, seed);
-        let Ok(d) = delaunay3(&world(&points)) else { return Ok(()) };
-        let box_of = |f: fn(f64, f64) -> f64| points.iter().copied().reduce(|a, b| [0, 1, 2].map(|k| f(a[k], b[k]))).unwrap();
-        let (low, high) = (box_of(f64::min), box_of(f64::max));
-        let shape = [11, 10, 9];
-        let spacing = [0, 1, 2].map(|k| (high[k] - low[k]) / (shape[k] as f64 - 1.7));
-        let grid = Grid::new(shape, Affine::scaled(spacing, [0, 1, 2].map(|k| low[k] - 0.3 * spacing[k])).unwrap()).unwrap();
-        let linear = |p: WorldPoint| {
-            let [x, y, z] = [0, 1, 2].map(|k| (p.0[k] - low[k]) / (high[k] - low[k]));
-            [x - 0.5 * y + 1.0, 0.3 * z - y, 0.1 * x + 0.7 * z]
-        };
-        let u: Vec<[f64; 3]> = d.mesh.nodes().iter().map(|&p| linear(p)).collect();
-        let result = interpolate_tetrahedra(&d.mesh, &u, &grid).unwrap();
-        let (mut inside, mut slivers) = (0, 0);
-        for v in (0..grid.len()).filter(|&v| result.inside.as_slice()[v] == 1) {
-            inside += 1;
-            let (found, truth) = (result.displacement.at(v), linear(grid.world(v % 11, v / 11 % 10, v / 110)));
-            let found = found.map(f64::from);
-            if (0..3).any(|c| (found[c] - truth[c]).abs() >= 1e-5) {
-                prop_assert!(kind == 8 || kind == 11, "{found:?} for {truth:?}");
-                for c in 0..3 {
-                    let [low, high] = [f64::min as fn(f64, f64) -> f64, f64::max].map(|f| u.iter().map(|u| u[c]).reduce(f).unwrap());
-                    prop_assert!(found[c] > low - 1e-5 && found[c] < high + 1e-5, "{found:?} for {truth:?}");
-                }
-                slivers += 1;
-            }
-        }
-        prop_assert!(slivers * 100 <= inside, "{slivers} of {inside}");
-        // In a slab of rounding's thickness no voxel need lie.
-        prop_assert!(inside > 0 || kind == 7 || kind == 9);
+        linear_field_comes_back(kind, n, seed);
     }
 
     /// Triangles in a plane anywhere: exact on axis-aligned ones, tiling the hull on all.

@@ -6,8 +6,7 @@
 //! elements and the voxels they hold.
 //!
 //! Elements are filled in voxel coordinates, where any affine grid is the unit lattice and barycentric weights are what
-//! they were. An element thinner than one in 1e6 yields to the others at voxels that both hold, since its gradient is all
-//! rounding.
+//! they were. One that is flat up to rounding is left to its neighbours, which hold the same voxels.
 
 use crate::error::MeshError;
 use crate::types::space::{cross, dot};
@@ -17,8 +16,8 @@ use rayon::prelude::*;
 /// Voxel centres this far (voxels) outside of an element are filled too, so that rounding leaves no gaps.
 const TOLERANCE: f64 = 1e-9;
 
-/// Least height over length of an element that is not a sliver.
-const THIN: f64 = 1e-6;
+/// Rounding of a determinant, per unit of the coordinates that it is made of.
+const ROUNDING: f64 = 1e-15;
 
 /// Up to so many rows, cutting each with the faces costs less than finding those that an element reaches in a slice.
 const FEW_ROWS: usize = 6;
@@ -109,10 +108,8 @@ fn fill_elements<const N: usize>(
     let corners = |e: u32| elements[e as usize].map(|v| nodes[v as usize]);
     let queues = queues(elements.len(), shape[2], |e| {
         let x = corners(e);
-        let (_, determinant) = gradients(&x);
-        let edges: [f64; 3] = std::array::from_fn(|k| extent(&x, k)[1] - extent(&x, k)[0]);
-        let bound = THIN * dot(edges, edges).sqrt().powi(N as i32 - 1);
-        (voxel_range(extent(&x, 2), shape[2]), determinant.abs() <= bound)
+        let (weights, determinant) = gradients(&x);
+        if is_flat(&x, &weights, determinant) { 0..0 } else { voxel_range(extent(&x, 2), shape[2]) }
     });
     let mut displacements = DenseField::zeros(*grid);
     let mut inside = Volume::filled(*grid, 0u8);
@@ -123,46 +120,42 @@ fn fill_elements<const N: usize>(
     parts.zip(inside.as_mut_slice().par_chunks_mut(plane)).zip(&queues).enumerate().for_each(
         |(s, ((((right, front), up), inside), queue))| {
             let mut slab = Slab { components: [right, front, up], inside, first: s * SLAB, shape };
-            for (list, thin) in queue.iter().zip([true, false]) {
-                for &e in list {
-                    let values = elements[e as usize].map(|v| displacement[v as usize]);
-                    let x = corners(e);
-                    let (weights, determinant) = gradients(&x);
-                    if determinant != 0.0 {
-                        slab.fill(&x, &values, &weights.map(|g| g.map(|v| v / determinant)), thin);
-                    }
-                }
+            for &e in queue {
+                let values = elements[e as usize].map(|v| displacement[v as usize]);
+                let x = corners(e);
+                let (weights, determinant) = gradients(&x);
+                slab.fill(&x, &values, &weights.map(|g| g.map(|v| v / determinant)));
             }
         },
     );
     Interpolated { displacement: displacements, inside }
 }
 
-/// The elements that touch each slab: first the thin ones, then the others, each in the mesh's order. `place` gives an
-/// element's slices and whether it is thin.
-fn queues(elements: usize, slices: usize, place: impl Fn(u32) -> (std::ops::Range<usize>, bool)) -> Vec<[Vec<u32>; 2]> {
-    let mut queues = vec![<[Vec<u32>; 2]>::default(); slices.div_ceil(SLAB)];
+/// Whether an element is so thin, or so nearly so up to rounding, that all of it lies within the tolerance of its
+/// neighbours. `weights` are the gradients over the determinant: the least height is the determinant over the largest.
+fn is_flat<const N: usize>(x: &[[f64; 3]; N], weights: &[[f64; 3]; N], determinant: f64) -> bool {
+    let norm = |v: [f64; 3]| dot(v, v).sqrt();
+    let steepest = weights.iter().map(|&g| norm(g)).fold(0.0, f64::max);
+    let reach = x.iter().map(|&p| norm(p)).fold(0.0, f64::max);
+    let length = norm(std::array::from_fn(|k| extent(x, k)[1] - extent(x, k)[0]));
+    determinant.abs() <= TOLERANCE * steepest + ROUNDING * reach * length.powi(N as i32 - 2)
+}
+
+/// The elements that touch each slab, in the mesh's order; `slices` gives those of an element.
+fn queues(elements: usize, depth: usize, slices: impl Fn(u32) -> std::ops::Range<usize>) -> Vec<Vec<u32>> {
+    let mut queues = vec![Vec::new(); depth.div_ceil(SLAB)];
     for e in 0..elements as u32 {
-        let (range, thin) = place(e);
+        let range = slices(e);
         if !range.is_empty() {
-            for queue in &mut queues[range.start / SLAB..=(range.end - 1) / SLAB] {
-                queue[usize::from(!thin)].push(e);
-            }
+            queues[range.start / SLAB..=(range.end - 1) / SLAB].iter_mut().for_each(|queue| queue.push(e));
         }
     }
     queues
 }
 
 impl Slab<'_> {
-    /// Fills one element with corners `x` (voxels), `values` (mm) there, and the `gradients` of its weights. In a `thin`
-    /// one, rounding is kept from leaving the range of the corners' values.
-    fn fill<const N: usize>(
-        &mut self,
-        x: &[[f64; 3]; N],
-        values: &[[f64; 3]; N],
-        gradients: &[[f64; 3]; N],
-        thin: bool,
-    ) {
+    /// Fills one element with corners `x` (voxels), `values` (mm) there, and the `gradients` of its weights.
+    fn fill<const N: usize>(&mut self, x: &[[f64; 3]; N], values: &[[f64; 3]; N], gradients: &[[f64; 3]; N]) {
         // A voxel is inside where each distance from a face, `offset + normal . p`, is at least minus the tolerance. Along
         // a row that is where x is above (normal to the right) or below `limit[0] + limit[1] y + limit[2] z`.
         let faces: [(bool, [f64; 3]); N] = std::array::from_fn(|i| {
@@ -178,7 +171,6 @@ impl Slab<'_> {
         let slope: [[f64; 3]; 3] = std::array::from_fn(|c| {
             std::array::from_fn(|k| (1..N).map(|i| (values[i][c] - values[0][c]) * gradients[i][k]).sum())
         });
-        let range: [[f64; 2]; 3] = std::array::from_fn(|c| extent(values, c));
         let [width, depth, _] = self.shape;
         let columns = voxel_range(extent(x, 0), width);
         let rows = voxel_range(extent(x, 1), depth);
@@ -206,16 +198,8 @@ impl Slab<'_> {
                     continue;
                 }
                 let offset = minus([from as f64, y, z], x[0]);
-                let mut start: [f64; 3] = std::array::from_fn(|c| values[0][c] + dot(slope[c], offset));
-                let mut step = slope.map(|s| s[0]);
-                if thin {
-                    let last = (to - from - 1) as f64;
-                    for c in 0..3 {
-                        let end = (start[c] + step[c] * last).max(range[c][0]).min(range[c][1]);
-                        start[c] = start[c].max(range[c][0]).min(range[c][1]);
-                        step[c] = (end - start[c]) / last.max(1.0);
-                    }
-                }
+                let start = std::array::from_fn(|c| values[0][c] + dot(slope[c], offset));
+                let step = slope.map(|s| s[0]);
                 self.fill_row(width * (j + depth * (k - self.first)) + from, to - from, start, step);
             }
         }

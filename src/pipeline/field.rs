@@ -20,7 +20,6 @@ use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
 use std::borrow::Cow;
-use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -175,7 +174,6 @@ fn canonical(
                     start
                 };
                 let wide = MatchParams::new(params, points, true, search, 2, 0.3);
-                let clock = RefCell::new(&mut clock);
                 let seek = |about: Option<&SplineField>| {
                     progress("matching", done(0.0));
                     let started = Instant::now();
@@ -186,10 +184,10 @@ fn canonical(
                         }
                         Some(field) => level::matches_again(&pair, field, wide),
                     };
-                    clock.borrow_mut().skip("matching", started.elapsed().as_secs_f64());
+                    clock.skip("matching", started.elapsed().as_secs_f64());
                     (fitted.filter(|_| report.counts.kept >= FEWEST), report)
                 };
-                let begun = begin(&pair, &lattice, factor, starts, refine, || seek(None), |field| seek(Some(field)));
+                let begun = begin(&pair, &lattice, factor, starts, refine, seek);
                 let begun = begun.ok_or_else(|| too_few(0, search))?;
                 doubted = begun.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT);
                 reports.extend(begun.report);

@@ -92,7 +92,7 @@ pub(super) struct Begun {
 
 /// The coarsest level of a search that may start from `known` fields.
 ///
-/// `refine` brings a start to the residual, `search` matches the whole volume, `again` does so about a field.
+/// `refine` brings a start to the residual; `search` matches the whole volume, from nothing or about a field.
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
@@ -105,8 +105,7 @@ pub(super) fn begin(
     factor: [usize; 3],
     known: &[Start],
     refine: impl Fn(SplineField) -> SplineField,
-    search: impl FnOnce() -> (Option<SplineField>, LevelReport),
-    again: impl Fn(&SplineField) -> (Option<SplineField>, LevelReport),
+    mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
     let agreement = |field: &SplineField, sigma| {
@@ -125,14 +124,14 @@ pub(super) fn begin(
             return Some(Begun { field: field.clone(), report: None, searched });
         }
     }
-    let (found, mut report) = search();
+    let (found, mut report) = search(None);
     let own = [found, Some(SplineField::still(lattice.clone()))].into_iter().flatten().map(&refine);
     let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
             break;
         }
-        let (next, seen) = again(&field);
+        let (next, seen) = search(Some(&field));
         let Some(next) = next.filter(|_| seen.counts.kept > report.counts.kept) else { break };
         (field, report) = (refine(next), seen);
     }
