@@ -75,9 +75,14 @@ impl<'a> Aligned<'a> {
 
     /// The pair with blocks of `factor` voxels averaged.
     pub fn level(&self, factor: [usize; 3]) -> Pair<'_> {
+        self.level_within(&self.mask, factor)
+    }
+
+    /// The same inside another mask on the initial volume's grid.
+    pub fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
-        let mask = pyramid::reduce_mask(&self.mask, self.shape, factor);
+        let mask = pyramid::reduce_mask(mask, self.shape, factor);
         let moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
         Pair {
             shape,

@@ -5,7 +5,7 @@ use crate::consistency::models::{Choice, choose};
 use crate::error::{FieldError, MeshError};
 use crate::field::spline::ScalarSpline;
 use crate::field::{interpolation, jacobian, spline};
-use crate::matching::levels::{Aligned, factors, from_level, to_level};
+use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::bspline::Lattice;
@@ -15,7 +15,7 @@ use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 pub use crate::pipeline::start::Start;
-use crate::pipeline::start::begin;
+use crate::pipeline::start::{Begun, begin};
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
@@ -50,6 +50,9 @@ pub struct FieldResult {
 
 /// Fewest matches that a result may rest on.
 const FEWEST: usize = 20;
+
+/// Fewest matches that a search may start from; it competes with stillness.
+const FEWEST_SOUGHT: usize = 8;
 
 /// Stage names and their wall seconds.
 struct Clock(Vec<(String, f64)>, Instant);
@@ -138,12 +141,16 @@ fn canonical(
     params.check()?;
     progress("pyramid", 0.0);
     let mut clock = Clock(Vec::new(), Instant::now());
+    let given = mask.is_some();
     let Checked { mask, initial: clean, deformed: seen, not_finite } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
-    let factors = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
+    let mut factors = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
+    let inside = mask.as_slice().iter().filter(|&&m| m != 0).count();
+    let too_coarse = |f: &[usize; 3]| inside / f.iter().product::<usize>() < LEAST_SEARCHED;
+    factors.drain(..factors.iter().take_while(|f| too_coarse(f)).count().min(factors.len() - 1));
     clock.book("pyramid");
 
     // Coarse to fine.
@@ -168,26 +175,37 @@ fn canonical(
             }
             None => {
                 let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
-                let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
-                let refine = |mut start| {
-                    level::refine(&pair, &mut start, passes, params.seed, tick);
-                    start
-                };
-                let wide = MatchParams::new(params, points, true, search, 2, 0.3);
-                let seek = |about: Option<&SplineField>| {
-                    progress("matching", done(0.0));
-                    let started = Instant::now();
-                    let (fitted, report) = match about {
-                        None => {
-                            let (_, fitted, report) = level::matches(&pair, None, lattice.clone(), wide);
-                            (fitted, report)
-                        }
-                        Some(field) => level::matches_again(&pair, field, wide),
+                let mut begin_in = |pair: &Pair<'_>, starts: &[Start]| {
+                    let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
+                    let refine = |mut start| {
+                        level::refine(pair, &mut start, passes, params.seed, tick);
+                        start
                     };
-                    clock.skip("matching", started.elapsed().as_secs_f64());
-                    (fitted.filter(|_| report.counts.kept >= FEWEST), report)
+                    let wide = MatchParams::new(params, points, true, search, 2, 0.3);
+                    let seek = |about: Option<&SplineField>| {
+                        progress("matching", done(0.0));
+                        let started = Instant::now();
+                        let (fitted, report) = match about {
+                            None => {
+                                let (_, fitted, report) = level::matches(pair, None, lattice.clone(), wide);
+                                (fitted, report)
+                            }
+                            Some(field) => level::matches_again(pair, field, wide),
+                        };
+                        clock.skip("matching", started.elapsed().as_secs_f64());
+                        (fitted.filter(|_| report.counts.kept >= FEWEST_SOUGHT), report)
+                    };
+                    begin(pair, &lattice, factor, starts, refine, seek)
                 };
-                let begun = begin(&pair, &lattice, factor, starts, refine, seek);
+                let mut begun = begin_in(&pair, starts);
+                if given && begun.as_ref().is_none_or(Begun::is_unsure) {
+                    let tissue = around(&mask, &clean);
+                    let wider = begin_in(&aligned.level_within(&tissue, factor), &[]);
+                    begun = match (begun, wider) {
+                        (Some(own), Some(wider)) => Some(Begun::surer(&pair, own, wider)),
+                        (own, wider) => own.or(wider),
+                    };
+                }
                 let begun = begun.ok_or_else(|| too_few(0, search))?;
                 doubted = begun.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT);
                 reports.extend(begun.report);
@@ -301,6 +319,9 @@ const COARSE_SHARE: usize = 24;
 /// See [`COARSE_SHARE`].
 const COARSE_POINTS: usize = 4000;
 
+/// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and [`FEWEST`] must be left.
+const LEAST_SEARCHED: usize = 1500;
+
 /// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30 mm.
 pub(super) fn search_mm(grid: &Grid, asked: f64) -> f64 {
     let (shape, spacing) = (grid.shape(), grid.spacing());
@@ -329,6 +350,12 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
 /// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more
 /// where the motion was found (heads and legs, 3 to 20 mm), and 0.45 or less with inverted contrast.
 const BORNE_OUT: f64 = 0.5;
+
+/// The mask and all other tissue: what is searched when too little inside the mask agrees.
+fn around(mask: &Mask, initial: &Volume) -> Vec<u8> {
+    let tissue = foreground(initial);
+    tissue.as_slice().iter().zip(mask.as_slice()).map(|(t, m)| u8::from(*t != 0 || *m != 0)).collect()
+}
 
 fn in_doubt(counts: Counts) -> String {
     let Counts { kept, features_initial: all, .. } = counts;

@@ -47,8 +47,13 @@ impl SplineField {
 
 /// The field under which the two volumes agree better.
 pub fn better(pair: &Pair<'_>, a: SplineField, b: SplineField) -> SplineField {
+    if is_better(pair, &b, &a) { b } else { a }
+}
+
+/// Whether the two volumes agree better under `a` than under `b`.
+pub fn is_better(pair: &Pair<'_>, a: &SplineField, b: &SplineField) -> bool {
     let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
-    if residual::excess(pair, &warp(&b), &warp(&a)) < 0.0 { b } else { a }
+    residual::excess(pair, &warp(a), &warp(b)) < 0.0
 }
 
 /// Volume of a lattice cell (mm^3), flat axes counting 1.

@@ -78,6 +78,9 @@ const UNSURE: f64 = 0.25;
 /// and small motions keep nine tenths, legs in thick slices that moved by 16 mm four.
 const AGREED: f64 = 0.75;
 
+/// Matches that must agree for their share to tell a search that found the motion from one that did not.
+const ENOUGH: usize = 20;
+
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
@@ -88,6 +91,26 @@ pub(super) struct Begun {
     pub report: Option<LevelReport>,
     /// For the next frame.
     pub searched: Searched,
+}
+
+impl Begun {
+    /// Whether all was searched and few features agreed with their neighbours.
+    pub fn is_unsure(&self) -> bool {
+        self.report.as_ref().is_some_and(|r| r.counts.kept_share() < AGREED || r.counts.kept < ENOUGH)
+    }
+
+    /// Of two searches the one in which more of the features agreed: the agreement of the volumes does not tell a wrong island
+    /// from the truth, neighbours do. Where there are too few features to count it is all there is.
+    pub fn surer(pair: &Pair<'_>, a: Self, b: Self) -> Self {
+        let counts = |s: &Self| s.report.as_ref().map(|r| r.counts).unwrap_or_default();
+        let [first, second] = [&a, &b].map(counts);
+        let b_is_surer = if first.kept.min(second.kept) < ENOUGH {
+            level::is_better(pair, &b.field, &a.field)
+        } else {
+            second.kept_share() > first.kept_share()
+        };
+        if b_is_surer { b } else { a }
+    }
 }
 
 /// The coarsest level of a search that may start from `known` fields.
