@@ -42,6 +42,37 @@ pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField
     out
 }
 
+/// Gives voxels of a field that was made by [`dense`] the displacement of another place, `(voxel, place)` in voxels; returns
+/// by how much each changed (mm).
+pub fn follow(
+    field: &mut DenseField,
+    lattice: &Lattice,
+    coefficients: &[f32],
+    places: &[([usize; 3], [f64; 3])],
+) -> Vec<f32> {
+    let grid = *field.grid();
+    let (shape, spacing, linear, n) = (grid.shape(), grid.spacing(), grid.affine().linear(), grid.len());
+    let values = field.as_mut_slice();
+    let own = &values;
+    let found: Vec<([f32; 3], f32)> = places
+        .par_iter()
+        .map(|([i, j, k], p)| {
+            let d = lattice.at(coefficients, std::array::from_fn(|a| p[a].clamp(0.0, (shape[a] - 1) as f64)));
+            let world: [f32; 3] =
+                std::array::from_fn(|r| (0..3).map(|a| linear[r][a] / spacing[a] * d[a]).sum::<f64>() as f32);
+            let at = grid.index(*i, *j, *k);
+            let change = (0..3).map(|c| (world[c] - own[c * n + at]).powi(2)).sum::<f32>().sqrt();
+            (world, change)
+        })
+        .collect();
+    for (([i, j, k], _), (d, _)) in places.iter().zip(&found) {
+        for (c, d) in d.iter().enumerate() {
+            values[c * n + grid.index(*i, *j, *k)] = *d;
+        }
+    }
+    found.into_iter().map(|(_, change)| change).collect()
+}
+
 /// A smooth scalar over a grid, kept as its B-spline coefficients: small, and worked out where it is asked for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScalarSpline {

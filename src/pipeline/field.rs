@@ -7,6 +7,7 @@ use crate::field::spline::ScalarSpline;
 use crate::field::{interpolation, jacobian, spline};
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
+use crate::matching::sliding::{Sliding, sliding};
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
@@ -20,6 +21,7 @@ use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
 use std::borrow::Cow;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -248,6 +250,9 @@ fn canonical(
     choice.evidence.push(why_so_many(params, points, found));
     let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
+    let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
+    choice.evidence.extend(glides.as_ref().map(why_sliding));
+    let level_shape = pair.shape;
     drop(pair);
     drop(aligned);
     clock.book("model");
@@ -257,7 +262,9 @@ fn canonical(
     let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
     let (mesh, source) = triangulate(&sparse, flat)?;
     clock.book("mesh");
-    let smooth = spline::dense(&grid, &lattice, &coefficients);
+    let mut smooth = spline::dense(&grid, &lattice, &coefficients);
+    let places = glides.map_or(Vec::new(), |g| beside(&g, &grid, level_shape, factor));
+    let changes = spline::follow(&mut smooth, &lattice, &coefficients, &places);
     let kept_matches: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
     let displacement = match params.interpolation {
@@ -276,7 +283,8 @@ fn canonical(
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
     progress("uncertainty", 0.95);
-    let uncertainty = uncertainty(&grid, &field, spacing, params.seed);
+    let jumps = places.iter().map(|(v, _)| *v).zip(changes);
+    let uncertainty = uncertainty(&grid, &field, spacing, params.seed, jumps);
     let (uncertainty_median_mm, uncertainty_mean_mm) = average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
@@ -402,6 +410,33 @@ fn full_lattice(grid: &Grid, field: &SplineField, factor: [usize; 3], choice: &C
     (lattice, coefficients)
 }
 
+fn why_sliding(sliding: &Sliding) -> String {
+    let Sliding { voxels, strained, left } = sliding;
+    format!(
+        "sliding: {} of {strained} strained voxels move with the tissue on one side of a jump, which leaves {left:.2} of their \
+         squared residual",
+        voxels.len()
+    )
+}
+
+/// The full-resolution voxels beside a jump, and the places with which they move (voxels).
+fn beside(sliding: &Sliding, grid: &Grid, level: [usize; 3], factor: [usize; 3]) -> Vec<([usize; 3], [f64; 3])> {
+    let shape = grid.shape();
+    let block = |&(at, offset): &(u32, [f32; 3])| {
+        let at = at as usize;
+        let v = [at % level[0], at / level[0] % level[1], at / (level[0] * level[1])];
+        let [x, y, z]: [Range<usize>; 3] =
+            std::array::from_fn(|a| v[a] * factor[a]..((v[a] + 1) * factor[a]).min(shape[a]));
+        let row = move |k| {
+            let x = x.clone();
+            y.clone().flat_map(move |j| x.clone().map(move |i| [i, j, k]))
+        };
+        z.flat_map(row)
+            .map(move |v| (v, std::array::from_fn(|a| v[a] as f64 + f64::from(offset[a]) * factor[a] as f64)))
+    };
+    sliding.voxels.iter().flat_map(block).collect()
+}
+
 /// A level's match in world mm (RAS).
 fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
     let (spacing, linear) = (grid.spacing(), grid.affine().linear());
@@ -455,9 +490,18 @@ fn barycentric(mesh: &Mesh, nodes: &[[f64; 3]], mut outside: DenseField) -> Resu
 /// the 95 % band without it.
 const CALIBRATION: f32 = 1.25;
 
+/// Standard deviation that a voxel beside a jump adds, as a part of how far it was moved: which side it follows can be wrong.
+const SIDE: f32 = 0.5;
+
 /// Posterior standard deviation of the coupled field (mm), from a lattice twice as coarse as the field's own, times
-/// [`CALIBRATION`].
-fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -> ScalarSpline {
+/// [`CALIBRATION`], and what is in doubt beside `jumps` (voxel, mm).
+fn uncertainty(
+    grid: &Grid,
+    field: &SplineField,
+    spacing: [f64; 3],
+    seed: u64,
+    jumps: impl Iterator<Item = ([usize; 3], f32)>,
+) -> ScalarSpline {
     let fine = &field.lattice;
     let coarse = Lattice::new(fine.shape, fine.step.map(|s| 2 * s));
     let mut blocks = vec![[0.0f32; 6]; coarse.len()];
@@ -476,6 +520,15 @@ fn uncertainty(grid: &Grid, field: &SplineField, spacing: [f64; 3], seed: u64) -
         coupling::deviation(&energy, field.lambda.map(|l| (l * cell) as f32), &blocks, coarse.nodes, 6, seed);
     deviation.iter_mut().for_each(|v| *v *= CALIBRATION);
     let factor: [usize; 3] = std::array::from_fn(|a| (spacing[a] / grid.spacing()[a]).round() as usize);
+    let cell: usize = (0..3).filter(|&a| coarse.shape[a] > 1).map(|a| coarse.step[a] * factor[a]).product();
+    let mut squares = vec![0.0f32; deviation.len()];
+    for (voxel, jump) in jumps {
+        let square = (SIDE * jump).powi(2) / cell as f32;
+        coarse.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| squares[node] += w * square);
+    }
+    for (v, square) in deviation.iter_mut().zip(squares) {
+        *v = (*v * *v + square).sqrt();
+    }
     let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));
     if full.nodes == coarse.nodes {
         return ScalarSpline::new(*grid, full, deviation);
