@@ -149,10 +149,7 @@ fn canonical(
     let search = search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
-    let mut factors = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
-    let inside = mask.as_slice().iter().filter(|&&m| m != 0).count();
-    let too_coarse = |f: &[usize; 3]| inside / f.iter().product::<usize>() < LEAST_SEARCHED;
-    factors.drain(..factors.iter().take_while(|f| too_coarse(f)).count().min(factors.len() - 1));
+    let factors = worked_on(&grid, &mask, finest, search);
     clock.book("pyramid");
 
     // Coarse to fine.
@@ -337,6 +334,15 @@ pub(super) fn search_mm(grid: &Grid, asked: f64) -> f64 {
     let side = thick().map(|a| shape[a] as f64 * spacing[a]).fold(f64::INFINITY, f64::min);
     let voxel = thick().map(|a| spacing[a]).fold(0.0, f64::max);
     if asked > 0.0 { asked } else { (0.15 * side).min(30.0).max(2.0 * voxel) }
+}
+
+/// Reduction factors of the levels, coarse to fine: none but the finest with less tissue than [`LEAST_SEARCHED`].
+pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) -> Vec<[usize; 3]> {
+    let inside = mask.as_slice().iter().filter(|&&m| m != 0).count();
+    let mut all = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
+    let too_coarse = all.iter().take_while(|f| inside / f.iter().product::<usize>() < LEAST_SEARCHED).count();
+    all.drain(..too_coarse.min(all.len() - 1));
+    all
 }
 
 /// Voxels of the mask that a preset without a fixed finest level works on at most.

@@ -1,10 +1,10 @@
 //! What a field run would do, worked out before any of it is done.
 
 use crate::error::FieldError;
-use crate::matching::levels::{Aligned, factors};
+use crate::matching::levels::Aligned;
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::field::{finest_level, search_mm};
+use crate::pipeline::field::{finest_level, search_mm, worked_on};
 use crate::types::{FieldParams, Grid, Mask, Volume};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
@@ -38,7 +38,7 @@ pub fn field(
     let search = search_mm(&grid, params.search_mm);
     Aligned::new(&clean, deformed, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
-    let factors = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
+    let factors = worked_on(&grid, &mask, finest, search);
     let mask_voxels = mask.as_slice().iter().filter(|&&m| m != 0).count();
     let last: usize = factors.last().map_or(1, |f| f.iter().product());
     let automatic = (mask_voxels / last / params.voxels_per_point).max(200);

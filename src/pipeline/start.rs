@@ -99,17 +99,17 @@ impl Begun {
         self.report.as_ref().is_some_and(|r| r.counts.kept_share() < AGREED || r.counts.kept < ENOUGH)
     }
 
-    /// Of two searches the one in which more of the features agreed: the agreement of the volumes does not tell a wrong island
-    /// from the truth, neighbours do. Where there are too few features to count it is all there is.
-    pub fn surer(pair: &Pair<'_>, a: Self, b: Self) -> Self {
+    /// Of an unsure search and a wider one the one in which more of the features agreed: the agreement of the volumes does not
+    /// tell a wrong island from the truth, neighbours do. Where there are too few features to count it is all there is.
+    pub fn surer(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
         let counts = |s: &Self| s.report.as_ref().map(|r| r.counts).unwrap_or_default();
-        let [first, second] = [&a, &b].map(counts);
-        let b_is_surer = if first.kept.min(second.kept) < ENOUGH {
-            level::is_better(pair, &b.field, &a.field)
-        } else {
-            second.kept_share() > first.kept_share()
+        let [few, many] = [&own, &wider].map(counts);
+        let wider_is_surer = match (few.kept < ENOUGH, many.kept < ENOUGH) {
+            (false, false) => many.kept_share() > few.kept_share(),
+            (true, false) if many.kept_share() >= AGREED => true,
+            _ => level::is_better(pair, &wider.field, &own.field),
         };
-        if b_is_surer { b } else { a }
+        if wider_is_surer { wider } else { own }
     }
 }
 
