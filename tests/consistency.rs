@@ -443,7 +443,11 @@ fn a_free_motion_stays_free_and_the_evidence_says_why() {
     }
     assert!(choice.evidence[0].contains("excess misfit 20.00 per degree of freedom"), "{}", choice.evidence[0]);
     assert!(choice.evidence[3].contains("200 degrees of freedom"), "{}", choice.evidence[3]);
-    // Just at the limit the simplest stands.
+    // Just at the limit the simplest that the matches bear out stands.
+    let affine = choose(&matches, |_| 200.0, 200.0, 0.05);
+    assert_ne!(affine.model, MotionModel::Identity);
+    assert!(affine.evidence[0].contains("mm off"), "{}", affine.evidence[0]);
+    let matches = moved(&AffineMotion::IDENTITY, 0, false);
     let at = |ratio: f64| choose(&matches, |_| 200.0 * ratio, 200.0, 0.05).model;
     assert_eq!((at(CHANCE), at(CHANCE + 0.01)), (MotionModel::Identity, MotionModel::Free));
     // Few degrees of freedom count as a hundred.

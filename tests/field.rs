@@ -103,7 +103,7 @@ fn in_a_small_mask_stillness_does_not_pass_for_motion() {
     for mask in [ball([43.5, 39.5, 31.5], 9.0), ball([43.5, 39.5, 31.5], 13.0), ball([31.5; 3], 9.0)] {
         let result = run(&p.initial, &p.deformed, Some(&mask), &FieldParams::default(), &|_, _| {}).unwrap();
         let m = evaluate::metrics(&result.displacement, &p.truth, Some(&mask), &[]).unwrap();
-        assert_eq!(result.summary.model, MotionModel::Free, "{:?}", result.summary.evidence);
+        assert_ne!(result.summary.model, MotionModel::Identity, "{:?}", result.summary.evidence);
         assert!(m.mean_mm < 0.5 * m.identity_mm, "{m:?}");
     }
 }
