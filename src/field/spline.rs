@@ -11,8 +11,7 @@ use rayon::prelude::*;
 /// The lattice must lie over `grid`'s shape.
 pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField {
     let [nx, ny, _] = grid.shape();
-    let (spacing, linear) = (grid.spacing(), grid.affine().linear());
-    let axes: [[f32; 3]; 3] = std::array::from_fn(|r| std::array::from_fn(|a| (linear[r][a] / spacing[a]) as f32));
+    let axes = axes(grid).map(|row| row.map(|v| v as f32));
     let mut out = DenseField::zeros(*grid);
     let n = grid.len();
     let (x, rest) = out.as_mut_slice().split_at_mut(n);
@@ -42,6 +41,12 @@ pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField
     out
 }
 
+/// Unit vectors along the grid's axes, one a column (world RAS).
+pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
+    let (spacing, linear) = (grid.spacing(), grid.affine().linear());
+    std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
+}
+
 /// Gives voxels of a field that was made by [`dense`] the displacement of another place, `(voxel, place)` in voxels; returns
 /// by how much each changed (mm).
 pub fn follow(
@@ -51,15 +56,14 @@ pub fn follow(
     places: &[([usize; 3], [f64; 3])],
 ) -> Vec<f32> {
     let grid = *field.grid();
-    let (shape, spacing, linear, n) = (grid.shape(), grid.spacing(), grid.affine().linear(), grid.len());
+    let (shape, axes, n) = (grid.shape(), axes(&grid), grid.len());
     let values = field.as_mut_slice();
     let own = &values;
     let found: Vec<([f32; 3], f32)> = places
         .par_iter()
         .map(|([i, j, k], p)| {
             let d = lattice.at(coefficients, std::array::from_fn(|a| p[a].clamp(0.0, (shape[a] - 1) as f64)));
-            let world: [f32; 3] =
-                std::array::from_fn(|r| (0..3).map(|a| linear[r][a] / spacing[a] * d[a]).sum::<f64>() as f32);
+            let world: [f32; 3] = std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * d[a]).sum::<f64>() as f32);
             let at = grid.index(*i, *j, *k);
             let change = (0..3).map(|c| (world[c] - own[c * n + at]).powi(2)).sum::<f32>().sqrt();
             (world, change)

@@ -65,10 +65,9 @@ pub fn sliding(pair: &Pair<'_>, lattice: &Lattice, coefficients: &[f32]) -> Opti
     if !is_steep(&steep) {
         return None;
     }
-    let everywhere = vec![1; pair.fixed.len()];
     let residual = Residual::new(pair, lattice, coefficients);
     let step = (0..3).map(|a| lattice.step[a] as f64 * pair.spacing[a]).fold(f64::INFINITY, f64::min);
-    let sparse = look(&steep, &residual, step, &SURVEYED, 2, &everywhere, SOME)?;
+    let sparse = look(&steep, &residual, step, &SURVEYED, 2, &pair.mask, SOME)?;
     let mut worth = vec![0u8; pair.fixed.len()];
     for (at, _) in &sparse.voxels {
         worth[*at as usize] = 1;

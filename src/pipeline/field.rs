@@ -445,8 +445,7 @@ fn beside(sliding: &Sliding, grid: &Grid, level: [usize; 3], factor: [usize; 3])
 
 /// A level's match in world mm (RAS).
 fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
-    let (spacing, linear) = (grid.spacing(), grid.affine().linear());
-    let axes: [[f64; 3]; 3] = std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]));
+    let axes = spline::axes(grid);
     let [xx, yy, zz, xy, xz, yz] = m.measured.covariance;
     let c = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
     let turned = |r: usize, s: usize| -> f64 {
