@@ -465,7 +465,7 @@ fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
 #[test]
 fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     let folder = TempDir::new().unwrap();
-    let command = ["demo", "--preset", "fast", "--nodes", "4000", "--quiet"];
+    let command = ["demo", "--preset", "fast", "--size", "48", "--nodes", "4000", "--quiet"];
     let (out, _) = run(folder.path(), &command, 0);
     println!("{out}");
     let demo = folder.path().join("palpate-demo");
