@@ -21,7 +21,7 @@ const DEPTH: f64 = 0.2;
 const DEPTHS: u32 = 12;
 
 /// Nodes of the finite elements of a map, about: forces on a fingertip change by 1 % up to eight times as many.
-pub const NODES: usize = 2500;
+pub const NODES: usize = 2000;
 
 /// Checks a number of nodes for the finite elements: 0 for none.
 ///

@@ -17,8 +17,8 @@ use crate::types::stiffness::{Law, Side};
 pub const STIFF: f64 = 50.0;
 /// Penetration over which a plate comes to its stiffness (parts of an element's size).
 const ONSET: f64 = 0.02;
-/// Precision of a solution (mm).
-const PRECISION: f64 = 1e-4;
+/// The last step of a solution (mm): what is left is about a tenth of it.
+const PRECISION: f64 = 1e-3;
 /// Times the softest modulus, beyond which a part is as good as rigid.
 const RIGID: f64 = 500.0;
 /// Part of the way between two depths below which no shorter step is tried.
@@ -227,6 +227,7 @@ impl Press<'_> {
         let mut problem = Problem { plate: Some(plate), ..Problem::new(body, Law::NeoHookean, materials, held) };
         let (mut x, mut out) = (vec![0.0; body.pattern.unknowns()], Vec::new());
         let (mut reached, mut squeeze) = (0.0, 0.0);
+        let mut before: Option<(Vec<f64>, f64)> = None;
         for (k, &depth) in depths.iter().enumerate() {
             progress(k as f64 / depths.len() as f64);
             let goal = depth + squeeze;
@@ -234,8 +235,17 @@ impl Press<'_> {
             let mut step = whole;
             while reached < goal {
                 let next = if reached + 1.5 * step < goal { reached + step } else { goal };
-                match problem.lowered(top - next).near(&x, PRECISION) {
-                    Ok(found) => (x, reached) = (found, next),
+                // As it went on before, so it may go on.
+                let ahead = before.as_ref().and_then(|(y, from)| {
+                    let part = (next - reached) / (reached - from);
+                    let ahead: Vec<f64> = x.iter().zip(y).map(|(x, y)| x + part * (x - y)).collect();
+                    problem.lowered(top - next).near(&ahead, PRECISION).ok()
+                });
+                match ahead.map_or_else(|| problem.lowered(top - next).near(&x, PRECISION), Ok) {
+                    Ok(found) => {
+                        before = Some((std::mem::replace(&mut x, found), reached));
+                        reached = next;
+                    }
                     Err(error) if step < SHORTEST * whole => {
                         return if out.is_empty() { Err(error) } else { Ok(out) };
                     }

@@ -1,6 +1,6 @@
 """The Snakemake workflow on a cohort of phantoms: a pair that is broken, a command that fails once, a kill, and the group report.
 
-PALPATE_SUBJECTS says how many subjects: 4 without it, 20 for docs/scale.md.
+PALPATE_SUBJECTS says how many subjects: 3 without it, 20 for docs/scale.md.
 """
 
 import csv
@@ -20,7 +20,7 @@ pytest.importorskip("snakemake")
 sys.path.insert(0, str(ROOT / "examples/cohort"))
 from make_cohort import make  # noqa: E402
 
-SUBJECTS = int(os.environ.get("PALPATE_SUBJECTS", "4"))
+SUBJECTS = int(os.environ.get("PALPATE_SUBJECTS", "3"))
 
 
 def snakemake(folder, program, *arguments):
