@@ -177,6 +177,34 @@ fn coupling_recovers_an_affine_field_through_the_aperture() {
     }
 }
 
+/// A found bug: the fewer bends the evidence showed, the more the weight of the bending energy grew, until the rounding of what it
+/// multiplies sent a field of tenths of a millimetre to 25 mm.
+#[test]
+fn evidence_that_does_not_bend_keeps_its_field() {
+    let lattice = Lattice::new([32, 40, 30], [3; 3]);
+    let smoothness = Smoothness::new(lattice.nodes, [2.1; 3]);
+    let mut random = Random::new(11, 0);
+    let cases = [(0.1, 0.02), (0.1, 0.05), (0.1, 0.1), (0.1, 0.2), (4.0, 0.05), (4.0, 0.2), (0.0, 0.2)];
+    for (moved, scatter) in cases {
+        let moved = [moved, -0.5 * moved, 2.0 * moved];
+        let exact = |at: [f64; 3]| [0, 1, 2].map(|c| moved[c] * (1.0 + 0.01 * (at[0] - 16.0)));
+        let evidence: Vec<Evidence> = (0..42)
+            .map(|_| {
+                let at = [random.uniform(8.0, 24.0), random.uniform(10.0, 30.0), random.uniform(8.0, 22.0)];
+                let displacement = exact(at).map(|v| v + scatter * random.normals()[0]);
+                Evidence { at, displacement, information: [8.0, 8.0, 8.0, 0.0, 0.0, 0.0] }
+            })
+            .collect();
+        let (c, lambda) = coupling::fit(&lattice, &smoothness, &evidence, 7);
+        let off = evidence.iter().map(|e| {
+            let (u, x) = (lattice.at(&c, e.at), exact(e.at));
+            (0..3).map(|a| (u[a] - x[a]).powi(2)).sum::<f64>()
+        });
+        let off = (off.sum::<f64>() / evidence.len() as f64).sqrt();
+        assert!(off < 0.8 * scatter, "moved {moved:?}: off by {off} mm at a weight of {lambda}");
+    }
+}
+
 #[test]
 fn coupling_withstands_outliers() {
     let (lattice, smoothness) = lattice();

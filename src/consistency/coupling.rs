@@ -104,18 +104,31 @@ pub struct Evidence {
     pub information: Symmetric3,
 }
 
+/// What rounding of `lambda L c` may pull with, of what the evidence pulls with.
+const ROUNDING: f64 = 0.1;
+
+/// The largest weight of the bending energy in single precision: of an affine field `L c` is zero but for rounding, and that must
+/// not outweigh the evidence.
+fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
+    let pull = evidence.iter().map(|e| e.information[..3].iter().sum::<f64>() / 3.0).sum::<f64>();
+    let rounded = smoothness.diagonal().iter().map(|&v| f64::from(v)).sum::<f64>() * f64::from(f32::EPSILON);
+    ((ROUNDING * pull / rounded.max(f64::MIN_POSITIVE)) as f32).clamp(1.0, 1e9)
+}
+
 /// The smooth field nearest to scattered evidence, robustly.
 ///
 /// Minimises `sum_i rho(e_i . A_i e_i) + lambda c . L c` with `e_i = u(x_i) - d_i` by reweighted conjugate gradients:
 /// every place pulls only along the directions that its patch determines, so a match that slid along an edge does no
 /// harm (aperture). `rho` is Geman & McClure's, its scale falling from `start` to 3 standard deviations.
 /// `lambda` (per mm^3 of lattice cell) is set in each round from the evidence as in [`determined`], one for all axes: of an
-/// axis alone a few dozen matches tell too little.
+/// axis alone a few dozen matches tell too little. Where nothing bends, the evidence asks for ever more of it, up to what single
+/// precision bears.
 pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], rounds: usize) -> (Vec<f32>, f32) {
     let n = lattice.len();
     let mut c = vec![0.0f32; 3 * n];
     // A first guess of lambda: second derivatives of 0.01 / mm.
-    let mut lambda = 1e4f32;
+    let most = borne(smoothness, evidence);
+    let mut lambda = most.min(1e4);
     let mut scale = 400.0;
     let stencils: Vec<Stencil> = evidence.iter().map(|e| lattice.stencil_near(e.at)).collect();
     let mut probe = Probe::new(n, 0);
@@ -166,7 +179,7 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         let [gamma, energy] = [gamma, smoothness.energy(&c)].map(|v| v.iter().sum::<f64>());
         // Half way on the logarithm: whole steps swing to and fro.
         let target = (lambda * (0.5 * gamma.max(1.0) / energy.max(1e-9)) as f32).sqrt();
-        lambda = target.clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, 1e9);
+        lambda = target.clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, most);
         scale = (scale * 0.5f64).max(9.0);
     }
     (c, lambda)
