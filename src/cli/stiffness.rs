@@ -66,16 +66,16 @@ pub struct Options {
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<f64>,
     /// Poisson's ratio of all regions
-    #[arg(long, value_name = "NU", default_value_t = 0.49, allow_negative_numbers = true)]
+    #[arg(long, value_name = "NU", default_value_t = StiffnessParams::default().poisson, allow_negative_numbers = true)]
     poisson: f64,
     /// linear, neo-hookean, or auto: linear unless the data ask for more
     #[arg(long, default_value = "auto")]
     model: LawChoice,
     /// Nodes of the mesh, about; 500 to 500,000
-    #[arg(long, value_name = "N", default_value_t = 20_000)]
+    #[arg(long, value_name = "N", default_value_t = StiffnessParams::default().nodes)]
     nodes: usize,
     /// Regions to try at most without labels, 1 to 8
-    #[arg(long, value_name = "N", default_value_t = 4)]
+    #[arg(long, value_name = "N", default_value_t = StiffnessParams::default().regions)]
     regions: usize,
     /// Folder for the results
     #[arg(short, long, value_name = "DIR")]

@@ -16,7 +16,10 @@ mod stiffness;
 
 mod track;
 
+use crate::pipeline::fingertip::NODES;
+use crate::types::StiffnessParams;
 use pyo3::prelude::*;
+use serde_json::json;
 
 pyo3::create_exception!(
     palpate,
@@ -25,10 +28,18 @@ pyo3::create_exception!(
     "What the command line would say after `error:`."
 );
 
+/// Of the command line's flags, by command, where the package's functions have them in their signatures.
+fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
+    let StiffnessParams { poisson, nodes, regions, .. } = StiffnessParams::default();
+    let stiffness = json!({ "poisson": poisson, "nodes": nodes, "regions": regions });
+    arrays::python(py, &json!({ "stiffness": stiffness, "fingertip": { "nodes": NODES } }))
+}
+
 /// `palpate._palpate`.
 #[pymodule]
 fn _palpate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("DEFAULTS", defaults(module.py())?)?;
     module.add("PalpateError", module.py().get_type::<PalpateError>())?;
     module.add_function(wrap_pyfunction!(arrays::read_volume, module)?)?;
     module.add_function(wrap_pyfunction!(field::field, module)?)?;

@@ -2,7 +2,7 @@
 
 use super::arrays::{self, Image, told};
 use crate::io;
-use crate::pipeline::fingertip::{NODES, PadOutcome, of_map};
+use crate::pipeline::fingertip::{PadOutcome, of_map};
 use pyo3::prelude::*;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -39,7 +39,6 @@ impl Pad {
 
 /// Reduces a stiffness result, its map (kPa) and its summary as JSON, to a fingertip.
 #[pyfunction]
-#[pyo3(signature = (map, summary, nodes=NODES))]
 pub fn fingertip(py: Python<'_>, map: Image<'_>, summary: &str, nodes: usize) -> PyResult<Pad> {
     let folder = io::stiffness_folder(arrays::volume(&map)?, summary).map_err(told)?;
     let outcome = py.detach(|| of_map(&folder, nodes, &|_, _| ())).map_err(told)?;

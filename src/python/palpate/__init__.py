@@ -16,6 +16,7 @@ from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence, Tuple
 import numpy as np
 
 from . import _palpate
+from ._palpate import DEFAULTS as _DEFAULTS
 from ._palpate import PalpateError, __version__
 
 __all__ = [
@@ -238,10 +239,10 @@ def stiffness(
     load: Union[str, Image] = "z+",
     force: Optional[float] = None,
     matches: Union[None, bool, np.ndarray] = None,
-    poisson: float = 0.49,
+    poisson: float = _DEFAULTS["stiffness"]["poisson"],
     model: str = "auto",
-    nodes: int = 20_000,
-    regions: int = 4,
+    nodes: int = _DEFAULTS["stiffness"]["nodes"],
+    regions: int = _DEFAULTS["stiffness"]["regions"],
     progress: Progress = None,
     threads: Optional[int] = None,
 ) -> Stiffness:
@@ -291,7 +292,7 @@ def stiffness(
     )
 
 
-def fingertip(source: Stiffness, nodes: int = 2500) -> Fingertip:
+def fingertip(source: Stiffness, nodes: int = _DEFAULTS["fingertip"]["nodes"]) -> Fingertip:
     """Reduces a stiffness map with bone under the pad to a fingertip; it must be in kPa, that is made with a force.
 
     ``nodes`` is about how many the finite elements of the map have that are pressed by a flat plate; 0 leaves them out.

@@ -11,6 +11,8 @@ _Image = Tuple[NDArray[np.float32], _Rows]
 _Progress = Optional[Callable[[str, float], object]]
 
 __version__: str
+#: Of the command line's flags, by command.
+DEFAULTS: Dict[str, Dict[str, Any]]
 
 class PalpateError(ValueError):
     """What the command line would say after ``error:``."""
@@ -48,7 +50,7 @@ class Pad:
     def summary(self) -> Dict[str, Any]: ...
     def write(self, path: Union[str, PathLike[str]], source: str) -> None: ...
 
-def fingertip(map: _Image, summary: str, nodes: int = ...) -> Pad: ...
+def fingertip(map: _Image, summary: str, nodes: int) -> Pad: ...
 def grasp(
     scene: Union[str, PathLike[str]],
     model: Optional[str] = None,
