@@ -126,8 +126,8 @@ fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
 pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], rounds: usize) -> (Vec<f32>, f32) {
     let n = lattice.len();
     let mut c = vec![0.0f32; 3 * n];
-    // A first guess of lambda: second derivatives of 0.01 / mm.
     let most = borne(smoothness, evidence);
+    // A first guess of lambda: second derivatives of 0.01 / mm.
     let mut lambda = most.min(1e4);
     let mut scale = 400.0;
     let stencils: Vec<Stencil> = evidence.iter().map(|e| lattice.stencil_near(e.at)).collect();

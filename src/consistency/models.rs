@@ -7,6 +7,7 @@
 //! the map does not. The first model, from the simplest, whose ratio is under [`CHANCE`] is taken; else the field stays
 //! free.
 
+use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
 use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
 use crate::numerics::statistics::median;
@@ -77,13 +78,8 @@ pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, deter
     let mut chosen = None;
     for (model, motion) in tried {
         let ratio = excess(&motion) / determined.max(FEWEST);
-        let mut off: Vec<f32> = matches
-            .iter()
-            .map(|m| {
-                let d = apart(motion.displacement(m.place), m.displacement);
-                d.iter().map(|v| v * v).sum::<f64>().sqrt() as f32
-            })
-            .collect();
+        let mut off: Vec<f32> =
+            matches.iter().map(|m| distance(motion.displacement(m.place), m.displacement) as f32).collect();
         let off = if off.is_empty() { 0.0 } else { f64::from(median(&mut off)) };
         let name = format!("{model:?}").to_lowercase();
         let contradicted = off > CONTRADICTED * model_mm;

@@ -336,9 +336,14 @@ pub(super) fn search_mm(grid: &Grid, asked: f64) -> f64 {
     if asked > 0.0 { asked } else { (0.15 * side).min(30.0).max(2.0 * voxel) }
 }
 
+/// Voxels of the mask.
+pub(super) fn inside(mask: &Mask) -> usize {
+    mask.as_slice().iter().filter(|&&m| m != 0).count()
+}
+
 /// Reduction factors of the levels, coarse to fine: none but the finest with less tissue than [`LEAST_SEARCHED`].
 pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) -> Vec<[usize; 3]> {
-    let inside = mask.as_slice().iter().filter(|&&m| m != 0).count();
+    let inside = inside(mask);
     let mut all = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
     let too_coarse = all.iter().take_while(|f| inside / f.iter().product::<usize>() < LEAST_SEARCHED).count();
     all.drain(..too_coarse.min(all.len() - 1));
@@ -353,7 +358,7 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
     if asked > 0 {
         return asked;
     }
-    let inside = mask.as_slice().iter().filter(|&&m| m != 0).count();
+    let inside = inside(mask);
     let left = |f: usize| {
         let factor = factors(grid.shape(), grid.spacing(), f, 0.0)[0];
         inside / factor.iter().product::<usize>()

@@ -4,7 +4,7 @@ use crate::error::FieldError;
 use crate::matching::levels::Aligned;
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::field::{finest_level, search_mm, worked_on};
+use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
 use crate::types::{FieldParams, Grid, Mask, Volume};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
@@ -39,7 +39,7 @@ pub fn field(
     Aligned::new(&clean, deformed, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
-    let mask_voxels = mask.as_slice().iter().filter(|&&m| m != 0).count();
+    let mask_voxels = inside(&mask);
     let last: usize = factors.last().map_or(1, |f| f.iter().product());
     let automatic = (mask_voxels / last / params.voxels_per_point).max(200);
     let shape = grid.shape();

@@ -235,13 +235,14 @@ impl Press<'_> {
             let mut step = whole;
             while reached < goal {
                 let next = if reached + 1.5 * step < goal { reached + step } else { goal };
+                let lowered = problem.lowered(top - next);
                 // As it went on before, so it may go on.
                 let ahead = before.as_ref().and_then(|(y, from)| {
                     let part = (next - reached) / (reached - from);
                     let ahead: Vec<f64> = x.iter().zip(y).map(|(x, y)| x + part * (x - y)).collect();
-                    problem.lowered(top - next).near(&ahead, PRECISION).ok()
+                    lowered.near(&ahead, PRECISION).ok()
                 });
-                match ahead.map_or_else(|| problem.lowered(top - next).near(&x, PRECISION), Ok) {
+                match ahead.map_or_else(|| lowered.near(&x, PRECISION), Ok) {
                     Ok(found) => {
                         before = Some((std::mem::replace(&mut x, found), reached));
                         reached = next;
