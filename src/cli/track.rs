@@ -19,8 +19,7 @@ use palpate::pipeline::{
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
 use palpate::report::track::{TrackReport, look as track_look, page, summary, text, warnings as frame_warnings};
-use palpate::types::{DenseField, Grid, Mask, Volume};
-use std::borrow::Cow;
+use palpate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -237,7 +236,7 @@ fn start_film(reference: &Volume, field: &DenseField, mask: Option<&Mask>, range
 fn add_to(
     film: &mut Film,
     number: usize,
-    volume: &Volume,
+    volume: &Voxels<'_>,
     field: &DenseField,
     strain: &(dyn Fn(usize) -> f32 + Sync),
 ) -> Result<()> {
@@ -248,9 +247,9 @@ fn add_to(
 }
 
 /// The volume as it is, or resampled where it lies on another grid.
-fn on_grid<'a>(volume: &'a Volume, grid: &Grid) -> Cow<'a, Volume> {
+fn on_grid<'a>(volume: &'a Voxels<'_>, grid: &Grid) -> Voxels<'a> {
     match volume.grid() == grid {
-        true => Cow::Borrowed(volume),
-        false => Cow::Owned(warp_image(volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0)),
+        true => volume.view(),
+        false => warp_image(volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0),
     }
 }

@@ -7,13 +7,13 @@
 use crate::numerics::cubic::LANES;
 use crate::numerics::sampling::{Interpolation, Sampler, displacement, inside, nearest};
 use crate::numerics::simd::dispatch;
-use crate::types::{DenseField, Grid, Volume, WorldPoint};
+use crate::types::{Displacement, Grid, Volume, Voxels, WorldPoint};
 use rayon::prelude::*;
 
 /// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background` outside the image.
 pub fn warp_image(
-    image: &Volume,
-    field: &DenseField,
+    image: &Voxels<'_>,
+    field: &Displacement<'_>,
     reference: Option<&Grid>,
     interpolation: Interpolation,
     background: f32,
@@ -27,7 +27,7 @@ pub fn warp_image(
 }
 
 /// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be sampled.
-pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &DenseField) -> Volume {
+pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>) -> Volume {
     let grid = field.grid();
     let [nx, ny, _] = grid.shape();
     let components: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
@@ -63,7 +63,7 @@ pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &DenseField) -> 
 /// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not there.
 pub fn warp_labels<T: Copy + Default + Send + Sync>(
     labels: &Volume<T>,
-    field: &DenseField,
+    field: &Displacement<'_>,
     reference: Option<&Grid>,
     background: T,
 ) -> Volume<T> {
@@ -74,18 +74,18 @@ pub fn warp_labels<T: Copy + Default + Send + Sync>(
 }
 
 /// p + u(p) with u trilinear at each point (world mm), `None` for a point outside the field's grid.
-pub fn warp_points(points: &[WorldPoint], field: &DenseField) -> Vec<Option<WorldPoint>> {
+pub fn warp_points(points: &[WorldPoint], field: &Displacement<'_>) -> Vec<Option<WorldPoint>> {
     points.iter().map(|&p| warp_point(p, field)).collect()
 }
 
-fn warp_point(p: WorldPoint, field: &DenseField) -> Option<WorldPoint> {
+fn warp_point(p: WorldPoint, field: &Displacement<'_>) -> Option<WorldPoint> {
     let grid = field.grid();
     inside(grid.shape(), grid.affine().to_voxel(p)).then(|| p.moved(displacement(field, p)))
 }
 
 /// `value` at x + u(x) for each x of the output grid.
 fn warp_with<T: Copy + Default + Send + Sync>(
-    field: &DenseField,
+    field: &Displacement<'_>,
     reference: Option<&Grid>,
     background: T,
     value: impl Fn(WorldPoint) -> T + Sync,

@@ -25,23 +25,40 @@ fn strings(names: &[&str]) -> Vec<String> {
     names.iter().map(|n| (*n).to_string()).collect()
 }
 
+/// To nine decimals.
+fn nano(v: f64) -> f64 {
+    (v * 1e9).round() / 1e9
+}
+
+/// [`Sample::COLUMNS`] as trajectory.csv keeps them: the time to the nanosecond.
+pub fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
+    let mut row = sample.row();
+    row[0] = nano(row[0]);
+    row
+}
+
+/// [`MotionRow::COLUMNS`] behind the step as motions.csv keeps them: desired angles as they were written, without the rounding
+/// of degrees to radians and back.
+pub fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] {
+    let mut row = motion.row();
+    row[..2].iter_mut().for_each(|v| *v = nano(*v));
+    row
+}
+
 /// Writes [`Sample::COLUMNS`] (s, m, rad, N), a row a sample.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
 pub fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<(), IoError> {
     let rows = samples.iter().map(|s| {
-        let [time, rest @ ..] = s.row();
+        let [time, rest @ ..] = stored_sample(s);
         std::iter::once(seconds(time)).chain(rest.map(number)).collect()
     });
     write_table(path.as_ref(), &Sample::COLUMNS, rows)
 }
 
 fn motion_row(m: &MotionRow) -> Vec<String> {
-    let [a, b, rest @ ..] = m.row();
-    // Desired angles as they were written, without the rounding of degrees to radians and back.
-    let desired = [a, b].map(|v| number((v * 1e9).round() / 1e9));
-    std::iter::once(m.step.to_string()).chain(desired).chain(rest.map(number)).collect()
+    std::iter::once(m.step.to_string()).chain(stored_motion(m).map(number)).collect()
 }
 
 /// Writes [`MotionRow::COLUMNS`] (m, degrees, N), a row a motion.

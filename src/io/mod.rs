@@ -76,7 +76,8 @@ pub use csv::{
 pub use field::{FieldConvention, read_field, read_field_as};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
-    write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep, write_trajectory,
+    stored_motion, stored_sample, write_energy, write_motions, write_pinch_map, write_posture_force, write_stability,
+    write_sweep, write_trajectory,
 };
 pub use image::{ImageKind, Stored, count_non_finite, labels_of, read_header, read_labels, read_mask, read_volume};
 pub use live::abandon;

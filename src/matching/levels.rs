@@ -5,7 +5,7 @@ use crate::matching::pair::{Pair, Spans};
 use crate::numerics::sampling::{Interpolation, Sampler};
 use crate::numerics::statistics::{noise_sigma, quantile};
 use crate::numerics::{filters, pyramid};
-use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint};
+use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint, Voxels};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -28,7 +28,12 @@ impl<'a> Aligned<'a> {
     ///
     /// # Errors
     /// [`FieldError::NoOverlap`] when the two boxes, widened by `reach_mm`, do not meet.
-    pub fn new(initial: &'a Volume, deformed: &'a Volume, mask: &'a Mask, reach_mm: f64) -> Result<Self, FieldError> {
+    pub fn new(
+        initial: &'a Voxels<'a>,
+        deformed: &'a Voxels<'a>,
+        mask: &'a Mask,
+        reach_mm: f64,
+    ) -> Result<Self, FieldError> {
         let (g, m) = (initial.grid(), deformed.grid());
         let spacing = g.spacing();
         let corners = corners(m).map(|c| g.affine().to_voxel(m.affine().to_world(c)).0);
@@ -147,7 +152,7 @@ pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm:
 
 /// A mask of tissue where none is given: brighter than a tenth of the way from the dark to the bright end (2nd and
 /// 98th percentile) after smoothing; everything when that leaves less than 2 % of the volume.
-pub fn foreground(volume: &Volume) -> Mask {
+pub fn foreground(volume: &Voxels<'_>) -> Mask {
     let shape = volume.grid().shape();
     let smooth = filters::gaussian(volume.as_slice(), shape, [1.0; 3]);
     let stride = (smooth.len() / 400_000).max(1);
@@ -170,7 +175,7 @@ fn corners(g: &Grid) -> [VoxelPoint; 8] {
 
 /// `volume` on a lattice with `grid`'s axes that starts at `origin` (voxels of `grid`); smoothed first along its axes
 /// where its voxels are finer, so that nothing aliases. NaN beyond half a voxel outside it.
-fn resample(volume: &Volume, grid: &Grid, origin: [f64; 3], shape: [usize; 3]) -> Result<Vec<f32>, FieldError> {
+fn resample(volume: &Voxels<'_>, grid: &Grid, origin: [f64; 3], shape: [usize; 3]) -> Result<Vec<f32>, FieldError> {
     let affine = {
         let mut rows = grid.affine().rows();
         let start = grid.affine().to_world(VoxelPoint(origin)).0;

@@ -1,6 +1,6 @@
 //! How a grid's axes lie in space, and the same voxels stored with axes that run right, forward and up.
 
-use crate::types::{Affine, DenseField, Grid, Volume, VoxelPoint};
+use crate::types::{Affine, DenseField, Grid, Volume, VoxelPoint, Voxels};
 use rayon::prelude::*;
 
 /// Which stored axis runs nearest along each world axis (right, anterior, superior), and which of them run backwards.
@@ -73,8 +73,11 @@ impl Orientation {
         self.inverse().steps(self.axis.map(|s| stored[s]))
     }
 
-    /// The same voxels on the canonical grid.
-    pub fn turned<T: Copy + Default + Send + Sync>(&self, stored: &Volume<T>) -> Volume<T> {
+    /// The same voxels on the canonical grid, where they lie if that is theirs already.
+    pub fn turned<'a, T: Copy + Default + Send + Sync + 'static>(&self, stored: &'a Voxels<'_, T>) -> Voxels<'a, T> {
+        if self.is_canonical() {
+            return stored.view();
+        }
         let grid = self.canonical(stored.grid());
         let mut out = Volume::filled(grid, T::default());
         gather(stored.as_slice(), out.as_mut_slice(), grid.shape(), self.steps(stored.grid().shape()));

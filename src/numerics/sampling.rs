@@ -13,7 +13,7 @@ use crate::error::UnknownName;
 use crate::numerics::bspline;
 use crate::numerics::cubic::{self, LANES, Places};
 use crate::types::names::choose;
-use crate::types::{DenseField, Volume, VoxelPoint, WorldPoint};
+use crate::types::{Displacement, VoxelPoint, Voxels, WorldPoint};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -98,7 +98,7 @@ impl Stencil {
 
 /// The displacement (mm) at a world position, trilinear; outside the grid the value of its nearest edge.
 #[inline]
-pub fn displacement(field: &DenseField, p: WorldPoint) -> [f64; 3] {
+pub fn displacement(field: &Displacement<'_>, p: WorldPoint) -> [f64; 3] {
     let grid = field.grid();
     let stencil = Stencil::new(grid.shape(), grid.affine().to_voxel(p));
     std::array::from_fn(|c| stencil.of(field.component(c)))
@@ -123,7 +123,7 @@ pub struct Sampler<'a> {
 
 impl Sampler<'static> {
     /// Cubic, from a volume that is not needed any more: it is filtered in place.
-    pub fn owning(volume: Volume, background: f32) -> Self {
+    pub fn owning(volume: Voxels<'_>, background: f32) -> Self {
         let shape = volume.grid().shape();
         let values = bspline_coefficients(volume.into_vec(), shape).into();
         Self { shape, values, interpolation: Interpolation::Cubic, background }
@@ -132,7 +132,7 @@ impl Sampler<'static> {
 
 impl<'a> Sampler<'a> {
     /// Prepares `volume`; `background` is the value outside. Cubic filters a copy of the volume, the others borrow it.
-    pub fn new(volume: &'a Volume, interpolation: Interpolation, background: f32) -> Self {
+    pub fn new(volume: &'a Voxels<'a>, interpolation: Interpolation, background: f32) -> Self {
         if interpolation == Interpolation::Cubic {
             return Sampler::owning(volume.clone(), background);
         }

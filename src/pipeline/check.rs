@@ -3,18 +3,17 @@
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::quantile;
-use crate::types::{Mask, Volume};
+use crate::types::{Mask, Voxels};
 use rayon::prelude::*;
-use std::borrow::Cow;
 
 /// What a measurement works on.
 pub struct Checked<'a> {
     /// The given mask or the foreground, less the voxels that are not finite.
     pub mask: Mask,
     /// The initial volume with numbers everywhere, in a range that can be squared.
-    pub initial: Cow<'a, Volume>,
+    pub initial: Voxels<'a>,
     /// The deformed volume, as far as it has numbers, in such a range.
-    pub deformed: Cow<'a, Volume>,
+    pub deformed: Voxels<'a>,
     /// Voxels of the two that are not finite.
     pub not_finite: [usize; 2],
 }
@@ -28,7 +27,11 @@ pub struct Checked<'a> {
 ///
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
-pub fn inputs<'a>(initial: &'a Volume, deformed: &'a Volume, mask: Option<&Mask>) -> Result<Checked<'a>, FieldError> {
+pub fn inputs<'a>(
+    initial: &'a Voxels<'a>,
+    deformed: &'a Voxels<'a>,
+    mask: Option<&Mask>,
+) -> Result<Checked<'a>, FieldError> {
     let ranges = [initial, deformed].map(Range::of);
     for ((volume, v), range) in [("initial", initial), ("deformed", deformed)].into_iter().zip(&ranges) {
         let refuse = |what: &str, hint: &str| Err(FieldError::Volume { volume, what: what.into(), hint: hint.into() });
@@ -48,11 +51,11 @@ pub fn inputs<'a>(initial: &'a Volume, deformed: &'a Volume, mask: Option<&Mask>
         return Err(FieldError::Volume { volume: "mask", what, hint });
     }
     let not_finite = ranges.each_ref().map(|r| r.not_finite);
-    let fill = |volume, bad| if bad == 0 { Cow::Borrowed(volume) } else { Cow::Owned(filled(volume)) };
+    let fill = |volume: &'a Voxels<'a>, bad| if bad == 0 { volume.view() } else { filled(volume) };
     let (mut first, second) = (fill(initial, not_finite[0]), fill(deformed, not_finite[1]));
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
     if not_finite[0] > 0 {
-        first.to_mut().as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
+        first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
         for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
             if !v.is_finite() {
                 *m = 0;
@@ -73,7 +76,7 @@ struct Range {
 }
 
 impl Range {
-    fn of(volume: &Volume) -> Self {
+    fn of(volume: &Voxels<'_>) -> Self {
         let none = || Self { low: f32::INFINITY, high: f32::NEG_INFINITY, not_finite: 0 };
         let with = |r: Self, &v: &f32| match v.is_finite() {
             true => Self { low: r.low.min(v), high: r.high.max(v), ..r },
@@ -93,9 +96,9 @@ impl Range {
 const AROUND: usize = 13;
 
 /// With numbers in single voxels that have none, from the finite ones around them.
-fn filled(volume: &Volume) -> Volume {
+fn filled<'a>(volume: &'a Voxels<'_>) -> Voxels<'a> {
     let values = volume.as_slice();
-    let (grid, mut out) = (*volume.grid(), volume.clone());
+    let (grid, mut out) = (*volume.grid(), volume.view());
     let shape = grid.shape();
     // In one slice there are 8 around a voxel, not 26.
     let least = if shape.contains(&1) { AROUND / 3 } else { AROUND };
@@ -120,7 +123,7 @@ const FAR: f64 = 100.0;
 
 /// With intensities that can be squared and summed in single precision, and with their spread, which comes near to `like`:
 /// gains between the volumes are bounded, and noise is measured in the initial one alone.
-fn in_range<'a>(volume: Cow<'a, Volume>, range: &Range, like: Option<f64>) -> (Cow<'a, Volume>, f64) {
+fn in_range<'a>(mut volume: Voxels<'a>, range: &Range, like: Option<f64>) -> (Voxels<'a>, f64) {
     let values = volume.as_slice();
     let mut sample: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
     sample.retain(|v| v.is_finite());
@@ -137,18 +140,17 @@ fn in_range<'a>(volume: Cow<'a, Volume>, range: &Range, like: Option<f64>) -> (C
     let aim = like.unwrap_or(1000.0);
     let scale = (aim / spread).log2().round().exp2();
     let limit = 2.0 * aim * FAR;
-    let mut out = volume.into_owned();
-    for v in out.as_mut_slice().iter_mut().filter(|v| v.is_finite()) {
+    for v in volume.as_mut_slice().iter_mut().filter(|v| v.is_finite()) {
         *v = ((f64::from(*v) - a) * scale).clamp(-limit, limit) as f32;
     }
-    (Cow::Owned(out), spread * scale)
+    (volume, spread * scale)
 }
 
 /// The mask must lie on the initial volume's grid.
 ///
 /// # Errors
 /// [`FieldError::GridMismatch`] when it does not.
-pub fn mask_grid(initial: &Volume, mask: Option<&Mask>) -> Result<(), FieldError> {
+pub fn mask_grid(initial: &Voxels<'_>, mask: Option<&Mask>) -> Result<(), FieldError> {
     match mask {
         Some(m) if !m.grid().same_as(initial.grid()) => Err(FieldError::GridMismatch {
             what: "the mask".into(),

@@ -20,7 +20,6 @@ use crate::pipeline::start::{Begun, begin};
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
-use std::borrow::Cow;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -90,8 +89,8 @@ impl Clock {
 /// [`FieldError`] when a volume is constant or not finite, the mask is empty or on another grid, the two volumes do not
 /// overlap, or fewer than 20 matches survive.
 pub fn run(
-    initial: &Volume,
-    deformed: &Volume,
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
     mask: Option<&Mask>,
     params: &FieldParams,
     progress: Progress<'_>,
@@ -105,21 +104,20 @@ pub fn run(
 /// # Errors
 /// As [`run`].
 pub fn run_from(
-    initial: &Volume,
-    deformed: &Volume,
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
     mask: Option<&Mask>,
     params: &FieldParams,
     starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
     let [here, there] = [initial, deformed].map(|v| Orientation::of(v.grid()));
-    let turned = |v, o: Orientation| if o.is_canonical() { Cow::Borrowed(v) } else { Cow::Owned(o.turned(v)) };
-    let (first, second) = (turned(initial, here), turned(deformed, there));
+    let (first, second) = (here.turned(initial), there.turned(deformed));
     if here.is_canonical() {
         return canonical(&first, &second, mask, params, starts, progress);
     }
     check::mask_grid(initial, mask)?;
-    let mask = mask.map(|m| here.turned(m));
+    let mask = mask.map(|m| here.turned(m).into_volume());
     let found = canonical(&first, &second, mask.as_ref(), params, starts, progress)?;
     drop((first, second));
     let grid = initial.grid();
@@ -133,8 +131,8 @@ pub fn run_from(
 /// As [`run_from`], for volumes whose axes run right, anterior and superior, nearly: then the way in which voxels are
 /// stored changes nothing.
 fn canonical(
-    initial: &Volume,
-    deformed: &Volume,
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
     mask: Option<&Mask>,
     params: &FieldParams,
     starts: &[Start],
@@ -371,7 +369,7 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
 const BORNE_OUT: f64 = 0.5;
 
 /// The mask and all other tissue: what is searched when too little inside the mask agrees.
-fn around(mask: &Mask, initial: &Volume) -> Vec<u8> {
+fn around(mask: &Mask, initial: &Voxels<'_>) -> Vec<u8> {
     let tissue = foreground(initial);
     tissue.as_slice().iter().zip(mask.as_slice()).map(|(t, m)| u8::from(*t != 0 || *m != 0)).collect()
 }

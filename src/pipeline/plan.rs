@@ -5,7 +5,7 @@ use crate::matching::levels::Aligned;
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
-use crate::types::{FieldParams, Grid, Mask, Volume};
+use crate::types::{FieldParams, Grid, Mask, Voxels};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,8 +27,8 @@ pub struct FieldPlan {
 /// # Errors
 /// As [`crate::pipeline::field::run`], but for too few matches.
 pub fn field(
-    initial: &Volume,
-    deformed: &Volume,
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
     mask: Option<&Mask>,
     params: &FieldParams,
 ) -> Result<FieldPlan, FieldError> {

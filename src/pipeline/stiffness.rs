@@ -12,7 +12,7 @@ use crate::stiffness::patches::Place;
 use crate::stiffness::rim::rim;
 use crate::stiffness::{geometry, maps, summary};
 use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
-use crate::types::{DenseField, Mask, QuadraticMesh, SparseField, WorldPoint};
+use crate::types::{Displacement, Mask, QuadraticMesh, SparseField, WorldPoint};
 use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -22,7 +22,7 @@ pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 #[derive(Clone, Copy)]
 pub struct Inputs<'a> {
     /// The displacement, on the grid of `labels`.
-    pub field: &'a DenseField,
+    pub field: &'a Displacement<'a>,
     /// Matches to use in place of the field inside the body.
     pub matches: Option<&'a SparseField>,
     /// Regions; 0 outside the body.

@@ -6,7 +6,7 @@ use crate::stiffness::sequence::combine;
 use crate::types::stiffness::{
     FrameStiffness, Gain, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams, StiffnessResult,
 };
-use crate::types::{DenseField, Mask};
+use crate::types::{Displacement, Mask};
 
 /// Collects frames, the one that moved most first, so that a sequence is never in memory as a whole.
 #[derive(Debug, Default)]
@@ -82,7 +82,7 @@ impl Sequence {
 }
 
 /// Mean length of the displacement in the body (mm); not finite where the field is not.
-pub fn motion(field: &DenseField, labels: &Mask) -> f64 {
+pub fn motion(field: &Displacement<'_>, labels: &Mask) -> f64 {
     let inside = labels.as_slice();
     let (mut sum, mut count) = (0.0, 0.0);
     for o in (0..inside.len()).filter(|&o| inside[o] > 0) {

@@ -15,7 +15,7 @@ use std::time::Instant;
 /// Follows the tissue of one volume through others that were taken one after the other.
 #[derive(Debug, Clone)]
 pub struct Tracker<'a> {
-    reference: &'a Volume,
+    reference: &'a Voxels<'a>,
     mask: Option<&'a Mask>,
     params: &'a FieldParams,
     /// Of the frame before, and of the one before that.
@@ -24,7 +24,7 @@ pub struct Tracker<'a> {
 
 impl<'a> Tracker<'a> {
     /// `mask` lies on the reference's grid.
-    pub fn new(reference: &'a Volume, mask: Option<&'a Mask>, params: &'a FieldParams) -> Self {
+    pub fn new(reference: &'a Voxels<'a>, mask: Option<&'a Mask>, params: &'a FieldParams) -> Self {
         Self { reference, mask, params, past: [None, None] }
     }
 
@@ -37,7 +37,7 @@ impl<'a> Tracker<'a> {
     ///
     /// # Errors
     /// As [`crate::pipeline::field::run`]; the tracker then goes on from the frames before.
-    pub fn next(&mut self, frame: &Volume, progress: Progress<'_>) -> Result<FieldResult, FieldError> {
+    pub fn next(&mut self, frame: &Voxels<'_>, progress: Progress<'_>) -> Result<FieldResult, FieldError> {
         let [last, before] = &self.past;
         let steady = last.as_ref().zip(before.as_ref()).and_then(|(l, b)| l.extrapolated(b));
         let starts: Vec<Start> = last.iter().cloned().chain(steady).collect();
@@ -54,7 +54,7 @@ pub struct Frame<'a> {
     /// Its number, from 0.
     pub number: usize,
     /// Its image.
-    pub volume: &'a Volume,
+    pub volume: &'a Voxels<'a>,
     /// Its displacement and all that goes with it.
     pub result: &'a FieldResult,
     /// Its strain.
@@ -69,12 +69,12 @@ pub struct Frame<'a> {
 ///
 /// # Errors
 /// Those of `read` and `keep`, and [`FieldError`] when no frame at all can be measured.
-pub fn run<E: From<FieldError>>(
+pub fn run<'v, E: From<FieldError>>(
     (frames, origin): (usize, usize),
-    reference: &Volume,
+    reference: &Voxels<'_>,
     (mask, labels): (Option<&Mask>, Option<&Mask>),
     params: &FieldParams,
-    mut read: impl FnMut(usize) -> Result<Volume, E>,
+    mut read: impl FnMut(usize) -> Result<Voxels<'v>, E>,
     mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
     progress: Progress<'_>,
 ) -> Result<Tracked, E> {
@@ -127,7 +127,7 @@ pub fn run<E: From<FieldError>>(
 }
 
 /// The offsets of each region's voxels: by label, or of the whole mask (of everything without one) as label 1.
-fn regions(reference: &Volume, mask: Option<&Mask>, labels: Option<&Mask>) -> Vec<(u8, Vec<usize>)> {
+fn regions(reference: &Voxels<'_>, mask: Option<&Mask>, labels: Option<&Mask>) -> Vec<(u8, Vec<usize>)> {
     let inside = |at: usize| mask.is_none_or(|m| m.as_slice()[at] != 0);
     let all = (0..reference.grid().len()).filter(|&at| inside(at));
     let Some(labels) = labels else { return vec![(1, all.collect())] };

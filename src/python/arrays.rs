@@ -3,7 +3,9 @@
 use crate::error::FieldError;
 use crate::io;
 use crate::python::PalpateError;
-use crate::types::{Affine, DenseField, Grid, Mask, Match, Mesh, SparseField, Volume, WorldPoint};
+use crate::types::{
+    Affine, DenseField, Displacement, Grid, Mask, Match, Mesh, SparseField, Volume, Voxels, WorldPoint,
+};
 use ndarray::{Array2, Array3, Array4, ShapeBuilder};
 use numpy::{
     IntoPyArray, PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
@@ -32,25 +34,25 @@ pub fn grid(shape: &[usize], rows: Rows) -> PyResult<Grid> {
     Grid::new([x, y, z], Affine::new(rows).map_err(told)?).map_err(told)
 }
 
-/// The values of an array in Fortran order, x fastest.
+/// The values of an array in Fortran order, x fastest, where they lie.
 macro_rules! values {
     ($array:expr) => {{
         let array = $array;
         if !array.is_fortran_contiguous() {
             return Err(told("an array must lie in Fortran order"));
         }
-        array.as_slice().map_err(told)?.to_vec()
+        array.as_slice().map_err(told)?
     }};
 }
 
-/// A volume from its array and affine.
-pub fn volume((array, rows): &Image<'_>) -> PyResult<Volume> {
-    Volume::from_vec(grid(array.shape(), *rows)?, values!(array)).map_err(told)
+/// A volume on the memory of its array.
+pub fn volume<'a>((array, rows): &'a Image<'_>) -> PyResult<Voxels<'a>> {
+    Voxels::lent(grid(array.shape(), *rows)?, values!(array)).map_err(told)
 }
 
 /// A label map or mask, called `name`.
 pub fn labels(image: &Image<'_>, name: &str) -> PyResult<Mask> {
-    io::labels_of(volume(image)?, Path::new(name)).map_err(told)
+    io::labels_of(volume(image)?.into_volume(), Path::new(name)).map_err(told)
 }
 
 /// The same if it is there, on the grid of `reference`, which is called `of`.
@@ -68,12 +70,12 @@ pub fn mask(image: Option<&Image<'_>>, name: &str, reference: &Grid, of: &str) -
     Ok(Some(mask))
 }
 
-/// A displacement, (nx, ny, nz, 3), mm, RAS.
-pub fn displacement(array: &PyReadonlyArray4<'_, f32>, rows: Rows) -> PyResult<DenseField> {
+/// A displacement, (nx, ny, nz, 3), mm, RAS, on the memory of its array.
+pub fn displacement<'a>(array: &'a PyReadonlyArray4<'_, f32>, rows: Rows) -> PyResult<Displacement<'a>> {
     if array.shape()[3] != 3 {
         return Err(told("a displacement has three components, on the last axis"));
     }
-    DenseField::from_vec(grid(array.shape(), rows)?, values!(array)).map_err(told)
+    Displacement::lent(grid(array.shape(), rows)?, values!(array)).map_err(told)
 }
 
 /// Matches from the columns of matches.csv.

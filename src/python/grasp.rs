@@ -49,10 +49,10 @@ pub fn grasp<'py>(
     };
     let out = PyDict::new(py);
     out.set_item("summary", arrays::python(py, &summary(&report))?)?;
-    let samples: Vec<_> = run.samples.iter().map(Sample::row).collect();
+    let samples: Vec<_> = run.samples.iter().map(io::stored_sample).collect();
     out.set_item("trajectory", arrays::table(py, &samples))?;
     out.set_item("trajectory_columns", Sample::COLUMNS.to_vec())?;
-    let motions: Vec<_> = run.motions.iter().map(MotionRow::row).collect();
+    let motions: Vec<_> = run.motions.iter().map(io::stored_motion).collect();
     out.set_item("motions", arrays::table(py, &motions))?;
     out.set_item("motion_columns", MotionRow::COLUMNS[1..].to_vec())?;
     Ok(out)

@@ -40,7 +40,7 @@ impl Pad {
 /// Reduces a stiffness result, its map (kPa) and its summary as JSON, to a fingertip.
 #[pyfunction]
 pub fn fingertip(py: Python<'_>, map: Image<'_>, summary: &str, nodes: usize) -> PyResult<Pad> {
-    let folder = io::stiffness_folder(arrays::volume(&map)?, summary).map_err(told)?;
+    let folder = io::stiffness_folder(arrays::volume(&map)?.into_volume(), summary).map_err(told)?;
     let outcome = py.detach(|| of_map(&folder, nodes, &|_, _| ())).map_err(told)?;
     let warnings = outcome.warnings(&folder);
     Ok(Pad { outcome, force_n: folder.force_n, warnings })

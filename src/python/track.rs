@@ -6,7 +6,7 @@ use crate::error::FieldError;
 use crate::pipeline::track::{Frame, run};
 use crate::report::film::Film;
 use crate::report::track::{TrackReport, summary, warnings};
-use crate::types::{DenseField, Volume};
+use crate::types::{DenseField, Voxels};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use serde_json::json;
@@ -29,13 +29,15 @@ pub fn track<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = self::params(params)?;
     let frames = volumes.len();
-    if frames < 2 || reference >= frames {
-        return Err(told(format!(
-            "reference is {reference}, but there are {frames} volumes (counted from 0, two at least)"
-        )));
+    if frames < 2 {
+        let name = names.first().map_or("volumes", String::as_str);
+        return Err(told(format!("{name}: is one volume; give two or more, or a 4-D file")));
+    }
+    if reference >= frames {
+        return Err(told(format!("reference is {reference}, but there are {frames} volumes (counted from 0)")));
     }
     let started = Instant::now();
-    let all = volumes.iter().map(arrays::volume).collect::<PyResult<Vec<Volume>>>()?;
+    let all = volumes.iter().map(arrays::volume).collect::<PyResult<Vec<Voxels<'_>>>>()?;
     let grid = *all[reference].grid();
     let mask = arrays::mask(mask.as_ref(), &regions[0], &grid, &names[reference])?;
     let labels = arrays::mask(labels.as_ref(), &regions[1], &grid, &names[reference])?;

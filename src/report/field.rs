@@ -1,6 +1,6 @@
 //! What the report of `palpate field` is made from.
 
-use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Volume};
+use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Volume, Voxels};
 
 /// A value for each voxel offset (x fastest): a volume, or what can be worked out where a picture asks for it.
 pub type Values<'a> = &'a (dyn Fn(usize) -> f32 + Sync);
@@ -13,7 +13,7 @@ pub struct FieldReport<'a> {
     /// Initial volume, deformed volume and mask, as they are called.
     pub names: [&'a str; 3],
     /// The initial volume.
-    pub initial: &'a Volume,
+    pub initial: &'a Voxels<'a>,
     /// The deformed volume without any displacement.
     pub deformed: Values<'a>,
     /// The grid the deformed volume came on.

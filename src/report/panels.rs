@@ -6,7 +6,7 @@ use crate::report::picture::Picture;
 use crate::report::scale::Scale;
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
-use crate::types::{DenseField, Mask, Volume, VoxelPoint, WorldPoint};
+use crate::types::{DenseField, Mask, VoxelPoint, Voxels, WorldPoint};
 
 /// One quantity in each plane.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,7 +43,7 @@ impl Panel {
     pub fn coloured(
         title: &str,
         sections: &[Section],
-        base: (&Volume, [f64; 2]),
+        base: (&Voxels<'_>, [f64; 2]),
         mask: Option<&Mask>,
         scale: Scale,
         value: impl Fn(usize) -> f32,
@@ -64,7 +64,7 @@ impl Panel {
 }
 
 /// Gray levels for a volume: its 0.5th to its 99.7th percentile.
-pub fn gray_range(volume: &Volume) -> [f64; 2] {
+pub fn gray_range(volume: &Voxels<'_>) -> [f64; 2] {
     let values = volume.as_slice();
     let picked = sample(values.len(), None);
     let at = |q| quantile(picked.iter().map(|&o| f64::from(values[o])), q);
@@ -100,8 +100,8 @@ pub fn centre_of_motion(field: &DenseField, mask: Option<&Mask>) -> WorldPoint {
 /// # Errors
 /// As [`Panel::gray`].
 pub fn synthetic_pair(
-    initial: &Volume,
-    deformed: &Volume,
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
     truth: &DenseField,
     mask: Option<&Mask>,
 ) -> Result<Vec<Panel>, ReportError> {
@@ -121,7 +121,7 @@ pub fn synthetic_pair(
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{Affine, Grid};
+    use crate::types::{Affine, Grid, Volume};
 
     #[test]
     fn the_cut_goes_where_the_motion_is() {

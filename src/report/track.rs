@@ -13,7 +13,7 @@ use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
 use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Viewer, elements};
-use crate::types::{DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Volume};
+use crate::types::{DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -83,7 +83,7 @@ impl TrackReport<'_> {
 /// The viewer of one frame: the reference, the frame as it came and warped back (on the reference's grid), its displacement,
 /// matches, mesh and largest principal strain.
 pub fn look(
-    [reference, frame, warped]: [&Volume; 3],
+    [reference, frame, warped]: [&Voxels<'_>; 3],
     mask: Option<&Mask>,
     (field, matches, mesh): (&DenseField, &SparseField, &Mesh),
     strain: Values<'_>,
@@ -92,7 +92,7 @@ pub fn look(
     let [low, high] = gray_range(reference);
     let inside = sample(grid.len(), mask);
     let most = |f: &dyn Fn(usize) -> f64, q| quantile(inside.iter().map(|&o| f(o)), q);
-    let values = [reference, frame, warped].map(Volume::as_slice);
+    let values = [reference, frame, warped].map(|v| v.as_slice());
     let [a, b, c]: [Values<'_>; 3] = [&|o| values[0][o], &|o| values[1][o], &|o| values[2][o]];
     let images = [("reference", a), ("frame", b), ("warped", c)].map(|(name, values)| Layer {
         name,

@@ -10,7 +10,7 @@ use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::{Observation, find, from_field, from_matches};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
 use crate::types::stiffness::Law;
-use crate::types::{DenseField, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
+use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
 
 /// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
 const FLOOR: f64 = 0.005;
@@ -56,7 +56,7 @@ impl Level {
     /// [`StiffnessError`] for a patch without surface or motion, and too few samples.
     pub fn new(
         mesh: &QuadraticMesh,
-        field: &DenseField,
+        field: &Displacement<'_>,
         matches: Option<&SparseField>,
         labels: &Mask,
         held: &Place,

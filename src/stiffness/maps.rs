@@ -6,7 +6,7 @@ use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
-use crate::types::{DenseField, Mask, Volume, WorldPoint};
+use crate::types::{Displacement, Mask, Volume, WorldPoint};
 
 /// Volume of the voxels that are not 0 (mm^3).
 pub fn volume(labels: &Mask) -> f64 {
@@ -48,7 +48,7 @@ pub fn residual(labels: &Mask, observations: &[Observation], residuals: &[[f64; 
 /// Standard deviation of what is rough in a field (mm, a component), the mean over the components; `sigma` measures it in
 /// one volume.
 pub fn noise(
-    field: &DenseField,
+    field: &Displacement<'_>,
     labels: &Mask,
     sigma: impl Fn(&[f32], [usize; 3], &dyn Fn(usize) -> bool) -> f64,
 ) -> f64 {

@@ -4,7 +4,7 @@ use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
 use crate::stiffness::elements::locate;
 use crate::types::space::{Matrix3, determinant};
-use crate::types::{DenseField, Mask, SparseField, VoxelPoint, WorldPoint};
+use crate::types::{Displacement, Mask, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// Barycentric coordinates down to this count as inside an element.
@@ -137,7 +137,7 @@ fn located(body: &Body, raw: Vec<([f64; 3], [f64; 3], f64)>) -> Vec<Observation>
 
 /// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The second value is the number of
 /// voxels along a block's edge.
-pub fn from_field(body: &Body, field: &DenseField, mask: &Mask) -> (Vec<Observation>, usize) {
+pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Observation>, usize) {
     let grid = field.grid();
     let [nx, ny, nz] = grid.shape();
     let inside = mask.as_slice();
@@ -181,7 +181,7 @@ pub fn from_matches(body: &Body, matches: &SparseField) -> Vec<Observation> {
 
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to the voxels of the mask
 /// within `reach` voxels, so that nothing outside the body is read and noise is averaged.
-pub fn at_surface(field: &DenseField, mask: &Mask, p: [f64; 3], reach: f64) -> Option<([f64; 3], f64)> {
+pub fn at_surface(field: &Displacement<'_>, mask: &Mask, p: [f64; 3], reach: f64) -> Option<([f64; 3], f64)> {
     let grid = field.grid();
     let (shape, at) = (grid.shape(), grid.affine().to_voxel(WorldPoint(p)).0);
     let range = |a: usize| {

@@ -15,7 +15,7 @@ use crate::stiffness::observations::at_surface;
 use crate::stiffness::plate;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Contact, Side};
-use crate::types::{DenseField, Mask, VoxelPoint, WorldPoint};
+use crate::types::{Displacement, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// Voxels around a surface node that are read for its motion.
@@ -65,7 +65,7 @@ pub struct SurfaceMotion {
 
 impl SurfaceMotion {
     /// Reads the field at the surface of a body.
-    pub fn new(body: &Body, field: &DenseField, mask: &Mask) -> Self {
+    pub fn new(body: &Body, field: &Displacement<'_>, mask: &Mask) -> Self {
         let nodes = body.nodes_on(0..body.surface.len());
         let all = |reach: f64| {
             let read = |&n: &u32| at_surface(field, mask, body.places[n as usize], reach);

@@ -6,7 +6,7 @@
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
-use crate::types::{DenseField, Mask, VoxelPoint};
+use crate::types::{Displacement, Mask, VoxelPoint};
 use rayon::prelude::*;
 
 /// Voxels on both sides of the rim, and below it, where the mesh is fine.
@@ -18,7 +18,7 @@ const WIDE: usize = 25;
 /// whole side is pressed.
 ///
 /// A voxel's motion is read from those within `reach` (voxels), and is that of the plate within `tolerance` (mm).
-pub fn rim(patch: &Patch, field: &DenseField, labels: &Mask, tolerance: f64, reach: f64) -> Vec<[f64; 3]> {
+pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f64, reach: f64) -> Vec<[f64; 3]> {
     if patch.curved() {
         return Vec::new();
     }

@@ -4,21 +4,25 @@ use crate::error::SpaceError;
 use crate::types::space::{Grid, WorldPoint};
 use ndarray::{ArrayView4, ShapeBuilder};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Displacements on the initial volume's grid, in world mm, RAS components, initial to deformed.
 ///
 /// The array has shape (nx, ny, nz, 3) with x fastest, so each component is one contiguous volume. (On disk the
 /// components are LPS; `io` converts.)
 #[derive(Debug, Clone, PartialEq)]
-pub struct DenseField {
+pub struct Displacement<'a> {
     grid: Grid,
-    values: Vec<f32>,
+    values: Cow<'a, [f32]>,
 }
+
+/// Displacements of its own on the initial volume's grid.
+pub type DenseField = Displacement<'static>;
 
 impl DenseField {
     /// No motion.
     pub fn zeros(grid: Grid) -> Self {
-        Self { grid, values: vec![0.0; 3 * grid.len()] }
+        Self { grid, values: vec![0.0; 3 * grid.len()].into() }
     }
 
     /// From the three components one after the other, each x fastest (mm, RAS).
@@ -26,11 +30,7 @@ impl DenseField {
     /// # Errors
     /// [`SpaceError::Length`] when the length is not three times the grid's.
     pub fn from_vec(grid: Grid, values: Vec<f32>) -> Result<Self, SpaceError> {
-        let (expected, found) = (3 * grid.len(), values.len());
-        if expected != found {
-            return Err(SpaceError::Length { expected, found });
-        }
-        Ok(Self { grid, values })
+        Self::of(grid, values.into())
     }
 
     /// The displacement (mm) that `f` gives for each voxel centre.
@@ -68,6 +68,24 @@ impl DenseField {
         });
         out
     }
+}
+
+impl<'a> Displacement<'a> {
+    /// On components that stay where they are, one after the other, each x fastest (mm, RAS).
+    ///
+    /// # Errors
+    /// [`SpaceError::Length`] when the length is not three times the grid's.
+    pub fn lent(grid: Grid, values: &'a [f32]) -> Result<Self, SpaceError> {
+        Self::of(grid, values.into())
+    }
+
+    fn of(grid: Grid, values: Cow<'a, [f32]>) -> Result<Self, SpaceError> {
+        let (expected, found) = (3 * grid.len(), values.len());
+        if expected != found {
+            return Err(SpaceError::Length { expected, found });
+        }
+        Ok(Self { grid, values })
+    }
 
     /// The lattice (the initial volume's).
     pub fn grid(&self) -> &Grid {
@@ -86,9 +104,9 @@ impl DenseField {
         &self.values
     }
 
-    /// The same, to be changed in place.
+    /// The same, to be changed in place (in a copy, when they are lent).
     pub fn as_mut_slice(&mut self) -> &mut [f32] {
-        &mut self.values
+        self.values.to_mut()
     }
 
     /// Component `c` (0 = right, 1 = front, 2 = up), x fastest.
@@ -104,8 +122,8 @@ impl DenseField {
         [v[index], v[n + index], v[2 * n + index]]
     }
 
-    /// The three components, x fastest.
+    /// The three components, x fastest (a copy, when they are lent).
     pub fn into_vec(self) -> Vec<f32> {
-        self.values
+        self.values.into_owned()
     }
 }

@@ -38,7 +38,7 @@ pub mod trial;
 
 pub mod batch;
 
-pub use field::DenseField;
+pub use field::{DenseField, Displacement};
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
 pub use metrics::Metrics;
@@ -50,4 +50,4 @@ pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Tracked, Trajectory};
 pub use trial::{Part, Standing, StressCurve, StressRun, Trial};
-pub use volume::{Mask, Volume};
+pub use volume::{Mask, Volume, Voxels};

@@ -4,13 +4,18 @@ use crate::error::SpaceError;
 use crate::types::space::{Grid, WorldPoint};
 use ndarray::{Array3, ArrayView3, ShapeBuilder};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
-/// Values on a [`Grid`]; the array has shape (nx, ny, nz) and lies in memory with x fastest (NIfTI's order).
+/// Values on a [`Grid`], its own or lent to it; the array has shape (nx, ny, nz) and lies in memory with x fastest
+/// (NIfTI's order).
 #[derive(Debug, Clone, PartialEq)]
-pub struct Volume<T = f32> {
+pub struct Voxels<'a, T: Clone = f32> {
     grid: Grid,
-    values: Vec<T>,
+    values: Cow<'a, [T]>,
 }
+
+/// Values of its own on a [`Grid`].
+pub type Volume<T = f32> = Voxels<'static, T>;
 
 /// A mask (0 = outside) or a label map (one number a region).
 pub type Mask = Volume<u8>;
@@ -21,11 +26,7 @@ impl<T: Clone> Volume<T> {
     /// # Errors
     /// [`SpaceError::Length`] when it is not.
     pub fn from_vec(grid: Grid, values: Vec<T>) -> Result<Self, SpaceError> {
-        let (expected, found) = (grid.len(), values.len());
-        if expected != found {
-            return Err(SpaceError::Length { expected, found });
-        }
-        Ok(Self { grid, values })
+        Self::of(grid, values.into())
     }
 
     /// From an (nx, ny, nz) array in any memory order (copied when not already x-fastest).
@@ -59,7 +60,30 @@ impl<T: Clone> Volume<T> {
 
     /// The same value everywhere.
     pub fn filled(grid: Grid, value: T) -> Self {
-        Self { grid, values: vec![value; grid.len()] }
+        Self { grid, values: vec![value; grid.len()].into() }
+    }
+}
+
+impl<'a, T: Clone> Voxels<'a, T> {
+    /// On values that stay where they are, x fastest; the length must be the grid's.
+    ///
+    /// # Errors
+    /// [`SpaceError::Length`] when it is not.
+    pub fn lent(grid: Grid, values: &'a [T]) -> Result<Self, SpaceError> {
+        Self::of(grid, values.into())
+    }
+
+    /// The same, on these values.
+    pub fn view(&self) -> Voxels<'_, T> {
+        Voxels { grid: self.grid, values: self.as_slice().into() }
+    }
+
+    fn of(grid: Grid, values: Cow<'a, [T]>) -> Result<Self, SpaceError> {
+        let (expected, found) = (grid.len(), values.len());
+        if expected != found {
+            return Err(SpaceError::Length { expected, found });
+        }
+        Ok(Self { grid, values })
     }
 
     /// The lattice.
@@ -79,13 +103,18 @@ impl<T: Clone> Volume<T> {
         &self.values
     }
 
-    /// All values, x fastest, to be changed in place.
+    /// All values, x fastest, to be changed in place (in a copy, when they are lent).
     pub fn as_mut_slice(&mut self) -> &mut [T] {
-        &mut self.values
+        self.values.to_mut()
     }
 
-    /// The values, x fastest.
+    /// The values, x fastest (a copy, when they are lent).
     pub fn into_vec(self) -> Vec<T> {
-        self.values
+        self.values.into_owned()
+    }
+
+    /// With values of its own (a copy, when they are lent).
+    pub fn into_volume(self) -> Volume<T> {
+        Voxels { grid: self.grid, values: self.values.into_owned().into() }
     }
 }

@@ -1,6 +1,6 @@
 """The Snakemake workflow on a cohort of phantoms: a pair that is broken, a command that fails once, a kill, and the group report.
 
-PALPATE_SUBJECTS says how many subjects: 3 without it, 20 for docs/scale.md.
+PALPATE_SUBJECTS says how many subjects: 20 without it.
 """
 
 import csv
@@ -20,12 +20,12 @@ pytest.importorskip("snakemake")
 sys.path.insert(0, str(ROOT / "examples/cohort"))
 from make_cohort import make  # noqa: E402
 
-SUBJECTS = int(os.environ.get("PALPATE_SUBJECTS", "3"))
+SUBJECTS = int(os.environ.get("PALPATE_SUBJECTS", "20"))
 
 
 def snakemake(folder, program, *arguments):
     command = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "examples/cohort/Snakefile"), "--cores", "2", *arguments]
-    command += ["--config", "table=data/pairs.csv", "output=out", f"palpate={program}", "preset=fast", "nodes=1500"]
+    command += ["--config", "table=data/pairs.csv", "output=out", f"palpate={program}", "preset=fast", "nodes=1000"]
     log = open(folder / "snakemake.txt", "w")
     return subprocess.Popen(command, cwd=folder, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
 
@@ -46,13 +46,15 @@ def test_a_cohort_from_end_to_end(shell, tmp_path):
     make(tmp_path / "data", SUBJECTS, 28, 1, shell.program)
     names = [f"sub-{n:02}_ses-01" for n in range(1, SUBJECTS + 1)]
 
-    # The first subject's volume is damaged; the last one's stiffness fails once, as a busy node might.
+    # The first subject's volume is damaged; the last one's stiffness fails once, as a busy node might. Fingertips of all but the
+    # first, which is compared below, are pressed with fewer elements.
     broken = tmp_path / "data/sub-01/ses-01/anat/sub-01_ses-01_desc-after_T2w.nii.gz"
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
     flaky = tmp_path / "flaky.sh"
     flaky.write_text(
-        f'#!/bin/sh\ncase "$*" in stiffness*{names[-1]}*) if mkdir "{tmp_path}/once" 2>/dev/null; then exit 1; fi;; esac\n'
+        f'#!/bin/sh\ncase "$*" in stiffness*{names[-1]}*) if mkdir "{tmp_path}/once" 2>/dev/null; then exit 1; fi;;\n'
+        f'fingertip*{names[0]}*) ;; fingertip*) set -- "$@" --nodes 500;; esac\n'
         f'exec "{shell.program}" "$@"\n'
     )
     flaky.chmod(0o755)
@@ -61,7 +63,7 @@ def test_a_cohort_from_end_to_end(shell, tmp_path):
     process = snakemake(tmp_path, flaky, "--keep-going")
     started = time.monotonic()
     while not list(tmp_path.glob("out/*/fingertip.toml")) and process.poll() is None:
-        assert time.monotonic() - started < 300
+        assert time.monotonic() - started < 600
         time.sleep(0.05)
     assert process.poll() is None, (tmp_path / "snakemake.txt").read_text()
     os.killpg(process.pid, signal.SIGKILL)
@@ -82,7 +84,7 @@ def test_a_cohort_from_end_to_end(shell, tmp_path):
     # Mended: only that pair is run, then the group report is made.
     broken.write_bytes(whole)
     before = {n: (tmp_path / f"out/{n}/grasp/summary.json").stat().st_mtime_ns for n in names[1:]}
-    finish(snakemake(tmp_path, shell.program, "--rerun-triggers", "mtime"), tmp_path)
+    finish(snakemake(tmp_path, flaky, "--rerun-triggers", "mtime"), tmp_path)
     assert before == {n: (tmp_path / f"out/{n}/grasp/summary.json").stat().st_mtime_ns for n in names[1:]}
     rows = table(tmp_path)
     assert [r["status"] for r in rows] == ["done"] * SUBJECTS
@@ -106,7 +108,7 @@ def test_a_cohort_from_end_to_end(shell, tmp_path):
         writer.writeheader()
         writer.writerows(first)
     subprocess.run(
-        [shell.program, "batch", alone, "-o", tmp_path / "alone", "--preset", "fast", "--nodes", "1500"], check=True
+        [shell.program, "batch", alone, "-o", tmp_path / "alone", "--preset", "fast", "--nodes", "1000"], check=True
     )
     for part in ("field/displacement.nii.gz", "stiffness/stiffness.nii.gz", "grasp/trajectory.csv"):
         assert (tmp_path / "alone" / names[0] / part).read_bytes() == (tmp_path / "out" / names[0] / part).read_bytes()

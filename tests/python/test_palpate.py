@@ -1,6 +1,8 @@
 """The Python package gives the bits of the command line, and its words."""
 
 import csv
+import subprocess
+import sys
 import threading
 import time
 
@@ -118,6 +120,22 @@ def test_stiffness_fingertip_and_grasp_equal_the_command_line(shell, pad, tmp_pa
     assert rows[0] == grasp.trajectory_columns and len(rows) - 1 == len(grasp.trajectory)
 
 
+def test_grasp_equals_the_command_line(shell):
+    scene = ROOT / "examples/eight_motions.toml"
+    shell("grasp", scene, "-o", "eight")
+    found = palpate.grasp(scene)
+    expected = shell.summary("eight")
+    for key in expected.keys() - {"seconds"}:
+        assert found.summary[key] == expected[key], key
+    for name, columns, values, skipped in (
+        ("trajectory", found.trajectory_columns, found.trajectory, 0),
+        ("motions", found.motion_columns, found.motions, 1),
+    ):
+        rows = list(csv.reader(open(shell.folder / f"eight/{name}.csv")))
+        assert rows[0][skipped:] == columns
+        same(values, np.array([row[skipped:] for row in rows[1:]], float))
+
+
 def test_track_equals_the_command_line(shell):
     shell("phantom", "pinch", "--frames", 3, "--size", 24, "-o", "pinch")
     frames = [shell.folder / f"pinch/frame_{t:03}.nii.gz" for t in range(3)]
@@ -126,6 +144,11 @@ def test_track_equals_the_command_line(shell):
     found = palpate.track([nibabel.load(f) for f in frames], mask=mask, labels=labels)
     for t in range(3):
         same(lps(found.displacement[t]), volume(shell.folder / f"tracked/displacement_{t:03}.nii.gz")[:, :, :, 0, :])
+    loaded = [nibabel.load(f) for f in frames]
+    series = np.stack([np.asarray(f.dataobj) for f in loaded], axis=-1)
+    for given in ((series, loaded[0].affine), nibabel.Nifti1Image(series, loaded[0].affine)):
+        again = palpate.track(given, mask=mask, labels=labels)
+        [same(a, b) for a, b in zip(again.displacement, found.displacement)]
     rows = list(csv.DictReader(open(shell.folder / "tracked/strain.csv")))
     assert [f"{r['volume_change']:.6f}" for r in found.strain] == [r["volume_change"] for r in rows]
     told = shell.summary("tracked")
@@ -157,11 +180,73 @@ def test_errors_are_those_of_the_command_line(shell, pair):
         (lambda: palpate.field((np.ones((4, 4, 4)), np.eye(2)), deformed), "4 x 4"),
         (lambda: palpate.stiffness((np.zeros((4, 4, 4, 3)), np.eye(4))), "either labels or mask"),
         (lambda: palpate.grasp("nowhere.toml"), "nowhere.toml"),
-        (lambda: palpate.track([initial]), "two at least"),
+        (lambda: palpate.track([initial]), "one volume"),
+        (lambda: palpate.track(initial), "one volume"),
     ]
     for call, message in cases:
         with pytest.raises(palpate.PalpateError, match=message):
             call()
+
+
+def test_errors_of_the_other_parts_are_those_of_the_command_line_too(shell, pair, pad, tmp_path):
+    folder, elastic = pad
+    displacement, labels = shell.folder / "pad-field/displacement.nii.gz", folder / "labels.nii.gz"
+    field = nibabel.load(displacement)
+    field = (lps(np.asarray(field.dataobj)[:, :, :, 0, :]), field.affine)
+    far = tmp_path / "far.nii.gz"
+    image = nibabel.load(labels)
+    nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj)[1:], image.affine), far)
+
+    def refused(*arguments):
+        return shell(*arguments, "-o", tmp_path / "none.toml", code=None).stderr
+
+    def stiffness(labels=labels, **more):
+        flags = [f"--{key}={value}" for key, value in more.items()]
+        said = refused("stiffness", "--field", displacement, "--labels", labels, *flags)
+        return said, lambda: palpate.stiffness(field, labels=labels, matches=False, **more)
+
+    ratios = shell.folder / "pad-ratios"
+    held = {"held": elastic["held"], "load": elastic["load"]}
+    shell(
+        "stiffness", "--field", displacement, "--labels", labels, "--nodes=500", *[f"--{k}={v}" for k, v in held.items()],
+        "-o", ratios,
+    )
+    ratio = palpate.stiffness(field, labels=labels, nodes=500, matches=False, **held)
+    scene = tmp_path / "scene.toml"
+    scene.write_text((ROOT / "examples/finger_pad.toml").read_text() + "\n[stray]\nkey = 1\n")
+    frame = pair / "initial.nii.gz"
+    cases = [
+        stiffness(poisson=0.5),
+        stiffness(force=-1.0),
+        stiffness(held="z+", load="z+"),
+        stiffness(labels=far),
+        (refused("fingertip", ratios), lambda: palpate.fingertip(ratio)),
+        (refused("grasp", scene), lambda: palpate.grasp(scene)),
+        (refused("track", frame), lambda: palpate.track([frame])),
+        (refused("track", frame), lambda: palpate.track(frame)),
+        (refused("track", frame, frame, "--reference", 2), lambda: palpate.track([frame, frame], reference=2)),
+    ]
+    for said, call in cases:
+        with pytest.raises(palpate.PalpateError) as caught:
+            call()
+        # An array has no file of its own to be called by.
+        assert str(caught.value) in said.replace(str(displacement), "displacement"), said
+
+
+def test_arrays_are_worked_on_where_they_lie():
+    """Two volumes of 400 MB, of which no voxel is ever written, take no memory unless they are copied."""
+    script = (
+        "import numpy as np, palpate, resource\n"
+        "before, after = (np.zeros((512, 512, 400), np.float32, order='F') for _ in range(2))\n"
+        "start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "try:\n"
+        "    palpate.field((before, np.eye(4)), (after, np.eye(4)))\n"
+        "except palpate.PalpateError as error:\n"
+        "    assert 'constant' in str(error)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start)\n"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert int(said) < 100_000, f"{int(said) / 1000:.0f} MB"
 
 
 def test_progress_is_told_and_what_it_raises_is_raised(pair):

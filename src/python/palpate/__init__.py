@@ -4,7 +4,8 @@ A volume is given as ``(array, affine)``, as an image of nibabel (anything with 
 ``get_fdata()``), or as the path of a file. Arrays have shape (nx, ny, nz); affines are 4 x 4, voxels to world mm (RAS).
 
 Results are rounded as the files of the command line are, so that both give the same bits. Work is done without holding
-the interpreter. A volume in float32 and Fortran order is taken as it is, by one copy; results are handed over without any.
+the interpreter. A volume or displacement in float32 and Fortran order is worked on where it lies, so leave it as it is until
+the work is done; anything else is converted first. Results are handed over without a copy.
 """
 
 from __future__ import annotations
@@ -314,8 +315,19 @@ def grasp(
     return Grasp(_palpate.grasp(scene, model, formulation, step, progress, threads))
 
 
+def _frames(volumes: Any) -> Sequence[Image]:
+    """The volumes of a list, or of one (array, affine) or image with time on the last axis."""
+    given = volumes
+    if hasattr(given, "affine"):
+        given = (given.dataobj if hasattr(given, "dataobj") else given.get_fdata(), given.affine)
+    if not (isinstance(given, (tuple, list)) and len(given) == 2 and getattr(given[0], "ndim", 0) == 4):
+        return [volumes] if hasattr(volumes, "affine") or isinstance(volumes, (str, _os.PathLike)) else volumes
+    array = np.asarray(given[0])
+    return [(array[..., t], given[1]) for t in range(array.shape[3])]
+
+
 def track(
-    volumes: Sequence[Image],
+    volumes: Union[Sequence[Image], Image],
     *,
     reference: int = 0,
     mask: Optional[Image] = None,
@@ -328,7 +340,11 @@ def track(
     progress: Progress = None,
     threads: Optional[int] = None,
 ) -> Track:
-    """The displacement from one of ``volumes`` to each other, in the order in which they were taken."""
+    """The displacement from one of ``volumes`` to each other, in the order in which they were taken.
+
+    ``volumes`` is a list, or one image or ``(array, affine)`` of shape (nx, ny, nz, frames).
+    """
+    volumes = _frames(volumes)
     images = [_image(v, f"volume {i}") for i, v in enumerate(volumes)]
     asked = _params(preset, points, search, seed, params)
     names = [_called(v, f"volume {i}") for i, v in enumerate(volumes)]
