@@ -5,7 +5,7 @@ mod fixtures;
 
 use fixtures::run;
 use palpate::io;
-use palpate::types::{Affine, DenseField, Grid, Mask};
+use palpate::types::{Affine, DenseField, Grid, Mask, Volume};
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
@@ -73,6 +73,35 @@ fn everything_promised_is_written() {
         assert!(fs::metadata(results.join(file)).unwrap().len() > 500, "{file}");
     }
     check_febio(&fs::read_to_string(results.join("model.feb")).unwrap());
+}
+
+#[test]
+fn the_report_shows_the_tissue_behind_the_maps() {
+    let folder = folder();
+    let at = |name: &str| folder.path().join(name);
+    fs::create_dir(at("measured")).unwrap();
+    fs::copy(at("field.nii.gz"), at("measured/displacement.nii.gz")).unwrap();
+    fs::write(at("measured/summary.json"), "{}").unwrap();
+    let g = grid([16, 16, 16]);
+    let wavy = Volume::from_voxels(g, |_, p| p.0.iter().map(|x| x.sin() as f32).sum());
+    io::write_volume(at("measured/warped.nii.gz"), &wavy, "").unwrap();
+    let coarse = Grid::new([8; 3], Affine::scaled([2.0; 3], [-3.0, 5.0, 1.0]).unwrap()).unwrap();
+    io::write_volume(at("scan.nii.gz"), &Volume::from_voxels(coarse, |o, _| o as f32), "").unwrap();
+    let page = |field: &str, more: &[&str]| {
+        let base = ["stiffness", "--field", field, "--labels", "labels.nii.gz", "--nodes", "500", "-o", "results"];
+        run(folder.path(), &[&base, more, &["--overwrite", "--quiet"]].concat(), 0);
+        fs::read_to_string(at("results/report.html")).unwrap()
+    };
+    assert!(page("measured", &[]).contains("\"warped\""));
+    assert!(page("field.nii.gz", &[]).contains("\"body\""));
+    let asked = page("measured", &["--image", "scan.nii.gz", "--image", "measured/warped.nii.gz"]);
+    assert!(asked.contains("\"scan.nii.gz\"") && asked.contains("\"warped.nii.gz\"") && !asked.contains("\"body\""));
+    // What was not asked for may be damaged; what was is refused.
+    fs::write(at("measured/warped.nii.gz"), "no volume").unwrap();
+    assert!(page("measured", &[]).contains("\"body\""));
+    fs::remove_dir_all(at("results")).unwrap();
+    refused(folder.path(), &["--image", "measured/warped.nii.gz"], 1, &["measured/warped.nii.gz"]);
+    refused(folder.path(), &["--image", "nowhere.nii.gz"], 1, &["nowhere.nii.gz"]);
 }
 
 #[test]

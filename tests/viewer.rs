@@ -65,9 +65,10 @@ fn the_stiffness_report_too() {
     let phantom = ["phantom", "inclusion", "--size", "20", "--quiet", "-o", "block"];
     palpate(folder.path()).args(phantom).assert().success();
     let stiffness = ["stiffness", "--field", "block/truth.nii.gz", "--labels", "block/labels.nii.gz"];
+    let images = ["--image", "block/initial.nii.gz", "--image", "block/deformed.nii.gz"];
     let rest = ["--nodes", "800", "--model", "linear", "--quiet", "-o", "stiffness"];
-    palpate(folder.path()).args(stiffness).args(rest).assert().success();
-    all_is_well(&folder.path().join("stiffness/report.html"), 20);
+    palpate(folder.path()).args(stiffness).args(images).args(rest).assert().success();
+    all_is_well(&folder.path().join("stiffness/report.html"), 25);
 }
 
 #[test]

@@ -4,8 +4,10 @@ use super::Usage;
 use super::console::Console;
 use anyhow::{Result, bail};
 use palpate::error::FieldError;
+use palpate::field::warp::warp_image;
 use palpate::io::{self, Stored};
-use palpate::types::{Grid, Mask, Volume};
+use palpate::numerics::sampling::Interpolation;
+use palpate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
 
 /// The last part of a path, for messages and reports.
@@ -84,6 +86,14 @@ pub fn usable(volume: Volume, path: &str, warnings: &mut Vec<String>) -> Result<
         bail!("{path}: every voxel has the same value, so nothing can be found in it; check the file");
     }
     Ok(volume)
+}
+
+/// The volume as it is, or resampled where it lies on another grid.
+pub fn on_grid<'a>(volume: Voxels<'a>, grid: &Grid) -> Voxels<'a> {
+    match volume.grid() == grid {
+        true => volume,
+        false => warp_image(&volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0),
+    }
 }
 
 /// A mask on `grid`, which is that of `reference`.

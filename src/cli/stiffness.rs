@@ -4,7 +4,7 @@ use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
 use super::dry_run;
-use super::inputs::{check_distinct, name, read_mask, warn_all};
+use super::inputs::{check_distinct, name, on_grid, read_mask, warn_all};
 use super::limits::mesh_fits;
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -15,7 +15,7 @@ use palpate::pipeline::stiffness::{ENOUGH, Inputs, inside};
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
-use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult};
+use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult, Volume};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -77,6 +77,10 @@ pub struct Options {
     /// Regions to try at most without labels, 1 to 8
     #[arg(long, value_name = "N", default_value_t = StiffnessParams::default().regions)]
     regions: usize,
+    /// Volume to show behind the maps in report.html, before the motion; may be given several times [default: warped.nii.gz of
+    /// the same results of palpate field, if any]
+    #[arg(long = "image", value_name = "FILE")]
+    pub(super) images: Vec<PathBuf>,
     /// Folder for the results
     #[arg(short, long, value_name = "DIR")]
     pub(super) output: PathBuf,
@@ -115,6 +119,16 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
     named.map(PathBuf::from).collect()
 }
 
+/// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field, if it can be read.
+pub(super) fn images(options: &Options, beside: Option<&Path>, grid: &Grid) -> Result<Vec<(String, Volume)>> {
+    let read = |path: &Path| -> Result<Volume> { Ok(on_grid(io::read_volume(path)?, grid)) };
+    if options.images.is_empty() {
+        let found = beside.and_then(|path| read(path).ok());
+        return Ok(found.map(|volume| ("warped".into(), volume)).into_iter().collect());
+    }
+    options.images.iter().map(|path| Ok((name(path), read(path)?))).collect()
+}
+
 /// Says what would be done with a field, or with the first of a sequence, whose forces are given.
 pub(super) fn plan(
     options: &Options,
@@ -137,7 +151,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let given: Vec<&Path> = [Some(source.field.as_path()), Some(body), source.matches.as_deref()]
         .into_iter()
         .flatten()
-        .chain(patches.iter().map(PathBuf::as_path))
+        .chain(patches.iter().chain(&options.images).map(PathBuf::as_path))
         .collect();
     check_distinct(&given, &FILES.map(|f| options.output.join(f)))?;
 
@@ -151,6 +165,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         console.detail(&format!("fewer than {ENOUGH} matches in the body: the field itself is taken"));
         (matches, source.matches) = (None, None);
     }
+    let images = images(options, source.image.as_deref(), field.grid())?;
     if options.dry_run {
         drop(progress);
         return plan(options, params, &source.field, &setting, &[], console);
@@ -171,7 +186,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     };
     write(&mut folder, &mut result)?;
     folder.write("summary.json", |p| io::write_json(p, &report::summary(&result, &names)))?;
-    let page = report::page(&result, &names, Some(&field))?;
+    let page = report::page(&result, &names, &report::Shown { field: Some(&field), images: &images })?;
     folder.write("report.html", |p| io::write_text(p, &page))?;
     folder.commit()?;
     drop(progress);
@@ -192,6 +207,8 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
 struct Source {
     field: PathBuf,
     matches: Option<PathBuf>,
+    /// The deformed volume drawn back to where the initial one lies.
+    image: Option<PathBuf>,
 }
 
 impl Source {
@@ -200,17 +217,15 @@ impl Source {
     fn of(given: &Path, matches: Option<&Path>) -> Self {
         let folder = given.is_dir();
         let field = if folder { given.join("displacement.nii.gz") } else { given.to_path_buf() };
-        let beside = || {
-            let ours = folder || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
-            let [found, summary] = ["matches.csv", "summary.json"].map(|f| field.with_file_name(f));
-            (ours && found.is_file() && summary.is_file()).then_some(found)
-        };
+        let ours = folder || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
+        let ours = ours && field.with_file_name("summary.json").is_file();
+        let beside = |file: &str| Some(field.with_file_name(file)).filter(|f| ours && f.is_file());
         let matches = match matches {
             Some(path) if path.as_os_str() == "none" => None,
             Some(path) => Some(path.to_path_buf()),
-            None => beside(),
+            None => beside("matches.csv"),
         };
-        Self { field, matches }
+        Self { image: beside("warped.nii.gz"), matches, field }
     }
 }
 

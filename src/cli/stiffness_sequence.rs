@@ -3,7 +3,7 @@
 use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
-use super::stiffness::{FILES, Options, Setting, patch_files, plan, write};
+use super::stiffness::{FILES, Options, Setting, images, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
@@ -19,8 +19,8 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let frames = frames(options, from, reference)?;
     let trajectories = from.join("trajectories.csv");
     let patches = patch_files(options);
-    let given: Vec<&Path> =
-        frames.iter().map(|f| f.1.as_path()).chain([body]).chain(patches.iter().map(PathBuf::as_path)).collect();
+    let others = patches.iter().chain(&options.images).map(PathBuf::as_path);
+    let given: Vec<&Path> = frames.iter().map(|f| f.1.as_path()).chain([body]).chain(others).collect();
     let files: Vec<PathBuf> = FILES.iter().chain(&["frames.csv"]).map(|f| options.output.join(f)).collect();
     check_distinct(&given, &files)?;
 
@@ -28,6 +28,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     progress.set("read", 0.0);
     let grid = *io::read_field(&frames[0].1)?.grid();
     let setting = Setting::read(options, body, &grid, &frames[0].1)?;
+    let images = images(options, None, &grid)?;
     if options.dry_run {
         drop(progress);
         let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
@@ -77,7 +78,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let mut summary = report::summary(&shared.result, &names);
     summary["sequence"] = report::sequence_summary(&shared);
     folder.write("summary.json", |p| io::write_json(p, &summary))?;
-    let page = report::sequence_page(&shared, &names)?;
+    let page = report::sequence_page(&shared, &names, &report::Shown { field: None, images: &images })?;
     folder.write("report.html", |p| io::write_text(p, &page))?;
     folder.commit()?;
     drop(progress);

@@ -4,7 +4,7 @@ use super::Usage;
 use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
-use super::inputs::{check_distinct, name, read_mask, read_volume, usable, warn_all, warn_of_two_places};
+use super::inputs::{check_distinct, name, on_grid, read_mask, read_volume, usable, warn_all, warn_of_two_places};
 use super::limits::field_fits;
 use super::outputs::Target;
 use anyhow::{Result, bail};
@@ -164,7 +164,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
         let mean = result.summary.mean_mm;
         if look.as_ref().is_none_or(|l| mean > WORTH_A_LOOK * l.1) {
-            let there = on_grid(volume, &grid);
+            let there = on_grid(volume.view(), &grid);
             let warped = warp_image(volume, field, None, Interpolation::Linear, 0.0);
             let found = (field, &result.matches, &result.mesh);
             let stretch = |o: usize| strain.principal(o)[0] as f32;
@@ -241,15 +241,7 @@ fn add_to(
     strain: &(dyn Fn(usize) -> f32 + Sync),
 ) -> Result<()> {
     let grid: &Grid = field.grid();
-    let image = on_grid(volume, grid);
+    let image = on_grid(volume.view(), grid);
     let values = image.as_slice();
     Ok(film.add(number, &|o| values[o], field, strain)?)
-}
-
-/// The volume as it is, or resampled where it lies on another grid.
-fn on_grid<'a>(volume: &'a Voxels<'_>, grid: &Grid) -> Voxels<'a> {
-    match volume.grid() == grid {
-        true => volume.view(),
-        false => warp_image(volume, &DenseField::zeros(*grid), None, Interpolation::Linear, 0.0),
-    }
 }

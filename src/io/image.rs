@@ -7,7 +7,7 @@ use super::flaw::Flaw;
 use super::raw::RawImage;
 use super::{metaimage, nifti, nrrd, os};
 use crate::error::IoError;
-use crate::types::{Grid, Mask, Volume};
+use crate::types::{Grid, Mask, Volume, Voxels};
 use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
@@ -149,14 +149,14 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
 /// # Errors
 /// As [`read_volume`]; also when a value is anything else.
 pub fn read_labels(path: impl AsRef<Path>) -> Result<Mask, IoError> {
-    labels_of(read_volume(path.as_ref())?, path.as_ref())
+    labels_of(&read_volume(path.as_ref())?, path.as_ref())
 }
 
 /// `volume`, called `path` in errors, as a label map.
 ///
 /// # Errors
 /// [`IoError`] when a value is no whole number from 0 to 255.
-pub fn labels_of(volume: Volume, path: &Path) -> Result<Mask, IoError> {
+pub fn labels_of(volume: &Voxels<'_>, path: &Path) -> Result<Mask, IoError> {
     let grid = *volume.grid();
     let odd = volume.as_slice().iter().position(|&v| !(0.0..=255.0).contains(&v) || v.fract() != 0.0);
     if let Some(at) = odd {
@@ -165,7 +165,7 @@ pub fn labels_of(volume: Volume, path: &Path) -> Result<Mask, IoError> {
         let what = format!("voxel ({i}, {j}, {k}) is {v}, but labels are whole numbers from 0 to 255");
         return Err(Flaw::new(what, "give a mask or label map, resampled with nearest neighbour").at(path));
     }
-    let labels = volume.into_vec().into_iter().map(|v| v as u8).collect();
+    let labels = volume.as_slice().iter().map(|&v| v as u8).collect();
     Mask::from_vec(grid, labels).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
 }
 

@@ -2,7 +2,7 @@
 
 use crate::error::{FieldError, SpaceError};
 use crate::matching::pair::{Pair, Spans};
-use crate::numerics::sampling::{Interpolation, Sampler};
+use crate::numerics::sampling::Sampler;
 use crate::numerics::statistics::{noise_sigma, quantile};
 use crate::numerics::{filters, pyramid};
 use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint, Voxels};
@@ -193,11 +193,11 @@ fn resample(volume: &Voxels<'_>, grid: &Grid, origin: [f64; 3], shape: [usize; 3
         0.425 * ((seen / fine[a]).powi(2) - 1.0).max(0.0).sqrt()
     });
     let smooth = if sigma.iter().all(|&s| s < 0.2) {
-        volume.clone()
+        volume.clone().into_volume()
     } else {
         Volume::from_vec(*volume.grid(), filters::gaussian(volume.as_slice(), volume.grid().shape(), sigma))?
     };
-    let sampler = Sampler::new(&smooth, Interpolation::Cubic, 0.0);
+    let sampler = Sampler::owning(smooth, 0.0);
     let limit: [f64; 3] = volume.grid().shape().map(|n| (n - 1) as f64);
     let mut out = vec![0.0f32; target.len()];
     out.par_chunks_mut(shape[0] * shape[1]).enumerate().for_each(|(k, plane)| {

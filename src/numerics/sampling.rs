@@ -13,7 +13,7 @@ use crate::error::UnknownName;
 use crate::numerics::bspline;
 use crate::numerics::cubic::{self, LANES, Places};
 use crate::types::names::choose;
-use crate::types::{Displacement, VoxelPoint, Voxels, WorldPoint};
+use crate::types::{Displacement, Volume, VoxelPoint, Voxels, WorldPoint};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -123,7 +123,7 @@ pub struct Sampler<'a> {
 
 impl Sampler<'static> {
     /// Cubic, from a volume that is not needed any more: it is filtered in place.
-    pub fn owning(volume: Voxels<'_>, background: f32) -> Self {
+    pub fn owning(volume: Volume, background: f32) -> Self {
         let shape = volume.grid().shape();
         let values = bspline_coefficients(volume.into_vec(), shape).into();
         Self { shape, values, interpolation: Interpolation::Cubic, background }
@@ -134,7 +134,7 @@ impl<'a> Sampler<'a> {
     /// Prepares `volume`; `background` is the value outside. Cubic filters a copy of the volume, the others borrow it.
     pub fn new(volume: &'a Voxels<'a>, interpolation: Interpolation, background: f32) -> Self {
         if interpolation == Interpolation::Cubic {
-            return Sampler::owning(volume.clone(), background);
+            return Sampler::owning(volume.clone().into_volume(), background);
         }
         let values = Cow::Borrowed(volume.as_slice());
         Self { shape: volume.grid().shape(), values, interpolation, background }

@@ -3,7 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::quantile;
-use crate::types::{Mask, Voxels};
+use crate::types::{Mask, Volume, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
@@ -96,9 +96,10 @@ impl Range {
 const AROUND: usize = 13;
 
 /// With numbers in single voxels that have none, from the finite ones around them.
-fn filled<'a>(volume: &'a Voxels<'_>) -> Voxels<'a> {
+fn filled(volume: &Voxels<'_>) -> Volume {
     let values = volume.as_slice();
-    let (grid, mut out) = (*volume.grid(), volume.view());
+    let (grid, mut out) = (*volume.grid(), volume.clone().into_volume());
+    let new = out.as_mut_slice();
     let shape = grid.shape();
     // In one slice there are 8 around a voxel, not 26.
     let least = if shape.contains(&1) { AROUND / 3 } else { AROUND };
@@ -111,7 +112,7 @@ fn filled<'a>(volume: &'a Voxels<'_>) -> Voxels<'a> {
                 (sum, count) = (sum + f64::from(x), count + 1);
             }
         }
-        out.as_mut_slice()[at] = if count >= least { (sum / count as f64) as f32 } else { f32::NAN };
+        new[at] = if count >= least { (sum / count as f64) as f32 } else { f32::NAN };
     }
     out
 }

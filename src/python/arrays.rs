@@ -1,14 +1,14 @@
 //! Arrays in and out, errors, progress and threads.
 
-use crate::error::FieldError;
+use crate::error::{FieldError, IoError};
 use crate::io;
 use crate::python::PalpateError;
 use crate::types::{
     Affine, DenseField, Displacement, Grid, Mask, Match, Mesh, SparseField, Volume, Voxels, WorldPoint,
 };
-use ndarray::{Array2, Array3, Array4, ShapeBuilder};
+use ndarray::{Array2, Array3, Array4, Dimension, ShapeBuilder};
 use numpy::{
-    IntoPyArray, PyArray2, PyArray3, PyArray4, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
+    IntoPyArray, PyArray2, PyArray3, PyArray4, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
     PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
@@ -20,6 +20,8 @@ use std::sync::Mutex;
 pub type Rows = [[f64; 4]; 3];
 /// A scalar volume and its affine.
 pub type Image<'py> = (PyReadonlyArray3<'py, f32>, Rows);
+/// Volumes, their affine, and the time between them (s).
+pub type Series<'py> = (Vec<Bound<'py, PyArray3<f32>>>, Rows, Option<f64>);
 /// A callable of a stage's name and the part that is done (0 to 1).
 pub type Callback = Option<Py<PyAny>>;
 
@@ -35,24 +37,21 @@ pub fn grid(shape: &[usize], rows: Rows) -> PyResult<Grid> {
 }
 
 /// The values of an array in Fortran order, x fastest, where they lie.
-macro_rules! values {
-    ($array:expr) => {{
-        let array = $array;
-        if !array.is_fortran_contiguous() {
-            return Err(told("an array must lie in Fortran order"));
-        }
-        array.as_slice().map_err(told)?
-    }};
+fn values<'a, D: Dimension>(array: &'a PyReadonlyArray<'_, f32, D>) -> PyResult<&'a [f32]> {
+    if !array.is_fortran_contiguous() {
+        return Err(told("an array must lie in Fortran order"));
+    }
+    array.as_slice().map_err(told)
 }
 
 /// A volume on the memory of its array.
 pub fn volume<'a>((array, rows): &'a Image<'_>) -> PyResult<Voxels<'a>> {
-    Voxels::lent(grid(array.shape(), *rows)?, values!(array)).map_err(told)
+    Voxels::lent(grid(array.shape(), *rows)?, values(array)?).map_err(told)
 }
 
 /// A label map or mask, called `name`.
 pub fn labels(image: &Image<'_>, name: &str) -> PyResult<Mask> {
-    io::labels_of(volume(image)?.into_volume(), Path::new(name)).map_err(told)
+    io::labels_of(&volume(image)?, Path::new(name)).map_err(told)
 }
 
 /// The same if it is there, on the grid of `reference`, which is called `of`.
@@ -75,7 +74,7 @@ pub fn displacement<'a>(array: &'a PyReadonlyArray4<'_, f32>, rows: Rows) -> PyR
     if array.shape()[3] != 3 {
         return Err(told("a displacement has three components, on the last axis"));
     }
-    Displacement::lent(grid(array.shape(), rows)?, values!(array)).map_err(told)
+    Displacement::lent(grid(array.shape(), rows)?, values(array)?).map_err(told)
 }
 
 /// Matches from the columns of matches.csv.
@@ -113,11 +112,10 @@ pub fn array3<'py, T: numpy::Element + Clone>(py: Python<'py>, volume: Volume<T>
     Ok(Array3::from_shape_vec((x, y, z).f(), volume.into_vec()).map_err(told)?.into_pyarray(py))
 }
 
-/// A displacement as an (nx, ny, nz, 3) array, mm, RAS.
-pub fn array4<'py>(py: Python<'py>, field: &DenseField) -> PyResult<Bound<'py, PyArray4<f32>>> {
+/// A displacement as an (nx, ny, nz, 3) array, mm, RAS, without a copy.
+pub fn array4(py: Python<'_>, field: DenseField) -> PyResult<Bound<'_, PyArray4<f32>>> {
     let [x, y, z] = field.grid().shape();
-    let values = [0, 1, 2].map(|c| field.component(c)).concat();
-    Ok(Array4::from_shape_vec((x, y, z, 3).f(), values).map_err(told)?.into_pyarray(py))
+    Ok(Array4::from_shape_vec((x, y, z, 3).f(), field.into_vec()).map_err(told)?.into_pyarray(py))
 }
 
 /// Rows of `N` numbers.
@@ -180,4 +178,17 @@ pub fn read_volume<'py>(py: Python<'py>, path: std::path::PathBuf) -> PyResult<(
     let volume = py.detach(|| io::read_volume(&path)).map_err(told)?;
     let rows = volume.grid().affine().rows();
     Ok((array3(py, volume)?, rows))
+}
+
+/// A series of volumes, their affine, and the time between them (s) where the file gives it.
+#[pyfunction]
+pub fn read_series(py: Python<'_>, path: std::path::PathBuf) -> PyResult<Series<'_>> {
+    let read = || -> Result<_, IoError> {
+        let mut file = io::Series::open(&path)?;
+        let frames = (0..file.frames()).map(|t| file.read(t)).collect::<Result<Vec<_>, _>>()?;
+        Ok((frames, file.grid().affine().rows(), file.step_s()))
+    };
+    let (frames, rows, step_s) = py.detach(read).map_err(told)?;
+    let frames = frames.into_iter().map(|v| array3(py, v)).collect::<PyResult<Vec<_>>>()?;
+    Ok((frames, rows, step_s))
 }

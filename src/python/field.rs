@@ -5,7 +5,7 @@ use crate::error::FieldError;
 use crate::field::jacobian::jacobian_determinant;
 use crate::field::warp::warp_sampled;
 use crate::io;
-use crate::numerics::sampling::Sampler;
+use crate::numerics::sampling::{Interpolation, Sampler};
 use crate::pipeline;
 use crate::report::{FieldReport, json};
 use crate::types::params::Preset;
@@ -60,7 +60,8 @@ pub fn field<'py>(
     let measured = arrays::run(py, progress, threads, |tell| {
         let result = pipeline::field::run(&fixed, &moving, mask.as_ref(), &params, tell)?;
         let deformed_grid = *moving.grid();
-        let warped = warp_sampled(&Sampler::owning(moving, 0.0), &deformed_grid, &result.displacement);
+        let warped =
+            warp_sampled(&Sampler::new(&moving, Interpolation::Cubic, 0.0), &deformed_grid, &result.displacement);
         let jacobian = jacobian_determinant(&result.displacement);
         let uncertainty = result.uncertainty.volume();
         let unseen = |_: usize| 0.0;
@@ -93,7 +94,7 @@ pub fn field<'py>(
     let out = PyDict::new(py);
     out.set_item("affine", arrays::stored_rows(result.displacement.grid()))?;
     let (nodes, elements) = arrays::mesh(py, &result.mesh);
-    out.set_item("displacement", arrays::array4(py, &kept_field(result.displacement))?)?;
+    out.set_item("displacement", arrays::array4(py, kept_field(result.displacement))?)?;
     out.set_item("warped", arrays::array3(py, warped)?)?;
     out.set_item("jacobian", arrays::array3(py, jacobian)?)?;
     out.set_item("uncertainty", arrays::array3(py, uncertainty)?)?;

@@ -1,8 +1,9 @@
 //! The Python module `palpate._palpate` (feature `python`): the pipelines on arrays.
 //!
 //! What a user imports is the package in `src/python/palpate`, which turns images into arrays and results into objects. Arrays
-//! come in Fortran order (x fastest) and are read while the interpreter is held; all work is done without it. Numbers are
-//! rounded as the files of the command line keep them, so that both give the same bits.
+//! come in Fortran order (x fastest). Volumes and displacements are worked on where they lie and without the interpreter, so the caller
+//! leaves them alone meanwhile; masks, label maps and matches are taken over first. Numbers are rounded as the files of the
+//! command line keep them, so that both give the same bits.
 
 mod arrays;
 
@@ -42,6 +43,7 @@ fn _palpate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("DEFAULTS", defaults(module.py())?)?;
     module.add("PalpateError", module.py().get_type::<PalpateError>())?;
     module.add_function(wrap_pyfunction!(arrays::read_volume, module)?)?;
+    module.add_function(wrap_pyfunction!(arrays::read_series, module)?)?;
     module.add_function(wrap_pyfunction!(field::field, module)?)?;
     module.add_function(wrap_pyfunction!(stiffness::stiffness, module)?)?;
     module.add_function(wrap_pyfunction!(pad::fingertip, module)?)?;

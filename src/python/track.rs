@@ -14,7 +14,7 @@ use std::time::Instant;
 
 /// The displacement from one volume of a sequence to each other, with strain and trajectories.
 #[pyfunction]
-#[pyo3(signature = (volumes, reference, mask, labels, params, names, regions, progress=None, threads=None))]
+#[pyo3(signature = (volumes, reference, mask, labels, params, names, regions, step_s=None, progress=None, threads=None))]
 pub fn track<'py>(
     py: Python<'py>,
     volumes: Vec<Image<'py>>,
@@ -24,14 +24,15 @@ pub fn track<'py>(
     params: &str,
     names: Vec<String>,
     regions: [String; 2],
+    step_s: Option<f64>,
     progress: Callback,
     threads: Option<usize>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = self::params(params)?;
     let frames = volumes.len();
     if frames < 2 {
-        let name = names.first().map_or("volumes", String::as_str);
-        return Err(told(format!("{name}: is one volume; give two or more, or a 4-D file")));
+        let what = names.first().map_or("no volume is given".into(), |name| format!("{name}: is one volume"));
+        return Err(told(format!("{what}; give two or more, or a 4-D file")));
     }
     if reference >= frames {
         return Err(told(format!("reference is {reference}, but there are {frames} volumes (counted from 0)")));
@@ -45,7 +46,7 @@ pub fn track<'py>(
     let mut fields: Vec<Option<DenseField>> = vec![None; frames];
     fields[reference] = Some(DenseField::zeros(grid));
     let tracked = arrays::run(py, progress, threads, |tell| {
-        let read = |number: usize| Ok::<_, FieldError>(all[number].clone());
+        let read = |number: usize| Ok::<_, FieldError>(all[number].view());
         let keep = |frame: Frame<'_>| {
             fields[frame.number] = Some(kept_field(frame.result.displacement.clone()));
             Ok(())
@@ -55,7 +56,7 @@ pub fn track<'py>(
     let tracked = tracked.map_err(told)?;
     let out = PyDict::new(py);
     let list = PyList::empty(py);
-    for field in &fields {
+    for field in fields {
         match field {
             Some(field) => list.append(arrays::array4(py, field)?)?,
             None => list.append(py.None())?,
@@ -78,7 +79,7 @@ pub fn track<'py>(
     let report = TrackReport {
         names: &names,
         reference,
-        step_s: None,
+        step_s,
         grid: &grid,
         regions: regions.each_ref().map(String::as_str),
         params: &params,

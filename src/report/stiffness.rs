@@ -4,7 +4,7 @@ use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
 use crate::report::html::{card, document, escape};
-use crate::report::panels::{Panel, length};
+use crate::report::panels::{Panel, gray_range, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
 use crate::report::section::Section;
@@ -155,8 +155,17 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
     })
 }
 
-/// Maps, displacement and mesh in a viewer, with the scales of the pictures.
-fn look(result: &StiffnessResult, inside: &Mask, field: Option<&DenseField>, panels: [&Panel; 3]) -> String {
+/// What the page shows beside its maps, all on their grid.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Shown<'a> {
+    /// The displacement that the moduli came from.
+    pub field: Option<&'a DenseField>,
+    /// Volumes with what they are called, the first behind the maps.
+    pub images: &'a [(String, Volume)],
+}
+
+/// Maps, displacement and mesh over the images in a viewer, with the scales of the pictures.
+fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, panels: [&Panel; 3]) -> String {
     let [map, sd, rest] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
     let (map, sd, rest): (Values<'_>, Values<'_>, Values<'_>) = (&|o| map[o], &|o| sd[o], &|o| rest[o]);
     let names = ["Young's modulus", "Standard deviation", "Residual"];
@@ -165,8 +174,18 @@ fn look(result: &StiffnessResult, inside: &Mask, field: Option<&DenseField>, pan
         .filter_map(|((name, values), panel)| Some(Layer { name, values, scale: panel.scale.clone()? }))
         .collect();
     let body = |o: usize| f32::from(inside.as_slice()[o]);
-    let gray = Scale { low: 0.0, high: 2.0, unit: "", map: ColorMap::Gray };
-    let displacement = field.map(|field| {
+    let gray = |[low, high]: [f64; 2]| Scale { low, high, unit: "", map: ColorMap::Gray };
+    let volumes: Vec<_> = shown.images.iter().map(|(_, v)| |o: usize| v.as_slice()[o]).collect();
+    let mut images: Vec<Layer<'_>> = shown
+        .images
+        .iter()
+        .zip(&volumes)
+        .map(|((name, v), values)| Layer { name, values, scale: gray(gray_range(v)) })
+        .collect();
+    if images.is_empty() {
+        images.push(Layer { name: "body", values: &body, scale: gray([0.0, 2.0]) });
+    }
+    let displacement = shown.field.map(|field| {
         let lengths = (0..field.grid().len()).step_by(7).filter(|&o| inside.as_slice()[o] > 0);
         let most = quantile(lengths.map(|o| f64::from(length(field, o))), 0.998);
         (field, Scale::from_zero(most, "mm", ColorMap::Viridis))
@@ -176,7 +195,7 @@ fn look(result: &StiffnessResult, inside: &Mask, field: Option<&DenseField>, pan
         grid: result.map.grid(),
         centre: centre(&result.map),
         mask: Some(inside),
-        images: &[Layer { name: "body", values: &body, scale: gray }],
+        images: &images,
         overlays: &overlays,
         shown: Some(0),
         displacement,
@@ -186,34 +205,34 @@ fn look(result: &StiffnessResult, inside: &Mask, field: Option<&DenseField>, pan
     viewer.html()
 }
 
-/// The page; its viewer also shows the displacement the moduli came from (on the map's grid), where that is given.
+/// The page.
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn page(result: &StiffnessResult, inputs: &InputNames, field: Option<&DenseField>) -> Result<String, ReportError> {
-    page_with(result, inputs, field, "")
+pub fn page(result: &StiffnessResult, inputs: &InputNames, shown: &Shown<'_>) -> Result<String, ReportError> {
+    page_with(result, inputs, shown, "")
 }
 
 /// The page of a map that the frames of a sequence share.
 ///
 /// # Errors
 /// As [`page`].
-pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames) -> Result<String, ReportError> {
-    page_with(&shared.result, inputs, None, &sequence_section(shared))
+pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames, shown: &Shown<'_>) -> Result<String, ReportError> {
+    page_with(&shared.result, inputs, shown, &sequence_section(shared))
 }
 
 fn page_with(
     result: &StiffnessResult,
     inputs: &InputNames,
-    field: Option<&DenseField>,
+    shown: &Shown<'_>,
     extra: &str,
 ) -> Result<String, ReportError> {
     let grid = *result.map.grid();
     let inside = Mask::from_vec(grid, result.map.as_slice().iter().map(|&v| u8::from(v > 0.0)).collect());
     let Ok(inside) = inside else { return Ok(String::new()) };
     let sections = Section::through(&grid, centre(&result.map));
-    let base = Volume::filled(grid, 0.0f32);
-    let base = (&base, [0.0, 1.0]);
+    let black = Volume::filled(grid, 0.0f32);
+    let base = shown.images.first().map_or((&black, [0.0, 1.0]), |(_, v)| (v, gray_range(v)));
     let unit = if result.absolute { "kPa" } else { "" };
     let body: Vec<usize> = (0..grid.len()).filter(|&o| inside.as_slice()[o] > 0).collect();
     let spread =
@@ -235,7 +254,7 @@ fn page_with(
         "Standard deviation",
         &result.map_sd,
         Scale::from_zero(top(&result.map_sd, 1.0), unit, ColorMap::Magma),
-        "From the residuals, counted by blocks of the body, and the change with the mesh. Black: not identifiable.",
+        "From the residuals, counted by blocks of the body, and the change with the mesh. Without colour: not identifiable.",
     )?;
     // Matches leave most voxels without one.
     let residuals = body.iter().map(|&o| f64::from(result.residual.as_slice()[o]));
@@ -273,7 +292,7 @@ fn page_with(
         region_table(result)
     );
     out.push_str(extra);
-    let viewer = look(result, &inside, field, [&map, &sd, &rest]);
+    let viewer = look(result, &inside, shown, [&map, &sd, &rest]);
     let _ = write!(out, "<section><h2>Look</h2><article class=\"wide\">{viewer}</article></section>");
     let _ = write!(
         out,

@@ -225,13 +225,15 @@
     say();
   };
 
+  // Past the end of a scale the value is not known here.
+  const known = (layer, byte) => (byte > 254.5 ? "at least " : "") + short(real(layer, byte));
   const short = (v) => (Math.abs(v) >= 100 ? v.toFixed(0) : v.toFixed(2));
   const say = () => {
     const world = data.affine.map((row) => row[0] * cross[0] + row[1] * cross[1] + row[2] * cross[2] + row[3]);
     const parts = [`x ${world[0].toFixed(1)}, y ${world[1].toFixed(1)}, z ${world[2].toFixed(1)} mm`];
     images.forEach((i) => parts.push(`${i.name} ${short(real(i, sample(i, i.values, cross)))}`));
     if (field) parts.push(`motion ${short(Math.hypot(...motion(cross)))} mm`);
-    overlays.filter((o) => !o.vector).forEach((o) => parts.push(`${o.name.toLowerCase()} ${short(real(o, sample(o, o.values, cross)))} ${o.unit}`.trim()));
+    overlays.filter((o) => !o.vector).forEach((o) => parts.push(`${o.name.toLowerCase()} ${known(o, sample(o, o.values, cross))} ${o.unit}`.trim()));
     readout.textContent = parts.join(" · ");
     const overlay = chosen("colour", overlays);
     $("factor").nextElementSibling.textContent = `${factors[+$("factor").value]}×`;

@@ -115,10 +115,9 @@ impl<'a> Thinned<'a> {
     }
 }
 
-/// `value` in 8 bits of the scale; what is not finite is at its low end.
+/// `value` in 8 bits of the scale; what is infinite is at its end, what is no number at its low end.
 fn byte(scale: &Scale, value: f32) -> u8 {
-    let t = scale.position(f64::from(value));
-    if t.is_finite() { (255.0 * t.clamp(0.0, 1.0)).round() as u8 } else { 0 }
+    (255.0 * scale.position(f64::from(value)).clamp(0.0, 1.0)).round() as u8
 }
 
 fn with(mut lattice: Value, more: Value) -> Value {
@@ -359,6 +358,13 @@ mod tests {
             affine.iter().map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3]).collect()
         };
         assert_eq!(world([10.5, 1.0, 4.5]), [9.0, 0.0, 4.0]);
+    }
+
+    #[test]
+    fn what_is_infinite_lies_at_the_end_of_the_scale_not_at_zero() {
+        let scale = Scale { low: 10.0, high: 20.0, unit: "kPa", map: ColorMap::Magma };
+        let bytes = [9.0, 10.0, 15.0, 20.0, f32::INFINITY, f32::NAN].map(|v| byte(&scale, v));
+        assert_eq!(bytes, [0, 0, 128, 255, 255, 0]);
     }
 
     #[test]

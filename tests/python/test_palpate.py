@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -144,11 +145,27 @@ def test_track_equals_the_command_line(shell):
     found = palpate.track([nibabel.load(f) for f in frames], mask=mask, labels=labels)
     for t in range(3):
         same(lps(found.displacement[t]), volume(shell.folder / f"tracked/displacement_{t:03}.nii.gz")[:, :, :, 0, :])
+    # The same as one series, and in images with an axis too many.
     loaded = [nibabel.load(f) for f in frames]
-    series = np.stack([np.asarray(f.dataobj) for f in loaded], axis=-1)
-    for given in ((series, loaded[0].affine), nibabel.Nifti1Image(series, loaded[0].affine)):
+    series = nibabel.Nifti1Image(np.stack([np.asarray(f.dataobj) for f in loaded], axis=-1), loaded[0].affine)
+    series.header.set_xyzt_units("mm", "msec")
+    series.header.set_zooms((*series.header.get_zooms()[:3], 40))
+    nibabel.save(series, shell.folder / "series.nii.gz")
+    shell("track", "series.nii.gz", "--mask", mask, "--labels", labels, "-o", "series")
+    one = [nibabel.Nifti1Image(np.asarray(f.dataobj)[..., None], f.affine) for f in loaded]
+    path = shell.folder / "series.nii.gz"
+    for given in (path, nibabel.load(path), (series.dataobj, series.affine), one):
         again = palpate.track(given, mask=mask, labels=labels)
-        [same(a, b) for a, b in zip(again.displacement, found.displacement)]
+        assert len(again.displacement) == 3
+        for t in range(3):
+            same(again.displacement[t], found.displacement[t])
+        if given is path:
+            told = shell.summary("series")
+            assert told["step_s"] == 0.04
+            for key in ("inputs", "step_s", "params"):
+                assert again.summary[key] == told[key], key
+    two = palpate.track(one[:2])
+    assert two.displacement[1].shape == loaded[0].shape + (3,)
     rows = list(csv.DictReader(open(shell.folder / "tracked/strain.csv")))
     assert [f"{r['volume_change']:.6f}" for r in found.strain] == [r["volume_change"] for r in rows]
     told = shell.summary("tracked")
@@ -233,17 +250,24 @@ def test_errors_of_the_other_parts_are_those_of_the_command_line_too(shell, pair
         assert str(caught.value) in said.replace(str(displacement), "displacement"), said
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc to know the peak of memory")
 def test_arrays_are_worked_on_where_they_lie():
-    """Two volumes of 400 MB, of which no voxel is ever written, take no memory unless they are copied."""
+    """Volumes and a displacement of hundreds of MB, of which no voxel is ever written, take no memory unless they are copied."""
     script = (
-        "import numpy as np, palpate, resource\n"
+        "import numpy as np, palpate\n"
         "before, after = (np.zeros((512, 512, 400), np.float32, order='F') for _ in range(2))\n"
-        "start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "peak = lambda: int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])\n"
+        "start = peak()\n"
         "try:\n"
         "    palpate.field((before, np.eye(4)), (after, np.eye(4)))\n"
         "except palpate.PalpateError as error:\n"
         "    assert 'constant' in str(error)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start)\n"
+        "try:\n"
+        "    field = np.zeros((512, 512, 100, 3), np.float32, order='F')\n"
+        "    palpate.stiffness((field, np.eye(4)), labels=(np.ones((2, 2, 2)), np.eye(4)))\n"
+        "except palpate.PalpateError as error:\n"
+        "    assert 'grid' in str(error)\n"
+        "print(peak() - start)\n"
     )
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     assert int(said) < 100_000, f"{int(said) / 1000:.0f} MB"

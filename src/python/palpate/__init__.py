@@ -4,8 +4,8 @@ A volume is given as ``(array, affine)``, as an image of nibabel (anything with 
 ``get_fdata()``), or as the path of a file. Arrays have shape (nx, ny, nz); affines are 4 x 4, voxels to world mm (RAS).
 
 Results are rounded as the files of the command line are, so that both give the same bits. Work is done without holding
-the interpreter. A volume or displacement in float32 and Fortran order is worked on where it lies, so leave it as it is until
-the work is done; anything else is converted first. Results are handed over without a copy.
+the interpreter. A volume or displacement in float32 and Fortran order is not copied on the way in: leave it, and the file it may
+be mapped from, as it is until the work is done. Anything else is converted first. Results are handed over without a copy.
 """
 
 from __future__ import annotations
@@ -57,7 +57,12 @@ def _fortran(array: Any, axes: int, what: str) -> np.ndarray:
     if array.dtype.kind not in "biuf":
         raise PalpateError(f"{what}: has values of type {array.dtype}, but numbers are needed")
     with np.errstate(over="ignore"):
-        return np.asfortranarray(array, dtype=np.float32)
+        return np.require(array, np.float32, ["F", "A"])
+
+
+def _data(image: Any) -> Any:
+    """What an image of nibabel holds, on the disk as long as it can be."""
+    return image.dataobj if hasattr(image, "dataobj") else image.get_fdata()
 
 
 def _image(given: Image, what: str) -> Tuple[np.ndarray, List[List[float]]]:
@@ -65,8 +70,7 @@ def _image(given: Image, what: str) -> Tuple[np.ndarray, List[List[float]]]:
     if isinstance(given, (str, _os.PathLike)):
         return _palpate.read_volume(given)
     if hasattr(given, "affine"):
-        data = given.dataobj if hasattr(given, "dataobj") else given.get_fdata()
-        return _fortran(data, 3, what), _rows(given.affine)
+        return _fortran(_data(given), 3, what), _rows(given.affine)
     if isinstance(given, (tuple, list)) and len(given) == 2:
         return _fortran(given[0], 3, what), _rows(given[1])
     raise PalpateError(f"{what}: is no volume; give a path, (array, affine), or an image of nibabel")
@@ -315,15 +319,22 @@ def grasp(
     return Grasp(_palpate.grasp(scene, model, formulation, step, progress, threads))
 
 
-def _frames(volumes: Any) -> Sequence[Image]:
-    """The volumes of a list, or of one (array, affine) or image with time on the last axis."""
-    given = volumes
-    if hasattr(given, "affine"):
-        given = (given.dataobj if hasattr(given, "dataobj") else given.get_fdata(), given.affine)
-    if not (isinstance(given, (tuple, list)) and len(given) == 2 and getattr(given[0], "ndim", 0) == 4):
-        return [volumes] if hasattr(volumes, "affine") or isinstance(volumes, (str, _os.PathLike)) else volumes
-    array = np.asarray(given[0])
-    return [(array[..., t], given[1]) for t in range(array.shape[3])]
+def _frames(volumes: Any) -> Tuple[List[Image], List[str], Optional[float]]:
+    """The volumes, what they are called, and the time between them (s) where the file of a series says so."""
+    pair = isinstance(volumes, (tuple, list)) and len(volumes) == 2 and hasattr(volumes[0], "dtype")
+    path = isinstance(volumes, (str, _os.PathLike))
+    if not pair and not path and not hasattr(volumes, "affine"):
+        given = list(volumes)
+        return given, [_called(v, f"volume {t}") for t, v in enumerate(given)], None
+    called, step = _called(volumes, "volumes"), None
+    if path:
+        frames, affine, step = _palpate.read_series(volumes)
+    else:
+        data, affine = volumes if pair else (_data(volumes), volumes.affine)
+        array = np.asarray(data)
+        frames = [array[..., t] for t in range(array.shape[3])] if array.ndim == 4 else [array]
+    names = [f"{called}[{t}]" for t in range(len(frames))] if len(frames) > 1 else [called]
+    return [(frame, affine) for frame in frames], names, step
 
 
 def track(
@@ -340,14 +351,15 @@ def track(
     progress: Progress = None,
     threads: Optional[int] = None,
 ) -> Track:
-    """The displacement from one of ``volumes`` to each other, in the order in which they were taken.
+    """The displacement from number ``reference`` of ``volumes``, counted from 0, to each other, in the order in which they were
+    taken, in mm (RAS).
 
-    ``volumes`` is a list, or one image or ``(array, affine)`` of shape (nx, ny, nz, frames).
+    ``volumes`` is a list, or one image, path or ``(array, affine)`` with the frames on its fourth axis. ``mask`` and ``labels`` lie
+    on the reference's grid. Raises `PalpateError` with the message of the command line.
     """
-    volumes = _frames(volumes)
-    images = [_image(v, f"volume {i}") for i, v in enumerate(volumes)]
+    given, names, step = _frames(volumes)
+    images = [_image(v, name) for v, name in zip(given, names)]
     asked = _params(preset, points, search, seed, params)
-    names = [_called(v, f"volume {i}") for i, v in enumerate(volumes)]
     regions = ["" if given is None else _called(given, what) for given, what in ((mask, "mask"), (labels, "labels"))]
     parts = _palpate.track(
         images,
@@ -357,6 +369,7 @@ def track(
         asked,
         names,
         regions,
+        step,
         progress,
         threads,
     )

@@ -18,6 +18,7 @@ class PalpateError(ValueError):
     """What the command line would say after ``error:``."""
 
 def read_volume(path: Union[str, PathLike[str]]) -> _Image: ...
+def read_series(path: Union[str, PathLike[str]]) -> Tuple[List[NDArray[np.float32]], _Rows, Optional[float]]: ...
 def field(
     initial: _Image,
     deformed: _Image,
@@ -67,6 +68,7 @@ def track(
     params: str,
     names: Sequence[str],
     regions: Sequence[str],
+    step_s: Optional[float] = None,
     progress: _Progress = None,
     threads: Optional[int] = None,
 ) -> Dict[str, Any]: ...
