@@ -102,6 +102,9 @@ fn the_report_shows_the_tissue_behind_the_maps() {
     fs::remove_dir_all(at("results")).unwrap();
     refused(folder.path(), &["--image", "measured/warped.nii.gz"], 1, &["measured/warped.nii.gz"]);
     refused(folder.path(), &["--image", "nowhere.nii.gz"], 1, &["nowhere.nii.gz"]);
+    let far = Grid::new([8; 3], Affine::scaled([2.0; 3], [500.0; 3]).unwrap()).unwrap();
+    io::write_volume(at("far.nii.gz"), &Volume::from_voxels(far, |o, _| o as f32), "").unwrap();
+    refused(folder.path(), &["--image", "far.nii.gz"], 1, &["far.nii.gz", "shows nothing where the field lies"]);
 }
 
 #[test]

@@ -4,6 +4,10 @@
 mod fixtures;
 
 use fixtures::{palpate, small_pair, text};
+use palpate::report::colormap::ColorMap;
+use palpate::report::scale::Scale;
+use palpate::report::viewer::{Layer, Viewer};
+use palpate::types::{Affine, Grid};
 use std::path::Path;
 use std::process::Command;
 use tempfile::TempDir;
@@ -42,11 +46,13 @@ fn work(report: &Path) -> Option<String> {
     Some(dom[from + 15..from + dom[from..].find("</pre>").unwrap()].to_string())
 }
 
-fn all_is_well(report: &Path, least: usize) {
-    let Some(said) = work(report) else { return };
+/// All checks pass and are `least` in number; gives what the readout says at first, empty without a browser.
+fn all_is_well(report: &Path, least: usize) -> String {
+    let Some(said) = work(report) else { return String::new() };
     assert!(!said.contains("FAILED"), "{said}");
     let checks = said.lines().filter(|l| l.starts_with("ok: ")).count();
     assert!(checks >= least, "only {checks} checks:\n{said}");
+    said.lines().find_map(|l| l.strip_prefix("reads: ")).unwrap().into()
 }
 
 #[test]
@@ -68,7 +74,8 @@ fn the_stiffness_report_too() {
     let images = ["--image", "block/initial.nii.gz", "--image", "block/deformed.nii.gz"];
     let rest = ["--nodes", "800", "--model", "linear", "--quiet", "-o", "stiffness"];
     palpate(folder.path()).args(stiffness).args(images).args(rest).assert().success();
-    all_is_well(&folder.path().join("stiffness/report.html"), 25);
+    let said = all_is_well(&folder.path().join("stiffness/report.html"), 25);
+    assert!(!said.contains("at least") && !said.contains("unknown"), "{said}");
 }
 
 #[test]
@@ -77,4 +84,42 @@ fn the_report_of_a_sequence_too() {
     let track = ["track", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--quiet", "-o", "tracked"];
     palpate(folder.path()).args(track).assert().success();
     all_is_well(&folder.path().join("tracked/report.html"), 30);
+}
+
+#[test]
+fn what_is_past_a_scale_or_unknown_is_said_and_what_ends_it_is_exact() {
+    let grid = Grid::new([12; 3], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+    let scale = |map| Scale { low: 0.0, high: 2.0, unit: "kPa", map };
+    let stripes = |o: usize| (o % 7) as f32 / 3.0;
+    let ramp = |o: usize| grid.voxel(o)[0] as f32 / 6.0;
+    let overlay = |name, values| Layer { name, values, scale: scale(ColorMap::Viridis) };
+    // Known but for a block around the centre.
+    let hole = |o: usize| if grid.voxel(o).into_iter().all(|i| (3..10).contains(&i)) { f32::INFINITY } else { 1.0 };
+    let overlays = [
+        overlay("ramp", &ramp),
+        overlay("end", &|o| 2.0 - (o % 12 / 11) as f32),
+        overlay("past", &|o| 2.1 - (o % 12 / 11) as f32),
+        overlay("hole", &hole),
+    ];
+    let viewer = Viewer {
+        grid: &grid,
+        centre: grid.world(6, 6, 6),
+        mask: None,
+        images: &[Layer { name: "stripes", values: &stripes, scale: scale(ColorMap::Gray) }],
+        overlays: &overlays,
+        shown: Some(0),
+        displacement: None,
+        matches: None,
+        mesh: None,
+    };
+    let folder = TempDir::new().unwrap();
+    let page = folder.path().join("page.html");
+    std::fs::write(&page, format!("<!doctype html><html><head></head><body>{}</body></html>", viewer.html())).unwrap();
+    let said = all_is_well(&page, 5);
+    if said.is_empty() {
+        return;
+    }
+    for part in ["ramp 1.00 kPa", "end 2.00 kPa", "past at least 2.00 kPa", "hole unknown"] {
+        assert!(said.contains(part), "no {part:?} in {said:?}");
+    }
 }

@@ -77,8 +77,8 @@ pub struct Options {
     /// Regions to try at most without labels, 1 to 8
     #[arg(long, value_name = "N", default_value_t = StiffnessParams::default().regions)]
     regions: usize,
-    /// Volume to show behind the maps in report.html, before the motion; may be given several times [default: warped.nii.gz of
-    /// the same results of palpate field, if any]
+    /// Volume to show behind the maps in report.html; may be given several times [default: warped.nii.gz of the same results of
+    /// palpate field, if any: the deformed volume drawn back to where the initial one lies]
     #[arg(long = "image", value_name = "FILE")]
     pub(super) images: Vec<PathBuf>,
     /// Folder for the results
@@ -119,9 +119,16 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
     named.map(PathBuf::from).collect()
 }
 
-/// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field, if it can be read.
+/// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field; that is left out where it cannot
+/// be shown.
 pub(super) fn images(options: &Options, beside: Option<&Path>, grid: &Grid) -> Result<Vec<(String, Volume)>> {
-    let read = |path: &Path| -> Result<Volume> { Ok(on_grid(io::read_volume(path)?, grid)) };
+    let read = |path: &Path| -> Result<Volume> {
+        let shown = on_grid(io::read_volume(path)?, grid);
+        if !shown.as_slice().iter().any(|v| v.is_finite() && *v != 0.0) {
+            bail!("{}: shows nothing where the field lies; check the file and its affine", path.display());
+        }
+        Ok(shown)
+    };
     if options.images.is_empty() {
         let found = beside.and_then(|path| read(path).ok());
         return Ok(found.map(|volume| ("warped".into(), volume)).into_iter().collect());

@@ -156,7 +156,7 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
 }
 
 /// What the page shows beside its maps, all on their grid.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub struct Shown<'a> {
     /// The displacement that the moduli came from.
     pub field: Option<&'a DenseField>,
@@ -164,10 +164,17 @@ pub struct Shown<'a> {
     pub images: &'a [(String, Volume)],
 }
 
+/// A residual, none where no displacement was taken.
+fn taken(residual: f32) -> f32 {
+    if residual > 0.0 { residual } else { f32::NAN }
+}
+
 /// Maps, displacement and mesh over the images in a viewer, with the scales of the pictures.
 fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, panels: [&Panel; 3]) -> String {
     let [map, sd, rest] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
-    let (map, sd, rest): (Values<'_>, Values<'_>, Values<'_>) = (&|o| map[o], &|o| sd[o], &|o| rest[o]);
+    let within = |o: usize, value: f32| if inside.as_slice()[o] > 0 { value } else { f32::NAN };
+    let (map, sd, rest): (Values<'_>, Values<'_>, Values<'_>) =
+        (&|o| within(o, map[o]), &|o| within(o, sd[o]), &|o| taken(rest[o]));
     let names = ["Young's modulus", "Standard deviation", "Residual"];
     let layers = names.into_iter().zip([map, sd, rest]).zip(panels);
     let overlays: Vec<Layer<'_>> = layers
@@ -237,31 +244,30 @@ fn page_with(
     let body: Vec<usize> = (0..grid.len()).filter(|&o| inside.as_slice()[o] > 0).collect();
     let spread =
         |v: &Volume, q: f64| quantile(body.iter().map(|&o| f64::from(v.as_slice()[o])).filter(|v| v.is_finite()), q);
-    let panel = |title: &str, v: &Volume, scale: Scale, note: &str| {
-        let values = v.as_slice();
-        Panel::coloured(title, &sections, base, Some(&inside), scale, |o| values[o]).map(|p| p.with_note(note))
+    let panel = |title: &str, value: Values<'_>, scale: Scale, note: &str| {
+        Panel::coloured(title, &sections, base, Some(&inside), scale, value).map(|p| p.with_note(note))
     };
+    let [moduli, deviations, residuals] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
     let top = |v: &Volume, q: f64| spread(v, q).max(1e-9);
     let seen = result.regions.iter().filter(|r| r.identifiable).map(|r| r.youngs_modulus).fold(0.0, f64::max);
     let seen = if seen > 0.0 { seen } else { top(&result.map, 1.0) };
     let map = panel(
         "Young's modulus",
-        &result.map,
+        &|o| moduli[o],
         Scale::from_zero(seen, unit, ColorMap::Viridis),
         "One value a region. A region that is not identifiable shows its bound, at the end of the scale if beyond.",
     )?;
     let sd = panel(
         "Standard deviation",
-        &result.map_sd,
+        &|o| deviations[o],
         Scale::from_zero(top(&result.map_sd, 1.0), unit, ColorMap::Magma),
         "From the residuals, counted by blocks of the body, and the change with the mesh. Without colour: not identifiable.",
     )?;
     // Matches leave most voxels without one.
-    let residuals = body.iter().map(|&o| f64::from(result.residual.as_slice()[o]));
-    let largest = quantile(residuals.filter(|v| v.is_finite() && *v > 0.0), 0.995);
+    let largest = quantile(body.iter().map(|&o| f64::from(taken(residuals[o]))).filter(|v| v.is_finite()), 0.995);
     let rest = panel(
         "Residual",
-        &result.residual,
+        &|o| taken(residuals[o]),
         Scale::from_zero(largest.max(1e-9), "mm", ColorMap::Magma),
         "Length of measured less modelled displacement, where one was taken. Structure here means that the model misses \
          something.",

@@ -19,6 +19,8 @@
     return new Response(stream).arrayBuffer();
   };
 
+  // Overlays end at 253; past that is a value beyond the scale, and 255, here no number, one that is not known.
+  const END = 253, unknown = 0 / 0, isUnknown = (value) => value !== value;
   // Offsets along one axis of a layer for places in mm: the two voxels around, and the weight of the second.
   const taps = (layer, axis, mm) => {
     const at = Math.min(Math.max((mm - layer.first[axis]) / layer.step[axis], 0), layer.shape[axis] - 1);
@@ -26,10 +28,10 @@
     return [low, high, at - low];
   };
   const stride = (layer) => [1, layer.shape[0], layer.shape[0] * layer.shape[1]];
-  // The value of one component of a layer at a place (mm), linear between voxels.
+  // The value of one component of a layer at a place (mm), linear between voxels; none where most of them are not known.
   const sample = (layer, values, place) => {
     const s = stride(layer), t = [0, 1, 2].map((a) => taps(layer, a, place[a]));
-    let sum = 0;
+    let sum = 0, sure = 0;
     for (let c = 0; c < 8; c++) {
       let weight = 1, at = 0;
       for (let a = 0; a < 3; a++) {
@@ -37,12 +39,13 @@
         weight *= up ? t[a][2] : 1 - t[a][2];
         at += s[a] * t[a][up];
       }
-      if (weight) sum += weight * values[at];
+      if (weight && !isUnknown(values[at])) { sum += weight * values[at]; sure += weight; }
     }
-    return sum;
+    return sure > 0.5 ? sum / sure : unknown;
   };
   const motion = (place) => [0, 1, 2].map((c) => sample(field, field.values[c], place) / 100);
-  const real = (layer, byte) => layer.low + (byte / 255) * (layer.high - layer.low);
+  const ofImage = (layer, byte) => layer.low + (byte / 255) * (layer.high - layer.low);
+  const real = (layer, byte) => layer.low + (Math.min(byte, END) / END) * (layer.high - layer.low);
 
   // A section through a layer, pixel by pixel of the image grid; smooth layers are interpolated, images are not.
   const cut = (plane, layer, values, grid, smooth) => {
@@ -59,13 +62,14 @@
           out[y * width + x] = values[s[h] * near(tx) + s[v] * near(ty) + s[n] * near(through)];
           continue;
         }
-        let sum = 0;
+        let sum = 0, sure = 0;
         for (let c = 0; c < 8; c++) {
           const a = c & 1, b = (c >> 1) & 1, d = c >> 2;
           const weight = (a ? tx[2] : 1 - tx[2]) * (b ? ty[2] : 1 - ty[2]) * (d ? through[2] : 1 - through[2]);
-          if (weight) sum += weight * values[s[h] * tx[a] + s[v] * ty[b] + s[n] * through[d]];
+          const value = values[s[h] * tx[a] + s[v] * ty[b] + s[n] * through[d]];
+          if (weight && !isUnknown(value)) { sum += weight * value; sure += weight; }
         }
-        out[y * width + x] = sum;
+        out[y * width + x] = sure > 0.5 ? sum / sure : unknown;
       }
     }
     return out;
@@ -95,7 +99,7 @@
       const tile = ((i % width) / square ^ Math.floor(i / width) / square) & 1;
       const gray = compare === "flicker" ? (blink ? two[i] : one[i]) : compare === "checkerboard" && tile ? two[i] : one[i];
       let r = gray, g = gray, b = gray;
-      if (overlay && (!inside || inside[i] > 0.5)) {
+      if (overlay && !isUnknown(coloured[i]) && (!inside || inside[i] > 0.5)) {
         const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (coloured[i] - overlay.low) / (overlay.high - overlay.low))));
         r += (table[t] - r) * opacity; g += (table[t + 1] - g) * opacity; b += (table[t + 2] - b) * opacity;
       }
@@ -225,15 +229,17 @@
     say();
   };
 
-  // Past the end of a scale the value is not known here.
-  const known = (layer, byte) => (byte > 254.5 ? "at least " : "") + short(real(layer, byte));
+  const reading = (layer, byte) => {
+    if (isUnknown(byte)) return "unknown";
+    return `${byte > END + 0.5 ? "at least " : ""}${short(real(layer, byte))} ${layer.unit}`.trim();
+  };
   const short = (v) => (Math.abs(v) >= 100 ? v.toFixed(0) : v.toFixed(2));
   const say = () => {
     const world = data.affine.map((row) => row[0] * cross[0] + row[1] * cross[1] + row[2] * cross[2] + row[3]);
     const parts = [`x ${world[0].toFixed(1)}, y ${world[1].toFixed(1)}, z ${world[2].toFixed(1)} mm`];
-    images.forEach((i) => parts.push(`${i.name} ${short(real(i, sample(i, i.values, cross)))}`));
+    images.forEach((i) => parts.push(`${i.name} ${short(ofImage(i, sample(i, i.values, cross)))}`));
     if (field) parts.push(`motion ${short(Math.hypot(...motion(cross)))} mm`);
-    overlays.filter((o) => !o.vector).forEach((o) => parts.push(`${o.name.toLowerCase()} ${known(o, sample(o, o.values, cross))} ${o.unit}`.trim()));
+    overlays.filter((o) => !o.vector).forEach((o) => parts.push(`${o.name.toLowerCase()} ${reading(o, sample(o, o.values, cross))}`));
     readout.textContent = parts.join(" · ");
     const overlay = chosen("colour", overlays);
     $("factor").nextElementSibling.textContent = `${factors[+$("factor").value]}×`;
@@ -290,7 +296,8 @@
   const load = async () => {
     if (typeof DecompressionStream === "undefined") throw new Error("it needs a newer browser; the pictures below show the same");
     const unpacked = await Promise.all([...images, ...overlays.filter((o) => o.data), data.mask].filter((l) => l.data).map(async (l) => {
-      l.values = new Uint8Array(await bytesOf(l.data));
+      const bytes = new Uint8Array(await bytesOf(l.data));
+      l.values = overlays.includes(l) ? Float32Array.from(bytes, (b) => (b > END + 1 ? unknown : b)) : bytes;
     }));
     if (data.field) {
       const all = new Int16Array(await bytesOf(data.field.data)), n = all.length / 3;

@@ -115,9 +115,22 @@ impl<'a> Thinned<'a> {
     }
 }
 
-/// `value` in 8 bits of the scale; what is infinite is at its end, what is no number at its low end.
+/// `value` in 8 bits of the scale; what is no number is at its low end.
 fn byte(scale: &Scale, value: f32) -> u8 {
     (255.0 * scale.position(f64::from(value)).clamp(0.0, 1.0)).round() as u8
+}
+
+/// The byte of an overlay for the end of its scale; the next one is for what lies past it, the last for what is not known.
+const END: u8 = 253;
+
+/// `value`, which an overlay shows, in 8 bits; what is not finite is not known.
+fn code(scale: &Scale, value: f32) -> u8 {
+    match scale.position(f64::from(value)) {
+        t if !t.is_finite() => END + 2,
+        // Single precision may lie a little beyond the end that it is meant to be.
+        t if t > 1.0 + 1e-6 => END + 1,
+        t => (f64::from(END) * t.clamp(0.0, 1.0)).round() as u8,
+    }
 }
 
 fn with(mut lattice: Value, more: Value) -> Value {
@@ -127,7 +140,7 @@ fn with(mut lattice: Value, more: Value) -> Value {
     lattice
 }
 
-fn layer(thinned: &Thinned<'_>, offsets: &[usize], layer: &Layer<'_>) -> Value {
+fn layer(thinned: &Thinned<'_>, offsets: &[usize], layer: &Layer<'_>, byte: fn(&Scale, f32) -> u8) -> Value {
     let Layer { name, values, scale } = layer;
     let bytes: Vec<u8> = offsets.par_iter().with_min_len(1 << 12).map(|&o| byte(scale, values(o))).collect();
     let about = json!({ "name": name, "low": scale.low, "high": scale.high, "unit": scale.unit,
@@ -150,7 +163,7 @@ impl Viewer<'_> {
         let canonical = Canonical::of(self.grid);
         let (fine, coarse) = (Thinned::new(&canonical, IMAGE_VOXELS), Thinned::new(&canonical, SMOOTH_VOXELS));
         let (fine_offsets, coarse_offsets) = (fine.offsets(), coarse.offsets());
-        let images: Vec<Value> = self.images.iter().map(|l| layer(&fine, &fine_offsets, l)).collect();
+        let images: Vec<Value> = self.images.iter().map(|l| layer(&fine, &fine_offsets, l, byte)).collect();
         let mut overlays: Vec<Value> = Vec::new();
         let mut maps: Vec<ColorMap> = Vec::new();
         if let Some((_, scale)) = &self.displacement {
@@ -160,7 +173,7 @@ impl Viewer<'_> {
         }
         for overlay in self.overlays {
             maps.push(overlay.scale.map);
-            overlays.push(layer(&coarse, &coarse_offsets, overlay));
+            overlays.push(layer(&coarse, &coarse_offsets, overlay, code));
         }
         let field = self.displacement.as_ref().map(|(field, _)| {
             let moved: Vec<[f64; 3]> =
@@ -361,10 +374,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_infinite_lies_at_the_end_of_the_scale_not_at_zero() {
+    fn past_the_end_of_the_scale_and_not_known_are_told_apart_from_its_end() {
         let scale = Scale { low: 10.0, high: 20.0, unit: "kPa", map: ColorMap::Magma };
-        let bytes = [9.0, 10.0, 15.0, 20.0, f32::INFINITY, f32::NAN].map(|v| byte(&scale, v));
-        assert_eq!(bytes, [0, 0, 128, 255, 255, 0]);
+        let bytes = [9.0, 10.0, 15.0, 20.0, 20.1, f32::INFINITY, f32::NAN].map(|v| code(&scale, v));
+        assert_eq!(bytes, [0, 0, 127, 253, 254, 255, 255]);
+        assert_eq!(code(&Scale::from_zero(0.3, "", ColorMap::Magma), 0.3), 253);
     }
 
     #[test]

@@ -262,11 +262,15 @@ def test_arrays_are_worked_on_where_they_lie():
         "    palpate.field((before, np.eye(4)), (after, np.eye(4)))\n"
         "except palpate.PalpateError as error:\n"
         "    assert 'constant' in str(error)\n"
+        "else:\n"
+        "    raise AssertionError('a constant volume is measured')\n"
         "try:\n"
         "    field = np.zeros((512, 512, 100, 3), np.float32, order='F')\n"
         "    palpate.stiffness((field, np.eye(4)), labels=(np.ones((2, 2, 2)), np.eye(4)))\n"
         "except palpate.PalpateError as error:\n"
         "    assert 'grid' in str(error)\n"
+        "else:\n"
+        "    raise AssertionError('labels on another grid are taken')\n"
         "print(peak() - start)\n"
     )
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout

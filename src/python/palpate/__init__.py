@@ -354,11 +354,13 @@ def track(
     """The displacement from number ``reference`` of ``volumes``, counted from 0, to each other, in the order in which they were
     taken, in mm (RAS).
 
-    ``volumes`` is a list, or one image, path or ``(array, affine)`` with the frames on its fourth axis. ``mask`` and ``labels`` lie
+    ``volumes`` is a list, or one image, path or ``(array, affine)`` with the frames on its fourth axis; of these only a path gives
+    the time between frames. ``mask`` and ``labels`` lie
     on the reference's grid. Raises `PalpateError` with the message of the command line.
     """
-    given, names, step = _frames(volumes)
-    images = [_image(v, name) for v, name in zip(given, names)]
+    frames, names, step = _frames(volumes)
+    images = [_image(v, name) for v, name in zip(frames, names)]
+    del frames
     asked = _params(preset, points, search, seed, params)
     regions = ["" if given is None else _called(given, what) for given, what in ((mask, "mask"), (labels, "labels"))]
     parts = _palpate.track(
