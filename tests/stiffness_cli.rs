@@ -68,6 +68,12 @@ fn everything_promised_is_written() {
     let map = io::read_volume(results.join("stiffness.nii.gz")).unwrap();
     assert!(map.as_slice()[0] == 0.0 && map.as_slice()[map.grid().index(7, 7, 7)] > 15.0);
     let page = fs::read_to_string(results.join("report.html")).unwrap();
+    let stages = summary["seconds"].as_object().unwrap();
+    for stage in stages.keys() {
+        assert_eq!(page.matches(&format!("</i>{stage} <b>")).count(), 1, "{stage} is booked twice");
+    }
+    assert!(stages.contains_key("read") && stages.contains_key("observe"), "{stages:?}");
+    assert!(page.contains("<h3>Distributions</h3>"));
     assert!(page.contains("left") && !page.contains("NaN") && !page.contains("http"));
     for file in ["stiffness_sd.nii.gz", "residual.nii.gz", "mesh.vtu", "model.feb", "model.inp"] {
         assert!(fs::metadata(results.join(file)).unwrap().len() > 500, "{file}");

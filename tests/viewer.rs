@@ -6,7 +6,7 @@ mod fixtures;
 use fixtures::{palpate, small_pair, text};
 use palpate::report::colormap::ColorMap;
 use palpate::report::scale::Scale;
-use palpate::report::viewer::{Layer, Viewer};
+use palpate::report::viewer::{Layer, Moment, Viewer};
 use palpate::types::{Affine, Grid};
 use std::path::Path;
 use std::process::Command;
@@ -79,11 +79,16 @@ fn the_stiffness_report_too() {
 }
 
 #[test]
-fn the_report_of_a_sequence_too() {
-    let folder = small_pair();
-    let track = ["track", "initial.nii.gz", "deformed.nii.gz", "--mask", "mask.nii.gz", "--quiet", "-o", "tracked"];
-    palpate(folder.path()).args(track).assert().success();
-    all_is_well(&folder.path().join("tracked/report.html"), 30);
+fn the_report_of_a_sequence_too_at_every_moment() {
+    let folder = TempDir::new().unwrap();
+    let phantom = ["phantom", "pinch", "--size", "32", "--frames", "4", "--quiet", "-o", "pinch"];
+    palpate(folder.path()).args(phantom).assert().success();
+    let frames = [0, 1, 2, 3].map(|n| format!("pinch/frame_{n:03}.nii.gz"));
+    let rest = ["--mask", "pinch/mask.nii.gz", "--quiet", "-o", "tracked"];
+    palpate(folder.path()).arg("track").args(frames).args(rest).assert().success();
+    let report = folder.path().join("tracked/report.html");
+    assert!(std::fs::read_to_string(&report).unwrap().contains("Every frame measured, at first the one"));
+    all_is_well(&report, 42);
 }
 
 #[test]
@@ -101,16 +106,15 @@ fn what_is_past_a_scale_or_unknown_is_said_and_what_ends_it_is_exact() {
         overlay("past", &|o| 2.1 - (o % 12 / 11) as f32),
         overlay("hole", &hole),
     ];
+    let moment = Moment { name: "", images: &[], overlays: &overlays, displacement: None, matches: None, mesh: None };
     let viewer = Viewer {
         grid: &grid,
         centre: grid.world(6, 6, 6),
         mask: None,
         images: &[Layer { name: "stripes", values: &stripes, scale: scale(ColorMap::Gray) }],
-        overlays: &overlays,
         shown: Some(0),
-        displacement: None,
-        matches: None,
-        mesh: None,
+        moments: &[&moment.pack(&grid)],
+        first: 0,
     };
     let folder = TempDir::new().unwrap();
     let page = folder.path().join("page.html");

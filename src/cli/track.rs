@@ -9,6 +9,7 @@ use super::limits::field_fits;
 use super::outputs::Target;
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::field::jacobian::determinant_at;
 use palpate::field::warp::warp_image;
 use palpate::io::{self, PackedField, Series};
 use palpate::numerics::sampling::Interpolation;
@@ -18,13 +19,10 @@ use palpate::pipeline::{
 };
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
-use palpate::report::track::{TrackReport, look as track_look, page, summary, text, warnings as frame_warnings};
+use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as frame_warnings};
 use palpate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-
-/// A frame is looked at anew when it moves so many times further than the one before.
-const WORTH_A_LOOK: f64 = 1.1;
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -134,8 +132,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut folder = target.create()?;
     let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
     let mut film = None;
-    // The frame that moves most so far, how far (mm), and its viewer.
-    let mut look: Option<(usize, f64, String)> = None;
+    let mut looks = Looks::new(frames, &grid);
+    let step_s = source.step_s();
     let (mut reading, mut writing) = (started.elapsed(), std::time::Duration::ZERO);
 
     let range = gray_range(&reference);
@@ -163,12 +161,22 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let film = film.get_or_insert_with(|| start_film(&reference, field, shown, range));
         add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
         let mean = result.summary.mean_mm;
-        if look.as_ref().is_none_or(|l| mean > WORTH_A_LOOK * l.1) {
+        if looks.wants(number, mean) {
             let there = on_grid(volume.view(), &grid);
             let warped = warp_image(volume, field, None, Interpolation::Linear, 0.0);
-            let found = (field, &result.matches, &result.mesh);
-            let stretch = |o: usize| strain.principal(o)[0] as f32;
-            look = Some((number, mean, track_look([&reference, &there, &warped], shown, found, &stretch)));
+            looks.add(&Seen {
+                frame: number,
+                name: &clock(number, step_s),
+                mean_mm: mean,
+                volumes: [&reference, &there, &warped],
+                mask: shown,
+                displacement: field,
+                matches: &result.matches,
+                mesh: &result.mesh,
+                strain: &|o| strain.principal(o)[0] as f32,
+                jacobian: &|o| determinant_at(field, o),
+                uncertainty: &|o| result.uncertainty.at(o),
+            });
         }
         writing += started.elapsed();
         Ok(())
@@ -185,7 +193,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         packed[origin] = Some(io::write_series_field(p, &still)?);
         Ok(())
     })?;
-    let step_s = source.step_s();
     folder.write("displacement.nii.gz", |p| io::write_field_series(p, &grid, &packed, step_s.unwrap_or(0.0)))?;
     folder.write("trajectories.csv", |p| io::write_trajectories(p, &tracked.trajectories, step_s))?;
     folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
@@ -207,7 +214,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params: &params,
         tracked: &tracked,
         film: &film,
-        look: look.as_ref().map(|l| (l.0, l.2.as_str())),
+        look: Some((&looks, &reference, shown)),
         warnings: &warnings,
         seconds: &seconds,
     };

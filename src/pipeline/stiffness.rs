@@ -99,7 +99,7 @@ fn labelled(
     let coarse_mesh = mesher.mesh(&Fineness::for_nodes(volume, coarse_nodes))?;
     clock.book("mesh");
 
-    progress("read", 0.05);
+    progress("observe", 0.05);
     let level =
         |mesh: &QuadraticMesh| Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load);
     let mut coarse = level(&coarse_mesh)?;
@@ -139,7 +139,7 @@ fn labelled(
     }
     let mut fine = level(&fine_mesh)?;
     let reference = fine.largest();
-    clock.book("read");
+    clock.book("observe");
 
     progress("coarse", 0.1);
     let choice = choose(&mut coarse, params.model, params.poisson, reference)?;

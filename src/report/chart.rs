@@ -1,5 +1,6 @@
 //! Histograms, and where the time went.
 
+use crate::report::field::Values;
 use crate::report::scale::{Scale, short, thousands};
 use crate::report::statistics::Histogram;
 use std::fmt::Write;
@@ -34,6 +35,12 @@ pub fn histogram(h: &Histogram, title: &str, unit: &str, scale: Option<&Scale>) 
         short(h.high)
     );
     svg
+}
+
+/// A histogram of a quantity over the voxels at `offsets`, in the colours of its scale.
+pub fn distribution(title: &str, values: Values<'_>, scale: &Scale, offsets: &[usize]) -> String {
+    let counts = Histogram::new(offsets.iter().map(|&o| f64::from(values(o))), scale.low, scale.high, 40);
+    histogram(&counts, title, scale.unit, Some(scale))
 }
 
 /// Seconds by stage as one bar with a legend, in HTML.

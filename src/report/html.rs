@@ -10,7 +10,7 @@ use crate::report::scale::{Scale, short, thousands};
 use crate::report::section::Plane;
 use crate::report::statistics::{Histogram, sample};
 use crate::report::verdict::{short2, verdict};
-use crate::report::viewer::{Layer, Viewer, elements};
+use crate::report::viewer::{Layer, Moment, Viewer, elements};
 use crate::report::views::Views;
 use crate::report::{chart, tables};
 use crate::types::Mesh;
@@ -121,17 +121,17 @@ fn look(report: &FieldReport<'_>, views: &Views) -> String {
     .into_iter()
     .flatten()
     .collect();
-    let viewer = Viewer {
-        grid: report.initial.grid(),
-        centre: views.centre,
-        mask: report.mask,
-        images: &images,
+    let grid = report.initial.grid();
+    let moment = Moment {
+        name: "",
+        images: &[],
         overlays: &overlays,
-        shown: None,
         displacement: views.magnitude.scale.clone().map(|scale| (report.displacement, scale)),
         matches: Some((&report.matches.matches, views.matches.2.clone())),
         mesh: Some(elements(report.mesh)),
     };
+    let (centre, mask, moments) = (views.centre, report.mask, &[&moment.pack(grid)]);
+    let viewer = Viewer { grid, centre, mask, images: &images, shown: None, moments, first: 0 };
     format!("<section><h2>Look</h2>{LOOK}<article class=\"wide\">{}</article></section>", viewer.html())
 }
 
@@ -242,21 +242,16 @@ fn blink(volumes: &[Panel]) -> String {
 
 fn histograms(report: &FieldReport<'_>, views: &Views) -> String {
     let inside = sample(report.initial.grid().len(), report.mask);
-    let of = |values: &dyn Fn(usize) -> f32, scale: &Scale| {
-        Histogram::new(inside.iter().map(|&o| f64::from(values(o))), scale.low, scale.high, 40)
-    };
-    let mut out = String::new();
     let motion = |o| length(report.displacement, o);
-    let panels: [(&Panel, &dyn Fn(usize) -> f32, &str); 3] = [
+    let panels: [(&Panel, Values<'_>, &str); 3] = [
         (&views.magnitude, &motion, "Displacement"),
         (&views.jacobian, report.jacobian, "Jacobian determinant"),
         (&views.uncertainty, report.uncertainty, "Uncertainty"),
     ];
-    for (panel, values, title) in panels {
-        if let Some(scale) = &panel.scale {
-            out.push_str(&chart::histogram(&of(values, scale), title, scale.unit, Some(scale)));
-        }
-    }
+    let mut out: String = panels
+        .into_iter()
+        .filter_map(|(panel, values, title)| Some(chart::distribution(title, values, panel.scale.as_ref()?, &inside)))
+        .collect();
     let ncc = Histogram::new(report.matches.kept().map(|m| f64::from(m.ncc)), 0.0, 1.0, 40);
     out.push_str(&chart::histogram(&ncc, "Correlation of kept matches", "", None));
     let precision = &views.matches.2;

@@ -8,9 +8,9 @@ use crate::report::panels::{Panel, gray_range, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
 use crate::report::section::Section;
-use crate::report::statistics::quantile;
+use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
-use crate::report::viewer::{Layer, Viewer};
+use crate::report::viewer::{Layer, Moment, Viewer};
 use crate::report::{chart, json};
 use crate::types::stiffness::{Evidence, FrameStiffness, Gain, RegionStiffness, SharedStiffness, StiffnessResult};
 use crate::types::{DenseField, Mask, Volume, WorldPoint};
@@ -164,21 +164,11 @@ pub struct Shown<'a> {
     pub images: &'a [(String, Volume)],
 }
 
-/// A residual, none where no displacement was taken.
-fn taken(residual: f32) -> f32 {
-    if residual > 0.0 { residual } else { f32::NAN }
-}
-
 /// Maps, displacement and mesh over the images in a viewer, with the scales of the pictures.
-fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, panels: [&Panel; 3]) -> String {
-    let [map, sd, rest] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
-    let within = |o: usize, value: f32| if inside.as_slice()[o] > 0 { value } else { f32::NAN };
-    let (map, sd, rest): (Values<'_>, Values<'_>, Values<'_>) =
-        (&|o| within(o, map[o]), &|o| within(o, sd[o]), &|o| taken(rest[o]));
-    let names = ["Young's modulus", "Standard deviation", "Residual"];
-    let layers = names.into_iter().zip([map, sd, rest]).zip(panels);
-    let overlays: Vec<Layer<'_>> = layers
-        .filter_map(|((name, values), panel)| Some(Layer { name, values, scale: panel.scale.clone()? }))
+fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Values<'_>, &Panel); 3]) -> String {
+    let overlays: Vec<Layer<'_>> = maps
+        .into_iter()
+        .filter_map(|(values, panel)| Some(Layer { name: &panel.title, values, scale: panel.scale.clone()? }))
         .collect();
     let body = |o: usize| f32::from(inside.as_slice()[o]);
     let gray = |[low, high]: [f64; 2]| Scale { low, high, unit: "", map: ColorMap::Gray };
@@ -198,18 +188,17 @@ fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, panels: [&Pa
         (field, Scale::from_zero(most, "mm", ColorMap::Viridis))
     });
     let corners: Vec<u32> = result.mesh.tetrahedra().iter().flat_map(|e| e[..4].to_vec()).collect();
-    let viewer = Viewer {
-        grid: result.map.grid(),
-        centre: centre(&result.map),
-        mask: Some(inside),
-        images: &images,
+    let grid = result.map.grid();
+    let moment = Moment {
+        name: "",
+        images: &[],
         overlays: &overlays,
-        shown: Some(0),
         displacement,
         matches: None,
         mesh: Some((result.mesh.nodes(), corners, 4)),
     };
-    viewer.html()
+    let (centre, mask, moments) = (centre(&result.map), Some(inside), &[&moment.pack(grid)]);
+    Viewer { grid, centre, mask, images: &images, shown: Some(0), moments, first: 0 }.html()
 }
 
 /// The page.
@@ -238,37 +227,41 @@ fn page_with(
     let inside = Mask::from_vec(grid, result.map.as_slice().iter().map(|&v| u8::from(v > 0.0)).collect());
     let Ok(inside) = inside else { return Ok(String::new()) };
     let sections = Section::through(&grid, centre(&result.map));
-    let black = Volume::filled(grid, 0.0f32);
-    let base = shown.images.first().map_or((&black, [0.0, 1.0]), |(_, v)| (v, gray_range(v)));
+    let black = shown.images.is_empty().then(|| Volume::filled(grid, 0.0f32));
+    let image = shown.images.first().map(|(_, v)| v);
+    let base = image.or(black.as_ref()).map(|v| (v, image.map_or([0.0, 1.0], gray_range)));
+    let Some(base) = base else { return Ok(String::new()) };
     let unit = if result.absolute { "kPa" } else { "" };
-    let body: Vec<usize> = (0..grid.len()).filter(|&o| inside.as_slice()[o] > 0).collect();
-    let spread =
-        |v: &Volume, q: f64| quantile(body.iter().map(|&o| f64::from(v.as_slice()[o])).filter(|v| v.is_finite()), q);
+    let [map, sd, rest] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
+    let within = |o: usize, value: f32| if inside.as_slice()[o] > 0 { value } else { f32::NAN };
+    let moduli: Values<'_> = &|o| within(o, map[o]);
+    let deviations: Values<'_> = &|o| within(o, sd[o]);
+    // Matches leave most voxels without one.
+    let residuals: Values<'_> = &|o| within(o, if rest[o] > 0.0 { rest[o] } else { f32::NAN });
+    let top = |value: Values<'_>, q: f64| {
+        quantile((0..grid.len()).map(|o| f64::from(value(o))).filter(|v| v.is_finite()), q).max(1e-9)
+    };
     let panel = |title: &str, value: Values<'_>, scale: Scale, note: &str| {
         Panel::coloured(title, &sections, base, Some(&inside), scale, value).map(|p| p.with_note(note))
     };
-    let [moduli, deviations, residuals] = [&result.map, &result.map_sd, &result.residual].map(|v| v.as_slice());
-    let top = |v: &Volume, q: f64| spread(v, q).max(1e-9);
     let seen = result.regions.iter().filter(|r| r.identifiable).map(|r| r.youngs_modulus).fold(0.0, f64::max);
-    let seen = if seen > 0.0 { seen } else { top(&result.map, 1.0) };
+    let seen = if seen > 0.0 { seen } else { top(moduli, 1.0) };
     let map = panel(
         "Young's modulus",
-        &|o| moduli[o],
+        moduli,
         Scale::from_zero(seen, unit, ColorMap::Viridis),
         "One value a region. A region that is not identifiable shows its bound, at the end of the scale if beyond.",
     )?;
     let sd = panel(
         "Standard deviation",
-        &|o| deviations[o],
-        Scale::from_zero(top(&result.map_sd, 1.0), unit, ColorMap::Magma),
+        deviations,
+        Scale::from_zero(top(deviations, 1.0), unit, ColorMap::Magma),
         "From the residuals, counted by blocks of the body, and the change with the mesh. Without colour: not identifiable.",
     )?;
-    // Matches leave most voxels without one.
-    let largest = quantile(body.iter().map(|&o| f64::from(taken(residuals[o]))).filter(|v| v.is_finite()), 0.995);
     let rest = panel(
         "Residual",
-        &|o| taken(residuals[o]),
-        Scale::from_zero(largest.max(1e-9), "mm", ColorMap::Magma),
+        residuals,
+        Scale::from_zero(top(residuals, 0.995), "mm", ColorMap::Magma),
         "Length of measured less modelled displacement, where one was taken. Structure here means that the model misses \
          something.",
     )?;
@@ -298,11 +291,18 @@ fn page_with(
         region_table(result)
     );
     out.push_str(extra);
-    let viewer = look(result, &inside, shown, [&map, &sd, &rest]);
+    let maps = [(moduli, &map), (deviations, &sd), (residuals, &rest)];
+    let viewer = look(result, &inside, shown, maps);
     let _ = write!(out, "<section><h2>Look</h2><article class=\"wide\">{viewer}</article></section>");
+    let some = sample(grid.len(), Some(&inside));
+    let distributions: String = maps
+        .into_iter()
+        .filter_map(|(values, panel)| Some(chart::distribution(&panel.title, values, panel.scale.as_ref()?, &some)))
+        .collect();
     let _ = write!(
         out,
-        "<section><h2>Maps</h2><div class=\"grid\">{}{}{}</div></section>",
+        "<section><h2>Maps</h2><div class=\"grid\">{}{}{}<article class=\"wide\"><h3>Distributions</h3><div class=\"charts\">\
+         {distributions}</div></article></div></section>",
         card(&map),
         card(&sd),
         card(&rest)

@@ -1,5 +1,6 @@
 //! report.html, summary.json and the short summary of `palpate track`.
 
+use crate::report::chart;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
 use crate::report::film::Film;
@@ -9,11 +10,14 @@ use crate::report::json::{grid, seconds};
 use crate::report::panels::{centre_of_motion, gray_range, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
-use crate::report::statistics::{quantile, sample};
+use crate::report::statistics::{Histogram, quantile, sample};
 use crate::report::tables::table;
 use crate::report::verdict::short2;
-use crate::report::viewer::{Layer, Viewer, elements};
-use crate::types::{DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels};
+use crate::report::viewer::{Layer, Moment, PackedMoment, Viewer, elements};
+use crate::report::views::matched;
+use crate::types::{
+    DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels, WorldPoint,
+};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -35,21 +39,26 @@ pub struct TrackReport<'a> {
     pub tracked: &'a Tracked,
     /// Sections of the frames.
     pub film: &'a Film,
-    /// The frame that moves most and its viewer, where one was made.
-    pub look: Option<(usize, &'a str)>,
+    /// Frames to look at, with the reference and where it was measured.
+    pub look: Option<(&'a Looks, &'a Voxels<'a>, Option<&'a Mask>)>,
     /// What the user should know.
     pub warnings: &'a [String],
     /// Stage names and wall seconds.
     pub seconds: &'a [(String, f64)],
 }
 
+/// The time of a frame in words, `step_s` seconds from one to the next.
+pub fn clock(frame: usize, step_s: Option<f64>) -> String {
+    match step_s {
+        Some(step) => format!("frame {frame}, {} s", short2(step * frame as f64)),
+        None => format!("frame {frame}"),
+    }
+}
+
 impl TrackReport<'_> {
     /// The time of a frame in words.
     fn clock(&self, frame: usize) -> String {
-        match self.step_s {
-            Some(step) => format!("frame {frame}, {} s", short2(step * frame as f64)),
-            None => format!("frame {frame}"),
-        }
+        clock(frame, self.step_s)
     }
 
     /// Horizontal position of a frame in plots.
@@ -80,40 +89,120 @@ impl TrackReport<'_> {
     }
 }
 
-/// The viewer of one frame: the reference, the frame as it came and warped back (on the reference's grid), its displacement,
-/// matches, mesh and largest principal strain.
-pub fn look(
-    [reference, frame, warped]: [&Voxels<'_>; 3],
-    mask: Option<&Mask>,
-    (field, matches, mesh): (&DenseField, &SparseField, &Mesh),
-    strain: Values<'_>,
-) -> String {
-    let grid = reference.grid();
-    let [low, high] = gray_range(reference);
-    let inside = sample(grid.len(), mask);
-    let most = |f: &dyn Fn(usize) -> f64, q| quantile(inside.iter().map(|&o| f(o)), q);
-    let values = [reference, frame, warped].map(|v| v.as_slice());
-    let [a, b, c]: [Values<'_>; 3] = [&|o| values[0][o], &|o| values[1][o], &|o| values[2][o]];
-    let images = [("reference", a), ("frame", b), ("warped", c)].map(|(name, values)| Layer {
-        name,
-        values,
-        scale: Scale { low, high, unit: "", map: ColorMap::Gray },
-    });
-    let stretch = Scale::from_zero(most(&|o| strain(o).into(), 0.99), "", ColorMap::Magma);
-    let lengths = Scale::from_zero(most(&|o| length(field, o).into(), 0.998), "mm", ColorMap::Viridis);
-    let precision = Scale::from_zero(quantile(matches.kept().map(|m| m.sigma()), 0.95), "mm", ColorMap::Viridis);
-    Viewer {
-        grid,
-        centre: centre_of_motion(field, mask),
-        mask,
-        images: &images,
-        overlays: &[Layer { name: "Largest principal strain", values: strain, scale: stretch }],
-        shown: None,
-        displacement: Some((field, lengths)),
-        matches: Some((&matches.matches, precision)),
-        mesh: Some(elements(mesh)),
+/// A frame is looked at anew when it moves so many times further than the one before.
+const WORTH_A_LOOK: f64 = 1.1;
+
+/// The frames that the viewer holds: as many as the page has room for, evenly spread, and the one that moves most.
+pub struct Looks {
+    frames: usize,
+    room: usize,
+    held: Vec<Look>,
+}
+
+struct Look {
+    frame: usize,
+    mean_mm: f64,
+    centre: WorldPoint,
+    moment: PackedMoment,
+    histograms: String,
+}
+
+/// A frame to look at. All on the reference's grid.
+pub struct Seen<'a> {
+    /// Its number.
+    pub frame: usize,
+    /// What it is called.
+    pub name: &'a str,
+    /// Its motion (mm), on the mean.
+    pub mean_mm: f64,
+    /// The reference, the frame as it came, and warped back.
+    pub volumes: [&'a Voxels<'a>; 3],
+    /// Where it was measured.
+    pub mask: Option<&'a Mask>,
+    /// Displacement, reference to frame (mm, RAS).
+    pub displacement: &'a DenseField,
+    /// Matches with covariance.
+    pub matches: &'a SparseField,
+    /// The mesh through the kept ones.
+    pub mesh: &'a Mesh,
+    /// Largest principal strain (Green-Lagrange).
+    pub strain: Values<'a>,
+    /// Jacobian determinant of x + u(x).
+    pub jacobian: Values<'a>,
+    /// One standard deviation of the displacement (mm).
+    pub uncertainty: Values<'a>,
+}
+
+impl Looks {
+    /// None yet of so many `frames` on the reference's grid.
+    pub fn new(frames: usize, grid: &Grid) -> Self {
+        Self { frames, room: Moment::room(grid, 2, 3), held: Vec::new() }
     }
-    .html()
+
+    /// Whether this one is held whatever it shows; one place is kept for the one that moves most.
+    fn regular(&self, frame: usize) -> bool {
+        let before = |n: usize| n * (self.room - 1) / self.frames;
+        self.room >= self.frames || before(frame + 1) > before(frame)
+    }
+
+    /// Whether a frame of so much motion (mm, mean) is to be added.
+    pub fn wants(&self, frame: usize, mean_mm: f64) -> bool {
+        self.regular(frame) || self.held.iter().all(|l| mean_mm > WORTH_A_LOOK * l.mean_mm)
+    }
+
+    /// Adds a frame, in place of the one that moved most before.
+    pub fn add(&mut self, seen: &Seen<'_>) {
+        let Seen { frame, name, mean_mm, volumes, mask, displacement, matches, mesh, .. } = *seen;
+        let Seen { strain, jacobian, uncertainty, .. } = *seen;
+        let grid = displacement.grid();
+        let inside = sample(grid.len(), mask);
+        let most = |f: Values<'_>, q| quantile(inside.iter().map(|&o| f64::from(f(o))), q);
+        let [reference, a, b] = volumes.map(|v| v.as_slice());
+        let [a, b]: [Values<'_>; 2] = [&|o| a[o], &|o| b[o]];
+        let range = gray_range(volumes[0]);
+        let images = [("frame", a), ("warped", b)].map(|(name, values)| {
+            let gain = f64::from(matched(reference, values, &inside));
+            Layer { name, values, scale: gray(range.map(|r| r / gain)) }
+        });
+        let moved: Values<'_> = &|o| length(displacement, o);
+        let change = most(&|o| (jacobian(o) - 1.0).abs(), 0.99).clamp(0.05, 1.0);
+        let lengths = Scale::from_zero(most(moved, 0.998), "mm", ColorMap::Viridis);
+        let precision = Scale::from_zero(quantile(matches.kept().map(|m| m.sigma()), 0.95), "mm", ColorMap::Viridis);
+        let overlays = [
+            ("Largest principal strain", strain, Scale::from_zero(most(strain, 0.99), "", ColorMap::Magma)),
+            ("Jacobian determinant", jacobian, Scale::about(1.0, change, "")),
+            ("Uncertainty", uncertainty, Scale::from_zero(most(uncertainty, 0.98), "mm", ColorMap::Magma)),
+        ]
+        .map(|(name, values, scale)| Layer { name, values, scale });
+        let displacements = Layer { name: "Displacement", values: moved, scale: lengths.clone() };
+        let mut histograms: String = std::iter::once(&displacements)
+            .chain(&overlays)
+            .map(|l| chart::distribution(l.name, l.values, &l.scale, &inside))
+            .collect();
+        let sigma = Histogram::new(matches.kept().map(|m| m.sigma()), precision.low, precision.high, 40);
+        histograms += &chart::histogram(&sigma, "Precision of kept matches", "mm", Some(&precision));
+        let moment = Moment {
+            name,
+            images: &images,
+            overlays: &overlays,
+            displacement: Some((displacement, lengths)),
+            matches: Some((&matches.matches, precision)),
+            mesh: Some(elements(mesh)),
+        };
+        let (moment, centre) = (moment.pack(grid), centre_of_motion(displacement, mask));
+        let extra = self.held.iter().position(|l| !self.regular(l.frame)).filter(|_| !self.regular(frame));
+        extra.map(|at| self.held.remove(at));
+        self.held.push(Look { frame, mean_mm, centre, moment, histograms });
+    }
+
+    /// The frame that moves most.
+    fn first(&self) -> Option<&Look> {
+        self.held.iter().max_by(|a, b| a.mean_mm.total_cmp(&b.mean_mm))
+    }
+}
+
+fn gray([low, high]: [f64; 2]) -> Scale {
+    Scale { low, high, unit: "", map: ColorMap::Gray }
 }
 
 /// The keys are those of docs/file-formats.md.
@@ -201,14 +290,7 @@ pub fn page(report: &TrackReport<'_>) -> String {
          largest principal strain.</p><article class=\"wide\">{}</article></section>",
         report.film.player(&clock)
     );
-    if let Some((frame, viewer)) = report.look {
-        let clock = escape(&report.clock(frame));
-        let _ = write!(
-            body,
-            "<section><h2>Look</h2><p class=\"lead\">The frame that moves most, {clock}. Click or drag in a picture to move the \
-             planes, scroll to go through the slices.</p><article class=\"wide\">{viewer}</article></section>"
-        );
-    }
+    body.push_str(&look(report));
     let _ = write!(
         body,
         "<section><h2>Over time</h2><p class=\"lead\">E1 and E3 are the largest and the smallest principal strain (Green-Lagrange), peaks their \
@@ -240,6 +322,37 @@ pub fn page(report: &TrackReport<'_>) -> String {
         ["Frame", "Volume", "Motion", "Mean, mm", "Largest, mm", "Matches", "Residual, mm", "Uncertainty, mm", "Folds"];
     let _ = write!(body, "<section><h2>Frames</h2><article class=\"wide\">{}</article></section>", table(&head, &rows));
     document(&escape(&format!("{} and {all} more", report.names[report.reference])), &body)
+}
+
+/// The viewer, where a frame was measured.
+fn look(report: &TrackReport<'_>) -> String {
+    let Some((looks, reference, mask)) = report.look else { return String::new() };
+    let Some(first) = looks.first() else { return String::new() };
+    let mut held: Vec<&Look> = looks.held.iter().collect();
+    held.sort_by_key(|l| l.frame);
+    let values = reference.as_slice();
+    let viewer = Viewer {
+        grid: report.grid,
+        centre: first.centre,
+        mask,
+        images: &[Layer { name: "reference", values: &|o| values[o], scale: gray(gray_range(reference)) }],
+        shown: None,
+        moments: &held.iter().map(|l| &l.moment).collect::<Vec<_>>(),
+        first: held.iter().position(|l| l.frame == first.frame).unwrap_or_default(),
+    };
+    let (clock, measured) = (escape(&report.clock(first.frame)), report.measured());
+    let held = match held.len() {
+        1 if measured > 1 => format!("The frame that moves most, {clock}."),
+        n if n < measured => format!("{n} of the {measured} frames, at first the one that moves most, {clock}."),
+        _ => format!("Every frame measured, at first the one that moves most, {clock}."),
+    };
+    format!(
+        "<section><h2>Look</h2><p class=\"lead\">{held} Click or drag in a picture to move the planes, scroll to go through the \
+         slices.</p><div class=\"grid\"><article class=\"wide\">{}</article><article class=\"wide\"><h3>Distributions, {clock}</h3>\
+         <div class=\"charts\">{}</div></article></div></section>",
+        viewer.html(),
+        first.histograms
+    )
 }
 
 /// Strain of each region, motion and points over time.

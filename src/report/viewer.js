@@ -2,16 +2,19 @@
   const root = document.currentScript.previousElementSibling;
   const data = JSON.parse(root.querySelector("script").textContent);
   const $ = (name) => root.querySelector(`[name="${name}"]`);
+  const on = (name) => $(name) && $(name).checked;
   const canvases = [...root.querySelectorAll("canvas")];
   const readout = root.querySelector("output"), bar = root.querySelector(".bar");
   const note = (text) => { root.querySelector(".state").textContent = text; };
   // Canonical axes: 0 to the right, 1 to the front, 2 up. Across, up and through each plane.
   const AXES = { axial: [0, 1, 2], coronal: [0, 2, 1], sagittal: [1, 2, 0] };
   const planes = data.planes.map((name, n) => ({ name, axes: AXES[name], canvas: canvases[n] }));
-  const { extent, images, overlays, colours } = data;
+  const { extent, colours, moments } = data;
   const cross = data.centre.slice(); // mm from the first corner
   const factors = [1, 1.5, 2, 3, 5, 8, 12, 20, 30, 50];
-  let blink = false, timer = null, field = null, matches = null, mesh = null;
+  let blink = false, timer = null, now = data.first;
+  // Of the moment that is shown.
+  let images = [], overlays = [], field = null, matches = null, mesh = null;
 
   const bytesOf = async (text) => {
     const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -100,7 +103,7 @@
       const gray = compare === "flicker" ? (blink ? two[i] : one[i]) : compare === "checkerboard" && tile ? two[i] : one[i];
       let r = gray, g = gray, b = gray;
       if (overlay && !isUnknown(coloured[i]) && (!inside || inside[i] > 0.5)) {
-        const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (coloured[i] - overlay.low) / (overlay.high - overlay.low))));
+        const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (coloured[i] - overlay.bottom) / (overlay.top - overlay.bottom))));
         r += (table[t] - r) * opacity; g += (table[t + 1] - g) * opacity; b += (table[t + 2] - b) * opacity;
       }
       p[4 * i] = r; p[4 * i + 1] = g; p[4 * i + 2] = b; p[4 * i + 3] = 255;
@@ -113,7 +116,7 @@
 
   const css = (rgb) => `rgb(${rgb[0]},${rgb[1]},${rgb[2]})`;
   const colour = (overlay, value) => {
-    const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (value - overlay.low) / (overlay.high - overlay.low))));
+    const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (value - overlay.bottom) / (overlay.top - overlay.bottom))));
     return css(colours[overlay.map].subarray(t, t + 3));
   };
 
@@ -163,8 +166,8 @@
       const node = (x, y) => { const p = cross.slice(); p[h] = x; p[v] = y; return p; };
       const known = (p) => !data.mask.values || sample(data.mask, data.mask.values, p) > 0.5;
       context.lineWidth = fine;
-      if (mesh && $("tetrahedra").checked) drawMesh(context, plane, point);
-      if (field && $("grid").checked) {
+      if (mesh && on("tetrahedra")) drawMesh(context, plane, point);
+      if (field && on("grid")) {
         context.strokeStyle = "rgba(255,214,102,.85)";
         const small = step / 4;
         [[h, v], [v, h]].forEach(([along, other]) => {
@@ -182,7 +185,7 @@
           }
         });
       }
-      if (field && $("arrows").checked) {
+      if (field && on("arrows")) {
         const overlay = overlays.find((o) => o.vector);
         for (let y = step / 2; y < extent[v]; y += step) for (let x = step / 2; x < extent[h]; x += step) {
           const p = node(x, y);
@@ -199,7 +202,7 @@
           context.stroke();
         }
       }
-      if (matches && $("matches").checked) {
+      if (matches && on("matches")) {
         const slab = Math.max(images[0].step[n], 1) * 0.75, r = 2.4 * fine, m = matches;
         for (let i = 0; i < m.count; i++) {
           if (Math.abs(m.place[3 * i + n] - cross[n]) > slab) continue;
@@ -216,7 +219,7 @@
           }
         }
       }
-      if ($("cross").checked) {
+      if (on("cross")) {
         const [x, y] = point(cross[h], cross[v]), gap = 7 * fine;
         context.strokeStyle = "rgba(80,220,120,.8)";
         context.lineWidth = fine;
@@ -248,9 +251,9 @@
       const stops = Array.from({ length: 9 }, (_, i) => css(colours[overlay.map].subarray(3 * Math.round(i * 31.875), 3 * Math.round(i * 31.875) + 3)));
       bar.querySelector("i").style.background = `linear-gradient(90deg,${stops.join(",")})`;
       const trim = (v) => String(+v.toFixed(3)), marks = bar.querySelectorAll("span");
-      marks[0].textContent = trim(overlay.low);
-      marks[1].textContent = trim((overlay.low + overlay.high) / 2);
-      marks[2].textContent = `${trim(overlay.high)} ${overlay.unit}`;
+      marks[0].textContent = trim(overlay.bottom);
+      marks[1].textContent = trim((overlay.bottom + overlay.top) / 2);
+      marks[2].textContent = `${trim(overlay.top)} ${overlay.unit}`;
     }
   };
 
@@ -281,7 +284,11 @@
         draw();
       }, { passive: false });
     });
-    root.querySelectorAll(".choices select, .choices input").forEach((e) => e.addEventListener("input", () => {
+    root.querySelectorAll(".choices select, .choices input").forEach((e) => e.addEventListener("input", async () => {
+      if (e.name === "moment") {
+        await show(+e.value);
+        if (now !== +e.value) return;
+      }
       $("other").hidden = $("compare").value === "alone";
       flicker();
       draw();
@@ -293,27 +300,51 @@
     note("");
   };
 
-  const load = async () => {
-    if (typeof DecompressionStream === "undefined") throw new Error("it needs a newer browser; the pictures below show the same");
-    const unpacked = await Promise.all([...images, ...overlays.filter((o) => o.data), data.mask].filter((l) => l.data).map(async (l) => {
-      const bytes = new Uint8Array(await bytesOf(l.data));
-      l.values = overlays.includes(l) ? Float32Array.from(bytes, (b) => (b > END + 1 ? unknown : b)) : bytes;
-    }));
-    if (data.field) {
-      const all = new Int16Array(await bytesOf(data.field.data)), n = all.length / 3;
-      field = { ...data.field, values: [0, 1, 2].map((c) => all.subarray(c * n, (c + 1) * n)) };
+  const bytes = async (layer) => {
+    if (layer.data) layer.values = new Uint8Array(await bytesOf(layer.data));
+  };
+  const unpack = async (moment) => {
+    await Promise.all(moment.images.map(bytes));
+    await Promise.all(moment.overlays.map(bytes));
+    moment.overlays.filter((o) => o.values).forEach((o) => { o.values = Float32Array.from(o.values, (b) => (b > END + 1 ? unknown : b)); });
+    if (moment.field) {
+      const all = new Int16Array(await bytesOf(moment.field.data)), n = all.length / 3;
+      moment.field.values = [0, 1, 2].map((c) => all.subarray(c * n, (c + 1) * n));
     }
     const places = (buffer) => Float32Array.from(new Uint16Array(buffer), (v, i) => (v / 65535) * extent[i % 3]);
-    if (data.matches) {
-      const m = data.matches, [place, sigma, kept] = await Promise.all([m.place, m.sigma, m.kept].map(bytesOf));
-      matches = { ...m, place: places(place), sigma: new Uint8Array(sigma), kept: new Uint8Array(kept), count: sigma.byteLength };
+    if (moment.matches) {
+      const m = moment.matches, [place, sigma, kept] = await Promise.all([m.place, m.sigma, m.kept].map(bytesOf));
+      Object.assign(m, { place: places(place), sigma: new Uint8Array(sigma), kept: new Uint8Array(kept), count: sigma.byteLength });
     }
-    if (data.mesh) {
-      const [nodes, cells] = await Promise.all([data.mesh.nodes, data.mesh.cells].map(bytesOf));
-      mesh = { nodes: places(nodes), cells: new Uint32Array(cells), corners: data.mesh.corners };
+    if (moment.mesh) {
+      const m = moment.mesh, [nodes, cells] = await Promise.all([m.nodes, m.cells].map(bytesOf));
+      Object.assign(m, { nodes: places(nodes), cells: new Uint32Array(cells) });
     }
+  };
+  // Makes a moment the one that is shown, unless another was asked for meanwhile.
+  const show = async (number) => {
+    const moment = moments[number];
+    now = number;
+    moment.ready = moment.ready || unpack(moment);
+    await moment.ready;
+    if (now !== number) return;
+    images = [...data.images, ...moment.images];
+    ({ overlays, field, matches, mesh } = moment);
+    if ($("moment")) $("moment").nextElementSibling.textContent = moment.name;
+  };
+
+  const load = async () => {
+    if (typeof DecompressionStream === "undefined") throw new Error("it needs a newer browser; the pictures below show the same");
+    await Promise.all([...data.images, data.mask].map(bytes));
     Object.keys(colours).forEach((k) => { colours[k] = Uint8Array.from(atob(colours[k]), (c) => c.charCodeAt(0)); });
-    return unpacked;
+    // Colours mean the same at all moments.
+    const range = (layers) => layers.forEach((l) => {
+      l.bottom = Math.min(...layers.map((o) => o.low));
+      l.top = Math.max(...layers.map((o) => o.high));
+    });
+    moments[0].overlays.forEach((_, k) => range(moments.map((m) => m.overlays[k])));
+    range(moments.map((m) => m.matches).filter((m) => m));
+    await show(now);
   };
   load().then(start, (error) => note(`The viewer cannot start: ${error.message}.`));
 })();

@@ -122,7 +122,7 @@ impl Views {
 }
 
 /// The gain that brings `volume` closest to `reference` in the least squares over `offsets`; 1 where there is none.
-fn matched(reference: &[f32], volume: Values<'_>, offsets: &[usize]) -> f32 {
+pub(super) fn matched(reference: &[f32], volume: Values<'_>, offsets: &[usize]) -> f32 {
     let pairs = || {
         offsets.iter().map(|&o| (f64::from(reference[o]), f64::from(volume(o)))).filter(|(x, y)| (x * y).is_finite())
     };

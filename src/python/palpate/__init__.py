@@ -355,8 +355,8 @@ def track(
     taken, in mm (RAS).
 
     ``volumes`` is a list, or one image, path or ``(array, affine)`` with the frames on its fourth axis; of these only a path gives
-    the time between frames. ``mask`` and ``labels`` lie
-    on the reference's grid. Raises `PalpateError` with the message of the command line.
+    the time between frames. ``mask`` and ``labels`` lie on the reference's grid. Raises `PalpateError` with the message of the
+    command line.
     """
     frames, names, step = _frames(volumes)
     images = [_image(v, name) for v, name in zip(frames, names)]
