@@ -167,7 +167,7 @@ fn canonical(
         let field = match &state {
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
-                level::refine(&pair, &mut field, passes, params.seed, tick);
+                level::refine(&pair, &mut field, (passes, level::FROM_LEVEL), params.seed, tick);
                 field
             }
             None => {
@@ -175,7 +175,7 @@ fn canonical(
                 let mut begin_in = |pair: &Pair<'_>, starts: &[Start]| {
                     let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
                     let refine = |mut start| {
-                        level::refine(pair, &mut start, passes, params.seed, tick);
+                        level::refine(pair, &mut start, (passes, level::FROM_SEARCH), params.seed, tick);
                         start
                     };
                     let wide = MatchParams::new(params, points, true, search, 2, 0.3);
