@@ -16,7 +16,7 @@ use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 pub use crate::pipeline::start::Start;
-use crate::pipeline::start::{Begun, begin};
+use crate::pipeline::start::{Begun, FROM_LEVEL, begin};
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
@@ -156,6 +156,7 @@ fn canonical(
     let mut fine = None;
     let mut searched = None;
     let mut doubted = None;
+    let mut reach = f64::INFINITY;
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let pair = aligned.level(factor);
@@ -167,15 +168,15 @@ fn canonical(
         let field = match &state {
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
-                level::refine(&pair, &mut field, (passes, level::FROM_LEVEL), params.seed, tick);
+                level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
                 field
             }
             None => {
                 let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
                 let mut begin_in = |pair: &Pair<'_>, starts: &[Start]| {
                     let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
-                    let refine = |mut start| {
-                        level::refine(pair, &mut start, (passes, level::FROM_SEARCH), params.seed, tick);
+                    let refine = |mut start, reach| {
+                        level::refine(pair, &mut start, (passes, reach), params.seed, tick);
                         start
                     };
                     let wide = MatchParams::new(params, points, true, search, 2, 0.3);
@@ -205,6 +206,9 @@ fn canonical(
                 }
                 let begun = begun.ok_or_else(|| too_few(0, search))?;
                 doubted = begun.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT);
+                if begun.is_loose() {
+                    reach = FROM_LEVEL;
+                }
                 reports.extend(begun.report);
                 searched = Some(begun.searched);
                 begun.field

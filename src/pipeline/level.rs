@@ -86,13 +86,6 @@ const SETTLED: f64 = 0.004;
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 15;
 
-/// How far the passes may take a field from where a search or a known field left it (voxels of the finest axis): about as far as
-/// the residual of smooth tissue points the way. Without, a field that the search left bent by a slide ran on by centimetres along
-/// a leg, where nothing holds it.
-pub const FROM_SEARCH: f64 = 2.0;
-/// The same from the field of the coarser level: the two voxels of that one.
-pub const FROM_LEVEL: f64 = 4.0;
-
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence (MacKay 1992):
 /// `lambda = determined / (2 energy)` along each axis. No node ends further than `reach` (voxels of the finest axis, along each
 /// axis) from where it began. Calls `tick` after each pass.

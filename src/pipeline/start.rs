@@ -78,6 +78,23 @@ const UNSURE: f64 = 0.25;
 /// and small motions keep nine tenths, legs in thick slices that moved by 16 mm four.
 const AGREED: f64 = 0.75;
 
+/// Where fewer of the features than this agree with each other, the field is held near what they say: the passes would take it
+/// on by centimetres where nothing holds it. Slides and legs that move far keep 0.4 to 0.81; pads under a press, whose edges the
+/// passes alone can find, all.
+const LOOSE: f64 = 0.85;
+
+/// How far a field is then taken from the search (voxels of the finest axis, along each axis): about as far as the residual of
+/// smooth tissue points the way.
+const FROM_SEARCH: f64 = 2.0;
+
+/// The same from the field of the coarser level: the two voxels of that one.
+pub(super) const FROM_LEVEL: f64 = 4.0;
+
+/// Whether the field is to be held near the search.
+fn is_loose(report: &LevelReport) -> bool {
+    report.counts.kept_share() < LOOSE
+}
+
 /// Matches that must agree for their share to tell a search that found the motion from one that did not.
 const ENOUGH: usize = 20;
 
@@ -99,6 +116,11 @@ impl Begun {
         self.report.as_ref().is_some_and(|r| r.counts.kept_share() < AGREED || r.counts.kept < ENOUGH)
     }
 
+    /// Whether the field is to be held near the search at finer levels too.
+    pub fn is_loose(&self) -> bool {
+        self.report.as_ref().is_some_and(is_loose)
+    }
+
     /// Of an unsure search and a wider one the one in which more of the features agreed: the agreement of the volumes does not
     /// tell a wrong island from the truth, neighbours do. Where there are too few features to count it is all there is.
     pub fn surer(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
@@ -115,7 +137,8 @@ impl Begun {
 
 /// The coarsest level of a search that may start from `known` fields.
 ///
-/// `refine` brings a start to the residual; `search` matches the whole volume, from nothing or about a field.
+/// `refine` brings a start to the residual within a reach (voxels of the finest axis); `search` matches the whole volume,
+/// from nothing or about a field.
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
@@ -127,14 +150,14 @@ pub(super) fn begin(
     lattice: &Lattice,
     factor: [usize; 3],
     known: &[Start],
-    refine: impl Fn(SplineField) -> SplineField,
+    refine: impl Fn(SplineField, f64) -> SplineField,
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
     let agreement = |field: &SplineField, sigma| {
         Agreement::measure(pair, &pair.warp(&field.lattice, &field.coefficients, &pair.spans), sigma)
     };
-    let followed = known.iter().map(|s| refine(s.on(lattice, factor))).reduce(better);
+    let followed = known.iter().map(|s| refine(s.on(lattice, factor), f64::INFINITY)).reduce(better);
     let recent = known
         .first()
         .filter(|_| known.len() > 1)
@@ -148,7 +171,9 @@ pub(super) fn begin(
         }
     }
     let (found, mut report) = search(None);
-    let own = [found, Some(SplineField::still(lattice.clone()))].into_iter().flatten().map(&refine);
+    let reach = |report: &LevelReport| if is_loose(report) { FROM_SEARCH } else { f64::INFINITY };
+    let starts = [found, Some(SplineField::still(lattice.clone()))];
+    let own = starts.into_iter().flatten().map(|start| refine(start, reach(&report)));
     let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
@@ -156,7 +181,7 @@ pub(super) fn begin(
         }
         let (next, seen) = search(Some(&field));
         let Some(next) = next.filter(|_| seen.counts.kept > report.counts.kept) else { break };
-        (field, report) = (refine(next), seen);
+        (field, report) = (refine(next, reach(&seen)), seen);
     }
     let searched = Searched { agreement: agreement(&field, None), frames: 0, certain: false };
     Some(Begun { field, report: Some(report), searched })
