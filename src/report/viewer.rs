@@ -81,7 +81,7 @@ pub struct Viewer<'a> {
     pub first: usize,
 }
 
-/// Nodes and corners of a mesh, for [`Viewer::mesh`].
+/// Nodes and corners of a mesh, for [`Moment::mesh`].
 pub fn elements(mesh: &Mesh) -> (&[WorldPoint], Vec<u32>, usize) {
     match mesh {
         Mesh::Tetrahedra(m) => (m.nodes(), m.tetrahedra().as_flattened().to_vec(), 4),
