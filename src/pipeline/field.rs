@@ -16,7 +16,7 @@ use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 pub use crate::pipeline::start::Start;
-use crate::pipeline::start::{Begun, FROM_LEVEL, begin};
+use crate::pipeline::start::{Begun, begin};
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
@@ -206,9 +206,7 @@ fn canonical(
                 }
                 let begun = begun.ok_or_else(|| too_few(0, search))?;
                 doubted = begun.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT);
-                if begun.is_loose() {
-                    reach = FROM_LEVEL;
-                }
+                reach = begun.reach();
                 reports.extend(begun.report);
                 searched = Some(begun.searched);
                 begun.field

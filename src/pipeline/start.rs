@@ -88,11 +88,11 @@ const LOOSE: f64 = 0.85;
 const FROM_SEARCH: f64 = 2.0;
 
 /// The same from the field of the coarser level: the two voxels of that one.
-pub(super) const FROM_LEVEL: f64 = 4.0;
+const FROM_LEVEL: f64 = 4.0;
 
-/// Whether the field is to be held near the search.
-fn is_loose(report: &LevelReport) -> bool {
-    report.counts.kept_share() < LOOSE
+/// `held` where the field is to be held near what the matches say, else as far as the passes take it.
+fn reach(report: &LevelReport, held: f64) -> f64 {
+    if report.counts.kept_share() < LOOSE { held } else { f64::INFINITY }
 }
 
 /// Matches that must agree for their share to tell a search that found the motion from one that did not.
@@ -116,9 +116,9 @@ impl Begun {
         self.report.as_ref().is_some_and(|r| r.counts.kept_share() < AGREED || r.counts.kept < ENOUGH)
     }
 
-    /// Whether the field is to be held near the search at finer levels too.
-    pub fn is_loose(&self) -> bool {
-        self.report.as_ref().is_some_and(is_loose)
+    /// How far the passes of a finer level may take the field from the one it starts with (voxels of the finest axis).
+    pub fn reach(&self) -> f64 {
+        self.report.as_ref().map_or(f64::INFINITY, |r| reach(r, FROM_LEVEL))
     }
 
     /// Of an unsure search and a wider one the one in which more of the features agreed: the agreement of the volumes does not
@@ -171,9 +171,8 @@ pub(super) fn begin(
         }
     }
     let (found, mut report) = search(None);
-    let reach = |report: &LevelReport| if is_loose(report) { FROM_SEARCH } else { f64::INFINITY };
     let starts = [found, Some(SplineField::still(lattice.clone()))];
-    let own = starts.into_iter().flatten().map(|start| refine(start, reach(&report)));
+    let own = starts.into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
     let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
@@ -181,7 +180,7 @@ pub(super) fn begin(
         }
         let (next, seen) = search(Some(&field));
         let Some(next) = next.filter(|_| seen.counts.kept > report.counts.kept) else { break };
-        (field, report) = (refine(next, reach(&seen)), seen);
+        (field, report) = (refine(next, reach(&seen, FROM_SEARCH)), seen);
     }
     let searched = Searched { agreement: agreement(&field, None), frames: 0, certain: false };
     Some(Begun { field, report: Some(report), searched })

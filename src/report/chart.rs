@@ -3,6 +3,7 @@
 use crate::report::field::Values;
 use crate::report::scale::{Scale, short, thousands};
 use crate::report::statistics::Histogram;
+use crate::types::SparseField;
 use std::fmt::Write;
 
 /// A histogram as SVG; bars take the colours of `scale` where one is given.
@@ -41,6 +42,12 @@ pub fn histogram(h: &Histogram, title: &str, unit: &str, scale: Option<&Scale>) 
 pub fn distribution(title: &str, values: Values<'_>, scale: &Scale, offsets: &[usize]) -> String {
     let counts = Histogram::new(offsets.iter().map(|&o| f64::from(values(o))), scale.low, scale.high, 40);
     histogram(&counts, title, scale.unit, Some(scale))
+}
+
+/// A histogram of the precision of the kept matches, in the colours of its scale.
+pub fn precision(matches: &SparseField, scale: &Scale) -> String {
+    let sigma = Histogram::new(matches.kept().map(|m| m.sigma()), scale.low, scale.high, 40);
+    histogram(&sigma, "Precision of kept matches", scale.unit, Some(scale))
 }
 
 /// Seconds by stage as one bar with a legend, in HTML.

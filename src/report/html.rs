@@ -123,7 +123,7 @@ fn look(report: &FieldReport<'_>, views: &Views) -> String {
     .collect();
     let grid = report.initial.grid();
     let moment = Moment {
-        name: "",
+        name: None,
         images: &[],
         overlays: &overlays,
         displacement: views.magnitude.scale.clone().map(|scale| (report.displacement, scale)),
@@ -254,10 +254,7 @@ fn histograms(report: &FieldReport<'_>, views: &Views) -> String {
         .collect();
     let ncc = Histogram::new(report.matches.kept().map(|m| f64::from(m.ncc)), 0.0, 1.0, 40);
     out.push_str(&chart::histogram(&ncc, "Correlation of kept matches", "", None));
-    let precision = &views.matches.2;
-    let sigma = Histogram::new(report.matches.kept().map(|m| m.sigma()), precision.low, precision.high, 40);
-    out.push_str(&chart::histogram(&sigma, "Precision of kept matches", "mm", Some(precision)));
-    out
+    out + &chart::precision(report.matches, &views.matches.2)
 }
 
 fn footer() -> &'static str {

@@ -10,6 +10,7 @@ use crate::report::scale::{Scale, thousands};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
+use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Moment, Viewer};
 use crate::report::{chart, json};
 use crate::types::stiffness::{Evidence, FrameStiffness, Gain, RegionStiffness, SharedStiffness, StiffnessResult};
@@ -190,7 +191,7 @@ fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Valu
     let corners: Vec<u32> = result.mesh.tetrahedra().iter().flat_map(|e| e[..4].to_vec()).collect();
     let grid = result.map.grid();
     let moment = Moment {
-        name: "",
+        name: None,
         images: &[],
         overlays: &overlays,
         displacement,
@@ -379,7 +380,7 @@ fn patch_table(result: &StiffnessResult) -> String {
             format!("{which} ({})", escape(&p.name)),
             p.contact.name().into(),
             format!("{:.1} mm^2", p.area),
-            p.translation.map(|v| format!("{v:.2}")).join(", ") + " mm",
+            p.translation.map(short2).join(", ") + " mm",
         ]
     };
     let [held, load] = &result.patches;
@@ -394,7 +395,7 @@ fn correlation_table(result: &StiffnessResult) -> String {
         .regions
         .iter()
         .zip(&result.correlation)
-        .map(|(r, c)| std::iter::once(escape(&r.name)).chain(c.iter().map(|v| format!("{v:.2}"))).collect())
+        .map(|(r, c)| std::iter::once(escape(&r.name)).chain(c.iter().map(|v| short2(*v))).collect())
         .collect();
     table(&head, &rows)
 }

@@ -10,11 +10,11 @@ use crate::report::json::{grid, seconds};
 use crate::report::panels::{centre_of_motion, gray_range, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
-use crate::report::statistics::{Histogram, quantile, sample};
+use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
 use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Moment, PackedMoment, Viewer, elements};
-use crate::report::views::matched;
+use crate::report::views::{Scales, matched};
 use crate::types::{
     DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels, WorldPoint,
 };
@@ -156,7 +156,6 @@ impl Looks {
         let Seen { strain, jacobian, uncertainty, .. } = *seen;
         let grid = displacement.grid();
         let inside = sample(grid.len(), mask);
-        let most = |f: Values<'_>, q| quantile(inside.iter().map(|&o| f64::from(f(o))), q);
         let [reference, a, b] = volumes.map(|v| v.as_slice());
         let [a, b]: [Values<'_>; 2] = [&|o| a[o], &|o| b[o]];
         let range = gray_range(volumes[0]);
@@ -165,13 +164,13 @@ impl Looks {
             Layer { name, values, scale: gray(range.map(|r| r / gain)) }
         });
         let moved: Values<'_> = &|o| length(displacement, o);
-        let change = most(&|o| (jacobian(o) - 1.0).abs(), 0.99).clamp(0.05, 1.0);
-        let lengths = Scale::from_zero(most(moved, 0.998), "mm", ColorMap::Viridis);
-        let precision = Scale::from_zero(quantile(matches.kept().map(|m| m.sigma()), 0.95), "mm", ColorMap::Viridis);
+        let Scales { length: lengths, jacobian: change, uncertainty: vague, precision } =
+            Scales::of(&inside, moved, jacobian, uncertainty, matches);
+        let strained = quantile(inside.iter().map(|&o| f64::from(strain(o))), 0.99);
         let overlays = [
-            ("Largest principal strain", strain, Scale::from_zero(most(strain, 0.99), "", ColorMap::Magma)),
-            ("Jacobian determinant", jacobian, Scale::about(1.0, change, "")),
-            ("Uncertainty", uncertainty, Scale::from_zero(most(uncertainty, 0.98), "mm", ColorMap::Magma)),
+            ("Largest principal strain", strain, Scale::from_zero(strained, "", ColorMap::Magma)),
+            ("Jacobian determinant", jacobian, change),
+            ("Uncertainty", uncertainty, vague),
         ]
         .map(|(name, values, scale)| Layer { name, values, scale });
         let displacements = Layer { name: "Displacement", values: moved, scale: lengths.clone() };
@@ -179,10 +178,9 @@ impl Looks {
             .chain(&overlays)
             .map(|l| chart::distribution(l.name, l.values, &l.scale, &inside))
             .collect();
-        let sigma = Histogram::new(matches.kept().map(|m| m.sigma()), precision.low, precision.high, 40);
-        histograms += &chart::histogram(&sigma, "Precision of kept matches", "mm", Some(&precision));
+        histograms += &chart::precision(matches, &precision);
         let moment = Moment {
-            name,
+            name: Some(name),
             images: &images,
             overlays: &overlays,
             displacement: Some((displacement, lengths)),

@@ -84,6 +84,9 @@
   };
 
   const chosen = (name, list) => list[+$(name).value];
+
+  // Where the colour of a value begins in its table.
+  const entry = ({ bottom, top }, value) => 3 * Math.round(255 * Math.min(1, Math.max(0, (value - bottom) / (top - bottom))));
   const paint = (plane) => {
     const first = chosen("image", images), second = chosen("other", images), compare = $("compare").value;
     const grid = first, [h, v] = plane.axes, width = grid.shape[h], height = grid.shape[v];
@@ -103,7 +106,7 @@
       const gray = compare === "flicker" ? (blink ? two[i] : one[i]) : compare === "checkerboard" && tile ? two[i] : one[i];
       let r = gray, g = gray, b = gray;
       if (overlay && !isUnknown(coloured[i]) && (!inside || inside[i] > 0.5)) {
-        const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (coloured[i] - overlay.bottom) / (overlay.top - overlay.bottom))));
+        const t = entry(overlay, coloured[i]);
         r += (table[t] - r) * opacity; g += (table[t + 1] - g) * opacity; b += (table[t + 2] - b) * opacity;
       }
       p[4 * i] = r; p[4 * i + 1] = g; p[4 * i + 2] = b; p[4 * i + 3] = 255;
@@ -115,10 +118,7 @@
   };
 
   const css = (rgb) => `rgb(${rgb[0]},${rgb[1]},${rgb[2]})`;
-  const colour = (overlay, value) => {
-    const t = 3 * Math.round(255 * Math.min(1, Math.max(0, (value - overlay.bottom) / (overlay.top - overlay.bottom))));
-    return css(colours[overlay.map].subarray(t, t + 3));
-  };
+  const colour = (overlay, value) => css(colours[overlay.map].subarray(entry(overlay, value)));
 
   // Where the plane meets a tetrahedron, or the edges of a triangle in it: segments in mm across and up.
   const drawMesh = (context, plane, point) => {

@@ -26,8 +26,6 @@ const MATCHES: usize = 60_000;
 /// A mesh of more elements is left out, of one moment and of several.
 const ELEMENTS: [usize; 2] = [200_000, 50_000];
 
-/// What the length of the displacement is called.
-const LENGTH: &str = "Length of the displacement";
 /// The tallest picture at most, on the page.
 const HEIGHT_PX: f64 = 520.0;
 
@@ -43,8 +41,8 @@ pub struct Layer<'a> {
 
 /// What a viewer shows at one moment: all of it, or what changes over a sequence. On the viewer's grid.
 pub struct Moment<'a> {
-    /// What it is called, where there are several.
-    pub name: &'a str,
+    /// What it is called where it is one of several; None where it is the only one, which has twice as many voxels of what is smooth.
+    pub name: Option<&'a str>,
     /// In gray, after those that all moments share.
     pub images: &'a [Layer<'a>],
     /// In colour over an image.
@@ -196,18 +194,18 @@ fn places(canonical: &Canonical, points: impl Iterator<Item = WorldPoint>) -> St
 }
 
 impl Moment<'_> {
-    /// Thinned and packed. A moment without a name is the only one, and has twice as many voxels of what is smooth.
+    /// Thinned and packed.
     pub fn pack(&self, grid: &Grid) -> PackedMoment {
         let canonical = Canonical::of(grid);
         let fine = Thinned::new(&canonical, IMAGE_VOXELS);
-        let several = usize::from(!self.name.is_empty());
+        let several = usize::from(self.name.is_some());
         let coarse = Thinned::new(&canonical, SMOOTH_VOXELS[several]);
         let images = layers(&fine, self.images, byte);
         let mut overlays: Vec<Value> = Vec::new();
         let mut maps: Vec<ColorMap> = Vec::new();
         if let Some((_, scale)) = &self.displacement {
             maps.push(scale.map);
-            overlays.push(json!({ "name": LENGTH, "vector": true, "low": scale.low,
+            overlays.push(json!({ "name": "Length of the displacement", "vector": true, "low": scale.low,
                 "high": scale.high, "unit": scale.unit, "map": map_name(scale.map) }));
         }
         maps.extend(self.overlays.iter().map(|l| l.scale.map));
@@ -392,7 +390,7 @@ mod tests {
             kept: true,
         };
         let moment = Moment {
-            name: "",
+            name: None,
             images: &[],
             overlays: &[],
             displacement: Some((&field, length.clone())),

@@ -9,7 +9,7 @@ use crate::report::picture::Picture;
 use crate::report::scale::{Scale, short};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
-use crate::types::WorldPoint;
+use crate::types::{SparseField, WorldPoint};
 
 /// Everything that is cut from the volumes, and the scales that go with it.
 #[derive(Debug, Clone, PartialEq)]
@@ -69,9 +69,8 @@ impl Views {
         };
 
         let motion = |o| length(displacement, o);
-        let lengths = Scale::from_zero(spread(0.998, &motion), "mm", ColorMap::Viridis);
-        let change = Scale::about(1.0, spread(0.99, &|o| (jacobian(o) - 1.0).abs()).clamp(0.05, 1.0), "");
-        let vague = Scale::from_zero(spread(0.98, uncertainty), "mm", ColorMap::Magma);
+        let scales = Scales::of(&inside, &motion, jacobian, uncertainty, report.matches);
+        let Scales { length: lengths, jacobian: change, uncertainty: vague, precision } = scales;
 
         let error = report.truth.map(|(truth, _)| {
             let gap = |o: usize| {
@@ -90,8 +89,6 @@ impl Views {
         };
         let arrows = each(&|s, b| drawing::arrows(s, b, displacement, mask, factor, &lengths));
         let slab = sections.iter().map(Section::thickness_mm).fold(1.0, f64::max);
-        let precision = quantile(report.matches.kept().map(|m| m.sigma()), 0.95);
-        let precision = Scale::from_zero(precision, "mm", ColorMap::Viridis);
         let dots = each(&|s, b| drawing::matches(s, b, &report.matches.matches, slab, &precision));
 
         Ok(Self {
@@ -118,6 +115,39 @@ impl Views {
             arrows: (arrows, factor),
             matches: (dots, slab, precision),
         })
+    }
+}
+
+/// Range and colours of what is measured: the same in pictures, viewers and distributions.
+pub(super) struct Scales {
+    /// Length of the displacement (mm).
+    pub length: Scale,
+    /// Jacobian determinant.
+    pub jacobian: Scale,
+    /// Uncertainty of the displacement (mm).
+    pub uncertainty: Scale,
+    /// Precision of the kept matches (mm).
+    pub precision: Scale,
+}
+
+impl Scales {
+    /// From the values over the voxels at `inside`, but for the few that stand out.
+    pub fn of(
+        inside: &[usize],
+        length: Values<'_>,
+        jacobian: Values<'_>,
+        uncertainty: Values<'_>,
+        matches: &SparseField,
+    ) -> Self {
+        let most = |f: Values<'_>, q| quantile(inside.iter().map(|&o| f64::from(f(o))), q);
+        let change = most(&|o| (jacobian(o) - 1.0).abs(), 0.99).clamp(0.05, 1.0);
+        let sigma = quantile(matches.kept().map(|m| m.sigma()), 0.95);
+        Self {
+            length: Scale::from_zero(most(length, 0.998), "mm", ColorMap::Viridis),
+            jacobian: Scale::about(1.0, change, ""),
+            uncertainty: Scale::from_zero(most(uncertainty, 0.98), "mm", ColorMap::Magma),
+            precision: Scale::from_zero(sigma, "mm", ColorMap::Viridis),
+        }
     }
 }
 
