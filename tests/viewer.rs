@@ -106,7 +106,7 @@ fn what_is_past_a_scale_or_unknown_is_said_and_what_ends_it_is_exact() {
         overlay("past", &|o| 2.1 - (o % 12 / 11) as f32),
         overlay("hole", &hole),
     ];
-    let moment = Moment { name: "", images: &[], overlays: &overlays, displacement: None, matches: None, mesh: None };
+    let moment = Moment { name: None, images: &[], overlays: &overlays, displacement: None, matches: None, mesh: None };
     let viewer = Viewer {
         grid: &grid,
         centre: grid.world(6, 6, 6),

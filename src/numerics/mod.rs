@@ -43,3 +43,4 @@ pub mod sparse;
 pub mod cholesky;
 
 pub mod trig;
+pub mod unfold;

@@ -14,9 +14,11 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
+use crate::pipeline::finer::finer;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
-use crate::pipeline::start::{Begun, begin};
+use crate::pipeline::whole::{self, Whole};
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
@@ -51,9 +53,6 @@ pub struct FieldResult {
 
 /// Fewest matches that a result may rest on.
 const FEWEST: usize = 20;
-
-/// Fewest matches that a search may start from; it competes with stillness.
-const FEWEST_SOUGHT: usize = 8;
 
 /// Stage names and their wall seconds.
 struct Clock(Vec<(String, f64)>, Instant);
@@ -154,9 +153,9 @@ fn canonical(
     let mut reports = Vec::new();
     let mut state: Option<(SplineField, [usize; 3])> = None;
     let mut fine = None;
-    let mut searched = None;
-    let mut doubted = None;
+    let mut begun = None;
     let mut reach = f64::INFINITY;
+    let mut asked = Vec::new();
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let pair = aligned.level(factor);
@@ -165,53 +164,49 @@ fn canonical(
         let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
         let passes = if last { params.passes } else { params.coarse_passes };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
-        let field = match &state {
+        let matching = || progress("matching", done(0.0));
+        let whole = Whole { params, range: search, flat: grid.is_single_slice(), matching: &matching, tick: &tick };
+        let mut matched = 0.0;
+        let mut field = match &state {
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
+                let loose = begun.as_ref().filter(|b: &&Begun| l == 1 && b.is_loose());
+                let coarsest = loose.map(|_| (aligned.level(*from), *from));
+                let closer = coarsest.and_then(|(coarse, from)| {
+                    whole.closer((&pair, factor), &field, (&coarse, from), passes, &mut matched)
+                });
+                if let Some(found) = closer {
+                    field = found.field.clone();
+                    reports.extend(found.report.clone());
+                    reach = found.reach();
+                    begun = Some(found);
+                }
                 field
             }
             None => {
-                let share = if grid.is_single_slice() { COARSE_SHARE / 4 } else { COARSE_SHARE };
-                let mut begin_in = |pair: &Pair<'_>, starts: &[Start]| {
-                    let points = pair.inside.div_ceil(share).clamp(40, COARSE_POINTS);
-                    let refine = |mut start, reach| {
-                        level::refine(pair, &mut start, (passes, reach), params.seed, tick);
-                        start
-                    };
-                    let wide = MatchParams::new(params, points, true, search, 2, 0.3);
-                    let seek = |about: Option<&SplineField>| {
-                        progress("matching", done(0.0));
-                        let started = Instant::now();
-                        let (fitted, report) = match about {
-                            None => {
-                                let (_, fitted, report) = level::matches(pair, None, lattice.clone(), wide);
-                                (fitted, report)
-                            }
-                            Some(field) => level::matches_again(pair, field, wide),
-                        };
-                        clock.skip("matching", started.elapsed().as_secs_f64());
-                        (fitted.filter(|_| report.counts.kept >= FEWEST_SOUGHT), report)
-                    };
-                    begin(pair, &lattice, factor, starts, refine, seek)
-                };
-                let mut begun = begin_in(&pair, starts);
-                if given && begun.as_ref().is_none_or(Begun::is_unsure) {
-                    let tissue = around(&mask, &clean);
-                    let wider = begin_in(&aligned.level_within(&tissue, factor), &[]);
-                    begun = match (begun, wider) {
+                let effort = (passes, whole::POINTS);
+                let mut found = whole.begin((&pair, factor), &lattice, starts, effort, &mut matched);
+                if given && found.as_ref().is_none_or(Begun::is_unsure) {
+                    let tissue = aligned.level_within(&around(&mask, &clean), factor);
+                    let wider = whole.begin((&tissue, factor), &lattice, &[], effort, &mut matched);
+                    found = match (found, wider) {
                         (Some(own), Some(wider)) => Some(Begun::surer(&pair, own, wider)),
                         (own, wider) => own.or(wider),
                     };
                 }
-                let begun = begun.ok_or_else(|| too_few(0, search))?;
-                doubted = begun.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT);
-                reach = begun.reach();
-                reports.extend(begun.report);
-                searched = Some(begun.searched);
-                begun.field
+                let found = found.ok_or_else(|| too_few(0, search))?;
+                reports.extend(found.report.clone());
+                reach = found.reach();
+                begun.insert(found).field.clone()
             }
         };
+        if last {
+            let refine =
+                |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
+            (field, asked) = finer(&pair, field, (params.node_spacing, passes), params.seed, refine);
+        }
+        clock.skip("matching", matched);
         clock.book("residual");
         if last {
             progress("matching", done(0.9));
@@ -244,6 +239,7 @@ fn canonical(
     let flat = grid.is_single_slice();
     let mut choice = smallest(&matches, &pair, &field, params.seed);
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
+    choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
     let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
@@ -270,10 +266,15 @@ fn canonical(
     };
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
+    let doubted = begun.as_ref().and_then(Begun::doubted);
     // Matches that do not bear each other out on any level and a motion past all that was looked for: not a measurement.
-    if doubted.is_some() && kept * 5 < found && length.1 > 1.2 * search {
+    if let Some(seen) = doubted.filter(|_| length.1 > 1.2 * search) {
         let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
-        return Err(FieldError::TooFew { found: kept, what: "matches survive", needed: found.div_ceil(5), hint });
+        let few = |found: usize, what, needed: usize| (found < needed).then_some((found, what, needed));
+        let searched = few(seen.kept, "features agree on the whole", seen.features_initial.div_ceil(3));
+        if let Some((found, what, needed)) = searched.or_else(|| few(kept, "matches survive", found.div_ceil(5))) {
+            return Err(FieldError::TooFew { found, what, needed, hint });
+        }
     }
 
     progress("jacobian", 0.94);
@@ -314,15 +315,10 @@ fn canonical(
     };
     progress("done", 1.0);
     let voxel = pyramid::finest(grid.shape(), grid.spacing());
-    let searched = searched.map(|s| s.judged(uncertainty_median_mm, length.0, voxel));
+    let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
     let spline = Start { field, factor, searched };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
-
-/// Voxels of the coarsest mask for each feature there, and the most features.
-const COARSE_SHARE: usize = 24;
-/// See [`COARSE_SHARE`].
-const COARSE_POINTS: usize = 4000;
 
 /// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and [`FEWEST`] must be left.
 const LEAST_SEARCHED: usize = 1500;
@@ -365,10 +361,6 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
     };
     [1, 2, 4].into_iter().find(|&f| left(f) <= WORKED_ON).unwrap_or(8)
 }
-
-/// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more
-/// where the motion was found (heads and legs, 3 to 20 mm), and 0.45 or less with inverted contrast.
-const BORNE_OUT: f64 = 0.5;
 
 /// The mask and all other tissue: what is searched when too little inside the mask agrees.
 fn around(mask: &Mask, initial: &Voxels<'_>) -> Vec<u8> {

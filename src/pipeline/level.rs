@@ -18,6 +18,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
+use crate::numerics::unfold::unfold;
 use crate::numerics::{filters, pyramid};
 use crate::types::{Counts, FieldParams, LevelReport};
 use rayon::prelude::*;
@@ -86,6 +87,9 @@ const SETTLED: f64 = 0.004;
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 15;
 
+/// What tissue is left of its volume at least; below it, the field is smoothed.
+const LEAST_VOLUME: f32 = 0.1;
+
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence (MacKay 1992):
 /// `lambda = determined / (2 energy)` along each axis. No node ends further than `reach` (voxels of the finest axis, along each
 /// axis) from where it began. Calls `tick` after each pass.
@@ -126,6 +130,7 @@ pub fn refine(
         for (((c, b), before), begun) in field.coefficients.iter_mut().zip(&base).zip(&before).zip(&begun) {
             *c = (*c + MOMENTUM * (b - before)).max(begun - reach).min(begun + reach);
         }
+        unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
         before = base;
         field.blocks = equations.blocks;
         if pass % 2 == 1 || pass + 1 == passes {
@@ -162,6 +167,18 @@ pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&Affine
         let warped = pair.warp(&field.lattice, &map, &active);
         residual::excess(pair, &warped, &free) * every as f64 * f64::from(independent(pair))
     }
+}
+
+/// By how much the misfit shrinks from one field to another, with the information that correlated noise leaves.
+pub fn gained(pair: &Pair<'_>, from: &SplineField, to: &SplineField) -> f64 {
+    let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
+    residual::excess(pair, &warp(from), &warp(to)) * f64::from(independent(pair))
+}
+
+/// Robust standard deviation of what is left of the difference under a field (intensity).
+pub fn misfit(pair: &Pair<'_>, field: &SplineField) -> f32 {
+    let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
+    residual::residual_sigma(pair, &warped, &GainField::measure(pair, &warped))
 }
 
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.

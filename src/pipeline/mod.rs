@@ -31,5 +31,7 @@ pub mod pressed;
 
 pub mod stress;
 
+mod finer;
 mod search;
 mod start;
+mod whole;

@@ -5,7 +5,7 @@ use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::level::{self, SplineField};
-use crate::types::LevelReport;
+use crate::types::{Counts, LevelReport};
 
 /// A field where another search may start.
 #[derive(Debug, Clone, PartialEq)]
@@ -54,6 +54,11 @@ pub(super) struct Searched {
 }
 
 impl Searched {
+    /// What a field found by a search of all leaves of the difference on the coarsest level.
+    pub fn of(pair: &Pair<'_>, field: &SplineField) -> Self {
+        Self { agreement: agreement(pair, field, None), frames: 0, certain: false }
+    }
+
     /// With the last frame's median uncertainty, its mean motion and its finest voxel edge (mm).
     pub fn judged(self, uncertainty: f64, motion: f64, voxel: f64) -> Self {
         Self { certain: uncertainty < (VAGUE * voxel).min(UNSURE * motion), ..self }
@@ -95,6 +100,10 @@ fn reach(report: &LevelReport, held: f64) -> f64 {
     if report.counts.kept_share() < LOOSE { held } else { f64::INFINITY }
 }
 
+/// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more
+/// where the motion was found (heads and legs, 3 to 20 mm), and 0.45 or less with inverted contrast.
+const BORNE_OUT: f64 = 0.5;
+
 /// Matches that must agree for their share to tell a search that found the motion from one that did not.
 const ENOUGH: usize = 20;
 
@@ -116,6 +125,16 @@ impl Begun {
         self.report.as_ref().is_some_and(|r| r.counts.kept_share() < AGREED || r.counts.kept < ENOUGH)
     }
 
+    /// Whether so few features agreed that the next level is to be searched as well.
+    pub fn is_loose(&self) -> bool {
+        self.reach().is_finite()
+    }
+
+    /// The features and those that agreed, where these are too few to go by.
+    pub fn doubted(&self) -> Option<Counts> {
+        self.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT)
+    }
+
     /// How far the passes of a finer level may take the field from the one it starts with (voxels of the finest axis).
     pub fn reach(&self) -> f64 {
         self.report.as_ref().map_or(f64::INFINITY, |r| reach(r, FROM_LEVEL))
@@ -133,6 +152,10 @@ impl Begun {
         };
         if wider_is_surer { wider } else { own }
     }
+}
+
+fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreement {
+    Agreement::measure(pair, &pair.warp(&field.lattice, &field.coefficients, &pair.spans), sigma)
 }
 
 /// The coarsest level of a search that may start from `known` fields.
@@ -154,9 +177,6 @@ pub(super) fn begin(
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
-    let agreement = |field: &SplineField, sigma| {
-        Agreement::measure(pair, &pair.warp(&field.lattice, &field.coefficients, &pair.spans), sigma)
-    };
     let followed = known.iter().map(|s| refine(s.on(lattice, factor), f64::INFINITY)).reduce(better);
     let recent = known
         .first()
@@ -164,7 +184,7 @@ pub(super) fn begin(
         .and_then(|s| s.searched.as_ref())
         .filter(|s| s.frames < FOLLOWED && s.certain);
     if let Some((field, searched)) = followed.as_ref().zip(recent) {
-        let now = agreement(field, Some(searched.agreement.sigma()));
+        let now = agreement(pair, field, Some(searched.agreement.sigma()));
         let searched = Searched { frames: searched.frames + 1, ..searched.clone() };
         if now.worsened(&searched.agreement) <= GROWN {
             return Some(Begun { field: field.clone(), report: None, searched });
@@ -182,6 +202,6 @@ pub(super) fn begin(
         let Some(next) = next.filter(|_| seen.counts.kept > report.counts.kept) else { break };
         (field, report) = (refine(next, reach(&seen, FROM_SEARCH)), seen);
     }
-    let searched = Searched { agreement: agreement(&field, None), frames: 0, certain: false };
+    let searched = Searched::of(pair, &field);
     Some(Begun { field, report: Some(report), searched })
 }

@@ -1,0 +1,187 @@
+//! Takes the folds out of a spline field: tissue cannot turn inside out.
+
+use crate::numerics::bspline::Lattice;
+use rayon::prelude::*;
+
+/// Rounds of smoothing at most.
+const ROUNDS: usize = 20;
+
+/// Weights of the three nodes about a knot: of the value, and of the derivative in steps.
+const VALUE: [f32; 3] = [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0];
+const SLOPE: [f32; 3] = [-0.5, 0.0, 0.5];
+/// Of the smoothing.
+const SMOOTH: [f32; 3] = [0.25, 0.5, 0.25];
+
+/// A lattice with its steps in mm.
+struct Knots<'a> {
+    lattice: &'a Lattice,
+    per_mm: [f32; 3],
+}
+
+impl<'a> Knots<'a> {
+    fn new(lattice: &'a Lattice, spacing: [f64; 3]) -> Self {
+        let edge = |a: usize| (lattice.step[a] as f64 * spacing[a]) as f32;
+        Self { lattice, per_mm: std::array::from_fn(|a| if lattice.nodes[a] == 1 { 0.0 } else { 1.0 / edge(a) }) }
+    }
+
+    /// Whether the node has a knot within the voxel grid.
+    fn is_inner(&self, p: [usize; 3]) -> bool {
+        (0..3).all(|a| self.lattice.nodes[a] == 1 || (1..=self.lattice.nodes[a] - 3).contains(&p[a]))
+    }
+
+    /// The node at `at` moved by `by` along each axis, kept on the lattice.
+    fn node(&self, at: [usize; 3], by: [usize; 3]) -> usize {
+        let n = self.lattice.nodes;
+        let p: [usize; 3] = std::array::from_fn(|a| (at[a] + by[a]).saturating_sub(1).min(n[a] - 1));
+        p[0] + n[0] * (p[1] + n[1] * p[2])
+    }
+
+    /// Jacobian determinant of x + u(x) at the knot of the node at `at`.
+    fn jacobian(&self, coefficients: &[f32], at: [usize; 3]) -> f32 {
+        let total = self.lattice.len();
+        let mut gradient = [[0.0f32; 3]; 3];
+        for k in 0..3 {
+            for j in 0..3 {
+                for i in 0..3 {
+                    let node = self.node(at, [i, j, k]);
+                    let w = [
+                        SLOPE[i] * VALUE[j] * VALUE[k] * self.per_mm[0],
+                        VALUE[i] * SLOPE[j] * VALUE[k] * self.per_mm[1],
+                        VALUE[i] * VALUE[j] * SLOPE[k] * self.per_mm[2],
+                    ];
+                    for (c, row) in gradient.iter_mut().enumerate() {
+                        let u = coefficients[c * total + node];
+                        for (g, w) in row.iter_mut().zip(w) {
+                            *g += w * u;
+                        }
+                    }
+                }
+            }
+        }
+        for (c, row) in gradient.iter_mut().enumerate() {
+            row[c] += 1.0;
+        }
+        let [a, b, c] = gradient;
+        a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    }
+
+    fn place(&self, node: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.lattice.nodes;
+        [node % nx, node / nx % ny, node / (nx * ny)]
+    }
+
+    /// The nodes within `reach` of those given, in order.
+    fn around(&self, nodes: &[usize], reach: usize) -> Vec<usize> {
+        let n = self.lattice.nodes;
+        let mut all = Vec::new();
+        for &node in nodes {
+            let p = self.place(node);
+            let [x, y, z]: [_; 3] = std::array::from_fn(|a| p[a].saturating_sub(reach)..(p[a] + reach + 1).min(n[a]));
+            for k in z {
+                for j in y.clone() {
+                    all.extend(x.clone().map(|i| i + n[0] * (j + n[1] * k)));
+                }
+            }
+        }
+        all.sort_unstable();
+        all.dedup();
+        all
+    }
+
+    /// Those of the nodes at whose knot the volume shrinks below `least`.
+    fn folded(
+        &self,
+        coefficients: &[f32],
+        nodes: impl IndexedParallelIterator<Item = usize>,
+        least: f32,
+    ) -> Vec<usize> {
+        nodes
+            .with_min_len(1024)
+            .filter(|&node| {
+                let p = self.place(node);
+                self.is_inner(p) && self.jacobian(coefficients, p) < least
+            })
+            .collect()
+    }
+
+    fn smoothed(&self, values: &[f32], node: usize) -> f32 {
+        let at = self.place(node);
+        let mut sum = 0.0;
+        for k in 0..3 {
+            for j in 0..3 {
+                for i in 0..3 {
+                    sum += SMOOTH[i] * SMOOTH[j] * SMOOTH[k] * values[self.node(at, [i, j, k])];
+                }
+            }
+        }
+        sum
+    }
+}
+
+/// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of what it was, until there is
+/// none or [`ROUNDS`] are over. `spacing` is that of the lattice's voxels (mm).
+pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
+    let per_mm = std::array::from_fn(|a| {
+        if lattice.nodes[a] == 1 { 0.0 } else { 1.0 / (lattice.step[a] as f64 * spacing[a]) as f32 }
+    });
+    let knots = Knots { lattice, per_mm };
+    let total = lattice.len();
+    let mut folded = knots.folded(coefficients, (0..total).into_par_iter(), least);
+    for _ in 0..ROUNDS {
+        if folded.is_empty() {
+            break;
+        }
+        let touched = knots.around(&folded, 1);
+        for values in coefficients.chunks_exact_mut(total) {
+            let smooth: Vec<f32> =
+                touched.par_iter().with_min_len(256).map(|&node| knots.smoothed(values, node)).collect();
+            for (&node, v) in touched.iter().zip(smooth) {
+                values[node] = v;
+            }
+        }
+        folded = knots.folded(coefficients, knots.around(&touched, 1).into_par_iter(), least);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Least determinant at the knots.
+    fn least(lattice: &Lattice, spacing: [f64; 3], coefficients: &[f32]) -> f32 {
+        let knots = Knots::new(lattice, spacing);
+        let all = (0..lattice.len()).filter(|&n| knots.is_inner(knots.place(n)));
+        all.map(|n| knots.jacobian(coefficients, knots.place(n))).fold(f32::INFINITY, f32::min)
+    }
+
+    fn bump(lattice: &Lattice, height: f32) -> Vec<f32> {
+        let mut c = vec![0.0; 3 * lattice.len()];
+        let [nx, ny, nz] = lattice.nodes;
+        c[nx / 2 + nx * (ny / 2 + ny * (nz / 2))] = height;
+        c
+    }
+
+    #[test]
+    fn the_determinant_is_that_of_an_affine_motion() {
+        let lattice = Lattice::new([20, 24, 9], [4, 3, 2]);
+        let spacing = [1.0, 2.0, 3.0];
+        let map = [[0.1, -0.2, 0.05], [0.3, -0.3, 0.1], [0.0, 0.2, 0.2]];
+        let c = lattice.fit(|p| map.map(|r| r[0] * p[0] * 1.0 + r[1] * p[1] * 2.0 + r[2] * p[2] * 3.0));
+        // (1.1)(0.7 * 1.2 - 0.1 * 0.2) - (-0.2)(0.3 * 1.2 - 0) + 0.05 (0.3 * 0.2 - 0)
+        assert!((least(&lattice, spacing, &c) - 0.977).abs() < 1e-3);
+    }
+
+    #[test]
+    fn folds_go_and_sound_fields_stay() {
+        for shape in [[40, 36, 30], [40, 36, 1]] {
+            let (lattice, spacing) = (Lattice::new(shape, [4; 3]), [1.0, 1.0, 2.0]);
+            let (mut folded, sound) = (bump(&lattice, 40.0), bump(&lattice, 3.0));
+            assert!(least(&lattice, spacing, &folded) < 0.0);
+            unfold(&lattice, spacing, &mut folded, 0.1);
+            assert!(least(&lattice, spacing, &folded) >= 0.1, "{}", least(&lattice, spacing, &folded));
+            let mut same = sound.clone();
+            unfold(&lattice, spacing, &mut same, 0.1);
+            assert_eq!(same, sound);
+        }
+    }
+}

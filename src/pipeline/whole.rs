@@ -1,0 +1,99 @@
+//! The search of a whole volume, on the coarsest level and, where few features agree there, on the next.
+
+use crate::matching::levels::{from_level, to_level};
+use crate::matching::pair::Pair;
+use crate::numerics::bspline::Lattice;
+use crate::pipeline::level::{self, MatchParams, SplineField};
+use crate::pipeline::start::{Begun, Searched, Start, begin};
+use crate::types::FieldParams;
+use std::time::Instant;
+
+/// Voxels of a level's mask for each feature, where a whole volume is searched; a quarter of it in one slice.
+const SHARE: usize = 24;
+
+/// The most features of the coarsest level.
+pub(super) const POINTS: usize = 4000;
+
+/// The most features of the next level, times the voxels of the finest level for each of its points.
+const CLOSER_POINTS: usize = 187_500;
+
+/// Fewest matches that a search may start from; it competes with stillness.
+const FEWEST: usize = 8;
+
+/// How a whole volume is searched.
+pub(super) struct Whole<'a> {
+    pub params: &'a FieldParams,
+    /// The largest motion looked for (mm).
+    pub range: f64,
+    /// Whether the volumes are one slice.
+    pub flat: bool,
+    /// Called as matching begins.
+    pub matching: &'a dyn Fn(),
+    /// Called after each pass with its number.
+    pub tick: &'a dyn Fn(usize),
+}
+
+impl Whole<'_> {
+    /// The most features on the level after the coarsest: more where more time is to be spent.
+    pub fn closer_points(&self) -> usize {
+        (CLOSER_POINTS / self.params.voxels_per_point.max(1)).min(POINTS)
+    }
+
+    /// What is found on a level, with at most `most` features and so many passes, from nothing or from `known` fields. Adds the
+    /// seconds that matching takes to `seconds`.
+    pub fn begin(
+        &self,
+        (pair, factor): (&Pair<'_>, [usize; 3]),
+        lattice: &Lattice,
+        known: &[Start],
+        (passes, most): (usize, usize),
+        seconds: &mut f64,
+    ) -> Option<Begun> {
+        let share = if self.flat { SHARE / 4 } else { SHARE };
+        let points = pair.inside.div_ceil(share).min(most).max(40);
+        let wide = MatchParams::new(self.params, points, true, self.range, 2, 0.3);
+        let refine = |mut start, reach| {
+            level::refine(pair, &mut start, (passes, reach), self.params.seed, self.tick);
+            start
+        };
+        let seek = |about: Option<&SplineField>| {
+            (self.matching)();
+            let started = Instant::now();
+            let (fitted, report) = match about {
+                None => {
+                    let (_, fitted, report) = level::matches(pair, None, lattice.clone(), wide);
+                    (fitted, report)
+                }
+                Some(field) => level::matches_again(pair, field, wide),
+            };
+            *seconds += started.elapsed().as_secs_f64();
+            (fitted.filter(|_| report.counts.kept >= FEWEST), report)
+        };
+        begin(pair, lattice, factor, known, refine, seek)
+    }
+
+    /// The better of a field that came down from the coarsest level and of what a search of the next level itself finds: smaller
+    /// patches are distorted less, and fine texture tells a wrong island from the truth, which the coarse volumes do not.
+    /// None where it is the first. `coarse` is the coarsest level, where a winner is remembered for the next frame.
+    pub fn closer(
+        &self,
+        (pair, factor): (&Pair<'_>, [usize; 3]),
+        own: &SplineField,
+        (coarse, coarsest): (&Pair<'_>, [usize; 3]),
+        passes: usize,
+        seconds: &mut f64,
+    ) -> Option<Begun> {
+        let lattice = level::lattice(pair, 3);
+        let effort = (self.params.coarse_passes, self.closer_points());
+        let mut found = self.begin((pair, factor), &lattice, &[], effort, seconds)?;
+        found.field = level::carry(&found.field, own.lattice.clone(), |p| p);
+        let reach = found.reach();
+        level::refine(pair, &mut found.field, (passes, reach), self.params.seed, self.tick);
+        if !level::is_better(pair, &found.field, own) {
+            return None;
+        }
+        let lattice = level::lattice(coarse, 3);
+        let seen = level::carry(&found.field, lattice, |p| to_level(from_level(p, coarsest), factor));
+        Some(Begun { searched: Searched::of(coarse, &seen), ..found })
+    }
+}
