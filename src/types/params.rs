@@ -42,7 +42,8 @@ pub struct FieldParams {
     pub search_mm: f64,
     /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000 voxels of tissue.
     pub finest: usize,
-    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 8.
+    /// Voxels between the nodes of the spline lattice on the finest level (1), or fewer where the residual is more than noise and
+    /// a finer lattice explains it; 2 to 16.
     pub node_spacing: usize,
     /// Residual passes on the finest level; 1 to 40.
     pub passes: usize,
