@@ -121,10 +121,7 @@ impl<'a> Knots<'a> {
 /// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of what it was, until there is
 /// none or [`ROUNDS`] are over. `spacing` is that of the lattice's voxels (mm).
 pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
-    let per_mm = std::array::from_fn(|a| {
-        if lattice.nodes[a] == 1 { 0.0 } else { 1.0 / (lattice.step[a] as f64 * spacing[a]) as f32 }
-    });
-    let knots = Knots { lattice, per_mm };
+    let knots = Knots::new(lattice, spacing);
     let total = lattice.len();
     let mut folded = knots.folded(coefficients, (0..total).into_par_iter(), least);
     for _ in 0..ROUNDS {

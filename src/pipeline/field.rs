@@ -186,10 +186,10 @@ fn canonical(
             }
             None => {
                 let effort = (passes, whole::POINTS);
-                let mut found = whole.begin((&pair, factor), &lattice, starts, effort, &mut matched);
+                let mut found = whole.begin((&pair, factor), &lattice, (starts, true), effort, &mut matched);
                 if given && found.as_ref().is_none_or(Begun::is_unsure) {
                     let tissue = aligned.level_within(&around(&mask, &clean), factor);
-                    let wider = whole.begin((&tissue, factor), &lattice, &[], effort, &mut matched);
+                    let wider = whole.begin((&tissue, factor), &lattice, (&[], true), effort, &mut matched);
                     found = match (found, wider) {
                         (Some(own), Some(wider)) => Some(Begun::surer(&pair, own, wider)),
                         (own, wider) => own.or(wider),

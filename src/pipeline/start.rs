@@ -165,14 +165,14 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
-/// stillness and the known fields compete, and the one that ends at the better agreement goes on; None when there is none.
+/// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on; None when there is none.
 /// Where few matches agreed, they are sought again about it for as long as more of them agree each time: the agreement of
 /// the volumes does not tell a wrong island there from the truth, neighbours do.
 pub(super) fn begin(
     pair: &Pair<'_>,
     lattice: &Lattice,
     factor: [usize; 3],
-    known: &[Start],
+    (known, rest): (&[Start], bool),
     refine: impl Fn(SplineField, f64) -> SplineField,
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
@@ -191,8 +191,8 @@ pub(super) fn begin(
         }
     }
     let (found, mut report) = search(None);
-    let starts = [found, Some(SplineField::still(lattice.clone()))];
-    let own = starts.into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
+    let still = rest.then(|| SplineField::still(lattice.clone()));
+    let own = [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
     let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {

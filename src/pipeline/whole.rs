@@ -39,13 +39,13 @@ impl Whole<'_> {
         (CLOSER_POINTS / self.params.voxels_per_point.max(1)).min(POINTS)
     }
 
-    /// What is found on a level, with at most `most` features and so many passes, from nothing or from `known` fields. Adds the
-    /// seconds that matching takes to `seconds`.
+    /// What is found on a level, with at most `most` features and so many passes, from nothing or from `known` fields, and from
+    /// stillness with `rest`. Adds the seconds that matching takes to `seconds`.
     pub fn begin(
         &self,
         (pair, factor): (&Pair<'_>, [usize; 3]),
         lattice: &Lattice,
-        known: &[Start],
+        (known, rest): (&[Start], bool),
         (passes, most): (usize, usize),
         seconds: &mut f64,
     ) -> Option<Begun> {
@@ -69,7 +69,7 @@ impl Whole<'_> {
             *seconds += started.elapsed().as_secs_f64();
             (fitted.filter(|_| report.counts.kept >= FEWEST), report)
         };
-        begin(pair, lattice, factor, known, refine, seek)
+        begin(pair, lattice, factor, (known, rest), refine, seek)
     }
 
     /// The better of a field that came down from the coarsest level and of what a search of the next level itself finds: smaller
@@ -85,7 +85,7 @@ impl Whole<'_> {
     ) -> Option<Begun> {
         let lattice = level::lattice(pair, 3);
         let effort = (self.params.coarse_passes, self.closer_points());
-        let mut found = self.begin((pair, factor), &lattice, &[], effort, seconds)?;
+        let mut found = self.begin((pair, factor), &lattice, (&[], false), effort, seconds)?;
         found.field = level::carry(&found.field, own.lattice.clone(), |p| p);
         let reach = found.reach();
         level::refine(pair, &mut found.field, (passes, reach), self.params.seed, self.tick);
