@@ -14,7 +14,7 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::finer::finer;
+use crate::pipeline::finer::{finer, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
@@ -246,6 +246,7 @@ fn canonical(
     let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
     choice.evidence.extend(glides.as_ref().map(why_sliding));
     let level_shape = pair.shape;
+    let unlike = unlike(&pair, &field);
     drop(pair);
     drop(aligned);
     clock.book("model");
@@ -311,6 +312,7 @@ fn canonical(
             .into_iter()
             .chain(vague(choice.model, uncertainty_mean_mm, length.0, &grid))
             .chain(doubted.map(in_doubt))
+            .chain(unlike)
             .collect(),
     };
     progress("done", 1.0);

@@ -12,6 +12,9 @@ const NOISY: f32 = 1.1;
 /// from noise and the last errors of interpolation (0.2 to 0.75 over pairs of the same tissue; two people, 0.9 to 1.6 with six passes before).
 const WORTH: f64 = 0.8;
 
+/// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is no matter.
+const UNLIKE: f32 = 0.05;
+
 /// Passes after which a finer lattice is judged.
 const TRIAL: usize = 6;
 
@@ -56,4 +59,23 @@ pub(super) fn finer(
         field = next;
     }
     (field, said)
+}
+
+/// Says so where what is left of the difference is more than noise, and not next to nothing in the tissue's contrast.
+pub(super) fn unlike(pair: &Pair<'_>, field: &SplineField) -> Option<String> {
+    let left = level::misfit(pair, field);
+    let tissue = || {
+        pair.fixed_smooth.iter().zip(&pair.mask).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| f64::from(*v))
+    };
+    let count = tissue().count().max(1) as f64;
+    let mean = tissue().sum::<f64>() / count;
+    let contrast = (tissue().map(|v| (v - mean).powi(2)).sum::<f64>() / count).sqrt() as f32;
+    let (times, part) = (left / pair.noise.max(f32::MIN_POSITIVE), left / contrast);
+    (times > NOISY && part > UNLIKE).then(|| {
+        format!(
+            "what is left of the difference is {times:.1} times the noise ({:.0} % of the contrast in the tissue): the volumes differ \
+             by more than motion (contrast, brightness, missing tissue, another person), and the field may follow that; look at warped.nii.gz",
+            100.0 * part
+        )
+    })
 }
