@@ -178,7 +178,7 @@ pub fn gained(pair: &Pair<'_>, from: &SplineField, to: &SplineField) -> f64 {
 /// Bending energy of a field (mm^2 per mm, all axes).
 pub fn bending(pair: &Pair<'_>, field: &SplineField) -> f64 {
     let energy = smoothness(&field.lattice, pair.spacing).energy(&field.coefficients);
-    energy.iter().map(|&e| f64::from(e)).sum::<f64>() * cell_volume(&field.lattice, pair.spacing)
+    energy.iter().sum::<f64>() * cell_volume(&field.lattice, pair.spacing)
 }
 
 /// Robust standard deviation of what is left of the difference under a field (intensity).
