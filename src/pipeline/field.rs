@@ -268,12 +268,14 @@ fn canonical(
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
     let doubted = begun.as_ref().and_then(Begun::doubted);
-    // Matches that do not bear each other out on any level and a motion past all that was looked for: not a measurement.
+    // Features that do not bear each other out, few matches or volumes that do not agree in the end, and a motion past all that was
+    // looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| length.1 > 1.2 * search) {
-        let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
-        let few = |found: usize, what, needed: usize| (found < needed).then_some((found, what, needed));
-        let searched = few(seen.kept, "features agree on the whole", seen.features_initial.div_ceil(3));
-        if let Some((found, what, needed)) = searched.or_else(|| few(kept, "matches survive", found.div_ceil(5))) {
+        let left = (kept, "matches survive", found.div_ceil(5));
+        let agreed = (seen.kept, "features agree in the search of all", seen.features_initial.div_ceil(3));
+        let agreed = unlike.is_some().then_some(agreed);
+        if let Some((found, what, needed)) = [Some(left), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
+            let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
             return Err(FieldError::TooFew { found, what, needed, hint });
         }
     }
