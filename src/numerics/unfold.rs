@@ -119,7 +119,7 @@ impl<'a> Knots<'a> {
 }
 
 /// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of what it was, until there is
-/// none or [`ROUNDS`] are over. `spacing` is that of the lattice's voxels (mm).
+/// none, twenty rounds at most. `spacing` is that of the lattice's voxels (mm).
 pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
     let knots = Knots::new(lattice, spacing);
     let total = lattice.len();
