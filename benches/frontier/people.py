@@ -11,8 +11,6 @@ greedy's field). "palpate ... mask" is given FIXED's mask. Prints Dice, folds, t
 Needs numpy, scipy, nibabel, SimpleITK and the tools themselves (peers.py).
 """
 import argparse
-import resource
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,7 +19,8 @@ import numpy as np
 import SimpleITK as sitk
 from scipy import ndimage
 
-HERE = Path(__file__).resolve().parent
+from run import field, run
+
 METHODS = [f"palpate {p}{m}" for p in ("fast", "balanced", "accurate") for m in ("", " mask")]
 METHODS += ["greedy half", "greedy full", "greedy long", "elastix", "ANTs SyNQuick", "plastimatch"]
 
@@ -64,29 +63,6 @@ def classes(path, mask):
     return np.where(values < 1, 0, found).astype(np.uint8)
 
 
-def field(path, shape):
-    return np.asarray(nib.load(path).dataobj, np.float32).reshape(*shape, 3) * np.float32([-1, -1, 1])
-
-
-def run(binary, pair, method, out):
-    """CPU seconds and the field's path; None where it was refused."""
-    fixed, moving, mask = pair
-    target = out / (method.replace(" ", "_") + ".nii.gz")
-    if method.startswith("palpate"):
-        preset, target = method.split()[1], out / method.replace(" ", "_") / "displacement.nii.gz"
-        command = [binary, "field", fixed, moving, "-o", target.parent, "--force", "--preset", preset, "--quiet"]
-        command += ["--mask", mask] if method.endswith("mask") else []
-    else:
-        command = [sys.executable, HERE / "peers.py", method, fixed, moving, target]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode:
-        print(f"{method}: {done.stderr.strip().splitlines()[-1]}", file=sys.stderr)
-        return None
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, target
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
@@ -125,8 +101,8 @@ def main():
     if moving_mask:
         seen = on_grid(moving_mask, maps[1])
     else:
-        _, path = run(None, (*paths, None), "greedy full", out)
-        u = in_voxels(field(path, shape))
+        *_, path = run(None, out, "greedy full", out / "greedy")
+        u = in_voxels(field(path)[0])
         back = np.zeros_like(u)
         for _ in range(15):
             back = -np.stack([ndimage.map_coordinates(c, voxels + back, order=1, mode="nearest") for c in u])
@@ -144,11 +120,15 @@ def main():
     scored = mask & ndimage.binary_erosion(filled, iterations=5)
     print("| method | fluid | gray | white | mean | folds | spread of log J | CPU (s) |\n|---|---|---|---|---|---|---|---|")
     for method in ["nothing", *options.methods]:
-        done = (0.0, None) if method == "nothing" else run(options.palpate, (*paths, mask_path), method, out)
-        if done is None:
-            continue
-        cpu, path = done
-        u = np.zeros((3, *shape), np.float32) if path is None else in_voxels(field(path, shape))
+        more = ["--force", *(["--mask", mask_path] if method.endswith("mask") else [])]
+        cpu, u = 0.0, np.zeros((3, *shape), np.float32)
+        if method != "nothing":
+            try:
+                cpu, *_, path = run(options.palpate, out, method, out / method.replace(" ", "_"), more)
+            except RuntimeError as refused:
+                print(refused, file=sys.stderr)
+                continue
+            u = in_voxels(field(path)[0])
         dice = []
         for k in (1, 2, 3):
             a, b = (carried(there == k, u) > 0.5) & scored, (here == k) & scored

@@ -29,13 +29,17 @@ PEERS = ["greedy half", "greedy full", "elastix", "plastimatch", "demons"]
 FIELDS = ["case", "method", "mean_mm", "median_mm", "p95_mm", "still_mm", "grad_err", "folds", "identity_mm", "cpu_s", "wall_s", "memory_mb"]
 
 
+def field(path):
+    """Displacement (mm, RAS, one vector a voxel) and affine of a 5-D NIfTI in LPS."""
+    import nibabel as nib
+
+    image = nib.load(path)
+    return np.asarray(image.dataobj, np.float32)[:, :, :, 0] * np.float32([-1, -1, 1]), image.affine
+
+
 def score(case, path):
     """Error of a field in the mask: mean, median, 95 % (mm), error in still tissue, median gradient error, folds."""
     import nibabel as nib
-
-    def field(p):
-        image = nib.load(p)
-        return np.asarray(image.dataobj, np.float32)[:, :, :, 0] * np.float32([-1, -1, 1]), image.affine
 
     (u, affine), (t, _) = field(path), field(case / "truth.nii.gz")
     mask = np.asarray(nib.load(case / "mask.nii.gz").dataobj) > 0
@@ -55,11 +59,11 @@ def score(case, path):
     }
 
 
-def run(binary, case, method, out):
-    """CPU seconds, wall seconds, memory (MB) and the field's path."""
+def run(binary, case, method, out, more=()):
+    """CPU seconds, wall seconds, memory (MB) and the field's path. `more` goes to our own command."""
     fixed, moving = case / "fixed.nii.gz", case / "moving.nii.gz"
     if method.startswith("palpate"):
-        command = [binary, "field", fixed, moving, "-o", out, "--preset", method.split()[1], "--threads", "2", "--quiet"]
+        command = [binary, "field", fixed, moving, "-o", out, "--preset", method.split()[1], "--threads", "2", "--quiet", *more]
         field = out / "displacement.nii.gz"
     else:
         field = out.with_suffix(".nii.gz")

@@ -14,6 +14,13 @@ pub fn median(values: &mut [f32]) -> f32 {
     quantile(values, 0.5)
 }
 
+/// Standard deviation of all values, 0 for none.
+pub fn deviation(values: impl Iterator<Item = f32> + Clone) -> f64 {
+    let count = values.clone().count().max(1) as f64;
+    let mean = values.clone().map(f64::from).sum::<f64>() / count;
+    (values.map(|v| (f64::from(v) - mean).powi(2)).sum::<f64>() / count).sqrt()
+}
+
 /// The `q`-th percentile (0 to 100) with linear interpolation between order statistics, as numpy does by default.
 ///
 /// Reorders `values`; NaN sorts last. An empty slice gives NaN.

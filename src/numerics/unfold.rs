@@ -1,6 +1,7 @@
 //! Takes the folds out of a spline field: tissue cannot turn inside out.
 
 use crate::numerics::bspline::Lattice;
+use crate::types::space::determinant;
 use rayon::prelude::*;
 
 /// Rounds of smoothing at most.
@@ -61,8 +62,7 @@ impl<'a> Knots<'a> {
         for (c, row) in gradient.iter_mut().enumerate() {
             row[c] += 1.0;
         }
-        let [a, b, c] = gradient;
-        a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+        determinant(&gradient.map(|row| row.map(f64::from))) as f32
     }
 
     fn place(&self, node: usize) -> [usize; 3] {

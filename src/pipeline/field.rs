@@ -155,7 +155,7 @@ fn canonical(
     let mut fine = None;
     let mut begun = None;
     let mut reach = f64::INFINITY;
-    let mut asked = Vec::new();
+    let (mut left, mut asked) = (0.0, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let pair = aligned.level(factor);
@@ -204,7 +204,8 @@ fn canonical(
         if last {
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
-            (field, asked) = finer(&pair, field, (params.node_spacing, passes), params.seed, refine);
+            let best = finer(&pair, field, (params.node_spacing, passes), params.seed, refine);
+            (field, left, asked) = (best.field, best.left, best.said);
         }
         clock.skip("matching", matched);
         clock.book("residual");
@@ -246,7 +247,7 @@ fn canonical(
     let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
     choice.evidence.extend(glides.as_ref().map(why_sliding));
     let level_shape = pair.shape;
-    let unlike = unlike(&pair, &field);
+    let unlike = unlike(&pair, left);
     drop(pair);
     drop(aligned);
     clock.book("model");
@@ -272,7 +273,7 @@ fn canonical(
     // looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| length.1 > 1.2 * search) {
         let left = (kept, "matches survive", found.div_ceil(5));
-        let agreed = (seen.kept, "features agree in the search of all", seen.features_initial.div_ceil(3));
+        let agreed = (seen.kept, "features agree with their neighbours in the search of the whole volume", seen.features_initial.div_ceil(3));
         let agreed = unlike.is_some().then_some(agreed);
         if let Some((found, what, needed)) = [Some(left), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
             let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();

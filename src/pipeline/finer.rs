@@ -1,6 +1,7 @@
 //! A finer lattice where the volumes still differ by more than noise, and the finer field explains why.
 
 use crate::matching::pair::Pair;
+use crate::numerics::statistics::deviation;
 use crate::pipeline::level::{self, SplineField};
 
 /// Residual (in standard deviations of the noise) beyond which a finer lattice is tried. The spline filter leaves noise alone at
@@ -24,29 +25,39 @@ const CLOSEST: usize = 2;
 /// Nodes at most, to bound memory.
 const NODES: usize = 4_000_000;
 
+/// A field with what it leaves.
+pub(super) struct Explained {
+    pub field: SplineField,
+    /// Robust standard deviation of what is left of the difference (intensity).
+    pub left: f32,
+    /// What was tried, in words.
+    pub said: Vec<String>,
+}
+
 /// Brings the field to lattices of one voxel less between nodes, from `spacing`, for as long as the residual is more than noise
-/// and each explains it. `refine` brings a field to the residual. With what was tried, in words.
+/// and each explains it. `refine` brings a field to the residual.
 pub(super) fn finer(
     pair: &Pair<'_>,
-    mut field: SplineField,
+    field: SplineField,
     (spacing, passes): (usize, usize),
     seed: u64,
     refine: impl Fn(&mut SplineField, usize),
-) -> (SplineField, Vec<String>) {
-    let mut said = Vec::new();
+) -> Explained {
+    let left = level::misfit(pair, &field);
+    let mut best = Explained { field, left, said: Vec::new() };
     for closer in (CLOSEST..spacing).rev() {
         let lattice = level::lattice(pair, closer);
-        let noisy = level::misfit(pair, &field) / pair.noise.max(f32::MIN_POSITIVE);
-        if noisy < NOISY || lattice.len() > NODES || lattice == field.lattice {
+        let noisy = times(best.left, pair.noise);
+        if noisy < NOISY || lattice.len() > NODES || lattice == best.field.lattice {
             break;
         }
-        let mut next = level::carry(&field, lattice, |p| p);
+        let mut next = level::carry(&best.field, lattice, |p| p);
         refine(&mut next, TRIAL);
-        let gain = level::gained(pair, &field, &next);
-        let [few, many] = [&field, &next].map(|f| level::determined(pair, f, seed));
+        let gain = level::gained(pair, &best.field, &next);
+        let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
         let worth = gain / (many - few).max(1.0);
         let taken = gain > 0.0 && worth > WORTH;
-        said.push(format!(
+        best.said.push(format!(
             "nodes every {closer} voxels: {}; the residual is {noisy:.1} times the noise, and {:.0} degrees of freedom more explain {worth:.2} of it each \
              (the same tissue: up to 0.75)",
             if taken { "taken" } else { "not taken" },
@@ -56,21 +67,21 @@ pub(super) fn finer(
             break;
         }
         refine(&mut next, passes.saturating_sub(TRIAL));
-        field = next;
+        best.left = level::misfit(pair, &next);
+        best.field = next;
     }
-    (field, said)
+    best
 }
 
-/// Says so where what is left of the difference is more than noise, and not next to nothing in the tissue's contrast.
-pub(super) fn unlike(pair: &Pair<'_>, field: &SplineField) -> Option<String> {
-    let left = level::misfit(pair, field);
-    let tissue = || {
-        pair.fixed_smooth.iter().zip(&pair.mask).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| f64::from(*v))
-    };
-    let count = tissue().count().max(1) as f64;
-    let mean = tissue().sum::<f64>() / count;
-    let contrast = (tissue().map(|v| (v - mean).powi(2)).sum::<f64>() / count).sqrt() as f32;
-    let (times, part) = (left / pair.noise.max(f32::MIN_POSITIVE), left / contrast);
+/// A residual in standard deviations of the noise.
+fn times(left: f32, noise: f32) -> f32 {
+    left / noise.max(f32::MIN_POSITIVE)
+}
+
+/// Says so where what is `left` of the difference is more than noise, and not next to nothing in the tissue's contrast.
+pub(super) fn unlike(pair: &Pair<'_>, left: f32) -> Option<String> {
+    let tissue = pair.fixed_smooth.iter().zip(&pair.mask).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);
+    let (times, part) = (times(left, pair.noise), left / deviation(tissue) as f32);
     (times > NOISY && part > UNLIKE).then(|| {
         format!(
             "what is left of the difference is {times:.1} times the noise ({:.0} % of the contrast in the tissue): the volumes differ \

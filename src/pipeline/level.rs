@@ -53,8 +53,7 @@ pub fn better(pair: &Pair<'_>, a: SplineField, b: SplineField) -> SplineField {
 
 /// Whether the two volumes agree better under `a` than under `b`.
 pub fn is_better(pair: &Pair<'_>, a: &SplineField, b: &SplineField) -> bool {
-    let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
-    residual::excess(pair, &warp(a), &warp(b)) < 0.0
+    gained(pair, b, a) > 0.0
 }
 
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
