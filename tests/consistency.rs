@@ -234,7 +234,7 @@ fn each_axis_is_held_as_its_own_data_ask() {
     assert!(weights[0] < 4.4 * together, "{weights:?}");
     let alike = coupling::supported([30.0; 3], [2.0; 3]);
     assert!(alike.iter().all(|w| (w - 7.5).abs() < 1e-9), "{alike:?}");
-    // What was not worked out to the end may come out negative.
+    // Of one axis alone what was not worked out to the end may come out negative.
     assert!(coupling::supported([-50.0, 0.0, 20.0], [0.0; 3]).iter().all(|w| w.is_finite() && *w > 0.0));
 }
 
@@ -285,13 +285,36 @@ fn a_step_reaches_the_minimum() {
     assert!((f64::from(moved) - exact.sqrt()).abs() < 1e-4);
 }
 
+/// A found bug: where the weight had just changed, a few iterations from the last solution found -4,000 degrees of freedom where there
+/// were 600, the weight followed by its largest step, and the fields of a sequence came out now stiff, now loose.
+#[test]
+fn determined_degrees_of_freedom_follow_a_weight_that_swings() {
+    let nodes = [30, 30, 20];
+    let smoothness = Smoothness::new(nodes, [4.0; 3]);
+    // Texture here and there, as in tissue.
+    let mut blocks = random_blocks(18_000, 8);
+    for (i, block) in blocks.iter_mut().enumerate() {
+        let strength = if i % 7 == 0 { 300.0 } else { 0.3 };
+        block.iter_mut().for_each(|v| *v *= strength);
+    }
+    let mut probe = coupling::Probe::new(18_000, 3);
+    for (pass, lambda) in [1e3, 5e3, 1e3, 2e2, 1e3, 5e3, 2.5e4, 5e3].into_iter().enumerate() {
+        let lambda = [lambda, 0.3 * lambda, lambda];
+        let limit = if pass == 0 { 20 } else { 10 };
+        let quick = probe.determined(&smoothness, lambda, &blocks, limit, false);
+        let sure = coupling::determined(&smoothness, lambda, &blocks, 3, 2000);
+        let [quick, sure] = [quick, sure].map(|v| v.iter().sum::<f64>());
+        assert!(quick > 0.9 * sure && quick < 1.02 * sure, "{lambda:?}: {quick:.0} of {sure:.0}");
+    }
+}
+
 #[test]
 fn determined_degrees_of_freedom_are_the_trace() {
     let (_, smoothness, l) = small();
     let blocks = random_blocks(80, 4);
     for lambda in [[0.1f32; 3], [10.0, 1.0, 100.0], [1000.0; 3]] {
         let inverse = invert(&system(&l, lambda, &blocks));
-        let seeds = 60;
+        let seeds = 1500;
         let all: Vec<[f64; 3]> =
             (0..seeds).map(|s| coupling::determined(&smoothness, lambda, &blocks, s, 200)).collect();
         for a in 0..3 {

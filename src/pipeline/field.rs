@@ -273,7 +273,11 @@ fn canonical(
     // looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| length.1 > 1.2 * search) {
         let left = (kept, "matches survive", found.div_ceil(5));
-        let agreed = (seen.kept, "features agree with their neighbours in the search of the whole volume", seen.features_initial.div_ceil(3));
+        let agreed = (
+            seen.kept,
+            "features agree with their neighbours in the search of the whole volume",
+            seen.features_initial.div_ceil(3),
+        );
         let agreed = unlike.is_some().then_some(agreed);
         if let Some((found, what, needed)) = [Some(left), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
             let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
