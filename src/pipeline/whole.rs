@@ -44,6 +44,13 @@ impl Whole<'_> {
         (CLOSER_POINTS / self.params.voxels_per_point.max(1)).min(POINTS)
     }
 
+    /// Voxels between nodes: half of how far apart so many features lie, within 3 to 6.
+    fn nodes_for(&self, pair: &Pair<'_>, features: usize) -> usize {
+        let axes = if self.flat { 2.0 } else { 3.0 };
+        let apart = (pair.inside as f64 / features as f64).powf(1.0 / axes);
+        ((0.5 * apart).round() as usize).clamp(3, 6)
+    }
+
     /// What is found on a level, with at most `most` features and so many passes, from nothing or from `known` fields, and from
     /// stillness with `rest`. Adds the seconds that matching takes to `seconds`.
     pub fn begin(
@@ -89,8 +96,8 @@ impl Whole<'_> {
         passes: usize,
         seconds: &mut f64,
     ) -> Option<Begun> {
-        let lattice = level::lattice(pair, 3);
         let effort = (self.params.coarse_passes, self.closer_points());
+        let lattice = level::lattice(pair, self.nodes_for(pair, effort.1));
         let mut found = self.begin((pair, factor), &lattice, (&[], false), effort, seconds)?;
         found.field = level::carry(&found.field, own.lattice.clone(), |p| p);
         let reach = found.reach();
