@@ -75,9 +75,9 @@ const FOLLOWED: usize = 5;
 /// Median uncertainty (voxels) beyond which the agreement does not tell one motion from another. Where texture leaves
 /// the motion open (a leg in thick slices: 0.11 to 0.18) fields that are wrong by millimetres agree as well as the right
 /// one; in finger pads it is 0.08 to 0.11.
-const VAGUE: f64 = 0.12;
+const VAGUE: f64 = 0.15;
 /// The same, as a part of the mean motion: at 0.4 of it frames were followed 1.4 times worse than measured alone.
-const UNSURE: f64 = 0.25;
+const UNSURE: f64 = 0.32;
 
 /// Where fewer of the features than this agree with each other, matches are sought again on the warped volume. Heads, pads
 /// and small motions keep nine tenths, legs in thick slices that moved by 16 mm four.
