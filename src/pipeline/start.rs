@@ -107,10 +107,6 @@ const BORNE_OUT: f64 = 0.5;
 /// Matches that must agree for their share to tell a search that found the motion from one that did not.
 const ENOUGH: usize = 20;
 
-/// What a known field must explain for each degree of freedom to go on in place of what the search found: with less, both are right
-/// and the known one hands on the frame before's errors (a pen grasp, 0.013, was 1.5 times worse for it).
-const FAVOUR: f64 = 0.1;
-
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
@@ -169,8 +165,7 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
-/// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on, a known one only
-/// where it is clearly better; None when there is none.
+/// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on; None when there is none.
 /// Where few matches agreed, they are sought again about it for as long as more of them agree each time: the agreement of
 /// the volumes does not tell a wrong island there from the truth, neighbours do.
 pub(super) fn begin(
@@ -178,7 +173,6 @@ pub(super) fn begin(
     lattice: &Lattice,
     factor: [usize; 3],
     (known, rest): (&[Start], bool),
-    seed: u64,
     refine: impl Fn(SplineField, f64) -> SplineField,
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
@@ -199,13 +193,7 @@ pub(super) fn begin(
     let (found, mut report) = search(None);
     let still = rest.then(|| SplineField::still(lattice.clone()));
     let own = [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
-    let mut field = match (own.reduce(better), followed) {
-        (Some(own), Some(known)) => {
-            let gain = level::gained(pair, &own, &known);
-            if gain > FAVOUR * level::determined(pair, &own, seed) { known } else { own }
-        }
-        (own, known) => own.or(known)?,
-    };
+    let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
             break;

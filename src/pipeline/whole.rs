@@ -81,7 +81,7 @@ impl Whole<'_> {
             *seconds += started.elapsed().as_secs_f64();
             (fitted.filter(|_| report.counts.kept >= FEWEST), report)
         };
-        begin(pair, lattice, factor, (known, rest), self.params.seed, refine, seek)
+        begin(pair, lattice, factor, (known, rest), refine, seek)
     }
 
     /// The better of a field that came down from the coarsest level and of what a search of the next level itself finds: smaller
