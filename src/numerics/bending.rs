@@ -156,16 +156,10 @@ impl Smoothness {
 
     /// The energy of each component of a planar vector field.
     pub fn energy(&self, x: &[f32]) -> [f64; 3] {
-        self.between(x, x)
-    }
-
-    /// `x . L y` for each component of two planar vector fields.
-    pub fn between(&self, x: &[f32], y: &[f32]) -> [f64; 3] {
-        let mut ly = vec![0.0; y.len() / 3];
-        let (x, y) = (thirds(x), thirds(y));
-        std::array::from_fn(|c| {
-            self.apply(y[c], &mut ly);
-            x[c].iter().zip(&ly).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+        let mut lx = vec![0.0; x.len() / 3];
+        thirds(x).map(|x| {
+            self.apply(x, &mut lx);
+            x.iter().zip(&lx).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
         })
     }
 }

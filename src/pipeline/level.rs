@@ -134,7 +134,7 @@ pub fn refine(
         field.blocks = equations.blocks;
         if pass % 2 == 1 || pass + 1 == passes {
             let limit = if pass < 2 { 20 } else { 10 };
-            // A warm start saves iterations; where little is determined it can miss by more than there is.
+            // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
             let determined = probe.determined(&energy, lambda, &field.blocks, limit, false);
             let target = coupling::supported(determined, energy.energy(&field.coefficients));
             for (lambda, target) in field.lambda.iter_mut().zip(target) {

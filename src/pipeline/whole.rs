@@ -96,8 +96,9 @@ impl Whole<'_> {
         passes: usize,
         seconds: &mut f64,
     ) -> Option<Begun> {
-        let effort = (self.params.coarse_passes, self.closer_points());
-        let lattice = level::lattice(pair, self.nodes_for(pair, effort.1));
+        let features = self.closer_points();
+        let lattice = level::lattice(pair, self.nodes_for(pair, features));
+        let effort = (self.params.coarse_passes, features);
         let mut found = self.begin((pair, factor), &lattice, (&[], false), effort, seconds)?;
         found.field = level::carry(&found.field, own.lattice.clone(), |p| p);
         let reach = found.reach();
