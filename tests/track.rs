@@ -62,6 +62,22 @@ fn following_is_no_worse_than_pairs_and_far_better_than_a_chain() {
 }
 
 #[test]
+fn the_first_frames_bring_no_error_into_the_next() {
+    // The field of the frame before, off by as much as has moved since, won by nothing: 1.5 times the error of the pair.
+    let params = SequenceParams { frames: 24, ..SequenceParams::new(SequenceKind::Pen).sized(56) };
+    let s = Sequence::new(&params).unwrap();
+    let (params, reference) = (FieldParams::default(), s.frame(0));
+    let mut tracker = Tracker::new(&reference, Some(&s.mask), &params);
+    for t in 1..5 {
+        let (frame, truth) = (s.frame(t), s.truth(t));
+        let followed = tracker.next(&frame, &|_, _| {}).unwrap().displacement;
+        let alone = pair(&reference, &frame, Some(&s.mask), &params, &|_, _| {}).unwrap().displacement;
+        let [followed, alone] = [followed, alone].map(|u| error(&u, &truth, &s.mask));
+        assert!(followed <= 1.2 * alone, "frame {t}: {followed:.4} mm, alone {alone:.4} mm");
+    }
+}
+
+#[test]
 fn steady_frames_are_followed_and_a_jump_is_searched() {
     let s =
         Sequence::new(&SequenceParams { frames: 16, ..SequenceParams::new(SequenceKind::Pinch).sized(64) }).unwrap();

@@ -272,14 +272,14 @@ fn canonical(
     // Features that do not bear each other out, few matches or volumes that do not agree in the end, and a motion past all that was
     // looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| length.1 > 1.2 * search) {
-        let left = (kept, "matches survive", found.div_ceil(5));
+        let survived = (kept, "matches survive", found.div_ceil(5));
         let agreed = (
             seen.kept,
             "features agree with their neighbours in the search of the whole volume",
             seen.features_initial.div_ceil(3),
         );
         let agreed = unlike.is_some().then_some(agreed);
-        if let Some((found, what, needed)) = [Some(left), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
+        if let Some((found, what, needed)) = [Some(survived), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
             let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
             return Err(FieldError::TooFew { found, what, needed, hint });
         }
@@ -325,7 +325,7 @@ fn canonical(
     progress("done", 1.0);
     let voxel = pyramid::finest(grid.shape(), grid.spacing());
     let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
-    let spline = Start { field, factor, searched };
+    let spline = Start { field, factor, spacing, searched };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 

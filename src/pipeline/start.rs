@@ -1,5 +1,6 @@
 //! Where the search begins: with what the matches say, with stillness, or with a field known from the frame before.
 
+use crate::consistency::coupling::step;
 use crate::matching::agreement::Agreement;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
@@ -13,6 +14,8 @@ pub struct Start {
     pub(super) field: SplineField,
     /// Voxels that a voxel of its level stands for.
     pub(super) factor: [usize; 3],
+    /// Voxel edges of its level (mm).
+    pub(super) spacing: [f64; 3],
     /// Of the search that it comes from.
     pub(super) searched: Option<Searched>,
 }
@@ -34,6 +37,16 @@ impl Start {
             *n += *n - b;
         }
         Some(next)
+    }
+
+    /// Smoothed by its own posterior once more: what its data determine stays, what is left of their noise goes. The passes of
+    /// the next frame end before they have forgotten what they began with, and a steady course has three times the noise.
+    pub fn settled(mut self) -> Self {
+        let field = &mut self.field;
+        let energy = level::smoothness(&field.lattice, self.spacing);
+        let still = vec![0.0; field.coefficients.len()];
+        step(&energy, field.coupled_at, &field.blocks, &still, &mut field.coefficients, 0.02, 30);
+        self
     }
 
     /// The field on a level's lattice.
@@ -73,10 +86,10 @@ const GROWN: f32 = 1.5;
 const FOLLOWED: usize = 5;
 
 /// Median uncertainty (voxels) beyond which the agreement does not tell one motion from another. Where texture leaves
-/// the motion open (a leg in thick slices: 0.11 to 0.18) fields that are wrong by millimetres agree as well as the right
-/// one; in finger pads it is 0.08 to 0.11.
+/// the motion open (a leg in thick slices: 0.14 to 0.23) fields that are wrong by millimetres agree as well as the right
+/// one; in finger pads it is 0.10 to 0.14.
 const VAGUE: f64 = 0.15;
-/// The same, as a part of the mean motion: at 0.4 of it frames were followed 1.4 times worse than measured alone.
+/// The same, as a part of the mean motion: at 0.5 of it frames were followed 1.4 times worse than measured alone.
 const UNSURE: f64 = 0.32;
 
 /// Where fewer of the features than this agree with each other, matches are sought again on the warped volume. Heads, pads
@@ -165,7 +178,8 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
-/// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on; None when there is none.
+/// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on; None when there is
+/// none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
 /// Where few matches agreed, they are sought again about it for as long as more of them agree each time: the agreement of
 /// the volumes does not tell a wrong island there from the truth, neighbours do.
 pub(super) fn begin(
@@ -177,12 +191,9 @@ pub(super) fn begin(
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
-    let followed = known.iter().map(|s| refine(s.on(lattice, factor), f64::INFINITY)).reduce(better);
-    let recent = known
-        .first()
-        .filter(|_| known.len() > 1)
-        .and_then(|s| s.searched.as_ref())
-        .filter(|s| s.frames < FOLLOWED && s.certain);
+    let follow = || known.iter().map(|s| refine(s.on(lattice, factor), f64::INFINITY)).reduce(better);
+    let followed = if known.len() > 1 { follow() } else { None };
+    let recent = known.first().and_then(|s| s.searched.as_ref()).filter(|s| s.frames < FOLLOWED && s.certain);
     if let Some((field, searched)) = followed.as_ref().zip(recent) {
         let now = agreement(pair, field, Some(searched.agreement.sigma()));
         let searched = Searched { frames: searched.frames + 1, ..searched.clone() };
@@ -193,6 +204,8 @@ pub(super) fn begin(
     let (found, mut report) = search(None);
     let still = rest.then(|| SplineField::still(lattice.clone()));
     let own = [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
+    let sure = report.counts.kept_share() >= LOOSE && report.counts.kept >= ENOUGH;
+    let followed = if sure { followed } else { followed.or_else(follow) };
     let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
