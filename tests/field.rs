@@ -6,7 +6,7 @@ use palpate::evaluate;
 use palpate::numerics::random::Random;
 use palpate::numerics::sampling::displacement;
 use palpate::pipeline::field::{FieldResult, run};
-use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom, phantom_on};
+use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, Trouble, phantom, phantom_on, troubled};
 use palpate::types::params::{Interpolation, Preset};
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, Mesh, Metrics, MotionModel, Volume};
 
@@ -191,6 +191,22 @@ fn another_contrast_is_warned_of_and_noise_is_not() {
             assert!(noise > 0.05 || warned(&measured(&root)), "{kind:?} {noise}");
         }
     }
+}
+
+#[test]
+fn tissue_without_texture_is_warned_of_and_noisy_tissue_is_not() {
+    // A ball of even grey was crossed smoothly, in millimetres, and not a word about it.
+    let warned = |r: &FieldResult| r.summary.warnings.iter().any(|w| w.contains("shows no texture"));
+    for (kind, even) in [(PhantomKind::Block, 50.0), (PhantomKind::Head, 50.0), (PhantomKind::Calf, 30.0)] {
+        let base = PhantomParams::new(kind).sized(64);
+        let said = [0.0, even].map(|percent| {
+            let p = troubled(&base, Trouble::NoTexture, percent).unwrap();
+            warned(&run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {}).unwrap())
+        });
+        assert_eq!(said, [false, true], "{kind:?}");
+    }
+    let (noisy, _) = measure(&PhantomParams { noise: 0.1, ..PhantomParams::new(PhantomKind::Block).sized(64) });
+    assert!(!warned(&noisy), "{:?}", noisy.summary.warnings);
 }
 
 #[test]

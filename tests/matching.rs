@@ -351,6 +351,25 @@ fn the_covariance_of_a_match_is_calibrated() {
     assert!((2.1..3.9).contains(&mean), "mean chi-square {mean} with 3 degrees of freedom");
 }
 
+// Texture
+
+#[test]
+fn what_is_noise_alone_counts_as_plain() {
+    // Slabs of texture under noise of a tenth of it, the first `even` of eight noise alone, in cubes and in thick slices.
+    for spacing in [[1.0; 3], [1.0, 1.0, 3.5]] {
+        let shape = [56, 42, 28];
+        let (textured, _) = texture(shape, 6.0, 8);
+        let mean = textured.iter().sum::<f32>() / textured.len() as f32;
+        let noise = normals(textured.len(), 9);
+        for even in [0, 2, 5, 8] {
+            let value = |at: usize| if at % 56 < 7 * even { mean } else { textured[at] };
+            let fixed: Vec<f32> = (0..textured.len()).map(|at| value(at) + 10.0 * noise[at] as f32).collect();
+            let found = pair(shape, spacing, &fixed, &fixed).plain();
+            assert!((found - even as f64 / 8.0).abs() < 0.02, "{found:.3} of {even} eighths, {spacing:?}");
+        }
+    }
+}
+
 // Gain
 
 #[test]
