@@ -363,7 +363,7 @@ fn what_is_noise_alone_counts_as_plain() {
         let noise = normals(textured.len(), 9);
         for even in [0, 2, 5, 8] {
             let value = |at: usize| if at % 56 < 7 * even { mean } else { textured[at] };
-            let fixed: Vec<f32> = (0..textured.len()).map(|at| value(at) + 10.0 * noise[at] as f32).collect();
+            let fixed: Vec<f32> = (0..textured.len()).map(|at| value(at) + 10.0 * noise[at]).collect();
             let found = pair(shape, spacing, &fixed, &fixed).plain();
             assert!((found - even as f64 / 8.0).abs() < 0.02, "{found:.3} of {even} eighths, {spacing:?}");
         }
