@@ -54,37 +54,42 @@ impl Pair<'_> {
         std::array::from_fn(|a| (p[a] - self.moving_origin[a]) as f32)
     }
 
+    /// About as far along every axis (mm) as `n` of the finest axis' voxels, in voxels of each: at least one.
+    pub fn in_voxels(&self, n: usize) -> [usize; 3] {
+        let finest = pyramid::finest(self.shape, self.spacing);
+        self.spacing.map(|s| ((n as f64 * finest / s).round() as usize).max(1))
+    }
+
     /// The part of the mask where nothing stands out of the noise: blocks of about seven of the finest voxels along each axis in
     /// which the initial volume's standard deviation is hardly more than the noise. How that moves only its surroundings tell.
     pub fn plain(&self) -> f64 {
-        let finest = pyramid::finest(self.shape, self.spacing);
         let [nx, ny, nz] = self.shape;
-        let side = self.spacing.map(|s| ((BLOCK as f64 * finest / s).round() as usize).max(1));
+        let side = self.in_voxels(BLOCK);
         let least = f64::from(STANDS_OUT * self.noise).powi(2);
-        let slab = |k: usize| -> usize {
-            let (planes, mut plain) = (k..(k + side[2]).min(nz), 0);
-            for j in (0..ny).step_by(side[1]) {
-                for i in (0..nx).step_by(side[0]) {
-                    let (mut sums, mut n, mut inside) = ([0.0f64; 2], 0, 0);
-                    for k in planes.clone() {
-                        for j in j..(j + side[1]).min(ny) {
-                            let row = nx * (j + ny * k);
-                            let row = row + i..row + (i + side[0]).min(nx);
-                            inside += self.mask[row.clone()].iter().filter(|&&m| m != 0).count();
-                            for v in self.fixed[row].iter().map(|v| f64::from(v - self.centres[0])) {
-                                sums = [sums[0] + v, sums[1] + v * v];
-                                n += 1;
-                            }
-                        }
-                    }
-                    let n = f64::from(n);
-                    plain += if sums[1] / n - (sums[0] / n).powi(2) < least { inside } else { 0 };
-                }
-            }
-            plain
+        let corners = |n: usize, a: usize| (0..n).step_by(side[a]);
+        let in_slab = |k: usize| -> usize {
+            let blocks = corners(ny, 1).flat_map(|j| corners(nx, 0).map(move |i| self.block([i, j, k], side)));
+            blocks.filter(|&(variance, _)| variance < least).map(|(_, inside)| inside).sum()
         };
-        let slabs: Vec<usize> = (0..nz).step_by(side[2]).collect();
-        slabs.into_par_iter().map(slab).sum::<usize>() as f64 / self.inside.max(1) as f64
+        let slabs: Vec<usize> = corners(nz, 2).collect();
+        slabs.into_par_iter().map(in_slab).sum::<usize>() as f64 / self.inside.max(1) as f64
+    }
+
+    /// The initial volume's variance over a block that ends at the volume's faces, and the block's voxels of the mask.
+    fn block(&self, first: [usize; 3], side: [usize; 3]) -> (f64, usize) {
+        let [xs, ys, zs]: [Range<usize>; 3] =
+            std::array::from_fn(|a| first[a]..(first[a] + side[a]).min(self.shape[a]));
+        let (mut sums, mut inside) = ([0.0f64; 2], 0);
+        for (j, k) in zs.clone().flat_map(|k| ys.clone().map(move |j| (j, k))) {
+            let from = self.shape[0] * (j + self.shape[1] * k);
+            let row = from + xs.start..from + xs.end;
+            inside += self.mask[row.clone()].iter().filter(|&&m| m != 0).count();
+            for v in self.fixed[row].iter().map(|v| f64::from(v - self.centres[0])) {
+                sums = [sums[0] + v, sums[1] + v * v];
+            }
+        }
+        let n = (xs.len() * ys.len() * zs.len()) as f64;
+        (sums[1] / n - (sums[0] / n).powi(2), inside)
     }
 
     /// The deformed volume as a sampler.

@@ -68,8 +68,7 @@ pub fn smoothness(lattice: &Lattice, spacing: [f64; 3]) -> Smoothness {
 
 /// A lattice whose nodes are `step` of the finest axis' voxels apart along every axis (in mm).
 pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
-    let finest = pyramid::finest(pair.shape, pair.spacing);
-    Lattice::new(pair.shape, pair.spacing.map(|s| ((step as f64 * finest / s).round() as usize).max(1)))
+    Lattice::new(pair.shape, pair.in_voxels(step))
 }
 
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
@@ -247,7 +246,7 @@ pub fn matches(
 ) -> (Vec<LevelMatch>, Option<SplineField>, LevelReport) {
     let spacing = pair.spacing;
     let finest = pyramid::finest(pair.shape, spacing);
-    let radius: [usize; 3] = spacing.map(|s| ((params.patch as f64 * finest / s).round() as usize).max(1));
+    let radius = pair.in_voxels(params.patch);
     let noise = pair.noise;
     let room = pair.inside as f64 / params.points as f64;
     // The deformed side: as it is, or warped by the known field, where both volumes' features share one frame.

@@ -108,9 +108,19 @@ const FROM_SEARCH: f64 = 2.0;
 /// The same from the field of the coarser level: the two voxels of that one.
 const FROM_LEVEL: f64 = 4.0;
 
+/// Whether few of the features agree.
+fn is_loose(report: &LevelReport) -> bool {
+    report.counts.kept_share() < LOOSE
+}
+
+/// Whether few of the features agree, or there are too few to tell.
+fn is_in_doubt(report: &LevelReport) -> bool {
+    is_loose(report) || report.counts.kept < ENOUGH
+}
+
 /// `held` where the field is to be held near what the matches say, else as far as the passes take it.
 fn reach(report: &LevelReport, held: f64) -> f64 {
-    if report.counts.kept_share() < LOOSE { held } else { f64::INFINITY }
+    if is_loose(report) { held } else { f64::INFINITY }
 }
 
 /// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more
@@ -140,7 +150,7 @@ impl Begun {
 
     /// Whether so few features agreed that the next level is to be searched as well.
     pub fn is_loose(&self) -> bool {
-        self.reach().is_finite()
+        self.report.as_ref().is_some_and(is_loose)
     }
 
     /// The features and those that agreed, where these are too few to go by.
@@ -192,9 +202,9 @@ pub(super) fn begin(
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
     let follow = || known.iter().map(|s| refine(s.on(lattice, factor), f64::INFINITY)).reduce(better);
-    let followed = if known.len() > 1 { follow() } else { None };
+    let course = (known.len() > 1).then(follow).flatten();
     let recent = known.first().and_then(|s| s.searched.as_ref()).filter(|s| s.frames < FOLLOWED && s.certain);
-    if let Some((field, searched)) = followed.as_ref().zip(recent) {
+    if let Some((field, searched)) = course.as_ref().zip(recent) {
         let now = agreement(pair, field, Some(searched.agreement.sigma()));
         let searched = Searched { frames: searched.frames + 1, ..searched.clone() };
         if now.worsened(&searched.agreement) <= GROWN {
@@ -204,8 +214,7 @@ pub(super) fn begin(
     let (found, mut report) = search(None);
     let still = rest.then(|| SplineField::still(lattice.clone()));
     let own = [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
-    let sure = report.counts.kept_share() >= LOOSE && report.counts.kept >= ENOUGH;
-    let followed = if sure { followed } else { followed.or_else(follow) };
+    let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
     let mut field = own.chain(followed).reduce(better)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
