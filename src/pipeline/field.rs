@@ -327,7 +327,7 @@ fn canonical(
     progress("done", 1.0);
     let voxel = pyramid::finest(grid.shape(), grid.spacing());
     let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
-    let spline = Start { field, factor, spacing, searched };
+    let spline = Start { field, factor, searched };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 

@@ -1,6 +1,5 @@
 //! Where the search begins: with what the matches say, with stillness, or with a field known from the frame before.
 
-use crate::consistency::coupling::step;
 use crate::matching::agreement::Agreement;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
@@ -14,8 +13,6 @@ pub struct Start {
     pub(super) field: SplineField,
     /// Voxels that a voxel of its level stands for.
     pub(super) factor: [usize; 3],
-    /// Voxel edges of its level (mm).
-    pub(super) spacing: [f64; 3],
     /// Of the search that it comes from.
     pub(super) searched: Option<Searched>,
 }
@@ -37,16 +34,6 @@ impl Start {
             *n += *n - b;
         }
         Some(next)
-    }
-
-    /// Smoothed by its own posterior once more: what its data determine stays, what is left of their noise goes. The passes of
-    /// the next frame end before they have forgotten what they began with, and a steady course has three times the noise.
-    pub fn settled(mut self) -> Self {
-        let field = &mut self.field;
-        let energy = level::smoothness(&field.lattice, self.spacing);
-        let still = vec![0.0; field.coefficients.len()];
-        step(&energy, field.coupled_at, &field.blocks, &still, &mut field.coefficients, 0.02, 30);
-        self
     }
 
     /// The field on a level's lattice.
@@ -190,6 +177,8 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
 /// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on; None when there is
 /// none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
+/// A known field that goes on is refined twice: it begins with the noise of another frame, which takes long to forget. Of several
+/// the one that agrees best as it is goes on, so that this costs no more than to refine each once.
 /// Where few matches agreed, they are sought again about it for as long as more of them agree each time: the agreement of
 /// the volumes does not tell a wrong island there from the truth, neighbours do.
 pub(super) fn begin(
@@ -201,21 +190,26 @@ pub(super) fn begin(
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
-    let follow = || known.iter().map(|s| refine(s.on(lattice, factor), f64::INFINITY)).reduce(better);
+    let refined = |field| refine(field, f64::INFINITY);
+    let follow = || known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
     let course = (known.len() > 1).then(follow).flatten();
     let recent = known.first().and_then(|s| s.searched.as_ref()).filter(|s| s.frames < FOLLOWED && s.certain);
     if let Some((field, searched)) = course.as_ref().zip(recent) {
         let now = agreement(pair, field, Some(searched.agreement.sigma()));
         let searched = Searched { frames: searched.frames + 1, ..searched.clone() };
         if now.worsened(&searched.agreement) <= GROWN {
-            return Some(Begun { field: field.clone(), report: None, searched });
+            return course.map(|field| Begun { field: refined(field), report: None, searched });
         }
     }
     let (found, mut report) = search(None);
     let still = rest.then(|| SplineField::still(lattice.clone()));
-    let own = [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH)));
+    let own =
+        [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH))).reduce(better);
     let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
-    let mut field = own.chain(followed).reduce(better)?;
+    let mut field = match (own, followed) {
+        (Some(own), Some(followed)) if level::is_better(pair, &followed, &own) => refined(followed),
+        (own, followed) => own.or(followed)?,
+    };
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
             break;

@@ -43,7 +43,7 @@ impl<'a> Tracker<'a> {
         let starts: Vec<Start> = last.iter().cloned().chain(steady).collect();
         let result = run_from(self.reference, frame, self.mask, self.params, &starts, progress)?;
         self.past.swap(0, 1);
-        self.past[0] = Some(result.spline.clone().settled());
+        self.past[0] = Some(result.spline.clone());
         Ok(result)
     }
 }
