@@ -682,3 +682,25 @@ fn random_numbers_are_normal_and_uniform() {
     assert_eq!(a, normals(5, 1));
     assert_ne!(a, b);
 }
+
+#[test]
+fn the_principal_vector_is_that_of_the_largest_eigenvalue() {
+    let mut random = Random::new(5, 1);
+    for n in 0..3000 {
+        let size = [1.0, 1e-8, 1e6][n % 3];
+        let mut m: [f64; 6] = std::array::from_fn(|_| size * random.uniform(-1.0, 1.0));
+        match n % 7 {
+            0 => m[3..].fill(0.0),
+            // Nearly or wholly the same along two axes or all three.
+            1 => m = [m[0], m[0] * (1.0 + 1e-9), -m[0].abs(), 0.0, 1e-10 * m[4], 0.0],
+            2 => m = [m[0], m[0], m[0], 0.0, 0.0, 0.0],
+            _ => {}
+        }
+        let v = small::principal(&m);
+        let norm = v.iter().map(|v| v * v).sum::<f64>();
+        assert!((norm - 1.0).abs() < 1e-12, "{m:?}: {v:?}");
+        // No unit vector has a larger quadratic form.
+        let (most, found) = (small::eigenvalues(&m)[0], small::quadratic(&m, v));
+        assert!((found - most).abs() < 2e-7 * size, "{m:?}: {found} is not {most}");
+    }
+}

@@ -9,9 +9,8 @@
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, dilate};
 use crate::numerics::bspline::Lattice;
-use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::eigenvalues;
+use crate::numerics::small::{Symmetric3, eigenvalues, principal};
 use crate::numerics::{filters, pyramid};
 use rayon::prelude::*;
 
@@ -207,24 +206,21 @@ impl Steepness<'_> {
     }
 
     /// `G^T G` of the gradient.
-    fn squares(&self, at: usize) -> [[f64; 3]; 3] {
+    fn squares(&self, at: usize) -> Symmetric3 {
         let g = self.gradient(at);
-        std::array::from_fn(|a| std::array::from_fn(|b| (0..3).map(|c| g[c][a] * g[c][b]).sum()))
+        [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|(a, b)| (0..3).map(|c| g[c][a] * g[c][b]).sum())
     }
 
     /// Whether the greatest singular value exceeds `strain`.
     fn is_over(&self, at: usize, strain: f64) -> bool {
         let s = self.squares(at);
         // The trace bounds the greatest eigenvalue.
-        s[0][0] + s[1][1] + s[2][2] > strain * strain && {
-            let packed = [s[0][0], s[1][1], s[2][2], s[0][1], s[0][2], s[1][2]];
-            eigenvalues(&packed).into_iter().fold(0.0, f64::max) > strain * strain
-        }
+        s[0] + s[1] + s[2] > strain * strain && eigenvalues(&s)[0] > strain * strain
     }
 
     /// Unit vector along which the field changes most.
     fn direction(&self, at: usize) -> [f32; 3] {
-        symmetric_eigen(&self.squares(at))[2].1.map(|v| v as f32)
+        principal(&self.squares(at)).map(|v| v as f32)
     }
 
     /// The field at a voxel and an offset (voxels), trilinear, the border's value beyond it.

@@ -1,5 +1,8 @@
 //! Symmetric 3 x 3 algebra. A symmetric matrix is `[xx, yy, zz, xy, xz, yz]`.
 
+use crate::numerics::dense::symmetric_eigen;
+use crate::types::space::cross;
+
 /// A symmetric 3 x 3 matrix as `[xx, yy, zz, xy, xz, yz]`.
 pub type Symmetric3 = [f64; 6];
 
@@ -90,4 +93,20 @@ pub fn eigenvalues(m: &Symmetric3) -> [f64; 3] {
     let high = mean + 2.0 * size * angle.cos();
     let low = mean + 2.0 * size * (angle + 2.0 * std::f64::consts::FRAC_PI_3).cos();
     [high, 3.0 * mean - high - low, low]
+}
+
+/// A unit eigenvector of the largest eigenvalue: perpendicular to the two rows of `m` less that eigenvalue that span most.
+pub fn principal(m: &Symmetric3) -> [f64; 3] {
+    let high = eigenvalues(m)[0];
+    let rows = [[m[0] - high, m[3], m[4]], [m[3], m[1] - high, m[5]], [m[4], m[5], m[2] - high]];
+    let normals = [(0, 1), (0, 2), (1, 2)].map(|(i, j)| cross(rows[i], rows[j]));
+    let square = |v: [f64; 3]| v.iter().map(|v| v * v).sum::<f64>();
+    let best = normals.into_iter().max_by(|a, b| square(*a).total_cmp(&square(*b))).unwrap_or_default();
+    // Of two eigenvalues that are nearly equal rounding decides: then by rotations.
+    let size = m.iter().map(|v| v * v).sum::<f64>();
+    if square(best) > 1e-8 * size * size {
+        return best.map(|v| v / square(best).sqrt());
+    }
+    let full = [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]];
+    symmetric_eigen(&full)[2].1
 }
