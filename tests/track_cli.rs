@@ -74,6 +74,8 @@ fn volumes_and_a_series_give_the_same() {
     let from_files = [&["track"], &listed[..], &["--mask", "mask.nii.gz", "--labels", "labels.nii.gz", "-o"]].concat();
     let (said, _) = run(&[&from_files[..], &[&out("files")]].concat(), 0);
     assert!(said.starts_with("3 of 3 frames measured against frame 0"), "{said}");
+    let (said, _) = run(&["track", listed[0], listed[1], "-o", &out("two")], 0);
+    assert!(said.starts_with("1 of 1 frames measured against frame 0 (each by a search of all)"), "{said}");
     for (name, pack) in [("series.nii", false), ("series.nii.gz", true)] {
         fs::write(folder.path().join(name), series(pack)).unwrap();
         let arguments = ["--mask", "mask.nii.gz", "--labels", "labels.nii.gz", "-o", &out("series"), "--force"];

@@ -16,7 +16,8 @@ use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Moment, PackedMoment, Viewer, elements};
 use crate::report::views::{Scales, matched};
 use crate::types::{
-    DenseField, FieldParams, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels, WorldPoint,
+    DenseField, FieldParams, FrameSummary, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels,
+    WorldPoint,
 };
 use serde_json::{Value, json};
 use std::fmt::Write;
@@ -66,22 +67,24 @@ impl TrackReport<'_> {
         self.step_s.unwrap_or(1.0) * frame as f64
     }
 
-    fn measured(&self) -> usize {
-        self.tracked.frames.iter().filter(|f| f.lost.is_none()).count()
+    fn measured(&self) -> impl Iterator<Item = &FrameSummary> {
+        self.tracked.frames.iter().filter(|f| f.lost.is_none())
     }
 
     fn headline(&self) -> String {
         let all = self.tracked.frames.len();
         let largest = self.tracked.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max);
-        let searched = self.tracked.frames.iter().filter(|f| f.searched).count();
-        let lost = match all - self.measured() {
+        let (measured, searched) = (self.measured().count(), self.measured().filter(|f| f.searched).count());
+        let lost = match all - measured {
             0 => String::new(),
             n => format!("; {n} lost"),
         };
+        let how = match searched {
+            n if n == measured => "each by a search of all".to_string(),
+            n => format!("{n} by a search of all, the others by the frames before"),
+        };
         format!(
-            "{} of {all} frames measured against frame {}{lost} ({searched} by a search of all, the others by the frames \
-             before): tissue moved {} mm at most, {} points followed.",
-            self.measured(),
+            "{measured} of {all} frames measured against frame {}{lost} ({how}): tissue moved {} mm at most, {} points followed.",
             self.reference,
             short2(largest),
             thousands(self.tracked.trajectories.len())
@@ -254,7 +257,7 @@ pub fn warnings(tracked: &Tracked) -> impl Iterator<Item = String> + '_ {
 /// The page.
 pub fn page(report: &TrackReport<'_>) -> String {
     let t = report.tracked;
-    let (all, measured) = (t.frames.len(), report.measured());
+    let (all, measured) = (t.frames.len(), report.measured().count());
     let edge = report.grid.spacing().iter().product::<f64>().cbrt();
     let uncertain = t.frames.iter().map(|f| f.uncertainty_median_mm).fold(0.0, f64::max);
     let trust = match (measured == all, uncertain < edge / 2.0, measured * 2 >= all) {
@@ -338,7 +341,7 @@ fn look(report: &TrackReport<'_>) -> String {
         moments: &held.iter().map(|l| &l.moment).collect::<Vec<_>>(),
         first: held.iter().position(|l| l.frame == first.frame).unwrap_or_default(),
     };
-    let (clock, measured) = (escape(&report.clock(first.frame)), report.measured());
+    let (clock, measured) = (escape(&report.clock(first.frame)), report.measured().count());
     let held = match held.len() {
         1 if measured > 1 => format!("The frame that moves most, {clock}."),
         n if n < measured => format!("{n} of the {measured} frames, at first the one that moves most, {clock}."),
