@@ -6,6 +6,7 @@ mod truth;
 
 use palpate::numerics::bending::{Data, Smoothness, solve};
 use palpate::numerics::bspline::{Lattice, SmoothSampler, weights};
+use palpate::numerics::dense::symmetric_eigen;
 use palpate::numerics::neighbours::Neighbours;
 use palpate::numerics::random::Random;
 use palpate::numerics::{filters, pyramid, small, statistics};
@@ -683,19 +684,40 @@ fn random_numbers_are_normal_and_uniform() {
     assert_ne!(a, b);
 }
 
+/// Symmetric matrices (xx, yy, zz, xy, xz, yz) of three sizes, some diagonal or with eigenvalues that are equal or nearly so.
+fn symmetric_matrices() -> impl Iterator<Item = (f64, [f64; 6])> {
+    let mut random = Random::new(3, 1);
+    (0..3000).map(move |n| {
+        let size = [1.0, 1e-8, 1e6][n % 3];
+        let m: [f64; 6] = std::array::from_fn(|_| size * random.uniform(-1.0, 1.0));
+        let m = match n % 7 {
+            0 => [m[0], m[1], m[2], 0.0, 0.0, 0.0],
+            1 => [m[0], m[0] * (1.0 + 1e-9), -m[0].abs(), 0.0, 1e-10 * m[4], 0.0],
+            2 => [m[0], m[0], m[2], 0.0, 0.0, 0.0],
+            3 => [m[0], m[0], m[0], 0.0, 0.0, 0.0],
+            _ => m,
+        };
+        (size, m)
+    })
+}
+
+#[test]
+fn eigenvalues_agree_with_jacobi_rotations() {
+    for (size, m) in symmetric_matrices() {
+        let full = [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]];
+        let truth = symmetric_eigen(&full).map(|p| p.0);
+        let found = small::eigenvalues(&m);
+        for k in 0..3 {
+            assert!((found[k] - truth[2 - k]).abs() < 2e-7 * size, "{m:?}: {found:?} is not {truth:?}");
+        }
+    }
+    assert_eq!(small::eigenvalues(&[2.0, 2.0, 2.0, 0.0, 0.0, 0.0]), [2.0; 3]);
+    assert_eq!(small::eigenvalues(&[0.0; 6]), [0.0; 3]);
+}
+
 #[test]
 fn the_principal_vector_is_that_of_the_largest_eigenvalue() {
-    let mut random = Random::new(5, 1);
-    for n in 0..3000 {
-        let size = [1.0, 1e-8, 1e6][n % 3];
-        let mut m: [f64; 6] = std::array::from_fn(|_| size * random.uniform(-1.0, 1.0));
-        match n % 7 {
-            0 => m[3..].fill(0.0),
-            // Nearly or wholly the same along two axes or all three.
-            1 => m = [m[0], m[0] * (1.0 + 1e-9), -m[0].abs(), 0.0, 1e-10 * m[4], 0.0],
-            2 => m = [m[0], m[0], m[0], 0.0, 0.0, 0.0],
-            _ => {}
-        }
+    for (size, m) in symmetric_matrices() {
         let v = small::principal(&m);
         let norm = v.iter().map(|v| v * v).sum::<f64>();
         assert!((norm - 1.0).abs() < 1e-12, "{m:?}: {v:?}");

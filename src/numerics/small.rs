@@ -1,7 +1,7 @@
 //! Symmetric 3 x 3 algebra. A symmetric matrix is `[xx, yy, zz, xy, xz, yz]`.
 
 use crate::numerics::dense::symmetric_eigen;
-use crate::types::space::cross;
+use crate::types::space::{cross, dot};
 
 /// A symmetric 3 x 3 matrix as `[xx, yy, zz, xy, xz, yz]`.
 pub type Symmetric3 = [f64; 6];
@@ -95,18 +95,21 @@ pub fn eigenvalues(m: &Symmetric3) -> [f64; 3] {
     [high, 3.0 * mean - high - low, low]
 }
 
+/// All nine entries, row by row.
+fn full(m: &Symmetric3) -> [[f64; 3]; 3] {
+    [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]]
+}
+
 /// A unit eigenvector of the largest eigenvalue: perpendicular to the two rows of `m` less that eigenvalue that span most.
 pub fn principal(m: &Symmetric3) -> [f64; 3] {
     let high = eigenvalues(m)[0];
-    let rows = [[m[0] - high, m[3], m[4]], [m[3], m[1] - high, m[5]], [m[4], m[5], m[2] - high]];
-    let normals = [(0, 1), (0, 2), (1, 2)].map(|(i, j)| cross(rows[i], rows[j]));
-    let square = |v: [f64; 3]| v.iter().map(|v| v * v).sum::<f64>();
-    let best = normals.into_iter().max_by(|a, b| square(*a).total_cmp(&square(*b))).unwrap_or_default();
+    let [x, y, z] = full(&[m[0] - high, m[1] - high, m[2] - high, m[3], m[4], m[5]]);
+    let longer = |a, b| if dot(b, b) > dot(a, a) { b } else { a };
+    let normal = longer(longer(cross(x, y), cross(x, z)), cross(y, z));
     // Of two eigenvalues that are nearly equal rounding decides: then by rotations.
-    let size = m.iter().map(|v| v * v).sum::<f64>();
-    if square(best) > 1e-8 * size * size {
-        return best.map(|v| v / square(best).sqrt());
+    let (square, size) = (dot(normal, normal), m.iter().map(|v| v * v).sum::<f64>());
+    if square > 1e-8 * size * size {
+        return normal.map(|v| v / square.sqrt());
     }
-    let full = [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]];
-    symmetric_eigen(&full)[2].1
+    symmetric_eigen(&full(m))[2].1
 }

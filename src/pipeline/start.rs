@@ -206,10 +206,8 @@ pub(super) fn begin(
     let own =
         [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH))).reduce(better);
     let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
-    let mut field = match (own, followed) {
-        (Some(own), Some(followed)) if level::is_better(pair, &followed, &own) => refined(followed),
-        (own, followed) => own.or(followed)?,
-    };
+    let wins = |known: &SplineField| own.as_ref().is_none_or(|own| level::is_better(pair, known, own));
+    let mut field = followed.filter(wins).map(refined).or(own)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
             break;
