@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::mesh::quality::{quality, volume};
-use palpate::mesh::tetrahedral::{Fineness, curving, mesh_labels, pieces};
+use palpate::mesh::tetrahedral::{Fineness, Mesher, curving, mesh_labels, pieces};
 use palpate::types::{Affine, Grid, Mask, QuadraticMesh, WorldPoint};
 use std::collections::HashMap;
 
@@ -106,6 +106,51 @@ fn layers_are_cut_where_they_meet() {
         assert!((v[&label] / exact - 1.0).abs() < 0.02, "{label}: {} of {exact}", v[&label]);
     }
     assert!(least > 3.0);
+}
+
+/// The edge of a punch lies within a side of a body, and no element may lie on both sides of it.
+#[test]
+fn a_wall_is_made_of_faces() {
+    let map = labels([64, 64, 48], 0.5, |p| {
+        let inside = (2.0..28.0).contains(&p[0]) && (2.0..28.0).contains(&p[1]) && (2.0..20.0).contains(&p[2]);
+        if inside { 1 + u8::from(p[2] > 16.2) } else { 0 }
+    });
+    let round = |p: [f64; 3]| 6.3 - (p[0] - 15.1).hypot(p[1] - 14.4);
+    let square = |p: [f64; 3]| (6.1 - (p[0] - 15.1).abs()).min(5.2 - (p[1] - 14.4).abs());
+    let walls: [(&str, f64, &(dyn Fn([f64; 3]) -> f64 + Sync)); 2] =
+        [("round", std::f64::consts::PI * 6.3 * 6.3, &round), ("square", 12.2 * 10.4, &square)];
+    for (name, exact, wall) in walls {
+        let near: Vec<[f64; 3]> = (0..64 * 64)
+            .map(|c| [0.5 * f64::from(c % 64), 0.5 * f64::from(c / 64), 19.5])
+            .filter(|p| wall(*p).abs() < 0.5)
+            .collect();
+        let fineness = Fineness::for_nodes(26.0 * 26.0 * 18.0, 4000);
+        let mesh = Mesher::new(&map).unwrap().mesh_finer(&fineness, &near, 1.0, Some(wall)).unwrap();
+        assert!(report(name, &mesh) > 2.0);
+        let v = volumes(&mesh);
+        for label in [1, 2] {
+            let voxels = map.as_slice().iter().filter(|&&v| v == label).count() as f64 * 0.125;
+            assert!((v[&label] / voxels - 1.0).abs() < 0.02, "{label}: {} of {voxels}", v[&label]);
+        }
+        let mut top = 0.0;
+        for t in mesh.tetrahedra() {
+            let corners = [0, 1, 2, 3].map(|i| mesh.nodes()[t[i] as usize].0);
+            let levels = corners.map(wall);
+            let (low, high) = levels.iter().fold((0.0f64, 0.0f64), |(a, b), l| (a.min(*l), b.max(*l)));
+            // Corners of a square are cut off by an element's chord.
+            let off = if name == "round" { 0.15 } else { 0.45 };
+            assert!(low > -off || high < off || corners.iter().any(|p| p[2] < 17.5), "{name}: {levels:?}");
+            for i in 0..4 {
+                let f = [0, 1, 2].map(|k| corners[(i + 1 + k) % 4]);
+                let middle = [0, 1, 2].map(|a| (f[0][a] + f[1][a] + f[2][a]) / 3.0);
+                if f.iter().all(|p| p[2] > 19.5) && wall(middle) > 0.0 {
+                    let [u, v] = [1, 2].map(|k| [0, 1].map(|a| f[k][a] - f[0][a]));
+                    top += 0.5 * (u[0] * v[1] - u[1] * v[0]).abs();
+                }
+            }
+        }
+        assert!((top / exact - 1.0).abs() < 0.02, "{name}: {top} of {exact}");
+    }
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub(super) fn regions(
     let fineness = Fineness::for_nodes(maps::volume(inputs.labels), (COARSE * params.nodes as f64) as usize);
     let level = |labels: &Mask| {
         let mesh = mesh_labels(labels, &fineness)?;
-        Level::new(&mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load)
+        Level::new(&mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, None)
     };
     let mut one = level(inputs.labels)?;
     let choice = choose(&mut one, params.model, params.poisson, 0)?;

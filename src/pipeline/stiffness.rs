@@ -1,15 +1,15 @@
 //! A displacement field to Young's modulus, region by region.
 
 use crate::error::StiffnessError;
-use crate::mesh::tetrahedral::{Fineness, Mesher, pieces};
+use crate::mesh::tetrahedral::{Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
-use crate::stiffness::choice::choose;
+use crate::stiffness::choice::{choose, settle};
 use crate::stiffness::identify::State;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
-use crate::stiffness::rim::rim;
+use crate::stiffness::rim::{Outline, rim};
 use crate::stiffness::{geometry, maps, summary};
 use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
 use crate::types::{Displacement, Mask, QuadraticMesh, SparseField, WorldPoint};
@@ -60,6 +60,8 @@ const ELSEWHERE: [f64; 5] = [0.7, 0.4, 0.25, 0.15, 0.08];
 const COARSER: [f64; 3] = [1.0, 1.5, 2.5];
 /// Nodes over the limit at most, where a mesh can be had.
 const OVER: f64 = 1.15;
+/// Moves of a punch's edge on the fine mesh at most: the coarse one has found most of the way.
+const FINE_MOVES: usize = 2;
 /// Precision of forward solutions on the fine mesh (mm).
 const PRECISION: f64 = 1e-5;
 
@@ -100,12 +102,16 @@ fn labelled(
     clock.book("mesh");
 
     progress("observe", 0.05);
-    let level =
-        |mesh: &QuadraticMesh| Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load);
-    let mut coarse = level(&coarse_mesh)?;
+    let level = |mesh: &QuadraticMesh, outline: Option<&Outline>| {
+        Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, outline)
+    };
+    let mut coarse = level(&coarse_mesh, None)?;
     let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
+    let outline = rim.outline.as_ref();
+    let within = outline.map(|o| |p| o.within(p));
+    let wall = within.as_ref().map(|w| w as Wall<'_>);
     let meshed = |nodes: f64, size: f64| {
-        if rim.is_empty() {
+        if rim.places.is_empty() {
             let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
             let count = mesh.nodes().len() as f64;
             // Thin layers and a rough surface take more than a block does.
@@ -115,29 +121,33 @@ fn labelled(
             };
         }
         // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
-        let mut best: Option<(f64, QuadraticMesh)> = None;
+        let mut best: Option<(f64, Fineness, f64)> = None;
         for coarser in COARSER {
             for elsewhere in ELSEWHERE {
                 let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
-                let mesh = mesher.mesh_finer(&fineness, &rim, coarser * size * coarse.voxel)?;
-                let count = mesh.nodes().len() as f64 / nodes;
+                let size = coarser * size * coarse.voxel;
+                let Some(count) = mesher.nodes(&fineness, &rim.places, size, wall) else { continue };
+                let count = count as f64 / nodes;
                 let rank = if count <= OVER { -count } else { count };
-                if best.as_ref().is_none_or(|(least, _)| rank < *least) {
-                    best = Some((rank, mesh));
+                if best.as_ref().is_none_or(|(least, ..)| rank < *least) {
+                    best = Some((rank, fineness, size));
                 }
             }
-            if best.as_ref().is_some_and(|(rank, _)| *rank < 0.0) {
+            if best.as_ref().is_some_and(|(rank, ..)| *rank < 0.0) {
                 break;
             }
         }
-        best.map_or_else(|| mesher.mesh(&Fineness::for_nodes(volume, nodes as usize)), |b| Ok(b.1))
+        match best {
+            Some((_, fineness, size)) => mesher.mesh_finer(&fineness, &rim.places, size, wall),
+            None => mesher.mesh(&Fineness::for_nodes(volume, nodes as usize)),
+        }
     };
     let fine_mesh = meshed(params.nodes as f64, RIM)?;
-    if !rim.is_empty() {
+    if !rim.places.is_empty() {
         let mesh = meshed(coarse_nodes as f64, 2.0 * RIM)?;
-        coarse = level(&mesh)?;
+        coarse = level(&mesh, outline)?;
     }
-    let mut fine = level(&fine_mesh)?;
+    let mut fine = level(&fine_mesh, outline)?;
     let reference = fine.largest();
     clock.book("observe");
 
@@ -149,6 +159,7 @@ fn labelled(
     fine.touch_like(&coarse);
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
+    let estimate = settle(&mut fine, choice.law, params.poisson, reference, estimate, (FINE_MOVES, PRECISION))?;
     clock.book("fine");
 
     progress("uncertainty", 0.9);

@@ -17,6 +17,8 @@ const ITERATIONS: usize = 12;
 
 /// Moves of a punch's edge at most.
 const MOVES: usize = 4;
+/// Those of each law before the two are compared: the law that is chosen goes on.
+const LAW_MOVES: usize = 2;
 /// Length of one at most (voxels): the difference that it is taken from is linear about as far.
 const LONGEST: f64 = 2.0;
 /// Shorter ones are left to the last step with all offsets (voxels).
@@ -117,12 +119,12 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
     let (contact, mut estimate) = tried.swap_remove(best);
     (level.patches[0].contact, level.patches[1].contact) = (contact[0], contact[1]);
     let mut law = first;
-    estimate = settle(level, law, poisson, reference, estimate)?;
     if wanted != LawChoice::Linear && first == Law::Linear {
+        estimate = settle(level, law, poisson, reference, estimate, (LAW_MOVES, COARSE))?;
         let start = estimate.state.clone();
         let edge = level.edge.map_or(0.0, |e| e.1);
         let large = level.setup(Law::NeoHookean, poisson, reference).run(start, ITERATIONS, COARSE)?;
-        let large = settle(level, Law::NeoHookean, poisson, reference, large)?;
+        let large = settle(level, Law::NeoHookean, poisson, reference, large, (LAW_MOVES, COARSE))?;
         let samples = estimate.effective.min(large.effective);
         let scores = [&estimate, &large].map(|e| bic(e.squares, samples, e.parameters));
         let better = scores[1] + MARGIN < scores[0];
@@ -159,26 +161,28 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
             reason: "as asked".into(),
         });
     }
+    estimate = settle(level, law, poisson, reference, estimate, (MOVES, COARSE))?;
     Ok(Choice { law, estimate, evidence })
 }
 
-/// Moves the edge of a punch to where the data put it, and identifies again, until it stays.
+/// Moves the edge of a punch to where the data put it, and identifies again, until it stays, or has moved `moves` times.
+/// `precision`: of the forward solutions (mm).
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-fn settle(
+pub fn settle(
     level: &mut Level,
     law: Law,
     poisson: f64,
     reference: usize,
     mut estimate: Estimate,
+    (moves, precision): (usize, f64),
 ) -> Result<Estimate, StiffnessError> {
-    for _ in 0..MOVES {
+    for _ in 0..moves {
         let step = edge_step(&level.setup(law, poisson, reference), &estimate, &level.grid)?;
         let Some((step, (_, moved))) = step.zip(level.edge).filter(|(step, _)| step.abs() > SETTLED) else { break };
         level.move_edge(moved + step.clamp(-LONGEST, LONGEST));
-        let start = estimate.state.clone();
-        estimate = level.setup(law, poisson, reference).run(start, ITERATIONS, COARSE)?;
+        estimate = level.setup(law, poisson, reference).run(estimate.state, ITERATIONS, precision)?;
     }
     Ok(estimate)
 }

@@ -9,6 +9,7 @@ use crate::stiffness::geometry::Edge;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::{Observation, find, from_field, from_matches};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
+use crate::stiffness::rim::Outline;
 use crate::types::stiffness::Law;
 use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
 
@@ -61,11 +62,12 @@ impl Level {
         labels: &Mask,
         held: &Place,
         load: &Place,
+        outline: Option<&Outline>,
     ) -> Result<Self, StiffnessError> {
         let body = Body::new(mesh)?;
         let voxel = field.grid().least_spacing();
         let motion = SurfaceMotion::new(&body, field, labels);
-        let patches = patches::find(&body, &motion, held, load, voxel)?;
+        let patches = patches::find(&body, &motion, held, load, outline, voxel)?;
         let (observations, block) = match matches {
             Some(m) => (from_matches(&body, m), 0),
             None => from_field(&body, field, labels),

@@ -13,6 +13,7 @@ use crate::stiffness::body::Body;
 use crate::stiffness::forward::Tie;
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::plate;
+use crate::stiffness::rim::Outline;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Contact, Side};
 use crate::types::{Displacement, Mask, VoxelPoint, WorldPoint};
@@ -25,6 +26,9 @@ const NEAR: f64 = 1.8;
 
 /// Noise of that (voxels) beyond which it tells a touch worse than a reading from further around.
 const NOISY: f64 = 0.1;
+
+/// Cosine of the angle to a side within which a facet faces it.
+const FACING: f64 = 0.3;
 
 /// What ends further beyond the plane of a plate (voxels) passes beside it.
 const BESIDE: f64 = 1.0;
@@ -244,7 +248,8 @@ fn refuse(which: &'static str, place: &Place, what: &str, hint: &str) -> Stiffne
     StiffnessError::Patch { which, name: place.name(), what: what.into(), hint: hint.into() }
 }
 
-/// Finds the held and the loaded patch. `voxel` is the least voxel size (mm).
+/// Finds the held and the loaded patch. `voxel` is the least voxel size (mm); `outline` that of a punch on the loaded side, where
+/// it is known.
 ///
 /// # Errors
 /// [`StiffnessError::Patch`] for a patch without surface, [`StiffnessError::NoLoad`] when they do not move against each other.
@@ -253,6 +258,7 @@ pub fn find(
     motion: &SurfaceMotion,
     held: &Place,
     load: &Place,
+    outline: Option<&Outline>,
     voxel: f64,
 ) -> Result<[Patch; 2], StiffnessError> {
     if held == load {
@@ -276,8 +282,11 @@ pub fn find(
     };
     let hint_load = "name the side that the plate presses, or give a mask that covers the patch";
     let (facets, plane, moved) = match load {
-        Place::Side(side) => pressed_facets(body, motion, &against, *side, voxel)
-            .ok_or_else(|| refuse("loaded", load, "is empty: no surface faces that way", hint_load))?,
+        Place::Side(side) => {
+            let (facets, plane, moved) = pressed_facets(body, motion, &against, *side, voxel)
+                .ok_or_else(|| refuse("loaded", load, "is empty: no surface faces that way", hint_load))?;
+            (outline.map_or(facets, |o| facets_within(body, *side, o)), plane, moved)
+        }
         Place::Mask(mask, _) => {
             let facets = masked_facets(body, mask);
             if facets.is_empty() {
@@ -367,6 +376,13 @@ fn masked_facets(body: &Body, mask: &Mask) -> Vec<usize> {
     (0..body.surface.len()).filter(covered).collect()
 }
 
+/// Facets on a side whose middle lies within the outline of a punch.
+fn facets_within(body: &Body, side: Side, outline: &Outline) -> Vec<usize> {
+    let d = side.direction();
+    let under = |f: &usize| dot(body.surface[*f].normal, d) > FACING && outline.holds(body.surface[*f].centre);
+    (0..body.surface.len()).filter(under).collect()
+}
+
 /// A plane: a point (mm) and its outward unit normal.
 type Plane = ([f64; 3], [f64; 3]);
 
@@ -379,7 +395,7 @@ fn pressed_facets(
     voxel: f64,
 ) -> Option<(Vec<usize>, Option<Plane>, f64)> {
     let d = side.direction();
-    let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > 0.3).collect();
+    let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > FACING).collect();
     let mut nodes = body.nodes_on(facing.iter().copied());
     nodes.retain(|&n| against(n).is_some());
     if nodes.len() < 6 {

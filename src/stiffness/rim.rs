@@ -1,26 +1,82 @@
-//! The rim of a flat punch on the surface around it: where the mesh must be fine.
+//! The rim of a flat punch on the surface around it: where the mesh must be fine, and where its faces must end.
 //!
 //! Under the edge of a punch strain has a singularity, and what is near it (a thin skin) hangs on where that edge is. So it is
 //! looked for among the surface voxels: those that moved with the plate next to those that did not.
 
+use crate::numerics::statistics::percentile;
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
-use crate::types::{Displacement, Mask, VoxelPoint};
+use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
+use std::f64::consts::TAU;
 
 /// Voxels on both sides of the rim, and below it, where the mesh is fine.
 const AROUND: i32 = 1;
 /// Columns of a patch beside a punch at least.
 const WIDE: usize = 25;
 
-/// Places (grid mm: voxel index times spacing) around the rim of `patch`; empty for a patch on a curved surface, and where the
-/// whole side is pressed.
+/// Directions in which an outline is looked for.
+const RAYS: usize = 256;
+/// From where to where beside a punch its outline is told by how the surface gives way (voxels).
+const SEEN: [f64; 2] = [1.0, 6.0];
+/// Half of the arc over which the outline's distance is the median (voxels).
+const ARC: f64 = 1.5;
+/// How far the outline may lie from the last voxel that moved with the punch (voxels).
+const OFF: f64 = 2.0;
+/// Part of the area of what moved with the punch by which the outline's may differ.
+const UNLIKE: f64 = 0.15;
+
+/// The rim of a flat punch.
+#[derive(Debug, Clone, Default)]
+pub struct Rim {
+    /// Places around it (grid mm: voxel index times spacing).
+    pub places: Vec<[f64; 3]>,
+    /// Where it runs; none where it is not seen all around the middle of the patch.
+    pub outline: Option<Outline>,
+}
+
+/// A closed curve around the middle of a punch, on the plane of two voxel axes.
+#[derive(Debug, Clone)]
+pub struct Outline {
+    grid: Grid,
+    plane: [usize; 2],
+    middle: [f64; 2],
+    /// Distance from the middle (mm) by direction.
+    radii: Vec<f64>,
+}
+
+impl Outline {
+    /// How far (mm) a place (grid mm) lies within the curve, along the ray from the middle.
+    pub fn within(&self, p: [f64; 3]) -> f64 {
+        let [x, y]: [f64; 2] = std::array::from_fn(|k| p[self.plane[k]] - self.middle[k]);
+        let turn = (y.atan2(x) / TAU).rem_euclid(1.0) * RAYS as f64;
+        let (low, part) = (turn as usize % RAYS, turn.fract());
+        let radius = (1.0 - part) * self.radii[low] + part * self.radii[(low + 1) % RAYS];
+        radius - x.hypot(y)
+    }
+
+    /// The same for a place in mm, RAS.
+    pub fn holds(&self, p: [f64; 3]) -> bool {
+        let v = self.grid.affine().to_voxel(WorldPoint(p)).0;
+        let spacing = self.grid.spacing();
+        self.within(std::array::from_fn(|a| v[a] * spacing[a])) > 0.0
+    }
+
+    /// Its area (mm^2).
+    fn area(&self) -> f64 {
+        let next = |k: usize| self.radii[(k + 1) % RAYS];
+        let sine = (TAU / RAYS as f64).sin();
+        (0..RAYS).map(|k| 0.5 * sine * self.radii[k] * next(k)).sum()
+    }
+}
+
+/// The rim of `patch`; empty for a patch on a curved surface, and where the whole side is pressed.
 ///
 /// A voxel's motion is read from those within `reach` (voxels), and is that of the plate within `tolerance` (mm).
-pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f64, reach: f64) -> Vec<[f64; 3]> {
+pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f64, reach: f64) -> Rim {
     if patch.curved() {
-        return Vec::new();
+        return Rim::default();
     }
     let grid = labels.grid();
     let (shape, spacing, inside) = (grid.shape(), grid.spacing(), labels.as_slice());
@@ -58,7 +114,7 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
     let short: Vec<Option<(usize, f64)>> = (0..width * shape[v]).into_par_iter().map(column).collect();
     let columns: Vec<Option<(usize, bool)>> = (0..short.len()).map(|c| voted(&short, c, width, tolerance)).collect();
     let beside = clear_of(&columns, &short, width, tolerance);
-    let mut found = Vec::new();
+    let mut places = Vec::new();
     for (c, here) in columns.iter().enumerate() {
         let Some((top, true)) = *here else { continue };
         let (i, j) = ((c % width) as i32, (c / width) as i32);
@@ -71,11 +127,121 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
                 let mut at = [0.0; 3];
                 at[axis] = top as f64 + f64::from(if up { -down } else { down });
                 (at[u], at[v]) = (f64::from(i + di), f64::from(j + dj));
-                found.push(std::array::from_fn(|a| at[a] * spacing[a]));
+                places.push(std::array::from_fn(|a| at[a] * spacing[a]));
             }
         }
     }
-    found
+    let lag = |c: usize| {
+        let at = index(columns[c]?.0, c % width, c / width);
+        let place = grid.world(at[0], at[1], at[2]).0;
+        let (moved, plate) = (field.at(grid.index(at[0], at[1], at[2])), patch.motion(place));
+        Some(dot(std::array::from_fn(|a| f64::from(moved[a]) - plate[a]), patch.normal)).filter(|v| v.is_finite())
+    };
+    let face = Face {
+        width,
+        spacing: [spacing[u], spacing[v]],
+        with: columns.iter().map(|c| c.is_some_and(|(_, with)| with)).collect(),
+        lag: (0..columns.len()).map(lag).collect(),
+    };
+    let middle = grid.affine().to_voxel(WorldPoint(patch.middle)).0;
+    let radii = (!places.is_empty()).then(|| face.outline([middle[u], middle[v]])).flatten();
+    let outline = radii.map(|radii| Outline {
+        grid: *grid,
+        plane: [u, v],
+        middle: [middle[u] * spacing[u], middle[v] * spacing[v]],
+        radii,
+    });
+    let seen = face.with.iter().filter(|w| **w).count() as f64 * spacing[u] * spacing[v];
+    let outline = outline.filter(|o| (o.area() / seen - 1.0).abs() < UNLIKE);
+    Rim { places, outline }
+}
+
+/// A side of the body, column by column.
+struct Face {
+    width: usize,
+    spacing: [f64; 2],
+    /// Which moved with the punch.
+    with: Vec<bool>,
+    /// By how much the outermost voxel stays behind it (mm); none outside the body.
+    lag: Vec<Option<f64>>,
+}
+
+impl Face {
+    /// Distance of the punch's edge from `middle` (columns) in each direction (mm); none where the middle is not below it.
+    ///
+    /// Beside the edge of a punch the surface gives way as the root of the distance (Johnson, Contact Mechanics, 1985, sec. 2.8), so
+    /// the square of that begins as a straight line where the punch ends; a parabola takes up the bend further out.
+    fn outline(&self, middle: [f64; 2]) -> Option<Vec<f64>> {
+        let step = 0.5 * self.spacing[0].min(self.spacing[1]);
+        let voxel = 2.0 * step;
+        let one = |k: usize| {
+            let (sin, cos) = (TAU * k as f64 / RAYS as f64).sin_cos();
+            let at = |r: f64| [middle[0] + r * cos / self.spacing[0], middle[1] + r * sin / self.spacing[1]];
+            let last =
+                (0..).map(|n| f64::from(n) * step).find(|&r| self.nearest(at(r)).is_none_or(|c| !self.with[c]))?;
+            if last == 0.0 {
+                return None;
+            }
+            // Where the body ends before the punch does, there is no edge.
+            if self.nearest(at(last)).is_none_or(|c| self.lag[c].is_none()) {
+                return Some(last + OFF * voxel);
+            }
+            let mut edge = last;
+            for _ in 0..3 {
+                let places = (0..).map(|n| edge + SEEN[0] * voxel + f64::from(n) * step);
+                let places = places.take_while(|r| *r < edge + SEEN[1] * voxel);
+                let samples: Vec<[f64; 2]> =
+                    places.map_while(|r| self.read(at(r)).map(|lag| [r - edge, lag * lag.abs()])).collect();
+                let Some(end) = zero(&samples) else { break };
+                edge = (edge + end).clamp(last - OFF * voxel, last + OFF * voxel);
+            }
+            Some(edge)
+        };
+        let raw: Vec<f64> = (0..RAYS).map(one).collect::<Option<_>>()?;
+        let median = |k: usize| {
+            let half = (ARC * voxel / raw[k] / TAU * RAYS as f64) as usize;
+            let mut near: Vec<f64> = (0..=2 * half).map(|n| raw[(k + RAYS + n - half) % RAYS]).collect();
+            percentile(&mut near, 50.0)
+        };
+        Some((0..RAYS).map(median).collect())
+    }
+
+    fn nearest(&self, at: [f64; 2]) -> Option<usize> {
+        let [i, j] = at.map(|v| v.round());
+        let high = (self.lag.len() / self.width) as f64;
+        ((0.0..self.width as f64).contains(&i) && (0.0..high).contains(&j))
+            .then(|| i as usize + self.width * j as usize)
+    }
+
+    /// How far the surface stays behind, between the columns.
+    fn read(&self, at: [f64; 2]) -> Option<f64> {
+        let (low, part) = (at.map(f64::floor), at.map(|v| v - v.floor()));
+        let corner = |k: usize| {
+            let to = [k & 1, k >> 1];
+            let weight: f64 = (0..2).map(|a| if to[a] == 1 { part[a] } else { 1.0 - part[a] }).product();
+            let column = self.nearest(std::array::from_fn(|a| low[a] + to[a] as f64))?;
+            Some(weight * self.lag[column]?)
+        };
+        (0..4).map(corner).sum()
+    }
+}
+
+/// Where the parabola through `samples` (place from about there, value) is 0 and rises, next to 0.
+fn zero(samples: &[[f64; 2]]) -> Option<f64> {
+    if samples.len() < 6 {
+        return None;
+    }
+    let (mut m, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
+    for &[x, y] in samples {
+        let row = [1.0, x, x * x];
+        for i in 0..3 {
+            b[i] += row[i] * y;
+            (0..3).for_each(|j| m[i][j] += row[i] * row[j]);
+        }
+    }
+    let [c, b, a] = crate::numerics::dense::solve(&m, &b)?;
+    let under = b * b - 4.0 * a * c;
+    (under >= 0.0 && b > 0.0).then(|| -2.0 * c / (b + under.sqrt()))
 }
 
 /// Columns within `reach` along both axes, with the one itself.
@@ -157,5 +323,52 @@ mod tests {
     #[test]
     fn the_face_beside_a_punch_is_clear_of_it() {
         assert_eq!(clear(|i, _| if i < 8 { 0.3 } else { 0.0 }), 160);
+    }
+
+    /// The outline that is found of a punch whose edge lies `far` (columns) beyond a place on a face of 60 by 50 columns of
+    /// 0.5 by 0.6 mm; the surface gives way as the root of that, and a little less further away.
+    fn outline(far: impl Fn([f64; 2]) -> f64, noise: f64) -> Vec<f64> {
+        let mut random = crate::numerics::random::Random::new(5, 0);
+        let width = 60;
+        let lag = |c: usize| {
+            let d = far([(c % width) as f64, (c / width) as f64]).max(0.0);
+            Some(0.15 * (d * (1.0 - 0.01 * d)).sqrt())
+        };
+        let lag: Vec<Option<f64>> = (0..50 * width).map(|c| lag(c).map(|v| v + noise * random.normals()[0])).collect();
+        let with = (0..50 * width).map(|c| far([(c % width) as f64, (c / width) as f64]) < 0.3).collect();
+        Face { width, spacing: [0.5, 0.6], with, lag }.outline([30.4, 24.7]).unwrap_or_default()
+    }
+
+    #[test]
+    fn the_outline_of_a_round_punch_is_told_to_a_part_of_a_voxel() {
+        for (noise, bar, part) in [(0.0, 0.08, 0.01), (0.02, 0.5, 0.05)] {
+            // 8.2 mm around a middle beside the one from which it is looked for.
+            let far = |[i, j]: [f64; 2]| ((0.5 * (i - 29.1)).hypot(0.6 * (j - 25.2)) - 8.2) / 0.5;
+            let radii = outline(far, noise);
+            assert_eq!(radii.len(), RAYS);
+            let off = |(k, r): (usize, &f64)| {
+                let (sin, cos) = (TAU * k as f64 / RAYS as f64).sin_cos();
+                far([30.4 + r * cos / 0.5, 24.7 + r * sin / 0.6])
+            };
+            let square = radii.iter().enumerate().map(|r| off(r).powi(2)).sum::<f64>() / RAYS as f64;
+            assert!(square.sqrt() < bar, "{noise} {}", square.sqrt());
+            let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / RAYS as f64;
+            let exact = 0.5 * TAU * 8.2 * 8.2;
+            assert!((area / exact - 1.0).abs() < part, "{noise} {area} {exact}");
+        }
+    }
+
+    #[test]
+    fn the_outline_of_a_square_punch_has_its_area() {
+        // Turned by half a radian, sides of 13 and 17 mm.
+        let far = |[i, j]: [f64; 2]| {
+            let (x, y) = (0.5 * (i - 30.9), 0.6 * (j - 24.1));
+            let (sin, cos) = 0.5f64.sin_cos();
+            let [a, b] = [(cos * x + sin * y).abs() - 6.5, (cos * y - sin * x).abs() - 8.5];
+            if a > 0.0 && b > 0.0 { a.hypot(b) / 0.5 } else { a.max(b) / 0.5 }
+        };
+        let radii = outline(far, 0.0);
+        let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / RAYS as f64;
+        assert!((area / 221.0 - 1.0).abs() < 0.02, "{area}");
     }
 }

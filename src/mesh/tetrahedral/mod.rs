@@ -109,18 +109,24 @@ impl Mesher {
     /// # Errors
     /// As [`mesh_labels`].
     pub fn mesh(&self, fineness: &Fineness) -> Result<QuadraticMesh, MeshError> {
-        self.mesh_finer(fineness, &[], 0.0)
+        self.mesh_finer(fineness, &[], 0.0, None)
     }
 
-    /// With cubes of about `size` (mm) around the places `near` (grid mm: voxel index times spacing). Where a part gets no
-    /// element, smaller cubes are tried, down to a third of the side.
+    /// With cubes of about `size` (mm) around the places `near` (grid mm: voxel index times spacing), and faces where `wall` is 0,
+    /// though both sides are of one part. Where a part gets no element, smaller cubes are tried, down to a third of the side.
     ///
     /// # Errors
     /// As [`mesh_labels`].
-    pub fn mesh_finer(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64) -> Result<QuadraticMesh, MeshError> {
+    pub fn mesh_finer(
+        &self,
+        fineness: &Fineness,
+        near: &[[f64; 3]],
+        size: f64,
+        wall: Option<Wall<'_>>,
+    ) -> Result<QuadraticMesh, MeshError> {
         let mut fineness = *fineness;
         for _ in 0..FINER {
-            match self.meshed(&fineness, near, size) {
+            match self.meshed(&fineness, near, size, wall) {
                 Err(MeshError::PartLost { .. }) => {
                     fineness.size *= 0.8;
                     fineness.nodes *= 2;
@@ -128,20 +134,36 @@ impl Mesher {
                 done => return done,
             }
         }
-        self.meshed(&fineness, near, size)
+        self.meshed(&fineness, near, size, wall)
     }
 
-    fn meshed(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64) -> Result<QuadraticMesh, MeshError> {
-        let mut levels = self.levels.clone();
-        let mut octree = lattice::Octree::new(levels.bounds(), fineness.size);
-        refine(&mut octree, &levels, fineness);
+    /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this fineness itself.
+    pub fn nodes(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64, wall: Option<Wall<'_>>) -> Option<usize> {
+        let lattice = self.lattice(fineness, near, size);
+        build(&lattice, &self.levels, wall).ok().map(|made| made.places.len())
+    }
+
+    fn lattice(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64) -> lattice::Lattice {
+        let mut octree = lattice::Octree::new(self.levels.bounds(), fineness.size);
+        refine(&mut octree, &self.levels, fineness);
         let halvings = (octree.base() / size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
         near.iter().for_each(|p| octree.refine(*p, halvings));
-        let lattice = octree.tetrahedra();
-        let mut made = build(&lattice, &levels)?;
+        octree.tetrahedra()
+    }
+
+    fn meshed(
+        &self,
+        fineness: &Fineness,
+        near: &[[f64; 3]],
+        size: f64,
+        wall: Option<Wall<'_>>,
+    ) -> Result<QuadraticMesh, MeshError> {
+        let mut levels = self.levels.clone();
+        let lattice = self.lattice(fineness, near, size);
+        let mut made = build(&lattice, &levels, wall)?;
         for _ in 0..CALIBRATIONS {
             calibrate(&made, &mut levels);
-            made = build(&lattice, &levels)?;
+            made = build(&lattice, &levels, wall)?;
         }
         let Made { places, mut tetrahedra, part } = made;
         let (affine, spacing) = (self.grid.affine(), self.grid.spacing());
@@ -155,6 +177,11 @@ impl Mesher {
     }
 }
 
+/// A level function (of grid mm) whose zero is to be made of faces.
+pub type Wall<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
+
+/// The bit of vertices on such a wall.
+const WALL: u32 = 1 << 31;
 /// Times that smaller cubes are tried.
 const FINER: usize = 5;
 /// Times that surfaces are moved so that volumes come out right.
@@ -167,7 +194,7 @@ struct Made {
     part: Vec<u8>,
 }
 
-fn build(lattice: &lattice::Lattice, levels: &Levels) -> Result<Made, MeshError> {
+fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) -> Result<Made, MeshError> {
     let mut cut = Cut::new(lattice.clone());
     let inside = cut.along(|p| levels.body(p), 1, |_, _| false);
     cut.retain(&inside);
@@ -183,6 +210,10 @@ fn build(lattice: &lattice::Lattice, levels: &Levels) -> Result<Made, MeshError>
         }
     }
     cut.part.iter_mut().filter(|p| **p == cutting::NO_PART).for_each(|p| *p = parts as u8 - 1);
+    if let Some(wall) = wall {
+        let edges = boundary_edges(&cut.cells);
+        cut.along(wall, WALL, |a, b| cut_edge(&edges, a, b));
+    }
     smoothing::smooth(&mut cut);
     if cut.cells.len() < 4 {
         return Err(MeshError::TooFew { found: cut.places.len(), needed: 4 });
