@@ -409,10 +409,10 @@ fn phantom_moduli(kind: PhantomKind, size: usize, nodes: usize) -> (Pressed, Sti
 
 #[test]
 fn layers_under_a_punch_are_told_though_the_edge_is_known_to_a_voxel_only() {
-    // With the edge where the surface's motion puts it the skin was 13 % off, and 50 on a mesh that is not fine there.
+    // Before the mesh was cut along the edge the skin was up to 18 % off on a finer grid, and 50 on a mesh that is not fine there.
     let (body, result) = phantom_moduli(PhantomKind::Slab, 48, 15_000);
     assert_eq!(result.law, Law::NeoHookean, "{:?}", result.evidence);
-    for (r, bar) in result.regions.iter().zip([0.15, 0.05, 0.03]) {
+    for (r, bar) in result.regions.iter().zip([0.1, 0.04, 0.02]) {
         let off = r.youngs_modulus / body.modulus(r.label) - 1.0;
         assert!(r.identifiable && off.abs() < bar, "{} {off}", r.name);
     }

@@ -61,7 +61,7 @@ const COARSER: [f64; 3] = [1.0, 1.5, 2.5];
 /// Nodes over the limit at most, where a mesh can be had.
 const OVER: f64 = 1.15;
 /// Moves of a punch's edge on the fine mesh at most: the coarse one has found most of the way.
-const FINE_MOVES: usize = 2;
+const FINE_MOVES: usize = 1;
 /// Precision of forward solutions on the fine mesh (mm).
 const PRECISION: f64 = 1e-5;
 
