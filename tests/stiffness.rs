@@ -1,7 +1,7 @@
 //! Forward models against closed forms, sensitivities, and identification of fields with a closed form.
 #![allow(clippy::unwrap_used)]
 
-use palpate::mesh::tetrahedral::{Fineness, Mesher, mesh_labels};
+use palpate::mesh::tetrahedral::{Detail, Fineness, Mesher, mesh_labels};
 use palpate::pipeline::pressed::Pressed;
 use palpate::pipeline::stiffness::{Inputs, run};
 use palpate::stiffness::body::Body;
@@ -228,7 +228,8 @@ fn a_punch_needs_the_force_of_a_half_space_within_a_seventh() {
     let ring = (0..52 * 52).map(|c| [f64::from(c % 52), f64::from(c / 52), 31.0]);
     let near: Vec<[f64; 3]> = ring.filter(|p| wall(*p).abs() < 1.0).collect();
     let fineness = Fineness::for_nodes(48.0 * 48.0 * 30.0, 8_000);
-    let mesh = Mesher::new(&map).unwrap().mesh_finer(&fineness, &near, 1.0, Some(&wall)).unwrap();
+    let mesh =
+        Mesher::new(&map).unwrap().mesh_finer(&fineness, Detail { near: &near, size: 1.0, wall: Some(&wall) }).unwrap();
     let body = Body::new(&mesh).unwrap();
     let mut ties = Vec::new();
     for f in &body.surface {

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::mesh::quality::{quality, volume};
-use palpate::mesh::tetrahedral::{Fineness, Mesher, curving, mesh_labels, pieces};
+use palpate::mesh::tetrahedral::{Detail, Fineness, Mesher, curving, mesh_labels, pieces};
 use palpate::types::{Affine, Grid, Mask, QuadraticMesh, WorldPoint};
 use std::collections::HashMap;
 
@@ -125,7 +125,10 @@ fn a_wall_is_made_of_faces() {
             .filter(|p| wall(*p).abs() < 0.5)
             .collect();
         let fineness = Fineness::for_nodes(26.0 * 26.0 * 18.0, 4000);
-        let mesh = Mesher::new(&map).unwrap().mesh_finer(&fineness, &near, 1.0, Some(wall)).unwrap();
+        let mesh = Mesher::new(&map)
+            .unwrap()
+            .mesh_finer(&fineness, Detail { near: &near, size: 1.0, wall: Some(wall) })
+            .unwrap();
         assert!(report(name, &mesh) > 2.0);
         let v = volumes(&mesh);
         for label in [1, 2] {

@@ -68,7 +68,7 @@ pub struct Options {
     /// Poisson's ratio of all regions
     #[arg(long, value_name = "NU", default_value_t = StiffnessParams::default().poisson, allow_negative_numbers = true)]
     poisson: f64,
-    /// linear, neo-hookean, or auto: linear unless the data ask for more
+    /// linear, neo-hookean, or auto: linear unless strains past 5 % or the data ask for more
     #[arg(long, default_value = "auto")]
     model: LawChoice,
     /// Nodes of the mesh, about; 500 to 500,000

@@ -1,7 +1,7 @@
 //! A displacement field to Young's modulus, region by region.
 
 use crate::error::StiffnessError;
-use crate::mesh::tetrahedral::{Fineness, Mesher, Wall, pieces};
+use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
@@ -110,6 +110,7 @@ fn labelled(
     let outline = rim.outline.as_ref();
     let within = outline.map(|o| |p| o.within(p));
     let wall = within.as_ref().map(|w| w as Wall<'_>);
+    let detail = |size: f64| Detail { near: &rim.places, size: size * coarse.voxel, wall };
     let meshed = |nodes: f64, size: f64| {
         if rim.places.is_empty() {
             let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
@@ -121,26 +122,26 @@ fn labelled(
             };
         }
         // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
-        let mut best: Option<(f64, Fineness, f64)> = None;
+        let mut best: Option<(f64, Fineness, Detail<'_>)> = None;
         for coarser in COARSER {
             for elsewhere in ELSEWHERE {
                 let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
-                let size = coarser * size * coarse.voxel;
-                let Some(count) = mesher.nodes(&fineness, &rim.places, size, wall) else { continue };
+                let detail = detail(coarser * size);
+                let Some(count) = mesher.nodes(&fineness, detail) else { continue };
                 let count = count as f64 / nodes;
                 let rank = if count <= OVER { -count } else { count };
                 if best.as_ref().is_none_or(|(least, ..)| rank < *least) {
-                    best = Some((rank, fineness, size));
+                    best = Some((rank, fineness, detail));
                 }
             }
             if best.as_ref().is_some_and(|(rank, ..)| *rank < 0.0) {
                 break;
             }
         }
-        match best {
-            Some((_, fineness, size)) => mesher.mesh_finer(&fineness, &rim.places, size, wall),
-            None => mesher.mesh(&Fineness::for_nodes(volume, nodes as usize)),
-        }
+        // Where none of them keeps all parts, the mesher goes on to smaller cubes.
+        let plain = (Fineness::for_nodes(volume, nodes as usize), detail(size));
+        let (fineness, detail) = best.map_or(plain, |(_, fineness, detail)| (fineness, detail));
+        mesher.mesh_finer(&fineness, detail)
     };
     let fine_mesh = meshed(params.nodes as f64, RIM)?;
     if !rim.places.is_empty() {

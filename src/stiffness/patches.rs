@@ -285,7 +285,8 @@ pub fn find(
         Place::Side(side) => {
             let (facets, plane, moved) = pressed_facets(body, motion, &against, *side, voxel)
                 .ok_or_else(|| refuse("loaded", load, "is empty: no surface faces that way", hint_load))?;
-            (outline.map_or(facets, |o| facets_within(body, *side, o)), plane, moved)
+            let under = outline.map(|o| facets_within(body, *side, o)).filter(|under| !under.is_empty());
+            (under.unwrap_or(facets), plane, moved)
         }
         Place::Mask(mask, _) => {
             let facets = masked_facets(body, mask);

@@ -3,6 +3,7 @@
 //! Under the edge of a punch strain has a singularity, and what is near it (a thin skin) hangs on where that edge is. So it is
 //! looked for among the surface voxels: those that moved with the plate next to those that did not.
 
+use crate::numerics::dense::solve;
 use crate::numerics::statistics::percentile;
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::patches::Patch;
@@ -131,6 +132,9 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
             }
         }
     }
+    if places.is_empty() {
+        return Rim::default();
+    }
     let lag = |c: usize| {
         let at = index(columns[c]?.0, c % width, c / width);
         let place = grid.world(at[0], at[1], at[2]).0;
@@ -144,8 +148,7 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
         lag: (0..columns.len()).map(lag).collect(),
     };
     let middle = grid.affine().to_voxel(WorldPoint(patch.middle)).0;
-    let radii = (!places.is_empty()).then(|| face.outline([middle[u], middle[v]])).flatten();
-    let outline = radii.map(|radii| Outline {
+    let outline = face.outline([middle[u], middle[v]]).map(|radii| Outline {
         grid: *grid,
         plane: [u, v],
         middle: [middle[u] * spacing[u], middle[v] * spacing[v]],
@@ -193,13 +196,13 @@ impl Face {
                 let samples: Vec<[f64; 2]> =
                     places.map_while(|r| self.read(at(r)).map(|lag| [r - edge, lag * lag.abs()])).collect();
                 let Some(end) = zero(&samples) else { break };
-                edge = (edge + end).clamp(last - OFF * voxel, last + OFF * voxel);
+                edge = (edge + end).clamp((last - OFF * voxel).max(step), last + OFF * voxel);
             }
             Some(edge)
         };
         let raw: Vec<f64> = (0..RAYS).map(one).collect::<Option<_>>()?;
         let median = |k: usize| {
-            let half = (ARC * voxel / raw[k] / TAU * RAYS as f64) as usize;
+            let half = (ARC * voxel / raw[k] / TAU * RAYS as f64).min(RAYS as f64 / 8.0) as usize;
             let mut near: Vec<f64> = (0..=2 * half).map(|n| raw[(k + RAYS + n - half) % RAYS]).collect();
             percentile(&mut near, 50.0)
         };
@@ -239,7 +242,7 @@ fn zero(samples: &[[f64; 2]]) -> Option<f64> {
             (0..3).for_each(|j| m[i][j] += row[i] * row[j]);
         }
     }
-    let [c, b, a] = crate::numerics::dense::solve(&m, &b)?;
+    let [c, b, a] = solve(&m, &b)?;
     let under = b * b - 4.0 * a * c;
     (under >= 0.0 && b > 0.0).then(|| -2.0 * c / (b + under.sqrt()))
 }
@@ -355,6 +358,16 @@ mod tests {
             let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / RAYS as f64;
             let exact = 0.5 * TAU * 8.2 * 8.2;
             assert!((area / exact - 1.0).abs() < part, "{noise} {area} {exact}");
+        }
+    }
+
+    #[test]
+    fn the_outline_of_a_punch_of_a_voxel_or_two_is_finite_and_positive() {
+        // An edge put two voxels further in was at or past the middle, and its arc without end.
+        for radius in [0.2, 0.35, 0.6, 1.0, 1.6] {
+            let far = |[i, j]: [f64; 2]| ((0.5 * (i - 30.4)).hypot(0.6 * (j - 24.7)) - radius) / 0.5;
+            let radii = outline(far, 0.03);
+            assert!(radii.iter().all(|r| *r > 0.0 && *r < radius + 2.0), "{radius} {radii:?}");
         }
     }
 

@@ -30,7 +30,7 @@ impl Law {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "kebab-case")]
 pub enum LawChoice {
-    /// Linear unless the data ask for more.
+    /// Linear unless strains past 5 % or the data ask for more.
     #[default]
     Auto,
     /// Always linear.

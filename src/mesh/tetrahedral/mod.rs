@@ -46,6 +46,20 @@ impl Fineness {
     }
 }
 
+/// A level function of the place (grid mm: voxel index times spacing).
+pub type Wall<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
+
+/// What of a mesh is told in more detail than the rest.
+#[derive(Clone, Copy, Default)]
+pub struct Detail<'a> {
+    /// Places (grid mm) around which cubes are smaller.
+    pub near: &'a [[f64; 3]],
+    /// About their side (mm).
+    pub size: f64,
+    /// Its zero is made of faces, though both sides are of one part.
+    pub wall: Option<Wall<'a>>,
+}
+
 /// Face-connected pieces of the voxels that are not 0, largest first, as voxel counts.
 pub fn pieces(labels: &Mask) -> Vec<usize> {
     let shape = labels.grid().shape();
@@ -109,24 +123,17 @@ impl Mesher {
     /// # Errors
     /// As [`mesh_labels`].
     pub fn mesh(&self, fineness: &Fineness) -> Result<QuadraticMesh, MeshError> {
-        self.mesh_finer(fineness, &[], 0.0, None)
+        self.mesh_finer(fineness, Detail::default())
     }
 
-    /// With cubes of about `size` (mm) around the places `near` (grid mm: voxel index times spacing), and faces where `wall` is 0,
-    /// though both sides are of one part. Where a part gets no element, smaller cubes are tried, down to a third of the side.
+    /// With some places in more detail. Where a part gets no element, smaller cubes are tried, down to a third of the side.
     ///
     /// # Errors
     /// As [`mesh_labels`].
-    pub fn mesh_finer(
-        &self,
-        fineness: &Fineness,
-        near: &[[f64; 3]],
-        size: f64,
-        wall: Option<Wall<'_>>,
-    ) -> Result<QuadraticMesh, MeshError> {
+    pub fn mesh_finer(&self, fineness: &Fineness, detail: Detail<'_>) -> Result<QuadraticMesh, MeshError> {
         let mut fineness = *fineness;
         for _ in 0..FINER {
-            match self.meshed(&fineness, near, size, wall) {
+            match self.meshed(&fineness, detail) {
                 Err(MeshError::PartLost { .. }) => {
                     fineness.size *= 0.8;
                     fineness.nodes *= 2;
@@ -134,36 +141,29 @@ impl Mesher {
                 done => return done,
             }
         }
-        self.meshed(&fineness, near, size, wall)
+        self.meshed(&fineness, detail)
     }
 
     /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this fineness itself.
-    pub fn nodes(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64, wall: Option<Wall<'_>>) -> Option<usize> {
-        let lattice = self.lattice(fineness, near, size);
-        build(&lattice, &self.levels, wall).ok().map(|made| made.places.len())
+    pub fn nodes(&self, fineness: &Fineness, detail: Detail<'_>) -> Option<usize> {
+        build(&self.lattice(fineness, detail), &self.levels, detail.wall).ok().map(|made| made.places.len())
     }
 
-    fn lattice(&self, fineness: &Fineness, near: &[[f64; 3]], size: f64) -> lattice::Lattice {
+    fn lattice(&self, fineness: &Fineness, detail: Detail<'_>) -> lattice::Lattice {
         let mut octree = lattice::Octree::new(self.levels.bounds(), fineness.size);
         refine(&mut octree, &self.levels, fineness);
-        let halvings = (octree.base() / size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
-        near.iter().for_each(|p| octree.refine(*p, halvings));
+        let halvings = (octree.base() / detail.size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
+        detail.near.iter().for_each(|p| octree.refine(*p, halvings));
         octree.tetrahedra()
     }
 
-    fn meshed(
-        &self,
-        fineness: &Fineness,
-        near: &[[f64; 3]],
-        size: f64,
-        wall: Option<Wall<'_>>,
-    ) -> Result<QuadraticMesh, MeshError> {
+    fn meshed(&self, fineness: &Fineness, detail: Detail<'_>) -> Result<QuadraticMesh, MeshError> {
         let mut levels = self.levels.clone();
-        let lattice = self.lattice(fineness, near, size);
-        let mut made = build(&lattice, &levels, wall)?;
+        let lattice = self.lattice(fineness, detail);
+        let mut made = build(&lattice, &levels, detail.wall)?;
         for _ in 0..CALIBRATIONS {
             calibrate(&made, &mut levels);
-            made = build(&lattice, &levels, wall)?;
+            made = build(&lattice, &levels, detail.wall)?;
         }
         let Made { places, mut tetrahedra, part } = made;
         let (affine, spacing) = (self.grid.affine(), self.grid.spacing());
@@ -177,10 +177,7 @@ impl Mesher {
     }
 }
 
-/// A level function (of grid mm) whose zero is to be made of faces.
-pub type Wall<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
-
-/// The bit of vertices on such a wall.
+/// The bit of vertices on the wall of a [`Detail`].
 const WALL: u32 = 1 << 31;
 /// Times that smaller cubes are tried.
 const FINER: usize = 5;
