@@ -157,7 +157,8 @@ fn a_killed_run_is_taken_up() {
     let (first, last) =
         (folder.path().join("out/p0/field/summary.json"), folder.path().join("out/p3/field/summary.json"));
     let started = Instant::now();
-    while !folder.path().join("out/p1").exists() && started.elapsed() < Duration::from_secs(120) {
+    // Its own files in the folder are whole by then: what is killed itself cannot take its own away.
+    while !folder.path().join("out/p1/pair.json").exists() && started.elapsed() < Duration::from_secs(120) {
         std::thread::sleep(Duration::from_millis(2));
     }
     child.kill().unwrap();

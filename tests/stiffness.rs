@@ -431,3 +431,33 @@ fn a_fingertip_touches_the_plate_where_it_would_go_through_it() {
     assert_eq!(bone.bound, Some("lower"), "{bone:?}");
     assert!(bone.youngs_modulus < body.modulus(bone.label));
 }
+
+/// A mask of the held side that leaves out a quarter of it made moduli 20 % too high without a word.
+#[test]
+fn a_held_side_that_its_mask_covers_in_part_is_warned_of() {
+    let map = labels([20, 20, 20], 1.0, |p| u8::from(p.iter().all(|v| (2.0..18.0).contains(v))));
+    // Held as a plate below, pressed above, with a bulge between.
+    let field = DenseField::from_fn(grid([20, 20, 20], 1.0), |p: WorldPoint| {
+        let (h, bulge) = ((p.0[2] - 1.5) / 16.0, 0.2 * (1.0 - ((p.0[2] - 9.5) / 8.0).powi(2)));
+        [bulge * (p.0[0] - 9.5) / 8.0, bulge * (p.0[1] - 9.5) / 8.0, -0.8 * h]
+    });
+    let load = Place::Side(Side::parse("z+").unwrap());
+    let names = |l: u8| format!("region {l}");
+    let params = StiffnessParams { nodes: 3000, ..Default::default() };
+    for (part, warned) in [(18.0, false), (14.0, true)] {
+        let mask = Mask::from_voxels(grid([20, 20, 20], 1.0), |_, p| u8::from(p.0[2] < 3.0 && p.0[0] < part));
+        let held = Place::Mask(Box::new(mask), "held.nii.gz".into());
+        let inputs = Inputs {
+            field: &field,
+            matches: None,
+            labels: &map,
+            labelled: true,
+            held: &held,
+            load: &load,
+            names: &names,
+        };
+        let result = run(&inputs, &params, &|_, _| {}).unwrap();
+        let said = result.warnings.iter().any(|w| w.contains("beside the held patch"));
+        assert_eq!(said, warned, "{:?}", result.warnings);
+    }
+}

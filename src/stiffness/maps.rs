@@ -119,12 +119,25 @@ pub fn warnings(
     if area < 100.0 * level.voxel * level.voxel {
         out.push(format!("the loaded patch is small ({area:.1} mm^2), so absolute moduli hang on its edge"));
     }
+    for (patch, which) in level.patches.iter().zip(["held", "loaded"]) {
+        let part = patch.beside / patch.area(&level.body);
+        if part > BESIDE {
+            out.push(format!(
+                "the surface beside the {which} patch moves with it, over {:.0} mm^2 or {:.0} % of its area: if that is {which} \
+                 as well, widen the mask; moduli come out wrong otherwise",
+                patch.beside,
+                100.0 * part
+            ));
+        }
+    }
     if params.poisson < 0.4 {
         out.push(format!("Poisson's ratio {} is low for soft tissue, which is nearly incompressible", params.poisson));
     }
     out
 }
 
+/// Part of a patch's area that may move with it beside it without a word: its rim is known to a voxel.
+const BESIDE: f64 = 0.07;
 /// Thickness (voxels) from which a field measured from images resolves a region: two of its lattice's steps.
 const RESOLVED: usize = 8;
 

@@ -9,7 +9,7 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::dense::{solve, symmetric_eigen};
-use crate::stiffness::body::Body;
+use crate::stiffness::body::{Body, Facet};
 use crate::stiffness::forward::Tie;
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::plate;
@@ -116,6 +116,8 @@ pub struct Patch {
     pub residual: [f64; 2],
     /// What a curved patch comes to lie on.
     landing: Option<Landing>,
+    /// Area (mm^2) of the surface beside a patch given by a mask that lies on its plane and moves with it.
+    pub beside: f64,
 }
 
 /// The plane onto which a curved patch comes.
@@ -317,10 +319,33 @@ pub fn find(
     }
     let mut load_patch = build(body, motion, load.name(), facets, plane, voxel)
         .ok_or_else(|| refuse("loaded", load, "holds no measured motion", "check that the field covers it"))?;
+    for (patch, place) in [(&mut held_patch, held), (&mut load_patch, load)] {
+        if matches!(place, Place::Mask(..)) {
+            patch.beside = moving_with(body, motion, patch, voxel);
+        }
+    }
     let before = held_patch.clone();
     round_rim(body, &mut held_patch, &load_patch, voxel);
     round_rim(body, &mut load_patch, &before, voxel);
     Ok([held_patch, load_patch])
+}
+
+/// Area (mm^2) of the surface on the plane of a patch that is not of it and moves as it does.
+fn moving_with(body: &Body, motion: &SurfaceMotion, patch: &Patch, voxel: f64) -> f64 {
+    let tolerance = on_plane(voxel, motion.error);
+    let with = |n: u32| {
+        let p = body.places[n as usize];
+        motion.displacement[n as usize].is_some_and(|u| square(sub(u, patch.motion(p))) < tolerance * tolerance)
+    };
+    // A part of its nodes: those on a rim lie inside of the plane.
+    let part = |facet: &Facet| {
+        let on = dot(facet.normal, patch.normal) > 0.7
+            && dot(sub(facet.centre, patch.middle), patch.normal).abs() < 2.0 * voxel;
+        if on { facet.nodes.iter().filter(|n| with(**n)).count() as f64 / facet.nodes.len() as f64 } else { 0.0 }
+    };
+    let own: std::collections::HashSet<usize> = patch.facets.iter().copied().collect();
+    let others = body.surface.iter().enumerate().filter(|(f, _)| !own.contains(f)).map(|(_, facet)| facet);
+    others.map(|facet| facet.area * part(facet)).sum()
 }
 
 /// The mesh rounds the rim of a flat face by a part of a voxel, so its nodes lie inside of the plate's plane. They do not move
@@ -542,7 +567,21 @@ fn build(
     let landing = plane
         .and_then(|plane| landing_on(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
     let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
-    Some(Patch { name, facets, nodes, normal, middle, radius, rigid, contact, guided, rim, residual, landing })
+    Some(Patch {
+        name,
+        facets,
+        nodes,
+        normal,
+        middle,
+        radius,
+        rigid,
+        contact,
+        guided,
+        rim,
+        residual,
+        landing,
+        beside: 0.0,
+    })
 }
 
 /// The plane that a patch comes to lie on, where it takes more than the plate's motion to bring it there.
