@@ -413,29 +413,6 @@ fn the_gain_field_follows_a_slow_bias() {
     assert!(after < 0.05 * before, "{after} of {before} left");
 }
 
-/// Smoothing flattens a bias that curves, and what it left of one was taken for motion.
-#[test]
-fn the_gain_field_follows_a_bias_that_curves() {
-    let shape = [64, 48, 48];
-    let (fixed, _) = texture(shape, 6.0, 7);
-    let bias = |i: usize| (0.3 * (std::f32::consts::TAU * i as f32 / 48.0).sin()).exp();
-    let moving: Vec<f32> = fixed.iter().enumerate().map(|(at, v)| v / bias(at % 64)).collect();
-    let pair = pair(shape, [1.0; 3], &fixed, &moving);
-    let field = GainField::sharpened(&Pair { noise: 1.0, ..pair.clone() }, &unmoved(&pair));
-    let (mut a, mut b) = ([0.0; 64], [0.0; 64]);
-    let (mut along, mut all) = (0.0, 0.0);
-    for (j, k) in voxels([48, 48, 1]).map(|p| (p[0], p[1])).filter(|p| p.0 > 7 && p.0 < 40 && p.1 > 7 && p.1 < 40) {
-        field.row(j, k, &mut a, &mut b);
-        for (i, a) in a.iter().enumerate().take(56).skip(8) {
-            along += f64::from(a.ln() * bias(i).ln());
-            all += f64::from(bias(i).ln().powi(2));
-        }
-    }
-    // 0.82; measured once, 0.64.
-    let share = along / all;
-    assert!((share - 1.0).abs() < 0.25, "{share} of the bias is seen");
-}
-
 // Residual
 
 #[test]

@@ -2,8 +2,7 @@
 //!
 //! In blocks of voxels the deformed volume's mean and spread are brought to the initial one's (ratio of standard
 //! deviations, signed by the correlation: unlike a regression it is not biased by noise or by what motion is left);
-//! block sums are smoothed over their neighbours and interpolated linearly. For the passes, what smoothing flattens of a bias is
-//! measured again on the corrected blocks and put back (twicing; Tukey 1977): what was left of it looked like motion.
+//! block sums are smoothed over their neighbours and interpolated linearly.
 
 use crate::matching::pair::Pair;
 use crate::numerics::simd::dispatch;
@@ -11,9 +10,6 @@ use rayon::prelude::*;
 
 /// Edge of a block (voxels).
 const BLOCK: usize = 8;
-
-/// Times that what is left is put back.
-const AGAIN: usize = 3;
 
 /// Gain and offset at block centres.
 #[derive(Debug, Clone)]
@@ -27,19 +23,8 @@ pub struct GainField {
 type Sums = [f64; 6];
 
 impl GainField {
-    /// From the initial volume (smoothed) and the warped one, inside the mask; smooth enough to judge by how well the two agree.
+    /// From the initial volume (smoothed) and the warped one, inside the mask.
     pub fn measure(pair: &Pair<'_>, warped: &[f32]) -> Self {
-        Self::after(pair, warped, 0)
-    }
-
-    /// As [`GainField::measure`], with what its smoothing flattened put back: little of a bias is then taken for motion, but it
-    /// takes up more of another contrast as well.
-    pub fn sharpened(pair: &Pair<'_>, warped: &[f32]) -> Self {
-        Self::after(pair, warped, AGAIN)
-    }
-
-    /// With what is left put back so many times.
-    fn after(pair: &Pair<'_>, warped: &[f32], again: usize) -> Self {
         let [nx, ny, _] = pair.shape;
         let blocks = pair.shape.map(|n| n.div_ceil(BLOCK));
         let (bx, by) = (blocks[0], blocks[1]);
@@ -77,17 +62,10 @@ impl GainField {
         });
         let total = sums.iter().fold([0.0; 6], add);
         let centre = centre.map(f64::from);
-        let noise = f64::from(pair.noise);
-        let global = gain(&total, noise, centre, [1.0, 0.0]);
-        let mut values: Vec<[f64; 2]> = smooth(&sums, blocks).iter().map(|s| gain(s, noise, centre, global)).collect();
-        for _ in 0..again {
-            let left: Vec<Sums> = sums.iter().zip(&values).map(|(s, v)| corrected(s, *v, centre)).collect();
-            for (v, s) in values.iter_mut().zip(smooth(&left, blocks)) {
-                let [g, o] = gain(&s, noise, [centre[0]; 2], [1.0, 0.0]);
-                *v = [g * v[0], g * v[1] + o];
-            }
-        }
-        Self { blocks, values: values.into_iter().map(|v| v.map(|v| v as f32)).collect() }
+        let global = gain(&total, f64::from(pair.noise), centre, [1.0, 0.0]);
+        let smooth = smooth(&sums, blocks);
+        let values = smooth.iter().map(|s| gain(s, f64::from(pair.noise), centre, global).map(|v| v as f32)).collect();
+        Self { blocks, values }
     }
 
     /// Writes gain and offset along row `(j, k)`.
@@ -145,12 +123,6 @@ fn add_columns(lanes: &mut [[f32; BLOCK]; 6], f: &[f32; BLOCK], w: &[f32; BLOCK]
         lanes[4][l] += w * w;
         lanes[5][l] += f * w;
     }
-}
-
-/// A block's sums with `g w + o` in place of `w`, about the mean of f.
-fn corrected([n, f, w, ff, ww, fw]: &Sums, [g, o]: [f64; 2], centre: [f64; 2]) -> Sums {
-    let o = g * centre[1] + o - centre[0];
-    [*n, *f, g * w + o * n, *ff, g * g * ww + 2.0 * g * o * w + o * o * n, g * fw + o * f]
 }
 
 fn add(mut a: Sums, b: &Sums) -> Sums {
