@@ -68,15 +68,8 @@ pub const ATTENDED: &str = "PALPATE_ATTENDED";
 pub fn watch(console: Console, limit: Option<Duration>) {
     let run_out = console.clone();
     let attended = console.clone();
-    // Without a thread for it a signal ends the program in the system's own way.
     #[cfg(unix)]
-    let _ = std::thread::Builder::new().name("signals".into()).spawn(move || {
-        use signal_hook::consts::{SIGINT, SIGTERM};
-        let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM]) else { return };
-        if let Some(signal) = signals.forever().next() {
-            stop(&console, if signal == SIGINT { "stopped by Ctrl-C" } else { "stopped by a signal" }, 128 + signal);
-        }
-    });
+    catch_signals(console);
     if std::env::var_os(ATTENDED).is_some() {
         let _ = std::thread::Builder::new().name("attended".into()).spawn(move || {
             let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
@@ -90,4 +83,21 @@ pub fn watch(console: Console, limit: Option<Duration>) {
             stop(&run_out, &format!("not done after {seconds} s, which --timeout allows"), 1);
         });
     }
+}
+
+/// Ends the program in its own way on SIGINT and SIGTERM; they are caught when this returns, so before anything is made. Without a
+/// thread for it they end the program in the system's way.
+#[cfg(unix)]
+fn catch_signals(console: Console) {
+    use signal_hook::consts::{SIGINT, SIGTERM};
+    let (waiting, caught) = std::sync::mpsc::channel::<()>();
+    let _ = std::thread::Builder::new().name("signals".into()).spawn(move || {
+        let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM]) else { return };
+        drop(waiting);
+        if let Some(signal) = signals.forever().next() {
+            stop(&console, if signal == SIGINT { "stopped by Ctrl-C" } else { "stopped by a signal" }, 128 + signal);
+        }
+    });
+    // Comes back once the other end is dropped.
+    let _ = caught.recv();
 }
