@@ -35,7 +35,7 @@ fn deep(mask: &Mask) -> Vec<usize> {
 #[test]
 fn following_is_no_worse_than_pairs_and_far_better_than_a_chain() {
     // The finer the steps, the more of them a chain has to add up.
-    for (kind, frames) in [(SequenceKind::Pinch, 12), (SequenceKind::Pen, 20)] {
+    for (kind, frames) in [(SequenceKind::Pinch, 12), (SequenceKind::Pen, 24)] {
         let s = sequence(kind, frames);
         let params = FieldParams::default();
         let reference = s.frame(0);

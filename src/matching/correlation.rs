@@ -20,11 +20,16 @@ pub struct Template {
     values: Vec<f32>,
     /// The same, each row along x filled up with zeros; empty where rows are wider.
     padded: Vec<[f32; WIDTH]>,
-    radius: [usize; 3],
 }
 
-/// Shifts worked out together.
+/// Shifts worked out together, or twice as many.
 const LANES: usize = 16;
+
+/// Reach along y or z (voxels) from which every second shift is looked at first.
+const SPARSE: usize = 4;
+
+/// Places about which all shifts are then looked at, for each that is kept.
+const ROUGH: usize = 2;
 
 /// Widest patch along x whose sums are made on the spot.
 const WIDTH: usize = 8;
@@ -99,6 +104,87 @@ impl<'a> Searchable<'a> {
         cross / (square - sum * sum / template.values.len() as f32).sqrt()
     }
 
+    /// Sums of products with the patches around the voxels from `at` on along x, as many as `line` holds (a multiple of [`LANES`]).
+    /// What lies past the volume's last voxel is not summed.
+    #[inline(always)]
+    fn line(&self, template: &Template, at: [usize; 3], line: &mut [f32]) {
+        let (wide, rest) = line.as_chunks_mut::<{ 2 * LANES }>();
+        for (b, sums) in wide.iter_mut().enumerate() {
+            self.sums(template, [at[0] + b * 2 * LANES, at[1], at[2]], sums);
+        }
+        if let Some(sums) = rest.first_chunk_mut::<LANES>() {
+            self.sums(template, [at[0] + wide.len() * 2 * LANES, at[1], at[2]], sums);
+        }
+    }
+
+    /// As [`Searchable::line`], for so many that the sums stay in registers.
+    #[inline(always)]
+    fn sums<const N: usize>(&self, template: &Template, at: [usize; 3], sums: &mut [f32; N]) {
+        let [rx, ry, rz] = self.radius;
+        let [nx, ny, _] = self.shape;
+        let width = 2 * rx + 1;
+        let last = at[0] - rx + nx * (at[1] + ry + ny * (at[2] + rz));
+        if last + N + width - 1 > self.data.len() {
+            self.last_sums(template, at, sums);
+            return;
+        }
+        let mut sum = [0.0f32; N];
+        let mut rows = template.values.chunks_exact(width);
+        for k in at[2] - rz..=at[2] + rz {
+            for j in at[1] - ry..=at[1] + ry {
+                let Some(t) = rows.next() else { continue };
+                let source = &self.data[at[0] - rx + nx * (j + ny * k)..][..N + width - 1];
+                for (&w, v) in t.iter().zip(source.windows(N)) {
+                    let Some(v) = v.first_chunk::<N>() else { continue };
+                    for l in 0..N {
+                        sum[l] += w * v[l];
+                    }
+                }
+            }
+        }
+        *sums = sum;
+    }
+
+    /// As [`Searchable::sums`] at the end of the volume.
+    fn last_sums(&self, template: &Template, at: [usize; 3], sums: &mut [f32]) {
+        let [rx, ry, rz] = self.radius;
+        let [nx, ny, _] = self.shape;
+        sums.fill(0.0);
+        for (r, t) in template.values.chunks_exact(2 * rx + 1).enumerate() {
+            let (j, k) = (at[1] + r % (2 * ry + 1) - ry, at[2] + r / (2 * ry + 1) - rz);
+            for (o, w) in t.iter().enumerate() {
+                let source = self.data.get(at[0] - rx + nx * (j + ny * k) + o..).unwrap_or_default();
+                for (s, v) in sums.iter_mut().zip(source) {
+                    *s += w * v;
+                }
+            }
+        }
+    }
+
+    /// Sum of products with the patch around voxel `at`, which lies inside.
+    #[inline(always)]
+    fn cross(&self, template: &Template, at: [usize; 3]) -> f32 {
+        let [rx, ry, rz] = self.radius;
+        let [nx, ny, _] = self.shape;
+        let width = 2 * rx + 1;
+        let mut cross = [0.0f32; WIDTH];
+        let mut t = template.padded.iter();
+        for k in at[2] - rz..=at[2] + rz {
+            for j in at[1] - ry..=at[1] + ry {
+                let Some(t) = t.next() else { continue };
+                let rest = &self.data[at[0] - rx + nx * (j + ny * k)..];
+                // Past the patch stand the next voxels of the row, and zeros in the template.
+                let mut v = [0.0; WIDTH];
+                match rest.first_chunk::<WIDTH>() {
+                    Some(row) => (0..WIDTH).for_each(|l| v[l] = if l < width { row[l] } else { 0.0 }),
+                    None => v[..width].copy_from_slice(&rest[..width]),
+                }
+                (0..WIDTH).for_each(|l| cross[l] += t[l] * v[l]);
+            }
+        }
+        cross.iter().sum()
+    }
+
     /// The patch around a voxel; none where it leaves the volume, holds NaN, or is constant.
     pub fn template(&self, centre: [usize; 3]) -> Option<Template> {
         let [rx, ry, rz] = self.radius;
@@ -128,7 +214,7 @@ impl<'a> Searchable<'a> {
                 wide
             }));
         }
-        Some(Template { values, padded, radius: self.radius })
+        Some(Template { values, padded })
     }
 
     /// Correlation with the patch around a voxel; none where that leaves the volume or holds NaN.
@@ -138,102 +224,109 @@ impl<'a> Searchable<'a> {
 
     /// The `keep` best local maxima of the correlation over shifts up to `reach` voxels about `centre`, best first.
     ///
-    /// Exhaustive; shifts whose patch leaves the volume do not take part.
+    /// Shifts whose patch leaves the volume do not take part. Exhaustive where `reach` is short; along y and z, where it is not, every
+    /// second shift is looked at and then all that lie beside the best of these: a patch of a smoothed volume is still like itself
+    /// a voxel away.
     pub fn search(&self, template: &Template, centre: [i64; 3], reach: [usize; 3], keep: usize) -> Vec<Peak> {
-        let size = reach.map(|r| 2 * r + 1);
-        let mut scores = vec![f32::NEG_INFINITY; size.iter().product()];
-        // Shifts along x whose patch lies inside.
-        let first = |a: usize| (self.radius[a] as i64 - centre[a]).max(-(reach[a] as i64));
-        let last = |a: usize| ((self.shape[a] - self.radius[a]) as i64 - 1 - centre[a]).min(reach[a] as i64);
-        let (fx, lx) = (first(0), last(0));
-        if fx > lx {
+        // Shifts whose patch lies inside, along each axis.
+        let within: [[i64; 2]; 3] = std::array::from_fn(|a| {
+            let (reach, radius) = (reach[a] as i64, self.radius[a] as i64);
+            [(radius - centre[a]).max(-reach), (self.shape[a] as i64 - radius - 1 - centre[a]).min(reach)]
+        });
+        if within.iter().any(|[first, last]| first > last) {
             return Vec::new();
         }
-        let count = (lx - fx + 1) as usize;
-        let [rx, ry, rz] = template.radius;
-        let width = 2 * rx + 1;
-        if self.norm.is_empty() {
-            dispatch(
-                #[inline(always)]
-                || {
-                    for dz in first(2)..=last(2) {
-                        for dy in first(1)..=last(1) {
-                            for dx in fx..=lx {
-                                let d = [dx, dy, dz];
-                                let at = std::array::from_fn(|a| (centre[a] + d[a]) as usize);
-                                let [i, j, k] = std::array::from_fn(|a| (d[a] + reach[a] as i64) as usize);
-                                let v = self.direct(template, at);
-                                scores[i + size[0] * (j + size[1] * k)] =
-                                    if v.is_finite() { v } else { f32::NEG_INFINITY };
-                            }
-                        }
-                    }
-                },
-            );
-            return peaks(&scores, size, reach, keep);
-        }
+        let rows_apart = |a: usize| if reach[a] >= SPARSE && !template.padded.is_empty() { 2 } else { 1 };
+        let step = if self.norm.is_empty() { [1; 3] } else { [1, rows_apart(1), rows_apart(2)] };
+        let count = |a: usize| (within[a][1] - within[a][0]) as usize / step[a] + 1;
+        let size = [count(0), count(1), count(2)];
+        let mut scores = vec![f32::NEG_INFINITY; size.iter().product()];
+        let at = |i: [usize; 3]| -> [usize; 3] {
+            std::array::from_fn(|a| (centre[a] + within[a][0]) as usize + step[a] * i[a])
+        };
         // Room for whole blocks of shifts.
-        let mut line = vec![0.0f32; count.next_multiple_of(LANES)];
+        let mut line = vec![0.0f32; size[0].next_multiple_of(LANES)];
         dispatch(
             #[inline(always)]
             || {
-                for dz in first(2)..=last(2) {
-                    for dy in first(1)..=last(1) {
-                        line.fill(0.0);
-                        let at = [centre[0] + fx, centre[1] + dy, centre[2] + dz].map(|v| v as usize);
-                        for (row, t) in template.values.chunks_exact(width).enumerate() {
-                            let (j, k) = (at[1] + row % (2 * ry + 1) - ry, at[2] + row / (2 * ry + 1) - rz);
-                            let from = at[0] - rx + self.shape[0] * (j + self.shape[1] * k);
-                            // What lies past the last shift is worked out with it and left alone.
-                            match self.data.get(from..from + line.len() + width - 1) {
-                                Some(source) => {
-                                    for (b, line) in line.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
-                                        let source = &source[b * LANES..];
-                                        let mut sum = *line;
-                                        for (o, &w) in t.iter().enumerate() {
-                                            let v = &source[o..o + LANES];
-                                            for l in 0..LANES {
-                                                sum[l] += w * v[l];
-                                            }
-                                        }
-                                        *line = sum;
-                                    }
-                                }
-                                None => {
-                                    let source = &self.data[from..from + count + width - 1];
-                                    for (o, &w) in t.iter().enumerate() {
-                                        for (l, v) in line.iter_mut().zip(&source[o..]) {
-                                            *l += w * v;
-                                        }
-                                    }
-                                }
-                            }
+                for (row, scores) in scores.chunks_exact_mut(size[0]).enumerate() {
+                    let at = at([0, row % size[1], row / size[1]]);
+                    if self.norm.is_empty() {
+                        for (i, s) in scores.iter_mut().enumerate() {
+                            *s = finite(self.direct(template, [at[0] + i, at[1], at[2]]));
                         }
-                        let from = at[0] + self.shape[0] * (at[1] + self.shape[1] * at[2]);
-                        let to = size[0]
-                            * ((dy + reach[1] as i64) as usize + size[1] * (dz + reach[2] as i64) as usize)
-                            + (fx + reach[0] as i64) as usize;
-                        for ((s, l), n) in scores[to..to + count].iter_mut().zip(&line).zip(&self.norm[from..]) {
-                            let v = l / n;
-                            *s = if v.is_finite() { v } else { f32::NEG_INFINITY };
-                        }
+                        continue;
+                    }
+                    self.line(template, at, &mut line);
+                    for ((s, l), n) in scores.iter_mut().zip(&line).zip(&self.norm[self.offset(at)..]) {
+                        *s = finite(l / n);
                     }
                 }
             },
         );
-        peaks(&scores, size, reach, keep)
+        let shift = |i: [usize; 3]| std::array::from_fn(|a| within[a][0] as i32 + (step[a] * i[a]) as i32);
+        if step == [1; 3] {
+            let whole = |(i, ncc)| Peak { offset: shift(i), ncc };
+            return peaks(&scores, size, keep).into_iter().map(whole).collect();
+        }
+        let rough = peaks(&scores, size, ROUGH * keep);
+        let mut found: Vec<Peak> = Vec::with_capacity(rough.len());
+        dispatch(
+            #[inline(always)]
+            || {
+                for &(i, ncc) in &rough {
+                    let middle: [i32; 3] = shift(i);
+                    let mut best = Peak { offset: middle, ncc };
+                    let beside =
+                        |a: usize| (middle[a] - 1).max(within[a][0] as i32)..=(middle[a] + 1).min(within[a][1] as i32);
+                    for dz in beside(2) {
+                        for dy in beside(1) {
+                            for dx in beside(0) {
+                                let offset = [dx, dy, dz];
+                                let at = std::array::from_fn(|a| (centre[a] + i64::from(offset[a])) as usize);
+                                let ncc = finite(self.cross(template, at) / self.norm[self.offset(at)]);
+                                if ncc > best.ncc {
+                                    best = Peak { offset, ncc };
+                                }
+                            }
+                        }
+                    }
+                    found.push(best);
+                }
+            },
+        );
+        found.sort_by(|a, b| b.ncc.total_cmp(&a.ncc).then(a.offset.cmp(&b.offset)));
+        found.dedup_by_key(|p| p.offset);
+        found.truncate(keep);
+        found
+    }
+
+    /// Offset of a voxel.
+    #[inline(always)]
+    fn offset(&self, at: [usize; 3]) -> usize {
+        at[0] + self.shape[0] * (at[1] + self.shape[1] * at[2])
     }
 }
 
-/// Local maxima (26 neighbours) of a block of scores, the best `keep`, best first.
-fn peaks(scores: &[f32], size: [usize; 3], reach: [usize; 3], keep: usize) -> Vec<Peak> {
-    let mut found: Vec<Peak> = Vec::new();
+/// What is not finite is worse than all else.
+#[inline(always)]
+fn finite(score: f32) -> f32 {
+    if score.is_finite() { score } else { f32::NEG_INFINITY }
+}
+
+/// Local maxima (26 neighbours) of a block of scores and their places, the best `keep`, best first.
+fn peaks(scores: &[f32], size: [usize; 3], keep: usize) -> Vec<([usize; 3], f32)> {
+    let mut found: Vec<([usize; 3], f32)> = Vec::new();
     for k in 0..size[2] {
         for j in 0..size[1] {
             for i in 0..size[0] {
                 let at = i + size[0] * (j + size[1] * k);
                 let s = scores[at];
-                if s == f32::NEG_INFINITY || (found.len() == keep && s <= found[keep - 1].ncc) {
+                if s == f32::NEG_INFINITY || (found.len() == keep && s <= found[keep - 1].1) {
+                    continue;
+                }
+                // Most places have a better one beside them in their row.
+                if (i > 0 && scores[at - 1] >= s) || (i + 1 < size[0] && scores[at + 1] > s) {
                     continue;
                 }
                 let near = |a: usize, n: usize| a.saturating_sub(1)..=(a + 1).min(n - 1);
@@ -246,9 +339,8 @@ fn peaks(scores: &[f32], size: [usize; 3], reach: [usize; 3], keep: usize) -> Ve
                     })
                 });
                 if !higher {
-                    let offset = [i as i32 - reach[0] as i32, j as i32 - reach[1] as i32, k as i32 - reach[2] as i32];
-                    let place = found.partition_point(|p| p.ncc >= s);
-                    found.insert(place, Peak { offset, ncc: s });
+                    let place = found.partition_point(|p| p.1 >= s);
+                    found.insert(place, ([i, j, k], s));
                     found.truncate(keep);
                 }
             }

@@ -1,15 +1,76 @@
 //! Local gain and offset between two aligned volumes, so that a bias field or another contrast is not taken for motion.
 //!
 //! In blocks of voxels the deformed volume's mean and spread are brought to the initial one's (ratio of standard
-//! deviations, signed by the correlation: unlike a regression it is not biased by noise or by what motion is left);
-//! block sums are smoothed over their neighbours and interpolated linearly.
+//! deviations, signed by the correlation: unlike a regression it is not biased by noise or by what motion is left). A voxel
+//! counts the less the steeper the volume is there: what is left of the motion shows in proportion to that ([`weigh`]). The
+//! sums of the blocks are smoothed over their neighbours and interpolated linearly. For the passes, what smoothing flattens of a bias is
+//! measured again on the corrected blocks and put back (twicing; Tukey 1977): what was left of it looked like motion.
 
 use crate::matching::pair::Pair;
+use crate::numerics::filters::gradient_rows;
+use crate::numerics::pyramid;
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 
 /// Edge of a block (voxels).
 const BLOCK: usize = 8;
+
+/// Times that what is left is put back.
+const AGAIN: usize = 3;
+
+/// The greatest weight of a voxel.
+const FULL: f32 = 255.0;
+
+/// Variance of what is left of the motion along an axis, over that of the smoothed difference's noise in the volume's own
+/// (voxels^-2): half a voxel for a quarter of the noise's variance. 0.1 and 3 gave the same errors within 1 %, 10 was 3 % worse.
+const LEFT: f32 = 1.0;
+
+/// Least variance of the noise, in the mean square of the gradients: volumes without noise differ by interpolation at least.
+const LEAST_NOISE: f32 = 0.03;
+
+/// A voxel's weight in [`GainField`] in place of each that is set in `mask`, 1 to 255: the inverse variance of the difference there,
+/// noise and the gradient times what is left of the motion. `smooth` is the initial volume (smoothed), `noise` its noise.
+pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 3], noise: f32) {
+    let [nx, ny, _] = shape;
+    let finest = pyramid::finest(shape, spacing);
+    let scale = spacing.map(|s| (finest / s) as f32);
+    let squares = |row: usize, g: &mut [Vec<f32>; 4]| {
+        let [gx, gy, gz, square] = g;
+        dispatch(
+            #[inline(always)]
+            || {
+                gradient_rows(smooth, shape, row % ny, row / ny, [gx, gy, gz]);
+                for (((s, x), y), z) in square.iter_mut().zip(&*gx).zip(&*gy).zip(&*gz) {
+                    let (x, y, z) = (scale[0] * x, scale[1] * y, scale[2] * z);
+                    *s = x * x + y * y + z * z;
+                }
+            },
+        );
+    };
+    let room = || std::array::from_fn(|_| vec![0.0f32; nx]);
+    let rows = mask.len() / nx;
+    let (mut sum, mut count, mut g) = (0.0f64, 0usize, room());
+    for row in (0..rows).step_by((rows / SAMPLED).max(1)) {
+        squares(row, &mut g);
+        for (square, _) in g[3].iter().zip(&mask[row * nx..]).filter(|(s, m)| **m != 0 && s.is_finite()) {
+            (sum, count) = (sum + f64::from(*square), count + 1);
+        }
+    }
+    let mean = (sum / count.max(1) as f64) as f32;
+    let over = LEFT / (noise * noise + LEAST_NOISE * mean).max(f32::MIN_POSITIVE);
+    mask.par_chunks_mut(nx).enumerate().for_each_init(room, |g, (row, mask)| {
+        if mask.iter().all(|&m| m == 0) {
+            return;
+        }
+        squares(row, g);
+        for (m, square) in mask.iter_mut().zip(&g[3]).filter(|(m, _)| **m != 0) {
+            *m = (FULL / (1.0 + over * square)).max(1.0) as u8;
+        }
+    });
+}
+
+/// Rows from which the mean square of the gradients is taken, about.
+const SAMPLED: usize = 1000;
 
 /// Gain and offset at block centres.
 #[derive(Debug, Clone)]
@@ -19,12 +80,23 @@ pub struct GainField {
     values: Vec<[f32; 2]>,
 }
 
-/// Sums of a block: count, f, w, ff, ww, fw, with f and w less the volumes' means so that no precision is lost.
+/// Sums of a block: weight, f, w, ff, ww, fw, with f and w less the volumes' means so that no precision is lost.
 type Sums = [f64; 6];
 
 impl GainField {
-    /// From the initial volume (smoothed) and the warped one, inside the mask.
+    /// From the initial volume (smoothed) and the warped one, inside the mask; smooth enough to judge by how well the two agree.
     pub fn measure(pair: &Pair<'_>, warped: &[f32]) -> Self {
+        Self::after(pair, warped, 0)
+    }
+
+    /// As [`GainField::measure`], with what its smoothing flattened put back: little of a bias is then taken for motion, but it
+    /// takes up more of another contrast as well.
+    pub fn sharpened(pair: &Pair<'_>, warped: &[f32]) -> Self {
+        Self::after(pair, warped, AGAIN)
+    }
+
+    /// With what is left put back so many times.
+    fn after(pair: &Pair<'_>, warped: &[f32], again: usize) -> Self {
         let [nx, ny, _] = pair.shape;
         let blocks = pair.shape.map(|n| n.div_ceil(BLOCK));
         let (bx, by) = (blocks[0], blocks[1]);
@@ -62,10 +134,17 @@ impl GainField {
         });
         let total = sums.iter().fold([0.0; 6], add);
         let centre = centre.map(f64::from);
-        let global = gain(&total, f64::from(pair.noise), centre, [1.0, 0.0]);
-        let smooth = smooth(&sums, blocks);
-        let values = smooth.iter().map(|s| gain(s, f64::from(pair.noise), centre, global).map(|v| v as f32)).collect();
-        Self { blocks, values }
+        let noise = f64::from(pair.noise);
+        let global = gain(&total, noise, centre, [1.0, 0.0]);
+        let mut values: Vec<[f64; 2]> = smooth(&sums, blocks).iter().map(|s| gain(s, noise, centre, global)).collect();
+        for _ in 0..again {
+            let left: Vec<Sums> = sums.iter().zip(&values).map(|(s, v)| corrected(s, *v, centre)).collect();
+            for (v, s) in values.iter_mut().zip(smooth(&left, blocks)) {
+                let [g, o] = gain(&s, noise, [centre[0]; 2], [1.0, 0.0]);
+                *v = [g * v[0], g * v[1] + o];
+            }
+        }
+        Self { blocks, values: values.into_iter().map(|v| v.map(|v| v as f32)).collect() }
     }
 
     /// Writes gain and offset along row `(j, k)`.
@@ -110,19 +189,27 @@ impl GainField {
     }
 }
 
-/// Adds one row of a block: a voxel counts where the mask is set and the warp saw it.
+/// Adds one row of a block: a voxel counts by its weight where the warp saw it.
 #[inline(always)]
 fn add_columns(lanes: &mut [[f32; BLOCK]; 6], f: &[f32; BLOCK], w: &[f32; BLOCK], m: &[u8; BLOCK], centre: [f32; 2]) {
     for l in 0..BLOCK {
-        let good = m[l] != 0 && (f[l] + w[l]).is_finite();
-        let (one, f, w) = if good { (1.0, f[l] - centre[0], w[l] - centre[1]) } else { (0.0, 0.0, 0.0) };
-        lanes[0][l] += one;
-        lanes[1][l] += f;
-        lanes[2][l] += w;
-        lanes[3][l] += f * f;
-        lanes[4][l] += w * w;
-        lanes[5][l] += f * w;
+        let good = (f[l] + w[l]).is_finite();
+        let (m, f, w) =
+            if good { (f32::from(m[l]) / FULL, f[l] - centre[0], w[l] - centre[1]) } else { (0.0, 0.0, 0.0) };
+        let (mf, mw) = (m * f, m * w);
+        lanes[0][l] += m;
+        lanes[1][l] += mf;
+        lanes[2][l] += mw;
+        lanes[3][l] += mf * f;
+        lanes[4][l] += mw * w;
+        lanes[5][l] += mf * w;
     }
+}
+
+/// A block's sums with `g w + o` in place of `w`, about the mean of f.
+fn corrected([n, f, w, ff, ww, fw]: &Sums, [g, o]: [f64; 2], centre: [f64; 2]) -> Sums {
+    let o = g * centre[1] + o - centre[0];
+    [*n, *f, g * w + o * n, *ff, g * g * ww + 2.0 * g * o * w + o * o * n, g * fw + o * f]
 }
 
 fn add(mut a: Sums, b: &Sums) -> Sums {

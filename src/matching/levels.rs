@@ -1,6 +1,7 @@
 //! The coarse-to-fine pyramid: both volumes on one lattice at several voxel sizes.
 
 use crate::error::{FieldError, SpaceError};
+use crate::matching::gain::weigh;
 use crate::matching::pair::{Pair, Spans};
 use crate::numerics::sampling::Sampler;
 use crate::numerics::statistics::{noise_sigma, quantile};
@@ -87,16 +88,20 @@ impl<'a> Aligned<'a> {
     pub fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
-        let mask = pyramid::reduce_mask(mask, self.shape, factor);
+        let mut mask = pyramid::reduce_mask(mask, self.shape, factor);
         let moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
+        let spacing = std::array::from_fn(|a| self.spacing[a] * factor[a] as f64);
+        let noise = noise_sigma(&fixed, shape, |i| mask[i] != 0);
+        let fixed_smooth = filters::bspline(&fixed, shape);
+        weigh(&mut mask, &fixed_smooth, shape, spacing, noise);
         Pair {
             shape,
             centres: [mean(&fixed), mean(&moving)],
             inside: mask.iter().filter(|&&m| m != 0).count(),
             spans: Spans::new(&mask, shape),
-            noise: noise_sigma(&fixed, shape, |i| mask[i] != 0),
-            spacing: std::array::from_fn(|a| self.spacing[a] * factor[a] as f64),
-            fixed_smooth: filters::bspline(&fixed, shape),
+            noise,
+            spacing,
+            fixed_smooth,
             fixed,
             mask,
             moving_shape: pyramid::reduced_shape(self.moving_shape, factor),

@@ -24,7 +24,8 @@ pub struct Pair<'a> {
     pub fixed: Cow<'a, [f32]>,
     /// The same, smoothed by the cubic B-spline (see [`SmoothSampler`]).
     pub fixed_smooth: Vec<f32>,
-    /// Where matches are wanted (not 0), on the initial lattice.
+    /// Where matches are wanted (not 0), on the initial lattice; the value is the voxel's weight in the local gain
+    /// ([`crate::matching::gain::weigh`]).
     pub mask: Vec<u8>,
     /// Voxels of the mask.
     pub inside: usize,

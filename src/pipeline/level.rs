@@ -109,7 +109,7 @@ pub fn refine(
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     for pass in 0..passes {
         let warped = pair.warp(&field.lattice, &field.coefficients, &active);
-        let gain = GainField::measure(pair, &warped);
+        let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
         for v in equations.blocks.iter_mut().flatten().chain(&mut equations.rhs) {
             *v *= weight;

@@ -120,6 +120,10 @@ const ENOUGH: usize = 20;
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
+/// Part of the features by which those that agree must have grown in a search for another to follow: where fewer were won, the
+/// next won nothing.
+const GREW: f64 = 0.05;
+
 /// What the coarsest level found.
 pub(super) struct Begun {
     pub field: SplineField,
@@ -179,7 +183,7 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 /// none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
 /// A known field that goes on is refined twice: it begins with the noise of another frame, which takes long to forget. Of several
 /// the one that agrees best as it is goes on, so that this costs no more than to refine each once.
-/// Where few matches agreed, they are sought again about it for as long as more of them agree each time: the agreement of
+/// Where few matches agreed, they are sought again about it for as long as clearly more of them agree each time: the agreement of
 /// the volumes does not tell a wrong island there from the truth, neighbours do.
 pub(super) fn begin(
     pair: &Pair<'_>,
@@ -214,7 +218,11 @@ pub(super) fn begin(
         }
         let (next, seen) = search(Some(&field));
         let Some(next) = next.filter(|_| seen.counts.kept > report.counts.kept) else { break };
+        let won = seen.counts.kept - report.counts.kept;
         (field, report) = (refine(next, reach(&seen, FROM_SEARCH)), seen);
+        if (won as f64) < GREW * report.counts.features_initial as f64 {
+            break;
+        }
     }
     let searched = Searched::of(pair, &field);
     Some(Begun { field, report: Some(report), searched })

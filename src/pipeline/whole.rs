@@ -63,7 +63,7 @@ impl Whole<'_> {
     ) -> Option<Begun> {
         let share = if self.flat { SHARE / 4 } else { SHARE };
         let points = pair.inside.div_ceil(share).min(most).max(40);
-        let wide = MatchParams::new(self.params, points, true, self.range, 2, 0.3);
+        let wide = MatchParams::new(self.params, points, false, self.range, 2, 0.3);
         let refine = |mut start, reach| {
             level::refine(pair, &mut start, (passes, reach), self.params.seed, self.tick);
             start
