@@ -28,6 +28,9 @@ const LEFT: f32 = 1.0;
 /// Least variance of the noise, in the mean square of the gradients: volumes without noise differ by interpolation at least.
 const LEAST_NOISE: f32 = 0.03;
 
+/// Rows from which the mean square of the gradients is taken, about.
+const SAMPLED: usize = 1000;
+
 /// A voxel's weight in [`GainField`] in place of each that is set in `mask`, 1 to 255: the inverse variance of the difference there,
 /// noise and the gradient times what is left of the motion. `smooth` is the initial volume (smoothed), `noise` its noise.
 pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 3], noise: f32) {
@@ -68,9 +71,6 @@ pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 
         }
     });
 }
-
-/// Rows from which the mean square of the gradients is taken, about.
-const SAMPLED: usize = 1000;
 
 /// Gain and offset at block centres.
 #[derive(Debug, Clone)]

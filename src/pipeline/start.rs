@@ -120,8 +120,8 @@ const ENOUGH: usize = 20;
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
-/// Part of the features by which those that agree must have grown in a search for another to follow: where fewer were won, the
-/// next won nothing.
+/// Part of the features by which those that agree must have grown in a search for another to follow: in four legs, after
+/// fewer were won the next won nothing.
 const GREW: f64 = 0.05;
 
 /// What the coarsest level found.
