@@ -337,6 +337,38 @@ fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
     }
 }
 
+/// A coarse mesh found the tip of a finger curved and the next one flat: the flat one's few ties along its normal left no
+/// equilibrium, and the pair failed.
+#[test]
+fn a_mesh_that_sees_a_curved_patch_flat_takes_over_what_the_other_found() {
+    let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
+    let body = Pressed::new(&params).unwrap();
+    let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
+    let volume = palpate::stiffness::maps::volume(&map);
+    let [held, load] = ["z+", "z-"].map(|side| Place::Side(Side::parse(side).unwrap()));
+    let level = |nodes: usize, part: f32| {
+        let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, nodes)).unwrap();
+        let mut field = body.phantom.truth.clone();
+        field.as_mut_slice().iter_mut().for_each(|v| *v *= part);
+        Level::new(&mesh, &field, None, &map, &held, &load, None).unwrap()
+    };
+    // Pressed by a tenth, it bends by less than can be seen.
+    let (mut coarse, mut fine) = (level(2500, 1.0), level(4000, 0.1));
+    assert!(coarse.patches[1].curved() && !fine.patches[1].curved());
+    coarse.patches[1].contact = Contact::Sliding;
+    let slides = |level: &Level| {
+        let patch = &level.patches[1];
+        (patch.plate(&level.body, &[0.0; 3], |_| 1.0).is_some(), patch.ties(&level.body, &[0.0; 3]).len())
+    };
+    fine.touch_like(&coarse);
+    assert_eq!(slides(&fine), (true, 0));
+    // And the other way: what the first found flat is tied to its plate.
+    let (mut curved, mut flat) = (level(4000, 1.0), level(2500, 0.1));
+    flat.patches[1].contact = Contact::Sliding;
+    curved.touch_like(&flat);
+    assert_eq!(slides(&curved), (false, curved.patches[1].nodes.len()));
+}
+
 /// The field of a homogeneous block between frictionless plates, linear: closed form, whatever the modulus.
 fn squeezed(strain: f64, nu: f64) -> DenseField {
     DenseField::from_fn(grid([20, 20, 20], 1.0), |p: WorldPoint| {

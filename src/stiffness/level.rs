@@ -113,7 +113,7 @@ impl Level {
     /// makes the patch as large.
     pub fn touch_like(&mut self, other: &Level) {
         for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
-            own.contact = theirs.contact;
+            own.touch_like(theirs);
         }
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
         if let Some((edge, _)) = self.edge {

@@ -114,13 +114,15 @@ pub struct Patch {
     rim: Vec<[f64; 3]>,
     /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
     pub residual: [f64; 2],
-    /// What a curved patch comes to lie on.
+    /// What it comes to lie on; none where that was not looked for.
     landing: Option<Landing>,
+    /// Whether it takes more than the plate's motion to bring it there.
+    bends: bool,
     /// Area (mm^2) of the surface beside a patch given by a mask that lies on its plane and moves with it.
     pub beside: f64,
 }
 
-/// The plane onto which a curved patch comes.
+/// The plane onto which a patch comes.
 #[derive(Debug, Clone)]
 struct Landing {
     /// Where it is.
@@ -159,11 +161,11 @@ impl Patch {
     /// The ties for plate parameters `change` from the fitted motion: where the patch is curved, what holds it along the
     /// [plate](Self::plate) only.
     pub fn ties(&self, body: &Body, change: &[f64]) -> Vec<Tie> {
-        let directions: &[Option<[f64; 3]>] = match (self.contact, &self.landing) {
-            (Contact::Sticking, _) | (Contact::Guided, None) => &[None],
-            (Contact::Sliding, None) => &[Some(self.normal)],
-            (Contact::Sliding, Some(_)) => &[],
-            (Contact::Guided, Some(_)) => &tangents(self.normal).map(Some),
+        let directions: &[Option<[f64; 3]>] = match (self.contact, self.curved()) {
+            (Contact::Sticking, _) | (Contact::Guided, false) => &[None],
+            (Contact::Sliding, false) => &[Some(self.normal)],
+            (Contact::Sliding, true) => &[],
+            (Contact::Guided, true) => &tangents(self.normal).map(Some),
         };
         let one = |(i, &node): (usize, &u32)| {
             let p = body.places[node as usize];
@@ -175,7 +177,9 @@ impl Patch {
             if self.contact == Contact::Guided {
                 (0..3).for_each(|a| u[a] += self.guided[i][a]);
             }
-            (0..3).for_each(|a| u[a] += self.rim[i][a]);
+            if !self.curved() {
+                (0..3).for_each(|a| u[a] += self.rim[i][a]);
+            }
             directions.iter().map(move |&direction| Tie { node, direction, target: u, strength: 1.0 })
         };
         self.nodes.iter().enumerate().flat_map(one).collect()
@@ -184,7 +188,7 @@ impl Patch {
     /// The plate that a curved patch slides along, for plate parameters `change` from the fitted motion; none where the patch
     /// is flat or sticks. `modulus` (kPa) is the shear modulus of an element.
     pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<plate::Plate> {
-        let Landing { plane: (q, _), facets } = self.landing.as_ref().filter(|_| self.contact != Contact::Sticking)?;
+        let Landing { plane: (q, _), facets } = self.landed().filter(|_| self.contact != Contact::Sticking)?;
         let stiffness = plate::STIFF * self.backing(body, modulus) / self.area(body);
         let facing = facets.iter().map(|&f| &body.surface[f]);
         let mut out = plate::Plate::touching(body, facing, self.normal, stiffness);
@@ -204,12 +208,24 @@ impl Patch {
 
     /// Whether it is curved before it is pressed.
     pub fn curved(&self) -> bool {
-        self.landing.is_some()
+        self.landed().is_some()
+    }
+
+    /// What it comes to lie on, where it is curved.
+    fn landed(&self) -> Option<&Landing> {
+        self.landing.as_ref().filter(|_| self.bends)
+    }
+
+    /// Takes over how the same patch of another mesh touches, and whether it is curved: near the limit, facets that end
+    /// elsewhere would say otherwise, and the two would solve different problems.
+    pub fn touch_like(&mut self, other: &Self) {
+        self.contact = other.contact;
+        self.bends = other.curved();
     }
 
     /// How far inwards its foremost place goes (mm): the largest motion of its nodes against the normal.
     pub fn travelled(&self, body: &Body) -> f64 {
-        let inward = |p: [f64; 3]| match &self.landing {
+        let inward = |p: [f64; 3]| match self.landed() {
             Some(Landing { plane: (q, normal), .. }) => dot(sub(p, *q), *normal),
             None => -dot(self.motion(p), self.normal),
         };
@@ -351,9 +367,6 @@ fn moving_with(body: &Body, motion: &SurfaceMotion, patch: &Patch, voxel: f64) -
 /// The mesh rounds the rim of a flat face by a part of a voxel, so its nodes lie inside of the plate's plane. They do not move
 /// as the plate but as tissue at that depth, to first order: between the two plates in proportion.
 fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
-    if patch.curved() {
-        return;
-    }
     let height = |p: [f64; 3]| dot(sub(p, patch.middle), patch.normal);
     let mut all: Vec<f64> = patch.nodes.iter().map(|&n| height(body.places[n as usize])).collect();
     let face = crate::numerics::statistics::percentile(&mut all, 75.0);
@@ -564,8 +577,9 @@ fn build(
     let residual = [part(true), part(false)];
     let quadratic = fit_quadratic(&rest, middle, radius, normal);
     let guided = nodes.iter().map(|&n| quadratic(body.places[n as usize])).collect();
-    let landing = plane
-        .and_then(|plane| landing_on(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
+    let landing = plane.map(|plane| Landing { plane, facets: facets_before(body, motion, plane, voxel) });
+    let bends = plane
+        .is_some_and(|plane| bent(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
     let (contact, rim) = (Contact::Sticking, vec![[0.0; 3]; nodes.len()]);
     Some(Patch {
         name,
@@ -580,32 +594,41 @@ fn build(
         rim,
         residual,
         landing,
+        bends,
         beside: 0.0,
     })
 }
 
-/// The plane that a patch comes to lie on, where it takes more than the plate's motion to bring it there.
-fn landing_on(
+/// Height (mm) over a plane at which a node ends.
+fn beyond(body: &Body, motion: &SurfaceMotion, (q, normal): Plane, n: u32) -> Option<f64> {
+    ended(body, motion, n).map(|end| dot(sub(end, q), normal))
+}
+
+/// Whether it takes more than the plate's motion to bring nodes onto a plane.
+fn bent(
     body: &Body,
     motion: &SurfaceMotion,
     nodes: &[u32],
     rigid: impl Fn([f64; 3]) -> [f64; 3],
     plane: Plane,
     voxel: f64,
-) -> Option<Landing> {
+) -> bool {
     let (q, normal) = plane;
-    let beyond = |n: u32| ended(body, motion, n).map(|end| dot(sub(end, q), normal));
     let tolerance = on_plane(voxel, motion.error);
     let bend = |&n: &u32| {
         let p = body.places[n as usize];
         // The rim of a flat face is rounded in the mesh: it ends short of the plane and moves with the plate as it is.
-        let on = beyond(n).is_some_and(|h| h.abs() < tolerance);
+        let on = beyond(body, motion, plane, n).is_some_and(|h| h.abs() < tolerance);
         if on { dot(sub(sub(q, p), rigid(p)), normal).abs() } else { 0.0 }
     };
     let mut bends: Vec<f64> = nodes.iter().map(bend).collect();
-    let curved = crate::numerics::statistics::percentile(&mut bends, 75.0) >= (0.1 * voxel).max(2.0 * motion.error);
-    let before = |f: &usize| body.surface[*f].nodes.iter().all(|&n| beyond(n).is_none_or(|h| h < BESIDE * voxel));
-    curved.then(|| Landing { plane, facets: (0..body.surface.len()).filter(before).collect() })
+    crate::numerics::statistics::percentile(&mut bends, 75.0) >= (0.1 * voxel).max(2.0 * motion.error)
+}
+
+/// Facets that may touch a plane: what was not seen to pass beside it.
+fn facets_before(body: &Body, motion: &SurfaceMotion, plane: Plane, voxel: f64) -> Vec<usize> {
+    let may = |n: &u32| beyond(body, motion, plane, *n).is_none_or(|h| h < BESIDE * voxel);
+    (0..body.surface.len()).filter(|&f| body.surface[f].nodes.iter().all(may)).collect()
 }
 
 /// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.
