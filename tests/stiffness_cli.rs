@@ -279,6 +279,8 @@ fn bad_numbers_are_usage_errors_that_say_the_range() {
     refused(folder.path(), &["--poisson", "0.5"], 2, &["poisson", "0.5", "below 0.5", "0.499"]);
     refused(folder.path(), &["--nodes", "3"], 2, &["nodes"]);
     refused(folder.path(), &["--names", "7=skin"], 2, &["no label 7"]);
+    // As a table of pairs has them: the second was taken for a part of the first one's name.
+    refused(folder.path(), &["--names", "1=skin;7=fat"], 2, &["no label 7"]);
     refused(folder.path(), &["--model", "hyper"], 2, &["hyper", "neo-hookean"]);
 }
 

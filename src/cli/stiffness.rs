@@ -53,7 +53,7 @@ pub struct Options {
     /// Regions: a label map on the field's grid, 0 outside
     #[arg(long, value_name = "L")]
     pub(super) labels: Option<PathBuf>,
-    /// Names of the labels, as 1=skin,2=fat
+    /// Names of the labels, as 1=skin,2=fat (or with ; between, as a table of pairs has them)
     #[arg(long, value_name = "NAMES", requires = "labels")]
     names: Option<String>,
     /// Where the body is held: x-, x+ ... z+ in world axes, or a mask that covers the patch
@@ -291,10 +291,10 @@ fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place>
     }
 }
 
-/// A name for every label.
+/// A name for every label; separated as on a command line or as in a table of pairs.
 fn names(given: Option<&str>, labels: &Mask) -> Result<Vec<String>> {
     let mut out: Vec<String> = (0..256).map(|l| format!("region {l}")).collect();
-    for pair in given.into_iter().flat_map(|g| g.split(',')) {
+    for pair in given.into_iter().flat_map(|g| g.split([',', ';'])) {
         let parsed = pair.split_once('=').and_then(|(l, n)| Some((l.trim().parse::<u8>().ok()?, n.trim())));
         let Some((label, text)) = parsed.filter(|p| !p.1.is_empty()) else {
             bail!(Usage(format!("--names: {pair:?} is not of the form 1=skin")));
