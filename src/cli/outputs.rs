@@ -86,10 +86,14 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     result.summary.seconds.push(("warp".into(), started.elapsed().as_secs_f64()));
 
     let started = Instant::now();
-    let affine = deformed_grid.affine();
-    let still = |offset| {
-        let [i, j, k] = initial.grid().voxel(offset);
-        sampler.at(affine.to_voxel(initial.grid().world(i, j, k)))
+    let still: Box<dyn Fn(usize) -> f32 + Sync> = if deformed_grid == *initial.grid() {
+        let values = sampler.at_centres();
+        Box::new(move |offset| values[offset])
+    } else {
+        Box::new(move |offset| {
+            let [i, j, k] = initial.grid().voxel(offset);
+            sampler.at(deformed_grid.affine().to_voxel(initial.grid().world(i, j, k)))
+        })
     };
     let swelling = |offset| determinant_at(&result.displacement, offset);
     let vague = |offset| result.uncertainty.at(offset);
@@ -97,7 +101,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         command,
         names,
         initial,
-        deformed: &still,
+        deformed: &*still,
         deformed_grid: &deformed_grid,
         warped: &warped,
         mask,

@@ -193,7 +193,7 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
             });
         };
         // Early rounds only sort the evidence; the last two settle the field.
-        let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-3, 60) };
+        let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-2, 60) };
         solve(smoothness, [lambda; 3], &blocks, Data::Operator(&operator), true, &rhs, &mut c, tolerance, limit);
         let gamma = probe.determined(smoothness, [lambda; 3], &blocks, if round < 2 { 30 } else { 15 }, true);
         let [gamma, energy] = [gamma, smoothness.energy(&c)].map(|v| v.iter().sum::<f64>());

@@ -140,6 +140,15 @@ impl<'a> Sampler<'a> {
         Self { shape: volume.grid().shape(), values, interpolation, background }
     }
 
+    /// The value at every voxel centre (x fastest).
+    pub fn at_centres(self) -> Vec<f32> {
+        let mut values = self.values.into_owned();
+        if self.interpolation == Interpolation::Cubic {
+            along_axes(&mut values, self.shape, refilter);
+        }
+        values
+    }
+
     /// The value at a position in voxels.
     #[inline]
     pub fn at(&self, p: VoxelPoint) -> f32 {
@@ -213,7 +222,13 @@ fn mirror(i: isize, n: usize) -> usize {
 }
 
 /// Coefficients of the cubic B-spline that passes through `values` (x fastest).
-fn bspline_coefficients(mut values: Vec<f32>, [nx, ny, nz]: [usize; 3]) -> Vec<f32> {
+fn bspline_coefficients(mut values: Vec<f32>, shape: [usize; 3]) -> Vec<f32> {
+    along_axes(&mut values, shape, prefilter);
+    values
+}
+
+/// Filters in place along x, y and z. `filter` takes a sequence of rows, and filters along it each entry of a row on its own.
+fn along_axes(values: &mut [f32], [nx, ny, nz]: [usize; 3], filter: fn(Vec<&mut [f32]>)) {
     values.par_chunks_mut(nx).for_each(|row| filter(row.chunks_mut(1).collect()));
     values.par_chunks_mut(nx * ny).for_each(|slice| filter(slice.chunks_mut(nx).collect()));
     let mut planes: Vec<Vec<&mut [f32]>> = (0..ny).map(|_| Vec::with_capacity(nz)).collect();
@@ -221,11 +236,29 @@ fn bspline_coefficients(mut values: Vec<f32>, [nx, ny, nz]: [usize; 3]) -> Vec<f
         planes[n % ny].push(row);
     }
     planes.into_par_iter().for_each(filter);
-    values
 }
 
-/// The recursive prefilter along a sequence of rows, each entry of a row on its own (Unser 1999, box 2).
-fn filter(mut rows: Vec<&mut [f32]>) {
+/// Takes [`prefilter`] back: the spline at the samples, (1, 4, 1) / 6 of the coefficients.
+fn refilter(mut rows: Vec<&mut [f32]>) {
+    let n = rows.len();
+    if n == 1 {
+        return;
+    }
+    let mut before = rows[1].to_vec();
+    for i in 0..n {
+        let (now, after) = rows.split_at_mut(i + 1);
+        let now = &mut now[i];
+        for (e, (v, last)) in now.iter_mut().zip(&mut before).enumerate() {
+            // Mirrored: what comes after the end is what came before it.
+            let next = after.first().map_or(*last, |row| row[e]);
+            let sum = 4.0 * *v + (*last + next);
+            *last = std::mem::replace(v, sum / 6.0);
+        }
+    }
+}
+
+/// The recursive prefilter along a sequence of rows (Unser 1999, box 2).
+fn prefilter(mut rows: Vec<&mut [f32]>) {
     /// The filter's pole, sqrt(3) - 2; its 16th power is below f32's precision.
     const POLE: f32 = -0.267_949_2;
     let n = rows.len();

@@ -137,7 +137,8 @@ impl<'a> Thinned<'a> {
 
 /// `value` in 8 bits of the scale; what is no number is at its low end.
 fn byte(scale: &Scale, value: f32) -> u8 {
-    (255.0 * scale.position(f64::from(value)).clamp(0.0, 1.0)).round() as u8
+    // Saturates, and rounds what is not below 0 to the nearest.
+    (255.0 * scale.position(f64::from(value)) + 0.5) as u8
 }
 
 /// The byte of an overlay for the end of its scale; the next one is for what lies past it, the last for what is not known.
@@ -149,7 +150,7 @@ fn code(scale: &Scale, value: f32) -> u8 {
         t if !t.is_finite() => END + 2,
         // Single precision may lie a little beyond the end that it is meant to be.
         t if t > 1.0 + 1e-6 => END + 1,
-        t => (f64::from(END) * t.clamp(0.0, 1.0)).round() as u8,
+        t => (f64::from(END) * t.min(1.0) + 0.5) as u8,
     }
 }
 
