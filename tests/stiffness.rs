@@ -337,10 +337,10 @@ fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
     }
 }
 
-/// A coarse mesh found the tip of a finger curved and the next one flat: the flat one's few ties along its normal left no
+/// A mesh found the tip of a finger curved and the next one flat: the flat one's few ties along its normal left no
 /// equilibrium, and the pair failed.
 #[test]
-fn a_mesh_that_sees_a_curved_patch_flat_takes_over_what_the_other_found() {
+fn meshes_of_a_body_agree_on_what_is_curved_as_the_finer_sees_it() {
     let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
     let body = Pressed::new(&params).unwrap();
     let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
@@ -350,23 +350,25 @@ fn a_mesh_that_sees_a_curved_patch_flat_takes_over_what_the_other_found() {
         let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, nodes)).unwrap();
         let mut field = body.phantom.truth.clone();
         field.as_mut_slice().iter_mut().for_each(|v| *v *= part);
-        Level::new(&mesh, &field, None, &map, &held, &load, None).unwrap()
+        let mut level = Level::new(&mesh, &field, None, &map, &held, &load, None).unwrap();
+        level.patches[1].contact = Contact::Sliding;
+        level
     };
-    // Pressed by a tenth, it bends by less than can be seen.
-    let (mut coarse, mut fine) = (level(2500, 1.0), level(4000, 0.1));
-    assert!(coarse.patches[1].curved() && !fine.patches[1].curved());
-    coarse.patches[1].contact = Contact::Sliding;
     let slides = |level: &Level| {
         let patch = &level.patches[1];
         (patch.plate(&level.body, &[0.0; 3], |_| 1.0).is_some(), patch.ties(&level.body, &[0.0; 3]).len())
     };
-    fine.touch_like(&coarse);
-    assert_eq!(slides(&fine), (true, 0));
-    // And the other way: what the first found flat is tied to its plate.
-    let (mut curved, mut flat) = (level(4000, 1.0), level(2500, 0.1));
-    flat.patches[1].contact = Contact::Sliding;
-    curved.touch_like(&flat);
-    assert_eq!(slides(&curved), (false, curved.patches[1].nodes.len()));
+    // Pressed by a tenth, it bends by less than can be seen.
+    for (coarse, fine) in [(0.1, 1.0), (1.0, 0.1)] {
+        let (mut few, mut many) = (level(2500, coarse), level(10_000, fine));
+        assert!(few.patches[1].curved() != many.patches[1].curved());
+        assert!(few.patches[1].nodes.len() < many.patches[1].nodes.len());
+        few.agree_on_shape(&mut many);
+        for level in [&few, &many] {
+            let expected = if fine == 1.0 { (true, 0) } else { (false, level.patches[1].nodes.len()) };
+            assert_eq!(slides(level), expected);
+        }
+    }
 }
 
 /// The field of a homogeneous block between frictionless plates, linear: closed form, whatever the modulus.

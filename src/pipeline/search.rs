@@ -48,7 +48,10 @@ pub(super) fn regions(
                 break;
             };
             let mut more = level(&candidate)?;
-            (0..2).for_each(|i| more.patches[i].contact = one.patches[i].contact);
+            for (own, theirs) in more.patches.iter_mut().zip(&one.patches) {
+                own.bend_like(theirs);
+                own.contact = theirs.contact;
+            }
             let estimate = identify(&more, choice.law, params.poisson)?;
             if !support.accept(&more, &estimate, count) {
                 break;

@@ -149,6 +149,7 @@ fn labelled(
         coarse = level(&mesh, outline)?;
     }
     let mut fine = level(&fine_mesh, outline)?;
+    coarse.agree_on_shape(&mut fine);
     let reference = fine.largest();
     clock.book("observe");
 

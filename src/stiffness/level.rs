@@ -109,11 +109,22 @@ impl Level {
         }
     }
 
+    /// Makes both meshes of a body agree on which patches are curved: the one with more nodes there knows better, as a
+    /// coarse mesh rounds the rim of a flat face.
+    pub fn agree_on_shape(&mut self, other: &mut Level) {
+        for (a, b) in self.patches.iter_mut().zip(&mut other.patches) {
+            if a.nodes.len() > b.nodes.len() { b.bend_like(a) } else { a.bend_like(b) }
+        }
+        for level in [self, other] {
+            level.edge = Edge::of(&level.patches[1], &level.body, level.voxel).map(|edge| (edge, 0.0));
+        }
+    }
+
     /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere, an edge of the punch that
     /// makes the patch as large.
     pub fn touch_like(&mut self, other: &Level) {
         for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
-            own.touch_like(theirs);
+            own.contact = theirs.contact;
         }
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
         if let Some((edge, _)) = self.edge {

@@ -216,10 +216,9 @@ impl Patch {
         self.landing.as_ref().filter(|_| self.bends)
     }
 
-    /// Takes over how the same patch of another mesh touches, and whether it is curved: near the limit, facets that end
-    /// elsewhere would say otherwise, and the two would solve different problems.
-    pub fn touch_like(&mut self, other: &Self) {
-        self.contact = other.contact;
+    /// Takes over from the same patch of another mesh whether it is curved: near the limit, facets that end elsewhere say
+    /// otherwise, and the two would solve different problems.
+    pub fn bend_like(&mut self, other: &Self) {
         self.bends = other.curved();
     }
 
