@@ -194,6 +194,18 @@ fn another_contrast_is_warned_of_and_noise_is_not() {
 }
 
 #[test]
+fn a_strong_bias_is_warned_of_and_a_weak_one_is_not() {
+    // A calf under a bias of 40 to 48 % was past its limit, and not a word about it.
+    for kind in [PhantomKind::Block, PhantomKind::Head, PhantomKind::Calf] {
+        for (bias, wanted) in [(0.0, false), (0.15, false), (0.5, true), (0.8, true)] {
+            let (result, _) = measure(&PhantomParams { bias, ..PhantomParams::new(kind).sized(64) });
+            let said = result.summary.warnings.iter().any(|w| w.contains("gain between the two volumes varies"));
+            assert_eq!(said, wanted, "{kind:?} {bias}: {:?}", result.summary.warnings);
+        }
+    }
+}
+
+#[test]
 fn tissue_without_texture_is_warned_of_and_noisy_tissue_is_not() {
     // A ball of even grey was crossed smoothly, in millimetres, and not a word about it.
     let warned = |r: &FieldResult| r.summary.warnings.iter().any(|w| w.contains("shows no texture"));

@@ -14,7 +14,7 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::finer::{finer, unlike};
+use crate::pipeline::finer::{finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
@@ -155,7 +155,7 @@ fn canonical(
     let mut fine = None;
     let mut begun = None;
     let mut reach = f64::INFINITY;
-    let (mut left, mut asked) = (0.0, Vec::new());
+    let (mut left, mut gain, mut asked) = (0.0, 1.0, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let pair = aligned.level(factor);
@@ -205,7 +205,7 @@ fn canonical(
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
             let best = finer(&pair, field, (params.node_spacing, passes), params.seed, refine);
-            (field, left, asked) = (best.field, best.left, best.said);
+            (field, left, gain, asked) = (best.field, best.left, best.gain, best.said);
         }
         clock.skip("matching", matched);
         clock.book("residual");
@@ -321,6 +321,7 @@ fn canonical(
             .chain(vague(choice.model, uncertainty_mean_mm, length.0, &grid))
             .chain(doubted.map(in_doubt))
             .chain(unlike)
+            .chain(uneven(gain))
             .chain(plain)
             .collect(),
     };

@@ -179,10 +179,12 @@ pub fn bending(pair: &Pair<'_>, field: &SplineField) -> f64 {
     energy.iter().sum::<f64>() * cell_volume(&field.lattice, pair.spacing)
 }
 
-/// Robust standard deviation of what is left of the difference under a field (intensity).
-pub fn misfit(pair: &Pair<'_>, field: &SplineField) -> f32 {
+/// How the two volumes differ under a field: the robust standard deviation of what is left (intensity), and by what factor the
+/// gain varies ([`GainField::variation`]).
+pub fn misfit(pair: &Pair<'_>, field: &SplineField) -> [f32; 2] {
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
-    residual::residual_sigma(pair, &warped, &GainField::measure(pair, &warped))
+    let gain = GainField::measure(pair, &warped);
+    [residual::residual_sigma(pair, &warped, &gain), GainField::sharpened(pair, &warped).variation(pair)]
 }
 
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
