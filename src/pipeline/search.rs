@@ -48,10 +48,7 @@ pub(super) fn regions(
                 break;
             };
             let mut more = level(&candidate)?;
-            for (own, theirs) in more.patches.iter_mut().zip(&one.patches) {
-                own.bend_like(theirs);
-                own.contact = theirs.contact;
-            }
+            more.contact_like(&one);
             let estimate = identify(&more, choice.law, params.poisson)?;
             if !support.accept(&more, &estimate, count) {
                 break;

@@ -75,11 +75,10 @@ impl Level {
         if observations.len() < NEEDED {
             return Err(StiffnessError::TooFew { found: observations.len(), needed: NEEDED });
         }
-        let edge = Edge::of(&patches[1], &body, voxel).map(|edge| (edge, 0.0));
-        Ok(Self {
+        let mut out = Self {
             unmoved: body.places.clone(),
             grid: *field.grid(),
-            edge,
+            edge: None,
             body,
             observations,
             block,
@@ -88,7 +87,9 @@ impl Level {
             sharp_error: motion.sharp_error,
             near: motion.near,
             voxel,
-        })
+        };
+        out.find_edge();
+        Ok(out)
     }
 
     /// How near to a plate's plane counts as on it (mm).
@@ -115,17 +116,28 @@ impl Level {
         for (a, b) in self.patches.iter_mut().zip(&mut other.patches) {
             if a.nodes.len() > b.nodes.len() { b.bend_like(a) } else { a.bend_like(b) }
         }
-        for level in [self, other] {
-            level.edge = Edge::of(&level.patches[1], &level.body, level.voxel).map(|edge| (edge, 0.0));
+        self.find_edge();
+        other.find_edge();
+    }
+
+    /// Takes over from another mesh of the body how the patches touch, and whether they are curved.
+    pub fn contact_like(&mut self, other: &Level) {
+        for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
+            own.bend_like(theirs);
+            own.contact = theirs.contact;
         }
+        self.find_edge();
+    }
+
+    /// The edge of the punch where it lies before it is moved; none where the loaded patch is curved.
+    fn find_edge(&mut self) {
+        self.edge = Edge::of(&self.patches[1], &self.body, self.voxel).map(|edge| (edge, 0.0));
     }
 
     /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere, an edge of the punch that
     /// makes the patch as large.
     pub fn touch_like(&mut self, other: &Level) {
-        for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
-            own.contact = theirs.contact;
-        }
+        self.contact_like(other);
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
         if let Some((edge, _)) = self.edge {
             self.move_edge(edge.radius() / self.voxel * ((asked / own).sqrt() - 1.0));
