@@ -9,6 +9,7 @@ use palpate::stiffness::forward::{Problem, Tie};
 use palpate::stiffness::identify::State;
 use palpate::stiffness::law::Material;
 use palpate::stiffness::level::Level;
+use palpate::stiffness::observations::from_field;
 use palpate::stiffness::patches::Place;
 use palpate::synth::{PhantomKind, PhantomParams};
 use palpate::types::stiffness::{Contact, Law, LawChoice, Side};
@@ -493,5 +494,35 @@ fn a_held_side_that_its_mask_covers_in_part_is_warned_of() {
         let result = run(&inputs, &params, &|_, _| {}).unwrap();
         let said = result.warnings.iter().any(|w| w.contains("beside the held patch"));
         assert_eq!(said, warned, "{:?}", result.warnings);
+    }
+}
+
+#[test]
+fn a_mean_over_a_block_of_a_curved_displacement_is_read_as_a_mean() {
+    // 56^3 voxels are averaged over blocks of two, 80^3 over three.
+    for (voxels, block) in [(56, 2), (80, 3)] {
+        let side = voxels as f64;
+        let map = labels([voxels + 4; 3], 1.0, |p| u8::from(p.iter().all(|v| (2.0..side + 2.0).contains(v))));
+        let body = straight(&map, 1500);
+        let curved = |p: [f64; 3]| [1e-3 * p[0] * p[0], 1e-3 * p[2] * (p[1] - p[2]), -1e-3 * p[0] * p[1]];
+        let field = DenseField::from_fn(*map.grid(), |p| curved(p.0));
+        let mut x = vec![0.0; body.pattern.unknowns()];
+        for (n, p) in body.places.iter().enumerate() {
+            let at = body.pattern.first(n as u32);
+            x[at..at + 3].copy_from_slice(&curved(*p));
+        }
+        let (observations, found) = from_field(&body, &field, &map);
+        assert_eq!(found, block);
+        assert!(observations.len() > 15_000, "{}", observations.len());
+        let mut middle: f64 = 0.0;
+        for o in &observations {
+            let (u, at) = (o.read(&body, &x), curved(o.place));
+            for a in 0..3 {
+                assert!((u[a] - o.displacement[a]).abs() < 2e-6, "{:?}: {u:?}, {:?}", o.place, o.displacement);
+                middle = middle.max((at[a] - o.displacement[a]).abs());
+            }
+        }
+        // What it would have been off by.
+        assert!(middle > 1e-4, "{middle}");
     }
 }

@@ -12,7 +12,7 @@
 use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
-use crate::stiffness::observations::find;
+use crate::stiffness::observations::{find, read};
 use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
 use crate::types::{Grid, VoxelPoint, WorldPoint};
@@ -164,6 +164,8 @@ fn offsets(
 ) -> Result<Option<Geometry>, StiffnessError> {
     let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
+    // What an offset changes is smooth: it is read in the middle of a block.
+    let before = find(setup.body, &places);
     let mut rows = estimate.rows.clone();
     let factor = setup.problem(&estimate.state).factorise(x)?;
     let mut force_slope = Vec::new();
@@ -176,12 +178,12 @@ fn offsets(
             Some(y) => y,
             None => problem.solve(Some(x), PRECISION)?.x,
         };
-        let column = setup.observations.iter().zip(&found).map(|(o, f)| {
-            let old = o.read(setup.body, x);
-            f.map_or([0.0; 3], |(element, weights)| {
-                let new = crate::stiffness::observations::Observation { element, weights, ..*o }.read(&body, &y);
+        let column = before.iter().zip(&found).map(|(before, now)| match (before, now) {
+            (Some(before), Some(now)) => {
+                let (old, new) = (read(&[*before], setup.body, x), read(&[*now], &body, &y));
                 std::array::from_fn(|a| (new[a] - old[a]) / FACE)
-            })
+            }
+            _ => [0.0; 3],
         });
         rows.push(column.collect());
         let force = moved.forces(&problem, &estimate.state, &y)[0];

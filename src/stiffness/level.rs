@@ -7,7 +7,7 @@ use crate::stiffness::body::Body;
 use crate::stiffness::elements::locate;
 use crate::stiffness::geometry::Edge;
 use crate::stiffness::identify::{Setup, State};
-use crate::stiffness::observations::{Observation, find, from_field, from_matches};
+use crate::stiffness::observations::{Observation, find, from_field, from_matches, readings};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
 use crate::stiffness::rim::Outline;
 use crate::types::stiffness::Law;
@@ -103,10 +103,12 @@ impl Level {
         *moved = outwards;
         let place = |p: &[f64; 3]| edge.widened(*p, outwards * self.voxel);
         self.body = self.body.with_places(self.unmoved.iter().map(place).collect());
-        let places: Vec<[f64; 3]> = self.observations.iter().map(|o| o.place).collect();
-        for (o, found) in self.observations.iter_mut().zip(find(&self.body, &places)) {
+        let found = readings(&self.body, &self.observations);
+        for (o, found) in self.observations.iter_mut().zip(found) {
             // What is within rounding of the surface stays in its element.
-            (o.element, o.weights) = found.unwrap_or((o.element, o.weights));
+            if let Some(readings) = found {
+                o.readings = readings;
+            }
         }
     }
 

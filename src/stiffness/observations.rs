@@ -4,23 +4,28 @@ use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
 use crate::stiffness::elements::locate;
 use crate::types::space::{Matrix3, determinant};
-use crate::types::{Displacement, Mask, SparseField, VoxelPoint, WorldPoint};
+use crate::types::{Displacement, Mask, Match, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// Barycentric coordinates down to this count as inside an element.
 const SLACK: f64 = 1e-6;
 /// Samples of a dense field at most; blocks of voxels are averaged so that there are fewer.
 const SAMPLES: usize = 60_000;
+/// Every other corner of a cube.
+const SIDES: [[f64; 3]; 4] = [[-1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]];
 
-/// A measured displacement in an element.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// An element and the weights of its nodes.
+pub type Reading = (u32, [f64; 10]);
+
+/// A measured displacement: at a place, or the mean over a block of voxels about it.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// Where (mm, RAS).
+    /// Where (mm, RAS); the middle of the block.
     pub place: [f64; 3],
-    /// The element that holds it.
-    pub element: u32,
-    /// The shape functions there.
-    pub weights: [f64; 10],
+    /// Four places whose mean is that over the block, to second order; none for a single place.
+    pub around: Option<[[f64; 3]; 4]>,
+    /// The elements that hold the places, and the shape functions there.
+    pub readings: Vec<Reading>,
     /// Measured displacement (mm, RAS).
     pub displacement: [f64; 3],
     /// Its standard deviation (mm, a component), up to a common factor.
@@ -31,19 +36,52 @@ impl Observation {
     /// The displacement of a vector of unknowns at this place (mm).
     #[inline]
     pub fn read(&self, body: &Body, x: &[f64]) -> [f64; 3] {
-        let mut u = [0.0; 3];
-        for (&n, &w) in body.cells[self.element as usize].iter().zip(&self.weights) {
+        read(&self.readings, body, x)
+    }
+
+    fn places(&self) -> &[[f64; 3]] {
+        self.around.as_ref().map_or(std::slice::from_ref(&self.place), |around| around)
+    }
+}
+
+/// The displacement of a vector of unknowns by elements and weights (mm).
+#[inline]
+pub fn read(readings: &[Reading], body: &Body, x: &[f64]) -> [f64; 3] {
+    let mut u = [0.0; 3];
+    for (element, weights) in readings {
+        for (&n, &w) in body.cells[*element as usize].iter().zip(weights) {
             let at = body.pattern.first(n);
             for a in 0..3 {
                 u[a] += w * x[at + a];
             }
         }
-        u
     }
+    u
+}
+
+/// How each observation is read in a body; none where a part of it lies outside.
+pub fn readings(body: &Body, observations: &[Observation]) -> Vec<Option<Vec<Reading>>> {
+    let places: Vec<[f64; 3]> = observations.iter().flat_map(Observation::places).copied().collect();
+    let mut rest = find(body, &places).into_iter();
+    let one = |o: &Observation| {
+        let count = o.places().len();
+        let found: Vec<Option<Reading>> = rest.by_ref().take(count).collect();
+        let mut out = Vec::<Reading>::new();
+        for f in found {
+            let (element, weights) = f?;
+            let weights = weights.map(|w| w / count as f64);
+            match out.iter_mut().find(|r| r.0 == element) {
+                Some((_, sum)) => sum.iter_mut().zip(weights).for_each(|(s, w)| *s += w),
+                None => out.push((element, weights)),
+            }
+        }
+        Some(out)
+    };
+    observations.iter().map(one).collect()
 }
 
 /// The element that holds each place (mm, RAS) and the shape functions there; none outside the body.
-pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<(u32, [f64; 10])>> {
+pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for p in &body.places {
         for a in 0..3 {
@@ -126,23 +164,29 @@ fn near(j: &Matrix3, det: f64, origin: [f64; 3], p: [f64; 3]) -> bool {
     sum < 1.3
 }
 
-fn located(body: &Body, raw: Vec<([f64; 3], [f64; 3], f64)>) -> Vec<Observation> {
-    let places: Vec<[f64; 3]> = raw.iter().map(|r| r.0).collect();
-    let found = find(body, &places);
-    let join = |((place, displacement, sigma), f): (([f64; 3], [f64; 3], f64), Option<(u32, [f64; 10])>)| {
-        f.map(|(element, weights)| Observation { place, element, weights, displacement, sigma })
-    };
-    raw.into_iter().zip(found).filter_map(join).collect()
+/// Those observations that lie in the body, ready to be read.
+fn located(body: &Body, observations: Vec<Observation>) -> Vec<Observation> {
+    let found = readings(body, &observations);
+    let join = |(o, f): (Observation, Option<_>)| f.map(|readings| Observation { readings, ..o });
+    observations.into_iter().zip(found).filter_map(join).collect()
+}
+
+/// How far from the middle of a block of voxels, along each axis and in voxels, lie four corners of a cube that have the
+/// block's mean and second moments.
+fn spread(block: usize) -> f64 {
+    ((block * block - 1) as f64 / 12.0).sqrt()
 }
 
 /// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The second value is the number of
-/// voxels along a block's edge.
+/// voxels along a block's edge. The model's mean is taken as well: where strain changes, that is not the displacement at the
+/// middle.
 pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Observation>, usize) {
     let grid = field.grid();
     let [nx, ny, nz] = grid.shape();
     let inside = mask.as_slice();
     let voxels = inside.iter().filter(|&&v| v > 0).count();
     let block = (1..6).find(|b| voxels / (b * b * b) <= SAMPLES).unwrap_or(6);
+    let middle = 0.5 * (block - 1) as f64;
     let parts: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
     let row = |k: usize| {
         let mut out = Vec::new();
@@ -158,11 +202,19 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
                         sum[a] += f64::from(parts[a][o]);
                     }
                 }
-                let middle = 0.5 * (block - 1) as f64;
-                let p = grid.affine().to_world(VoxelPoint([i as f64 + middle, j as f64 + middle, k as f64 + middle]));
+                let world = |[x, y, z]: [f64; 3]| {
+                    grid.affine().to_world(VoxelPoint([i as f64 + x, j as f64 + y, k as f64 + z])).0
+                };
+                let around = SIDES.map(|side| world(side.map(|s| middle + s * spread(block))));
                 let mean = sum.map(|s| s / (block * block * block) as f64);
                 if mean.iter().all(|v| v.is_finite()) {
-                    out.push((p.0, mean, 1.0));
+                    out.push(Observation {
+                        place: world([middle; 3]),
+                        around: (block > 1).then_some(around),
+                        readings: Vec::new(),
+                        displacement: mean,
+                        sigma: 1.0,
+                    });
                 }
             }
         }
@@ -175,8 +227,14 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
 
 /// The kept matches that lie in the body.
 pub fn from_matches(body: &Body, matches: &SparseField) -> Vec<Observation> {
-    let raw = matches.kept().map(|m| (m.initial.0, m.displacement, m.sigma().max(1e-4))).collect();
-    located(body, raw)
+    let one = |m: &Match| Observation {
+        place: m.initial.0,
+        around: None,
+        readings: Vec::new(),
+        displacement: m.displacement,
+        sigma: m.sigma().max(1e-4),
+    };
+    located(body, matches.kept().map(one).collect())
 }
 
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to the voxels of the mask

@@ -142,7 +142,7 @@ pub fn map(setup: &Setup<'_>, homogeneous: &State, target: f64) -> Result<Map, S
     let weights: Vec<Vec<(u32, f64)>> = centres.iter().map(|&c| lattice.weights(c)).collect();
     let used = lattice.used;
     let step = setup.observations.len().div_ceil(SAMPLES).max(1);
-    let picked: Vec<Observation> = setup.observations.iter().step_by(step).copied().collect();
+    let picked: Vec<Observation> = setup.observations.iter().step_by(step).cloned().collect();
     let plates = setup.patches[0].parameters() + setup.patches[1].parameters();
     let p = used + plates;
     let mut values = vec![0.0; used];
