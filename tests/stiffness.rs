@@ -526,3 +526,38 @@ fn a_mean_over_a_block_of_a_curved_displacement_is_read_as_a_mean() {
         assert!(middle > 1e-4, "{middle}");
     }
 }
+
+#[test]
+fn a_region_found_without_labels_is_drawn_to_its_size() {
+    // As the map drew it, a fifth too small, it came out a fifth too stiff.
+    let params = PhantomParams { seed: 64, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(48);
+    let body = Pressed::new(&params).unwrap();
+    let known = &body.phantom.stiffness.as_ref().unwrap().labels;
+    let tissue = Mask::from_voxels(*known.grid(), |at, _| u8::from(known.as_slice()[at] != 0));
+    let [held, load] = ["z-", "z+"].map(|side| Place::Side(Side::parse(side).unwrap()));
+    let inputs = Inputs {
+        field: &body.phantom.truth,
+        matches: None,
+        labels: &tissue,
+        labelled: false,
+        held: &held,
+        load: &load,
+        names: &|label| format!("region {label}"),
+    };
+    let params = StiffnessParams { force_n: Some(body.force_n), nodes: 12_000, ..StiffnessParams::default() };
+    let result = run(&inputs, &params, &|_, _| {}).unwrap();
+    let drawn = |label: u8| {
+        result
+            .map
+            .as_slice()
+            .iter()
+            .filter(|v| (f64::from(**v) - result.regions[label as usize - 1].youngs_modulus).abs() < 1e-3)
+            .count()
+    };
+    let truth = known.as_slice().iter().filter(|l| **l == 2).count() as f64;
+    let (size, ratio) = (drawn(2) as f64 / truth, result.regions[1].ratio / 5.0);
+    assert_eq!(result.regions.len(), 2);
+    assert!((size - 1.0).abs() < 0.15, "{size}");
+    assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
+    assert!((ratio - 1.0).abs() < 2.0 * result.regions[1].ratio_sd / 5.0);
+}

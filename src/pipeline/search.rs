@@ -5,18 +5,49 @@ use crate::mesh::tetrahedral::{Fineness, mesh_labels};
 use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::stiffness::{COARSE, Inputs, Progress};
 use crate::stiffness::choice::choose;
+use crate::stiffness::geometry;
+use crate::stiffness::identify::Estimate;
+use crate::stiffness::inclusion::{Inclusion, SHAPES};
 use crate::stiffness::level::Level;
 use crate::stiffness::support::{Support, identify};
 use crate::stiffness::{maps, unlabelled};
 use crate::types::Mask;
-use crate::types::stiffness::{Evidence, StiffnessParams};
+use crate::types::stiffness::{Evidence, Law, StiffnessParams};
 use std::time::Instant;
+
+/// Times that found regions are drawn anew at most.
+const REDRAWN: usize = 3;
+/// Surfaces that move less than this stay (voxels).
+const STAYS: f64 = 0.2;
+/// Part of the residual that drawing anew must take away for another time.
+const WORTH: f64 = 0.005;
 
 /// Regions and why these.
 pub(super) struct Found {
     pub labels: Mask,
     pub evidence: Vec<Evidence>,
     pub seconds: f64,
+}
+
+/// The regions of `labels` with their surfaces moved to where the data put them; none where they stay.
+fn redrawn(
+    labels: &Mask,
+    level: &Level,
+    estimate: &Estimate,
+    law: Law,
+    poisson: f64,
+) -> Result<Option<Mask>, StiffnessError> {
+    let (inclusions, grid) = (Inclusion::all(labels), labels.grid());
+    let setup = level.setup(law, poisson, level.largest());
+    let Some(fit) = geometry::fit(&setup, estimate, grid, &inclusions)? else { return Ok(None) };
+    if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
+        return Ok(None);
+    }
+    let mut out = labels.clone();
+    for (inclusion, offsets) in inclusions.iter().zip(fit.shapes.chunks_exact(SHAPES)) {
+        inclusion.draw(&mut out, &std::array::from_fn(|k| offsets[k] * grid.least_spacing()));
+    }
+    Ok(Some(out))
 }
 
 /// One region, then two ... as long as each more is supported.
@@ -43,13 +74,26 @@ pub(super) fn regions(
         let map = unlabelled::map(&setup, &choice.estimate.state, support.target())?;
         for count in 2..=params.regions {
             progress("regions", 0.6 + 0.4 * count as f64 / (params.regions + 1) as f64);
-            let Some(candidate) = unlabelled::regions(&map, inputs.labels, count) else {
+            let Some(mut candidate) = unlabelled::regions(&map, inputs.labels, count) else {
                 support.none(count);
                 break;
             };
             let mut more = level(&candidate)?;
             more.contact_like(&one);
-            let estimate = identify(&more, choice.law, params.poisson)?;
+            let mut estimate = identify(&more, choice.law, params.poisson, (&one, &choice.estimate.state))?;
+            for _ in 0..REDRAWN {
+                let Some(drawn) = redrawn(&candidate, &more, &estimate, choice.law, params.poisson)? else { break };
+                let mut next = level(&drawn)?;
+                next.contact_like(&one);
+                let better = identify(&next, choice.law, params.poisson, (&more, &estimate.state))?;
+                let gain = 1.0 - better.rms / estimate.rms;
+                if gain > 0.0 {
+                    (candidate, more, estimate) = (drawn, next, better);
+                }
+                if gain < WORTH {
+                    break;
+                }
+            }
             if !support.accept(&more, &estimate, count) {
                 break;
             }

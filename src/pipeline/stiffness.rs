@@ -7,6 +7,7 @@ use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
 use crate::stiffness::choice::{choose, settle};
 use crate::stiffness::identify::State;
+use crate::stiffness::inclusion::Inclusion;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
 use crate::stiffness::rim::{Outline, rim};
@@ -167,7 +168,8 @@ fn labelled(
     progress("uncertainty", 0.9);
     let setup = fine.setup(choice.law, params.poisson, reference);
     let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
-    let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid())?;
+    let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
+    let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid(), &inclusions)?;
     let corrected = |step: &[f64]| {
         let x = estimate.state.x.as_deref().unwrap_or_default();
         setup.advanced(&estimate.state, x, &estimate.columns, step)

@@ -12,6 +12,7 @@
 use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
+use crate::stiffness::inclusion::{Inclusion, SHAPES};
 use crate::stiffness::observations::{find, read};
 use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
@@ -35,26 +36,31 @@ const PRECISION: f64 = 1e-6;
 
 /// What has an offset.
 #[derive(Debug, Clone, Copy)]
-enum Part {
+enum Part<'a> {
     /// A flat face: voxel axis, and whether it is the upper one.
     Face(usize, bool),
     /// The edge of the loaded patch.
     Edge(Edge),
+    /// The surface of a region that was found without labels, and the number of its shape.
+    Inclusion(&'a Inclusion, usize),
 }
 
-impl Part {
-    /// One standard deviation (voxels).
-    fn sigma(self) -> f64 {
+impl Part<'_> {
+    /// One standard deviation (voxels) on voxels of `voxel` mm.
+    fn sigma(self, voxel: f64) -> f64 {
         match self {
             Part::Face(..) => FACE,
             Part::Edge(_) => EDGE,
+            Part::Inclusion(inclusion, _) => inclusion.prior() / voxel,
         }
     }
 
-    fn name(self) -> String {
+    /// None for a shape.
+    fn name(self) -> Option<String> {
         match self {
-            Part::Face(axis, upper) => format!("{}{axis}", if upper { '+' } else { '-' }),
-            Part::Edge(_) => "edge".into(),
+            Part::Face(axis, upper) => Some(format!("{}{axis}", if upper { '+' } else { '-' })),
+            Part::Edge(_) => Some("edge".into()),
+            Part::Inclusion(..) => None,
         }
     }
 
@@ -65,6 +71,10 @@ impl Part {
             Part::Edge(edge) => {
                 let wider = offset * grid.least_spacing();
                 body.with_places(body.places.iter().map(|p| edge.widened(*p, wider)).collect())
+            }
+            Part::Inclusion(inclusion, shape) => {
+                let by = offset * grid.least_spacing();
+                body.with_places(body.places.iter().map(|p| inclusion.moved(*p, shape, by)).collect())
             }
         }
     }
@@ -128,6 +138,8 @@ fn length(v: [f64; 3]) -> f64 {
 pub struct Geometry {
     /// Faces, as `+0` ... by voxel axis, and `edge`, and their offsets outwards (voxels).
     pub faces: Vec<(String, f64)>,
+    /// Offsets of the inclusions' shapes (voxels), one inclusion after the other.
+    pub shapes: Vec<f64>,
     /// Change of all parameters, then the offsets (voxels).
     pub step: Vec<f64>,
     /// Covariance of the same, row by row.
@@ -136,13 +148,19 @@ pub struct Geometry {
     pub force_slope: Vec<f64>,
 }
 
-/// Fits the offsets about an estimate; none when the body has no flat face and no punch.
+/// Fits the offsets about an estimate; none when the body has no flat face, no punch and no `inclusions` whose shape is open.
 ///
 /// # Errors
 /// As [`Setup::run`].
-pub fn fit(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option<Geometry>, StiffnessError> {
+pub fn fit(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    grid: &Grid,
+    inclusions: &[Inclusion],
+) -> Result<Option<Geometry>, StiffnessError> {
     let mut parts = flat_faces(setup.body, grid);
     parts.extend(setup.edge.map(|(edge, _)| Part::Edge(edge)));
+    parts.extend(inclusions.iter().flat_map(|i| (0..SHAPES).map(move |shape| Part::Inclusion(i, shape))));
     offsets(setup, estimate, grid, &parts)
 }
 
@@ -160,7 +178,7 @@ fn offsets(
     setup: &Setup<'_>,
     estimate: &Estimate,
     grid: &Grid,
-    parts: &[Part],
+    parts: &[Part<'_>],
 ) -> Result<Option<Geometry>, StiffnessError> {
     let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
@@ -189,11 +207,11 @@ fn offsets(
         let force = moved.forces(&problem, &estimate.state, &y)[0];
         force_slope.push((force / estimate.force[0]).ln() / FACE);
     }
-    let p = rows.len();
+    let (p, voxel) = (rows.len(), grid.least_spacing());
     let mut prior = setup.prior_terms(&estimate.state);
     // The edge has been moved already.
-    let moved = |part: &Part| if matches!(part, Part::Edge(_)) { setup.edge.map_or(0.0, |e| e.1) } else { 0.0 };
-    prior.extend(parts.iter().map(|part| (part.sigma().powi(-2), moved(part))));
+    let moved = |part: &Part<'_>| if matches!(part, Part::Edge(_)) { setup.edge.map_or(0.0, |e| e.1) } else { 0.0 };
+    prior.extend(parts.iter().map(|part| (part.sigma(voxel).powi(-2), moved(part))));
     let scale = setup.scale(&estimate.residuals);
     let weights = setup.weights(&estimate.residuals, scale);
     // Residuals hang together: as many independent samples as the estimate found, and no more than a model that knows the
@@ -222,16 +240,18 @@ fn offsets(
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
     let (covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
     let first = p - parts.len();
-    if step[first..].iter().zip(parts).any(|(v, part)| (v + moved(part)).abs() > 3.5 * part.sigma()) {
+    if step[first..].iter().zip(parts).any(|(v, part)| (v + moved(part)).abs() > 3.5 * part.sigma(voxel)) {
         // So far beyond what a voxel map leaves open it is not the shape that is wrong.
         return Ok(None);
     }
-    let faces = parts.iter().zip(&step[first..]).map(|(part, offset)| (part.name(), *offset)).collect();
-    Ok(Some(Geometry { faces, step, covariance, force_slope }))
+    let found = || parts.iter().zip(step[first..].iter().copied());
+    let faces = found().filter_map(|(part, offset)| part.name().map(|name| (name, offset))).collect();
+    let shapes = found().filter(|(part, _)| matches!(part, Part::Inclusion(..))).map(|(_, offset)| offset).collect();
+    Ok(Some(Geometry { faces, shapes, step, covariance, force_slope }))
 }
 
 /// Box faces (voxel axis, positive side) that the surface fills by [`FLAT`] or more.
-fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part> {
+fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part<'static>> {
     let voxel = |p: [f64; 3]| grid.affine().to_voxel(WorldPoint(p)).0;
     let [low, high] = bounds(body, grid);
     let spacing = grid.spacing();

@@ -37,3 +37,5 @@ pub mod unlabelled;
 pub mod support;
 
 pub mod geometry;
+
+pub mod inclusion;

@@ -8,7 +8,7 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::choice::{Choice, MARGIN, bic};
-use crate::stiffness::identify::Estimate;
+use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::level::Level;
 use crate::types::space::dot;
 use crate::types::stiffness::{Evidence, Law};
@@ -35,13 +35,12 @@ pub struct Support {
     pub evidence: Vec<Evidence>,
 }
 
-/// Identifies labelled regions on a coarse mesh.
+/// Identifies labelled regions on a coarse mesh, from the state of another mesh of the body.
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-pub fn identify(level: &Level, law: Law, poisson: f64) -> Result<Estimate, StiffnessError> {
-    let setup = level.setup(law, poisson, level.largest());
-    setup.run(setup.start(), 12, 1e-4)
+pub fn identify(level: &Level, law: Law, poisson: f64, from: (&Level, &State)) -> Result<Estimate, StiffnessError> {
+    level.setup(law, poisson, level.largest()).run(level.carry(from.0, from.1), 12, 1e-4)
 }
 
 impl Support {
