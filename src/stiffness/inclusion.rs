@@ -16,6 +16,8 @@ pub const SHAPES: usize = 9;
 const PRIOR: f64 = 0.25;
 /// Least distance (voxels) of a region from the surface of the body.
 const CLEAR: f64 = 2.0;
+/// Part of the reach that all offsets together may move the surface by at once: beyond, what is around it would fold.
+const ONCE: f64 = 0.4;
 /// Smoothing before a region is drawn anew (voxels): takes out stairs, and moves the surface of a ball of 14 voxels by 0.02.
 const SMOOTHED: f64 = 0.7;
 
@@ -132,11 +134,13 @@ impl Inclusion {
         std::array::from_fn(|a| p[a] + by * u[a])
     }
 
-    /// Draws the region anew with its surface moved by all offsets (mm); the other voxels of region 1 and of its own take each
+    /// Draws the region anew with its surface moved by all offsets (mm), as far as it may go at once; the other voxels of region 1 and of its own take each
     /// other's place.
     pub fn draw(&self, labels: &mut Mask, offsets: &[f64; SHAPES]) {
         let grid = *labels.grid();
         let shape = grid.shape();
+        let all: f64 = offsets.iter().map(|v| v.abs()).sum();
+        let part = (ONCE * self.reach / all.max(1e-9)).min(1.0);
         let own: Vec<f32> = labels.as_slice().iter().map(|&l| f32::from(u8::from(l == self.label))).collect();
         let smooth = gaussian(&own, shape, [SMOOTHED; 3]);
         let read = |p: [f64; 3]| {
@@ -160,7 +164,8 @@ impl Inclusion {
                 }
                 let p = grid.affine().to_world(VoxelPoint(grid.voxel(o).map(|v| v as f64))).0;
                 let u = self.shapes(p);
-                let from = std::array::from_fn(|a| p[a] - (0..SHAPES).map(|k| offsets[k] * u[k][a]).sum::<f64>());
+                let from =
+                    std::array::from_fn(|a| p[a] - part * (0..SHAPES).map(|k| offsets[k] * u[k][a]).sum::<f64>());
                 if read(from) > 0.5 { self.label } else { 1 }
             })
             .collect();
