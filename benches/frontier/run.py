@@ -90,11 +90,12 @@ def label(axis, points, colour):
     places = axis.transData.transform([p[:2] for p in points]) * 72 / axis.figure.dpi
     taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
     for (c, e, m), (x, y) in zip(points, places):
-        width, tried = 5.4 * len(m), []
-        for side, dx, dy in (("left", 7, 4), ("left", 7, -13), ("right", -7, 4), ("right", -7, -13), ("center", 0, 9), ("center", 0, -18), ("left", 7, 16), ("left", 7, -25)):
+        width, tried = 5.8 * len(m), []
+        for side, dx, dy in (("left", 7, 4), ("left", 7, -13), ("right", -7, 4), ("right", -7, -13), ("center", 0, 9), ("center", 0, -18), ("left", 7, 16), ("left", 7, -25), ("right", -7, -25)):
             start = x + dx - {"left": 0, "right": width, "center": width / 2}[side]
             box = (start, y + dy, start + width, y + dy + 10)
-            hits = 9 * (box[0] < axis.bbox.x0 * 72 / axis.figure.dpi) + sum(box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken)
+            shared = [max(0, min(box[k + 2], t[k + 2]) - max(box[k], t[k])) for t in taken for k in (0, 1)]
+            hits = 1e4 * (box[0] < axis.bbox.x0 * 72 / axis.figure.dpi) + sum(w * h for w, h in zip(shared[::2], shared[1::2]))
             tried.append((hits, len(tried), side, (dx, dy), box))
         _, _, side, offset, box = min(tried)
         taken.append(box)
@@ -132,7 +133,7 @@ def chart(rows, groups, path):
         axis.set_title(f"{title} ({count} cases)", fontsize=11)
         low, high = axis.get_xlim()
         axis.set_xlim(low / 3, high * 2.5)
-        axis.set_ylim(axis.get_ylim()[0] / 1.15, None)
+        axis.set_ylim(axis.get_ylim()[0] / 1.3, None)
         for which in (axis.xaxis, axis.yaxis):
             which.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
             which.set_major_formatter(matplotlib.ticker.FuncFormatter(lambda v, _: f"{v:g}"))
