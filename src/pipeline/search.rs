@@ -38,6 +38,9 @@ fn redrawn(
     poisson: f64,
 ) -> Result<Option<Mask>, StiffnessError> {
     let (inclusions, grid) = (Inclusion::all(labels), labels.grid());
+    if inclusions.is_empty() {
+        return Ok(None);
+    }
     let setup = level.setup(law, poisson, level.largest());
     let Some(fit) = geometry::fit(&setup, estimate, grid, &inclusions)? else { return Ok(None) };
     if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
@@ -82,10 +85,17 @@ pub(super) fn regions(
             more.contact_like(&one);
             let mut estimate = identify(&more, choice.law, params.poisson, (&one, &choice.estimate.state))?;
             for _ in 0..REDRAWN {
-                let Some(drawn) = redrawn(&candidate, &more, &estimate, choice.law, params.poisson)? else { break };
-                let mut next = level(&drawn)?;
-                next.contact_like(&one);
-                let better = identify(&next, choice.law, params.poisson, (&more, &estimate.state))?;
+                let again = || {
+                    let Some(drawn) = redrawn(&candidate, &more, &estimate, choice.law, params.poisson)? else {
+                        return Ok(None);
+                    };
+                    let mut next = level(&drawn)?;
+                    next.contact_like(&one);
+                    let better = identify(&next, choice.law, params.poisson, (&more, &estimate.state))?;
+                    Ok::<_, StiffnessError>(Some((drawn, next, better)))
+                };
+                // What cannot be drawn or solved anew stays as the map has it.
+                let Ok(Some((drawn, next, better))) = again() else { break };
                 let gain = 1.0 - better.rms / estimate.rms;
                 if gain > 0.0 {
                     (candidate, more, estimate) = (drawn, next, better);
