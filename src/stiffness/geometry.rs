@@ -129,7 +129,8 @@ impl Edge {
     }
 }
 
-fn length(v: [f64; 3]) -> f64 {
+/// Length of a vector.
+pub(super) fn length(v: [f64; 3]) -> f64 {
     dot(v, v).sqrt()
 }
 

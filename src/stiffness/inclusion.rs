@@ -7,7 +7,7 @@
 
 use crate::numerics::filters::gaussian;
 use crate::numerics::neighbours::Neighbours;
-use crate::types::space::dot;
+use crate::stiffness::geometry::length;
 use crate::types::{Mask, VoxelPoint, WorldPoint};
 
 /// Functions of the direction.
@@ -23,10 +23,6 @@ const SMOOTHED: f64 = 0.7;
 
 fn apart(p: [f64; 3], q: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|a| p[a] - q[a])
-}
-
-fn length(v: [f64; 3]) -> f64 {
-    dot(v, v).sqrt()
 }
 
 /// A region inside the first one.

@@ -205,12 +205,11 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
                 let world = |[x, y, z]: [f64; 3]| {
                     grid.affine().to_world(VoxelPoint([i as f64 + x, j as f64 + y, k as f64 + z])).0
                 };
-                let around = SIDES.map(|side| world(side.map(|s| middle + s * spread(block))));
                 let mean = sum.map(|s| s / (block * block * block) as f64);
                 if mean.iter().all(|v| v.is_finite()) {
                     out.push(Observation {
                         place: world([middle; 3]),
-                        around: (block > 1).then_some(around),
+                        around: (block > 1).then(|| SIDES.map(|side| world(side.map(|s| middle + s * spread(block))))),
                         readings: Vec::new(),
                         displacement: mean,
                         sigma: 1.0,
