@@ -275,7 +275,7 @@ fn sensitivities_are_those_of_finite_differences() {
     for law in [Law::Linear, Law::NeoHookean] {
         let problem = |theta: f64| {
             let m = body.region.iter().map(|&r| Material { mu: (f64::from(r) * theta).exp(), poisson: 0.49 }).collect();
-            Problem { spring: 1e7, ..Problem::new(&body, law, m, plates(&body, 1.0)) }
+            Problem { springs: vec![1e7; body.places.len()], ..Problem::new(&body, law, m, plates(&body, 1.0)) }
         };
         let (theta, h) = (0.8, 1e-3);
         let at = problem(theta);

@@ -1,7 +1,7 @@
 //! The forward problem: displacement and pressure of a body whose surface is held and pressed in places.
 //!
-//! Prescribed displacements are ties, springs 10^8 times as stiff as the tissue around (relative error of a prescribed
-//! value about 10^-8); the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law
+//! Prescribed displacements are ties, springs 10^6 times as stiff as the tissue around them (a tied node misses its place by
+//! about 10^-6 of an element's size times the strain; stiffer ones would leave nothing of the tissue in single precision); the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law
 //! takes one step.
 
 use crate::error::StiffnessError;
@@ -12,14 +12,16 @@ use crate::stiffness::plate::Plate;
 use crate::types::stiffness::Law;
 use rayon::prelude::*;
 
-/// Stiffness of a tie over that of the tissue.
-const TIE: f64 = 1e8;
+/// Stiffness of a tie over that of the tissue around it.
+const TIE: f64 = 1e6;
 /// Newton steps at most for one load.
 const STEPS: usize = 25;
 /// A tangent is kept while a step is at most this part of the one before.
 const CONTRACTS: f64 = 0.4;
 /// A tangent serves for derivatives at a solution this part of the largest displacement away: about their relative error.
 const STALE: f64 = 0.01;
+/// At a solution this part of the largest displacement away its factor still refines solutions of the tangent there quickly.
+const NEAR: f64 = 0.2;
 /// Elements computed together.
 const CHUNK: usize = 256;
 
@@ -58,17 +60,25 @@ pub struct Problem<'a> {
     pub materials: Vec<Material>,
     /// Prescribed displacements.
     pub ties: Vec<Tie>,
-    /// Spring constant of a firm tie (kPa mm).
-    pub spring: f64,
+    /// Spring constant of a firm tie to each node (kPa mm).
+    pub springs: Vec<f64>,
     /// A plate that nothing goes through.
     pub plate: Option<Plate>,
 }
 
 impl<'a> Problem<'a> {
-    /// A problem with the spring constant that goes with the body's stiffness and element size.
+    /// A problem with the spring constants that go with the element size and the stiffest element at each node.
     pub fn new(body: &'a Body, law: Law, materials: Vec<Material>, ties: Vec<Tie>) -> Self {
-        let stiffest = materials.iter().fold(0.0, |m: f64, v| m.max(v.mu));
-        Self { body, law, materials, ties, spring: TIE * stiffest * body.element_size(), plate: None }
+        let mut springs = vec![0.0f64; body.places.len()];
+        for (cell, material) in body.cells.iter().zip(&materials) {
+            let spring = TIE * material.mu * body.element_size();
+            cell.iter().for_each(|&n| springs[n as usize] = springs[n as usize].max(spring));
+        }
+        Self { body, law, materials, ties, springs, plate: None }
+    }
+
+    fn spring(&self, tie: &Tie) -> f64 {
+        self.springs[tie.node as usize] * tie.strength
     }
 
     /// Brings its plate to a height (mm).
@@ -80,7 +90,7 @@ impl<'a> Problem<'a> {
     /// Force (kPa mm^2) with which a tie pulls its node.
     pub fn pull(&self, tie: &Tie, x: &[f64]) -> [f64; 3] {
         let u = self.body.displacement(x, tie.node);
-        let k = self.spring * tie.strength;
+        let k = self.spring(tie);
         let gap: [f64; 3] = std::array::from_fn(|a| tie.target[a] - u[a]);
         match tie.direction {
             None => gap.map(|g| k * g),
@@ -147,7 +157,7 @@ impl<'a> Problem<'a> {
             }
         }
         for tie in &self.ties {
-            let k = self.spring * tie.strength;
+            let k = self.spring(tie);
             for r in 0..3 {
                 for c in 0..=r {
                     let value = match tie.direction {
@@ -170,7 +180,7 @@ impl<'a> Problem<'a> {
     /// [`StiffnessError`] when an element is inside out or the body can move freely.
     pub fn factorise(&self, x: &[f64]) -> Result<Factor<'a>, StiffnessError> {
         let values = self.tangent(x).ok_or(StiffnessError::InsideOut)?;
-        self.body.pattern.factorise(&values).map_err(|_| StiffnessError::Unsolvable)
+        self.body.pattern.factorise(values).map_err(|_| StiffnessError::Unsolvable)
     }
 
     /// Solves, from `start` where one is given. `precision` (mm) ends Newton's method.
@@ -289,7 +299,10 @@ impl<'a> Problem<'a> {
             let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > CONTRACTS * last);
             let stale = moved > stale * self.size(&x);
             fresh = if done { stale } else { slow };
-            if fresh {
+            if done && stale && moved < NEAR * self.size(&x) {
+                let matrix = self.tangent(&x).ok_or(StiffnessError::InsideOut)?;
+                factor = factor.map(|f| f.near(matrix));
+            } else if fresh {
                 drop(factor.take()); // its memory is the next one's
                 factor = Some(self.factorise(&x)?);
                 (factorisations, moved) = (factorisations + 1, 0.0);

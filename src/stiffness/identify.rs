@@ -130,7 +130,7 @@ impl Setup<'_> {
             for patch in &self.patches {
                 let mut guided = patch.clone();
                 guided.contact = Contact::Guided;
-                ties.extend(guided.ties(self.body, &[]).into_iter().map(|t| Tie { strength: 1e-9, ..t }));
+                ties.extend(guided.ties(self.body, &[]).into_iter().map(|t| Tie { strength: 1e-7, ..t }));
             }
         }
         let [_, loaded] = &self.patches;
@@ -301,7 +301,7 @@ impl Setup<'_> {
                 let end = self.advanced(&state, &x, &columns, &step);
                 if problem.plate.is_some() {
                     // A contact is stiff: what is left out would show as a force.
-                    let (problem, solution) = self.follow(&end, tangent, problem.spring, precision)?;
+                    let (problem, solution) = self.follow(&end, tangent, problem.springs, precision)?;
                     let rest = self.residuals(&solution.x);
                     let end = State { x: Some(solution.x), ..end };
                     factorisations += solution.factorisations;
@@ -329,7 +329,7 @@ impl Setup<'_> {
                 let change = trial.theta.iter().zip(&factorised).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 // A factor that is not good enough goes before the next one is made: two take twice the memory.
                 tangent.take_if(|_| change > SAME_TANGENT);
-                if let Ok((p, s)) = self.follow(&trial, tangent.take(), problem.spring, precision) {
+                if let Ok((p, s)) = self.follow(&trial, tangent.take(), problem.springs.clone(), precision) {
                     factorisations += s.factorisations;
                     if s.factorisations > 0 {
                         factorised.clone_from(&trial.theta);
@@ -357,17 +357,17 @@ impl Setup<'_> {
         }
     }
 
-    /// Solves from a state nearby, with its tangent where one is given and leads there. The ties keep the tangent's `spring`:
+    /// Solves from a state nearby, with its tangent where one is given and leads there. The ties keep the tangent's `springs`:
     /// the force is that times a gap which no step would close that is measured in mm.
     fn follow<'a>(
         &'a self,
         state: &State,
         tangent: Option<Factor<'a>>,
-        spring: f64,
+        springs: Vec<f64>,
         precision: f64,
     ) -> Result<(Problem<'a>, Solution<'a>), StiffnessError> {
         if let (Some(factor), Some(x)) = (tangent, &state.x) {
-            let problem = Problem { spring, ..self.problem(state) };
+            let problem = Problem { springs, ..self.problem(state) };
             if let Some(x) = problem.solve_near(x, &factor, precision) {
                 return Ok((problem, Solution { x, factor, factorisations: 0 }));
             }
