@@ -18,6 +18,7 @@ use faer::sparse::linalg::cholesky::{
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMatRef};
 use faer::traits::RealField;
 use faer::{Conj, MatMut, Par, Side};
+use rayon::prelude::*;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Parts with this many nodes or fewer are not divided further.
@@ -309,7 +310,7 @@ impl<'a> Factor<'a> {
     }
 
     /// Solves for several right-hand sides in place, one after the other in `x`. Relative error (2-norm over all unknowns of a
-    /// right-hand side): [`REFINED`], next to none where the factor is of the matrix itself.
+    /// right-hand side): 10^-7 at most, about 10^-12 where the factor is of the matrix itself.
     ///
     /// # Errors
     /// [`Singular`] when the solution is not finite.
@@ -341,7 +342,7 @@ impl<'a> Factor<'a> {
         let mut last = 1.0;
         for round in 0..REFINEMENTS {
             self.pattern.substitute(factor, &mut step).ok()?;
-            let mut change = 0.0;
+            let mut change = 0.0f64;
             for (x, step) in x.chunks_exact_mut(n).zip(step.chunks_exact(n)) {
                 let (mut moved, mut size) = (0.0, 0.0);
                 for (x, step) in x.iter_mut().zip(step) {
@@ -350,11 +351,13 @@ impl<'a> Factor<'a> {
                     moved += step * step;
                     size += *x * *x;
                 }
-                // Not `max`: it would pass over what is not a number.
-                let part: f64 = if moved == 0.0 { 0.0 } else { (moved / size).sqrt() };
-                change = if part <= change { change } else { part };
+                let part = if moved == 0.0 { 0.0 } else { (moved / size).sqrt() };
+                if !part.is_finite() {
+                    return None;
+                }
+                change = change.max(part);
             }
-            if !change.is_finite() || change > SLOWEST.powi(round) {
+            if change > SLOWEST.powi(round) {
                 return None;
             }
             // What is left is the next change and those after it: each as much smaller as this one is than the last.
@@ -362,10 +365,11 @@ impl<'a> Factor<'a> {
                 return Some(x);
             }
             last = change;
-            for ((step, x), right) in step.chunks_exact_mut(n).zip(x.chunks_exact(n)).zip(right.chunks_exact(n)) {
+            let rest = |((step, x), right): ((&mut [f32], &[f64]), &[f64])| {
                 let product = self.pattern.multiply(&self.matrix, x);
                 step.iter_mut().zip(right.iter().zip(product)).for_each(|(s, (r, p))| *s = (r - p) as f32);
-            }
+            };
+            step.par_chunks_exact_mut(n).zip(x.par_chunks_exact(n)).zip(right.par_chunks_exact(n)).for_each(rest);
         }
         None
     }
