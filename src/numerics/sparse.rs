@@ -5,9 +5,10 @@
 //! elements (George 1973): the elements are halved at the median along their longest extent, and the nodes that both
 //! halves touch are eliminated last.
 //!
-//! The factorisation is L D L^T without pivots (faer), in single precision with solutions refined in double. It exists for positive definite and for symmetric quasi-definite
-//! matrices, [K B^T; B -C] with K and C positive definite, under any order (Vanderbei, SIAM J. Optim. 5, 1995). Within a
-//! part of the dissection the nodes keep their order, so nodes of the second block belong at the end.
+//! The factorisation is L D L^T without pivots (faer), in single precision with solutions refined in double. It exists for
+//! positive definite and for symmetric quasi-definite matrices, [K B^T; B -C] with K and C positive definite, under any
+//! order (Vanderbei, SIAM J. Optim. 5, 1995). Within a part of the dissection the nodes keep their order, so nodes of the
+//! second block belong at the end.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::ldlt::factor::LdltRegularization;
@@ -574,6 +575,9 @@ mod tests {
         assert!(b.iter().zip(&x).all(|(p, q)| (p - q).abs() < 1e-10));
     }
 
+    /// The matrix of one element of the chain.
+    const LINK: [f64; 9] = [4.0, 1.0, 0.5, 1.0, 5.0, 0.2, 0.5, 0.2, 3.0];
+
     /// Elements of three nodes along a chain with some that reach far.
     fn chain() -> (Vec<u32>, Vec<[f64; 3]>) {
         let places: Vec<[f64; 3]> = (0..40).map(|i| [f64::from(i), f64::from(i * 7 % 5), 0.0]).collect();
@@ -609,8 +613,7 @@ mod tests {
         let solved = |scale: f64| {
             let mut values = pattern.zeros();
             for e in 0..38 {
-                let m = [4.0, 1.0, 0.5, 1.0, 5.0, 0.2, 0.5, 0.2, 3.0].map(|v| scale * v);
-                pattern.add(&mut values, e, &m, 3);
+                pattern.add(&mut values, e, &LINK.map(|v| scale * v), 3);
             }
             let mut x = vec![1.0; pattern.unknowns()];
             pattern.factorise(values).unwrap().solve(&mut x).unwrap();
@@ -621,12 +624,14 @@ mod tests {
         assert_eq!(solved(1.0), first);
         assert!(first.iter().zip(&second).all(|(a, b)| (a - 3.0 * b).abs() < 1e-12));
     }
-    /// Values of the chain's matrix with `scale` times the first element's and a spring along an oblique direction of its unknowns.
+
+    /// The chain's matrix with its first nine elements `scale` times as stiff and a spring along an oblique direction of the
+    /// first one's unknowns.
     fn chained(pattern: &Pattern, scale: f64, spring: f64) -> Vec<f64> {
         let mut values = pattern.zeros();
         for e in 0..38 {
             let s = if e < 9 { scale } else { 1.0 };
-            pattern.add(&mut values, e, &[4.0, 1.0, 0.5, 1.0, 5.0, 0.2, 0.5, 0.2, 3.0].map(|v| s * v), 3);
+            pattern.add(&mut values, e, &LINK.map(|v| s * v), 3);
         }
         let along = [1.0, 0.7, 0.3];
         pattern.add(&mut values, 0, &std::array::from_fn::<f64, 9, _>(|i| spring * along[i / 3] * along[i % 3]), 3);

@@ -1,8 +1,8 @@
 //! The forward problem: displacement and pressure of a body whose surface is held and pressed in places.
 //!
 //! Prescribed displacements are ties, springs 10^6 times as stiff as the tissue around them (a tied node misses its place by
-//! about 10^-6 of an element's size times the strain; stiffer ones would leave nothing of the tissue in single precision); the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law
-//! takes one step.
+//! about 10^-6 of an element's size times the strain; stiffer ones would leave nothing of the tissue in single precision);
+//! the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law takes one step.
 
 use crate::error::StiffnessError;
 use crate::numerics::sparse::Factor;
