@@ -187,7 +187,9 @@ fn labelled(
         .map(|r| summary::unseen(&coarse_setup, &choice.estimate, r, moduli.ratio_variance[r]))
         .collect::<Result<Vec<_>, _>>()?;
     let changes = [mesh_change.as_slice(), &ratio_change];
-    let regions = summary::regions(&fine.body, [&moduli, &alone], inputs.names, changes, &unseen, reference);
+    let drawn = |label: &u8| geometry.is_some() && inclusions.iter().any(|i| i.label() == *label);
+    let cut: Vec<bool> = fine.body.labels.iter().map(|l| !inputs.labelled && *l > 1 && !drawn(l)).collect();
+    let regions = summary::regions(&fine.body, [&moduli, &alone], inputs.names, changes, &unseen, &cut, reference);
     clock.book("uncertainty");
 
     let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);

@@ -41,8 +41,9 @@ enum Part<'a> {
     Face(usize, bool),
     /// The edge of the loaded patch.
     Edge(Edge),
-    /// The surface of a region that was found without labels, and the number of its shape.
-    Inclusion(&'a Inclusion, usize),
+    /// The surface of a region that was found without labels: how its shapes move the nodes (mm), which one, and one standard
+    /// deviation (mm).
+    Inclusion(&'a [[[f64; 3]; SHAPES]], usize, f64),
 }
 
 impl Part<'_> {
@@ -51,7 +52,7 @@ impl Part<'_> {
         match self {
             Part::Face(..) => FACE,
             Part::Edge(_) => EDGE,
-            Part::Inclusion(inclusion, _) => inclusion.prior() / voxel,
+            Part::Inclusion(.., sigma) => sigma / voxel,
         }
     }
 
@@ -72,9 +73,10 @@ impl Part<'_> {
                 let wider = offset * grid.least_spacing();
                 body.with_places(body.places.iter().map(|p| edge.widened(*p, wider)).collect())
             }
-            Part::Inclusion(inclusion, shape) => {
+            Part::Inclusion(nodes, shape, _) => {
                 let by = offset * grid.least_spacing();
-                body.with_places(body.places.iter().map(|p| inclusion.moved(*p, shape, by)).collect())
+                let place = |(p, u): (&[f64; 3], &[[f64; 3]; SHAPES])| std::array::from_fn(|a| p[a] + by * u[shape][a]);
+                body.with_places(body.places.iter().zip(nodes).map(place).collect())
             }
         }
     }
@@ -161,7 +163,8 @@ pub fn fit(
 ) -> Result<Option<Geometry>, StiffnessError> {
     let mut parts = flat_faces(setup.body, grid);
     parts.extend(setup.edge.map(|(edge, _)| Part::Edge(edge)));
-    parts.extend(inclusions.iter().flat_map(|i| (0..SHAPES).map(move |shape| Part::Inclusion(i, shape))));
+    let moving: Vec<_> = inclusions.iter().map(|i| (i.shapes(&setup.body.places), i.prior())).collect();
+    parts.extend(moving.iter().flat_map(|(nodes, sigma)| (0..SHAPES).map(|k| Part::Inclusion(nodes, k, *sigma))));
     offsets(setup, estimate, grid, &parts)
 }
 

@@ -1,31 +1,78 @@
 //! A region that was found without labels, with its shape open.
 //!
 //! A map of the modulus tells where a region is, but not to a voxel where it ends; drawn a tenth too small across, a ball came
-//! out a quarter too stiff. So the surface of a region that lies inside another is moved outwards by a sum of nine functions of
-//! the direction from its middle: size, place and flatness (spherical harmonics up to the second degree), fitted together
-//! with the moduli. What is around it gives way less and less.
+//! out a quarter too stiff. So the surface between such a region and the first one is moved along its normal by a sum of nine
+//! functions of the direction from its middle: size, place and flatness (spherical harmonics up to the second degree), fitted
+//! together with the moduli. What is around it gives way less and less. Where the region reaches the surface of the body, it
+//! moves along that surface only.
 
 use crate::numerics::filters::gaussian;
 use crate::numerics::neighbours::Neighbours;
 use crate::stiffness::geometry::length;
+use crate::types::space::dot;
 use crate::types::{Mask, VoxelPoint, WorldPoint};
+use rayon::prelude::*;
 
 /// Functions of the direction.
 pub const SHAPES: usize = 9;
 /// One standard deviation of each offset before anything is known (parts of the radius).
 const PRIOR: f64 = 0.25;
-/// Least distance (voxels) of a region from the surface of the body.
+/// Least distance (voxels) from another region, and from the surface of the body for a region inside it.
 const CLEAR: f64 = 2.0;
 /// Part of the reach that all offsets together may move the surface by at once: beyond, what is around it would fold.
 const ONCE: f64 = 0.4;
 /// Smoothing before a region is drawn anew (voxels): takes out stairs, and moves the surface of a ball of 14 voxels by 0.02.
 const SMOOTHED: f64 = 0.7;
+/// Faces of voxels whose mean is the normal without the stairs.
+const FACES: usize = 32;
+/// The same where the edges of a surface shall not be rounded.
+const FEW: usize = 9;
+/// Length of a mean of normals below which a surface has an edge there, and above which it has none.
+const SHARP: [f64; 2] = [0.85, 0.95];
 
 fn apart(p: [f64; 3], q: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|a| p[a] - q[a])
 }
 
-/// A region inside the first one.
+/// A surface made of faces of voxels.
+struct Sheet {
+    /// Middles of the faces (mm, RAS).
+    places: Vec<[f64; 3]>,
+    /// Unit normals, without the stairs.
+    normals: Vec<[f64; 3]>,
+    near: Neighbours,
+}
+
+impl Sheet {
+    /// From the middles of faces and their normals, with a mean over `count` of these for each.
+    fn new(faces: &[([f64; 3], [f64; 3])], count: usize) -> Self {
+        let places: Vec<[f64; 3]> = faces.iter().map(|f| f.0).collect();
+        let near = Neighbours::new(&places);
+        let mut out = Self { near, normals: faces.iter().map(|f| f.1).collect(), places };
+        let smooth = |p: &[f64; 3]| {
+            let n = out.around(*p, count).1;
+            let size = length(n).max(1e-9);
+            n.map(|v| v / size)
+        };
+        out.normals = out.places.par_iter().map(smooth).collect();
+        out
+    }
+
+    /// Distance (mm) of a place, and the mean of the normals nearest to it: as long as they agree.
+    fn at(&self, p: [f64; 3]) -> (f64, [f64; 3]) {
+        self.around(p, FACES)
+    }
+
+    fn around(&self, p: [f64; 3], faces: usize) -> (f64, [f64; 3]) {
+        let near = self.near.within(p, f64::INFINITY, faces);
+        let Some(&first) = near.first() else { return (f64::INFINITY, [0.0; 3]) };
+        let part = 1.0 / near.len() as f64;
+        let mean = near.iter().fold([0.0; 3], |m, &i| std::array::from_fn(|a| m[a] + part * self.normals[i][a]));
+        (length(apart(self.places[first], p)), mean)
+    }
+}
+
+/// A region beside the first one only.
 pub struct Inclusion {
     label: u8,
     middle: [f64; 3],
@@ -33,10 +80,11 @@ pub struct Inclusion {
     radius: f64,
     /// How far from its surface things still move (mm).
     reach: f64,
-    /// Of its surface from its middle (mm).
-    furthest: f64,
-    surface: Vec<[f64; 3]>,
-    near: Neighbours,
+    voxel: f64,
+    /// Between it and the first region.
+    surface: Sheet,
+    /// The surface of the body, where the region reaches it.
+    skin: Option<Sheet>,
 }
 
 impl std::fmt::Debug for Inclusion {
@@ -46,7 +94,7 @@ impl std::fmt::Debug for Inclusion {
 }
 
 impl Inclusion {
-    /// All regions of `labels` that lie inside region 1, apart from the surface of the body and from each other.
+    /// All regions of `labels` that lie apart from each other.
     pub fn all(labels: &Mask) -> Vec<Self> {
         let most = labels.as_slice().iter().copied().max().unwrap_or(0);
         (2..=most).filter_map(|label| Self::of(labels, label)).collect()
@@ -58,46 +106,61 @@ impl Inclusion {
         let world = |p: [f64; 3]| grid.affine().to_world(VoxelPoint(p)).0;
         let stride = [1, shape[0], shape[0] * shape[1]];
         let (mut sum, mut count) = ([0.0; 3], 0usize);
-        let (mut surface, mut others) = (Vec::new(), Vec::new());
+        let (mut surface, mut skin, mut others) = (Vec::new(), Vec::new(), Vec::new());
         for o in (0..grid.len()).filter(|&o| all[o] != 0) {
-            let at = grid.voxel(o);
+            let at = grid.voxel(o).map(|v| v as f64);
+            let middle = world(at);
             let own = all[o] == label;
             if own {
-                let p = world(at.map(|v| v as f64));
-                (0..3).for_each(|a| sum[a] += p[a]);
+                (0..3).for_each(|a| sum[a] += middle[a]);
                 count += 1;
             }
             for a in 0..3 {
                 for up in [false, true] {
-                    let outside = if up { at[a] + 1 == shape[a] } else { at[a] == 0 };
-                    let beside = match (outside, up) {
+                    let end = if up { grid.voxel(o)[a] + 1 == shape[a] } else { grid.voxel(o)[a] == 0 };
+                    let beside = match (end, up) {
                         (true, _) => 0,
                         (_, true) => all[o + stride[a]],
                         (_, false) => all[o - stride[a]],
                     };
-                    let mut face = at.map(|v| v as f64);
-                    face[a] += if up { 0.5 } else { -0.5 };
-                    if own && beside != label {
-                        surface.push(world(face));
+                    if beside == all[o] {
+                        continue;
                     }
-                    if beside == 0 || (all[o] != label && all[o] != 1 && beside != all[o]) {
-                        others.push(world(face));
+                    let mut face = at;
+                    face[a] += if up { 0.5 } else { -0.5 };
+                    let face = world(face);
+                    let out = apart(face, middle);
+                    let size = length(out);
+                    let face = (face, out.map(|v| v / size));
+                    match beside {
+                        0 => skin.push(face),
+                        1 if own => surface.push(face),
+                        _ if all[o] == 1 && beside == label => {}
+                        _ => others.push(face.0),
                     }
                 }
             }
         }
-        if count == 0 {
+        if surface.len() < FACES {
             return None;
         }
         let middle = sum.map(|s| s / count as f64);
         let volume = count as f64 * grid.spacing().iter().product::<f64>();
         let radius = (0.75 * volume / std::f64::consts::PI).cbrt();
-        let near = Neighbours::new(&surface);
-        let furthest = surface.iter().map(|p| length(apart(*p, middle))).fold(0.0, f64::max);
-        let mut out = Self { label, middle, radius, reach: f64::INFINITY, furthest, surface, near };
-        let clear = others.iter().map(|p| out.distance(*p)).fold(f64::INFINITY, f64::min);
-        out.reach = clear.min(radius);
-        (clear > CLEAR * grid.least_spacing()).then_some(out)
+        let voxel = grid.least_spacing();
+        let surface = Sheet::new(&surface, FACES);
+        let clear = |p: &[f64; 3]| surface.at(*p).0;
+        let within = skin.par_iter().map(|f| clear(&f.0)).reduce(|| f64::INFINITY, f64::min);
+        let beside = others.par_iter().map(clear).reduce(|| f64::INFINITY, f64::min);
+        let open = within <= CLEAR * voxel;
+        let reach = radius.min(beside).min(if open { f64::INFINITY } else { within });
+        let skin = open.then(|| Sheet::new(&skin, FEW));
+        (beside > CLEAR * voxel).then_some(Self { label, middle, radius, reach, voxel, surface, skin })
+    }
+
+    /// Its label.
+    pub fn label(&self) -> u8 {
+        self.label
     }
 
     /// One standard deviation of each offset before anything is known (mm).
@@ -105,66 +168,73 @@ impl Inclusion {
         PRIOR * self.radius
     }
 
-    /// Distance from its surface (mm), told from the middles of the faces of its voxels.
-    fn distance(&self, p: [f64; 3]) -> f64 {
-        let nearest = self.near.within(p, f64::INFINITY, 1);
-        nearest.first().map_or(f64::INFINITY, |&i| length(apart(self.surface[i], p)))
+    /// How far each place (mm, RAS) moves (mm) for a unit of each offset.
+    pub fn shapes(&self, places: &[[f64; 3]]) -> Vec<[[f64; 3]; SHAPES]> {
+        places.par_iter().map(|p| self.shape(*p)).collect()
     }
 
-    /// How far `p` (mm, RAS) moves (mm) for a unit of each offset.
-    fn shapes(&self, p: [f64; 3]) -> [[f64; 3]; SHAPES] {
+    fn shape(&self, p: [f64; 3]) -> [[f64; 3]; SHAPES] {
         let d = apart(p, self.middle);
         let from_middle = length(d);
-        if from_middle < 1e-9 || from_middle > self.furthest + self.reach {
+        let (distance, normal) = self.surface.at(p);
+        if from_middle < 1e-9 || distance >= self.reach {
             return [[0.0; 3]; SHAPES];
         }
-        let rest = (1.0 - (self.distance(p) / self.reach).powi(2)).max(0.0).powi(2);
+        let rest = (1.0 - (distance / self.reach).powi(2)).powi(2);
+        let mut step = normal.map(|v| rest * v);
+        if let Some(skin) = &self.skin {
+            let (depth, out) = skin.at(p);
+            let size = length(out);
+            let bound = 1.0 - ((depth - self.voxel) / (0.5 * self.reach)).clamp(0.0, 1.0);
+            let smooth = ((size - SHARP[0]) / (SHARP[1] - SHARP[0])).clamp(0.0, 1.0);
+            let across = bound * dot(step, out) / (size * size).max(1e-9);
+            let free = 1.0 - bound * (1.0 - smooth);
+            step = std::array::from_fn(|a| free * (step[a] - across * out[a]));
+        }
         let [x, y, z] = d.map(|v| v / from_middle);
         let values = [1.0, x, y, z, 2.0 * x * y, 2.0 * y * z, 2.0 * z * x, x * x - y * y, 0.5 * (3.0 * z * z - 1.0)];
-        values.map(|v| [x, y, z].map(|n| v * rest * n))
+        values.map(|v| step.map(|n| v * n))
     }
 
-    /// Where `p` (mm, RAS) comes to lie when one offset is `by` (mm).
-    pub fn moved(&self, p: [f64; 3], shape: usize, by: f64) -> [f64; 3] {
-        let u = self.shapes(p)[shape];
-        std::array::from_fn(|a| p[a] + by * u[a])
-    }
-
-    /// Draws the region anew with its surface moved by all offsets (mm), as far as it may go at once; the other voxels of region 1 and of its own take each
-    /// other's place.
+    /// Draws the region anew with its surface moved by all offsets (mm), as far as it may go at once; the other voxels of
+    /// region 1 and of its own take each other's place.
     pub fn draw(&self, labels: &mut Mask, offsets: &[f64; SHAPES]) {
         let grid = *labels.grid();
         let shape = grid.shape();
         let all: f64 = offsets.iter().map(|v| v.abs()).sum();
         let part = (ONCE * self.reach / all.max(1e-9)).min(1.0);
-        let own: Vec<f32> = labels.as_slice().iter().map(|&l| f32::from(u8::from(l == self.label))).collect();
-        let smooth = gaussian(&own, shape, [SMOOTHED; 3]);
-        let read = |p: [f64; 3]| {
+        let part_of = |is: &dyn Fn(u8) -> bool| {
+            let all: Vec<f32> = labels.as_slice().iter().map(|&l| f32::from(u8::from(is(l)))).collect();
+            gaussian(&all, shape, [SMOOTHED; 3])
+        };
+        let (own, both) = (part_of(&|l| l == self.label), part_of(&|l| l == self.label || l == 1));
+        // How much of what is there of the two regions is its own.
+        let held = |p: [f64; 3]| {
             let q = grid.affine().to_voxel(WorldPoint(p)).0;
             let base: [usize; 3] = std::array::from_fn(|a| (q[a].max(0.0) as usize).min(shape[a].saturating_sub(2)));
-            (0..8usize).fold(0.0, |sum, c| {
+            let sums = (0..8usize).fold([0.0, 1e-9], |sums, c| {
                 let up = [c & 1, c >> 1 & 1, c >> 2];
                 let weight = (0..3).fold(1.0, |w, a| {
                     let t = (q[a] - base[a] as f64).clamp(0.0, 1.0);
                     w * if up[a] == 1 { t } else { 1.0 - t }
                 });
                 let [i, j, k] = std::array::from_fn(|a| (base[a] + up[a]).min(shape[a] - 1));
-                sum + weight * f64::from(smooth[grid.index(i, j, k)])
-            })
+                let o = grid.index(i, j, k);
+                [sums[0] + weight * f64::from(own[o]), sums[1] + weight * f64::from(both[o])]
+            });
+            sums[0] / sums[1]
         };
-        let drawn: Vec<u8> = (0..grid.len())
-            .map(|o| {
-                let was = labels.as_slice()[o];
-                if was != 1 && was != self.label {
-                    return was;
-                }
-                let p = grid.affine().to_world(VoxelPoint(grid.voxel(o).map(|v| v as f64))).0;
-                let u = self.shapes(p);
-                let from =
-                    std::array::from_fn(|a| p[a] - part * (0..SHAPES).map(|k| offsets[k] * u[k][a]).sum::<f64>());
-                if read(from) > 0.5 { self.label } else { 1 }
-            })
-            .collect();
+        let drawn = |o: usize| {
+            let was = labels.as_slice()[o];
+            if was != 1 && was != self.label {
+                return was;
+            }
+            let p = grid.affine().to_world(VoxelPoint(grid.voxel(o).map(|v| v as f64))).0;
+            let u = self.shape(p);
+            let from = std::array::from_fn(|a| p[a] - part * (0..SHAPES).map(|k| offsets[k] * u[k][a]).sum::<f64>());
+            if held(from) > 0.5 { self.label } else { 1 }
+        };
+        let drawn: Vec<u8> = (0..grid.len()).into_par_iter().map(drawn).collect();
         if drawn.contains(&self.label)
             && let Ok(mask) = Mask::from_vec(grid, drawn)
         {
@@ -219,18 +289,54 @@ mod tests {
     #[test]
     fn a_unit_moves_the_surface_by_a_unit_and_the_rest_less() {
         let found = Inclusion::all(&ball([20.0; 3], BALL));
-        let at = |r: f64| [10.0 + r, 10.0, 10.0];
-        let moved = |r: f64| found[0].moved(at(r), 0, 0.1)[0] - at(r)[0];
-        assert!((moved(0.5 * BALL) - 0.1).abs() < 0.005, "{}", moved(0.5 * BALL));
-        assert!(moved(0.2) < 0.01 && moved(8.9) < 0.01, "{} {}", moved(0.2), moved(8.9));
+        let shape = |p: [f64; 3], k: usize| found[0].shapes(&[p])[0][k];
+        let size = |r: f64| shape([10.0 + r, 10.0, 10.0], 0)[0];
+        assert!((size(0.5 * BALL) - 1.0).abs() < 0.05, "{}", size(0.5 * BALL));
+        assert!(size(0.2).abs() < 0.1 && size(8.9).abs() < 0.1, "{} {}", size(0.2), size(8.9));
         // Flatness along z takes from x half of what it gives z.
-        let z = found[0].moved([10.0, 10.0, 10.0 + 0.5 * BALL], 8, 0.1)[2] - 10.0 - 0.5 * BALL;
-        let x = found[0].moved(at(0.5 * BALL), 8, 0.1)[0] - at(0.5 * BALL)[0];
-        assert!((z - 0.1).abs() < 0.005 && (x + 0.05).abs() < 0.005, "{z} {x}");
+        let z = shape([10.0, 10.0, 10.0 + 0.5 * BALL], 8)[2];
+        let x = shape([10.0 + 0.5 * BALL, 10.0, 10.0], 8)[0];
+        assert!((z - 1.0).abs() < 0.05 && (x + 0.5).abs() < 0.05, "{z} {x}");
+    }
+
+    /// A disc of a radius (voxels) through a plate of 12 voxels of half a millimetre, its axis `at`.
+    fn disc(at: [f64; 2], radius: f64) -> Mask {
+        let grid = Grid::new([60, 60, 16], Affine::scaled([0.5; 3], [0.0; 3]).unwrap()).unwrap();
+        Mask::from_voxels(grid, |o, _| {
+            let v = grid.voxel(o).map(|v| v as f64);
+            let from = (v[0] - at[0]).hypot(v[1] - at[1]);
+            let inside = v.iter().zip([57.0, 57.0, 13.0]).all(|(v, high)| (2.0..=high).contains(v));
+            if inside { u8::from(from < radius) + 1 } else { 0 }
+        })
     }
 
     #[test]
-    fn a_region_at_the_surface_of_the_body_keeps_its_shape() {
-        assert!(Inclusion::all(&ball([8.0, 20.0, 20.0], BALL)).is_empty());
+    fn offsets_draw_a_disc_through_a_plate_larger_and_elsewhere() {
+        let before = disc([29.3, 30.6], 14.0);
+        let found = Inclusion::all(&before);
+        assert_eq!(found.len(), 1);
+        let mut offsets = [0.0; SHAPES];
+        (offsets[0], offsets[2]) = (0.5, -0.75);
+        let mut drawn = before.clone();
+        found[0].draw(&mut drawn, &offsets);
+        let wanted = disc([29.3, 29.1], 15.0);
+        assert!(differ(&before, &wanted) > 0.14, "{}", differ(&before, &wanted));
+        assert!(differ(&drawn, &wanted) < 0.03, "{}", differ(&drawn, &wanted));
+    }
+
+    #[test]
+    fn the_surface_of_the_body_stays_where_it_is() {
+        let found = Inclusion::all(&disc([29.3, 30.6], 14.0));
+        for (x, y) in [(7.6, 15.3), (10.0, 10.0), (14.6, 8.3), (20.0, 12.0)] {
+            for z in [0.75, 6.75] {
+                let moved = found[0].shapes(&[[x, y, z]])[0];
+                assert!(moved.iter().all(|u| u[2].abs() < 1e-9), "{moved:?}");
+            }
+        }
+        // At an edge of the body nothing moves: a disc that comes near to one.
+        let found = Inclusion::all(&disc([29.3, 17.0], 14.0));
+        let moved = found[0].shapes(&[[14.6, 0.75, 0.75], [14.6, 0.75, 3.0]]);
+        assert!(moved[0].iter().flatten().all(|u| u.abs() < 0.05), "{:?}", moved[0]);
+        assert!(moved[1].iter().all(|u| u[1].abs() < 0.02), "{:?}", moved[1]);
     }
 }

@@ -13,6 +13,8 @@ const VAGUE: f64 = 0.35;
 /// What is left at the interfaces of a label map, as a standard deviation of ln E: this, and this much more for each unit of
 /// |ln contrast| (the displacement tells less and less of a stiffer inclusion). From the spread over the phantoms.
 const INTERFACE: [f64; 2] = [0.006, 0.005];
+/// In place of the latter where a region was found without labels and has the shape that the map gave it. From six phantoms.
+const CUT: f64 = 0.15;
 /// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
 const RESOLVED: f64 = 0.1;
 /// Contrasts beyond e^this are checked against a rigid region (12).
@@ -116,19 +118,21 @@ pub fn unseen(
 
 /// Everything about the regions. `alone` are the moduli as if the surface were known: the part of the uncertainty that more
 /// data of the same body lower. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
-/// counts as the error of the fine one, or all of it where it is large.
+/// counts as the error of the fine one, or all of it where it is large. `cut` says which have the shape of a map.
 pub fn regions(
     body: &Body,
     [moduli, alone]: [&Moduli; 2],
     names: &dyn Fn(u8) -> String,
     [mesh_change, ratio_change]: [&[f64]; 2],
     unseen: &[Option<&'static str>],
+    cut: &[bool],
     reference: usize,
 ) -> Vec<RegionStiffness> {
     let count = body.labels.len();
     let one = |r: usize| {
         let mesh = |change: f64| if change.abs() < RESOLVED { change / 3.0 } else { change };
-        let interface = INTERFACE[0] + INTERFACE[1] * (moduli.log[r] - moduli.log[reference]).abs();
+        let slope = if cut[r] { CUT } else { INTERFACE[1] };
+        let interface = INTERFACE[0] + slope * (moduli.log[r] - moduli.log[reference]).abs();
         let data = moduli.covariance[r * count + r].max(0.0);
         let model = if data > 0.0 && count > 1 { interface * interface } else { 0.0 };
         let sd = (data + mesh(mesh_change[r]).powi(2) + model).sqrt();

@@ -9,14 +9,13 @@
 use crate::error::StiffnessError;
 use crate::stiffness::choice::{Choice, MARGIN, bic};
 use crate::stiffness::identify::{Estimate, State};
+use crate::stiffness::inclusion::SHAPES;
 use crate::stiffness::level::Level;
 use crate::types::space::dot;
 use crate::types::stiffness::{Evidence, Law};
 
 /// How far a residual must stand out of the noise (1).
 const DISCREPANCY: f64 = 1.1;
-/// Parameters that a region's shape stands for: place, size, flatness, besides its modulus.
-const SHAPE: usize = 6;
 
 /// The case for more regions, so far.
 #[derive(Debug)]
@@ -127,7 +126,7 @@ impl Support {
     /// Judges the estimate with `count` regions; true makes it the model that stands.
     pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize) -> bool {
         let misfit = (e.rms * e.rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
-        let parameters = e.parameters + SHAPE * (count - 1);
+        let parameters = e.parameters + SHAPES * (count - 1);
         let samples = self.effective.min(e.effective);
         let gain = bic(self.squares, samples, self.parameters) - bic(e.squares, samples, parameters);
         let setup = level.setup(Law::Linear, 0.49, level.largest());
