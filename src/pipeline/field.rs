@@ -591,10 +591,11 @@ fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
 const LENGTH: f64 = 1.35;
 
 /// Says so where a free field is expected to be off by more than half of the motion or a voxel: beyond that it is of
-/// little use (docs/failures.md shows how often this is right).
-fn vague(model: MotionModel, sigma: f64, motion: f64, grid: &Grid) -> Option<String> {
+/// little use (docs/failures.md shows how often this is right). The field's own length holds its errors, as squares.
+fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
     let edge = pyramid::finest(grid.shape(), grid.spacing());
     let expected = LENGTH * sigma;
+    let motion = (length * length - expected * expected).max(0.0).sqrt();
     (model == MotionModel::Free && expected > (0.5 * motion).min(edge)).then(|| {
         format!(
             "the mean error to expect, {expected:.2} mm, is more than half of the mean motion ({motion:.2} mm) or a voxel \
