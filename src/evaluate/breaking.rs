@@ -5,6 +5,8 @@
 pub enum Spread {
     /// Even differences.
     Linear,
+    /// The same, rounded to whole numbers.
+    Whole,
     /// Even ratios; both ends must be positive.
     Ratio,
 }
@@ -21,7 +23,7 @@ pub struct Breaking<R> {
 }
 
 /// Tries `coarse` severities (at least 2) over `range`, harmless end first, and halves the interval before the first that
-/// breaks `halvings` times. `run` may find that a severity cannot be had at all (`None`): the range ends there.
+/// breaks `halvings` times, or until nothing lies between. `run` may find that a severity cannot be had at all (`None`): the range ends there.
 ///
 /// What lies past the first break is tried too, but not searched: a curve need not be monotone.
 pub fn breaking_point<R>(
@@ -34,6 +36,7 @@ pub fn breaking_point<R>(
 ) -> Breaking<R> {
     let between = |[a, b]: [f64; 2], t: f64| match spread {
         Spread::Linear => a + t * (b - a),
+        Spread::Whole => (a + t * (b - a)).round(),
         Spread::Ratio => a * (b / a).powf(t),
     };
     let mut tried: Vec<(f64, R)> = Vec::with_capacity(coarse + halvings);
@@ -57,6 +60,9 @@ pub fn breaking_point<R>(
     if let (Some(mut place), Some(mut low), Some(mut high)) = (first, holds_at, breaks_at) {
         for _ in 0..halvings {
             let at = between([low, high], 0.5);
+            if at == low || at == high {
+                break;
+            }
             let Some(found) = run(at) else { break };
             let broke = breaks(&found);
             tried.insert(place, (at, found));
@@ -84,13 +90,20 @@ mod tests {
             let (high, low) = (found.breaks_at.unwrap_or(f64::NAN), found.holds_at.unwrap_or(f64::NAN));
             assert!(worse(high) && !worse(low), "{found:?}");
             let width = match spread {
-                Spread::Linear => (high - low) / 2.5,
+                Spread::Linear | Spread::Whole => (high - low) / 2.5,
                 Spread::Ratio => (high / low).ln() / 0.01f64.ln() * 4.0,
             };
             assert!((width - 1.0 / 16.0).abs() < 1e-9, "{width}");
             assert!(found.tried.windows(2).all(|w| (w[1].0 - w[0].0) * (range[1] - range[0]) > 0.0));
             assert_eq!(found.tried.len(), 9);
         }
+    }
+
+    #[test]
+    fn whole_severities_are_bracketed_by_neighbours() {
+        let found = breaking_point([0.0, 8.0], Spread::Whole, 3, 5, Some, |s| *s > 2.4);
+        assert_eq!((found.breaks_at, found.holds_at), (Some(3.0), Some(2.0)));
+        assert_eq!(found.tried.iter().map(|t| t.0).collect::<Vec<_>>(), [0.0, 2.0, 3.0, 4.0, 8.0]);
     }
 
     #[test]

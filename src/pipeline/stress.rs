@@ -183,8 +183,8 @@ pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) ->
         Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &labels, &params)))
     }));
     progress(0.6);
-    out.push(search("labels beside their place", "voxels", [0.0, 8.0], Spread::Linear, &|s| {
-        let beside = shifted_labels(&labels, s.round() as usize);
+    out.push(search("labels beside their place", "voxels", [0.0, 8.0], Spread::Whole, &|s| {
+        let beside = shifted_labels(&labels, s as usize);
         Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &beside, &usual)))
     }));
     progress(0.8);
