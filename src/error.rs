@@ -205,7 +205,9 @@ pub enum FieldError {
     },
     /// Two grids that had to be the same are not.
     #[error(
-        "{what} is on another grid ({found:?}) than {reference} ({expected:?}); resample it with `palpate warp --reference`"
+        "{what} is on another grid ({found:?}) than {reference} ({expected:?}{}); resample it with `palpate warp {what} \
+         --reference {reference} --interpolation nearest -o OUT`, if both lie in the same space",
+        if found == expected { ", but other voxels or another place" } else { "" }
     )]
     GridMismatch {
         /// What.
@@ -262,6 +264,14 @@ pub enum StiffnessError {
         /// Voxels of the second.
         next: usize,
     },
+    /// A body without a third dimension.
+    #[error(
+        "the body (mask or labels) is one voxel thick along voxel axis {axis}: stiffness needs a volume; image several slices"
+    )]
+    Flat {
+        /// x, y or z.
+        axis: char,
+    },
     /// A patch without a surface.
     #[error("the {which} patch ({name}) {what}; {hint}")]
     Patch {
@@ -276,8 +286,13 @@ pub enum StiffnessError {
     },
     /// Nothing is deformed.
     #[error(
-        "no load: the loaded patch moves {moved:.3} mm against the held one, where the field is good to {noise:.3} mm; check \
-         --held and --load, and that the field is not of a body at rest"
+        "no load: the loaded patch moves {moved:.3} mm against the held one, where the field is good to {noise:.3} mm; {}",
+        if *moved < -noise {
+            "they move apart: check that the volumes, and with them the field, are not in the wrong order (`palpate invert`), \
+             and --held and --load"
+        } else {
+            "check --held and --load, and that the field is not of a body at rest"
+        }
     )]
     NoLoad {
         /// Inward motion (mm).

@@ -220,7 +220,7 @@ fn a_thick_sphere_follows_lame() {
 /// A flat frictionless round punch on a half space: F = 2 E / (1 - nu^2) a d (Johnson, Contact Mechanics, 3.36). The block is
 /// 8 radii wide and 5 deep, which stiffens it; the edge of the punch is made of faces of the mesh.
 #[test]
-fn a_punch_needs_the_force_of_a_half_space_within_a_seventh() {
+fn a_punch_needs_the_force_of_a_half_space_and_what_its_block_adds() {
     let map = labels([52, 52, 34], 1.0, |p| {
         u8::from((2.0..50.0).contains(&p[0]) && (2.0..50.0).contains(&p[1]) && (2.0..32.0).contains(&p[2]))
     });
@@ -261,7 +261,7 @@ fn a_punch_needs_the_force_of_a_half_space_within_a_seventh() {
     let exact = 2.0 * e / (1.0 - nu * nu) * radius * d;
     let force = -pushes(&problem, &s.x, true);
     println!("{} nodes, area {area}, {force} for {exact}", body.places.len());
-    assert!((0.95..1.3).contains(&(force / exact)), "{force} for {exact}");
+    assert!((1.0..1.25).contains(&(force / exact)), "{force} for {exact}");
 }
 
 #[test]
@@ -527,11 +527,8 @@ fn a_mean_over_a_block_of_a_curved_displacement_is_read_as_a_mean() {
     }
 }
 
-#[test]
-fn a_region_found_without_labels_is_drawn_to_its_size() {
-    // As the map drew it, a fifth too small, it came out a fifth too stiff.
-    let params = PhantomParams { seed: 64, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(48);
-    let body = Pressed::new(&params).unwrap();
+/// What is found without labels in a phantom's exact field.
+fn without_labels(body: &Pressed, nodes: usize) -> StiffnessResult {
     let known = &body.phantom.stiffness.as_ref().unwrap().labels;
     let tissue = Mask::from_voxels(*known.grid(), |at, _| u8::from(known.as_slice()[at] != 0));
     let [held, load] = ["z-", "z+"].map(|side| Place::Side(Side::parse(side).unwrap()));
@@ -544,8 +541,29 @@ fn a_region_found_without_labels_is_drawn_to_its_size() {
         load: &load,
         names: &|label| format!("region {label}"),
     };
-    let params = StiffnessParams { force_n: Some(body.force_n), nodes: 12_000, ..StiffnessParams::default() };
-    let result = run(&inputs, &params, &|_, _| {}).unwrap();
+    let params = StiffnessParams { force_n: Some(body.force_n), nodes, ..StiffnessParams::default() };
+    run(&inputs, &params, &|_, _| {}).unwrap()
+}
+
+#[test]
+fn a_homogeneous_body_is_one_region_within_two_deviations() {
+    // Its deviation left out what the surface is known to, and truth lay 2.3 to 2.7 of them away.
+    let mut params = PhantomParams { seed: 176, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(48);
+    params.elastic.inclusions = 0;
+    let body = Pressed::new(&params).unwrap();
+    let result = without_labels(&body, 6_000);
+    let [only] = &result.regions[..] else { panic!("{:?}", result.regions) };
+    let off = only.youngs_modulus - body.modulus(1);
+    assert!(off.abs() < 2.0 * only.sd && only.sd < 0.03 * only.youngs_modulus, "{only:?}");
+}
+
+#[test]
+fn a_region_found_without_labels_is_drawn_to_its_size() {
+    // As the map drew it, a fifth too small, it came out a fifth too stiff.
+    let params = PhantomParams { seed: 64, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(48);
+    let body = Pressed::new(&params).unwrap();
+    let result = without_labels(&body, 12_000);
+    let known = &body.phantom.stiffness.as_ref().unwrap().labels;
     let drawn = |label: u8| {
         result
             .map

@@ -289,7 +289,7 @@ fn labels_on_another_grid_are_refused() {
     let folder = folder();
     let other = Mask::filled(grid([16, 16, 15]), 1);
     io::write_labels(folder.path().join("labels.nii.gz"), &other, "").unwrap();
-    refused(folder.path(), &[], 1, &["labels.nii.gz", "another grid", "palpate warp --reference"]);
+    refused(folder.path(), &[], 1, &["labels.nii.gz", "another grid", "palpate warp labels.nii.gz --reference"]);
 }
 
 #[test]
@@ -308,6 +308,59 @@ fn a_body_at_rest_has_no_load() {
     let folder = folder();
     io::write_field(folder.path().join("field.nii.gz"), &DenseField::zeros(grid([16, 16, 16]))).unwrap();
     refused(folder.path(), &[], 1, &["no load", "--load"]);
+}
+
+#[test]
+fn a_body_pulled_apart_is_refused_with_what_may_be_wrong() {
+    let folder = folder();
+    let path = folder.path().join("field.nii.gz");
+    let mut field = io::read_field(&path).unwrap();
+    field.as_mut_slice().iter_mut().for_each(|v| *v = -*v);
+    io::write_field(&path, &field).unwrap();
+    refused(folder.path(), &[], 1, &["no load", "apart", "wrong order"]);
+}
+
+#[test]
+fn forces_without_a_sequence_are_refused() {
+    // They went unheard: --field, which --sequence conflicts with, had lifted the requirement.
+    refused(folder().path(), &["--forces", "1,2"], 2, &["--forces", "--sequence", "--force"]);
+}
+
+#[test]
+fn a_slice_is_refused_by_a_dry_run_too() {
+    let folder = folder();
+    let mut labels = io::read_labels(folder.path().join("labels.nii.gz")).unwrap();
+    let g = *labels.grid();
+    labels.as_mut_slice().iter_mut().enumerate().for_each(|(o, l)| *l *= u8::from(g.voxel(o)[1] == 7));
+    io::write_labels(folder.path().join("labels.nii.gz"), &labels, "").unwrap();
+    for more in [&[][..], &["--dry-run"]] {
+        refused(folder.path(), more, 1, &["labels.nii.gz", "one voxel thick", "axis y"]);
+    }
+    refused(self::folder().path(), &["--dry-run", "--held", "z+"], 1, &["is the held one"]);
+}
+
+#[test]
+fn what_is_left_out_or_left_over_is_warned_of() {
+    let folder = folder();
+    let path = folder.path().join("field.nii.gz");
+    let whole = io::read_field(&path).unwrap();
+    let (_, err) = run(folder.path(), &BASE, 0);
+    assert!(!err.contains("left"), "{err}");
+    let g = *whole.grid();
+    let mut holed = whole.clone();
+    let n = g.len();
+    holed.as_mut_slice()[n + g.index(7, 7, 7)] = f32::NAN;
+    io::write_field(&path, &holed).unwrap();
+    let (_, err) = run(folder.path(), &[&BASE[..], &["--overwrite"]].concat(), 0);
+    assert!(err.contains("1 voxels of the body hold no finite displacement"), "{err}");
+    // A wave that no elastic body between two plates makes.
+    let mut waved = whole.clone();
+    for (o, v) in waved.as_mut_slice()[..n].iter_mut().enumerate() {
+        *v += 0.2 * (g.voxel(o)[2] as f32).sin();
+    }
+    io::write_field(&path, &waved).unwrap();
+    let (_, err) = run(folder.path(), &[&BASE[..], &["--overwrite"]].concat(), 0);
+    assert!(err.contains("what the model leaves over"), "{err}");
 }
 
 #[test]

@@ -104,6 +104,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             "--sequence needs --labels: regions that each frame found for itself would not be the same ones".into()
         ));
     }
+    // Clap drops a requirement that conflicts with what is given.
+    if !options.forces.is_empty() && options.sequence.is_none() {
+        bail!(Usage("--forces belongs to --sequence; for a single field give --force".into()));
+    }
     let body = options.labels.as_ref().or(options.mask.as_ref());
     let Some(body) = body else { bail!(Usage("give --labels or --mask".into())) };
     match (&options.sequence, &options.field) {
@@ -174,6 +178,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     }
     let images = images(options, source.image.as_deref(), field.grid())?;
     if options.dry_run {
+        setting.check(&field, params).with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
         drop(progress);
         return plan(options, params, &source.field, &setting, &[], console);
     }
@@ -265,7 +270,16 @@ impl Setting {
         params: &StiffnessParams,
         progress: pipeline::stiffness::Progress<'_>,
     ) -> Result<StiffnessResult, StiffnessError> {
-        let inputs = Inputs {
+        self.with(field, matches, |inputs| pipeline::stiffness::run(inputs, params, progress))
+    }
+
+    /// What [`Self::run`] would refuse at its start.
+    pub(super) fn check(&self, field: &DenseField, params: &StiffnessParams) -> Result<(), StiffnessError> {
+        self.with(field, None, |inputs| pipeline::stiffness::check(inputs, params))
+    }
+
+    fn with<T>(&self, field: &DenseField, matches: Option<&SparseField>, run: impl FnOnce(&Inputs<'_>) -> T) -> T {
+        run(&Inputs {
             field,
             matches,
             labels: &self.labels,
@@ -273,8 +287,7 @@ impl Setting {
             held: &self.held,
             load: &self.load,
             names: &|label| self.names[label as usize].clone(),
-        };
-        pipeline::stiffness::run(&inputs, params, progress)
+        })
     }
 }
 
@@ -286,7 +299,8 @@ fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place>
             if !path.exists() {
                 bail!("{flag} {text}: is neither a side (x-, x+, y-, y+, z-, z+) nor a file; check the spelling");
             }
-            Ok(Place::Mask(Box::new(read_mask(path, grid, reference)?), name(path)))
+            let mask = read_mask(path, grid, reference).with_context(|| format!("{flag} {text}"))?;
+            Ok(Place::Mask(Box::new(mask), name(path)))
         }
     }
 }

@@ -30,6 +30,9 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let setting = Setting::read(options, body, &grid, &frames[0].1)?;
     let images = images(options, None, &grid)?;
     if options.dry_run {
+        setting
+            .check(&io::read_field(&frames[0].1)?, params)
+            .with_context(|| format!("{} with {}", name(&frames[0].1), name(body)))?;
         drop(progress);
         let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
         return plan(options, params, &frames[0].1, &setting, &forces, console);

@@ -1,22 +1,23 @@
 //! `palpate warp`: images, labels and points carried along a field.
 
+use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
 use super::inputs::{check_distinct, check_output_file};
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::IoError;
 use palpate::field::warp::{warp_image, warp_labels, warp_points};
 use palpate::io;
 use palpate::numerics::sampling::Interpolation;
-use palpate::types::{DenseField, WorldPoint};
+use palpate::types::{DenseField, Grid, WorldPoint};
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Args)]
 #[command(
     after_help = "An image is read at x + u(x), so the deformed volume comes to look like the initial one. A point \
                         moves to p + u(p), from its initial to its deformed place. Use --interpolation nearest for \
-                        labels and masks."
+                        labels and masks. With --reference and no --field nothing moves: the image comes onto that grid."
 )]
 pub struct Options {
     /// Image, label map or mask (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
@@ -26,12 +27,12 @@ pub struct Options {
     #[arg(long, value_name = "P", conflicts_with_all = ["image", "reference", "interpolation"])]
     points: Option<PathBuf>,
     /// Displacement field (5-D NIfTI, .nrrd or .mha; LPS mm, as `palpate field` writes it)
-    #[arg(long, value_name = "F")]
-    field: PathBuf,
+    #[arg(long, value_name = "F", required_unless_present = "reference")]
+    field: Option<PathBuf>,
     /// File to write
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Take the grid of this image instead of the field's
+    /// Take the grid of this image or field instead of the field's
     #[arg(long, value_name = "R")]
     reference: Option<PathBuf>,
     /// nearest, linear or cubic
@@ -43,17 +44,22 @@ pub struct Options {
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { image, points, field, output, reference, interpolation, convention } = options;
-    let given = [image, points, reference].into_iter().flatten().chain([field]).map(PathBuf::as_path);
+    let given = [image, points, reference].into_iter().flatten().chain(field).map(PathBuf::as_path);
     check_distinct(&given.collect::<Vec<_>>(), std::slice::from_ref(output))?;
     match (image, points) {
         (_, Some(points)) => {
             check_output_file(output, &[".csv", ".mrk.json"])?;
+            let Some(field) = field else { bail!(Usage("--points needs --field".into())) };
             move_points(points, &convention.read(field)?, output, console)
         }
         (Some(image), None) => {
             check_output_file(output, &[".nii", ".nii.gz"])?;
-            let grid = reference.as_ref().map(io::read_volume).transpose()?.map(|r| *r.grid());
-            let field = convention.read(field)?;
+            let grid = reference.as_deref().map(|path| grid_of(path, convention)).transpose()?;
+            let field = match (field, grid) {
+                (Some(field), _) => convention.read(field)?,
+                (None, Some(grid)) => DenseField::zeros(grid),
+                (None, None) => bail!(Usage("give --field, --reference or both".into())),
+            };
             let integers = (*interpolation == Interpolation::Nearest).then(|| io::read_labels(image));
             match integers {
                 Some(Ok(labels)) => {
@@ -73,6 +79,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             console.say(&format!("Wrote {}.", output.display()))
         }
         (None, None) => Ok(()),
+    }
+}
+
+/// The grid of an image or a field.
+fn grid_of(path: &Path, convention: &Convention) -> Result<Grid> {
+    match io::read_volume(path) {
+        Ok(volume) => Ok(*volume.grid()),
+        Err(error) => convention.read(path).map(|field| *field.grid()).map_err(|_| error.into()),
     }
 }
 

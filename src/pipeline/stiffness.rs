@@ -76,7 +76,7 @@ pub fn run(
     progress: Progress<'_>,
 ) -> Result<StiffnessResult, StiffnessError> {
     params.check()?;
-    check(inputs.labels)?;
+    whole(inputs.labels)?;
     if inputs.labelled {
         return labelled(inputs, params, Vec::new(), progress);
     }
@@ -85,6 +85,18 @@ pub fn run(
     let mut result = labelled(&inputs, params, found.evidence, &|s, f| progress(s, 0.5 + 0.5 * f))?;
     result.seconds.insert(0, ("search".into(), found.seconds));
     Ok(result)
+}
+
+/// What [`run`] would refuse before it looks for moduli: told from a coarse mesh.
+///
+/// # Errors
+/// As [`run`].
+pub fn check(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<(), StiffnessError> {
+    params.check()?;
+    whole(inputs.labels)?;
+    let nodes = (COARSE * params.nodes as f64) as usize;
+    let mesh = Mesher::new(inputs.labels)?.mesh(&Fineness::for_nodes(maps::volume(inputs.labels), nodes))?;
+    Level::new(&mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, None).map(|_| ())
 }
 
 /// The chain for labelled regions; `tried` is the evidence that led to them.
@@ -198,7 +210,8 @@ fn labelled(
     let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
     let touching = [None, setup.touching(&state)];
     let area = |i: usize| touching[i].as_ref().map_or_else(|| fine.patches[i].area(&fine.body), |t| t.1);
-    let mut warnings = maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params);
+    let mut warnings = maps::unfit(inputs.field, inputs.labels, &fine, &estimate, noise);
+    warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
     warnings.dedup();
     let patches = [0, 1].map(|i| {
         let p = &fine.patches[i];
@@ -246,8 +259,17 @@ fn labelled(
     })
 }
 
-/// The body must hang together.
-fn check(labels: &Mask) -> Result<(), StiffnessError> {
+/// The body must have three dimensions and hang together.
+fn whole(labels: &Mask) -> Result<(), StiffnessError> {
+    let grid = labels.grid();
+    let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
+    for o in (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0) {
+        let at = grid.voxel(o);
+        (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(at[a]), high[a].max(at[a])));
+    }
+    if let Some(a) = (0..3).find(|&a| low[a] == high[a]) {
+        return Err(StiffnessError::Flat { axis: ['x', 'y', 'z'][a] });
+    }
     let found = pieces(labels);
     match found[..] {
         [largest, next, ..] => Err(StiffnessError::Disconnected {

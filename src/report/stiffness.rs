@@ -6,7 +6,7 @@ use crate::report::field::Values;
 use crate::report::html::{card, document, escape};
 use crate::report::panels::{Panel, gray_range, length};
 use crate::report::plot::{Line, Plot};
-use crate::report::scale::{Scale, thousands};
+use crate::report::scale::{Scale, short, thousands};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
@@ -59,6 +59,9 @@ pub fn verdict(result: &StiffnessResult) -> String {
     let seen = result.regions.iter().filter(|r| r.identifiable).count();
     let count = result.regions.len();
     let mut out = match (count, result.labelled) {
+        (1, false) if asks_for_more(result) => {
+            "One modulus does not explain the field, and no second region was found that does.".to_string()
+        }
         (1, false) => "The data do not support a second region: one modulus explains the field.".to_string(),
         (n, false) => format!("The data support {n} regions."),
         (1, true) => "One region.".into(),
@@ -69,6 +72,11 @@ pub fn verdict(result: &StiffnessResult) -> String {
         out.push_str(" No force was given, so moduli are ratios.");
     }
     out
+}
+
+/// Whether a misfit stands out of noise and geometry with one region, by the evidence.
+fn asks_for_more(result: &StiffnessResult) -> bool {
+    result.evidence.iter().any(|e| e.question == "regions" && e.model != "1")
 }
 
 /// The short summary for stdout.
@@ -317,9 +325,12 @@ fn page_with(
         correlation_table(result),
         chart::stage_times(&result.seconds)
     );
-    out.push_str(
-        "<footer><p>Moduli hold for the Poisson's ratio above, the same in all regions, and for an isotropic elastic body whose \
-         skin is free but for the two patches. Positions are world mm, RAS.</p></footer>",
+    let force = result.force_n.map_or_else(String::new, |f| format!(" under a total force of {} N", short(f)));
+    let _ = write!(
+        out,
+        "<footer><p>Moduli hold for a Poisson's ratio of {}, the same in all regions,{force} and for an isotropic elastic body \
+         whose skin is free but for the two patches. Positions are world mm, RAS.</p></footer>",
+        result.poisson
     );
     Ok(document(&format!("Stiffness of {}", escape(&inputs.body)), &out))
 }
@@ -349,14 +360,14 @@ fn region_table(result: &StiffnessResult) -> String {
             vec![
                 escape(&r.name),
                 r.label.to_string(),
-                escape(&modulus(r, result.absolute)),
+                escape(&modulus(r, result.absolute)).replace("+-", "±"),
                 digits(r.ratio),
-                format!("{:.1} %", 100.0 * change.exp_m1()),
+                format!("{:.1} %", 100.0 * change.exp_m1()).replace("-0.0", "0.0"),
                 thousands(r.volume as usize),
             ]
         })
         .collect();
-    table(&["Region", "Label", "Young's modulus", "Ratio", "Change with the mesh", "Volume, mm^3"], &rows)
+    table(&["Region", "Label", "Young's modulus", "Ratio", "Change with the mesh", "Volume, mm³"], &rows)
 }
 
 fn evidence_table(result: &StiffnessResult) -> String {
@@ -379,7 +390,7 @@ fn patch_table(result: &StiffnessResult) -> String {
         vec![
             format!("{which} ({})", escape(&p.name)),
             p.contact.name().into(),
-            format!("{:.1} mm^2", p.area),
+            format!("{:.1} mm²", p.area),
             p.translation.map(short2).join(", ") + " mm",
         ]
     };

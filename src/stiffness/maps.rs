@@ -2,9 +2,10 @@
 
 use crate::stiffness::body::{Body, sorted};
 use crate::stiffness::forward::Tie;
-use crate::stiffness::identify::{Setup, State};
+use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
+use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
 
@@ -85,6 +86,35 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2
         let moved = |n| state.x.as_ref().map_or([0.0; 3], |x| setup.body.displacement(x, n));
         let one = |node| Prescribed { node, patch: number, direction, displacement: moved(node) };
         out.extend(sorted(nodes.iter().chain(guided).copied()).into_iter().map(one));
+    }
+    out
+}
+
+/// Part of the plates' motion that the model may leave over without a word.
+const LEFT: f64 = 0.1;
+
+/// What of the field was left out, and whether the model leaves over much more than its noise (mm, of a voxel).
+pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &Estimate, noise: f64) -> Vec<String> {
+    let mut out = Vec::new();
+    let body = labels.as_slice().iter().enumerate().filter(|(_, l)| **l > 0);
+    let empty = body.filter(|(o, _)| field.at(*o).iter().any(|v| !v.is_finite())).count();
+    if empty > 0 {
+        out.push(format!(
+            "{empty} voxels of the body hold no finite displacement; they were left out: check the field, or leave them out of \
+             the mask"
+        ));
+    }
+    let [held, load] = &level.patches;
+    let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
+    let travel = dot(travel, travel).sqrt();
+    let own = level.sample_noise(noise);
+    let misfit = (estimate.rms * estimate.rms - own * own).max(0.0).sqrt();
+    if misfit > LEFT * travel {
+        out.push(format!(
+            "what the model leaves over, {misfit:.3} mm, is {:.0} % of the plates' motion ({travel:.2} mm): body, patches or law \
+             do not fit the field, or it is noisy; do not trust the moduli",
+            100.0 * misfit / travel
+        ));
     }
     out
 }

@@ -10,8 +10,8 @@ use crate::types::stiffness::RegionStiffness;
 
 /// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies within two of them).
 const VAGUE: f64 = 0.35;
-/// What is left at the interfaces of a label map, as a standard deviation of ln E: this, and this much more for each unit of
-/// |ln contrast| (the displacement tells less and less of a stiffer inclusion). From the spread over the phantoms.
+/// What is left at surface and interfaces of a label map, as a standard deviation of ln E: this, and this much more for each unit
+/// of |ln contrast| (the displacement tells less and less of a stiffer inclusion). From the spread over the phantoms.
 const INTERFACE: [f64; 2] = [0.006, 0.005];
 /// In place of the latter where a region was found without labels and has the shape that the map gave it. From six phantoms.
 const CUT: f64 = 0.15;
@@ -134,7 +134,7 @@ pub fn regions(
         let slope = if cut[r] { CUT } else { INTERFACE[1] };
         let interface = INTERFACE[0] + slope * (moduli.log[r] - moduli.log[reference]).abs();
         let data = moduli.covariance[r * count + r].max(0.0);
-        let model = if data > 0.0 && count > 1 { interface * interface } else { 0.0 };
+        let model = if data > 0.0 { interface * interface } else { 0.0 };
         let sd = (data + mesh(mesh_change[r]).powi(2) + model).sqrt();
         let between = if r == reference { 0.0 } else { mesh(ratio_change[r]).powi(2) + interface * interface };
         let ratio_sd = (moduli.ratio_variance[r] + between).sqrt();
