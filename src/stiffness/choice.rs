@@ -84,7 +84,11 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
             level.patches[0].contact = a;
             level.patches[1].contact = b;
             let setup = level.setup(first, poisson, reference);
-            match setup.run(setup.start(), ITERATIONS, COARSE) {
+            let mut start = setup.start();
+            if let Some((_, last)) = tried.last() {
+                (start.theta, start.x) = (last.state.theta.clone(), last.state.x.clone());
+            }
+            match setup.run(start, ITERATIONS, COARSE) {
                 Ok(e) => tried.push(([a, b], e)),
                 Err(e) => failure = Some(e),
             }
