@@ -74,8 +74,8 @@ fn read_case(folder: &Path) -> Result<Case> {
 
 /// Sides of the heads that show cost against size (voxels).
 const SIDES: [usize; 4] = [32, 48, 80, 128];
-/// Nodes that are tried for the stiffness.
-const NODES: [usize; 5] = [1000, 2000, 4000, 8000, 16_000];
+/// Nodes that are tried for the stiffness, the default last.
+const NODES: [usize; 5] = [1000, 2000, 4000, 8000, 20_000];
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { target, case, peers, quick, part, seed } = options;

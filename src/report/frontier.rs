@@ -61,11 +61,12 @@ fn against_time(group: &Group) -> (Panel, String) {
             [x - 5.0, x + 5.0, y - 5.0, y + 5.0]
         })
         .collect();
-    // Names on the front come first, so that they find room.
-    let mut order: Vec<&Standing> = shown.clone();
-    order.sort_by_key(|s| !s.on_front);
-    for s in order {
-        let [x, y] = panel.at([s.cpu_s, s.error.max(1e-9)]);
+    // Presets and what is on the front find room for their names first, and lie on top.
+    let mut order: Vec<&Standing> = shown;
+    order.sort_by_key(|s| (s.varied != "preset", !s.on_front));
+    let place = |s: &Standing| panel.at([s.cpu_s, s.error.max(1e-9)]);
+    for s in order.iter().rev() {
+        let [x, y] = place(s);
         let k = if s.method.contains("semi-implicit") {
             5
         } else if s.method.contains("adaptive") {
@@ -79,7 +80,9 @@ fn against_time(group: &Group) -> (Panel, String) {
             r#"<circle class="d k{k}{whole}" cx="{x:.1}" cy="{y:.1}" r="4.2"><title>{}</title></circle>"#,
             escape(&hover(s, group.unit))
         );
-        if let Some([left, base]) = room(&panel, [x, y], s.method.chars().count(), &mut taken) {
+    }
+    for s in order {
+        if let Some([left, base]) = room(&panel, place(s), s.method.chars().count(), &mut taken) {
             let _ = write!(out, r#"<text x="{left:.1}" y="{base:.1}">{}</text>"#, escape(&s.method));
         }
     }
