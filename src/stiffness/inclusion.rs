@@ -80,6 +80,8 @@ pub struct Inclusion {
     radius: f64,
     /// How far from its surface things still move (mm).
     reach: f64,
+    /// Of its surface from its middle (mm).
+    furthest: f64,
     voxel: f64,
     /// Between it and the first region.
     surface: Sheet,
@@ -155,7 +157,8 @@ impl Inclusion {
         let open = within <= CLEAR * voxel;
         let reach = radius.min(beside).min(if open { f64::INFINITY } else { within });
         let skin = open.then(|| Sheet::new(&skin, FEW));
-        (beside > CLEAR * voxel).then_some(Self { label, middle, radius, reach, voxel, surface, skin })
+        let furthest = surface.places.iter().map(|p| length(apart(*p, middle))).fold(0.0, f64::max);
+        (beside > CLEAR * voxel).then_some(Self { label, middle, radius, reach, furthest, voxel, surface, skin })
     }
 
     /// Its label.
@@ -176,8 +179,11 @@ impl Inclusion {
     fn shape(&self, p: [f64; 3]) -> [[f64; 3]; SHAPES] {
         let d = apart(p, self.middle);
         let from_middle = length(d);
+        if from_middle < 1e-9 || from_middle > self.furthest + self.reach {
+            return [[0.0; 3]; SHAPES];
+        }
         let (distance, normal) = self.surface.at(p);
-        if from_middle < 1e-9 || distance >= self.reach {
+        if distance >= self.reach {
             return [[0.0; 3]; SHAPES];
         }
         let rest = (1.0 - (distance / self.reach).powi(2)).powi(2);
