@@ -196,6 +196,20 @@ fn what_is_no_sequence_is_refused() {
     assert!(!folder.path().join("results").exists());
 }
 
+#[test]
+fn a_dry_run_of_a_sequence_bears_frames_at_rest() {
+    let folder = tracked(4);
+    let base =
+        ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1500", "--dry-run", "-o", "results"];
+    let rest = DenseField::zeros(grid([16, 16, 16]));
+    io::write_field(folder.path().join("displacement_0.nii.gz"), &rest).unwrap();
+    let (out, _) = run(folder.path(), &base, 0);
+    assert!(out.contains("Nothing was written"), "{out}");
+    io::write_field(folder.path().join("displacement_2.nii.gz"), &rest).unwrap();
+    let (_, err) = run(folder.path(), &base, 1);
+    assert!(err.contains("no load"), "{err}");
+}
+
 /// The sections of a FEBio 4 file, in the order its manual gives, each opened and closed.
 fn check_febio(text: &str) {
     assert!(text.contains("<febio_spec version=\"4.0\">"));

@@ -30,9 +30,17 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let setting = Setting::read(options, body, &grid, &frames[0].1)?;
     let images = images(options, None, &grid)?;
     if options.dry_run {
-        setting
-            .check(&io::read_field(&frames[0].1)?, params)
-            .with_context(|| format!("{} with {}", name(&frames[0].1), name(body)))?;
+        // Frames at rest are left out: one that can be used is enough.
+        let mut refused = Ok(());
+        for (_, path, _) in &frames {
+            refused = setting
+                .check(&io::read_field(path)?, params)
+                .with_context(|| format!("{} with {}", name(path), name(body)));
+            if refused.is_ok() {
+                break;
+            }
+        }
+        refused?;
         drop(progress);
         let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
         return plan(options, params, &frames[0].1, &setting, &forces, console);
