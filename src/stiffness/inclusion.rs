@@ -44,7 +44,8 @@ struct Sheet {
 }
 
 impl Sheet {
-    /// From the middles of faces and their normals, with a mean over `count` of these for each.
+    /// From the middles of faces and their normals, each as long as its face is large, with a mean over `count` of these for
+    /// each.
     fn new(faces: &[([f64; 3], [f64; 3])], count: usize) -> Self {
         let places: Vec<[f64; 3]> = faces.iter().map(|f| f.0).collect();
         let near = Neighbours::new(&places);
@@ -133,7 +134,8 @@ impl Inclusion {
                     let face = world(face);
                     let out = apart(face, middle);
                     let size = length(out);
-                    let face = (face, out.map(|v| v / size));
+                    // As large as the face is: a voxel over its edge along the normal.
+                    let face = (face, out.map(|v| v / (size * size)));
                     match beside {
                         0 => skin.push(face),
                         1 if own => surface.push(face),
@@ -290,6 +292,21 @@ mod tests {
         let mut same = before.clone();
         found[0].draw(&mut same, &[0.0; SHAPES]);
         assert!(differ(&same, &before) < 0.03, "{}", differ(&same, &before));
+    }
+
+    #[test]
+    fn flat_voxels_do_not_turn_normals() {
+        let grid = Grid::new([60, 60, 20], Affine::scaled([0.5, 0.5, 1.5], [0.0; 3]).unwrap()).unwrap();
+        let map = Mask::from_voxels(grid, |o, _| {
+            let p = grid.affine().to_world(VoxelPoint(grid.voxel(o).map(|v| v as f64))).0;
+            u8::from(length(apart(p, [15.0; 3])) < 9.0) + 1
+        });
+        let found = Inclusion::all(&map);
+        for d in [[0.6, 0.0, 0.8], [0.8, 0.0, 0.6], [0.36, 0.48, 0.8], [0.64, 0.48, 0.6]] {
+            let n = found[0].shapes(&[std::array::from_fn(|a| 15.0 + 9.0 * d[a])])[0][0];
+            let across = dot(n, d) / length(n);
+            assert!(across > 0.98, "{d:?} {n:?} {across}");
+        }
     }
 
     #[test]
