@@ -205,8 +205,8 @@ pub enum FieldError {
     },
     /// Two grids that had to be the same are not.
     #[error(
-        "{what} is on another grid ({found:?}) than {reference} ({expected:?}{}); resample it with `palpate warp {what} \
-         --reference {reference} --interpolation nearest -o OUT`, if both lie in the same space",
+        "{what} is on another grid ({found:?}) than {reference} ({expected:?}{}); if both lie in the same \
+         space, resample it with `palpate warp --reference` (masks and labels with --interpolation nearest)",
         if found == expected { ", but other voxels or another place" } else { "" }
     )]
     GridMismatch {

@@ -303,7 +303,7 @@ fn labels_on_another_grid_are_refused() {
     let folder = folder();
     let other = Mask::filled(grid([16, 16, 15]), 1);
     io::write_labels(folder.path().join("labels.nii.gz"), &other, "").unwrap();
-    refused(folder.path(), &[], 1, &["labels.nii.gz", "another grid", "palpate warp labels.nii.gz --reference"]);
+    refused(folder.path(), &[], 1, &["labels.nii.gz", "another grid", "palpate warp --reference"]);
 }
 
 #[test]
