@@ -4,7 +4,7 @@ use crate::error::StiffnessError;
 use crate::stiffness::geometry::edge_step;
 use crate::stiffness::identify::Estimate;
 use crate::stiffness::level::Level;
-use crate::stiffness::patches::Patch;
+use crate::stiffness::patches::{Patch, travel};
 use crate::stiffness::summary;
 use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Evidence, Law, LawChoice};
@@ -50,7 +50,7 @@ pub fn bic(squares: f64, samples: f64, parameters: usize) -> f64 {
 /// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or guided, or either where noise hides it.
 fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     let [held, load] = &level.patches;
-    let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
+    let travel = travel(&level.patches);
     let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
     let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
     let one = |patch: &Patch| {

@@ -13,7 +13,7 @@ use crate::stiffness::forward::{Problem, Solution, Tie};
 use crate::stiffness::geometry::Edge;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
-use crate::stiffness::patches::Patch;
+use crate::stiffness::patches::{Patch, travel};
 use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Law};
 
@@ -399,8 +399,7 @@ impl Setup<'_> {
 
     /// How far the plates move against each other (mm).
     fn travel(&self) -> f64 {
-        let [held, load] = &self.patches;
-        let apart: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
+        let apart = travel(&self.patches);
         dot(apart, apart).sqrt()
     }
 

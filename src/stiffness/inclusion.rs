@@ -153,7 +153,7 @@ impl Inclusion {
         let radius = (0.75 * volume / std::f64::consts::PI).cbrt();
         let voxel = grid.least_spacing();
         let surface = Sheet::new(&surface, FACES);
-        let clear = |p: &[f64; 3]| surface.at(*p).0;
+        let clear = |p: &[f64; 3]| surface.around(*p, 1).0;
         let within = skin.par_iter().map(|f| clear(&f.0)).reduce(|| f64::INFINITY, f64::min);
         let beside = others.par_iter().map(clear).reduce(|| f64::INFINITY, f64::min);
         let open = within <= CLEAR * voxel;

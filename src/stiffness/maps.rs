@@ -2,10 +2,11 @@
 
 use crate::stiffness::body::{Body, sorted};
 use crate::stiffness::forward::Tie;
+use crate::stiffness::geometry::length;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
-use crate::types::space::dot;
+use crate::stiffness::patches::travel;
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
 
@@ -104,9 +105,7 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &
              the mask"
         ));
     }
-    let [held, load] = &level.patches;
-    let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
-    let travel = dot(travel, travel).sqrt();
+    let travel = length(travel(&level.patches));
     let own = level.sample_noise(noise);
     let misfit = (estimate.rms * estimate.rms - own * own).max(0.0).sqrt();
     if misfit > LEFT * travel {

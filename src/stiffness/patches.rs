@@ -265,6 +265,11 @@ fn refuse(which: &'static str, place: &Place, what: &str, hint: &str) -> Stiffne
     StiffnessError::Patch { which, name: place.name(), what: what.into(), hint: hint.into() }
 }
 
+/// How the loaded patch moves against the held one (mm).
+pub fn travel([held, load]: &[Patch; 2]) -> [f64; 3] {
+    std::array::from_fn(|a| load.rigid[a] - held.rigid[a])
+}
+
 /// Finds the held and the loaded patch. `voxel` is the least voxel size (mm); `outline` that of a punch on the loaded side, where
 /// it is known.
 ///

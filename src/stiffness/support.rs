@@ -11,6 +11,7 @@ use crate::stiffness::choice::{Choice, MARGIN, bic};
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::SHAPES;
 use crate::stiffness::level::Level;
+use crate::stiffness::patches::travel;
 use crate::types::space::dot;
 use crate::types::stiffness::{Evidence, Law};
 
@@ -46,7 +47,7 @@ impl Support {
     /// From the identification of one region; `noise` is the field's roughness (mm).
     pub fn new(level: &Level, choice: &Choice, noise: f64) -> Self {
         let [held, load] = &level.patches;
-        let travel: [f64; 3] = std::array::from_fn(|a| load.rigid[a] - held.rigid[a]);
+        let travel = travel(&level.patches);
         let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
         let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
         let e = &choice.estimate;
