@@ -13,6 +13,7 @@ use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, eigenvalues, principal};
 use crate::numerics::{filters, pyramid};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Largest stretch of the displacement (mm per mm) up to which a field is left alone.
 const STRAIN: f64 = 0.3;
@@ -43,6 +44,9 @@ const MOST: f32 = 0.5;
 /// and under 0.02 elsewhere.
 const SOME: f32 = 0.3;
 
+/// Voxels of a slab, about: with what is needed around it 0.1 to 0.5 GB.
+const SLAB: usize = 8_000_000;
+
 /// Voxels that move with one side of a surface along which tissue glides.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sliding {
@@ -57,117 +61,283 @@ pub struct Sliding {
 /// Looks for jumps that a spline field (mm along the axes, planar coefficients) has smeared; `None` where there are none.
 ///
 /// The field's change is its displacement gradient's greatest singular value, the direction of it the right singular vector. A
-/// survey of every second voxel along each axis tells where it is worth while to look at all of them.
+/// survey of every second voxel along each axis tells where it is worth while to look at all of them. A large volume is gone
+/// through in slabs, so that no more of the field is held than one of them needs; the result does not depend on them.
 pub fn sliding(pair: &Pair<'_>, lattice: &Lattice, coefficients: &[f32]) -> Option<Sliding> {
-    let field = lattice.evaluate(coefficients);
-    let steep = Steepness { pair, field: &field };
-    if !is_steep(&steep) {
+    in_slabs(pair, lattice, coefficients, SLAB)
+}
+
+/// The same, with slabs of about so many voxels.
+fn in_slabs(pair: &Pair<'_>, lattice: &Lattice, coefficients: &[f32], slab: usize) -> Option<Sliding> {
+    let mut fields = Fields { pair, lattice, coefficients, slab, held: None };
+    if !fields.is_steep() {
         return None;
     }
-    let residual = Residual::new(pair, lattice, coefficients);
-    let step = (0..3).map(|a| lattice.step[a] as f64 * pair.spacing[a]).fold(f64::INFINITY, f64::min);
-    let sparse = look(&steep, &residual, step, &SURVEYED, 2, &pair.mask, SOME)?;
+    let gain = GainField::measure(pair, &pair.warp(lattice, coefficients, &pair.spans));
+    let sparse = fields.look(&gain, &SURVEYED, 2, &pair.mask, SOME)?;
     let mut worth = vec![0u8; pair.fixed.len()];
     for (at, _) in &sparse.voxels {
         worth[*at as usize] = 1;
     }
-    look(&steep, &residual, step, &AWAY, 1, &dilate(&worth, pair.shape, 2 + REACH), MOST)
+    drop(sparse);
+    fields.look(&gain, &AWAY, 1, &dilate(&worth, pair.shape, 2 + REACH), MOST)
 }
 
-/// Whether any of every second voxel along each axis is strained.
-fn is_steep(steep: &Steepness<'_>) -> bool {
-    let mask = &steep.pair.mask;
-    (0..mask.len())
-        .into_par_iter()
-        .any(|at| mask[at] != 0 && place(steep.pair, at).iter().all(|v| v % 2 == 0) && steep.is_over(at, STRAIN))
+/// A field that is evaluated in slabs.
+struct Fields<'a> {
+    pair: &'a Pair<'a>,
+    lattice: &'a Lattice,
+    coefficients: &'a [f32],
+    /// Voxels of a slab, about.
+    slab: usize,
+    /// The slab that was evaluated last.
+    held: Option<Planes>,
 }
 
-/// Which voxels `within` move with a side, from every `every`th voxel along each axis.
-fn look(
-    steep: &Steepness<'_>,
-    residual: &Residual<'_>,
-    step: f64,
-    away: &[f64],
-    every: usize,
-    within: &[u8],
-    most: f32,
-) -> Option<Sliding> {
-    let pair = steep.pair;
-    let finest = pyramid::finest(pair.shape, pair.spacing);
-    let every: [usize; 3] = pair.shape.map(|n| every.min(n));
-    let shape: [usize; 3] = std::array::from_fn(|a| pair.shape[a].div_ceil(every[a]));
-    let spacing: [f64; 3] = std::array::from_fn(|a| pair.spacing[a] * every[a] as f64);
-    let full = |i: usize| {
-        let v = [i % shape[0], i / shape[0] % shape[1], i / (shape[0] * shape[1])];
-        v[0] * every[0] + pair.shape[0] * (v[1] * every[1] + pair.shape[1] * v[2] * every[2])
-    };
-    let n = shape.iter().product();
-    let inside = |i: usize| pair.mask[full(i)] != 0 && within[full(i)] != 0;
-    let strained: Vec<u8> =
-        (0..n).into_par_iter().map(|i| u8::from(inside(i) && steep.is_over(full(i), STRAIN))).collect();
-    let count = strained.iter().filter(|&&s| s != 0).count();
-    let near = dilate(&strained, shape, REACH.div_ceil(every[0]));
-    let seen: Vec<(u32, [f32; 3])> = (0..n)
-        .into_par_iter()
-        .filter(|&i| near[i] != 0 && inside(i))
-        .map(|i| (i as u32, steep.direction(full(i))))
-        .collect();
+/// Some planes of a dense field.
+struct Planes {
+    range: Range<usize>,
+    /// Displacement (mm along the axes), planar.
+    field: Vec<f32>,
+}
 
-    // The square of what is left under the field and under each side's motion.
-    let window: [f64; 3] = spacing.map(|s| WINDOW * finest / s);
-    let smooth = |values: &[f32]| {
-        let mut volume = vec![0.0; n];
-        for ((at, _), v) in seen.iter().zip(values) {
-            volume[*at as usize] = *v;
+/// A strained voxel that would move with a side: number, offset (voxels), and the squares of what is left before and after.
+struct Follower {
+    at: u32,
+    offset: [f32; 3],
+    squares: [f32; 2],
+}
+
+impl Fields<'_> {
+    /// Planes of which a slab consists, every `every`th counted.
+    fn thickness(&self, every: usize) -> usize {
+        let [nx, ny, nz] = self.pair.shape;
+        let most = nz.div_ceil(every);
+        if nx * ny * nz <= self.slab { most } else { (self.slab / (nx * ny * every)).clamp(1, most) }
+    }
+
+    /// The field on planes `range` and maybe more.
+    fn steepness(&mut self, range: Range<usize>) -> Steepness<'_> {
+        let covers = |p: &Planes| p.range.start <= range.start && range.end <= p.range.end;
+        let held = self.held.take().filter(covers);
+        let Fields { pair, lattice, coefficients, .. } = *self;
+        let evaluate = || Planes { field: lattice.evaluate_planes(coefficients, range.clone()), range: range.clone() };
+        let planes = self.held.insert(held.unwrap_or_else(evaluate));
+        Steepness { pair, planes }
+    }
+
+    /// Whether any of every second voxel along each axis is strained.
+    fn is_steep(&mut self) -> bool {
+        let pair = self.pair;
+        let [nx, ny, nz] = pair.shape;
+        let thick = self.thickness(1);
+        (0..nz).step_by(thick).any(|k| {
+            let end = (k + thick).min(nz);
+            let steep = self.steepness(k.saturating_sub(1)..(end + 1).min(nz));
+            let even = |at: usize| place(pair, at).iter().all(|v| v % 2 == 0);
+            let voxels = nx * ny * k..nx * ny * end;
+            voxels.into_par_iter().any(|at| pair.mask[at] != 0 && even(at) && steep.is_over(at, STRAIN))
+        })
+    }
+
+    /// Which voxels `within` move with a side, from every `every`th voxel along each axis.
+    fn look(&mut self, gain: &GainField, away: &[f64], every: usize, within: &[u8], most: f32) -> Option<Sliding> {
+        let Fields { pair, lattice, .. } = *self;
+        let step = (0..3).map(|a| lattice.step[a] as f64 * pair.spacing[a]).fold(f64::INFINITY, f64::min);
+        let finest = pyramid::finest(pair.shape, pair.spacing);
+        let sparse = Sparse::new(pair, every);
+        let spacing: [f64; 3] = std::array::from_fn(|a| pair.spacing[a] * sparse.every[a] as f64);
+        let window: [f64; 3] = spacing.map(|s| WINDOW * finest / s);
+        // Around a slab: what the window reaches, then what is strained near that, or as far as a side is looked for.
+        let border = filters::gaussian_kernel(window[2]).len() - 1;
+        let reach = REACH.div_ceil(sparse.every[0]);
+        let furthest = away.iter().copied().fold(0.0, f64::max) * step / pair.spacing[2];
+        let margin = (furthest.ceil() as usize + 2).max(reach * sparse.every[2] + 1);
+
+        let plane = sparse.shape[0] * sparse.shape[1];
+        let n = plane * sparse.shape[2];
+        let mut marks = vec![0u8; n];
+        let mut followers = Vec::new();
+        let thick = self.thickness(sparse.every[2]);
+        for from in (0..sparse.shape[2]).step_by(thick) {
+            let own = from..(from + thick).min(sparse.shape[2]);
+            let around = own.start.saturating_sub(border)..(own.end + border).min(sparse.shape[2]);
+            let near = around.start.saturating_sub(reach)..(around.end + reach).min(sparse.shape[2]);
+            let worth = |i: usize| pair.mask[sparse.full(i)] != 0 && within[sparse.full(i)] != 0;
+            if !(near.start * plane..near.end * plane).into_par_iter().any(worth) {
+                continue;
+            }
+            let planes = (around.start * sparse.every[2]).saturating_sub(margin)
+                ..(around.end * sparse.every[2] + margin).min(pair.shape[2]);
+            let steep = self.steepness(planes);
+            let slab = Slab { sparse: &sparse, steep, gain, window };
+            slab.follow(away, step, [own, around, near], worth, &mut marks, &mut followers);
         }
-        filters::gaussian(&volume, shape, window)
-    };
-    let own: Vec<f32> = seen.par_iter().map(|&(i, _)| residual.own(full(i as usize))).collect();
-    let base = smooth(&own);
-    let mut best: Vec<f32> = base.iter().map(|b| LEFT * b).collect();
-    let mut taken = vec![0.0f32; n];
-    for away in away.iter().flat_map(|a| [-a * step, a * step]) {
-        let mut other = vec![0.0; seen.len()];
-        other.par_chunks_mut(512).zip(seen.par_chunks(512)).zip(own.par_chunks(512)).for_each(
-            |((other, seen), own)| {
-                dispatch(
-                    #[inline(always)]
-                    || {
-                        for ((other, &(i, direction)), own) in other.iter_mut().zip(seen).zip(own) {
-                            let at = full(i as usize);
-                            let there = steep.sample(place(pair, at), offset(pair, direction, away));
-                            let square = residual.square(at, there);
-                            *other = if square.is_finite() { square } else { *own };
-                        }
-                    },
-                );
-            },
-        );
-        let cost = smooth(&other);
-        for (i, _) in &seen {
-            let i = *i as usize;
-            if strained[i] != 0 && cost[i] < best[i] {
-                (best[i], taken[i]) = (cost[i], away as f32);
+        believed(&sparse, &marks, &followers, spacing.map(|s| AROUND * step / s), most)
+    }
+}
+
+/// Marks of [`Slab::follow`].
+const STRAINED: u8 = 1;
+const FOLLOWS: u8 = 2;
+
+/// Every so manieth voxel of a pair.
+struct Sparse {
+    every: [usize; 3],
+    shape: [usize; 3],
+    whole: [usize; 3],
+}
+
+impl Sparse {
+    fn new(pair: &Pair<'_>, every: usize) -> Self {
+        let every: [usize; 3] = pair.shape.map(|n| every.min(n));
+        let shape = std::array::from_fn(|a| pair.shape[a].div_ceil(every[a]));
+        Self { every, shape, whole: pair.shape }
+    }
+
+    /// The number of a voxel among all.
+    #[inline(always)]
+    fn full(&self, i: usize) -> usize {
+        let Self { every, shape, whole } = self;
+        let v = [i % shape[0], i / shape[0] % shape[1], i / (shape[0] * shape[1])];
+        v[0] * every[0] + whole[0] * (v[1] * every[1] + whole[1] * v[2] * every[2])
+    }
+}
+
+/// Some planes of voxels, and the field around them.
+struct Slab<'a> {
+    sparse: &'a Sparse,
+    steep: Steepness<'a>,
+    gain: &'a GainField,
+    /// Standard deviation of the window in which residuals are compared (voxels).
+    window: [f64; 3],
+}
+
+impl Slab<'_> {
+    /// Which strained voxels of the planes `own` would follow a side. Residuals are needed on those `around`, strain on those `near`.
+    fn follow(
+        &self,
+        away: &[f64],
+        step: f64,
+        [own, around, near]: [Range<usize>; 3],
+        worth: impl Fn(usize) -> bool + Sync,
+        marks: &mut [u8],
+        followers: &mut Vec<Follower>,
+    ) {
+        let Self { sparse, steep, window, .. } = self;
+        let pair = steep.pair;
+        let plane = sparse.shape[0] * sparse.shape[1];
+        let shape = |planes: &Range<usize>| [sparse.shape[0], sparse.shape[1], planes.len()];
+        let full = |i: usize| sparse.full(i);
+        let strained: Vec<u8> = (near.start * plane..near.end * plane)
+            .into_par_iter()
+            .map(|i| u8::from(worth(i) && steep.is_over(full(i), STRAIN)))
+            .collect();
+        let close = dilate(&strained, shape(&near), REACH.div_ceil(sparse.every[0]));
+        let first = near.start * plane;
+        let seen: Vec<(u32, [f32; 3])> = (around.start * plane..around.end * plane)
+            .into_par_iter()
+            .filter(|&i| close[i - first] != 0 && worth(i))
+            .map(|i| (i as u32, steep.direction(full(i))))
+            .collect();
+        drop(close);
+
+        // The square of what is left under the field and under each side's motion.
+        let start = around.start * plane;
+        let smooth = |values: &[f32]| -> Vec<f32> {
+            let mut volume = vec![0.0; plane * around.len()];
+            for ((at, _), v) in seen.iter().zip(values) {
+                volume[*at as usize - start] = *v;
+            }
+            let volume = filters::gaussian(&volume, shape(&around), *window);
+            seen.iter().map(|(at, _)| volume[*at as usize - start]).collect()
+        };
+        let gains = self.gains(&seen);
+        let squares = |away: Option<f64>| -> Vec<f32> {
+            let mut out = vec![0.0; seen.len()];
+            out.par_chunks_mut(512).zip(seen.par_chunks(512)).zip(gains.par_chunks(512)).for_each(
+                |((out, seen), gains)| {
+                    dispatch(
+                        #[inline(always)]
+                        || {
+                            for ((out, &(i, direction)), gain) in out.iter_mut().zip(seen).zip(gains) {
+                                let at = full(i as usize);
+                                let offset = away.map_or([0.0; 3], |away| offset(pair, direction, away));
+                                *out = steep.square(at, offset, *gain);
+                            }
+                        },
+                    );
+                },
+            );
+            out
+        };
+        let mut still = squares(None);
+        still.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
+        let base = smooth(&still);
+        let mut best: Vec<f32> = base.iter().map(|b| LEFT * b).collect();
+        let mut taken = vec![0.0f32; seen.len()];
+        for away in away.iter().flat_map(|a| [-a * step, a * step]) {
+            let mut other = squares(Some(away));
+            other.iter_mut().zip(&still).filter(|(v, _)| !v.is_finite()).for_each(|(v, still)| *v = *still);
+            let cost = smooth(&other);
+            for (k, (i, _)) in seen.iter().enumerate() {
+                if strained[*i as usize - first] != 0 && cost[k] < best[k] {
+                    (best[k], taken[k]) = (cost[k], away as f32);
+                }
+            }
+        }
+        for (k, &(i, direction)) in seen.iter().enumerate() {
+            let at = i as usize;
+            if !(own.start * plane..own.end * plane).contains(&at) || strained[at - first] == 0 {
+                continue;
+            }
+            let follows = taken[k] != 0.0;
+            marks[at] = if follows { STRAINED | FOLLOWS } else { STRAINED };
+            // The survey counts all that are strained.
+            if follows || sparse.every[0] > 1 {
+                let offset = offset(pair, direction, f64::from(taken[k]));
+                followers.push(Follower { at: i, offset, squares: [base[k], best[k]] });
             }
         }
     }
 
-    // Believed where most of those around agree.
-    let wide: [f64; 3] = spacing.map(|s| AROUND * step / s);
-    let followed: Vec<f32> = taken.iter().map(|t| if *t != 0.0 { 1.0 } else { 0.0 }).collect();
-    let all: Vec<f32> = strained.iter().map(|&s| f32::from(s)).collect();
-    let [followed, all] = [followed, all].map(|v| filters::gaussian(&v, shape, wide));
+    /// Gain and offset at voxels, which ascend.
+    fn gains(&self, seen: &[(u32, [f32; 3])]) -> Vec<[f32; 2]> {
+        let [nx, ny, _] = self.steep.pair.shape;
+        let mut out = vec![[0.0; 2]; seen.len()];
+        let room = || (usize::MAX, vec![0.0; nx], vec![0.0; nx]);
+        out.par_chunks_mut(512).zip(seen.par_chunks(512)).for_each_init(room, |(held, gain, offset), (out, seen)| {
+            for (out, (i, _)) in out.iter_mut().zip(seen) {
+                let at = self.sparse.full(*i as usize);
+                if at / nx != *held {
+                    *held = at / nx;
+                    self.gain.row(*held % ny, *held / ny, gain, offset);
+                }
+                *out = [gain[at % nx], offset[at % nx]];
+            }
+        });
+        out
+    }
+}
+
+/// Those that most of the strained voxels around agree with; `wide` is the standard deviation of "around" (voxels).
+fn believed(sparse: &Sparse, marks: &[u8], followers: &[Follower], wide: [f64; 3], most: f32) -> Option<Sliding> {
+    let around = |mark: u8| -> Vec<f32> {
+        let marked: Vec<f32> = marks.par_iter().map(|m| f32::from(u8::from(m & mark != 0))).collect();
+        let share = filters::gaussian(&marked, sparse.shape, wide);
+        followers.iter().map(|f| share[f.at as usize]).collect()
+    };
+    let (followed, all) = (around(FOLLOWS), around(STRAINED));
     let (mut before, mut after) = (0.0, 0.0);
     let mut voxels = Vec::new();
-    for &(i, direction) in &seen {
-        let i = i as usize;
-        let keep = if every[0] > 1 { strained[i] != 0 } else { taken[i] != 0.0 };
-        if keep && followed[i] > most * all[i] {
-            voxels.push((full(i) as u32, offset(pair, direction, f64::from(taken[i]))));
-            (before, after) = (before + f64::from(base[i]), after + f64::from(best[i]));
+    for ((f, followed), all) in followers.iter().zip(followed).zip(all) {
+        if followed > most * all {
+            voxels.push((sparse.full(f.at as usize) as u32, f.offset));
+            (before, after) = (before + f64::from(f.squares[0]), after + f64::from(f.squares[1]));
         }
     }
-    (!voxels.is_empty()).then(|| Sliding { voxels, strained: count, left: after / before.max(f64::MIN_POSITIVE) })
+    let strained = marks.iter().filter(|m| **m & STRAINED != 0).count();
+    (!voxels.is_empty()).then(|| Sliding { voxels, strained, left: after / before.max(f64::MIN_POSITIVE) })
 }
 
 /// Voxels of a place of the pair's lattice.
@@ -181,22 +351,21 @@ fn offset(pair: &Pair<'_>, direction: [f32; 3], away: f64) -> [f32; 3] {
     std::array::from_fn(|a| (f64::from(direction[a]) * away / pair.spacing[a]) as f32)
 }
 
-/// A dense field and its gradient.
+/// Some planes of a dense field and its gradient.
 struct Steepness<'a> {
     pair: &'a Pair<'a>,
-    /// Displacement (mm along the axes), planar.
-    field: &'a [f32],
+    planes: &'a Planes,
 }
 
 impl Steepness<'_> {
     /// `gradient[c][a]`: change of component `c` per mm along axis `a`.
     fn gradient(&self, at: usize) -> [[f64; 3]; 3] {
         let Pair { shape, spacing, .. } = self.pair;
-        let n = self.pair.fixed.len();
         let v = place(self.pair, at);
         let stride = [1, shape[0], shape[0] * shape[1]];
+        let at = at - self.planes.range.start * stride[2];
         std::array::from_fn(|c| {
-            let u = &self.field[c * n..(c + 1) * n];
+            let u = self.component(c);
             std::array::from_fn(|a| {
                 let [low, high] = [v[a].min(1), (shape[a] - 1 - v[a]).min(1)];
                 let steps = (low + high).max(1) as f64 * spacing[a];
@@ -223,11 +392,17 @@ impl Steepness<'_> {
         principal(&self.squares(at)).map(|v| v as f32)
     }
 
+    /// One component of the field on the planes that are held.
+    #[inline(always)]
+    fn component(&self, c: usize) -> &[f32] {
+        let n = self.planes.field.len() / 3;
+        &self.planes.field[c * n..(c + 1) * n]
+    }
+
     /// The field at a voxel and an offset (voxels), trilinear, the border's value beyond it.
     #[inline(always)]
     fn sample(&self, voxel: [usize; 3], offset: [f32; 3]) -> [f32; 3] {
         let shape = self.pair.shape;
-        let n = self.pair.fixed.len();
         let mut low = [0; 3];
         let mut t = [0.0; 3];
         let mut next = [0; 3];
@@ -238,57 +413,59 @@ impl Steepness<'_> {
             t[a] = p - low[a] as f32;
             next[a] = if low[a] + 1 < shape[a] { stride[a] } else { 0 };
         }
-        let base = low[0] + stride[1] * low[1] + stride[2] * low[2];
+        let base = low[0] + stride[1] * low[1] + stride[2] * (low[2] - self.planes.range.start);
         std::array::from_fn(|c| {
-            let u = &self.field[c * n..(c + 1) * n];
+            let u = self.component(c);
             let line = |o: usize| u[base + o] + t[0] * (u[base + o + next[0]] - u[base + o]);
             let face = |o: usize| line(o) + t[1] * (line(o + next[1]) - line(o));
             face(0) + t[2] * (face(next[2]) - face(0))
         })
     }
+
+    /// The square of what is left between the volumes at a voxel that moves as the field does at an offset (voxels) from it; NaN
+    /// where the deformed volume was not seen.
+    #[inline(always)]
+    fn square(&self, at: usize, offset: [f32; 3], [gain, base]: [f32; 2]) -> f32 {
+        let pair = self.pair;
+        let voxel = place(pair, at);
+        let moved = self.sample(voxel, offset);
+        let target = std::array::from_fn(|a| voxel[a] as f64 + f64::from(moved[a]) / pair.spacing[a]);
+        let seen = pair.sampler().at(pair.to_moving(target));
+        (pair.fixed_smooth[at] - (gain * seen + base)).powi(2)
+    }
 }
 
-/// What is left between the initial volume and the deformed one.
-struct Residual<'a> {
-    pair: &'a Pair<'a>,
-    warped: Vec<f32>,
-    /// Gain and offset of each voxel under the field.
-    gain: Vec<[f32; 2]>,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::matching::levels::Aligned;
+    use crate::types::{Affine, Grid, Mask, Volume};
 
-impl<'a> Residual<'a> {
-    fn new(pair: &'a Pair<'a>, lattice: &Lattice, coefficients: &[f32]) -> Self {
-        let warped = pair.warp(lattice, coefficients, &pair.spans);
-        let field = GainField::measure(pair, &warped);
-        let [nx, ny, _] = pair.shape;
-        let mut gain = vec![[0.0; 2]; warped.len()];
-        gain.par_chunks_mut(nx).enumerate().for_each(|(row, gain)| {
-            let (mut a, mut b) = (vec![0.0; nx], vec![0.0; nx]);
-            field.row(row % ny, row / ny, &mut a, &mut b);
-            for ((gain, a), b) in gain.iter_mut().zip(a).zip(b) {
-                *gain = [a, b];
-            }
-        });
-        Self { pair, warped, gain }
-    }
-
-    /// Its square under the field itself, 0 where the deformed volume was not seen.
-    fn own(&self, at: usize) -> f32 {
-        let square = self.of(at, self.warped[at]);
-        if square.is_finite() { square } else { 0.0 }
-    }
-
-    /// Its square under a displacement (mm along the axes), NaN where the deformed volume was not seen.
-    #[inline(always)]
-    fn square(&self, at: usize, displacement: [f32; 3]) -> f32 {
-        let voxel = place(self.pair, at);
-        let target = std::array::from_fn(|a| voxel[a] as f64 + f64::from(displacement[a]) / self.pair.spacing[a]);
-        self.of(at, self.pair.sampler().at(self.pair.to_moving(target)))
-    }
-
-    #[inline(always)]
-    fn of(&self, at: usize, seen: f32) -> f32 {
-        let [gain, offset] = self.gain[at];
-        (self.pair.fixed_smooth[at] - (gain * seen + offset)).powi(2)
+    #[test]
+    fn slabs_leave_the_result_as_it_is() {
+        let shape = [36, 40, 44];
+        let grid = Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+        let noise = |i: usize| (i as u32).wrapping_mul(2_654_435_761).rotate_left(13).wrapping_mul(2_246_822_519) >> 8;
+        let raw: Vec<f32> = (0..grid.len()).map(|i| noise(i) as f32 / 1e5).collect();
+        let texture = filters::gaussian(&raw, shape, [1.2; 3]);
+        let above = |k: usize| k > 21;
+        let moved: Vec<f32> = (0..grid.len())
+            .map(|at| {
+                let [i, j, k] = grid.voxel(at);
+                let i = if above(k) { (i + shape[0] - 3) % shape[0] } else { (i + 3) % shape[0] };
+                texture[grid.index(i, j, k)]
+            })
+            .collect();
+        let [initial, deformed] = [texture, moved].map(|v| Volume::from_vec(grid, v).unwrap());
+        let mask = Mask::filled(grid, 1);
+        let aligned = Aligned::new(&initial, &deformed, &mask, 5.0).unwrap();
+        let pair = aligned.level([1; 3]);
+        let lattice = Lattice::new(shape, [4; 3]);
+        let smeared = lattice.fit(|p| [3.0 * ((p[2] - 21.5) / 4.0).tanh(), 0.0, 0.0]);
+        let whole = in_slabs(&pair, &lattice, &smeared, usize::MAX).expect("halves glide");
+        assert!(whole.voxels.len() > 2000 && whole.left < 0.5, "{} {}", whole.voxels.len(), whole.left);
+        for slab in [1, 3 * 36 * 40, 10 * 36 * 40] {
+            assert_eq!(in_slabs(&pair, &lattice, &smeared, slab).as_ref(), Some(&whole), "{slab}");
+        }
     }
 }

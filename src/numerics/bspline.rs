@@ -154,11 +154,16 @@ impl Lattice {
 
     /// Evaluates the field at every voxel: three planar components.
     pub fn evaluate(&self, coefficients: &[f32]) -> Vec<f32> {
+        self.evaluate_planes(coefficients, 0..self.shape[2])
+    }
+
+    /// The same for some planes: three planar components of so many.
+    pub fn evaluate_planes(&self, coefficients: &[f32], planes: Range<usize>) -> Vec<f32> {
         let [nx, ny, _] = self.shape;
-        let total: usize = self.shape.iter().product();
+        let total = nx * ny * planes.len();
         let mut out = vec![0.0f32; 3 * total];
-        for (c, volume) in out.chunks_exact_mut(total).enumerate() {
-            volume.par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
+        for (c, volume) in out.chunks_exact_mut(total.max(1)).enumerate() {
+            volume.par_chunks_mut(nx * ny).zip(planes.clone()).for_each(|(plane, k)| {
                 let slice = self.slice(coefficients, k);
                 let mut nodes = vec![0.0; self.nodes[0]];
                 dispatch(
