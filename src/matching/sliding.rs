@@ -444,7 +444,7 @@ mod tests {
     #[test]
     fn slabs_leave_the_result_as_it_is() {
         let shape = [36, 40, 44];
-        let grid = Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+        let grid = Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).expect("a scale")).expect("a grid");
         let noise = |i: usize| (i as u32).wrapping_mul(2_654_435_761).rotate_left(13).wrapping_mul(2_246_822_519) >> 8;
         let raw: Vec<f32> = (0..grid.len()).map(|i| noise(i) as f32 / 1e5).collect();
         let texture = filters::gaussian(&raw, shape, [1.2; 3]);
@@ -456,9 +456,9 @@ mod tests {
                 texture[grid.index(i, j, k)]
             })
             .collect();
-        let [initial, deformed] = [texture, moved].map(|v| Volume::from_vec(grid, v).unwrap());
+        let [initial, deformed] = [texture, moved].map(|v| Volume::from_vec(grid, v).expect("of that size"));
         let mask = Mask::filled(grid, 1);
-        let aligned = Aligned::new(&initial, &deformed, &mask, 5.0).unwrap();
+        let aligned = Aligned::new(&initial, &deformed, &mask, 5.0).expect("one place");
         let pair = aligned.level([1; 3]);
         let lattice = Lattice::new(shape, [4; 3]);
         let smeared = lattice.fit(|p| [3.0 * ((p[2] - 21.5) / 4.0).tanh(), 0.0, 0.0]);
