@@ -299,6 +299,15 @@ fn bad_numbers_are_usage_errors_that_say_the_range() {
 }
 
 #[test]
+fn a_number_of_regions_beside_labels_is_said_to_change_nothing() {
+    let folder = folder();
+    let (_, err) = run(folder.path(), &[&BASE[..], &["--regions", "3", "--dry-run"]].concat(), 0);
+    assert!(err.contains("--regions changes nothing with --labels"), "{err}");
+    let (_, err) = run(folder.path(), &[&BASE[..], &["--dry-run"]].concat(), 0);
+    assert!(!err.contains("--regions"), "{err}");
+}
+
+#[test]
 fn labels_on_another_grid_are_refused() {
     let folder = folder();
     let other = Mask::filled(grid([16, 16, 15]), 1);

@@ -74,9 +74,9 @@ pub struct Options {
     /// Nodes of the mesh, about; 500 to 500,000
     #[arg(long, value_name = "N", default_value_t = StiffnessParams::default().nodes)]
     nodes: usize,
-    /// Regions to try at most without labels, 1 to 8
-    #[arg(long, value_name = "N", default_value_t = StiffnessParams::default().regions)]
-    regions: usize,
+    /// Regions to try at most without labels, 1 to 8 [default: 4]
+    #[arg(long, value_name = "N")]
+    regions: Option<usize>,
     /// Volume to show behind the maps in report.html; may be given several times [default: warped.nii.gz of the same results of
     /// palpate field, if any: the deformed volume drawn back to where the initial one lies]
     #[arg(long = "image", value_name = "FILE")]
@@ -96,8 +96,12 @@ pub struct Options {
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { poisson, model, force, nodes, regions, .. } = *options;
-    let params = StiffnessParams { poisson, model, force_n: force, nodes, regions };
+    let tried = regions.unwrap_or(StiffnessParams::default().regions);
+    let params = StiffnessParams { poisson, model, force_n: force, nodes, regions: tried };
     params.check()?;
+    if regions.is_some() && options.labels.is_some() {
+        warn_all(console, &["--regions changes nothing with --labels, which say what the regions are".into()]);
+    }
     mesh_fits(params.nodes)?;
     if options.sequence.is_some() && options.labels.is_none() {
         bail!(Usage(

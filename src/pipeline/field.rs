@@ -590,16 +590,20 @@ fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
 /// that deviation allows for long tails (1.35 in the median of the same 27 pairs).
 const LENGTH: f64 = 1.35;
 
-/// Says so where a free field is expected to be off by more than half of the motion or a voxel: beyond that it is of
+/// Part of that limit from which it is said: the expected error is right to a tenth at best. Of 978 stressed runs two that were of
+/// no use lay at 0.97 and 0.99 of it; of 984 with other seeds none under 1.
+const NEARLY: f64 = 0.95;
+
+/// Says so where a free field is expected to be off by about half of the motion or a voxel, or more: beyond that it is of
 /// little use (docs/failures.md shows how often this is right). The field's own length holds its errors, as squares.
 fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
     let edge = pyramid::finest(grid.shape(), grid.spacing());
     let expected = LENGTH * sigma;
     let motion = (length * length - expected * expected).max(0.0).sqrt();
-    (model == MotionModel::Free && expected > (0.5 * motion).min(edge)).then(|| {
+    (model == MotionModel::Free && expected > NEARLY * (0.5 * motion).min(edge)).then(|| {
         format!(
-            "the mean error to expect, {expected:.2} mm, is more than half of the mean motion ({motion:.2} mm) or a voxel \
-             ({edge:.2} mm): there is too little texture or too much noise for it; use only places of small uncertainty"
+            "the mean error to expect, {expected:.2} mm, is about half of the mean motion ({motion:.2} mm) or a voxel \
+             ({edge:.2} mm), or more: there is too little texture or too much noise for it; use only places of small uncertainty"
         )
     })
 }
