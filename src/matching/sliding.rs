@@ -173,6 +173,9 @@ impl Fields<'_> {
             let slab = Slab { sparse: &sparse, steep, gain, window };
             slab.follow(away, step, [own, around, near], worth, &mut marks, &mut followers);
         }
+        if thick < sparse.shape[2] {
+            self.held = None;
+        }
         believed(&sparse, &marks, &followers, spacing.map(|s| AROUND * step / s), most)
     }
 }
@@ -195,11 +198,17 @@ impl Sparse {
         Self { every, shape, whole: pair.shape }
     }
 
+    #[inline(always)]
+    fn place(&self, i: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.shape;
+        [i % nx, i / nx % ny, i / (nx * ny)]
+    }
+
     /// The number of a voxel among all.
     #[inline(always)]
     fn full(&self, i: usize) -> usize {
-        let Self { every, shape, whole } = self;
-        let v = [i % shape[0], i / shape[0] % shape[1], i / (shape[0] * shape[1])];
+        let Self { every, whole, .. } = self;
+        let v = self.place(i);
         v[0] * every[0] + whole[0] * (v[1] * every[1] + whole[1] * v[2] * every[2])
     }
 }
@@ -320,12 +329,19 @@ impl Slab<'_> {
     }
 }
 
-/// Those that most of the strained voxels around agree with; `wide` is the standard deviation of "around" (voxels).
+/// Those that most of the strained voxels around agree with; `wide` is the standard deviation of "around" (voxels), for which
+/// blocks of two voxels are fine enough.
 fn believed(sparse: &Sparse, marks: &[u8], followers: &[Follower], wide: [f64; 3], most: f32) -> Option<Sliding> {
+    let side = sparse.shape.map(|n| n.min(2));
+    let shape = pyramid::reduced_shape(sparse.shape, side);
+    let wide = std::array::from_fn(|a| wide[a] / side[a] as f64);
     let around = |mark: u8| -> Vec<f32> {
-        let marked: Vec<f32> = marks.par_iter().map(|m| f32::from(u8::from(m & mark != 0))).collect();
-        let share = filters::gaussian(&marked, sparse.shape, wide);
-        followers.iter().map(|f| share[f.at as usize]).collect()
+        let share = filters::gaussian(&pyramid::share(marks, sparse.shape, side, |m| m & mark != 0), shape, wide);
+        let block = |f: &Follower| {
+            let v = sparse.place(f.at as usize);
+            v[0] / side[0] + shape[0] * (v[1] / side[1] + shape[1] * (v[2] / side[2]))
+        };
+        followers.iter().map(|f| share[block(f)]).collect()
     };
     let (followed, all) = (around(FOLLOWS), around(STRAINED));
     let (mut before, mut after) = (0.0, 0.0);

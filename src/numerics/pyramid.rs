@@ -29,6 +29,11 @@ pub fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Vec<u8
     blocks(mask, shape, factor, |m| f32::from(u8::from(m != 0)), |share| u8::from(share >= 0.5))
 }
 
+/// The part of each block's voxels that are `marked`.
+pub fn share(marks: &[u8], shape: [usize; 3], factor: [usize; 3], marked: impl Fn(u8) -> bool + Sync) -> Vec<f32> {
+    blocks(marks, shape, factor, |m| f32::from(u8::from(marked(m))), |mean| mean)
+}
+
 /// `result` of the mean `value` of each block of voxels.
 fn blocks<T: Copy + Sync, U: Clone + Default + Send>(
     data: &[T],

@@ -328,7 +328,8 @@ fn canonical(
     progress("done", 1.0);
     let voxel = pyramid::finest(grid.shape(), grid.spacing());
     let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
-    let spline = Start { field, factor, searched };
+    // What the data say at each node is as large again twice over, and no search starts from it.
+    let spline = Start { field: SplineField { blocks: Vec::new(), ..field }, factor, searched };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 

@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
 const CHUNK: usize = 1 << 18;
-/// Chunks that are held packed at a time.
-const BATCH: usize = 32;
+/// Chunks that are held packed at a time, for each thread.
+const BATCH: usize = 6;
 /// Bits of a float32's mantissa that a volume keeps (of 23).
 const MANTISSA_BITS: u32 = 15;
 /// Displacements are multiples of 1 / this (mm): 2^-12 mm.
@@ -246,7 +246,7 @@ fn write<T: Copy + Sync, const N: usize>(
             })
         };
         let mut ready = Vec::new();
-        for batch in chunks.chunks(BATCH) {
+        for batch in chunks.chunks(BATCH * rayon::current_num_threads()) {
             let (written, packed) = rayon::join(
                 || add(&ready),
                 || batch.par_iter().map(|chunk| (chunk.0, Chunk::new(&bytes(chunk)))).collect(),
