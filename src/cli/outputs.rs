@@ -77,7 +77,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     let Measured { command, names, initial, deformed, mask, params, truth } = measured;
     // One volume at a time: each is made where it is written, so that few are held.
     let started = Instant::now();
-    write_volumes(folder, result)?;
+    let kept = write_volumes(folder, result)?;
     let mut writing = started.elapsed();
     let started = Instant::now();
     let deformed_grid = *deformed.grid();
@@ -95,8 +95,16 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
             sampler.at(deformed_grid.affine().to_voxel(initial.grid().world(i, j, k)))
         })
     };
-    let swelling = |offset| determinant_at(&result.displacement, offset);
-    let vague = |offset| result.uncertainty.at(offset);
+    let [swelling, vague]: [Box<dyn Fn(usize) -> f32 + Sync>; 2] = match &kept {
+        Some([jacobian, uncertainty]) => [jacobian, uncertainty].map(|v| -> Box<dyn Fn(usize) -> f32 + Sync> {
+            let values = v.as_slice();
+            Box::new(move |offset| values[offset])
+        }),
+        None => {
+            let (field, uncertainty) = (&result.displacement, &result.uncertainty);
+            [Box::new(|offset| determinant_at(field, offset)), Box::new(|offset| uncertainty.at(offset))]
+        }
+    };
     let mut report = FieldReport {
         command,
         names,
@@ -107,8 +115,8 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         mask,
         params,
         displacement: &result.displacement,
-        jacobian: &swelling,
-        uncertainty: &vague,
+        jacobian: &*swelling,
+        uncertainty: &*vague,
         matches: &result.matches,
         mesh: &result.mesh,
         node_displacement: &result.node_displacement,
@@ -132,18 +140,23 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     Ok(text)
 }
 
-fn write_volumes(folder: &mut OutputFolder, result: &FieldResult) -> Result<()> {
+/// Voxels of a grid up to which what was made for a file is kept for the report; beyond, the report works it out where it shows it.
+const KEPT: usize = 2_000_000;
+
+/// Writes what does not depend on the volumes; Jacobian and uncertainty are given back where they are small.
+fn write_volumes(folder: &mut OutputFolder, result: &FieldResult) -> Result<Option<[Volume; 2]>> {
     folder.write("displacement.nii.gz", |p| io::write_field(p, &result.displacement))?;
-    folder.write("jacobian.nii.gz", |p| {
-        io::write_steps(p, &jacobian_determinant(&result.displacement), "palpate: Jacobian determinant", 13)
-    })?;
-    folder.write("uncertainty.nii.gz", |p| {
-        io::write_steps(p, &result.uncertainty.volume(), "palpate: 1 sigma of u, mm", 12)
-    })?;
+    let small = result.displacement.grid().len() <= KEPT;
+    let jacobian = jacobian_determinant(&result.displacement);
+    folder.write("jacobian.nii.gz", |p| io::write_steps(p, &jacobian, "palpate: Jacobian determinant", 13))?;
+    let jacobian = small.then_some(jacobian);
+    let uncertainty = result.uncertainty.volume();
+    folder.write("uncertainty.nii.gz", |p| io::write_steps(p, &uncertainty, "palpate: 1 sigma of u, mm", 12))?;
+    let kept = jacobian.map(|jacobian| [jacobian, uncertainty]);
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
     folder.write("mesh.vtu", |p| match &result.mesh {
         Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
         Mesh::Triangles(mesh) => io::write_tri_mesh(p, mesh, &result.node_displacement, &[]),
     })?;
-    Ok(())
+    Ok(kept)
 }
