@@ -87,57 +87,29 @@ type Sums = [f64; 6];
 impl GainField {
     /// From the initial volume (smoothed) and the warped one, inside the mask; smooth enough to judge by how well the two agree.
     pub fn measure(pair: &Pair<'_>, warped: &[f32]) -> Self {
-        Self::after(pair, warped, 0)
+        Self::of(pair, &block_sums(pair, warped), 0)
     }
 
     /// As [`GainField::measure`], with what its smoothing flattened put back: little of a bias is then taken for motion, but it
     /// takes up more of another contrast as well.
     pub fn sharpened(pair: &Pair<'_>, warped: &[f32]) -> Self {
-        Self::after(pair, warped, AGAIN)
+        Self::of(pair, &block_sums(pair, warped), AGAIN)
     }
 
-    /// With what is left put back so many times.
-    fn after(pair: &Pair<'_>, warped: &[f32], again: usize) -> Self {
-        let [nx, ny, _] = pair.shape;
-        let blocks = pair.shape.map(|n| n.div_ceil(BLOCK));
-        let (bx, by) = (blocks[0], blocks[1]);
-        let centre = pair.centres;
-        let mut sums = vec![[0.0f64; 6]; blocks.iter().product()];
-        sums.par_chunks_mut(bx).enumerate().for_each(|(row, sums)| {
-            // One partial sum for each column of a block.
-            let mut lanes = vec![[[0.0f32; BLOCK]; 6]; bx];
-            let (from, to) = ([row % by, row / by].map(|b| b * BLOCK), [ny, pair.shape[2]]);
-            for k in from[1]..(from[1] + BLOCK).min(to[1]) {
-                for j in from[0]..(from[0] + BLOCK).min(to[0]) {
-                    let span = pair.spans.row(j, k);
-                    if span.is_empty() {
-                        continue;
-                    }
-                    let at = nx * (j + ny * k);
-                    dispatch(
-                        #[inline(always)]
-                        || {
-                            for b in span.start / BLOCK..span.end.div_ceil(BLOCK) {
-                                let part = at + b * BLOCK..at + ((b + 1) * BLOCK).min(nx);
-                                let (mut f, mut w, mut m) = ([0.0f32; BLOCK], [f32::NAN; BLOCK], [0u8; BLOCK]);
-                                f[..part.len()].copy_from_slice(&pair.fixed_smooth[part.clone()]);
-                                w[..part.len()].copy_from_slice(&warped[part.clone()]);
-                                m[..part.len()].copy_from_slice(&pair.mask[part]);
-                                add_columns(&mut lanes[b], &f, &w, &m, centre);
-                            }
-                        },
-                    );
-                }
-            }
-            for (s, lanes) in sums.iter_mut().zip(&lanes) {
-                *s = lanes.map(|l| l.iter().map(|v| f64::from(*v)).sum());
-            }
-        });
+    /// [`GainField::measure`] and [`GainField::sharpened`] from one look at the volumes.
+    pub fn both(pair: &Pair<'_>, warped: &[f32]) -> [Self; 2] {
+        let sums = block_sums(pair, warped);
+        [0, AGAIN].map(|again| Self::of(pair, &sums, again))
+    }
+
+    /// From the sums of the blocks, with what is left put back so many times.
+    fn of(pair: &Pair<'_>, sums: &[Sums], again: usize) -> Self {
+        let blocks = blocks(pair);
+        let centre = pair.centres.map(f64::from);
         let total = sums.iter().fold([0.0; 6], add);
-        let centre = centre.map(f64::from);
         let noise = f64::from(pair.noise);
         let global = gain(&total, noise, centre, [1.0, 0.0]);
-        let mut values: Vec<[f64; 2]> = smooth(&sums, blocks).iter().map(|s| gain(s, noise, centre, global)).collect();
+        let mut values: Vec<[f64; 2]> = smooth(sums, blocks).iter().map(|s| gain(s, noise, centre, global)).collect();
         for _ in 0..again {
             let left: Vec<Sums> = sums.iter().zip(&values).map(|(s, v)| corrected(s, *v, centre)).collect();
             for (v, s) in values.iter_mut().zip(smooth(&left, blocks)) {
@@ -207,6 +179,51 @@ impl GainField {
             (lo, from) = (hi, to);
         }
     }
+}
+
+/// Blocks along each axis.
+fn blocks(pair: &Pair<'_>) -> [usize; 3] {
+    pair.shape.map(|n| n.div_ceil(BLOCK))
+}
+
+/// The sums of all blocks.
+fn block_sums(pair: &Pair<'_>, warped: &[f32]) -> Vec<Sums> {
+    let [nx, ny, _] = pair.shape;
+    let blocks = blocks(pair);
+    let (bx, by) = (blocks[0], blocks[1]);
+    let centre = pair.centres;
+    let mut sums = vec![[0.0f64; 6]; blocks.iter().product()];
+    sums.par_chunks_mut(bx).enumerate().for_each(|(row, sums)| {
+        // One partial sum for each column of a block.
+        let mut lanes = vec![[[0.0f32; BLOCK]; 6]; bx];
+        let (from, to) = ([row % by, row / by].map(|b| b * BLOCK), [ny, pair.shape[2]]);
+        for k in from[1]..(from[1] + BLOCK).min(to[1]) {
+            for j in from[0]..(from[0] + BLOCK).min(to[0]) {
+                let span = pair.spans.row(j, k);
+                if span.is_empty() {
+                    continue;
+                }
+                let at = nx * (j + ny * k);
+                dispatch(
+                    #[inline(always)]
+                    || {
+                        for b in span.start / BLOCK..span.end.div_ceil(BLOCK) {
+                            let part = at + b * BLOCK..at + ((b + 1) * BLOCK).min(nx);
+                            let (mut f, mut w, mut m) = ([0.0f32; BLOCK], [f32::NAN; BLOCK], [0u8; BLOCK]);
+                            f[..part.len()].copy_from_slice(&pair.fixed_smooth[part.clone()]);
+                            w[..part.len()].copy_from_slice(&warped[part.clone()]);
+                            m[..part.len()].copy_from_slice(&pair.mask[part]);
+                            add_columns(&mut lanes[b], &f, &w, &m, centre);
+                        }
+                    },
+                );
+            }
+        }
+        for (s, lanes) in sums.iter_mut().zip(&lanes) {
+            *s = lanes.map(|l| l.iter().map(|v| f64::from(*v)).sum());
+        }
+    });
+    sums
 }
 
 /// Adds one row of a block: a voxel counts by its weight where the warp saw it.

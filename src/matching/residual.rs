@@ -116,15 +116,32 @@ pub fn normal_equations(
     NormalEquations { blocks, rhs: sums[6 * n..9 * n].to_vec(), sigma }
 }
 
+/// A warp that others are judged against.
+#[derive(Debug)]
+pub struct Baseline {
+    warped: Vec<f32>,
+    gain: GainField,
+    /// Robust spread of what is left (intensity).
+    sigma: f32,
+}
+
+impl Baseline {
+    /// Takes the deformed volume as it was warped.
+    pub fn new(pair: &Pair<'_>, warped: Vec<f32>) -> Self {
+        let gain = GainField::measure(pair, &warped);
+        let sigma = residual_sigma(pair, &warped, &gain).max(f32::MIN_POSITIVE);
+        Self { warped, gain, sigma }
+    }
+}
+
 /// How much worse, in units of noise, the volumes agree under one warp than under another.
 ///
 /// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see, with Cauchy's cost
 /// `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread under the better warp `b`.
-pub fn excess(pair: &Pair<'_>, a: &[f32], b: &[f32]) -> f64 {
+pub fn excess(pair: &Pair<'_>, a: &[f32], b: &Baseline) -> f64 {
     let nx = pair.shape[0];
-    let gains = [GainField::measure(pair, a), GainField::measure(pair, b)];
-    let sigma = residual_sigma(pair, b, &gains[1]).max(f32::MIN_POSITIVE);
-    let cut = 1.0 / (CAUCHY * sigma);
+    let own = GainField::measure(pair, a);
+    let cut = 1.0 / (CAUCHY * b.sigma);
     let rows: Vec<f64> = (0..pair.shape[1] * pair.shape[2])
         .into_par_iter()
         .map(|row| {
@@ -135,7 +152,7 @@ pub fn excess(pair: &Pair<'_>, a: &[f32], b: &[f32]) -> f64 {
             let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);
             let from = row * nx;
             let mut costs = [vec![0.0f32; nx], vec![0.0f32; nx]];
-            for ((warped, field), cost) in [a, b].iter().zip(&gains).zip(&mut costs) {
+            for ((warped, field), cost) in [(a, &own), (&b.warped[..], &b.gain)].into_iter().zip(&mut costs) {
                 field.row(j, k, &mut gain, &mut offset);
                 let (f, w) = (&pair.fixed_smooth[from..from + nx], &warped[from..from + nx]);
                 for i in 0..nx {

@@ -12,7 +12,7 @@ use crate::matching::gain::GainField;
 use crate::matching::levels::from_level;
 use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::Pair;
-use crate::matching::residual::{self, normal_equations};
+use crate::matching::residual::{self, Baseline, normal_equations};
 use crate::numerics::bending::Smoothness;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
@@ -159,7 +159,7 @@ pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
 pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
     let every = if pair.shape.iter().all(|&n| n >= 48) { 4 } else { 1 };
     let active = pair.spans.slices(|k| k % every == every / 2);
-    let free = pair.warp(&field.lattice, &field.coefficients, &active);
+    let free = Baseline::new(pair, pair.warp(&field.lattice, &field.coefficients, &active));
     move |motion| {
         let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
         let warped = pair.warp(&field.lattice, &map, &active);
@@ -170,7 +170,7 @@ pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&Affine
 /// By how much the misfit shrinks from one field to another, with the information that correlated noise leaves.
 pub fn gained(pair: &Pair<'_>, from: &SplineField, to: &SplineField) -> f64 {
     let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
-    residual::excess(pair, &warp(from), &warp(to)) * f64::from(independent(pair))
+    residual::excess(pair, &warp(from), &Baseline::new(pair, warp(to))) * f64::from(independent(pair))
 }
 
 /// Bending energy of a field (mm^2 per mm, all axes).
@@ -183,8 +183,8 @@ pub fn bending(pair: &Pair<'_>, field: &SplineField) -> f64 {
 /// gain varies ([`GainField::variation`]).
 pub fn misfit(pair: &Pair<'_>, field: &SplineField) -> [f32; 2] {
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
-    let gain = GainField::measure(pair, &warped);
-    [residual::residual_sigma(pair, &warped, &gain), GainField::sharpened(pair, &warped).variation(pair)]
+    let [gain, sharpened] = GainField::both(pair, &warped);
+    [residual::residual_sigma(pair, &warped, &gain), sharpened.variation(pair)]
 }
 
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
