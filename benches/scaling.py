@@ -81,7 +81,7 @@ def chart(rows, path):
     left.set(xscale="log", yscale="log", xlabel="voxels of the volume", ylabel="CPU time (s), files included", title="Cost over voxels")
     some = [(r["found"], r["cpu_s"]) for r in rows if r["asked"]]
     right.plot(*zip(*sorted(some)), "o-", color="#c0392b")
-    right.set(xscale="log", xlabel="points found in the initial volume", ylabel="CPU time (s)", title="Cost over points (the largest volume)", ylim=(0, None))
+    right.set(xscale="log", xlabel="points found in the initial volume", ylabel="CPU time (s)", title="Cost over points (the largest volume)", ylim=(0, 1.08 * max(v for _, v in some)))
     left.legend(frameon=False)
     for axis in (left, right):
         axis.grid(which="both", color="0.92", lw=0.6)
