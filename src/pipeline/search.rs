@@ -1,9 +1,9 @@
 //! Regions without labels: a map of the modulus, cut into as many regions as the data support.
 
 use crate::error::StiffnessError;
-use crate::mesh::tetrahedral::{Fineness, mesh_labels};
+use crate::mesh::tetrahedral::mesh_labels;
 use crate::numerics::statistics::noise_sigma;
-use crate::pipeline::stiffness::{COARSE, Inputs, Progress};
+use crate::pipeline::stiffness::{Inputs, Progress, coarse_fineness};
 use crate::stiffness::choice::choose;
 use crate::stiffness::geometry;
 use crate::stiffness::identify::Estimate;
@@ -61,7 +61,7 @@ pub(super) fn regions(
 ) -> Result<Found, StiffnessError> {
     let started = Instant::now();
     progress("one region", 0.0);
-    let fineness = Fineness::for_nodes(maps::volume(inputs.labels), (COARSE * params.nodes as f64) as usize);
+    let fineness = coarse_fineness(inputs.labels, params);
     let level = |labels: &Mask| {
         let mesh = mesh_labels(labels, &fineness)?;
         Level::new(&mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, None)

@@ -52,7 +52,7 @@ pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
 }
 
 /// Nodes of the coarse mesh over those of the fine one.
-pub(super) const COARSE: f64 = 0.3;
+const COARSE: f64 = 0.3;
 /// Side of the mesh's cubes at the rim of a punch (voxels); nodes lie at half of it.
 const RIM: f64 = 2.0;
 /// Parts of the nodes that are tried for the rest of the body then.
@@ -87,6 +87,11 @@ pub fn run(
     Ok(result)
 }
 
+/// How fine the mesh is on which all is chosen.
+pub(super) fn coarse_fineness(labels: &Mask, params: &StiffnessParams) -> Fineness {
+    Fineness::for_nodes(maps::volume(labels), (COARSE * params.nodes as f64) as usize)
+}
+
 /// What [`run`] would refuse before it looks for moduli: told from a coarse mesh.
 ///
 /// # Errors
@@ -94,8 +99,7 @@ pub fn run(
 pub fn check(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<(), StiffnessError> {
     params.check()?;
     whole(inputs.labels)?;
-    let nodes = (COARSE * params.nodes as f64) as usize;
-    let mesh = Mesher::new(inputs.labels)?.mesh(&Fineness::for_nodes(maps::volume(inputs.labels), nodes))?;
+    let mesh = Mesher::new(inputs.labels)?.mesh(&coarse_fineness(inputs.labels, params))?;
     Level::new(&mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, None).map(|_| ())
 }
 
@@ -109,9 +113,8 @@ fn labelled(
     let mut clock = Clock { seconds: Vec::new(), since: Instant::now() };
     progress("mesh", 0.0);
     let volume = maps::volume(inputs.labels);
-    let coarse_nodes = (COARSE * params.nodes as f64) as usize;
     let mesher = Mesher::new(inputs.labels)?;
-    let coarse_mesh = mesher.mesh(&Fineness::for_nodes(volume, coarse_nodes))?;
+    let coarse_mesh = mesher.mesh(&coarse_fineness(inputs.labels, params))?;
     clock.book("mesh");
 
     progress("observe", 0.05);
@@ -158,7 +161,7 @@ fn labelled(
     };
     let fine_mesh = meshed(params.nodes as f64, RIM)?;
     if !rim.places.is_empty() {
-        let mesh = meshed(coarse_nodes as f64, 2.0 * RIM)?;
+        let mesh = meshed(COARSE * params.nodes as f64, 2.0 * RIM)?;
         coarse = level(&mesh, outline)?;
     }
     let mut fine = level(&fine_mesh, outline)?;
