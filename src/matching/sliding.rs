@@ -184,7 +184,7 @@ impl Fields<'_> {
 const STRAINED: u8 = 1;
 const FOLLOWS: u8 = 2;
 
-/// Every so manieth voxel of a pair.
+/// Voxels of a pair, some apart along each axis.
 struct Sparse {
     every: [usize; 3],
     shape: [usize; 3],
