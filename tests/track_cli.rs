@@ -167,6 +167,28 @@ fn what_cannot_be_tracked_is_refused() {
 }
 
 #[test]
+fn a_blank_file_among_others_is_lost_and_they_go_on() {
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let [blank, nothing, out] = ["blank.nii", "nothing.nii", "out"].map(path);
+    fs::write(&blank, Nifti::filled([28, 34, 26], 7.0).bytes()).unwrap();
+    fs::write(&nothing, Nifti::filled([28, 34, 26], f32::NAN).bytes()).unwrap();
+    let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
+    let (said, err) = run(&["track", a, &blank, b, &nothing, "-o", &out], 0);
+    assert!(said.contains("1 of 3 frames measured against frame 0; 2 lost"), "{said}");
+    assert!(err.contains("frame 1: the deformed volume is constant") && err.contains("frame 3"), "{err}");
+    let names = |dir: &str| fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name()).collect::<Vec<_>>();
+    assert!(
+        names(&out).contains(&"displacement_002.nii.gz".into()) && !names(&out).contains(&"strain_001.nii.gz".into())
+    );
+    // Alone it is what cannot be measured, and is named; so is a reference.
+    for arguments in [vec!["track", a, &blank], vec!["track", &blank, a, b]] {
+        let (_, err) = run(&[&arguments[..], &["-o", &path("none")]].concat(), 1);
+        assert!(err.contains("blank.nii: every voxel has the same value"), "{err}");
+    }
+}
+
+#[test]
 fn a_series_in_two_places_is_said_to_be() {
     let folder = TempDir::new().unwrap();
     let (path, out) = (folder.path().join("twice.nii"), folder.path().join("out").display().to_string());

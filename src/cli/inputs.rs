@@ -70,19 +70,23 @@ pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
     usable(io::read_volume(path)?, &path.display().to_string(), warnings)
 }
 
-/// `volume`, called `path`, if something can be found in it.
-pub fn usable(volume: Volume, path: &str, warnings: &mut Vec<String>) -> Result<Volume> {
-    let (bad, all) = (io::count_non_finite(&volume), volume.grid().len());
-    if bad == all {
-        bail!("{path}: every voxel is NaN or infinite; export it again");
-    }
-    if bad > 0 {
+/// Warns of single voxels of `volume`, called `path`, that are no number.
+pub fn warn_of_non_finite(volume: &Volume, path: &str, warnings: &mut Vec<String>) {
+    let (bad, all) = (io::count_non_finite(volume), volume.grid().len());
+    if (1..all).contains(&bad) {
         let short = name(Path::new(path));
         warnings.push(format!("{short}: {bad} of {all} voxels are NaN or infinite and are not used"));
     }
+}
+
+/// `volume`, called `path`, if something can be found in it.
+pub fn usable(volume: Volume, path: &str, warnings: &mut Vec<String>) -> Result<Volume> {
+    warn_of_non_finite(&volume, path, warnings);
     let mut finite = volume.as_slice().iter().filter(|v| v.is_finite());
-    let first = finite.next();
-    if finite.all(|v| Some(v) == first) {
+    let Some(first) = finite.next() else {
+        bail!("{path}: every voxel is NaN or infinite; export it again");
+    };
+    if finite.all(|v| v == first) {
         bail!("{path}: every voxel has the same value, so nothing can be found in it; check the file");
     }
     Ok(volume)

@@ -4,7 +4,9 @@ use super::Usage;
 use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
-use super::inputs::{check_distinct, name, on_grid, read_mask, read_volume, usable, warn_all, warn_of_two_places};
+use super::inputs::{
+    check_distinct, name, on_grid, read_mask, usable, warn_all, warn_of_non_finite, warn_of_two_places,
+};
 use super::limits::field_fits;
 use super::outputs::Target;
 use anyhow::{Result, bail};
@@ -84,14 +86,34 @@ impl<'a> Source<'a> {
         }
     }
 
-    fn read(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<Volume> {
+    fn read(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<(Volume, String)> {
         match self {
-            Self::Files(files) => read_volume(&files[frame], warnings),
+            Self::Files(files) => {
+                let path = &files[frame];
+                warn_of_two_places(path, warnings);
+                Ok((io::read_volume(path)?, path.display().to_string()))
+            }
             Self::Series(_, series) => {
                 let volume = series.read(frame)?;
-                usable(volume, &self.name(frame), warnings)
+                Ok((volume, self.name(frame)))
             }
         }
+    }
+
+    /// A volume in which something can be found.
+    fn read_usable(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<Volume> {
+        let (volume, path) = self.read(frame, warnings)?;
+        usable(volume, &path, warnings)
+    }
+
+    /// A volume among others: a blank one is lost, and they go on without it.
+    fn read_frame(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<Volume> {
+        if self.frames() == 2 {
+            return self.read_usable(frame, warnings);
+        }
+        let (volume, path) = self.read(frame, warnings)?;
+        warn_of_non_finite(&volume, &path, warnings);
+        Ok(volume)
     }
 }
 
@@ -116,14 +138,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if let Source::Series(file, _) = &source {
         warn_of_two_places(file, &mut warnings);
     }
-    let reference = source.read(origin, &mut warnings)?;
+    let reference = source.read_usable(origin, &mut warnings)?;
     let grid = *reference.grid();
     let first = named(origin);
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_mask(l, &grid, first)).transpose()?;
     if *dry_run {
         drop(progress);
-        let frame = source.read(if origin == 0 { 1 } else { 0 }, &mut warnings)?;
+        let frame = source.read_usable(if origin == 0 { 1 } else { 0 }, &mut warnings)?;
         let plan = pipeline::plan::field(&reference, &frame, inside.as_ref(), &params)?;
         warn_all(console, &warnings);
         let plan = dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files(frames, origin))?;
@@ -140,7 +162,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let shown = inside.as_ref().or(regions.as_ref());
     let read = |frame: usize| -> Result<Volume> {
         let started = Instant::now();
-        let volume = source.read(frame, &mut warnings);
+        let volume = source.read_frame(frame, &mut warnings);
         reading += started.elapsed();
         volume
     };
