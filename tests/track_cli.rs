@@ -181,6 +181,8 @@ fn a_blank_file_among_others_is_lost_and_they_go_on() {
     assert!(
         names(&out).contains(&"displacement_002.nii.gz".into()) && !names(&out).contains(&"strain_001.nii.gz".into())
     );
+    let (_, err) = run(&["track", a, &blank, &nothing, "-o", &path("none")], 1);
+    assert!(err.contains("no volume can be measured against frame_000.nii.gz"), "{err}");
     // Alone it is what cannot be measured, and is named; so is a reference.
     for arguments in [vec!["track", a, &blank], vec!["track", &blank, a, b]] {
         let (_, err) = run(&[&arguments[..], &["-o", &path("none")]].concat(), 1);

@@ -11,6 +11,7 @@ use super::limits::field_fits;
 use super::outputs::Target;
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::FieldError;
 use palpate::field::jacobian::determinant_at;
 use palpate::field::warp::warp_image;
 use palpate::io::{self, PackedField, Series};
@@ -206,6 +207,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let tracked =
         track::run((frames, origin), &reference, (inside.as_ref(), regions.as_ref()), &params, read, keep, &|s, f| {
             progress.set(s, f)
+        })
+        .map_err(|error| match error.is::<FieldError>() {
+            true => error.context(format!("no volume can be measured against {}", source.name(origin))),
+            false => error,
         })?;
 
     progress.set("write", 1.0);
