@@ -5,7 +5,7 @@ mod fixtures;
 
 use fixtures::run;
 use palpate::io;
-use palpate::types::{Affine, DenseField, Grid, Mask, Volume};
+use palpate::types::{Affine, DenseField, Grid, Mask, Match, SparseField, Volume};
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
@@ -144,6 +144,35 @@ fn tracked(frames: usize) -> TempDir {
     }
     fs::write(folder.path().join("summary.json"), r#"{"command": "track", "reference": 1}"#).unwrap();
     folder
+}
+
+#[test]
+fn a_sequence_is_read_by_the_matches_and_frames_of_its_own_track() {
+    let folder = tracked(4);
+    let at = |name: &str| folder.path().join(name);
+    // A second track into the same folder measured frame 0, lost frame 2, and left the field of frame 3 behind.
+    let summary = r#"{"command": "track", "reference": 1, "frames": [{"frame": 0, "lost": null}, {"frame": 2, "lost": "noise"}]}"#;
+    fs::write(at("summary.json"), summary).unwrap();
+    let g = grid([16, 16, 16]);
+    let field = io::read_field(at("field.nii.gz")).unwrap();
+    let one = |offset: usize| Match {
+        initial: g.world(g.voxel(offset)[0], g.voxel(offset)[1], g.voxel(offset)[2]),
+        displacement: field.at(offset).map(f64::from),
+        ncc: 1.0,
+        covariance: [1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0],
+        kept: true,
+    };
+    let inside = |offset: &usize| g.voxel(*offset).into_iter().all(|i| (3..13).contains(&i));
+    let matches = SparseField { matches: (0..g.len()).filter(inside).step_by(3).map(one).collect() };
+    io::write_matches(at("matches_0.csv"), &matches).unwrap();
+    let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1000", "--model", "linear"];
+    let (out, _) = run(folder.path(), &[&base[..], &["--forces", "0.1,0.2", "-o", "shared"]].concat(), 0);
+    assert!(out.contains("1 of 1 share these moduli"), "{out}");
+    let summary: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(at("shared").join("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["inputs"]["matches"], "matches_<t>.csv");
+    let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1", "-o", "none"]].concat(), 2);
+    assert!(err.contains("2 frames besides the reference (0, 2)"), "{err}");
 }
 
 #[test]

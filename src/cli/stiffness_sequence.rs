@@ -6,18 +6,17 @@ use super::inputs::{check_distinct, name, warn_all};
 use super::stiffness::{FILES, Options, Setting, images, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
 use palpate::io::{self, OutputFolder};
+use palpate::pipeline::stiffness::{ENOUGH, inside};
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
 use palpate::report::stiffness as report;
-use palpate::types::StiffnessParams;
+use palpate::types::{SparseField, StiffnessParams};
 use std::path::{Path, PathBuf};
 
 /// A frame: its number, its field, the force on the plate.
 type Frame = (usize, PathBuf, Option<f64>);
 
 pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path, console: &Console) -> Result<()> {
-    let reference = reference(from)?;
-    let frames = frames(options, from, reference)?;
-    let trajectories = from.join("trajectories.csv");
+    let frames = frames(options, from, &Tracked::of(from)?)?;
     let patches = patch_files(options);
     let others = patches.iter().chain(&options.images).map(PathBuf::as_path);
     let given: Vec<&Path> = frames.iter().map(|f| f.1.as_path()).chain([body]).chain(others).collect();
@@ -45,7 +44,6 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
         return plan(options, params, &frames[0].1, &setting, &forces, console);
     }
-    let points = trajectories.is_file().then(|| io::read_trajectories(&trajectories, reference)).transpose()?;
     let mut order = Vec::new();
     for (at, (_, path, _)) in frames.iter().enumerate() {
         let field = io::read_field(path)?;
@@ -60,15 +58,17 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
 
     let mut sequence = Sequence::default();
+    let mut by_matches = false;
     let count = order.len() as f64;
     for (done, &(at, moved)) in order.iter().enumerate() {
         let (frame, path, force_n) = &frames[at];
         let field = io::read_field(path)?;
         let part = done as f64 / count;
         let params = StiffnessParams { force_n: *force_n, ..sequence.params(params) };
-        let matches = points.as_ref().and_then(|p| p.get(frame));
+        let matches = matches_beside(path)?.filter(|m| inside(m, &setting.labels) >= ENOUGH);
+        by_matches |= matches.is_some();
         let stage = format!("frame {frame}");
-        let outcome = setting.run(&field, matches, &params, &|_, f| progress.set(&stage, part + f / count));
+        let outcome = setting.run(&field, matches.as_ref(), &params, &|_, f| progress.set(&stage, part + f / count));
         if let Err(error) = &outcome {
             console.detail(&format!("frame {frame}: {error}"));
         }
@@ -82,7 +82,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let names = report::InputNames {
         field: name(from),
         body: name(body),
-        matches: points.is_some().then(|| name(&trajectories)),
+        matches: by_matches.then(|| "matches_<t>.csv".into()),
         held: options.held.clone(),
         load: options.load.clone(),
     };
@@ -99,38 +99,70 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     console.say(&format!("{}{frames}  results      {}", report::text(&shared.result), page.display()))
 }
 
-/// The reference frame, from the track's summary.
-fn reference(from: &Path) -> Result<usize> {
-    let path = from.join("summary.json");
-    let hint = "give a folder that palpate track wrote";
-    let summary = io::read_json(&path).context(hint)?;
-    match summary["reference"].as_u64() {
-        Some(frame) if summary["command"] == "track" => Ok(frame as usize),
-        _ => bail!("{}: is not the summary of a track; {hint}", path.display()),
+/// What the summary of a track says.
+struct Tracked {
+    reference: usize,
+    /// Numbers of all other frames, and whether each was measured; none in a summary that does not list them.
+    others: Option<Vec<(usize, bool)>>,
+}
+
+impl Tracked {
+    fn of(from: &Path) -> Result<Self> {
+        let path = from.join("summary.json");
+        let hint = "give a folder that palpate track wrote";
+        let summary = io::read_json(&path).context(hint)?;
+        let reference = match summary["reference"].as_u64() {
+            Some(frame) if summary["command"] == "track" => frame as usize,
+            _ => bail!("{}: is not the summary of a track; {hint}", path.display()),
+        };
+        let one = |f: &serde_json::Value| Some((f["frame"].as_u64()? as usize, f["lost"].is_null()));
+        let others = summary["frames"].as_array().map(|all| all.iter().filter_map(one).collect());
+        Ok(Self { reference, others })
+    }
+
+    /// Whether a field in the folder is of this track: an earlier one may have left others behind.
+    fn measured(&self, frame: usize) -> bool {
+        frame != self.reference && self.others.as_ref().is_none_or(|o| o.contains(&(frame, true)))
     }
 }
 
-/// The fields of all frames but the reference, by frame.
-fn frames(options: &Options, from: &Path, reference: usize) -> Result<Vec<Frame>> {
+/// The matches beside a frame's field, if any.
+fn matches_beside(field: &Path) -> Result<Option<SparseField>> {
+    let number = field.file_name().and_then(|n| n.to_str()?.strip_prefix("displacement_")?.strip_suffix(".nii.gz"));
+    let path = number.map(|n| field.with_file_name(format!("matches_{n}.csv"))).filter(|p| p.is_file());
+    Ok(path.map(io::read_matches).transpose()?)
+}
+
+/// The fields of all measured frames but the reference, by frame.
+fn frames(options: &Options, from: &Path, tracked: &Tracked) -> Result<Vec<Frame>> {
     let mut found: Vec<(usize, PathBuf)> = io::list(from)?
         .into_iter()
         .filter_map(|path| {
             let number = path.file_name()?.to_str()?.strip_prefix("displacement_")?.strip_suffix(".nii.gz")?;
             Some((number.parse().ok()?, path))
         })
-        .filter(|f: &(usize, PathBuf)| f.0 != reference)
+        .filter(|f: &(usize, PathBuf)| tracked.measured(f.0))
         .collect();
     found.sort();
     if found.is_empty() {
         bail!("{}: holds no displacement_<t>.nii.gz; give a folder that palpate track wrote", from.display());
     }
+    // A force for each frame, lost ones too, as they were taken.
+    let here: Vec<usize> = found.iter().map(|f| f.0).collect();
+    let all = tracked.others.as_ref().map_or(here, |others| others.iter().map(|f| f.0).collect());
     let forces = &options.forces;
-    if !forces.is_empty() && forces.len() != found.len() {
-        let text = format!("--forces names {} forces for {} frames besides the reference", forces.len(), found.len());
+    if !forces.is_empty() && forces.len() != all.len() {
+        let text = format!(
+            "--forces names {} forces for {} frames besides the reference ({}); lost ones count too",
+            forces.len(),
+            all.len(),
+            all.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
+        );
         bail!(Usage(text));
     }
     if let Some(bad) = forces.iter().find(|f| !(f.is_finite() && **f > 0.0)) {
         bail!(Usage(format!("--forces: {bad} is not above 0 N; give magnitudes, without a sign")));
     }
-    Ok(found.into_iter().enumerate().map(|(i, (n, path))| (n, path, forces.get(i).copied())).collect())
+    let force = |frame: usize| all.iter().position(|f| *f == frame).and_then(|at| forces.get(at).copied());
+    Ok(found.into_iter().map(|(frame, path)| (frame, path, force(frame))).collect())
 }

@@ -178,6 +178,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             })
         };
         put(number, field)?;
+        folder.write(&format!("matches_{number:03}.csv"), |p| io::write_matches(p, &result.matches))?;
         folder.write(&format!("strain_{number:03}.nii.gz"), |p| {
             io::write_tensors(p, &grid, strain.tensors(), "palpate: Green-Lagrange strain, LPS axes")
         })?;
@@ -221,7 +222,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         Ok(())
     })?;
     folder.write("displacement.nii.gz", |p| io::write_field_series(p, &grid, &packed, step_s.unwrap_or(0.0)))?;
-    folder.write("trajectories.csv", |p| io::write_trajectories(p, &tracked.trajectories, step_s))?;
+    folder.write("trajectories.csv", |p| io::write_trajectories(p, &tracked.trajectories, origin, step_s))?;
     folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
     let mut film = film.unwrap_or_else(|| start_film(&reference, &still, shown, range));
     add_to(&mut film, origin, &reference, &still, &|_| 0.0)?;
@@ -257,8 +258,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 fn files(frames: usize, origin: usize) -> Vec<String> {
     let fixed = ["displacement.nii.gz", "trajectories.csv", "strain.csv", "summary.json", "report.html"];
     let each = (0..frames).map(|t| format!("displacement_{t:03}.nii.gz"));
-    let strain = (0..frames).filter(|&t| t != origin).map(|t| format!("strain_{t:03}.nii.gz"));
-    fixed.map(String::from).into_iter().chain(each).chain(strain).collect()
+    let others = (0..frames).filter(|&t| t != origin);
+    let rest = others.flat_map(|t| [format!("strain_{t:03}.nii.gz"), format!("matches_{t:03}.csv")]);
+    fixed.map(String::from).into_iter().chain(each).chain(rest).collect()
 }
 
 /// A film whose planes cross where the first measured frame moves most.

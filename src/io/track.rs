@@ -2,23 +2,26 @@
 
 use super::csv::{decimal, read_table, write_table};
 use crate::error::IoError;
-use crate::types::{Match, SparseField, StrainRow, Trajectory, WorldPoint};
+use crate::types::{Match, Place, PointState, SparseField, StrainRow, Trajectory, WorldPoint};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Writes a row for each point and frame in which its place is known: point, frame, time_s (empty when not known), x, y, z
-/// and sigma (world mm, RAS), state (measured, carried or outside).
+/// and sigma (world mm, RAS), state (measured, carried or outside). In the `reference` frame a point is where it was found, with
+/// sigma 0.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
 pub fn write_trajectories(
     path: impl AsRef<Path>,
     trajectories: &[Trajectory],
+    reference: usize,
     step_s: Option<f64>,
 ) -> Result<(), IoError> {
     let rows = trajectories.iter().enumerate().flat_map(|(point, t)| {
+        let start = Place { position: t.initial, sigma: 0.0, state: PointState::Measured };
         t.places.iter().enumerate().filter_map(move |(frame, place)| {
-            let place = place.as_ref()?;
+            let place = if frame == reference { &start } else { place.as_ref()? };
             let [x, y, z] = place.position.0.map(decimal);
             let sigma = decimal(f64::from(place.sigma));
             Some(vec![
