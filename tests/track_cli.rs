@@ -152,6 +152,7 @@ fn what_cannot_be_tracked_is_refused() {
         (vec![a], 2, ["frame_000.nii.gz", "two or more"]),
         (vec![a, b, "--reference", "2"], 2, ["--reference is 2", "2 volumes"]),
         (vec![a, "missing.nii"], 1, ["missing.nii", "check the spelling"]),
+        (vec![a, b, "missing.nii", "--dry-run"], 1, ["missing.nii", "check the spelling"]),
         (vec![&short], 1, ["short.nii.gz", "cut short"]),
         (vec![&cut], 1, ["cut.nii", "cut short"]),
         (vec![&flat], 1, ["flat.nii", "same value"]),

@@ -58,7 +58,11 @@ enum Source<'a> {
 
 impl<'a> Source<'a> {
     fn open(volumes: &'a [PathBuf]) -> Result<Self> {
-        let [one] = volumes else { return Ok(Self::Files(volumes)) };
+        let [one] = volumes else {
+            // What is not there, or no volume, is told before any work.
+            volumes.iter().try_for_each(|path| io::read_header(path).map(drop))?;
+            return Ok(Self::Files(volumes));
+        };
         let series = Series::open(one)?;
         if series.frames() < 2 {
             bail!(Usage(format!("{}: is one volume; give two or more, or a 4-D file", one.display())));
