@@ -100,6 +100,12 @@ fn volumes_and_a_series_give_the_same() {
     );
     let points = rows(&results.join("trajectories.csv"));
     assert!(points.iter().all(|r| r.len() == 8 && ["measured", "carried", "outside"].contains(&r[7].as_str())));
+    // Each point stands once in the reference, where it was found, and its frame's own matches lie beside.
+    let start: Vec<_> = points.iter().filter(|r| r[1] == "0").collect();
+    let numbers: std::collections::HashSet<_> = points.iter().map(|r| &r[0]).collect();
+    assert!(start.len() == numbers.len() && start.iter().all(|r| r[6] == "0.000000" && r[7] == "measured"));
+    let matches = io::read_matches(results.join("matches_003.csv")).unwrap();
+    assert!(matches.kept().count() >= 20);
     let page = fs::read_to_string(results.join("report.html")).unwrap();
     assert!(page.contains("<canvas>") && !page.contains("http"));
 

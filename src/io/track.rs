@@ -2,7 +2,7 @@
 
 use super::csv::{decimal, read_table, write_table};
 use crate::error::IoError;
-use crate::types::{Match, Place, PointState, SparseField, StrainRow, Trajectory, WorldPoint};
+use crate::types::{Match, SparseField, StrainRow, Trajectory, WorldPoint};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -19,21 +19,10 @@ pub fn write_trajectories(
     step_s: Option<f64>,
 ) -> Result<(), IoError> {
     let rows = trajectories.iter().enumerate().flat_map(|(point, t)| {
-        let start = Place { position: t.initial, sigma: 0.0, state: PointState::Measured };
-        t.places.iter().enumerate().filter_map(move |(frame, place)| {
-            let place = if frame == reference { &start } else { place.as_ref()? };
+        t.known(reference).map(move |(frame, place)| {
             let [x, y, z] = place.position.0.map(decimal);
             let sigma = decimal(f64::from(place.sigma));
-            Some(vec![
-                point.to_string(),
-                frame.to_string(),
-                time(frame, step_s),
-                x,
-                y,
-                z,
-                sigma,
-                place.state.name().into(),
-            ])
+            vec![point.to_string(), frame.to_string(), time(frame, step_s), x, y, z, sigma, place.state.name().into()]
         })
     });
     write_table(path.as_ref(), &["point", "frame", "time_s", "x", "y", "z", "sigma", "state"], rows)

@@ -65,12 +65,11 @@ pub fn track<'py>(
     out.set_item("displacement", list)?;
     out.set_item("affine", arrays::stored_rows(&grid))?;
     let points = tracked.trajectories.iter().enumerate().flat_map(|(point, t)| {
-        t.places.iter().enumerate().filter_map(move |(frame, place)| {
-            let p = place.as_ref()?;
-            Some(json!({
+        t.known(reference).map(move |(frame, p)| {
+            json!({
                 "point": point, "frame": frame, "x": p.position.0[0], "y": p.position.0[1], "z": p.position.0[2],
                 "sigma": p.sigma, "state": p.state,
-            }))
+            })
         })
     });
     out.set_item("trajectories", arrays::python(py, &points.collect())?)?;

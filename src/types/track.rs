@@ -47,6 +47,18 @@ pub struct Trajectory {
     pub places: Vec<Option<Place>>,
 }
 
+impl Trajectory {
+    /// The frames in which its place is known, and that place; in the `reference` it is where it was found, with sigma 0.
+    pub fn known(&self, reference: usize) -> impl Iterator<Item = (usize, Place)> + '_ {
+        let start = Place { position: self.initial, sigma: 0.0, state: PointState::Measured };
+        let place = move |(frame, place): (usize, &Option<Place>)| {
+            let place = if frame == reference { Some(start) } else { *place };
+            place.map(|place| (frame, place))
+        };
+        self.places.iter().enumerate().filter_map(place)
+    }
+}
+
 /// The strain of a region in a frame: Green-Lagrange, on the reference configuration (1).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StrainRow {
