@@ -100,6 +100,11 @@ fn volumes_and_a_series_give_the_same() {
     );
     let points = rows(&results.join("trajectories.csv"));
     assert!(points.iter().all(|r| r.len() == 8 && ["measured", "carried", "outside"].contains(&r[7].as_str())));
+    // NIfTI asks for the rows of a symmetric matrix.
+    let tensors = fs::read(results.join("strain_003.nii.gz")).unwrap();
+    let mut head = [0; 70];
+    std::io::Read::read_exact(&mut flate2::read::GzDecoder::new(&tensors[..]), &mut head).unwrap();
+    assert_eq!((head[56..60].try_into().map(f32::from_le_bytes).unwrap(), head[68..70].to_vec()), (3.0, vec![237, 3]));
     // Each point stands once in the reference, where it was found, and its frame's own matches lie beside.
     let start: Vec<_> = points.iter().filter(|r| r[1] == "0").collect();
     let numbers: std::collections::HashSet<_> = points.iter().map(|r| &r[0]).collect();

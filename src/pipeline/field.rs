@@ -603,7 +603,7 @@ fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<Str
     let motion = (length * length - expected * expected).max(0.0).sqrt();
     (model == MotionModel::Free && expected > NEARLY * (0.5 * motion).min(edge)).then(|| {
         format!(
-            "the mean error to expect, {expected:.2} mm, is about half of the mean motion ({motion:.2} mm) or a voxel \
+            "the mean error to expect, {expected:.2} mm, is about half of the mean motion ({length:.2} mm, this error in it) or a voxel \
              ({edge:.2} mm), or more: there is too little texture or too much noise for it; use only places of small uncertainty"
         )
     })

@@ -12,6 +12,8 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// NIfTI's code of a symmetric matrix a voxel.
+const SYMMETRIC: i16 = 1005;
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
 const CHUNK: usize = 1 << 18;
 /// Chunks that are held packed at a time, for each thread.
@@ -150,7 +152,7 @@ pub fn write_tensors(
     /// Component of ours, and its sign in LPS, for each one on disk.
     const ON_DISK: [(usize, f32); 6] = [(0, 1.0), (3, 1.0), (1, 1.0), (4, -1.0), (5, -1.0), (2, 1.0)];
     const STEPS: f32 = 262_144.0;
-    let form = Form { components: 6, intent: 1005, description, ..Form::FLOATS };
+    let form = Form { components: 6, intent: SYMMETRIC, description, ..Form::FLOATS };
     write(path.as_ref(), grid, form, &[tensors; 6], |c, t: [f32; 6]| {
         let (component, sign) = ON_DISK[c];
         ((sign * t[component] * STEPS).round_ties_even() / STEPS + 0.0).to_le_bytes()
@@ -274,6 +276,9 @@ fn header(grid: &Grid, form: &Form<'_>) -> Result<[u8; 352], Flaw> {
     }
     put(&mut h, 0, &348i32.to_le_bytes());
     put(&mut h, 40, &dim.map(i16::to_le_bytes).concat());
+    if form.intent == SYMMETRIC {
+        put_floats(&mut h, 56, &[3.0]); // intent_p1: the matrix has so many rows
+    }
     put(&mut h, 68, &form.intent.to_le_bytes());
     put(&mut h, 70, &form.datatype.to_le_bytes());
     put(&mut h, 72, &form.bits.to_le_bytes());
