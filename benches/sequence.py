@@ -30,8 +30,8 @@ def smooth_motion(random, shape, spacing, apart):
     return field / np.linalg.norm(field, axis=-1).max()
 
 
-def at(values, places, order=1):
-    return np.stack([ndimage.map_coordinates(values[..., c], places, order=order, mode="nearest") for c in range(3)], -1)
+def at(values, places):
+    return np.stack([ndimage.map_coordinates(values[..., c], places, order=1, mode="nearest") for c in range(3)], -1)
 
 
 def make(volume, out, frames, amplitude, seed):

@@ -176,7 +176,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let field = options.convention.read(&source.field)?;
     let setting = Setting::read(options, body, field.grid(), &source.field)?;
     let mut matches = source.matches.as_ref().map(io::read_matches).transpose()?;
-    if options.matches.is_none() && matches.as_ref().is_some_and(|m| inside(m, &setting.labels) < ENOUGH) {
+    if options.matches.is_none() && matches.as_ref().is_some_and(|m| !setting.holds_enough(m)) {
         console.detail(&format!("fewer than {ENOUGH} matches in the body: the field itself is taken"));
         (matches, source.matches) = (None, None);
     }
@@ -255,6 +255,11 @@ pub(super) struct Setting {
 }
 
 impl Setting {
+    /// Whether the body holds matches enough to go by them in place of the field.
+    pub(super) fn holds_enough(&self, matches: &SparseField) -> bool {
+        inside(matches, &self.labels) >= ENOUGH
+    }
+
     pub(super) fn read(options: &Options, body: &Path, grid: &Grid, reference: &Path) -> Result<Self> {
         let mut labels = read_mask(body, grid, reference)?;
         if options.labels.is_none() {

@@ -6,7 +6,6 @@ use super::inputs::{check_distinct, name, warn_all};
 use super::stiffness::{FILES, Options, Setting, images, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
 use palpate::io::{self, OutputFolder};
-use palpate::pipeline::stiffness::{ENOUGH, inside};
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
 use palpate::report::stiffness as report;
 use palpate::types::{SparseField, StiffnessParams};
@@ -65,7 +64,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         let field = io::read_field(path)?;
         let part = done as f64 / count;
         let params = StiffnessParams { force_n: *force_n, ..sequence.params(params) };
-        let matches = matches_beside(path)?.filter(|m| inside(m, &setting.labels) >= ENOUGH);
+        let matches = matches_beside(path)?.filter(|m| setting.holds_enough(m));
         by_matches |= matches.is_some();
         let stage = format!("frame {frame}");
         let outcome = setting.run(&field, matches.as_ref(), &params, &|_, f| progress.set(&stage, part + f / count));
@@ -126,10 +125,14 @@ impl Tracked {
     }
 }
 
+/// The number in the name of a frame's field, as it is written.
+fn number(field: &Path) -> Option<&str> {
+    field.file_name()?.to_str()?.strip_prefix("displacement_")?.strip_suffix(".nii.gz")
+}
+
 /// The matches beside a frame's field, if any.
 fn matches_beside(field: &Path) -> Result<Option<SparseField>> {
-    let number = field.file_name().and_then(|n| n.to_str()?.strip_prefix("displacement_")?.strip_suffix(".nii.gz"));
-    let path = number.map(|n| field.with_file_name(format!("matches_{n}.csv"))).filter(|p| p.is_file());
+    let path = number(field).map(|n| field.with_file_name(format!("matches_{n}.csv"))).filter(|p| p.is_file());
     Ok(path.map(io::read_matches).transpose()?)
 }
 
@@ -137,10 +140,7 @@ fn matches_beside(field: &Path) -> Result<Option<SparseField>> {
 fn frames(options: &Options, from: &Path, tracked: &Tracked) -> Result<Vec<Frame>> {
     let mut found: Vec<(usize, PathBuf)> = io::list(from)?
         .into_iter()
-        .filter_map(|path| {
-            let number = path.file_name()?.to_str()?.strip_prefix("displacement_")?.strip_suffix(".nii.gz")?;
-            Some((number.parse().ok()?, path))
-        })
+        .filter_map(|path| Some((number(&path)?.parse().ok()?, path)))
         .filter(|f: &(usize, PathBuf)| tracked.measured(f.0))
         .collect();
     found.sort();

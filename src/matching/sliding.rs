@@ -134,7 +134,7 @@ impl Fields<'_> {
         (0..nz).step_by(thick).any(|k| {
             let end = (k + thick).min(nz);
             let steep = self.steepness(k.saturating_sub(1)..(end + 1).min(nz));
-            let even = |at: usize| place(pair, at).iter().all(|v| v % 2 == 0);
+            let even = |at: usize| place(pair.shape, at).iter().all(|v| v % 2 == 0);
             let voxels = nx * ny * k..nx * ny * end;
             voxels.into_par_iter().any(|at| pair.mask[at] != 0 && even(at) && steep.is_over(at, STRAIN))
         })
@@ -173,6 +173,7 @@ impl Fields<'_> {
             let slab = Slab { sparse: &sparse, steep, gain, window };
             slab.follow(away, step, [own, around, near], worth, &mut marks, &mut followers);
         }
+        // The whole field serves again; one slab of many only takes room.
         if thick < sparse.shape[2] {
             self.held = None;
         }
@@ -198,17 +199,11 @@ impl Sparse {
         Self { every, shape, whole: pair.shape }
     }
 
-    #[inline(always)]
-    fn place(&self, i: usize) -> [usize; 3] {
-        let [nx, ny, _] = self.shape;
-        [i % nx, i / nx % ny, i / (nx * ny)]
-    }
-
     /// The number of a voxel among all.
     #[inline(always)]
     fn full(&self, i: usize) -> usize {
-        let Self { every, whole, .. } = self;
-        let v = self.place(i);
+        let Self { every, shape, whole } = self;
+        let v = place(*shape, i);
         v[0] * every[0] + whole[0] * (v[1] * every[1] + whole[1] * v[2] * every[2])
     }
 }
@@ -338,7 +333,7 @@ fn believed(sparse: &Sparse, marks: &[u8], followers: &[Follower], wide: [f64; 3
     let around = |mark: u8| -> Vec<f32> {
         let share = filters::gaussian(&pyramid::share(marks, sparse.shape, side, |m| m & mark != 0), shape, wide);
         let block = |f: &Follower| {
-            let v = sparse.place(f.at as usize);
+            let v = place(sparse.shape, f.at as usize);
             v[0] / side[0] + shape[0] * (v[1] / side[1] + shape[1] * (v[2] / side[2]))
         };
         followers.iter().map(|f| share[block(f)]).collect()
@@ -356,9 +351,9 @@ fn believed(sparse: &Sparse, marks: &[u8], followers: &[Follower], wide: [f64; 3
     (!voxels.is_empty()).then(|| Sliding { voxels, strained, left: after / before.max(f64::MIN_POSITIVE) })
 }
 
-/// Voxels of a place of the pair's lattice.
-fn place(pair: &Pair<'_>, at: usize) -> [usize; 3] {
-    let [nx, ny, _] = pair.shape;
+/// The place of a voxel by its number, x fastest.
+#[inline(always)]
+fn place([nx, ny, _]: [usize; 3], at: usize) -> [usize; 3] {
     [at % nx, at / nx % ny, at / (nx * ny)]
 }
 
@@ -377,7 +372,7 @@ impl Steepness<'_> {
     /// `gradient[c][a]`: change of component `c` per mm along axis `a`.
     fn gradient(&self, at: usize) -> [[f64; 3]; 3] {
         let Pair { shape, spacing, .. } = self.pair;
-        let v = place(self.pair, at);
+        let v = place(self.pair.shape, at);
         let stride = [1, shape[0], shape[0] * shape[1]];
         let at = at - self.planes.range.start * stride[2];
         std::array::from_fn(|c| {
@@ -443,7 +438,7 @@ impl Steepness<'_> {
     #[inline(always)]
     fn square(&self, at: usize, offset: [f32; 3], [gain, base]: [f32; 2]) -> f32 {
         let pair = self.pair;
-        let voxel = place(pair, at);
+        let voxel = place(pair.shape, at);
         let moved = self.sample(voxel, offset);
         let target = std::array::from_fn(|a| voxel[a] as f64 + f64::from(moved[a]) / pair.spacing[a]);
         let seen = pair.sampler().at(pair.to_moving(target));
