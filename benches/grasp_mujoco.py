@@ -9,8 +9,9 @@ softness, the nearest it has: it knows no tangential spring and no rolling dome,
 Several contact settings are tried, and the one with the least
 angle error counts. The loop runs in C (mujoco.rollout); Python only prepares.
 
-With `--postures A,B,...` (degrees at the ends of rest and holds) only MuJoCo runs, and each case that keeps both contacts
-is a line: time constant, cone, impratio, CPU seconds, angle error. `palpate chart --peers` carries this file and calls it so.
+With `--samples FILE` (a line a sample: seconds, degrees) only MuJoCo runs, and each case that keeps both contacts is a line:
+time constant, cone, impratio, CPU seconds, the largest difference of the angle at any sample. `palpate chart --peers` carries
+this file and calls it so.
 """
 
 import re
@@ -75,7 +76,7 @@ def control():
 
 
 def mujoco_run(time_constant, cone, impratio, repeats=3):
-    """Least CPU seconds, object angles (degrees) at the ends of the holds, least number of contacts at those."""
+    """Least CPU seconds, object angles (degrees) after each step, least number of contacts at the ends of the holds."""
     text = SCENE.format(step=STEP, solref=time_constant, cone=cone, impratio=impratio)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -93,14 +94,16 @@ def mujoco_run(time_constant, cone, impratio, repeats=3):
         data.qpos[:] = states[0, end - 1, 1:6]
         mujoco.mj_forward(model, data)
         contacts.append(data.ncon)
-    return best, np.degrees(states[0, ends - 1, 5]), min(contacts)
+    return best, np.degrees(states[0, :, 5]), min(contacts)
 
 
-def against(wanted):
-    """Prints a line a case: settings, CPU seconds, largest angle error (degrees)."""
+def against(samples):
+    """Prints a line a case: settings, CPU seconds, largest angle error (degrees) over samples of time (s) and angle (degrees)."""
+    steps = np.round(samples[:, 0] / STEP).astype(int)
+    used = (steps > 0) & (steps <= len(control()[0]))
     for case in CONTACTS:
         seconds, angles, contacts = mujoco_run(*case)
-        off = np.abs(angles - wanted).max()
+        off = np.abs(angles[steps[used] - 1] - samples[used, 1]).max()
         if contacts == 2 and off < 90:
             print(*case, f"{seconds:.6f}", f"{off:.6f}")
 
@@ -119,7 +122,7 @@ def main():
     held = []
     for case in CONTACTS:
         seconds, angles, contacts = mujoco_run(*case)
-        off = np.abs(angles - wanted).max()
+        off = np.abs(angles[control()[1] - 1] - wanted).max()
         shown = [*map(str, case), str(contacts), f"{seconds:.4f}", f"{duration / seconds:.0f}", f"{off:.2f}"]
         print("  ".join(v.rjust(len(c)) for v, c in zip(shown, columns)))
         # A dropped object costs nothing to simulate: only grasps that keep both contacts count.
@@ -137,7 +140,7 @@ def main():
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3 and sys.argv[1] == "--postures":
-        against(np.array([float(v) for v in sys.argv[2].split(",")]))
+    if len(sys.argv) == 3 and sys.argv[1] == "--samples":
+        against(np.loadtxt(sys.argv[2], ndmin=2))
     else:
         main()

@@ -91,3 +91,26 @@ fn other_grids_and_empty_masks_are_refused() {
     let error = metrics(&truth, &truth, Some(&Volume::filled(g, 0)), &[]).unwrap_err().to_string();
     assert!(error.contains("mask"), "{error}");
 }
+
+#[test]
+fn voxels_that_are_no_number_are_refused_where_errors_count_and_passed_over_elsewhere() {
+    let g = grid([6, 4, 4], [1.0; 3]);
+    let truth = DenseField::zeros(g);
+    let holed = DenseField::from_fn(g, |p| if p.0[0] < 0.5 { [f64::NAN, 0.0, 0.0] } else { [0.0; 3] });
+    let error = metrics(&holed, &truth, None, &[]).unwrap_err().to_string();
+    assert!(error.contains("measured volume has 16 voxels that are NaN or infinite"), "{error}");
+    let error = metrics(&truth, &holed, None, &[]).unwrap_err().to_string();
+    assert!(error.contains("truth volume has 16 voxels"), "{error}");
+    let mask = Volume::from_voxels(g, |_, p| u8::from(p.0[0] > 0.5));
+    let m = metrics(&holed, &truth, Some(&mask), &[]).unwrap();
+    assert!(m.voxels == 80 && m.mean_mm == 0.0 && m.grad_err_p95 == 0.0, "{m:?}");
+}
+
+#[test]
+fn landmarks_outside_the_volume_are_found() {
+    let g = grid([5, 5, 5], [2.0; 3]);
+    let mark = |p: [f64; 3]| Landmark { initial: WorldPoint(p), deformed: WorldPoint([0.0; 3]) };
+    let marks =
+        [mark([0.0; 3]), mark([-0.9, 0.0, 0.0]), mark([-1.1, 0.0, 0.0]), mark([4.0, 4.0, 8.9]), mark([4.0, 9.1, 4.0])];
+    assert_eq!(palpate::evaluate::beyond(&g, &marks), [2, 4]);
+}

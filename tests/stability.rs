@@ -6,7 +6,7 @@ mod fixtures;
 
 use fixtures::{palpate, text};
 use palpate::pipeline::field::FieldResult;
-use palpate::pipeline::stress::{Effort, field_curves, field_run, grasp_curves};
+use palpate::pipeline::stress::{Effort, GraspAxis, field_curves, field_run, grasp_curves};
 use palpate::pipeline::trials::{Case, Variant, posture_error};
 use palpate::report::verdict::{Trust, judge};
 use palpate::synth::{PhantomKind, PhantomParams, Trouble};
@@ -102,7 +102,7 @@ fn the_stated_band_holds_most_errors_where_there_is_texture() {
 
 #[test]
 fn grasps_break_where_they_should_and_say_so() {
-    let curves = grasp_curves(&Effort::new(true), &|_| {});
+    let curves = grasp_curves(&Effort::new(true), &GraspAxis::ALL.map(|a| a.1), &|_| {});
     assert_eq!(curves.iter().flat_map(|c| c.silent()).count(), 0);
     let of = |axis: &str, case: &str| {
         let curve = curves.iter().find(|c| c.axis == axis && c.case.starts_with(case)).unwrap();
@@ -188,4 +188,64 @@ fn curves_come_in_order_and_bracket_the_break() {
     let (low, high) = (curve.holds_at.unwrap(), curve.breaks_at.unwrap());
     assert!(low < high && high <= 100.0, "{low} {high}");
     assert!(curve.runs.iter().filter(|r| r.severity <= low).all(|r| !r.broken()));
+}
+
+/// A folder with the small cases `case`, `still` and `lost`.
+fn cases() -> TempDir {
+    let folder = TempDir::new().unwrap();
+    for (name, more) in [("case", &[][..]), ("still", &["--motion", "none"]), ("lost", &[])] {
+        let made = ["phantom", "block", "--size", "24", "-o", name];
+        palpate(folder.path()).args(made).args(more).assert().success();
+    }
+    folder
+}
+
+#[test]
+fn what_a_chart_cannot_score_is_refused_before_any_work() {
+    let folder = cases();
+    let refused = |arguments: &[&str], code: i32, word: &str| {
+        let run = palpate(folder.path()).arg("chart").args(arguments).args(["-o", "out"]).assert().code(code);
+        let said = text(&run.get_output().stderr);
+        assert!(said.contains(word), "{said}");
+        assert!(!folder.path().join("out").exists());
+    };
+    refused(&["--case", "case", "--case", "none"], 1, "none does not exist");
+    refused(&["--case", "case", "--case", "./case"], 2, "given twice");
+    refused(&["--case", "case", "--part", "grasp"], 2, "--case holds volumes");
+    let at = |file: &str| folder.path().join("lost").join(file);
+    // Every landmark in LPS, far away.
+    fs::write(at("landmarks.csv"), "fx,fy,fz,mx,my,mz\n-900,0,0,-900,0,1\n-901,0,0,-901,0,1\n").unwrap();
+    fs::remove_file(at("truth.nii.gz")).unwrap();
+    refused(&["--case", "lost"], 1, "2 of 2 landmarks lie outside the initial volume");
+    fs::write(at("landmarks.csv"), "fx,fy,fz,mx,my,mz\n0,0,0,0,0,1\n-901,0,0,-901,0,1\n").unwrap();
+    let run = palpate(folder.path()).args(["chart", "--quick", "--case", "lost", "-o", "some"]).assert().success();
+    assert!(text(&run.get_output().stderr).contains("1 of 2 landmarks lie outside"));
+}
+
+#[test]
+fn a_case_without_motion_is_charted_in_millimetres_and_missing_tools_do_not_end_a_chart() {
+    let folder = cases();
+    let arguments = ["chart", "--quick", "--peers", "--case", "case", "--case", "still", "-o", "out"];
+    let run = palpate(folder.path()).env("PYTHON", "no-such-python").args(arguments).assert().success();
+    let (said, shown) = (text(&run.get_output().stderr), text(&run.get_output().stdout));
+    assert!(said.contains("no other tool is run: cannot run no-such-python"), "{said}");
+    assert!(shown.contains(" mm\n") && !shown.contains("% of the motion"), "{shown}");
+    let summary = fs::read_to_string(folder.path().join("out/summary.json")).unwrap();
+    assert!(summary.contains("\"unit\": \"mm\""), "{summary}");
+}
+
+#[test]
+fn axes_of_every_part_are_picked_by_name() {
+    let folder = TempDir::new().unwrap();
+    let stress =
+        |more: &[&str]| palpate(folder.path()).arg("stress").args(["--quick", "-o", "out"]).args(more).assert();
+    let run = stress(&["--axis", "step", "--axis", "step", "--axis", "tip-stiffness"]).success();
+    let shown = text(&run.get_output().stdout);
+    // Four forms of the step, one of the stiffness; nothing of the other parts.
+    assert_eq!(shown.lines().filter(|l| l.contains("  grasp  ")).count(), 5, "{shown}");
+    assert!(!shown.contains("  field ") && !shown.contains("  stiffness  ") && !shown.contains("0.001 s"), "{shown}");
+    let refused = stress(&["--force", "--part", "field", "--axis", "mass"]).code(2);
+    assert!(text(&refused.get_output().stderr).contains("--axis mass is one of grasp, which --part leaves out"));
+    let unknown = stress(&["--force", "--axis", "nois"]).code(2);
+    assert!(text(&unknown.get_output().stderr).contains("noise"));
 }

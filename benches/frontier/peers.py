@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Run one registration tool on one pair and write its field: peers.py METHOD FIXED MOVING FIELD
 
-`peers.py list` prints the methods whose tools are installed here. `palpate chart --peers` carries this file and runs it.
+`peers.py list` prints a line a method: name, settings in words, what is missing here to run it, with tabs between.
+`palpate chart --peers` carries this file and runs it.
 
 The field is NIfTI 5-D, intent 1007, LPS mm on the fixed grid. Two threads. Settings are the tools' own defaults or
 those their authors recommend; none was changed after its score was seen. Needs numpy, nibabel and the tool itself
@@ -176,10 +177,14 @@ def deeds(_, fixed, moving, out):
 
 
 METHODS = {
-    "greedy half": (greedy, "100x50x0"),
-    "greedy full": (greedy, "100x50x10"),
-    "greedy long": (greedy, "100x100x50"),
-    "elastix": (elastix, {}),
+    "greedy half": (greedy, "100x50x0", "-m NCC 2x2x2 -n 100x50x0"),
+    "greedy full": (greedy, "100x50x10", "-m NCC 2x2x2 -n 100x50x10"),
+    "greedy long": (greedy, "100x100x50", "-m NCC 2x2x2 -n 100x100x50"),
+    "elastix": (
+        elastix,
+        {},
+        "itk-elastix's default B-spline map: mutual information and bending energy, 4 resolutions of 256 iterations, nodes every 10 mm",
+    ),
     "elastix finer": (
         elastix,
         {
@@ -188,13 +193,18 @@ METHODS = {
             "NumberOfSpatialSamples": 4096,
             "FinalGridSpacingInPhysicalUnits": 8.0,
         },
+        "normalized correlation and bending energy, 4 resolutions of 2000 iterations, nodes every 8 mm",
     ),
-    "plastimatch": (plastimatch, None),
-    "demons": (demons, None),
-    "NiftyReg": (niftyreg, []),
-    "NiftyReg half": (niftyreg, ["-lp", "2"]),
-    "deeds": (deeds, None),
-    "ANTs SyNQuick": (ants, "antsRegistrationSyNQuick[so]"),
+    "plastimatch": (
+        plastimatch,
+        None,
+        "B-splines with nodes every 40, 20, 12 mm, mean squares, at most 50, 50, 30 iterations of L-BFGS-B, regularization 0.01",
+    ),
+    "demons": (demons, None, "SimpleITK, fast symmetric forces, histograms matched, 20 iterations at a quarter, half and full resolution"),
+    "NiftyReg": (niftyreg, [], "reg_f3d with its defaults"),
+    "NiftyReg half": (niftyreg, ["-lp", "2"], "reg_f3d -lp 2: its two coarser levels"),
+    "deeds": (deeds, None, "deedsBCV with its defaults"),
+    "ANTs SyNQuick": (ants, "antsRegistrationSyNQuick[so]", "antsRegistrationSyNQuick[so]: no affine step, as no other has one"),
 }
 
 # What each needs: modules of Python and programs on the path, beside numpy and nibabel.
@@ -209,20 +219,29 @@ NEEDS = {
 }
 
 
-def installed():
-    """Names of the methods that can be run here."""
-    there = lambda modules: all(importlib.util.find_spec(m) for m in modules)
-    if not there(["numpy", "nibabel"]):
-        return []
-    needs = ((name, NEEDS[run]) for name, (run, _) in METHODS.items())
-    return [name for name, (modules, programs) in needs if there(modules) and all(map(shutil.which, programs))]
+def absent(modules, programs):
+    """What of these cannot be found here, in words."""
+    find = importlib.util.find_spec
+    return [f"Python's {m}" for m in modules if not find(m)] + [p for p in programs if not shutil.which(p)]
+
+
+def listed():
+    """A line a method: name, settings, what is missing."""
+    rows = [(name, f"{words}, {THREADS} threads", absent(["numpy", "nibabel", *NEEDS[run][0]], NEEDS[run][1])) for name, (run, _, words) in METHODS.items()]
+    rows.append(("MuJoCo", "", absent(["numpy", "mujoco"], [])))
+    return [f"{name}\t{words}\t{', '.join(missing)}" for name, words, missing in rows]
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["list"]:
-        print("\n".join(installed()))
+        print("\n".join(listed()))
         sys.exit()
     if len(sys.argv) != 5 or sys.argv[1] not in METHODS:
         sys.exit(f"usage: peers.py METHOD FIXED MOVING FIELD\nMETHOD is one of {', '.join(METHODS)}")
-    run, settings = METHODS[sys.argv[1]]
-    run(settings, *sys.argv[2:])
+    run, settings, _ = METHODS[sys.argv[1]]
+    try:
+        run(settings, *sys.argv[2:])
+    except subprocess.CalledProcessError as problem:
+        sys.exit(f"{problem.cmd[0]} ended with code {problem.returncode}")
+    except Exception as problem:
+        sys.exit(f"{type(problem).__name__}: {' '.join(str(problem).split())}")

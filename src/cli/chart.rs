@@ -1,20 +1,23 @@
 //! `palpate chart`: speed against accuracy.
 
+use super::Usage;
 use super::console::Console;
-use super::inputs::name;
+use super::inputs::{read_landmarks, read_mask, warn_all};
 use super::outputs::Target;
 use super::peers::Peers;
 use super::stress::part;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::FieldError;
-use palpate::evaluate::frontier::standings;
+use palpate::evaluate;
+use palpate::evaluate::frontier::{is_relative, standings};
 use palpate::grasp::simulate::simulate;
 use palpate::io;
 use palpate::pipeline::pressed;
 use palpate::pipeline::trials::{self, Case, Variant};
 use palpate::report::frontier::{self as report, Group};
-use palpate::types::{Part, Scene, Trial};
+use palpate::types::{DenseField, Grid, Part, Scene, Trial};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -35,9 +38,9 @@ pub struct Options {
     /// field, stiffness or grasp; may be given several times [default: all]
     #[arg(long, value_name = "PART", value_parser = part)]
     part: Vec<Part>,
-    /// Seed of the embedded cases
-    #[arg(long, value_name = "S", default_value_t = 1)]
-    seed: u64,
+    /// Seed of the embedded cases of the field [default: 1]
+    #[arg(long, value_name = "S")]
+    seed: Option<u64>,
 }
 
 /// The first of these files that the folder holds.
@@ -45,71 +48,138 @@ fn one_of(folder: &Path, names: &[&str]) -> Option<PathBuf> {
     names.iter().map(|n| folder.join(n)).find(|p| p.is_file())
 }
 
-/// A case from a folder: `initial` or `fixed`, `deformed` or `moving`, `truth`, `mask`, `landmarks.csv`.
-fn read_case(folder: &Path) -> Result<Case> {
+/// A case from a folder: `initial` or `fixed`, `deformed` or `moving`, `truth`, `mask`, `landmarks.csv`. Warns of landmarks
+/// outside the volume.
+fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Case> {
+    if !folder.is_dir() {
+        let what = if folder.exists() { "is not a folder" } else { "does not exist" };
+        bail!("{} {what}; --case takes a folder as palpate phantom writes it", folder.display());
+    }
     let needed = |names: &[&str]| {
         one_of(folder, names).with_context(|| format!("{}: holds no {}", folder.display(), names.join(" or ")))
     };
     let initial = io::read_volume(needed(&["initial.nii.gz", "fixed.nii.gz", "initial.nii", "fixed.nii"])?)?;
     let deformed = io::read_volume(needed(&["deformed.nii.gz", "moving.nii.gz", "deformed.nii", "moving.nii"])?)?;
-    let truth = one_of(folder, &["truth.nii.gz", "truth.nii"]).map(io::read_field).transpose()?;
-    let mask = one_of(folder, &["mask.nii.gz", "mask.nii"]).map(io::read_mask).transpose()?;
-    let landmarks = one_of(folder, &["landmarks.csv"]).map(io::read_landmarks).transpose()?.unwrap_or_default();
-    let grids = [truth.as_ref().map(|t| ("the truth", t.grid())), mask.as_ref().map(|m| ("the mask", m.grid()))];
-    for (what, grid) in grids.into_iter().flatten() {
-        if !grid.same_as(initial.grid()) {
-            bail!(FieldError::GridMismatch {
-                what: format!("{}: {what}", folder.display()),
-                found: grid.shape(),
-                reference: "the initial volume".into(),
-                expected: initial.grid().shape(),
-            });
-        }
-    }
-    if truth.is_none() && landmarks.is_empty() {
+    let truth = one_of(folder, &["truth.nii.gz", "truth.nii"]);
+    let mask = one_of(folder, &["mask.nii.gz", "mask.nii"]);
+    let landmarks = one_of(folder, &["landmarks.csv"]);
+    if truth.is_none() && landmarks.is_none() {
         bail!("{}: holds neither truth.nii.gz nor landmarks.csv, so nothing can be scored", folder.display());
     }
-    Ok(Case { name: name(folder), initial, deformed, truth, mask, landmarks })
+    let reference = format!("{}'s initial volume", folder.display());
+    let same_grid = |path: &Path, grid: &Grid| match grid.same_as(initial.grid()) {
+        true => Ok(()),
+        false => Err(FieldError::GridMismatch {
+            what: path.display().to_string(),
+            found: grid.shape(),
+            reference: reference.clone(),
+            expected: initial.grid().shape(),
+        }),
+    };
+    let read_truth = |path: &PathBuf| -> Result<DenseField> {
+        let field = io::read_field(path)?;
+        same_grid(path, field.grid())?;
+        Ok(field)
+    };
+    let truth_file = truth.as_ref();
+    let truth = truth_file.map(read_truth).transpose()?;
+    let mask = mask.map(|m| read_mask(&m, initial.grid(), Path::new(&reference))).transpose()?;
+    if let (Some(truth), Some(file)) = (&truth, truth_file) {
+        // Against itself: whether it can be compared with at all.
+        evaluate::metrics(truth, truth, mask.as_ref(), &[]).with_context(|| file.display().to_string())?;
+    }
+    // Where there is a true field, it is what errors are taken against.
+    let landmarks = match landmarks.filter(|_| truth.is_none()) {
+        Some(file) => read_landmarks(&[file], initial.grid(), warnings)?,
+        None => Vec::new(),
+    };
+    Ok(Case { name: name.into(), initial, deformed, truth, mask, landmarks })
+}
+
+/// A name for each folder: its own, with as many of those above it as tell them apart.
+///
+/// # Errors
+/// When one folder is given twice.
+fn case_names(folders: &[PathBuf]) -> Result<Vec<String>> {
+    let whole: Vec<PathBuf> = folders.iter().map(|f| f.canonicalize().unwrap_or_else(|_| f.clone())).collect();
+    if let Some(i) = (1..whole.len()).find(|&i| whole[..i].contains(&whole[i])) {
+        bail!(Usage(format!("--case {} is given twice", folders[i].display())));
+    }
+    let short = |path: &PathBuf, parts: usize| {
+        let all: Vec<_> = path.iter().map(|p| p.to_string_lossy()).collect();
+        all[all.len().saturating_sub(parts)..].join("/")
+    };
+    let deepest = whole.iter().map(|p| p.iter().count()).max().unwrap_or(1);
+    let named = (1..=deepest).map(|parts| whole.iter().map(|p| short(p, parts)).collect::<Vec<_>>());
+    let apart = |names: &Vec<String>| names.iter().collect::<BTreeSet<_>>().len() == names.len();
+    Ok(named.into_iter().find(apart).unwrap_or_default())
 }
 
 /// Sides of the heads that show cost against size (voxels).
 const SIDES: [usize; 4] = [32, 48, 80, 128];
 /// Nodes that are tried for the stiffness, the default last.
 const NODES: [usize; 5] = [1000, 2000, 4000, 8000, 20_000];
+/// Voxels across the pressed bodies: a third less, and the punch on the layers is too small to be found on coarse meshes.
+const PRESSED: usize = 48;
+
+/// What the flags ask for that cannot be had together.
+fn check(options: &Options, wanted: impl Fn(Part) -> bool, warnings: &mut Vec<String>) -> Result<()> {
+    let Options { case, peers, seed, .. } = options;
+    if !case.is_empty() && !wanted(Part::Field) {
+        bail!(Usage(
+            "--case holds volumes, of which only the field is charted; leave --part out, or give --part field".into()
+        ));
+    }
+    let embedded = case.is_empty() && wanted(Part::Field);
+    if seed.is_some() && !embedded {
+        warnings.push("--seed changes nothing here: only the embedded cases of the field have one".into());
+    }
+    if *peers && !wanted(Part::Field) && !wanted(Part::Grasp) {
+        warnings.push("--peers changes nothing here: no other tool that is known measures stiffness".into());
+    }
+    Ok(())
+}
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { target, case, peers, quick, part, seed } = options;
     let wanted = |p: Part| if part.is_empty() { case.is_empty() || p == Part::Field } else { part.contains(&p) };
+    let mut warnings = Vec::new();
+    check(options, wanted, &mut warnings)?;
+    target.check()?;
+    let names = case_names(case)?;
+    // All of them before any work.
+    for (folder, name) in case.iter().zip(&names) {
+        read_case(folder, name, &mut warnings)?;
+    }
+    warn_all(console, &warnings);
     let mut folder = target.create()?;
     let started = Instant::now();
     let between = io::Scratch::new()?;
-    let found = peers.then(|| Peers::find(between.path())).transpose()?;
-    if found.as_ref().is_some_and(|f| f.methods.is_empty()) {
-        console.warn("no other registration tool is installed (benches/frontier/peers.py says which are known)");
-    }
+    let found = if *peers { find_peers(between.path(), &wanted, console) } else { None };
     let progress = console.progress();
     let (mut trials, mut groups) = (Vec::new(), Vec::new());
     if wanted(Part::Field) {
         let variants = Variant::all(*quick);
-        let spread = if case.is_empty() { trials::spread(*quick, *seed) } else { Vec::new() };
-        let count = spread.len() + case.len();
-        let cases = spread.iter().map(|p| Ok(Case::embedded(p)?)).chain(case.iter().map(|c| read_case(c)));
+        let spread = if case.is_empty() { trials::spread(*quick, seed.unwrap_or(1)) } else { Vec::new() };
+        let count = (spread.len() + case.len()) as f64;
+        let given = case.iter().zip(&names).map(|(c, name)| read_case(c, name, &mut Vec::new()));
+        let cases = spread.iter().map(|p| Ok(Case::embedded(p)?)).chain(given);
         for (i, case) in cases.enumerate() {
-            let case = case?;
+            let (case, i) = (case?, i as f64);
+            let own = if found.is_some() { 0.5 } else { 1.0 };
             for (k, variant) in variants.iter().enumerate() {
-                progress.set("field", (i as f64 + k as f64 / variants.len() as f64) / count as f64);
+                progress.set("field", (i + own * k as f64 / variants.len() as f64) / count);
                 trials.push(case.run(variant));
             }
             if let Some(peers) = &found {
-                progress.set("other tools", (i as f64 + 0.5) / count as f64);
-                trials.extend(peers.run(&case)?);
+                let told = |done: f64| progress.set("other tools", (i + own + (1.0 - own) * done) / count);
+                trials.extend(peers.run(&case, &told)?);
             }
         }
-        let group = |title: &str, whole| Group {
-            part: Part::Field,
-            title: title.into(),
-            unit: "% of the motion left",
-            standings: standings(trials.iter().filter(|t| t.whole == whole)),
+        let group = |title: &str, whole| {
+            let some = || trials.iter().filter(|t| t.whole == whole);
+            let unit = if is_relative(some()) { "% of the motion left" } else { "mm" };
+            Group { part: Part::Field, title: title.into(), unit, standings: standings(some()) }
         };
         groups.push(group("Displacement field", false));
         if found.is_some() {
@@ -121,8 +191,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         }
     }
     if wanted(Part::Stiffness) {
-        let (side, nodes) = if *quick { (32, &NODES[..2]) } else { (48, &NODES[..]) };
-        let found = pressed::stiffness_trials(side, nodes, &|f| progress.set("stiffness", f))?;
+        let nodes = if *quick { &NODES[..2] } else { &NODES[..] };
+        let found = pressed::stiffness_trials(PRESSED, nodes, &|f| progress.set("stiffness", f))?;
         groups.push(Group {
             part: Part::Stiffness,
             title: "Stiffness".into(),
@@ -134,14 +204,16 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if wanted(Part::Grasp) {
         let mut runs = trials::grasp_trials(if *quick { 0.01 } else { 0.3 }, &|f| progress.set("grasp", f))?;
         if let Some(peers) = &found {
-            let exact = simulate(&trials::exact(&Scene::reference()), &|_| {})?;
-            let postures: Vec<f64> = exact.motions.iter().map(|m| m.reached.pose[2].to_degrees()).collect();
-            runs.extend(best_mujoco(peers.mujoco(&postures)?));
+            match peers.mujoco(&simulate(&trials::exact(&Scene::reference()), &|_| {})?) {
+                Ok(nearest) => runs.extend(nearest),
+                Err(e) => console.warn(&format!("left out: {e:#}")),
+            }
         }
         let (unit, title) = ("degrees", "Grasp: object angle over eight motions".into());
         groups.push(Group { part: Part::Grasp, title, unit, standings: standings(&runs) });
         trials.extend(runs);
     }
+    warn_of_failures(&trials, console)?;
     progress.set("write", 1.0);
     folder.write("chart.csv", |p| io::write_trials(p, &trials))?;
     folder.write("chart.svg", |p| io::write_text(p, &report::svg(&groups, &trials)))?;
@@ -154,11 +226,53 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     console.say(&format!("{}  results      {}", report::text(&groups), look.display()))
 }
 
-/// MuJoCo's settings with the least error and with the least time.
-fn best_mujoco(mut runs: Vec<Trial>) -> Vec<Trial> {
-    runs.sort_by(|a, b| a.error.total_cmp(&b.error));
-    let fastest = runs.iter().min_by(|a, b| a.cpu_s.total_cmp(&b.cpu_s)).cloned();
-    runs.truncate(1);
-    runs.extend(fastest.filter(|f| runs.first() != Some(f)));
-    runs
+/// The other tools; says which are left out, and goes on without any where they cannot be looked for.
+fn find_peers(between: &Path, wanted: &impl Fn(Part) -> bool, console: &Console) -> Option<Peers> {
+    let [field, grasp] = [Part::Field, Part::Grasp].map(wanted);
+    if !field && !grasp {
+        return None;
+    }
+    match Peers::find(between) {
+        Ok(peers) => {
+            if let Some(words) = peers.left_out(field, grasp) {
+                console.warn(&format!("other tools left out: {words}"));
+            }
+            Some(peers)
+        }
+        Err(e) => {
+            console.warn(&format!("no other tool is run: {e:#}"));
+            None
+        }
+    }
+}
+
+/// Says how many runs have no result, other than those that a step too long for its method ends.
+///
+/// # Errors
+/// When no run has one.
+fn warn_of_failures(trials: &[Trial], console: &Console) -> Result<()> {
+    let failed: Vec<&Trial> = trials.iter().filter(|t| !t.error.is_finite() && t.part != Part::Grasp).collect();
+    let Some(first) = failed.first() else { return Ok(()) };
+    let why = first.failure.as_deref().unwrap_or("no error was found");
+    let said = format!("{}, {}: {why}", first.method, first.case);
+    if trials.iter().all(|t| !t.error.is_finite()) {
+        bail!("none of the {} runs has a result ({said})", trials.len());
+    }
+    console.warn(&format!("{} of {} runs have no result ({said}); chart.html lists them", failed.len(), trials.len()));
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cases_of_one_name_are_told_apart_and_one_given_twice_is_refused() {
+        let names = |paths: &[&str]| case_names(&paths.iter().map(PathBuf::from).collect::<Vec<_>>());
+        assert_eq!(names(&["/none/a/case", "/none/b/case"]).unwrap_or_default(), ["a/case", "b/case"]);
+        assert_eq!(names(&["/none/a", "/none/b"]).unwrap_or_default(), ["a", "b"]);
+        assert!(names(&["/none/a", "/none/b", "/none/a"]).is_err());
+        let here = names(&["."]).unwrap_or_default();
+        assert!(here.len() == 1 && here[0] != "." && !here[0].is_empty(), "{here:?}");
+    }
 }

@@ -2,7 +2,7 @@
 
 use super::console::Console;
 use super::convention::Convention;
-use super::inputs::{name, read_mask};
+use super::inputs::{name, read_landmarks, read_mask, warn_all};
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::report::text;
@@ -35,11 +35,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let measured = convention.read(field)?;
     let exact = io::read_field(truth)?;
     let mask = mask.as_ref().map(|m| read_mask(m, exact.grid(), truth)).transpose()?;
-    let landmarks = match &landmarks[..] {
-        [] => Vec::new(),
-        [one] => io::read_landmarks(one)?,
-        [initial, deformed, ..] => io::read_landmark_pair(initial, deformed)?,
-    };
+    let mut warnings = Vec::new();
+    let landmarks =
+        if landmarks.is_empty() { Vec::new() } else { read_landmarks(landmarks, exact.grid(), &mut warnings)? };
+    warn_all(console, &warnings);
     let metrics = evaluate::metrics(&measured, &exact, mask.as_ref(), &landmarks)
         .with_context(|| format!("{} against {}", name(field), name(truth)))?;
     console.say(&if *json { serde_json::to_string_pretty(&metrics)? } else { text::metrics(&metrics) })

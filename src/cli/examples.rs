@@ -108,8 +108,6 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ("several, for a script", "info before.nii.gz after.nii.gz --json"),
         ],
     ),
-    ("chart", &[("speed against accuracy", "chart -o chart")]),
-    ("stress", &[("stability where methods fail", "stress -o stress")]),
     (
         "completions",
         &[
@@ -141,6 +139,13 @@ mod tests {
     use super::*;
     use crate::cli::Cli;
     use clap::CommandFactory;
+
+    #[test]
+    fn every_command_has_its_examples_once() {
+        let names: Vec<&str> = EXAMPLES.iter().map(|e| e.0).collect();
+        let twice = (1..names.len()).find(|&i| names[..i].contains(&names[i])).map(|i| names[i]);
+        assert_eq!(twice, None);
+    }
 
     #[test]
     fn every_command_has_examples_and_every_example_parses() {

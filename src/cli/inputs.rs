@@ -4,10 +4,11 @@ use super::Usage;
 use super::console::Console;
 use anyhow::{Result, bail};
 use palpate::error::FieldError;
+use palpate::evaluate;
 use palpate::field::warp::warp_image;
 use palpate::io::{self, Stored};
 use palpate::numerics::sampling::Interpolation;
-use palpate::types::{DenseField, Grid, Mask, Volume, Voxels};
+use palpate::types::{DenseField, Grid, Landmark, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
 
 /// The last part of a path, for messages and reports.
@@ -115,6 +116,34 @@ pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
         bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
     }
     Ok(mask)
+}
+
+/// Landmarks of one table, or of two files of points, in the volume on `grid`; warns of those that lie outside it.
+///
+/// # Errors
+/// When a file cannot be read, or all of them lie outside.
+pub fn read_landmarks(files: &[PathBuf], grid: &Grid, warnings: &mut Vec<String>) -> Result<Vec<Landmark>> {
+    let (file, landmarks) = match files {
+        [initial, deformed] => (initial, io::read_landmark_pair(initial, deformed)?),
+        [one, ..] => (one, io::read_landmarks(one)?),
+        [] => return Ok(Vec::new()),
+    };
+    let outside = evaluate::beyond(grid, &landmarks);
+    let Some(&first) = outside.first() else { return Ok(landmarks) };
+    let [x, y, z] = landmarks[first].initial.0;
+    let said = format!(
+        "{}: {} of {} landmarks lie outside the initial volume (the first is number {}, at {x:.1}, {y:.1}, {z:.1})",
+        file.display(),
+        outside.len(),
+        landmarks.len(),
+        first + 1
+    );
+    let hint = "places are world mm, RAS; those in LPS have x and y with the other sign";
+    if outside.len() == landmarks.len() {
+        bail!("{said}, so none can be scored; {hint}");
+    }
+    warnings.push(format!("{said}, and the field's edge stands for it; {hint}"));
+    Ok(landmarks)
 }
 
 /// All warnings, once.

@@ -1,13 +1,14 @@
 //! `palpate stress`: where each part breaks, and whether it says so.
 
+use super::Usage;
 use super::console::Console;
 use super::outputs::Target;
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
 use palpate::io;
 use palpate::pipeline::field::FieldResult;
-use palpate::pipeline::stress::{self, Effort};
+use palpate::pipeline::stress::{self, Effort, GraspAxis, StiffnessAxis};
 use palpate::report::stress as report;
 use palpate::report::verdict::{Trust, judge};
 use palpate::synth::Trouble;
@@ -24,9 +25,8 @@ pub struct Options {
     /// field, stiffness or grasp; may be given several times [default: all]
     #[arg(long, value_name = "PART", value_parser = part)]
     part: Vec<Part>,
-    /// For the field: one axis alone, as noise or slice-thickness; may be given several times [default: all]
-    #[arg(long, value_name = "AXIS", value_parser = axis)]
-    axis: Vec<Trouble>,
+    #[arg(long, value_name = "AXIS", help = axis_help())]
+    axis: Vec<String>,
 }
 
 /// A part by its name.
@@ -34,9 +34,57 @@ pub fn part(name: &str) -> Result<Part, UnknownName> {
     names::choose("part", name, &Part::ALL)
 }
 
-fn axis(name: &str) -> Result<Trouble, UnknownName> {
-    let spaced = name.replace('-', " ");
-    names::choose("axis", &spaced, &Trouble::ALL.map(|t| (t.1, t.0)))
+/// Axes of the field by name.
+fn field_axes() -> [(&'static str, Trouble); 14] {
+    Trouble::ALL.map(|t| (t.1, t.0))
+}
+
+/// Names of a part's axes as they are typed.
+fn axis_names(part: Part) -> Vec<String> {
+    let names: Vec<&str> = match part {
+        Part::Field => field_axes().iter().map(|a| a.0).collect(),
+        Part::Stiffness => StiffnessAxis::ALL.iter().map(|a| a.0).collect(),
+        Part::Grasp => GraspAxis::ALL.iter().map(|a| a.0).collect(),
+    };
+    names.iter().map(|n| n.replace(' ', "-")).collect()
+}
+
+fn axis_help() -> String {
+    let of = |(name, part): &(&str, Part)| format!("{name}: {}", axis_names(*part).join(", "));
+    let all = Part::ALL.iter().map(of).collect::<Vec<_>>().join("; ");
+    format!("One axis alone; may be given several times [default: all]. {all}")
+}
+
+/// Those of `all` that `asked` names, all of them when it is empty.
+fn picked<T: Copy>(asked: &[String], all: &[(&'static str, T)]) -> Vec<T> {
+    let named = |name: &str| asked.iter().any(|a| a.replace('-', " ").eq_ignore_ascii_case(name));
+    all.iter().filter(|(name, _)| asked.is_empty() || named(name)).map(|a| a.1).collect()
+}
+
+/// Every axis that is asked for must be one of a part that runs.
+fn check_axes(asked: &[String], wanted: impl Fn(Part) -> bool) -> Result<()> {
+    let known = |part: Part| axis_names(part);
+    let parts: Vec<Part> = Part::ALL.iter().map(|p| p.1).collect();
+    for axis in asked {
+        let same = |n: &String| n.replace('-', " ").eq_ignore_ascii_case(&axis.replace('-', " "));
+        let holders: Vec<Part> = parts.iter().copied().filter(|p| known(*p).iter().any(same)).collect();
+        if holders.is_empty() {
+            let all: Vec<(&'static str, ())> = field_axes()
+                .iter()
+                .map(|a| a.0)
+                .chain(StiffnessAxis::ALL.iter().map(|a| a.0))
+                .chain(GraspAxis::ALL.iter().map(|a| a.0))
+                .map(|n| (n, ()))
+                .collect();
+            let unknown = names::choose("axis", &axis.replace('-', " "), &all).err();
+            bail!(Usage(unknown.map_or_else(|| axis.clone(), |u| u.to_string())));
+        }
+        if !holders.iter().any(|p| wanted(*p)) {
+            let of: Vec<&str> = holders.iter().map(|p| p.name()).collect();
+            bail!(Usage(format!("--axis {axis} is one of {}, which --part leaves out", of.join(" and "))));
+        }
+    }
+    Ok(())
 }
 
 /// What `palpate field` would say against its result: its warnings, and a verdict of low trust.
@@ -49,21 +97,23 @@ fn said(initial: &Volume, result: &FieldResult) -> Vec<String> {
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { target, quick, part, axis } = options;
     let wanted = |p: Part| part.is_empty() || part.contains(&p);
+    check_axes(axis, wanted)?;
     let mut folder = target.create()?;
     let started = Instant::now();
     let progress = console.progress();
     let effort = Effort::new(*quick);
     let mut curves = Vec::new();
-    if wanted(Part::Field) {
-        let all = Trouble::ALL.map(|t| t.0);
-        let troubles = if axis.is_empty() { &all[..] } else { &axis[..] };
-        curves.extend(stress::field_curves(&effort, troubles, &said, &|f| progress.set("field", f)));
+    let troubles = picked(axis, &field_axes());
+    if wanted(Part::Field) && !troubles.is_empty() {
+        curves.extend(stress::field_curves(&effort, &troubles, &said, &|f| progress.set("field", f)));
     }
-    if wanted(Part::Stiffness) {
-        curves.extend(stress::stiffness_curves(&effort, *quick, &|f| progress.set("stiffness", f))?);
+    let axes = picked(axis, &StiffnessAxis::ALL);
+    if wanted(Part::Stiffness) && !axes.is_empty() {
+        curves.extend(stress::stiffness_curves(&effort, *quick, &axes, &|f| progress.set("stiffness", f))?);
     }
-    if wanted(Part::Grasp) {
-        curves.extend(stress::grasp_curves(&effort, &|f| progress.set("grasp", f)));
+    let axes = picked(axis, &GraspAxis::ALL);
+    if wanted(Part::Grasp) && !axes.is_empty() {
+        curves.extend(stress::grasp_curves(&effort, &axes, &|f| progress.set("grasp", f)));
     }
     progress.set("write", 1.0);
     folder.write("stress.csv", |p| io::write_stress(p, &curves))?;

@@ -2,10 +2,23 @@
 
 use crate::types::{Standing, Trial};
 
+/// Motion below this is none (mm).
+const NONE_MM: f64 = 1e-3;
+
+/// Whether errors are told as what is left of the motion: where every case has one. Else they are means as they are.
+pub fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
+    trials.into_iter().all(|t| t.nothing.is_some_and(|n| n > NONE_MM))
+}
+
 /// Each method over its cases, in the order in which methods first appear; [`Standing::on_front`] is set.
 ///
-/// A case without a result counts as doing nothing where that is known, and is left out elsewhere.
+/// All errors are of one kind, by [`is_relative`] over all trials. Where that holds, a case without a result counts as doing
+/// nothing; else it is left out. CPU time is that of the runs with a result: what ends early was not faster. A method that
+/// has failed on some case is not on the front, since it stands there for other cases than the rest do, and one that
+/// has failed on all has neither error nor time (NaN).
 pub fn standings<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> Vec<Standing> {
+    let trials: Vec<&Trial> = trials.into_iter().collect();
+    let relative = is_relative(trials.iter().copied());
     let mut groups: Vec<Vec<&Trial>> = Vec::new();
     for trial in trials {
         let same = |g: &&mut Vec<&Trial>| {
@@ -16,38 +29,42 @@ pub fn standings<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> Vec<Standin
             None => groups.push(vec![trial]),
         }
     }
-    let mut out: Vec<Standing> = groups.iter().filter_map(|g| standing(g)).collect();
-    let places: Vec<[f64; 2]> = out.iter().map(|s| [s.cpu_s, s.error]).collect();
+    let mut out: Vec<Standing> = groups.iter().filter_map(|g| standing(g, relative)).collect();
+    let sound: Vec<usize> = (0..out.len()).filter(|&i| out[i].failures == 0).collect();
+    let places: Vec<[f64; 2]> = sound.iter().map(|&i| [out[i].cpu_s, out[i].error]).collect();
     for at in pareto(&places) {
-        out[at].on_front = true;
+        out[sound[at]].on_front = true;
     }
     out
 }
 
-fn standing(group: &[&Trial]) -> Option<Standing> {
+fn standing(group: &[&Trial], relative: bool) -> Option<Standing> {
     let first = group.first()?;
-    let relative = group.iter().all(|t| t.nothing.is_some_and(|n| n > 0.0));
-    let errors: Vec<f64> = if relative {
-        let left = |t: &&Trial| {
-            let part = t.error / t.nothing.unwrap_or(f64::NAN);
-            if part.is_nan() { 1.0 } else { part.max(1e-6) }
-        };
-        group.iter().map(left).map(f64::ln).collect()
-    } else {
-        group.iter().map(|t| t.error).filter(|e| e.is_finite()).collect()
+    let done: Vec<&&Trial> = group.iter().filter(|t| t.error.is_finite()).collect();
+    let failures = group.len() - done.len();
+    let left = |t: &&&Trial| (t.error / t.nothing.unwrap_or(f64::NAN)).max(1e-6).ln();
+    let error = match (done.is_empty(), relative) {
+        (true, _) => f64::NAN,
+        // The logarithm of doing nothing is 0.
+        (false, true) => 100.0 * (done.iter().map(left).sum::<f64>() / group.len() as f64).exp(),
+        (false, false) => mean(done.iter().map(|t| t.error)),
     };
-    let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
-    let spent: Vec<f64> = group.iter().map(|t| t.cpu_s).collect();
     Some(Standing {
         varied: first.varied,
         method: first.method.clone(),
         settings: first.settings.clone(),
-        error: if relative { 100.0 * mean(&errors).exp() } else { mean(&errors) },
-        cpu_s: mean(&spent),
+        error,
+        cpu_s: mean(done.iter().map(|t| t.cpu_s)),
         cases: group.len(),
-        failures: group.iter().filter(|t| t.error.is_nan()).count(),
+        failures,
         on_front: false,
     })
+}
+
+/// NaN of nothing.
+fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = values.len() as f64;
+    values.sum::<f64>() / count
 }
 
 /// Numbers of the places (cost, error) that no other place beats in one without losing in the other, cheapest first.
@@ -99,12 +116,29 @@ mod tests {
     }
 
     #[test]
-    fn a_refusal_counts_as_doing_nothing() {
+    fn a_refusal_counts_as_doing_nothing_takes_no_time_and_keeps_a_method_off_the_front() {
         let trials =
-            [trial("a", 1.0, Some(4.0), 1.0), trial("a", f64::NAN, Some(4.0), 3.0), trial("b", 4.0, Some(4.0), 1.5)];
+            [trial("a", 1.0, Some(4.0), 1.0), trial("a", f64::NAN, Some(4.0), 0.1), trial("b", 4.0, Some(4.0), 1.5)];
         let s = standings(&trials);
-        assert!((s[0].error - 50.0).abs() < 1e-9 && s[0].failures == 1 && s[0].cpu_s == 2.0);
-        assert!((s[1].error - 100.0).abs() < 1e-9 && s[1].on_front && s[0].on_front);
+        assert!((s[0].error - 50.0).abs() < 1e-9 && s[0].failures == 1 && s[0].cpu_s == 1.0);
+        assert!((s[1].error - 100.0).abs() < 1e-9 && s[1].on_front && !s[0].on_front);
+    }
+
+    #[test]
+    fn a_method_without_any_result_has_no_error_and_no_time() {
+        let trials = [trial("a", f64::NAN, Some(4.0), 0.01), trial("b", 8.0, Some(4.0), 1.5)];
+        let s = standings(&trials);
+        assert!(s[0].error.is_nan() && s[0].cpu_s.is_nan() && !s[0].on_front && s[0].failures == 1);
+        assert!((s[1].error - 200.0).abs() < 1e-9 && s[1].on_front);
+    }
+
+    #[test]
+    fn one_case_without_motion_puts_all_methods_in_millimetres() {
+        let mixed = |m: &str| [trial(m, 1.0, Some(4.0), 1.0), trial(m, 0.5, Some(0.0), 1.0)];
+        let trials: Vec<Trial> = mixed("a").into_iter().chain([trial("b", 3.0, Some(4.0), 1.0)]).collect();
+        let s = standings(&trials);
+        assert!(!is_relative(&trials));
+        assert_eq!((s[0].error, s[1].error), (0.75, 3.0));
     }
 
     #[test]

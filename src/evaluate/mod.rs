@@ -27,7 +27,8 @@ const STILL_VOXELS: usize = 1000;
 /// Scores `field` against `truth` over `mask` (everywhere when `None`) and at `landmarks` (none when empty).
 ///
 /// # Errors
-/// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when the mask is empty.
+/// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when the mask is empty, or
+/// the truth or the field has voxels in it that are no number.
 pub fn metrics(
     field: &DenseField,
     truth: &DenseField,
@@ -49,8 +50,12 @@ pub fn metrics(
             hint: "give one that covers the tissue".into(),
         });
     }
+    for (volume, field) in [("truth", truth), ("measured", field)] {
+        check_numbers(volume, field, &used)?;
+    }
     let mut error: Vec<f64> = voxels.iter().map(|v| v.error).collect();
-    let mut gradient: Vec<f64> = voxels.iter().map(|v| v.gradient).collect();
+    // Beside voxels outside the mask that are no number there is no gradient.
+    let mut gradient: Vec<f64> = voxels.iter().map(|v| v.gradient).filter(|g| g.is_finite()).collect();
     let still: Vec<f64> = voxels.iter().filter(|v| v.motion < STILL_MM).map(|v| v.error).collect();
     let truths: Vec<f64> = voxels.iter().map(|v| v.motion).collect();
     let at_landmarks = self::landmarks(field, landmarks);
@@ -73,6 +78,31 @@ pub fn metrics(
 pub fn landmarks(field: &DenseField, landmarks: &[Landmark]) -> Vec<f64> {
     let error = |l: &Landmark| length(l.initial.moved(displacement(field, l.initial)).minus(l.deformed));
     landmarks.iter().map(error).collect()
+}
+
+/// Numbers of the landmarks whose initial place lies more than half a voxel outside `grid`, where the field is not known.
+pub fn beyond(grid: &Grid, landmarks: &[Landmark]) -> Vec<usize> {
+    let outside = |l: &Landmark| {
+        let place = grid.affine().to_voxel(l.initial).0;
+        (0..3).any(|a| !(-0.5..=grid.shape()[a] as f64 - 0.5).contains(&place[a]))
+    };
+    (0..landmarks.len()).filter(|&i| outside(&landmarks[i])).collect()
+}
+
+fn check_numbers(
+    volume: &'static str,
+    field: &DenseField,
+    used: &(impl Fn(&usize) -> bool + Sync),
+) -> Result<(), FieldError> {
+    let bad = |at: &usize| used(at) && field.at(*at).iter().any(|c| !c.is_finite());
+    match (0..field.grid().len()).into_par_iter().filter(bad).count() {
+        0 => Ok(()),
+        n => Err(FieldError::Volume {
+            volume,
+            what: format!("has {n} voxels that are NaN or infinite where errors count"),
+            hint: "give a mask that leaves them out".into(),
+        }),
+    }
 }
 
 /// What is measured at one voxel.

@@ -11,7 +11,7 @@ use crate::pipeline::trials::{exact, posture_error};
 use crate::synth::severity::{disturbed, shifted_labels};
 use crate::synth::{ElasticParams, Phantom, PhantomKind, PhantomParams, Trouble, troubled};
 use crate::types::scene::{Formulation, Method};
-use crate::types::{FieldParams, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Volume};
+use crate::types::{FieldParams, Mask, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Volume};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -94,10 +94,12 @@ fn curve(
     found: Breaking<Vec<StressRun>>,
 ) -> StressCurve {
     let told = |runs: &[StressRun]| 2 * runs.iter().filter(|r| r.told()).count() >= runs.len();
-    let told_at = found.tried.iter().find(|t| told(&t.1)).map(|t| t.0);
+    let first = found.tried.iter().position(|t| told(&t.1));
+    let told_at = first.map(|i| found.tried[i].0);
+    let quiet_at = found.tried[..first.unwrap_or(found.tried.len())].last().map(|t| t.0);
     let Breaking { tried, breaks_at, holds_at } = found;
     let runs = tried.into_iter().flat_map(|t| t.1).collect();
-    StressCurve { part, axis: axis.into(), unit, error_unit, case, range, runs, breaks_at, holds_at, told_at }
+    StressCurve { part, axis: axis.into(), unit, error_unit, case, range, runs, breaks_at, holds_at, told_at, quiet_at }
 }
 
 /// One phantom in trouble, measured without a mask and scored over the tissue that both volumes show.
@@ -145,54 +147,86 @@ fn limit(phantom: &Phantom, motion: f64) -> f64 {
 /// Error of a modulus beyond which it is of no use (per cent).
 const MODULUS: f64 = 20.0;
 
-/// The stiffness of a ball in a block from exact displacements, made worse along each axis: noise (per cent of the mean
-/// motion), contrast, Poisson's ratio that is assumed, labels beside their place (voxels), nodes. Quick: noise alone.
+/// What makes a stiffness worse.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StiffnessAxis {
+    /// Noise of the displacement (per cent of the mean motion).
+    Noise,
+    /// Contrast of the ball.
+    Contrast,
+    /// Poisson's ratio that is assumed.
+    Poisson,
+    /// Labels beside their place (voxels).
+    Labels,
+    /// Nodes of the mesh.
+    Mesh,
+}
+
+impl StiffnessAxis {
+    /// All of them by name.
+    pub const ALL: [(&'static str, Self); 5] = [
+        ("noise", Self::Noise),
+        ("contrast", Self::Contrast),
+        ("poisson", Self::Poisson),
+        ("labels", Self::Labels),
+        ("mesh", Self::Mesh),
+    ];
+}
+
+/// The stiffness of a ball in a block from exact displacements, made worse along each of `axes`; with fewer severities when
+/// `quick`.
 ///
 /// # Errors
 /// As [`Pressed::new`].
-pub fn stiffness_curves(effort: &Effort, quick: bool, progress: Progress<'_>) -> Result<Vec<StressCurve>, SynthError> {
+pub fn stiffness_curves(
+    effort: &Effort,
+    quick: bool,
+    axes: &[StiffnessAxis],
+    progress: Progress<'_>,
+) -> Result<Vec<StressCurve>, SynthError> {
     let base = PhantomParams::new(PhantomKind::Inclusion).sized(effort.side);
     let body = Pressed::new(&base)?;
     let motion = body.phantom.description.mean_mm;
     let usual = StiffnessParams { nodes: effort.nodes, force_n: Some(body.force_n), ..StiffnessParams::default() };
-    let truth = base.elastic.poisson;
+    let labels = body.phantom.stiffness.as_ref().map(|s| s.labels.clone()).ok_or(SynthError::NotElastic)?;
     let search = |axis: &str, unit, range, spread, run: &(dyn Fn(f64) -> Option<StressRun> + Sync)| {
         let [coarse, halvings] = if quick { [3, 1] } else { [5, 2] };
         let found = breaking_point(range, spread, coarse, halvings, |s| Some(vec![run(s)?]), |r| most_break(r));
         curve(Part::Stiffness, axis, [unit, "%"], "inclusion".into(), range, found)
     };
-    let labels = body.phantom.stiffness.as_ref().map(|s| s.labels.clone()).ok_or(SynthError::NotElastic)?;
-    let mut out = vec![search("noise", "%", [0.0, 20.0], Spread::Linear, &|s| {
-        let field = disturbed(&body.phantom.truth, s / 100.0 * motion, base.seed);
-        Some(stiffness_run(&body, s, body.measure(&field, None, &labels, &usual)))
-    })];
-    progress(0.2);
-    if quick {
-        return Ok(out);
+    let exact = |s: f64, labels: &Mask, params: &StiffnessParams| {
+        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, labels, params)))
+    };
+    let one = |axis: StiffnessAxis| match axis {
+        StiffnessAxis::Noise => search("noise", "%", [0.0, 20.0], Spread::Linear, &|s| {
+            let field = disturbed(&body.phantom.truth, s / 100.0 * motion, base.seed);
+            Some(stiffness_run(&body, s, body.measure(&field, None, &labels, &usual)))
+        }),
+        StiffnessAxis::Contrast => search("contrast", "ratio", [2.0, 100.0], Spread::Ratio, &|s| {
+            let elastic = ElasticParams { contrast: s, ..base.elastic };
+            let body = Pressed::new(&PhantomParams { elastic, ..base.clone() }).ok()?;
+            let labels = &body.phantom.stiffness.as_ref()?.labels;
+            let params = StiffnessParams { force_n: Some(body.force_n), ..usual.clone() };
+            Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, labels, &params)))
+        }),
+        StiffnessAxis::Poisson => {
+            let range = [base.elastic.poisson, 0.2];
+            search("Poisson's ratio assumed", "of 0.49", range, Spread::Linear, &|s| {
+                exact(s, &labels, &StiffnessParams { poisson: s, ..usual.clone() })
+            })
+        }
+        StiffnessAxis::Labels => search("labels beside their place", "voxels", [0.0, 8.0], Spread::Whole, &|s| {
+            exact(s, &shifted_labels(&labels, s as usize), &usual)
+        }),
+        StiffnessAxis::Mesh => search("mesh", "nodes", [8000.0, 500.0], Spread::Ratio, &|s| {
+            exact(s, &labels, &StiffnessParams { nodes: s.round() as usize, ..usual.clone() })
+        }),
+    };
+    let mut out = Vec::new();
+    for (i, axis) in axes.iter().enumerate() {
+        out.push(one(*axis));
+        progress((i + 1) as f64 / axes.len() as f64);
     }
-    out.push(search("contrast", "ratio", [2.0, 100.0], Spread::Ratio, &|s| {
-        let elastic = ElasticParams { contrast: s, ..base.elastic };
-        let body = Pressed::new(&PhantomParams { elastic, ..base.clone() }).ok()?;
-        let labels = &body.phantom.stiffness.as_ref()?.labels;
-        let params = StiffnessParams { force_n: Some(body.force_n), ..usual.clone() };
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, labels, &params)))
-    }));
-    progress(0.4);
-    out.push(search("Poisson's ratio assumed", "of 0.49", [truth, 0.2], Spread::Linear, &|s| {
-        let params = StiffnessParams { poisson: s, ..usual.clone() };
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &labels, &params)))
-    }));
-    progress(0.6);
-    out.push(search("labels beside their place", "voxels", [0.0, 8.0], Spread::Whole, &|s| {
-        let beside = shifted_labels(&labels, s as usize);
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &beside, &usual)))
-    }));
-    progress(0.8);
-    out.push(search("mesh", "nodes", [8000.0, 500.0], Spread::Ratio, &|s| {
-        let params = StiffnessParams { nodes: s.round() as usize, ..usual.clone() };
-        Some(stiffness_run(&body, s, body.measure(&body.phantom.truth, None, &labels, &params)))
-    }));
-    progress(1.0);
     Ok(out)
 }
 
@@ -228,45 +262,89 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
 /// Error of a posture beyond which it is of no use (degrees).
 const POSTURE: f64 = 0.5;
 
-/// The reference scene's eight motions made worse along each axis: step, stiffness and mass, width, friction.
-pub fn grasp_curves(effort: &Effort, progress: Progress<'_>) -> Vec<StressCurve> {
-    type Change = fn(&mut Scene, f64);
+/// What makes a grasp harder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GraspAxis {
+    /// Integrator's step (s), for each method and formulation.
+    Step,
+    /// Young's modulus of the tips (Pa).
+    TipStiffness,
+    /// Object's mass (kg).
+    Mass,
+    /// Object's width (m).
+    Width,
+    /// Coefficient of friction.
+    Friction,
+}
+
+impl GraspAxis {
+    /// All of them by name.
+    pub const ALL: [(&'static str, Self); 5] = [
+        ("step", Self::Step),
+        ("tip stiffness", Self::TipStiffness),
+        ("mass", Self::Mass),
+        ("width", Self::Width),
+        ("friction", Self::Friction),
+    ];
+
+    fn name(self) -> &'static str {
+        Self::ALL.iter().find(|a| a.1 == self).map_or("", |a| a.0)
+    }
+
+    /// Unit and range, easy end first.
+    fn range(self) -> (&'static str, [f64; 2]) {
+        match self {
+            Self::Step => ("s", [1e-4, 0.05]),
+            Self::TipStiffness => ("Pa", [2e5, 2e3]),
+            Self::Mass => ("kg", [0.1, 50.0]),
+            Self::Width => ("m", [0.06, 0.006]),
+            Self::Friction => ("", [1.0, 0.02]),
+        }
+    }
+
+    fn apply(self, scene: &mut Scene, v: f64) {
+        match self {
+            Self::Step => {
+                let integrator = &mut scene.integrator;
+                (integrator.step, integrator.output_every) = (v, integrator.output_every.max(v));
+            }
+            Self::TipStiffness => scene.fingertip.youngs_modulus = v,
+            Self::Mass => (scene.object.inertia, scene.object.mass) = (scene.object.inertia * v / scene.object.mass, v),
+            Self::Width => *scene = scene.clone().with_width(v),
+            Self::Friction => scene.object.friction = Some(v),
+        }
+    }
+}
+
+/// The reference scene's eight motions made worse along each of `axes`: the step with every method and formulation, all else
+/// with Runge and Kutta's in minimal coordinates.
+pub fn grasp_curves(effort: &Effort, axes: &[GraspAxis], progress: Progress<'_>) -> Vec<StressCurve> {
     let forms: Vec<(Method, Formulation)> = [Method::Rk4, Method::SemiImplicitEuler]
         .into_iter()
         .flat_map(|m| Formulation::ALL.map(|(_, f)| (m, f)))
         .collect();
-    let step: Change = |s, v| {
-        (s.integrator.step, s.integrator.output_every) = (v, s.integrator.output_every.max(v));
-    };
-    let mut axes: Vec<(&str, &'static str, [f64; 2], Change, (Method, Formulation))> =
-        forms.iter().map(|&form| ("step", "s", [1e-4, 0.05], step, form)).collect();
-    let usual = (Method::Rk4, Formulation::Minimal);
-    let others: [(&str, &'static str, [f64; 2], Change); 4] = [
-        ("tip stiffness", "Pa", [2e5, 2e3], |s, v| s.fingertip.youngs_modulus = v),
-        ("mass", "kg", [0.1, 50.0], |s, v| {
-            (s.object.inertia, s.object.mass) = (s.object.inertia * v / s.object.mass, v);
-        }),
-        ("width", "m", [0.06, 0.006], |s, v| *s = s.clone().with_width(v)),
-        ("friction", "", [1.0, 0.02], |s, v| s.object.friction = Some(v)),
-    ];
-    axes.extend(others.map(|(name, unit, range, change)| (name, unit, range, change, usual)));
+    let usual = [(Method::Rk4, Formulation::Minimal)];
+    let with = |&axis: &GraspAxis| if axis == GraspAxis::Step { &forms[..] } else { &usual[..] };
+    let all: Vec<_> = axes.iter().flat_map(|a| with(a).iter().map(move |form| (*a, *form))).collect();
     let done = AtomicUsize::new(0);
-    let one = |&(axis, unit, range, change, (method, formulation)): &(_, _, _, Change, _)| {
+    let one = |&(axis, (method, formulation)): &(GraspAxis, (Method, Formulation))| {
+        let friction = axis == GraspAxis::Friction;
         let run = |v: f64| {
             let mut scene = Scene::reference();
             (scene.integrator.method, scene.integrator.formulation) = (method, formulation);
-            change(&mut scene, v);
-            Some(vec![grasp_run(&scene, v, axis == "friction")])
+            axis.apply(&mut scene, v);
+            Some(vec![grasp_run(&scene, v, friction)])
         };
+        let (unit, range) = axis.range();
         let found =
             breaking_point(range, Spread::Ratio, effort.coarse.max(5), effort.halvings + 2, run, |r| most_break(r));
         let n = done.fetch_add(1, Ordering::Relaxed) + 1;
-        progress(n as f64 / axes.len() as f64);
+        progress(n as f64 / all.len() as f64);
         let case = format!("{}, {}", method.name(), formulation.name());
-        let error = if axis == "friction" { "of the friction there is" } else { "degrees" };
-        curve(Part::Grasp, axis, [unit, error], case, range, found)
+        let error = if friction { "of the friction there is" } else { "degrees" };
+        curve(Part::Grasp, axis.name(), [unit, error], case, range, found)
     };
-    axes.par_iter().map(one).collect()
+    all.par_iter().map(one).collect()
 }
 
 /// One scene against the same scene by the adaptive integrator. With `friction` the error is the largest share of the

@@ -25,7 +25,7 @@ pub struct Case {
     pub truth: Option<DenseField>,
     /// Where errors count; never given to a method.
     pub mask: Option<Mask>,
-    /// Known places; they are the truth where no field is.
+    /// Known places; they are the truth where no field is, all of them, whatever the mask.
     pub landmarks: Vec<Landmark>,
 }
 
@@ -135,31 +135,39 @@ impl Case {
     /// The trial of a field that some method has measured in `cpu_s` seconds.
     ///
     /// # Errors
-    /// [`FieldError`] when the field is on another grid than the truth.
+    /// [`FieldError`] when the field is on another grid than the truth, or no number where errors count.
     pub fn score(&self, variant: &Variant, measured: &DenseField, cpu_s: f64) -> Result<Trial, FieldError> {
         let mut trial = self.trial(variant, cpu_s);
         if let Some(truth) = &self.truth {
             let m = evaluate::metrics(measured, truth, self.mask.as_ref(), &[])?;
-            (trial.error, trial.error_p95) = (m.mean_mm, Some(m.p95_mm));
-            (trial.gradient_error, trial.nothing) = (Some(m.grad_err), Some(m.identity_mm));
-        } else {
-            let mut errors = evaluate::landmarks(measured, &self.landmarks);
-            let still = DenseField::zeros(*measured.grid());
-            let apart = evaluate::landmarks(&still, &self.landmarks);
-            trial.error = mean(&errors);
-            trial.error_p95 = Some(percentile(&mut errors, 95.0));
-            trial.nothing = Some(mean(&apart));
+            (trial.error, trial.error_p95, trial.gradient_error) = (m.mean_mm, Some(m.p95_mm), Some(m.grad_err));
+            return Ok(trial);
         }
+        let mut errors = evaluate::landmarks(measured, &self.landmarks);
+        if errors.iter().any(|e| !e.is_finite()) {
+            return Err(FieldError::Volume {
+                volume: "measured",
+                what: "is NaN or infinite at landmarks".into(),
+                hint: "leave these landmarks out".into(),
+            });
+        }
+        (trial.error, trial.error_p95) = (mean(&errors), Some(percentile(&mut errors, 95.0)));
         Ok(trial)
+    }
+
+    /// Error of doing nothing (mm): the mean motion where errors count, or the landmarks' mean distance.
+    pub fn nothing(&self) -> f64 {
+        let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let Some(truth) = &self.truth else {
+            return mean(&self.landmarks.iter().map(|l| length(l.initial.minus(l.deformed))).collect::<Vec<_>>());
+        };
+        let inside = |at: &usize| self.mask.as_ref().is_none_or(|m| m.as_slice()[*at] != 0);
+        let motion = |at: usize| length(truth.at(at).map(f64::from));
+        mean(&(0..truth.grid().len()).filter(inside).map(motion).collect::<Vec<_>>())
     }
 
     /// A trial without a result yet.
     pub fn trial(&self, variant: &Variant, cpu_s: f64) -> Trial {
-        let nothing = self.truth.as_ref().map(|truth| {
-            let inside = |at: &usize| self.mask.as_ref().is_none_or(|m| m.as_slice()[*at] != 0);
-            let length = |at: usize| truth.at(at).iter().map(|&c| f64::from(c).powi(2)).sum::<f64>().sqrt();
-            mean(&(0..truth.grid().len()).filter(inside).map(length).collect::<Vec<_>>())
-        });
         Trial {
             part: Part::Field,
             varied: variant.varied,
@@ -169,7 +177,7 @@ impl Case {
             error: f64::NAN,
             error_p95: None,
             gradient_error: None,
-            nothing,
+            nothing: Some(self.nothing()),
             size: self.initial.grid().len(),
             cpu_s,
             whole: false,

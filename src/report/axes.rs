@@ -13,10 +13,10 @@ text{font:11px system-ui,sans-serif;fill:#444}.t{font-weight:600;font-size:13px;
 .d{fill:var(--c);stroke:#fff;stroke-width:.7}.d.whole{fill:#fff;stroke:var(--c);stroke-width:1.8}.l{fill:none;stroke:var(--c);stroke-width:1.7}\
 .front{fill:none;stroke:#999;stroke-width:1.2}.ring{fill:none;stroke:#111;stroke-width:1.3}.x{stroke:#d00000;stroke-width:1.8;fill:none}\
 .limit{stroke:#999;stroke-dasharray:2 3;fill:none}.told{stroke:var(--c);stroke-dasharray:5 3;stroke-width:1.2}.broke{stroke:var(--c);stroke-width:1.2}\
-.d:hover{stroke:#111;stroke-width:2}\
+.d:hover{stroke:#111;stroke-width:2}.name{paint-order:stroke;stroke:#fff;stroke-width:3px;stroke-linejoin:round}\
 @media(prefers-color-scheme:dark){text{fill:#bbb}.t{fill:#eee}.n{fill:#999}.g{stroke:#333840}.page{fill:#14171c}\
 .k0{--c:#ff7a6b}.k1{--c:#6db3f2}.k2{--c:#b0b0b0}.k3{--c:#6fd39b}.k4{--c:#c79ae0}.k5{--c:#f0b04a}\
-.d{stroke:#14171c}.d.whole{fill:#14171c}.ring{stroke:#eee}.x{stroke:#ff5050}.d:hover{stroke:#fff}}";
+.d{stroke:#14171c}.d.whole{fill:#14171c}.ring{stroke:#eee}.name{stroke:#14171c}.x{stroke:#ff5050}.d:hover{stroke:#fff}}";
 
 /// One axis.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,7 +1,8 @@
 //! `palpate chart`: error against CPU time, cost against size, as SVG, page, JSON and text.
 
-use crate::report::axes::{Axis, Panel, label, path, tiled};
+use crate::report::axes::{Axis, Panel, path, tiled};
 use crate::report::html::{document, escape};
+use crate::report::scale::significant;
 use crate::report::tables::table;
 use crate::types::{Part, Standing, Trial};
 use serde_json::{Value, json};
@@ -33,10 +34,14 @@ fn colour(varied: &str) -> usize {
 
 const SIZE: [f64; 2] = [520.0, 360.0];
 
+/// Smaller errors are drawn here.
+const FLOOR: f64 = 1e-9;
+
 /// All panels as one SVG; pointing at a place shows its settings.
 pub fn svg(groups: &[Group], trials: &[Trial]) -> String {
     let mut panels: Vec<(Panel, String)> = groups.iter().map(against_time).collect();
     panels.extend(against_size(trials));
+    panels.extend(against_nodes(trials));
     tiled(2, SIZE, &panels)
 }
 
@@ -44,27 +49,34 @@ pub fn svg(groups: &[Group], trials: &[Trial]) -> String {
 fn against_time(group: &Group) -> (Panel, String) {
     let shown: Vec<&Standing> = group.standings.iter().filter(|s| s.error.is_finite() && s.cpu_s > 0.0).collect();
     let cases = shown.iter().map(|s| s.cases).max().unwrap_or(0);
+    let mut note = format!("{} settings, {cases} case{}", shown.len(), if cases == 1 { "" } else { "s" });
+    if shown.len() < group.standings.len() {
+        let _ = write!(note, "; {} without any result", group.standings.len() - shown.len());
+    }
+    if shown.iter().any(|s| s.error < FLOOR) {
+        let _ = write!(note, "; errors below {FLOOR:.0e} at it");
+    }
     let panel = Panel {
         title: group.title.clone(),
-        note: format!("{} settings, {cases} case{}", shown.len(), if cases == 1 { "" } else { "s" }),
+        note,
         across: Axis::around("CPU time, s", true, shown.iter().map(|s| s.cpu_s)),
-        up: Axis::around(&format!("error, {}", group.unit), true, shown.iter().map(|s| s.error.max(1e-9))),
+        up: Axis::around(&format!("error, {}", group.unit), true, shown.iter().map(|s| s.error.max(FLOOR))),
         size: SIZE,
     };
-    let mut front: Vec<[f64; 2]> = shown.iter().filter(|s| s.on_front).map(|s| [s.cpu_s, s.error.max(1e-9)]).collect();
+    let mut front: Vec<[f64; 2]> = shown.iter().filter(|s| s.on_front).map(|s| [s.cpu_s, s.error.max(FLOOR)]).collect();
     front.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let mut out = format!(r#"<path class="front" d="{}"/>"#, path(front.iter().map(|&p| panel.at(p))));
     let mut taken: Vec<[f64; 4]> = shown
         .iter()
         .map(|s| {
-            let [x, y] = panel.at([s.cpu_s, s.error.max(1e-9)]);
+            let [x, y] = panel.at([s.cpu_s, s.error.max(FLOOR)]);
             [x - 5.0, x + 5.0, y - 5.0, y + 5.0]
         })
         .collect();
     // Presets and what is on the front find room for their names first, and lie on top.
     let mut order: Vec<&Standing> = shown;
     order.sort_by_key(|s| (s.varied != "preset", !s.on_front));
-    let place = |s: &Standing| panel.at([s.cpu_s, s.error.max(1e-9)]);
+    let place = |s: &Standing| panel.at([s.cpu_s, s.error.max(FLOOR)]);
     for s in order.iter().rev() {
         let [x, y] = place(s);
         let k = if s.method.contains("semi-implicit") {
@@ -82,11 +94,20 @@ fn against_time(group: &Group) -> (Panel, String) {
         );
     }
     for s in order {
-        if let Some([left, base]) = room(&panel, place(s), s.method.chars().count(), &mut taken) {
-            let _ = write!(out, r#"<text x="{left:.1}" y="{base:.1}">{}</text>"#, escape(&s.method));
+        let name = name(s);
+        if let Some([left, base]) = room(&panel, place(s), name.chars().count(), &mut taken) {
+            let _ = write!(out, r#"<text class="name" x="{left:.1}" y="{base:.1}">{}</text>"#, escape(&name));
         }
     }
     (panel, out)
+}
+
+/// With how many of the cases it has a result on, where that is not all.
+fn name(s: &Standing) -> String {
+    match s.failures {
+        0 => s.method.clone(),
+        n => format!("{} ({} of {} cases)", s.method, s.cases - n, s.cases),
+    }
 }
 
 /// A free place for a name of `letters` beside a dot; none where there is no room, pointing at the dot still tells.
@@ -97,8 +118,14 @@ fn room(panel: &Panel, [x, y]: [f64; 2], letters: usize, taken: &mut Vec<[f64; 4
         [x - 7.0 - width, y + 4.0],
         [x - width / 2.0, y - 8.0],
         [x - width / 2.0, y + 16.0],
-        [x + 6.0, y - 6.0],
-        [x + 6.0, y + 14.0],
+        [x + 7.0, y - 7.0],
+        [x + 7.0, y + 15.0],
+        [x - 7.0 - width, y - 7.0],
+        [x - 7.0 - width, y + 15.0],
+        [x + 7.0, y - 19.0],
+        [x + 7.0, y + 27.0],
+        [x - 7.0 - width, y - 19.0],
+        [x - 7.0 - width, y + 27.0],
     ];
     let found = places.into_iter().find(|&[a, b]| {
         let own = [a, a + width, b - 9.0, b + 2.0];
@@ -116,30 +143,15 @@ fn hover(s: &Standing, unit: &str) -> String {
         "{}: {}\nerror {} {unit}, {} s of CPU time over {} cases{failed}{front}",
         s.method,
         s.settings,
-        label_3(s.error),
-        label_3(s.cpu_s),
+        significant(s.error),
+        significant(s.cpu_s),
         s.cases
     )
 }
 
-/// Three digits that count.
-fn label_3(v: f64) -> String {
-    match v.abs() {
-        a if a == 0.0 || !a.is_finite() => label(v),
-        a if a < 1e-3 => format!("{v:.2e}"),
-        a => format!("{v:.*}", (2 - a.log10().floor() as i32).max(0) as usize),
-    }
-}
-
 /// CPU time against voxels, a line a preset; none where sizes were not varied.
 fn against_size(trials: &[Trial]) -> Option<(Panel, String)> {
-    let mut lines: Vec<(&str, Vec<&Trial>)> = Vec::new();
-    for t in trials.iter().filter(|t| t.varied == "size" && t.error.is_finite()) {
-        match lines.iter_mut().find(|l| l.0 == t.method) {
-            Some(line) => line.1.push(t),
-            None => lines.push((&t.method, vec![t])),
-        }
-    }
+    let lines = lines(trials.iter().filter(|t| t.varied == "size"), |t| &t.method);
     let all = || lines.iter().flat_map(|l| &l.1);
     all().next()?;
     let panel = Panel {
@@ -149,34 +161,87 @@ fn against_size(trials: &[Trial]) -> Option<(Panel, String)> {
         up: Axis::around("CPU time, s", true, all().map(|t| t.cpu_s)),
         size: SIZE,
     };
+    let told = |name: &str, t: &Trial| {
+        let left = t.nothing.map_or(f64::NAN, |n| 100.0 * t.error / n);
+        format!("{name}, {} voxels: {} s, {} % left", t.size, significant(t.cpu_s), significant(left))
+    };
+    let out = drawn(&panel, &lines, |t| [t.size as f64, t.cpu_s], told);
+    Some((panel, out))
+}
+
+/// Error of the moduli against the nodes that the mesh has, a line a body; none where nodes were not varied.
+fn against_nodes(trials: &[Trial]) -> Option<(Panel, String)> {
+    let lines = lines(trials.iter().filter(|t| t.varied == "nodes"), |t| &t.case);
+    let all = || lines.iter().flat_map(|l| &l.1);
+    all().next()?;
+    let panel = Panel {
+        title: "Stiffness: error against nodes".into(),
+        note: "nodes of the mesh, which may be more than were asked for".into(),
+        across: Axis::around("nodes", true, all().map(|t| t.size as f64)),
+        up: Axis::around("error, % of the moduli", true, all().map(|t| t.error.max(FLOOR))),
+        size: SIZE,
+    };
+    let told = |name: &str, t: &Trial| {
+        let [error, seconds] = [t.error, t.cpu_s].map(significant);
+        format!("{name}, {}: {} nodes, error {error} %, {seconds} s of CPU time", t.method, t.size)
+    };
+    let out = drawn(&panel, &lines, |t| [t.size as f64, t.error.max(FLOOR)], told);
+    Some((panel, out))
+}
+
+/// Trials with a result by what they have in common, in the order in which they come.
+fn lines<'a>(
+    trials: impl Iterator<Item = &'a Trial>,
+    name: impl Fn(&'a Trial) -> &'a String,
+) -> Vec<(&'a str, Vec<&'a Trial>)> {
+    let mut out: Vec<(&str, Vec<&Trial>)> = Vec::new();
+    for t in trials.filter(|t| t.error.is_finite()) {
+        match out.iter_mut().find(|l| l.0 == name(t)) {
+            Some(line) => line.1.push(t),
+            None => out.push((name(t), vec![t])),
+        }
+    }
+    out
+}
+
+/// Lines with their dots and a legend, at the top where it is freer.
+fn drawn(
+    panel: &Panel,
+    lines: &[(&str, Vec<&Trial>)],
+    place: impl Fn(&Trial) -> [f64; 2],
+    told: impl Fn(&str, &Trial) -> String,
+) -> String {
     let mut out = String::new();
+    let [left, right, top, _] = panel.frame();
+    let at = |t: &Trial| panel.at(place(t));
+    // Lines that fall leave the right free.
+    let falls = lines.iter().any(|l| l.1.first().zip(l.1.last()).is_some_and(|(a, b)| at(a)[1] < at(b)[1]));
+    let from = if falls { right - 110.0 } else { left + 10.0 };
     for (k, (name, line)) in lines.iter().enumerate() {
-        let at = |t: &&Trial| panel.at([t.size as f64, t.cpu_s]);
-        let _ = write!(out, r#"<path class="l k{}" d="{}"/>"#, k % 6, path(line.iter().map(at)));
+        let (k, down) = (k % 6, 15.0 * k as f64);
+        let _ = write!(out, r#"<path class="l k{k}" d="{}"/>"#, path(line.iter().map(|t| at(t))));
         for t in line {
-            let [x, y] = at(t);
-            let left = t.nothing.map_or(f64::NAN, |n| 100.0 * t.error / n);
-            let title = format!("{name}, {} voxels: {} s, {} % left", t.size, label_3(t.cpu_s), label_3(left));
+            let ([x, y], title) = (at(t), escape(&told(name, t)));
             let _ = write!(
                 out,
-                r#"<circle class="d k{}" cx="{x:.1}" cy="{y:.1}" r="3.6"><title>{}</title></circle>"#,
-                k % 6,
-                escape(&title)
+                r#"<circle class="d k{k}" cx="{x:.1}" cy="{y:.1}" r="3.6"><title>{title}</title></circle>"#
             );
         }
-        let [left, _, top, _] = panel.frame();
         let _ = write!(
             out,
-            r#"<path class="l k{}" d="M{:.0} {:.0}h18"/><text x="{:.0}" y="{:.0}">{}</text>"#,
-            k % 6,
-            left + 10.0,
-            top + 12.0 + 15.0 * k as f64,
-            left + 33.0,
-            top + 16.0 + 15.0 * k as f64,
+            r#"<path class="l k{k}" d="M{from:.0} {:.0}h18"/><text x="{:.0}" y="{:.0}">{}</text>"#,
+            top + 12.0 + down,
+            from + 23.0,
+            top + 16.0 + down,
             escape(name)
         );
     }
-    Some((panel, out))
+    out
+}
+
+/// Three digits, or a dash where there is none.
+fn number(v: f64) -> String {
+    if v.is_finite() { significant(v) } else { "-".into() }
 }
 
 /// The page.
@@ -184,7 +249,8 @@ pub fn page(groups: &[Group], trials: &[Trial]) -> String {
     let mut body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>Speed against accuracy</h1><p class=\"verdict\">The line joins the \
          settings that no other beats in both. Point at a place to see its settings. Hollow places are whole commands, with \
-         their start and their files; all others are the work alone.</p></header><article class=\"wide\">{}</article>",
+         their start and their files; all others are the work alone. A method that has no result on some case is not on the line: \
+         there it counts as doing nothing, and its time is that of the others.</p></header><article class=\"wide\">{}</article>",
         env!("CARGO_PKG_VERSION"),
         svg(groups, trials)
     );
@@ -193,8 +259,8 @@ pub fn page(groups: &[Group], trials: &[Trial]) -> String {
             vec![
                 escape(&s.method),
                 escape(&s.settings),
-                label_3(s.error),
-                label_3(s.cpu_s),
+                number(s.error),
+                number(s.cpu_s),
                 s.cases.to_string(),
                 if s.failures > 0 { s.failures.to_string() } else { String::new() },
                 if s.on_front { "front".into() } else { String::new() },
@@ -203,14 +269,15 @@ pub fn page(groups: &[Group], trials: &[Trial]) -> String {
         let rows: Vec<_> = group.standings.iter().map(row).collect();
         let error = format!("Error, {}", group.unit);
         let head = ["Method", "Settings", &error, "CPU, s", "Cases", "No result", ""];
-        let _ = write!(body, "<section><h2>{}</h2>{}</section>", escape(&group.title), table(&head, &rows));
+        let rows = table(&head, &rows);
+        let _ = write!(body, "<section><h2>{}</h2><div class=\"two\">{rows}</div></section>", escape(&group.title));
     }
     let failed = |t: &Trial| t.failure.as_ref().map(|f| vec![escape(&t.method), escape(&t.case), escape(f)]);
     let failures: Vec<_> = trials.iter().filter_map(failed).collect();
     if !failures.is_empty() {
         let _ = write!(
             body,
-            "<section><h2>Without a result</h2>{}</section>",
+            "<section><h2>Without a result</h2><div class=\"two words\">{}</div></section>",
             table(&["Method", "Case", "Why"], &failures)
         );
     }
@@ -230,12 +297,14 @@ pub fn summary(groups: &[Group], seconds: f64) -> Value {
 pub fn text(groups: &[Group]) -> String {
     let mut out = String::new();
     for group in groups {
-        let _ = writeln!(out, "{}: what no other setting beats", group.title);
         let mut front: Vec<&Standing> = group.standings.iter().filter(|s| s.on_front).collect();
         front.sort_by(|a, b| a.cpu_s.total_cmp(&b.cpu_s));
+        let what = if front.is_empty() { "none has a result on every case" } else { "what no other setting beats" };
+        let _ = writeln!(out, "{}: {what}", group.title);
+        let width = front.iter().map(|s| s.method.chars().count()).max().unwrap_or(0).max(28);
         for s in front {
-            let _ =
-                writeln!(out, "  {:28} {:>9} s  {:>9} {}", s.method, label_3(s.cpu_s), label_3(s.error), group.unit);
+            let [seconds, error] = [s.cpu_s, s.error].map(significant);
+            let _ = writeln!(out, "  {:width$} {seconds:>9} s  {error:>9} {}", s.method, group.unit);
         }
     }
     out
@@ -264,7 +333,18 @@ mod tests {
     }
 
     #[test]
-    fn numbers_keep_three_digits() {
-        assert_eq!([0.012345, 12.345, 123.45, 1e-7].map(label_3), ["0.0123", "12.3", "123", "1.00e-7"]);
+    fn a_method_without_a_result_is_told_and_not_drawn() {
+        let mut failed = standing("fails", f64::NAN, f64::NAN, false);
+        failed.failures = 2;
+        let mut once = standing("once", 30.0, 1.5, false);
+        once.failures = 1;
+        let standings = vec![standing("a", 10.0, 1.0, true), failed, once];
+        let group = Group { part: Part::Field, title: "Field".into(), unit: "% left", standings };
+        let svg = svg(std::slice::from_ref(&group), &[]);
+        assert_eq!(svg.matches("<circle").count(), 2);
+        assert!(svg.contains("2 settings, 2 cases; 1 without any result") && svg.contains("once (1 of 2 cases)"));
+        let page = page(std::slice::from_ref(&group), &[]);
+        assert!(page.contains("<td>-</td><td>-</td><td>2</td><td>2</td>") && !page.contains("NaN"));
+        assert!(summary(&[group], 1.0)["groups"][0]["standings"][1]["error"].is_null());
     }
 }

@@ -64,6 +64,19 @@ pub fn short(v: f64) -> String {
     if s == "-0" { "0".into() } else { s.into() }
 }
 
+/// A number rounded to three digits that count: 0.00146, 2.80, 26700; below a thousandth as 1.46e-4.
+pub fn significant(v: f64) -> String {
+    match v.abs() {
+        a if a == 0.0 || !a.is_finite() => short(v),
+        a if a < 1e-3 => format!("{v:.2e}"),
+        a => {
+            let decimals = 2 - a.log10().floor() as i32;
+            let unit = 10f64.powi(decimals.min(0).abs());
+            format!("{:.*}", decimals.max(0) as usize, if unit > 1.0 { (v / unit).round() * unit } else { v })
+        }
+    }
+}
+
 /// 1234567 as 1,234,567.
 pub fn thousands(n: usize) -> String {
     let digits = n.to_string();
@@ -80,6 +93,13 @@ pub fn thousands(n: usize) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn three_digits_count_whatever_the_size() {
+        let shown = [0.001_46, 0.0028, 2.8, 9.999, 26_670.0, 123.45, 1e-7, 0.012_345, 0.0, -4.32].map(significant);
+        let wanted = ["0.00146", "0.00280", "2.80", "10.00", "26700", "123", "1.00e-7", "0.0123", "0", "-4.32"];
+        assert_eq!(shown, wanted);
+    }
 
     #[test]
     fn round_numbers_are_at_or_above() {

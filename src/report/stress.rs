@@ -2,7 +2,7 @@
 
 use crate::report::axes::{Axis, Panel, path, tiled};
 use crate::report::html::{document, escape};
-use crate::report::scale::short;
+use crate::report::scale::significant;
 use crate::report::tables::table;
 use crate::types::{Part, StressCurve, StressRun};
 use serde_json::{Value, json};
@@ -114,23 +114,35 @@ fn hover(curve: &StressCurve, runs: &[StressRun]) -> String {
     out
 }
 
-/// Three digits that count.
+/// Three digits that count, without zeros at the end.
 fn digits(v: f64) -> String {
-    match v.abs() {
-        a if a == 0.0 || !a.is_finite() => short(v),
-        a if a < 1e-3 => format!("{v:.1e}"),
-        a if a < 10.0 => short((v * 1000.0).round() / 1000.0),
-        _ => short((v * 10.0).round() / 10.0),
-    }
+    let s = significant(v);
+    if s.contains('.') && !s.contains('e') { s.trim_end_matches('0').trim_end_matches('.').into() } else { s }
+}
+
+/// With its unit.
+fn with_unit(v: f64, c: &StressCurve) -> String {
+    format!("{} {}", digits(v), c.unit).trim_end().to_string()
 }
 
 /// Where a curve breaks, in words.
 fn breaks(c: &StressCurve) -> String {
-    let unit = |v: f64| format!("{} {}", digits(v), c.unit).trim_end().to_string();
+    let last = c.runs.last().map(|r| r.severity);
     match (c.breaks_at, c.holds_at) {
-        (Some(at), Some(low)) => format!("{} (holds at {})", unit(at), digits(low)),
-        (Some(at), None) => format!("at once ({})", unit(at)),
-        (None, _) => "holds".into(),
+        (Some(at), Some(low)) => format!("breaks at {} (holds at {})", with_unit(at, c), digits(low)),
+        (Some(at), None) => format!("breaks at once ({})", with_unit(at, c)),
+        (None, Some(v)) if last.is_some_and(|l| l == c.range[1]) => format!("holds to {}", with_unit(v, c)),
+        (None, Some(v)) => format!("holds to {}, no more can be had", with_unit(v, c)),
+        (None, None) => "cannot be had".into(),
+    }
+}
+
+/// Where the program first says so, in words.
+fn told(c: &StressCurve) -> String {
+    match (c.told_at, c.quiet_at) {
+        (Some(at), Some(quiet)) => format!("at {} (not at {})", with_unit(at, c), digits(quiet)),
+        (Some(at), None) => format!("from {} on", with_unit(at, c)),
+        (None, _) => "nowhere".into(),
     }
 }
 
@@ -158,7 +170,7 @@ fn rows(curves: &[StressCurve]) -> Vec<Vec<String>> {
                 format!("{}: {}", c.part.name(), escape(&c.axis)),
                 escape(&c.case),
                 breaks(c),
-                c.told_at.map_or("-".into(), |v| format!("{} {}", digits(v), c.unit)),
+                told(c),
                 if silent > 0 { format!("{silent} of {}", c.runs.len()) } else { "none".into() },
                 inside,
             ]
@@ -166,7 +178,8 @@ fn rows(curves: &[StressCurve]) -> Vec<Vec<String>> {
         .collect()
 }
 
-const HEAD: [&str; 6] = ["Axis", "Body or form", "Breaks", "First says so", "Silent failures", "Inside 95 % band"];
+const HEAD: [&str; 6] =
+    ["Axis", "Body or form", "Breaking point", "First says so", "Silent failures", "Inside 95 % band"];
 
 /// The page.
 pub fn page(curves: &[StressCurve]) -> String {
@@ -177,7 +190,7 @@ pub fn page(curves: &[StressCurve]) -> String {
          or one of no use; {silent} of these without a word.</p></header><p class=\"lead\">Severity grows to the right. The dotted \
          line is the limit of use. On the axis, an upright stroke marks where at least half of the runs break, a dashed one where \
          at least half say that something is wrong. Hollow: refused. Red crosses: broken and silent.</p><article \
-         class=\"wide\">{}</article><section><h2>Table</h2>{}</section>",
+         class=\"wide\">{}</article><section><h2>Table</h2><div class=\"two\">{}</div></section>",
         env!("CARGO_PKG_VERSION"),
         curves.iter().map(|c| c.runs.len()).sum::<usize>(),
         svg(curves),
@@ -193,7 +206,7 @@ pub fn summary(curves: &[StressCurve], seconds: f64) -> Value {
         let mean = (!inside.is_empty()).then(|| inside.iter().sum::<f64>() / inside.len() as f64);
         json!({
             "part": c.part, "axis": c.axis, "case": c.case, "unit": c.unit, "range": c.range, "breaks_at": c.breaks_at,
-            "holds_at": c.holds_at, "told_at": c.told_at, "runs": c.runs.len(), "silent": c.silent().count(),
+            "holds_at": c.holds_at, "told_at": c.told_at, "quiet_at": c.quiet_at, "runs": c.runs.len(), "silent": c.silent().count(),
             "inside_band": mean,
         })
     };
@@ -206,18 +219,16 @@ pub fn summary(curves: &[StressCurve], seconds: f64) -> Value {
 /// A line a curve, for stdout.
 pub fn text(curves: &[StressCurve]) -> String {
     let mut out = String::from("Breaking points (harmless to hopeless), and where the program first says so:\n");
-    for c in curves {
+    let row = |c: &StressCurve| {
         let silent = c.silent().count();
-        let _ = writeln!(
-            out,
-            "  {:9} {:24} {:22} breaks {:32} says so {:14}{}",
-            c.part.name(),
-            c.axis,
-            c.case,
-            breaks(c),
-            c.told_at.map_or("-".into(), |v| format!("{} {}", digits(v), c.unit)),
-            if silent > 0 { format!("  {silent} silent") } else { String::new() }
-        );
+        let silent = if silent > 0 { format!("  {silent} silent") } else { String::new() };
+        [c.part.name().into(), c.axis.clone(), c.case.clone(), breaks(c), format!("says so {}{silent}", told(c))]
+    };
+    let rows: Vec<[String; 5]> = curves.iter().map(row).collect();
+    let widths: [usize; 5] = std::array::from_fn(|k| rows.iter().map(|r| r[k].chars().count()).max().unwrap_or(0));
+    for row in rows {
+        let cells: String = row.iter().zip(widths).map(|(cell, w)| format!("  {cell:w$}")).collect();
+        let _ = writeln!(out, "{}", cells.trim_end());
     }
     if let Some(share) = bands_that_hold(curves, Part::Field, 0.9) {
         let _ = writeln!(
@@ -251,12 +262,41 @@ mod tests {
             breaks_at: Some(10.0),
             holds_at: Some(0.0),
             told_at: Some(20.0),
+            quiet_at: Some(10.0),
         };
         let curves = [curve];
         assert_eq!(svg(&curves).matches(r#"class="x""#).count(), 1);
         assert!(page(&curves).contains("2 of 3 runs have no result or one of no use; 1 of these without a word"));
         assert_eq!(summary(&curves, 1.0)["curves"][0]["silent"], 1);
-        assert!(text(&curves).contains("breaks 10 % (holds at 0)") && text(&curves).contains("1 silent"));
+        assert!(text(&curves).contains("breaks at 10 % (holds at 0)") && text(&curves).contains("1 silent"));
+        assert!(text(&curves).contains("says so at 20 % (not at 10)"));
         assert_eq!(bands_that_hold(&curves, Part::Field, 0.9), Some(1.0));
+    }
+    #[test]
+    fn breaking_points_keep_their_digits_and_say_how_far_was_tried() {
+        let with = |range: [f64; 2], last: f64, breaks_at, holds_at| StressCurve {
+            part: Part::Grasp,
+            axis: "step".into(),
+            unit: "s",
+            error_unit: "degrees",
+            case: "rk4".into(),
+            range,
+            runs: vec![run(range[0], 0.1, ""), run(last, 0.2, "")],
+            breaks_at,
+            holds_at,
+            told_at: None,
+            quiet_at: Some(last),
+        };
+        assert_eq!(
+            breaks(&with([1e-4, 0.05], 0.05, Some(0.001_464), Some(0.0014))),
+            "breaks at 0.00146 s (holds at 0.0014)"
+        );
+        assert_eq!(
+            breaks(&with([1e-4, 0.05], 0.05, Some(0.002_8), Some(0.0027))),
+            "breaks at 0.0028 s (holds at 0.0027)"
+        );
+        assert_eq!(breaks(&with([1.0, 30.0], 30.0, None, Some(30.0))), "holds to 30 s");
+        assert_eq!(breaks(&with([1.0, 30.0], 24.0, None, Some(24.0))), "holds to 24 s, no more can be had");
+        assert_eq!(breaks(&with([2e5, 2e3], 2e3, Some(26_670.0), None)), "breaks at once (26700 s)");
     }
 }

@@ -65,9 +65,10 @@ pub struct Standing {
     pub method: String,
     /// All that sets it apart.
     pub settings: String,
-    /// Per cent that is left of the error of doing nothing (geometric mean) where all cases have that, else the mean error.
+    /// Per cent that is left of the error of doing nothing (geometric mean) where all cases have that, else the mean error;
+    /// NaN without any result.
     pub error: f64,
-    /// Mean CPU seconds.
+    /// Mean CPU seconds of the runs with a result; NaN without any.
     pub cpu_s: f64,
     /// Cases.
     pub cases: usize,
@@ -134,6 +135,8 @@ pub struct StressCurve {
     pub holds_at: Option<f64>,
     /// First severity at which at least half of the runs say that something is wrong.
     pub told_at: Option<f64>,
+    /// The last severity tried before that, where they do not; it first says so between the two.
+    pub quiet_at: Option<f64>,
 }
 
 impl StressCurve {
