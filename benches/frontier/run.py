@@ -86,20 +86,25 @@ def means(rows, key):
 
 
 def label(axis, points, colour):
-    """Names each point where nothing is written yet, to the right of it if there is room."""
-    places = axis.transData.transform([p[:2] for p in points]) * 72 / axis.figure.dpi
-    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    """Names each point beside it where nothing is written yet; further away a line leads to the name."""
+    scale = 72 / axis.figure.dpi
+    places = axis.transData.transform([p[:2] for p in points]) * scale
+    taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in places]
+    left, right, low, high = (v * scale for v in (axis.bbox.x0, axis.bbox.x1, axis.bbox.y0, axis.bbox.y1))
+    beside = [("left", 8, -3), ("right", -8, -3), ("center", 0, 8), ("center", 0, -16)]
+    away = [(side, sign * far, dy) for far in (14, 26, 40) for dy in (far - 3, -far - 3) for side, sign in (("left", 1), ("right", -1))]
     for (c, e, m), (x, y) in zip(points, places):
-        width, tried = 5.8 * len(m), []
-        for side, dx, dy in (("left", 7, 4), ("left", 7, -13), ("right", -7, 4), ("right", -7, -13), ("center", 0, 9), ("center", 0, -18), ("left", 7, 16), ("left", 7, -25), ("right", -7, -25)):
+        width, tried = 6.2 * len(m), []
+        for side, dx, dy in beside + away:
             start = x + dx - {"left": 0, "right": width, "center": width / 2}[side]
-            box = (start, y + dy, start + width, y + dy + 10)
-            shared = [max(0, min(box[k + 2], t[k + 2]) - max(box[k], t[k])) for t in taken for k in (0, 1)]
-            hits = 1e4 * (box[0] < axis.bbox.x0 * 72 / axis.figure.dpi) + sum(w * h for w, h in zip(shared[::2], shared[1::2]))
-            tried.append((hits, len(tried), side, (dx, dy), box))
-        _, _, side, offset, box = min(tried)
+            box = (start - 2, y + dy - 2, start + width + 2, y + dy + 9)
+            outside = box[0] < left or box[2] > right or box[1] < low or box[3] > high
+            shared = sum(max(0, min(box[2], t[2]) - max(box[0], t[0])) * max(0, min(box[3], t[3]) - max(box[1], t[1])) for t in taken)
+            tried.append((1e4 * outside + shared, len(tried), side, (dx, dy), box))
+        _, number, side, offset, box = min(tried)
         taken.append(box)
-        axis.annotate(m, (c, e), xytext=offset, textcoords="offset points", ha=side, color=colour(m))
+        lead = {"arrowprops": {"arrowstyle": "-", "color": "0.6", "lw": 0.8, "shrinkA": 0, "shrinkB": 3, "relpos": (side == "right", 0.5)}} if number >= len(beside) else {}
+        axis.annotate(m, (c, e), xytext=offset, textcoords="offset points", ha=side, color=colour(m), **lead)
 
 
 def chart(rows, groups, path):

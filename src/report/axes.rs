@@ -5,18 +5,32 @@ use crate::report::plot::ticks;
 use crate::report::scale::short;
 use std::fmt::Write;
 
+/// Rules for one colour. No CSS variables: viewers other than browsers do not know them.
+macro_rules! coloured {
+    ($($k:literal $colour:literal)*) => {
+        concat!($(
+            ".d.k", $k, ",.n.k", $k, "{fill:", $colour, "}",
+            ".l.k", $k, ",.told.k", $k, ",.broke.k", $k, ",.d.whole.k", $k, "{stroke:", $colour, "}",
+        )*)
+    };
+}
+
 /// Colours and fonts of all panels, for a `<style>` element.
-pub const STYLE: &str = "\
-text{font:11px system-ui,sans-serif;fill:#444}.t{font-weight:600;font-size:13px;fill:#111}.n{fill:#777}\
-.g{stroke:#e4e6ea;fill:none}.a{stroke:#888;fill:none}.page{fill:#fff}\
-.k0{--c:#c0392b}.k1{--c:#2166ac}.k2{--c:#7a7a7a}.k3{--c:#2a7f4f}.k4{--c:#8e44ad}.k5{--c:#c77700}\
-.d{fill:var(--c);stroke:#fff;stroke-width:.7}.d.whole{fill:#fff;stroke:var(--c);stroke-width:1.8}.l{fill:none;stroke:var(--c);stroke-width:1.7}\
-.front{fill:none;stroke:#999;stroke-width:1.2}.ring{fill:none;stroke:#111;stroke-width:1.3}.x{stroke:#d00000;stroke-width:1.8;fill:none}\
-.limit{stroke:#999;stroke-dasharray:2 3;fill:none}.told{stroke:var(--c);stroke-dasharray:5 3;stroke-width:1.2}.broke{stroke:var(--c);stroke-width:1.2}\
-.d:hover{stroke:#111;stroke-width:2}.name{paint-order:stroke;stroke:#fff;stroke-width:3px;stroke-linejoin:round}\
-@media(prefers-color-scheme:dark){text{fill:#bbb}.t{fill:#eee}.n{fill:#999}.g{stroke:#333840}.page{fill:#14171c}\
-.k0{--c:#ff7a6b}.k1{--c:#6db3f2}.k2{--c:#b0b0b0}.k3{--c:#6fd39b}.k4{--c:#c79ae0}.k5{--c:#f0b04a}\
-.d{stroke:#14171c}.d.whole{fill:#14171c}.ring{stroke:#eee}.name{stroke:#14171c}.x{stroke:#ff5050}.d:hover{stroke:#fff}}";
+const STYLE: &str = concat!(
+    "text{font:11px system-ui,sans-serif;fill:#444}.t{font-weight:600;font-size:13px;fill:#111}.n{fill:#777}",
+    ".g{stroke:#e4e6ea;fill:none}.a{stroke:#888;fill:none}.page{fill:#fff}",
+    ".d{stroke:#fff;stroke-width:.7}.d.whole{stroke-width:1.8}.l{fill:none;stroke-width:1.7}",
+    ".front{fill:none;stroke:#999;stroke-width:1.2}.lead{fill:none;stroke:#bbb;stroke-width:.8}",
+    ".ring{fill:none;stroke:#111;stroke-width:1.3}.x{stroke:#d00000;stroke-width:1.8;fill:none}",
+    ".limit{stroke:#999;stroke-dasharray:2 3;fill:none}.told{stroke-dasharray:5 3;stroke-width:1.2}.broke{stroke-width:1.2}",
+    ".name{paint-order:stroke;stroke:#fff;stroke-width:3px;stroke-linejoin:round}",
+    coloured!("0" "#c0392b" "1" "#2166ac" "2" "#7a7a7a" "3" "#2a7f4f" "4" "#8e44ad" "5" "#c77700"),
+    ".d.whole{fill:#fff}.d:hover{stroke:#111;stroke-width:2}",
+    "@media(prefers-color-scheme:dark){text{fill:#bbb}.t{fill:#eee}.n{fill:#999}.g{stroke:#333840}.page{fill:#14171c}",
+    ".d{stroke:#14171c}.ring{stroke:#eee}.name{stroke:#14171c}.lead{stroke:#555}.x{stroke:#ff5050}",
+    coloured!("0" "#ff7a6b" "1" "#6db3f2" "2" "#b0b0b0" "3" "#6fd39b" "4" "#c79ae0" "5" "#f0b04a"),
+    ".d.whole{fill:#14171c}.d:hover{stroke:#fff}}"
+);
 
 /// One axis.
 #[derive(Debug, Clone, PartialEq)]

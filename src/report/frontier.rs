@@ -77,6 +77,15 @@ fn against_time(group: &Group) -> (Panel, String) {
     let mut order: Vec<&Standing> = shown;
     order.sort_by_key(|s| (s.varied != "preset", !s.on_front));
     let place = |s: &Standing| panel.at([s.cpu_s, s.error.max(FLOOR)]);
+    let mut names = String::new();
+    for s in &order {
+        let (name, [x, y]) = (name(s), place(s));
+        let Some(([left, base], lead)) = room(&panel, [x, y], name.chars().count(), &mut taken) else { continue };
+        if let Some([a, b]) = lead {
+            let _ = write!(out, r#"<path class="lead" d="M{x:.1} {y:.1}L{a:.1} {b:.1}"/>"#);
+        }
+        let _ = write!(names, r#"<text class="name" x="{left:.1}" y="{base:.1}">{}</text>"#, escape(&name));
+    }
     for s in order.iter().rev() {
         let [x, y] = place(s);
         let k = if s.method.contains("semi-implicit") {
@@ -93,12 +102,7 @@ fn against_time(group: &Group) -> (Panel, String) {
             escape(&hover(s, group.unit))
         );
     }
-    for s in order {
-        let name = name(s);
-        if let Some([left, base]) = room(&panel, place(s), name.chars().count(), &mut taken) {
-            let _ = write!(out, r#"<text class="name" x="{left:.1}" y="{base:.1}">{}</text>"#, escape(&name));
-        }
-    }
+    out.push_str(&names);
     (panel, out)
 }
 
@@ -110,30 +114,32 @@ fn name(s: &Standing) -> String {
     }
 }
 
-/// A free place for a name of `letters` beside a dot; none where there is no room, pointing at the dot still tells.
-fn room(panel: &Panel, [x, y]: [f64; 2], letters: usize, taken: &mut Vec<[f64; 4]>) -> Option<[f64; 2]> {
-    let (width, [left, right, top, bottom]) = (5.9 * letters as f64, panel.frame());
-    let places = [
-        [x + 7.0, y + 4.0],
-        [x - 7.0 - width, y + 4.0],
-        [x - width / 2.0, y - 8.0],
-        [x - width / 2.0, y + 16.0],
-        [x + 7.0, y - 7.0],
-        [x + 7.0, y + 15.0],
-        [x - 7.0 - width, y - 7.0],
-        [x - 7.0 - width, y + 15.0],
-        [x + 7.0, y - 19.0],
-        [x + 7.0, y + 27.0],
-        [x - 7.0 - width, y - 19.0],
-        [x - 7.0 - width, y + 27.0],
-    ];
-    let found = places.into_iter().find(|&[a, b]| {
-        let own = [a, a + width, b - 9.0, b + 2.0];
+/// Where a name of `letters` beside a dot begins, and the end of a line that leads to it where it is not close by; none where
+/// there is no room, pointing at the dot still tells.
+fn room(
+    panel: &Panel,
+    [x, y]: [f64; 2],
+    letters: usize,
+    taken: &mut Vec<[f64; 4]>,
+) -> Option<([f64; 2], Option<[f64; 2]>)> {
+    let (width, [left, right, top, bottom]) = (6.4 * letters as f64, panel.frame());
+    let beside =
+        [[7.0, 4.0], [-7.0 - width, 4.0], [-width / 2.0, -8.0], [-width / 2.0, 16.0], [7.0, -7.0], [7.0, 15.0]];
+    let away = [15.0, 27.0, 40.0].into_iter().flat_map(|far| {
+        let [up, down] = [4.0 - far, 4.0 + far];
+        [[far, up], [far, down], [-far - width, up], [-far - width, down]]
+    });
+    let mut places = beside.into_iter().map(|p| (p, false)).chain(away.map(|p| (p, true)));
+    let (found, far) = places.find_map(|([a, b], far)| {
+        let (a, b) = (x + a, y + b);
+        let own = [a - 2.0, a + width + 2.0, b - 9.0, b + 2.0];
         let free = |t: &[f64; 4]| own[1] < t[0] || own[0] > t[1] || own[3] < t[2] || own[2] > t[3];
-        a >= left && a + width <= right && b - 9.0 >= top && b <= bottom && taken.iter().all(free)
+        let inside = a >= left && a + width <= right && own[2] >= top && b <= bottom;
+        (inside && taken.iter().all(free)).then_some(([a, b], far))
     })?;
     taken.push([found[0], found[0] + width, found[1] - 9.0, found[1] + 2.0]);
-    Some(found)
+    let end = if found[0] > x { found[0] - 2.0 } else { found[0] + width + 2.0 };
+    Some((found, far.then_some([end, found[1] - 4.0])))
 }
 
 fn hover(s: &Standing, unit: &str) -> String {

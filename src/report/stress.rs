@@ -89,7 +89,7 @@ fn panel(group: &[&StressCurve]) -> (Panel, String) {
         }
         let _ = write!(
             out,
-            r#"<text class="n k{k}" style="fill:var(--c)" x="{:.0}" y="{:.0}">{}</text>"#,
+            r#"<text class="n name k{k}" x="{:.0}" y="{:.0}">{}</text>"#,
             left + 5.0,
             top + 11.0 + 13.0 * k as f64,
             escape(&curve.case)
