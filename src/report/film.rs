@@ -9,7 +9,7 @@ use crate::report::scale::Scale;
 use crate::report::section::Section;
 use crate::report::statistics::quantile;
 use crate::types::{DenseField, Grid, Mask, WorldPoint};
-use serde_json::{Value, json};
+use serde::Serialize;
 use std::fmt::Write;
 
 /// Nodes of the mesh along the longer side of a section.
@@ -89,24 +89,8 @@ impl Film {
         let all = self.planes.iter().flat_map(|p| p.strain.iter().flatten()).map(|&v| f64::from(v));
         let scale = Scale::from_zero(quantile(all, 0.99), "", ColorMap::Magma);
         let byte = |v: &f32| (255.0 * scale.position(f64::from(*v)).clamp(0.0, 1.0)).round() as u8;
-        let planes: Vec<Value> = self
-            .planes
-            .iter()
-            .map(|p| {
-                let [width, height] = p.section.size_mm();
-                let round = |v: f64| (v * 100.0).round() / 100.0;
-                json!({
-                    "size": [round(width), round(height)],
-                    "cells": p.cells,
-                    "pictures": order.iter().map(|&at| p.pictures[at].data_uri()).collect::<Vec<_>>(),
-                    "places": order.iter().map(|&at| p.places[at].iter().map(|q| q.map(round)).collect::<Vec<_>>()).collect::<Vec<_>>(),
-                    "strain": order.iter().map(|&at| p.strain[at].iter().map(byte).collect::<Vec<_>>()).collect::<Vec<_>>(),
-                })
-            })
-            .collect();
         let colours: Vec<String> = (0..=255).map(|i| scale.map.hex(f64::from(i) / 255.0)).collect();
         let names: Vec<&String> = order.iter().filter_map(|&at| clock.get(self.frames[at])).collect();
-        let data = json!({ "planes": planes, "colours": colours, "clock": names });
         let canvases: String =
             self.planes.iter().map(|p| figure(p.section.plane, p.section.size_mm(), "<canvas></canvas>")).collect();
         let mut out = format!(
@@ -117,12 +101,46 @@ impl Film {
             order.len().saturating_sub(1),
             legend(Some(&scale))
         );
+        // As it is read: values of all nodes and frames would take many times the room of their text.
+        out.push_str("<script type=\"application/json\">{\"planes\":[");
+        for (n, plane) in self.planes.iter().enumerate() {
+            out.push_str(if n == 0 { "" } else { "," });
+            plane.write(&mut out, &order, &byte);
+        }
+        let names = text(&names).replace("</", "<\\/");
         let _ = write!(
             out,
-            "<script type=\"application/json\">{}</script></div><script>{}</script>",
-            data.to_string().replace("</", "<\\/"),
+            "],\"colours\":{},\"clock\":{names}}}</script></div><script>{}</script>",
+            text(&colours),
             include_str!("film.js")
         );
         out
     }
+}
+
+impl Plane {
+    /// The frames in `order` as JSON; `byte` gives a strain its colour's number.
+    fn write(&self, out: &mut String, order: &[usize], byte: &dyn Fn(&f32) -> u8) {
+        let round = |v: f64| (v * 100.0).round() / 100.0;
+        let places = |at: usize| self.places[at].iter().map(|q| q.map(round)).collect::<Vec<_>>();
+        let strain = |at: usize| self.strain[at].iter().map(byte).collect::<Vec<_>>();
+        let _ = write!(out, "{{\"size\":{},\"cells\":{}", text(&self.section.size_mm().map(round)), text(&self.cells));
+        let list = |out: &mut String, name: &str, of: &dyn Fn(usize) -> String| {
+            let _ = write!(out, ",\"{name}\":[");
+            for (n, &at) in order.iter().enumerate() {
+                out.push_str(if n == 0 { "" } else { "," });
+                out.push_str(&of(at));
+            }
+            out.push(']');
+        };
+        list(out, "pictures", &|at| text(&self.pictures[at].data_uri()));
+        list(out, "places", &|at| text(&places(at)));
+        list(out, "strain", &|at| text(&strain(at)));
+        out.push('}');
+    }
+}
+
+/// As JSON; what cannot be written so is null.
+fn text(value: &impl Serialize) -> String {
+    serde_json::to_string(value).unwrap_or_else(|_| "null".into())
 }
