@@ -1,4 +1,4 @@
-//! Line plots as SVG: axes with round ticks, several lines, marks along the bottom axis.
+//! Line plots as SVG: axes with round ticks, several lines, marks along the bottom axis, a legend under it.
 
 use crate::report::html::escape;
 use crate::report::scale::short;
@@ -9,7 +9,12 @@ const HEIGHT: f64 = 210.0;
 const LEFT: f64 = 46.0;
 const RIGHT: f64 = 8.0;
 const TOP: f64 = 26.0;
-const BOTTOM: f64 = 34.0;
+const BOTTOM: f64 = 38.0;
+/// From one row of the legend to the next.
+const ROW: f64 = 17.0;
+/// The stroke that stands before a name in the legend, with the room after it; what is left free between two entries.
+const STROKE: f64 = 21.0;
+const APART: f64 = 10.0;
 
 /// One line of a plot.
 #[derive(Debug, Clone, PartialEq)]
@@ -40,6 +45,46 @@ pub struct Plot<'a> {
     pub across: &'a str,
     /// Places on the horizontal axis with a faint upright line: (place, whether it is a warning).
     pub marks: &'a [(f64, bool)],
+}
+
+/// Width of `text` in the plots' 12 px type, at most: that of a wide typeface.
+fn width(text: &str) -> f64 {
+    let of = |c: char| match c {
+        'i' | 'j' | 'l' | ' ' | '.' | ',' | ':' | ';' | '\'' | '|' => 4.0,
+        'f' | 'r' | 't' | '(' | ')' | '-' | '/' => 5.2,
+        'm' | 'w' | 'M' | 'W' | '%' => 12.0,
+        'a'..='z' | '0'..='9' => 7.7,
+        'A' | 'B' | 'E' | 'F' | 'J' | 'L' | 'P' | 'S' | 'T' => 8.4,
+        'A'..='Z' => 9.6,
+        _ => 12.0,
+    };
+    text.chars().map(of).sum()
+}
+
+/// Where the names of a legend stand, each with its stroke: from the left and row, in as many rows as it takes. The first row
+/// ends before `across`, which stands at its right.
+fn legend<'a>(names: impl Iterator<Item = &'a str>, across: &str) -> Vec<[f64; 2]> {
+    let (mut left, mut row, mut end) = (LEFT, 0.0, WIDTH - RIGHT - width(across) - APART);
+    let place = |name: &str| {
+        let wide = STROKE + width(name);
+        if left > LEFT && left + wide > end {
+            (left, row, end) = (LEFT, row + 1.0, WIDTH - RIGHT);
+        }
+        let at = [left, row];
+        left += wide + APART;
+        at
+    };
+    names.map(place).collect()
+}
+
+/// Ticks from `low` to `high`; where all `places` are whole, as the numbers of frames are, so are the ticks.
+fn places_ticks(low: f64, high: f64, mut places: impl Iterator<Item = f64>) -> Vec<f64> {
+    let whole = |v: f64| (v - v.round()).abs() < 1e-9;
+    let mut found = ticks(low, high, 6.0);
+    if places.all(whole) {
+        found.retain(|v| whole(*v));
+    }
+    found
 }
 
 /// Round numbers from at or above `low` to at or below `high`, about `wanted` of them.
@@ -73,11 +118,14 @@ impl Plot<'_> {
         let size = y0.abs().max(y1.abs()).max(1e-9);
         let room = if y1 - y0 > 1e-4 * size { 0.06 * (y1 - y0) } else { 0.1 * size };
         (y0, y1) = (y0 - room, y1 + room);
+        let named: Vec<&Line> = lines.iter().filter(|l| !l.name.is_empty()).collect();
+        let entries = legend(named.iter().map(|l| l.name.as_str()), self.across);
+        let tall = HEIGHT + ROW * entries.last().map_or(0.0, |e| e[1]);
         let x = |v: f64| LEFT + (v - x0) / (x1 - x0) * (WIDTH - LEFT - RIGHT);
         let y = |v: f64| TOP + (y1 - v) / (y1 - y0) * (HEIGHT - TOP - BOTTOM);
         let base = HEIGHT - BOTTOM;
         let mut svg = format!(
-            r#"<svg class="chart plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{0}"><text x="0" y="12" class="strong">{0}</text>"#,
+            r#"<svg class="chart plot" viewBox="0 0 {WIDTH} {tall}" role="img" aria-label="{0}"><text x="0" y="12" class="strong">{0}</text>"#,
             escape(self.title)
         );
         for v in ticks(y0, y1, 4.0) {
@@ -96,7 +144,7 @@ impl Plot<'_> {
             let _ = write!(svg, r#"<path class="{class}" d="M{:.1} {TOP}V{base}"/>"#, x(place));
         }
         let _ = write!(svg, r#"<path class="axis" d="M{LEFT} {base}H{:.0}"/>"#, WIDTH - RIGHT);
-        for v in ticks(x0, x1, 6.0) {
+        for v in places_ticks(x0, x1, finite().map(|p| p[0])) {
             let _ =
                 write!(svg, r#"<text x="{:.1}" y="{:.0}" text-anchor="middle">{}</text>"#, x(v), base + 15.0, short(v));
         }
@@ -113,7 +161,9 @@ impl Plot<'_> {
             let mut pen = false;
             for p in &line.points {
                 if p[0].is_finite() && p[1].is_finite() {
-                    let _ = write!(path, "{}{:.1} {:.1}", if pen { 'L' } else { 'M' }, x(p[0]), y(p[1]));
+                    let _ = write!(path, "{}{:.1} {:.1}", if pen { "L" } else { "M" }, x(p[0]), y(p[1]));
+                    // A place alone between two gaps is a dot.
+                    path.push_str(if pen { "" } else { "h0" });
                     pen = true;
                 } else {
                     pen = false;
@@ -121,18 +171,16 @@ impl Plot<'_> {
             }
             let _ = write!(svg, r#"<path class="{class}" d="{path}"/>"#);
         }
-        // The legend, from the left below the axis.
-        let (mut left, under) = (LEFT, HEIGHT - 4.0);
-        for line in lines.iter().filter(|l| !l.name.is_empty()) {
+        for (line, [left, row]) in named.iter().zip(&entries) {
             let class = format!("line c{}{}", line.colour % 4, if line.dashed { " dashed" } else { "" });
+            let under = HEIGHT - 4.0 + ROW * row;
             let _ = write!(
                 svg,
                 r#"<path class="{class}" d="M{left:.0} {:.0}h16"/><text x="{:.0}" y="{under:.0}">{}</text>"#,
                 under - 4.0,
-                left + 21.0,
+                left + STROKE,
                 escape(&line.name)
             );
-            left += 21.0 + 7.2 * line.name.chars().count() as f64 + 12.0;
         }
         svg.push_str("</svg>");
         svg
@@ -148,6 +196,29 @@ mod tests {
         assert_eq!(ticks(0.0, 12.5, 6.0), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0]);
         assert_eq!(ticks(-0.3, 0.31, 3.0), [-0.2, 0.0, 0.2]);
         assert_eq!(ticks(1.0, 1.0, 3.0), [1.0]);
+    }
+
+    #[test]
+    fn whole_places_have_whole_ticks() {
+        let at = |points: &[f64]| places_ticks(points[0], points[points.len() - 1], points.iter().copied());
+        assert_eq!(at(&[1.0, 2.0, 3.0, 4.0, 5.0]), [1.0, 2.0, 3.0, 4.0, 5.0]);
+        assert_eq!(at(&[0.0, 1.0]), [0.0, 1.0]);
+        assert_eq!(at(&[0.0, 0.5, 1.0]).len(), 6);
+    }
+
+    #[test]
+    fn names_in_a_legend_do_not_overprint() {
+        let names = ["E1 mean", "E1 peak", "E3 mean", "E3 peak", "volume", "a layer with a long name of its own", "W"];
+        let places = legend(names.into_iter(), "time, s");
+        let ends = |at: usize| places[at][0] + STROKE + width(names[at]);
+        for at in 0..names.len() {
+            let next = places.get(at + 1).filter(|n| n[1] == places[at][1]).map_or(WIDTH, |n| n[0]);
+            assert!(ends(at) < next, "{}: ends at {:.0}, the next begins at {next:.0}", names[at], ends(at));
+            assert!(places[at][1] > 0.0 || ends(at) < WIDTH - RIGHT - width("time, s"), "{}", names[at]);
+        }
+        let lines = names.map(|n| Line::new(n, 0, false, vec![[0.0, 1.0], [1.0, 2.0]]));
+        let svg = Plot { title: "t", across: "time, s", marks: &[] }.draw(&lines);
+        assert!(svg.contains("viewBox=\"0 0 520 227\""), "{svg}");
     }
 
     #[test]

@@ -20,6 +20,7 @@ use crate::types::{
     WorldPoint,
 };
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// A tracked sequence.
@@ -356,55 +357,150 @@ fn look(report: &TrackReport<'_>) -> String {
     )
 }
 
-/// Strain of each region, motion and points over time.
+/// Labels whose strain is drawn in sight; that of the others is folded away below.
+const IN_SIGHT: usize = 8;
+
+/// Motion and points over time, and strain of each region.
 fn curves(report: &TrackReport<'_>) -> String {
     let t = report.tracked;
     let across = if report.step_s.is_some() { "time, s" } else { "frame" };
-    let mut labels: Vec<u8> = t.strain.iter().map(|s| s.label).collect();
-    labels.sort_unstable();
-    labels.dedup();
-    let of = |label: u8, f: &dyn Fn(&StrainRow) -> f64| -> Vec<[f64; 2]> {
-        let rest = [report.time(report.reference), 0.0];
-        let rows = t.strain.iter().filter(|s| s.label == label).map(|s| [report.time(s.frame), f(s)]);
-        let mut points: Vec<[f64; 2]> = rows.chain([rest]).collect();
-        points.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        points
-    };
     let draw =
         |title: &str, lines: &[Line]| format!("<article>{}</article>", Plot { title, across, marks: &[] }.draw(lines));
-    let mut out = String::new();
-    let frames = |f: &dyn Fn(usize) -> f64| -> Vec<[f64; 2]> {
-        (0..t.frames.len()).map(|at| [report.time(t.frames[at].frame), f(at)]).collect()
+    // A lost frame interrupts the lines.
+    let frames = |still: f64, f: &dyn Fn(&FrameSummary) -> f64| {
+        let value = |s: &FrameSummary| if s.lost.is_some() { f64::NAN } else { f(s) };
+        over_time(report, still, t.frames.iter().map(|s| (s.frame, value(s))))
     };
-    out += &draw(
+    let mut out = draw(
         "Displacement, mm",
         &[
-            Line::new("mean", 0, false, frames(&|at| t.frames[at].mean_mm)),
-            Line::new("largest", 1, false, frames(&|at| t.frames[at].max_mm)),
-            Line::new("uncertainty", 2, true, frames(&|at| t.frames[at].uncertainty_median_mm)),
+            Line::new("mean", 0, false, frames(0.0, &|s| s.mean_mm)),
+            Line::new("largest", 1, false, frames(0.0, &|s| s.max_mm)),
+            Line::new("uncertainty", 2, true, frames(0.0, &|s| s.uncertainty_median_mm)),
         ],
     );
     let state = |frame: usize, state: PointState| {
         t.trajectories.iter().filter(|p| p.places[frame].is_some_and(|p| p.state == state)).count() as f64
     };
+    let all = t.trajectories.len() as f64;
     out += &draw(
         "Points",
         &[
-            Line::new("measured", 0, false, frames(&|at| state(t.frames[at].frame, PointState::Measured))),
-            Line::new("carried", 1, false, frames(&|at| state(t.frames[at].frame, PointState::Carried))),
+            Line::new("measured", 0, false, frames(all, &|s| state(s.frame, PointState::Measured))),
+            Line::new("carried", 1, false, frames(0.0, &|s| state(s.frame, PointState::Carried))),
         ],
     );
-    for label in labels.into_iter().take(8) {
-        out += &draw(
-            &format!("Strain, label {label}"),
-            &[
-                Line::new("E1 mean", 0, false, of(label, &|s| s.mean[0])),
-                Line::new("E1 peak", 0, true, of(label, &|s| s.peak[0])),
-                Line::new("E3 mean", 1, false, of(label, &|s| s.mean[2])),
-                Line::new("E3 peak", 1, true, of(label, &|s| s.peak[1])),
-                Line::new("volume", 2, false, of(label, &|s| s.volume_change)),
-            ],
-        );
-    }
+    let mut by_label: BTreeMap<u8, Vec<&StrainRow>> = BTreeMap::new();
+    t.strain.iter().for_each(|s| by_label.entry(s.label).or_default().push(s));
+    let strain = |(label, rows): (&u8, &Vec<&StrainRow>)| {
+        let of = |f: &dyn Fn(&StrainRow) -> f64| {
+            let lost = t.frames.iter().filter(|f| f.lost.is_some()).map(|f| (f.frame, f64::NAN));
+            over_time(report, 0.0, rows.iter().map(|s| (s.frame, f(s))).chain(lost))
+        };
+        let lines = [
+            Line::new("E1 mean", 0, false, of(&|s| s.mean[0])),
+            Line::new("E1 peak", 0, true, of(&|s| s.peak[0])),
+            Line::new("E3 mean", 1, false, of(&|s| s.mean[2])),
+            Line::new("E3 peak", 1, true, of(&|s| s.peak[1])),
+            Line::new("volume", 2, false, of(&|s| s.volume_change)),
+        ];
+        draw(&format!("Strain, label {label}"), &lines)
+    };
+    out.extend(by_label.iter().take(IN_SIGHT).map(strain));
+    let rest: String = by_label.iter().skip(IN_SIGHT).map(strain).collect();
+    let Some(more) = by_label.len().checked_sub(IN_SIGHT).filter(|n| *n > 0) else { return out };
+    let _ = write!(
+        out,
+        "<details class=\"wide\"><summary>Strain of {more} more label{}</summary><div class=\"grid\">{rest}</div></details>",
+        if more == 1 { "" } else { "s" }
+    );
     out
+}
+
+/// Places of a line by frame; in the reference the value is `still`.
+fn over_time(report: &TrackReport<'_>, still: f64, values: impl Iterator<Item = (usize, f64)>) -> Vec<[f64; 2]> {
+    let all = values.chain([(report.reference, still)]);
+    let mut points: Vec<[f64; 2]> = all.map(|(frame, value)| [report.time(frame), value]).collect();
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    points
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::types::{Affine, Counts};
+
+    fn frame(frame: usize, lost: Option<&str>) -> FrameSummary {
+        FrameSummary {
+            frame,
+            lost: lost.map(String::from),
+            searched: true,
+            counts: Counts::default(),
+            model: None,
+            mean_mm: 0.5 * frame as f64,
+            max_mm: frame as f64,
+            residual_mm: 0.1,
+            uncertainty_median_mm: 0.1,
+            folds: 0,
+            seconds: 1.0,
+            warnings: Vec::new(),
+        }
+    }
+
+    /// Frames 1 to 4 after the reference, frame 2 lost, with as many labels.
+    fn sequence(labels: u8) -> Tracked {
+        let row = |frame: usize, label: u8| StrainRow {
+            frame,
+            label,
+            voxels: 9,
+            mean: [0.01, 0.0, -0.01],
+            peak: [0.02, -0.02],
+            shear: [0.01, 0.02],
+            volume_change: 0.0,
+        };
+        let strain = [1, 3, 4].into_iter().flat_map(|f| (1..=labels).map(move |l| row(f, l))).collect();
+        let frames = (1..5).map(|f| frame(f, (f == 2).then_some("it is blank"))).collect();
+        Tracked { frames, trajectories: Vec::new(), strain }
+    }
+
+    fn told<T>(tracked: &Tracked, tell: impl Fn(&TrackReport<'_>) -> T) -> T {
+        let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+        let names: Vec<String> = (0..5).map(|f| format!("frame_{f}.nii")).collect();
+        tell(&TrackReport {
+            names: &names,
+            reference: 0,
+            step_s: None,
+            grid: &grid,
+            regions: ["", ""],
+            params: &FieldParams::default(),
+            tracked,
+            film: &Film::new(&grid, grid.world(4, 4, 4), None, [0.0, 1.0]),
+            look: None,
+            warnings: &[],
+            seconds: &[],
+        })
+    }
+
+    #[test]
+    fn all_labels_are_drawn_and_those_past_the_eighth_folded_away() {
+        let drawn = |labels: u8| told(&sequence(labels), curves);
+        assert!(!drawn(8).contains("<details"));
+        let many = drawn(30);
+        let (open, folded) = many.split_once("<details").unwrap();
+        assert_eq!([open, folded].map(|part| part.matches("class=\"strong\">Strain, label").count()), [8, 22]);
+        assert!(folded.contains("Strain of 22 more labels") && folded.contains("Strain, label 30"));
+        assert!(drawn(9).contains("Strain of 1 more label<"));
+    }
+
+    #[test]
+    fn a_lost_frame_interrupts_the_curves_and_frames_are_whole() {
+        let drawn = told(&sequence(1), curves);
+        assert!(!drawn.contains("NaN") && !drawn.contains(">0.5<") && !drawn.contains(">1.5<"), "{drawn}");
+        // Frame 0 to 1, and 3 to 4.
+        let lines = drawn.split("class=\"line c").skip(1).map(|l| l.split('"').nth(2).unwrap_or_default());
+        let drawn: Vec<&str> = lines.filter(|l| !l.contains("h16")).collect();
+        assert_eq!(drawn.len(), 3 + 2 + 5);
+        assert!(drawn.iter().all(|l| l.matches('M').count() == 2 && l.matches('L').count() == 2), "{drawn:?}");
+    }
 }
