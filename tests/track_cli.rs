@@ -112,6 +112,12 @@ fn volumes_and_a_series_give_the_same() {
     let matches = io::read_matches(results.join("matches_003.csv")).unwrap();
     assert!(matches.kept().count() >= 20);
     let page = fs::read_to_string(results.join("report.html")).unwrap();
+    // So few matches are no better in a sequence than in a pair.
+    assert!(
+        matches.kept().count() < 100
+            && page.contains("Trust is low")
+            && page.contains("frames 1 to 3 are of low trust")
+    );
     assert!(page.contains("<canvas>") && !page.contains("http"));
 
     // The whole series holds each frame's field, unpacked to the same bytes.

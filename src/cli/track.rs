@@ -23,6 +23,7 @@ use palpate::pipeline::{
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
 use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as frame_warnings};
+use palpate::report::verdict::judge;
 use palpate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -160,6 +161,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
     let mut film = None;
     let mut looks = Looks::new(frames, &grid);
+    let mut judged = Vec::new();
     let step_s = source.step_s();
     let (mut reading, mut writing) = (started.elapsed(), std::time::Duration::ZERO);
 
@@ -188,6 +190,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         })?;
         let film = film.get_or_insert_with(|| start_film(&reference, field, shown, range));
         add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
+        judged.push((number, judge(&grid, inside.as_ref(), &|o| result.uncertainty.at(o), &result.summary)));
         let mean = result.summary.mean_mm;
         if looks.wants(number, mean) {
             let there = on_grid(volume.view(), &grid);
@@ -247,6 +250,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         tracked: &tracked,
         film: &film,
         look: Some((&looks, &reference, shown)),
+        judged: &judged,
         warnings: &warnings,
         seconds: &seconds,
     };

@@ -85,6 +85,7 @@ pub fn track<'py>(
         tracked: &tracked,
         film: &Film::new(&grid, grid.world(0, 0, 0), None, [0.0, 1.0]),
         look: None,
+        judged: &[],
         warnings: &warnings(&tracked).collect::<Vec<_>>(),
         seconds: &[("read", reading), ("measure", measuring)].map(|(stage, s)| (stage.to_string(), s)),
     };

@@ -12,7 +12,7 @@ use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
-use crate::report::verdict::short2;
+use crate::report::verdict::{Verdict, judge_frames, short2};
 use crate::report::viewer::{Layer, Moment, PackedMoment, Viewer, elements};
 use crate::report::views::{Scales, matched};
 use crate::types::{
@@ -43,6 +43,8 @@ pub struct TrackReport<'a> {
     pub film: &'a Film,
     /// Frames to look at, with the reference and where it was measured.
     pub look: Option<(&'a Looks, &'a Voxels<'a>, Option<&'a Mask>)>,
+    /// Frames that were measured and how each is judged as a pair.
+    pub judged: &'a [(usize, Verdict)],
     /// What the user should know.
     pub warnings: &'a [String],
     /// Stage names and wall seconds.
@@ -243,6 +245,8 @@ pub fn text(report: &TrackReport<'_>) -> String {
             ),
         };
     }
+    let (trust, reasons) = judge_frames(&t.frames, report.judged);
+    let _ = writeln!(out, "  trust        {}: {}", trust.name(), reasons.join("; "));
     let _ = writeln!(out, "  time         {:.1} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
     out
 }
@@ -259,27 +263,22 @@ pub fn warnings(tracked: &Tracked) -> impl Iterator<Item = String> + '_ {
 pub fn page(report: &TrackReport<'_>) -> String {
     let t = report.tracked;
     let (all, measured) = (t.frames.len(), report.measured().count());
-    let edge = report.grid.spacing().iter().product::<f64>().cbrt();
-    let uncertain = t.frames.iter().map(|f| f.uncertainty_median_mm).fold(0.0, f64::max);
-    let trust = match (measured == all, uncertain < edge / 2.0, measured * 2 >= all) {
-        (true, true, _) => "high",
-        (_, _, true) => "moderate",
-        _ => "low",
-    };
+    let (trust, reasons) = judge_frames(&t.frames, report.judged);
     let largest = |f: &dyn Fn(&StrainRow) -> f64| t.strain.iter().map(f).fold(0.0, f64::max);
     let mut body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>{} <span>and {all} more</span></h1><p class=\"verdict\">{}</p>\
-         <p class=\"trust {trust}\"><b>Trust is {trust}</b> median uncertainty at most {} mm in any frame.</p></header>\
+         <p class=\"trust {trust}\"><b>Trust is {trust}</b> {}.</p></header>\
          <div class=\"tiles\">{}{}{}{}{}</div>",
         env!("CARGO_PKG_VERSION"),
         escape(&report.names[report.reference]),
         escape(&report.headline()),
-        short2(uncertain),
+        escape(&reasons.join("; ")),
         tile(&measured.to_string(), "", "frames measured"),
         tile(&short2(t.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max)), "mm", "largest motion"),
         tile(&short2(largest(&|s| s.peak[0])), "", "peak principal strain"),
         tile(&thousands(t.trajectories.len()), "", "points followed"),
         tile(&format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "in all stages"),
+        trust = trust.name(),
     );
     if !report.warnings.is_empty() {
         let items: String = report.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
@@ -477,6 +476,7 @@ mod tests {
             tracked,
             film: &Film::new(&grid, grid.world(4, 4, 4), None, [0.0, 1.0]),
             look: None,
+            judged: &[],
             warnings: &[],
             seconds: &[],
         })
@@ -502,5 +502,15 @@ mod tests {
         let drawn: Vec<&str> = lines.filter(|l| !l.contains("h16")).collect();
         assert_eq!(drawn.len(), 3 + 2 + 5);
         assert!(drawn.iter().all(|l| l.matches('M').count() == 2 && l.matches('L').count() == 2), "{drawn:?}");
+    }
+
+    #[test]
+    fn the_verdict_names_what_was_lost() {
+        let tracked = sequence(1);
+        assert!(
+            told(&tracked, page)
+                .contains("<b>Trust is moderate</b> median uncertainty at most 0.1 mm in any frame; frame 2 is lost.")
+        );
+        assert!(told(&tracked, text).contains("  trust        moderate: median"));
     }
 }

@@ -3,10 +3,10 @@
 use crate::report::field::FieldReport;
 use crate::report::scale::{short, thousands};
 use crate::report::statistics::sample;
-use crate::types::{FieldSummary, Grid, Mask, MotionModel};
+use crate::types::{FieldSummary, FrameSummary, Grid, Mask, MotionModel};
 
 /// How far to rely on a field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Trust {
     /// Precise everywhere, nothing odd.
     High,
@@ -37,6 +37,8 @@ pub struct Verdict {
     /// Why, one sentence each; never empty.
     pub reasons: Vec<String>,
 }
+
+const MEDIAN: &str = "median uncertainty";
 
 /// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under 100 matches, folds in
 /// more than one voxel of a thousand, a median uncertainty above that edge, or one above the mean motion of a free field;
@@ -80,7 +82,7 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
         short2(edge)
     );
     let precise = s.uncertainty_median_mm <= edge / 2.0 && share < 0.1;
-    let median = format!("median uncertainty {} mm (1 sigma)", short2(s.uncertainty_median_mm));
+    let median = format!("{MEDIAN} {} mm (1 sigma)", short2(s.uncertainty_median_mm));
     let (trust, mut reasons) = match (low.is_empty(), precise && s.folds == 0) {
         (false, _) => (Trust::Low, low),
         (true, true) => (Trust::High, vec![median, "no folds".into()]),
@@ -93,6 +95,76 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
         reasons.push(format!("{} voxels fold", thousands(s.folds)));
     }
     Verdict { headline, trust, reasons }
+}
+
+/// Judges a sequence by its worst frames, which the reasons name: `judged` has the number of each measured frame and what
+/// [`judge`] says of it. A frame that is warned of is of moderate trust at most. Trust in the sequence is low where more than
+/// half of the frames are lost or of low trust, high where each frame is of high trust, else moderate.
+pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
+    let of = |f: &FrameSummary| judged.iter().find(|j| j.0 == f.frame).map(|j| &j.1);
+    let trust = |f: &FrameSummary| match (&f.lost, of(f).map_or(Trust::High, |v| v.trust)) {
+        (Some(_), _) => Trust::Low,
+        (None, Trust::High) if !f.warnings.is_empty() => Trust::Moderate,
+        (None, trust) => trust,
+    };
+    let numbers = |pick: &dyn Fn(&FrameSummary) -> bool| frames.iter().filter(|f| pick(f)).map(|f| f.frame).collect();
+    let lost: Vec<usize> = numbers(&|f| f.lost.is_some());
+    let low: Vec<usize> = numbers(&|f| f.lost.is_none() && trust(f) == Trust::Low);
+    let warned: Vec<usize> = numbers(&|f| f.lost.is_none() && trust(f) != Trust::Low && !f.warnings.is_empty());
+    let vague: Vec<usize> = numbers(&|f| trust(f) == Trust::Moderate && f.warnings.is_empty());
+
+    let median = frames.iter().map(|f| f.uncertainty_median_mm).fold(0.0, f64::max);
+    let mut reasons = vec![format!("{MEDIAN} at most {} mm in any frame", short2(median))];
+    for (which, what) in [(lost, "lost"), (low, "of low trust"), (warned, "warned of"), (vague, "of moderate trust")] {
+        if let Some(names) = named(&which) {
+            reasons.push(format!("{names} {} {what}", if which.len() == 1 { "is" } else { "are" }));
+        }
+    }
+    let share = |f: &FrameSummary| f.uncertainty_median_mm / f.mean_mm.max(1e-6);
+    let worse = |a: &&FrameSummary, b: &&FrameSummary| trust(a).cmp(&trust(b)).then(share(a).total_cmp(&share(b)));
+    let worst = frames.iter().filter(|f| f.lost.is_none() && trust(f) != Trust::High).max_by(worse);
+    if let Some(f) = worst {
+        let said = of(f).filter(|v| v.trust != Trust::High).map(|v| v.reasons.as_slice()).unwrap_or_default();
+        let why: String = said.iter().filter(|r| !r.starts_with(MEDIAN)).map(|r| format!(", {r}")).collect();
+        reasons.push(format!(
+            "the worst, frame {}, is uncertain by {} mm (median) where tissue moved {} mm on average{}",
+            f.frame,
+            short2(f.uncertainty_median_mm),
+            short2(f.mean_mm),
+            why
+        ));
+    }
+    let bad = frames.iter().filter(|f| trust(f) == Trust::Low).count();
+    let whole = match frames.iter().map(trust).max() {
+        _ if 2 * bad > frames.len() => Trust::Low,
+        Some(Trust::Low | Trust::Moderate) => Trust::Moderate,
+        _ => Trust::High,
+    };
+    (whole, reasons)
+}
+
+/// Runs of frames that are named one by one.
+const RUNS: usize = 6;
+
+/// Frames in words, "frames 1, 3 to 5 and 9"; none without any. `which` rises.
+fn named(which: &[usize]) -> Option<String> {
+    let mut runs: Vec<[usize; 2]> = Vec::new();
+    for &frame in which {
+        match runs.last_mut() {
+            Some(run) if run[1] + 1 == frame => run[1] = frame,
+            _ => runs.push([frame; 2]),
+        }
+    }
+    let word = |run: &[usize; 2]| match run[1] - run[0] {
+        0 => run[0].to_string(),
+        1 => format!("{}, {}", run[0], run[1]),
+        _ => format!("{} to {}", run[0], run[1]),
+    };
+    let shown: Vec<String> = runs.iter().take(RUNS).map(word).collect();
+    let left: usize = runs.iter().skip(RUNS).map(|r| r[1] - r[0] + 1).sum();
+    let more = if left > 0 { format!(" and {left} more") } else { String::new() };
+    let noun = if which.len() == 1 { "frame" } else { "frames" };
+    (!which.is_empty()).then(|| format!("{noun} {}{more}", shown.join(", ")))
 }
 
 /// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they lie to one side.
@@ -156,6 +228,60 @@ mod tests {
         case.summary.counts.kept = 31;
         let v = verdict(&case.report());
         assert_eq!((v.trust, v.reasons.len()), (Trust::Low, 2));
+    }
+
+    /// Frames of a sequence with so much median uncertainty and mean motion (mm).
+    fn frames(all: &[[f64; 2]]) -> Vec<FrameSummary> {
+        let frame = |(at, &[uncertainty_median_mm, mean_mm]): (usize, &[f64; 2])| FrameSummary {
+            frame: at + 1,
+            lost: None,
+            searched: true,
+            counts: Default::default(),
+            model: Some(MotionModel::Free),
+            mean_mm,
+            max_mm: 2.0 * mean_mm,
+            residual_mm: 0.0,
+            uncertainty_median_mm,
+            folds: 0,
+            seconds: 0.0,
+            warnings: Vec::new(),
+        };
+        all.iter().enumerate().map(frame).collect()
+    }
+
+    #[test]
+    fn a_sequence_is_judged_by_its_worst_frames() {
+        let mut all = frames(&[[0.05, 0.4], [0.13, 0.11], [0.2, 0.44], [0.3, 1.2]]);
+        let high =
+            |frame| (frame, Verdict { headline: String::new(), trust: Trust::High, reasons: vec!["fine".into()] });
+        let mut judged: Vec<(usize, Verdict)> = (1..=4).map(high).collect();
+        let (trust, reasons) = judge_frames(&all, &judged);
+        assert_eq!((trust, reasons.len()), (Trust::High, 1), "{reasons:?}");
+        // What is warned of is not of high trust, however small its uncertainty.
+        (1..3).for_each(|at| all[at].warnings.push("the mean error to expect is about half of the mean motion".into()));
+        let (trust, reasons) = judge_frames(&all, &judged);
+        assert_eq!((trust, reasons[1].as_str()), (Trust::Moderate, "frames 2, 3 are warned of"));
+        assert!(reasons[2].starts_with("the worst, frame 2, is uncertain by 0.13 mm"), "{reasons:?}");
+        judged[3].1.trust = Trust::Low;
+        judged[3].1.reasons = vec!["only 40 matches carry the field".into()];
+        all[0].lost = Some("no overlap".into());
+        let (trust, reasons) = judge_frames(&all, &judged);
+        assert_eq!(
+            (trust, reasons[1].as_str(), reasons[2].as_str()),
+            (Trust::Moderate, "frame 1 is lost", "frame 4 is of low trust")
+        );
+        assert!(
+            reasons[4].starts_with("the worst, frame 4") && reasons[4].ends_with("only 40 matches carry the field")
+        );
+        judged[2].1.trust = Trust::Low;
+        assert_eq!(judge_frames(&all, &judged).0, Trust::Low);
+    }
+
+    #[test]
+    fn frames_are_named_by_their_runs() {
+        let found = [&[7][..], &[1, 2, 4, 5, 6, 9], &[1, 3, 5, 7, 9, 11, 13, 14]].map(|w| named(w).unwrap_or_default());
+        assert_eq!(found, ["frame 7", "frames 1, 2, 4 to 6, 9", "frames 1, 3, 5, 7, 9, 11 and 2 more"]);
+        assert_eq!(named(&[]), None);
     }
 
     #[test]
