@@ -165,11 +165,20 @@ fn what_cannot_be_tracked_is_refused() {
     let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
     let (short, cut, flat, other, out) =
         (path("short.nii.gz"), path("cut.nii"), path("flat.nii"), path("other.nii"), path("out"));
+    let third = io::read_volume(pinch().join("frame_002.nii.gz")).unwrap();
+    let sform = third.grid().affine().rows().map(|row| row.map(|v| v as f32));
+    let zero = Nifti { sform, ..Nifti::filled(third.grid().shape().map(|n| n as i16), 0.0) };
+    fs::write(path("ended.nii"), &zero.bytes()[..1000]).unwrap();
+    let ended = path("ended.nii");
     for (arguments, code, parts) in [
         (vec![a], 2, ["frame_000.nii.gz", "two or more"]),
         (vec![a, b, "--reference", "2"], 2, ["--reference is 2", "2 volumes"]),
         (vec![a, "missing.nii"], 1, ["missing.nii", "check the spelling"]),
         (vec![a, b, "missing.nii", "--dry-run"], 1, ["missing.nii", "check the spelling"]),
+        // By their headers, before anything is measured.
+        (vec![a, b, &flat, "--dry-run"], 1, ["flat.nii", "is a series of 3 volumes"]),
+        (vec![a, b, "truth_001.nii.gz", "--dry-run"], 1, ["truth_001.nii.gz", "not a scalar volume"]),
+        (vec![a, b, &ended, "--dry-run"], 1, ["ended.nii", "cut short"]),
         (vec![&short], 1, ["short.nii.gz", "cut short"]),
         (vec![&cut], 1, ["cut.nii", "cut short"]),
         (vec![&flat], 1, ["flat.nii", "same value"]),
@@ -205,6 +214,32 @@ fn a_blank_file_among_others_is_lost_and_they_go_on() {
     for arguments in [vec!["track", a, &blank], vec!["track", &blank, a, b]] {
         let (_, err) = run(&[&arguments[..], &["-o", &path("none")]].concat(), 1);
         assert!(err.contains("blank.nii: every voxel has the same value"), "{err}");
+    }
+}
+
+#[test]
+fn a_dry_run_tells_what_would_be_lost_and_refuses_what_a_run_does() {
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let [far, blank, out] = ["far.nii", "blank.nii", "out"].map(path);
+    let mut away = Nifti::ramp([28, 34, 26]);
+    away.sform[0][3] = 5000.0;
+    fs::write(&far, away.bytes()).unwrap();
+    fs::write(&blank, Nifti::filled([28, 34, 26], 7.0).bytes()).unwrap();
+    let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
+    let (plan, err) = run(&["track", a, &blank, b, &far, "--dry-run", "-o", &out], 0);
+    assert!(
+        plan.contains("Would measure 3 volumes against number 0") && plan.contains("Nothing was written"),
+        "{plan}"
+    );
+    let lost = [
+        "frame 1 would be lost: the deformed volume is constant",
+        "frame 3 would be lost: the two volumes do not overlap",
+    ];
+    lost.iter().for_each(|part| assert!(err.contains(part), "should say {part:?}: {err}"));
+    for more in [&[][..], &["--dry-run"]] {
+        let (_, err) = run(&[&["track", a, &far, &far, "-o", &out][..], more].concat(), 1);
+        assert!(err.contains("no volume can be measured against frame_000.nii.gz") && err.contains("overlap"), "{err}");
     }
 }
 

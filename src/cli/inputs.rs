@@ -61,8 +61,13 @@ pub fn two_places(stored: &Stored) -> Option<String> {
 /// The same of a file or a folder, as a warning that names it.
 pub fn warn_of_two_places(path: &Path, warnings: &mut Vec<String>) {
     if let Ok((stored, _)) = io::read_header(path) {
-        warnings.extend(two_places(&stored).map(|w| format!("{}: {w}", path.display())));
+        warn_of_places(path, &stored, warnings);
     }
+}
+
+/// The same of what is known to be stored there.
+pub fn warn_of_places(path: &Path, stored: &Stored, warnings: &mut Vec<String>) {
+    warnings.extend(two_places(stored).map(|w| format!("{}: {w}", path.display())));
 }
 
 /// A volume to measure on; warns of two placements and about single voxels without a number and refuses a volume without any.

@@ -21,12 +21,17 @@ pub fn bytes(n: u64) -> String {
 pub fn field_fits(initial: &Path, deformed: &Path) -> Result<()> {
     // A header that cannot be read is reported by who reads the whole.
     let (Ok((a, _)), Ok((b, _))) = (io::read_header(initial), io::read_header(deformed)) else { return Ok(()) };
-    let (needed, left) = (memory(&a.grid, &b.grid), io::memory_left().unwrap_or(u64::MAX));
+    grids_fit((initial, &a.grid), (deformed, &b.grid))
+}
+
+/// The same of two volumes whose grids are known.
+pub fn grids_fit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
+    let (needed, left) = (memory(a, b), io::memory_left().unwrap_or(u64::MAX));
     if needed <= left {
         return Ok(());
     }
     let half = |g: &Grid| Grid::new(g.shape().map(|n| n.div_ceil(2)), *g.affine());
-    let halved = half(&a.grid).and_then(|a| Ok(memory(&a, &half(&b.grid)?))).map(bytes).unwrap_or_default();
+    let halved = half(a).and_then(|a| Ok(memory(&a, &half(b)?))).map(bytes).unwrap_or_default();
     bail!(
         "{} and {}: a field needs about {} of memory, but only {} are left; close other programs, crop both to the tissue, \
          or halve their resolution, which needs {halved} (the presets need the same)",

@@ -5,26 +5,27 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{
-    check_distinct, name, on_grid, read_mask, usable, warn_all, warn_of_non_finite, warn_of_two_places,
+    check_distinct, name, on_grid, read_mask, usable, warn_all, warn_of_non_finite, warn_of_places, warn_of_two_places,
 };
-use super::limits::field_fits;
+use super::limits::grids_fit;
 use super::outputs::Target;
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::FieldError;
 use palpate::field::jacobian::determinant_at;
 use palpate::field::warp::warp_image;
-use palpate::io::{self, PackedField, Series};
+use palpate::io::{self, PackedField, Series, Stored};
 use palpate::numerics::sampling::Interpolation;
 use palpate::pipeline::{
     self,
+    plan::FieldPlan,
     track::{self, Frame},
 };
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
 use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as frame_warnings};
 use palpate::report::verdict::judge;
-use palpate::types::{DenseField, Grid, Mask, Volume, Voxels};
+use palpate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -53,16 +54,16 @@ pub struct Options {
 
 /// Where the frames come from.
 enum Source<'a> {
-    Files(&'a [PathBuf]),
+    Files(&'a [PathBuf], Vec<Stored>),
     Series(&'a Path, Box<Series>),
 }
 
 impl<'a> Source<'a> {
     fn open(volumes: &'a [PathBuf]) -> Result<Self> {
         let [one] = volumes else {
-            // What is not there, or no volume, is told before any work.
-            volumes.iter().try_for_each(|path| io::read_header(path).map(drop))?;
-            return Ok(Self::Files(volumes));
+            // What is not there, or no single volume, is told before any work.
+            let headers = volumes.iter().map(io::read_volume_header).collect::<Result<_, _>>()?;
+            return Ok(Self::Files(volumes, headers));
         };
         let series = Series::open(one)?;
         if series.frames() < 2 {
@@ -73,30 +74,44 @@ impl<'a> Source<'a> {
 
     fn frames(&self) -> usize {
         match self {
-            Self::Files(files) => files.len(),
+            Self::Files(files, _) => files.len(),
             Self::Series(_, series) => series.frames(),
+        }
+    }
+
+    fn grid(&self, frame: usize) -> &Grid {
+        match self {
+            Self::Files(_, headers) => &headers[frame].grid,
+            Self::Series(_, series) => series.grid(),
+        }
+    }
+
+    fn path(&self, frame: usize) -> &'a Path {
+        match self {
+            Self::Files(files, _) => &files[frame],
+            Self::Series(file, _) => file,
         }
     }
 
     fn step_s(&self) -> Option<f64> {
         match self {
-            Self::Files(_) => None,
+            Self::Files(..) => None,
             Self::Series(_, series) => series.step_s(),
         }
     }
 
     fn name(&self, frame: usize) -> String {
         match self {
-            Self::Files(files) => name(&files[frame]),
+            Self::Files(files, _) => name(&files[frame]),
             Self::Series(file, _) => format!("{}[{frame}]", name(file)),
         }
     }
 
     fn read(&mut self, frame: usize, warnings: &mut Vec<String>) -> Result<(Volume, String)> {
         match self {
-            Self::Files(files) => {
+            Self::Files(files, headers) => {
                 let path = &files[frame];
-                warn_of_two_places(path, warnings);
+                warn_of_places(path, &headers[frame], warnings);
                 Ok((io::read_volume(path)?, path.display().to_string()))
             }
             Self::Series(_, series) => {
@@ -134,8 +149,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let given: Vec<&Path> = volumes.iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&files(frames, origin)))?;
 
-    let named = |number: usize| &volumes[number.min(volumes.len() - 1)];
-    field_fits(named(origin), named(usize::from(origin == 0)))?;
+    // The largest of the others is what has to fit.
+    let others = order(frames, origin).map(|t| (source.path(t), source.grid(t)));
+    if let Some(largest) = others.max_by_key(|o| o.1.len()) {
+        grids_fit((source.path(origin), source.grid(origin)), largest)?;
+    }
 
     let started = Instant::now();
     let progress = console.progress();
@@ -146,13 +164,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let reference = source.read_usable(origin, &mut warnings)?;
     let grid = *reference.grid();
-    let first = named(origin);
+    let first = source.path(origin);
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_mask(l, &grid, first)).transpose()?;
     if *dry_run {
         drop(progress);
-        let frame = source.read_usable(if origin == 0 { 1 } else { 0 }, &mut warnings)?;
-        let plan = pipeline::plan::field(&reference, &frame, inside.as_ref(), &params)?;
+        let plan = plan(&mut source, (origin, &reference), inside.as_ref(), &params, &mut warnings)?;
         warn_all(console, &warnings);
         let plan = dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files(frames, origin))?;
         return console.say(&plan);
@@ -216,10 +233,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         track::run((frames, origin), &reference, (inside.as_ref(), regions.as_ref()), &params, read, keep, &|s, f| {
             progress.set(s, f)
         })
-        .map_err(|error| match error.is::<FieldError>() {
-            true => error.context(format!("no volume can be measured against {}", source.name(origin))),
-            false => error,
-        })?;
+        .map_err(|error| if error.is::<FieldError>() { none_against(error, &source.name(origin)) } else { error })?;
 
     progress.set("write", 1.0);
     let started = Instant::now();
@@ -262,12 +276,52 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     console.say(&format!("{}{}", text(&report), target.look()))
 }
 
+/// The frames in the order in which they are measured.
+fn order(frames: usize, origin: usize) -> impl Iterator<Item = usize> {
+    (origin + 1..frames).chain((0..origin).rev())
+}
+
+/// All frames are lost, this one for `error`.
+fn none_against(error: anyhow::Error, reference: &str) -> anyhow::Error {
+    error.context(format!("no volume can be measured against {reference}"))
+}
+
+/// What would be done, by the first frame that can be measured against the reference, which is number `origin`. Warns of frames that
+/// would be lost by what their headers say.
+fn plan(
+    source: &mut Source<'_>,
+    (origin, reference): (usize, &Volume),
+    mask: Option<&Mask>,
+    params: &FieldParams,
+    warnings: &mut Vec<String>,
+) -> Result<FieldPlan> {
+    let (mut plan, mut refused) = (None, None);
+    for frame in order(source.frames(), origin) {
+        let met = pipeline::plan::grids(reference.grid(), source.grid(frame), params);
+        let tried = match met {
+            Ok(()) if plan.is_none() => {
+                let volume = source.read_frame(frame, warnings)?;
+                pipeline::plan::field(reference, &volume, mask, params).map(|found| plan = Some(found))
+            }
+            met => met,
+        };
+        if let Err(error) = tried {
+            warnings.push(format!("frame {frame} would be lost: {error}"));
+            refused = Some(error);
+        }
+    }
+    match (plan, refused) {
+        (None, Some(error)) => Err(none_against(error.into(), &source.name(origin))),
+        (None, None) => bail!(Usage("give two volumes or more".into())),
+        (Some(plan), _) => Ok(plan),
+    }
+}
+
 /// What is written at most.
 fn files(frames: usize, origin: usize) -> Vec<String> {
     let fixed = ["displacement.nii.gz", "trajectories.csv", "strain.csv", "summary.json", "report.html"];
     let each = (0..frames).map(|t| format!("displacement_{t:03}.nii.gz"));
-    let others = (0..frames).filter(|&t| t != origin);
-    let rest = others.flat_map(|t| [format!("strain_{t:03}.nii.gz"), format!("matches_{t:03}.csv")]);
+    let rest = order(frames, origin).flat_map(|t| [format!("strain_{t:03}.nii.gz"), format!("matches_{t:03}.csv")]);
     fixed.map(String::from).into_iter().chain(each).chain(rest).collect()
 }
 

@@ -109,6 +109,30 @@ pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoErro
     }
 }
 
+/// Reads only the header of a scalar volume: a file, or a folder with one DICOM series.
+///
+/// # Errors
+/// [`IoError`] where [`read_volume`] would refuse by the header and the file's size: no file, no scalar volume, or more voxels than
+/// the file can hold.
+pub fn read_volume_header(path: impl AsRef<Path>) -> Result<Stored, IoError> {
+    let path = path.as_ref();
+    match Format::of(path)? {
+        Format::Nifti => nifti::read::volume_header(path),
+        Format::Folder => super::dicom::series(path, false).map(|(stored, _)| stored),
+        format => scalar(path, format).and_then(|image| image.check_size().map(|()| image.stored())),
+    }
+}
+
+/// The header of a NRRD or MetaImage with one number a voxel.
+fn scalar(path: &Path, format: Format) -> Result<RawImage, IoError> {
+    let image = raw(path, format)?;
+    if image.components != 1 {
+        let what = format!("has {} numbers a voxel, not one", image.components);
+        return Err(Flaw::new(what, "give an image here; fields go to --field or to `palpate warp`").at(path));
+    }
+    Ok(image)
+}
+
 /// The header of a NRRD or MetaImage.
 fn raw(path: &Path, format: Format) -> Result<RawImage, IoError> {
     match format {
@@ -133,11 +157,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
             (stored.grid, values)
         }
         format => {
-            let image = raw(path, format)?;
-            if image.components != 1 {
-                let what = format!("has {} numbers a voxel, not one", image.components);
-                return Err(Flaw::new(what, "give an image here; fields go to --field or to `palpate warp`").at(path));
-            }
+            let image = scalar(path, format)?;
             (image.grid, image.load()?)
         }
     };

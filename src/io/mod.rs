@@ -79,7 +79,10 @@ pub use grasp::{
     stored_motion, stored_sample, write_energy, write_motions, write_pinch_map, write_posture_force, write_stability,
     write_sweep, write_trajectory,
 };
-pub use image::{ImageKind, Stored, count_non_finite, labels_of, read_header, read_labels, read_mask, read_volume};
+pub use image::{
+    ImageKind, Stored, count_non_finite, labels_of, read_header, read_labels, read_mask, read_volume,
+    read_volume_header,
+};
 pub use live::abandon;
 pub use markups::write_markups;
 pub use memory::memory_left;

@@ -99,11 +99,23 @@ impl RawImage {
         }
     }
 
-    /// The numbers, component after component.
-    pub(super) fn load(&self) -> Result<Vec<f32>, IoError> {
+    /// Bytes of all numbers.
+    fn needed(&self) -> u64 {
+        (self.grid.len() * self.components).saturating_mul(self.kind.size()) as u64
+    }
+
+    /// The file holds at most so many bytes where all numbers need more.
+    fn short(&self, holds: u64) -> IoError {
+        let (needed, shape) = (self.needed(), self.grid.shape());
+        let what = format!("needs {needed} bytes for its {shape:?} voxels but holds at most {holds}");
+        Flaw::new(what, "the file is cut short or its header is damaged: copy or export it again").at(&self.file)
+    }
+
+    /// The file of the numbers and where they start in it, if it can hold them all.
+    fn open(&self) -> Result<(File, u64), IoError> {
         let path = &self.file;
-        let needed = (self.grid.len() * self.components).saturating_mul(self.kind.size()) as u64;
-        let mut file = File::open(path).map_err(os(path, "read"))?;
+        let needed = self.needed();
+        let file = File::open(path).map_err(os(path, "read"))?;
         let size = file.metadata().map_err(os(path, "read"))?.len();
         let start = match self.start {
             Start::At(at) => at,
@@ -111,13 +123,19 @@ impl RawImage {
         };
         let held = size.saturating_sub(start);
         let most = if self.packing == Packing::None { held } else { held.saturating_mul(LARGEST_RATIO) };
-        let short = |holds: u64| {
-            let what = format!("needs {needed} bytes for its {:?} voxels but holds at most {holds}", self.grid.shape());
-            Flaw::new(what, "the file is cut short or its header is damaged: copy or export it again").at(path)
-        };
-        if needed > most {
-            return Err(short(most));
-        }
+        if needed > most { Err(self.short(most)) } else { Ok((file, start)) }
+    }
+
+    /// Whether the file can hold all numbers.
+    pub(super) fn check_size(&self) -> Result<(), IoError> {
+        self.open().map(drop)
+    }
+
+    /// The numbers, component after component.
+    pub(super) fn load(&self) -> Result<Vec<f32>, IoError> {
+        let path = &self.file;
+        let needed = self.needed();
+        let (mut file, start) = self.open()?;
         let damaged = |e: std::io::Error| {
             Flaw::new(format!("its packed voxels are damaged or cut short ({e})"), "copy or export it again").at(path)
         };
@@ -138,7 +156,7 @@ impl RawImage {
             }
         }
         if (bytes.len() as u64) < needed {
-            return Err(short(bytes.len() as u64));
+            return Err(self.short(bytes.len() as u64));
         }
         let values = decode(self.kind, self.big_endian, (1.0, 0.0), &bytes);
         if !self.interleaved || self.components == 1 {

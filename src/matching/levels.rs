@@ -37,18 +37,7 @@ impl<'a> Aligned<'a> {
     ) -> Result<Self, FieldError> {
         let (g, m) = (initial.grid(), deformed.grid());
         let spacing = g.spacing();
-        let corners = corners(m).map(|c| g.affine().to_voxel(m.affine().to_world(c)).0);
-        let (mut lo, mut hi) = ([0.0; 3], [0.0; 3]);
-        for a in 0..3 {
-            let reach = if g.shape()[a] == 1 { 0.5 } else { reach_mm / spacing[a] };
-            lo[a] = corners.iter().map(|c| c[a]).fold(f64::INFINITY, f64::min).max(-reach);
-            hi[a] =
-                corners.iter().map(|c| c[a]).fold(f64::NEG_INFINITY, f64::max).min((g.shape()[a] - 1) as f64 + reach);
-        }
-        if (0..3).any(|a| lo[a] > hi[a]) {
-            let hint = "check the affines (sform, qform) of both files, or align their origins first".into();
-            return Err(FieldError::NoOverlap { hint });
-        }
+        let [lo, hi] = overlap(g, m, reach_mm)?;
         let same_axes = (0..3)
             .all(|r| (0..3).all(|c| (g.affine().linear()[r][c] - m.affine().linear()[r][c]).abs() < 1e-4 * spacing[c]));
         let base = Self {
@@ -171,6 +160,27 @@ pub fn foreground(volume: &Voxels<'_>) -> Mask {
     let mut out = Mask::filled(*volume.grid(), 0);
     out.as_mut_slice().copy_from_slice(&crate::matching::pair::dilate(&inside, shape, 1));
     out
+}
+
+/// The box that the deformed volume's grid has in common with the initial one's, widened by `reach_mm`: its lowest and its highest
+/// place, in voxels of the initial grid.
+///
+/// # Errors
+/// [`FieldError::NoOverlap`] when they do not meet.
+pub fn overlap(initial: &Grid, deformed: &Grid, reach_mm: f64) -> Result<[[f64; 3]; 2], FieldError> {
+    let corners = corners(deformed).map(|c| initial.affine().to_voxel(deformed.affine().to_world(c)).0);
+    let (shape, spacing) = (initial.shape(), initial.spacing());
+    let (mut lo, mut hi) = ([0.0; 3], [0.0; 3]);
+    for a in 0..3 {
+        let reach = if shape[a] == 1 { 0.5 } else { reach_mm / spacing[a] };
+        lo[a] = corners.iter().map(|c| c[a]).fold(f64::INFINITY, f64::min).max(-reach);
+        hi[a] = corners.iter().map(|c| c[a]).fold(f64::NEG_INFINITY, f64::max).min((shape[a] - 1) as f64 + reach);
+    }
+    if (0..3).any(|a| lo[a] > hi[a]) {
+        let hint = "check the affines (sform, qform) of both files, or align their origins first".into();
+        return Err(FieldError::NoOverlap { hint });
+    }
+    Ok([lo, hi])
 }
 
 fn corners(g: &Grid) -> [VoxelPoint; 8] {

@@ -3,7 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::quantile;
-use crate::types::{Mask, Volume, Voxels};
+use crate::types::{Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
@@ -35,9 +35,7 @@ pub fn inputs<'a>(
     let ranges = [initial, deformed].map(Range::of);
     for ((volume, v), range) in [("initial", initial), ("deformed", deformed)].into_iter().zip(&ranges) {
         let refuse = |what: &str, hint: &str| Err(FieldError::Volume { volume, what: what.into(), hint: hint.into() });
-        if v.grid().shape().iter().filter(|&&n| n < 2).count() > 1 {
-            return refuse("is a line of voxels", "give a volume or one slice");
-        }
+        no_line(volume, v.grid())?;
         if range.low > range.high {
             return refuse("has no finite voxel", "check how it was exported");
         }
@@ -65,6 +63,20 @@ pub fn inputs<'a>(
     let (initial, spread) = in_range(first, &ranges[0], None);
     let (deformed, _) = in_range(second, &ranges[1], Some(spread));
     Ok(Checked { mask, initial, deformed, not_finite })
+}
+
+/// A volume, "initial" or "deformed", has at least two axes.
+///
+/// # Errors
+/// [`FieldError::Volume`] when it has not.
+pub fn no_line(volume: &'static str, grid: &Grid) -> Result<(), FieldError> {
+    match grid.shape().iter().filter(|&&n| n < 2).count() {
+        0 | 1 => Ok(()),
+        _ => {
+            let (what, hint) = ("is a line of voxels".into(), "give a volume or one slice".into());
+            Err(FieldError::Volume { volume, what, hint })
+        }
+    }
 }
 
 /// What a volume's voxels reach.

@@ -1,7 +1,7 @@
 //! What a field run would do, worked out before any of it is done.
 
 use crate::error::FieldError;
-use crate::matching::levels::Aligned;
+use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
@@ -50,6 +50,17 @@ pub fn field(
         points: if params.points > 0 { params.points } else { automatic },
         memory: memory(&grid, deformed.grid()),
     })
+}
+
+/// Makes the checks of [`field`] that the two grids are enough for: both volumes have two axes or more, and overlap as far as
+/// the search reaches.
+///
+/// # Errors
+/// [`FieldError::Volume`] and [`FieldError::NoOverlap`].
+pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<(), FieldError> {
+    check::no_line("initial", initial)?;
+    check::no_line("deformed", deformed)?;
+    overlap(initial, deformed, search_mm(initial, params.search_mm)).map(drop)
 }
 
 /// Memory of a field run on these grids (bytes): 14 MB, 18 bytes a voxel of both volumes up to 20 million voxels and 13

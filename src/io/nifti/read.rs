@@ -25,30 +25,14 @@ pub(in crate::io) fn field(path: &Path, flat: bool) -> Result<(Grid, Vec<f32>, I
 
 /// What the header says about the file, and its intent.
 pub(in crate::io) fn header(path: &Path) -> Result<(Stored, i64), IoError> {
-    let Opened { size, head, packed, .. } = open(path)?;
-    let describe = || {
-        let header = Header::parse(&head)?;
-        let axes = header.axes()?;
-        let format = match (header.first_offset, packed) {
-            (352, false) => "NIfTI-1",
-            (352, true) => "NIfTI-1, gzip",
-            (_, false) => "NIfTI-2",
-            (_, true) => "NIfTI-2, gzip",
-        };
-        let placed = match (header.sform_code, header.qform_code) {
-            (1.., _) => "sform",
-            (_, 1..) => "qform",
-            _ => "neither sform nor qform: the voxel size alone",
-        };
-        let used = header.dim[0].clamp(3, 7) as usize;
-        let datatype = kind(header.datatype)?.name();
-        let shape = [axes[0], axes[1], axes[2]];
-        let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
-        let apart_mm = disagreement(&header, shape);
-        let axes = axes[..used].to_vec();
-        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, bytes: size }, header.intent))
-    };
-    describe().map_err(|flaw: Flaw| flaw.at(path))
+    open(path)?.stored().map_err(|flaw| flaw.at(path))
+}
+
+/// What the header says about a scalar volume; refuses what [`volume`] would by it and the file's size.
+pub(in crate::io) fn volume_header(path: &Path) -> Result<Stored, IoError> {
+    let opened = open(path)?;
+    let plan = Plan::new(&opened.head, scalar_layout).and_then(|plan| plan.end_within(opened.most()));
+    plan.and_then(|_| opened.stored()).map(|(stored, _)| stored).map_err(|flaw| flaw.at(path))
 }
 
 const EXPORT: &str = "export it again";
@@ -113,6 +97,37 @@ pub(super) struct Opened {
     pub(super) packed: bool,
 }
 
+impl Opened {
+    /// Bytes that the file can unpack to.
+    pub(super) fn most(&self) -> u64 {
+        if self.packed { self.size.saturating_mul(gzip::LARGEST_RATIO) } else { self.size }
+    }
+
+    /// What the header says about the file, and its intent.
+    fn stored(&self) -> Result<(Stored, i64), Flaw> {
+        let header = Header::parse(&self.head)?;
+        let axes = header.axes()?;
+        let format = match (header.first_offset, self.packed) {
+            (352, false) => "NIfTI-1",
+            (352, true) => "NIfTI-1, gzip",
+            (_, false) => "NIfTI-2",
+            (_, true) => "NIfTI-2, gzip",
+        };
+        let placed = match (header.sform_code, header.qform_code) {
+            (1.., _) => "sform",
+            (_, 1..) => "qform",
+            _ => "neither sform nor qform: the voxel size alone",
+        };
+        let used = header.dim[0].clamp(3, 7) as usize;
+        let datatype = kind(header.datatype)?.name();
+        let shape = [axes[0], axes[1], axes[2]];
+        let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
+        let apart_mm = disagreement(&header, shape);
+        let axes = axes[..used].to_vec();
+        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, bytes: self.size }, header.intent))
+    }
+}
+
 pub(super) fn open(path: &Path) -> Result<Opened, IoError> {
     // Before it is opened: opening a pipe waits for who writes into it.
     let metadata = fs::metadata(path).map_err(os(path, "read"))?;
@@ -132,12 +147,12 @@ pub(super) fn open(path: &Path) -> Result<Opened, IoError> {
 
 /// The grid and all values, component after component; `layout` judges the axes and gives the number of components.
 fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
-    let Opened { mut file, size, head, packed } = open(path)?;
-    let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
+    let opened = open(path)?;
+    let plan = Plan::new(&opened.head, layout).map_err(|flaw| flaw.at(path))?;
+    let end = plan.end_within(opened.most()).map_err(|flaw| flaw.at(path))?;
+    let Opened { mut file, packed, .. } = opened;
     let values = match packed {
         true => {
-            let most = size.saturating_mul(gzip::LARGEST_RATIO);
-            let end = plan.end_within(most).map_err(|flaw| flaw.at(path))?;
             let mut packed = Vec::new();
             file.read_to_end(&mut packed).map_err(os(path, "read"))?;
             let data = gzip::unpack(&packed, end).map_err(|e| {
@@ -147,7 +162,6 @@ fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
             decode(&plan, &data[plan.start as usize..end])
         }
         false => {
-            let end = plan.end_within(size).map_err(|flaw| flaw.at(path))?;
             let mut data = vec![0; end - plan.start as usize];
             file.seek(SeekFrom::Start(plan.start))
                 .and_then(|_| file.read_exact(&mut data))

@@ -4,7 +4,7 @@ use super::header::Header;
 use super::read::{Opened, Plan, decode, open};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
-use crate::io::{gzip, os};
+use crate::io::os;
 use crate::types::{Grid, Volume};
 use flate2::bufread::MultiGzDecoder;
 use std::fs::File;
@@ -41,11 +41,10 @@ impl Series {
     /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of these.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, IoError> {
         let path = path.as_ref();
-        let Opened { file, size, head, packed } = open(path)?;
-        let (source, most) = match packed {
-            true => (Source::packed(file), size.saturating_mul(gzip::LARGEST_RATIO)),
-            false => (Source::Plain(file), size),
-        };
+        let opened = open(path)?;
+        let most = opened.most();
+        let Opened { file, head, packed, .. } = opened;
+        let source = if packed { Source::packed(file) } else { Source::Plain(file) };
         let header = Header::parse(&head).map_err(|flaw| flaw.at(path))?;
         let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
         plan.end_within(most).map_err(|flaw| flaw.at(path))?;
