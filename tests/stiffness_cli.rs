@@ -176,6 +176,18 @@ fn a_sequence_is_read_by_the_matches_and_frames_of_its_own_track() {
 }
 
 #[test]
+fn a_damaged_table_of_matches_is_told_before_any_work() {
+    let folder = tracked(4);
+    fs::write(folder.path().join("matches_2.csv"), "x,y,z,dx,dy,dz,ncc,sigma,kept\n1,2,3,oops,0,0,1,0.1,1\n").unwrap();
+    let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1000", "-o", "results"];
+    for more in [&["--dry-run"][..], &[]] {
+        let (_, err) = run(folder.path(), &[&base[..], more].concat(), 1);
+        assert!(err.contains("matches_2.csv") && err.contains("oops"), "{err}");
+    }
+    assert!(!folder.path().join("results").exists());
+}
+
+#[test]
 fn frames_share_a_map_and_lower_its_noise() {
     let folder = tracked(8);
     let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1000", "--model", "linear"];
