@@ -188,6 +188,13 @@ fn a_damaged_table_of_matches_is_told_before_any_work() {
 }
 
 #[test]
+fn labels_without_a_label_are_called_labels() {
+    let folder = folder();
+    io::write_labels(folder.path().join("labels.nii.gz"), &Mask::filled(grid([16; 3]), 0), "").unwrap();
+    refused(folder.path(), &[], 1, &["labels.nii.gz: no voxel has a label"]);
+}
+
+#[test]
 fn frames_share_a_map_and_lower_its_noise() {
     let folder = tracked(8);
     let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "--nodes", "1000", "--model", "linear"];

@@ -168,8 +168,9 @@ fn what_cannot_be_tracked_is_refused() {
     let third = io::read_volume(pinch().join("frame_002.nii.gz")).unwrap();
     let sform = third.grid().affine().rows().map(|row| row.map(|v| v as f32));
     let zero = Nifti { sform, ..Nifti::filled(third.grid().shape().map(|n| n as i16), 0.0) };
+    fs::write(path("zero.nii"), zero.bytes()).unwrap();
     fs::write(path("ended.nii"), &zero.bytes()[..1000]).unwrap();
-    let ended = path("ended.nii");
+    let (zero, ended) = (path("zero.nii"), path("ended.nii"));
     for (arguments, code, parts) in [
         (vec![a], 2, ["frame_000.nii.gz", "two or more"]),
         (vec![a, b, "--reference", "2"], 2, ["--reference is 2", "2 volumes"]),
@@ -179,6 +180,8 @@ fn what_cannot_be_tracked_is_refused() {
         (vec![a, b, &flat, "--dry-run"], 1, ["flat.nii", "is a series of 3 volumes"]),
         (vec![a, b, "truth_001.nii.gz", "--dry-run"], 1, ["truth_001.nii.gz", "not a scalar volume"]),
         (vec![a, b, &ended, "--dry-run"], 1, ["ended.nii", "cut short"]),
+        (vec![a, b, "--labels", &zero], 1, ["zero.nii", "no voxel has a label"]),
+        (vec![a, b, "--mask", &zero], 1, ["zero.nii", "the mask is empty"]),
         (vec![&short], 1, ["short.nii.gz", "cut short"]),
         (vec![&cut], 1, ["cut.nii", "cut short"]),
         (vec![&flat], 1, ["flat.nii", "same value"]),
@@ -265,4 +268,19 @@ fn a_sequence_takes_no_motion_of_a_pair() {
     assert!(err.contains("pinch") && err.contains("calf"), "{err}");
     let (_, err) = run(&["phantom", "pen", "--amplitude", "40", "-o", "never"], 1);
     assert!(err.contains("amplitude"), "{err}");
+}
+
+#[test]
+fn numbers_out_of_range_are_wrong_usage_in_every_command() {
+    let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
+    for (arguments, says) in [
+        (&["phantom", "pinch", "--frames", "1"][..], "frames is 1"),
+        (&["phantom", "pinch", "--size", "4"], "size is 4"),
+        (&["phantom", "pinch", "--noise", "2"], "noise is 2"),
+        (&["phantom", "calf", "--motion", "elastic"], "fingertip, inclusion or slab"),
+        (&["track", a, b, "--points", "3"], "points is 3"),
+    ] {
+        let (_, err) = run(&[arguments, &["-o", "never"]].concat(), 2);
+        assert!(err.contains(says), "should say {says:?}: {err}");
+    }
 }

@@ -108,7 +108,24 @@ pub fn on_grid<'a>(volume: Voxels<'a>, grid: &Grid) -> Voxels<'a> {
 
 /// A mask on `grid`, which is that of `reference`.
 pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
-    let mask = io::read_mask(path)?;
+    let mask = on_grid_of(io::read_mask(path)?, path, grid, reference)?;
+    if mask.as_slice().iter().all(|v| *v == 0) {
+        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
+    }
+    Ok(mask)
+}
+
+/// A label map on `grid`, which is that of `reference`.
+pub fn read_labels(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
+    let labels = on_grid_of(io::read_labels(path)?, path, grid, reference)?;
+    if labels.as_slice().iter().all(|v| *v == 0) {
+        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.display());
+    }
+    Ok(labels)
+}
+
+/// `mask`, read from `path`, if it lies on that grid.
+fn on_grid_of(mask: Mask, path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
     if !grid.same_as(mask.grid()) {
         bail!(FieldError::GridMismatch {
             what: path.display().to_string(),
@@ -116,9 +133,6 @@ pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
             reference: reference.display().to_string(),
             expected: grid.shape(),
         });
-    }
-    if mask.as_slice().iter().all(|v| *v == 0) {
-        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
     }
     Ok(mask)
 }

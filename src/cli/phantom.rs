@@ -4,7 +4,7 @@ use super::console::Console;
 use super::{Usage, sequence};
 use anyhow::{Result, bail};
 use clap::Args;
-use palpate::error::UnknownName;
+use palpate::error::{SynthError, UnknownName};
 use palpate::io::{self, OutputFolder};
 use palpate::report::{figure, panels};
 use palpate::synth::{
@@ -86,7 +86,7 @@ impl Options {
         }
     }
 
-    /// A sequence's parameters; their range is checked when it is made.
+    /// A sequence's parameters, in range.
     fn sequence(&self, kind: SequenceKind) -> Result<SequenceParams> {
         if self.motion.is_some() || self.bias != BIAS {
             bail!(Usage("a sequence has a motion of its own and no bias: leave --motion and --bias out".into()));
@@ -98,6 +98,7 @@ impl Options {
         }
         p.spacing = self.spacing()?.unwrap_or(p.spacing);
         p.amplitude = self.amplitude.unwrap_or(p.amplitude);
+        p.check()?;
         Ok(p)
     }
 
@@ -110,6 +111,11 @@ impl Options {
         p.spacing = self.spacing()?.unwrap_or(p.spacing);
         if let Some(motion) = self.motion {
             p = p.moving(motion);
+        }
+        if p.motion == MotionKind::Elastic
+            && !matches!(kind, PhantomKind::Fingertip | PhantomKind::Inclusion | PhantomKind::Slab)
+        {
+            bail!(Usage(SynthError::NotElastic.to_string()));
         }
         let Self { contrast, inclusions, poisson, .. } = *self;
         p.elastic = ElasticParams { contrast, inclusions, poisson };

@@ -4,7 +4,7 @@ use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
 use super::dry_run;
-use super::inputs::{check_distinct, name, on_grid, read_mask, warn_all};
+use super::inputs::{check_distinct, name, on_grid, read_labels, read_mask, warn_all};
 use super::limits::mesh_fits;
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -261,10 +261,14 @@ impl Setting {
     }
 
     pub(super) fn read(options: &Options, body: &Path, grid: &Grid, reference: &Path) -> Result<Self> {
-        let mut labels = read_mask(body, grid, reference)?;
-        if options.labels.is_none() {
-            labels.as_mut_slice().iter_mut().for_each(|v| *v = u8::from(*v > 0));
-        }
+        let labels = match &options.labels {
+            Some(labels) => read_labels(labels, grid, reference)?,
+            None => {
+                let mut mask = read_mask(body, grid, reference)?;
+                mask.as_mut_slice().iter_mut().for_each(|v| *v = u8::from(*v > 0));
+                mask
+            }
+        };
         let held = place(&options.held, grid, reference, "--held")?;
         let load = place(&options.load, grid, reference, "--load")?;
         let names = names(options.names.as_deref(), &labels)?;

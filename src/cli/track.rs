@@ -5,7 +5,8 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{
-    check_distinct, name, on_grid, read_mask, usable, warn_all, warn_of_non_finite, warn_of_places, warn_of_two_places,
+    check_distinct, name, on_grid, read_labels, read_mask, usable, warn_all, warn_of_non_finite, warn_of_places,
+    warn_of_two_places,
 };
 use super::limits::grids_fit;
 use super::outputs::Target;
@@ -166,7 +167,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let grid = *reference.grid();
     let first = source.path(origin);
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
-    let regions = labels.as_ref().map(|l| read_mask(l, &grid, first)).transpose()?;
+    let regions = labels.as_ref().map(|l| read_labels(l, &grid, first)).transpose()?;
     if *dry_run {
         drop(progress);
         let plan = plan(&mut source, (origin, &reference), inside.as_ref(), &params, &mut warnings)?;

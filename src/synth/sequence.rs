@@ -95,22 +95,30 @@ impl SequenceParams {
     /// # Errors
     /// [`SynthError`] when a value is out of range.
     pub fn grid(&self) -> Result<Grid, SynthError> {
-        let like = PhantomParams {
-            size: self.size,
-            spacing: self.spacing,
-            amplitude: self.amplitude,
-            noise: self.noise,
-            ..PhantomParams::new(PhantomKind::Block)
-        };
+        self.check()?;
+        self.pair().grid()
+    }
+
+    /// What a pair has too.
+    fn pair(&self) -> PhantomParams {
+        let Self { size, spacing, amplitude, noise, .. } = *self;
+        PhantomParams { size, spacing, amplitude, noise, ..PhantomParams::new(PhantomKind::Block) }
+    }
+
+    /// Checks every range.
+    ///
+    /// # Errors
+    /// [`ParamError`] names the first value out of range.
+    pub fn check(&self) -> Result<(), ParamError> {
         if !(2..=1000).contains(&self.frames) {
             let range = "2 to 1000";
-            return Err(ParamError { name: "frames", value: self.frames as f64, range }.into());
+            return Err(ParamError { name: "frames", value: self.frames as f64, range });
         }
         if let Some(n) = self.size.iter().find(|&&n| n < 8) {
             let range = "8 to 4096 voxels a side for a sequence";
-            return Err(ParamError { name: "size", value: *n as f64, range }.into());
+            return Err(ParamError { name: "size", value: *n as f64, range });
         }
-        like.grid()
+        self.pair().check()
     }
 }
 
