@@ -284,3 +284,23 @@ fn numbers_out_of_range_are_wrong_usage_in_every_command() {
         assert!(err.contains(says), "should say {says:?}: {err}");
     }
 }
+
+#[test]
+fn a_phantom_refuses_flags_that_mean_nothing_for_it() {
+    for (arguments, flag) in [
+        (&["calf", "--frames", "5"][..], "--frames belongs to a sequence"),
+        (&["pinch", "--contrast", "4"], "--contrast belongs to"),
+        (&["pen", "--poisson", "0.4"], "--poisson belongs to"),
+        (&["slab", "--contrast", "4"], "--contrast belongs to"),
+        (&["fingertip", "--inclusions", "2"], "--inclusions belongs to"),
+        (&["inclusion", "--motion", "press", "--poisson", "0.4"], "--poisson belongs to"),
+    ] {
+        let (_, err) = run(&[&["phantom"], arguments, &["-o", "never"]].concat(), 2);
+        assert!(err.contains(flag), "should say {flag:?}: {err}");
+    }
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("pair").display().to_string();
+    // What an inclusion looks like goes by its stiffness in every motion.
+    let line = "phantom inclusion --size 16 --motion press --amplitude 1 --contrast 0.5 -o";
+    run(&line.split(' ').chain([out.as_str()]).collect::<Vec<_>>(), 0);
+}

@@ -33,9 +33,9 @@ pub struct Options {
     /// Voxel edges in mm, one number or x,y,z; the number of voxels stays [default: by kind]
     #[arg(long, value_name = "MM", value_delimiter = ',')]
     spacing: Vec<f64>,
-    /// Frames of a sequence, the one at rest included
-    #[arg(long, value_name = "N", default_value_t = 16)]
-    frames: usize,
+    /// Frames of a sequence, the one at rest included [default: 16]
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
     /// Seed of anatomy, motion and noise
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
@@ -45,15 +45,15 @@ pub struct Options {
     /// Largest displacement in mm, degrees for rotate, largest strain in per cent for wave [default: by kind]
     #[arg(long, value_name = "MM")]
     amplitude: Option<f64>,
-    /// Elastic: Young's modulus of one inclusion over the background's
-    #[arg(long, value_name = "RATIO", default_value_t = 5.0)]
-    contrast: f64,
-    /// Elastic: inclusions, 0, 1 or 2 (of 0.5 and 4 times the background's modulus)
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    inclusions: usize,
-    /// Elastic: Poisson's ratio
-    #[arg(long, value_name = "NU", default_value_t = 0.49)]
-    poisson: f64,
+    /// Inclusion: Young's modulus of one inclusion over the background's [default: 5]
+    #[arg(long, value_name = "RATIO")]
+    contrast: Option<f64>,
+    /// Inclusion: how many, 0, 1 or 2 (of 0.5 and 4 times the background's modulus) [default: 1]
+    #[arg(long, value_name = "N")]
+    inclusions: Option<usize>,
+    /// Elastic: Poisson's ratio [default: 0.49]
+    #[arg(long, value_name = "NU")]
+    poisson: Option<f64>,
     /// Standard deviation of the Rician noise, as a part of the brightest tissue
     #[arg(long, value_name = "PART", default_value_t = 0.03)]
     noise: f64,
@@ -75,6 +75,18 @@ fn kind(name: &str) -> Result<Kind, UnknownName> {
     choose("phantom", name, &[&pairs[..], &sequences].concat())
 }
 
+/// What has inclusions, and what has Poisson's ratio.
+const INCLUSION: &str = "the phantom called inclusion";
+const ELASTIC: &str = "an elastic motion (fingertip, inclusion or slab)";
+
+/// Refuses a flag that is given and means nothing here, since it belongs `to` something else.
+fn refuse<T>(given: Option<T>, flag: &str, to: &str) -> Result<()> {
+    match given {
+        Some(_) => bail!(Usage(format!("--{flag} belongs to {to}: leave it out"))),
+        None => Ok(()),
+    }
+}
+
 impl Options {
     /// Voxel edges, where they are asked for (mm).
     fn spacing(&self) -> Result<Option<[f64; 3]>> {
@@ -91,8 +103,12 @@ impl Options {
         if self.motion.is_some() || self.bias != BIAS {
             bail!(Usage("a sequence has a motion of its own and no bias: leave --motion and --bias out".into()));
         }
-        let Self { frames, seed, noise, .. } = *self;
-        let mut p = SequenceParams { frames, seed, noise, ..SequenceParams::new(kind) };
+        refuse(self.contrast, "contrast", INCLUSION)?;
+        refuse(self.inclusions, "inclusions", INCLUSION)?;
+        refuse(self.poisson, "poisson", ELASTIC)?;
+        let Self { seed, noise, .. } = *self;
+        let mut p = SequenceParams { seed, noise, ..SequenceParams::new(kind) };
+        p.frames = self.frames.unwrap_or(p.frames);
         if let Some(n) = self.size {
             p = p.sized(n);
         }
@@ -112,13 +128,22 @@ impl Options {
         if let Some(motion) = self.motion {
             p = p.moving(motion);
         }
-        if p.motion == MotionKind::Elastic
-            && !matches!(kind, PhantomKind::Fingertip | PhantomKind::Inclusion | PhantomKind::Slab)
-        {
+        refuse(self.frames, "frames", "a sequence (pinch, pen or contraction)")?;
+        if kind != PhantomKind::Inclusion {
+            refuse(self.contrast, "contrast", INCLUSION)?;
+            refuse(self.inclusions, "inclusions", INCLUSION)?;
+        }
+        if p.motion != MotionKind::Elastic {
+            refuse(self.poisson, "poisson", ELASTIC)?;
+        } else if !matches!(kind, PhantomKind::Fingertip | PhantomKind::Inclusion | PhantomKind::Slab) {
             bail!(Usage(SynthError::NotElastic.to_string()));
         }
-        let Self { contrast, inclusions, poisson, .. } = *self;
-        p.elastic = ElasticParams { contrast, inclusions, poisson };
+        let usual = p.elastic;
+        p.elastic = ElasticParams {
+            contrast: self.contrast.unwrap_or(usual.contrast),
+            inclusions: self.inclusions.unwrap_or(usual.inclusions),
+            poisson: self.poisson.unwrap_or(usual.poisson),
+        };
         p.amplitude = self.amplitude.unwrap_or(p.amplitude);
         p.check()?;
         Ok(p)
