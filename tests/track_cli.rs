@@ -224,20 +224,22 @@ fn a_blank_file_among_others_is_lost_and_they_go_on() {
 fn a_dry_run_tells_what_would_be_lost_and_refuses_what_a_run_does() {
     let folder = TempDir::new().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
-    let [far, blank, out] = ["far.nii", "blank.nii", "out"].map(path);
+    let [far, blank, slice, out] = ["far.nii", "blank.nii", "slice.nii", "out"].map(path);
     let mut away = Nifti::ramp([28, 34, 26]);
     away.sform[0][3] = 5000.0;
     fs::write(&far, away.bytes()).unwrap();
     fs::write(&blank, Nifti::filled([28, 34, 26], 7.0).bytes()).unwrap();
     let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
-    let (plan, err) = run(&["track", a, &blank, b, &far, "--dry-run", "-o", &out], 0);
+    fs::write(&slice, Nifti::ramp([28, 34, 1]).bytes()).unwrap();
+    let (plan, err) = run(&["track", a, &blank, b, &far, &slice, "--dry-run", "-o", &out], 0);
     assert!(
-        plan.contains("Would measure 3 volumes against number 0") && plan.contains("Nothing was written"),
+        plan.contains("Would measure 4 volumes against number 0") && plan.contains("Nothing was written"),
         "{plan}"
     );
     let lost = [
         "frame 1 would be lost: the deformed volume is constant",
         "frame 3 would be lost: the two volumes do not overlap",
+        "frame 4 would be lost: the deformed volume is one slice",
     ];
     lost.iter().for_each(|part| assert!(err.contains(part), "should say {part:?}: {err}"));
     for more in [&[][..], &["--dry-run"]] {

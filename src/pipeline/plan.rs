@@ -53,13 +53,19 @@ pub fn field(
 }
 
 /// Makes the checks of [`field`] that the two grids are enough for: both volumes have two axes or more, and overlap as far as
-/// the search reaches.
+/// the search reaches. A slice for a volume is refused too: nothing is found in it that could be matched in space.
 ///
 /// # Errors
 /// [`FieldError::Volume`] and [`FieldError::NoOverlap`].
 pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<(), FieldError> {
     check::no_line("initial", initial)?;
     check::no_line("deformed", deformed)?;
+    let slice = |grid: &Grid| grid.shape().contains(&1);
+    if slice(deformed) && !slice(initial) {
+        let (what, hint) =
+            ("is one slice, the initial volume is more".into(), "give volumes only, or slices only".into());
+        return Err(FieldError::Volume { volume: "deformed", what, hint });
+    }
     overlap(initial, deformed, search_mm(initial, params.search_mm)).map(drop)
 }
 
