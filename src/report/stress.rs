@@ -189,8 +189,9 @@ pub fn page(curves: &[StressCurve]) -> String {
         "<header><p class=\"brand\">palpate {}</p><h1>Where it breaks</h1><p class=\"verdict\">{broken} of {} runs have no result \
          or one of no use; {silent} of these without a word.</p></header><p class=\"lead\">Severity grows to the right. The dotted \
          line is the limit of use. On the axis, an upright stroke marks where at least half of the runs break, a dashed one where \
-         at least half say that something is wrong. Hollow: refused. Red crosses: broken and silent.</p><article \
-         class=\"wide\">{}</article><section><h2>Table</h2><div class=\"two\">{}</div></section>",
+         at least half say that something is wrong. Hollow: refused. Red crosses: broken and silent. Errors below a thousandth of the limit are drawn at \
+         that, runs without a result at the top.</p><article \
+         class=\"wide\">{}</article><section><h2>Table</h2><div class=\"four\">{}</div></section>",
         env!("CARGO_PKG_VERSION"),
         curves.iter().map(|c| c.runs.len()).sum::<usize>(),
         svg(curves),
