@@ -101,39 +101,41 @@ impl Peers {
         io::write_volume(&fixed, &case.initial, "palpate chart")?;
         io::write_volume(&moving, &case.deformed, "palpate chart")?;
         let own = std::env::current_exe().context("this program cannot find itself")?;
-        let mut runs: Vec<(Variant, Vec<OsString>, PathBuf)> = Vec::new();
-        for preset in Variant::presets() {
-            let results = self.folder.join(format!("own-{}", preset.method));
+        let pair = [&fixed, &moving].map(|p| p.clone().into_os_string());
+        let presets = Variant::presets();
+        let tools: Vec<&Tool> = self.tools.iter().filter(|t| t.missing.is_empty() && t.name != SIMULATOR).collect();
+        let count = (presets.len() + tools.len()) as f64;
+        let mut out = Vec::new();
+        for preset in presets {
+            progress(out.len() as f64 / count);
+            // A folder a run: what one leaves is not taken for another's.
+            let results = io::Scratch::new()?;
             let mut command = vec![own.clone().into_os_string(), "field".into()];
-            command.extend([fixed.as_os_str(), moving.as_os_str(), "-o".as_ref(), results.as_os_str()].map(Into::into));
+            command.extend(pair.clone());
+            command.extend(["-o".into(), results.path().into()]);
             let flags = ["--force", "--quiet", "--threads", "2", "--preset", preset.method.as_str()];
             command.extend(flags.map(Into::into));
             let (method, settings) = (format!("palpate {}", preset.method), format!("{}, 2 threads", preset.settings));
             let variant = Variant { varied: "whole command", method, settings, ..preset };
-            runs.push((variant, command, results.join("displacement.nii.gz")));
+            out.push(self.trial(case, &variant, &command, &results.path().join("displacement.nii.gz"))?);
         }
-        for tool in self.tools.iter().filter(|t| t.missing.is_empty() && t.name != SIMULATOR) {
-            let field = self.folder.join("field.nii.gz");
-            let script = [python().get_program().to_owned(), self.folder.join("peers.py").into_os_string()];
-            let files = [&fixed, &moving, &field].map(|p| p.clone().into_os_string());
-            let command = script.into_iter().chain([OsString::from(&tool.name)]).chain(files).collect();
+        for tool in tools {
+            progress(out.len() as f64 / count);
+            let results = io::Scratch::new()?;
+            let field = results.path().join("field.nii.gz");
+            let mut command = vec![python().get_program().into(), self.folder.join("peers.py").into()];
+            command.push(OsString::from(&tool.name));
+            command.extend(pair.clone());
+            command.push(field.clone().into());
             let (method, settings) = (tool.name.clone(), tool.settings.clone());
             let variant = Variant { varied: "other tool", method, settings, params: FieldParams::default() };
-            runs.push((variant, command, field));
-        }
-        let mut out = Vec::new();
-        for (i, (variant, command, field)) in runs.iter().enumerate() {
-            progress(i as f64 / runs.len() as f64);
-            out.push(self.trial(case, variant, command, field)?);
+            out.push(self.trial(case, &variant, &command, &field)?);
         }
         Ok(out)
     }
 
     /// One command under the watch of usage.py, and the score of the field that it leaves.
     fn trial(&self, case: &Case, variant: &Variant, command: &[OsString], field: &Path) -> Result<Trial> {
-        if field.exists() {
-            std::fs::remove_file(field).with_context(|| format!("{} cannot be removed", field.display()))?;
-        }
         let done = output(python().arg(self.folder.join("usage.py")).args(command))?;
         let told = text(&done.stdout);
         let numbers: Vec<f64> = told.split_whitespace().filter_map(|v| v.parse().ok()).collect();
