@@ -636,8 +636,9 @@ fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max_mm: f64, s
         out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));
     }
     if max_mm > 0.9 * search {
+        let at = if max_mm > search { "past" } else { "near" };
         out.push(format!(
-            "the motion reaches {max_mm:.1} mm, near the search range of {search:.1} mm; try a wider --search"
+            "the motion reaches {max_mm:.1} mm, {at} the search range of {search:.1} mm; try a wider --search"
         ));
     }
     if counts.features_initial > 0 && counts.kept * 4 < counts.features_initial {
