@@ -39,49 +39,48 @@ fn field_axes() -> [(&'static str, Trouble); 14] {
     Trouble::ALL.map(|t| (t.1, t.0))
 }
 
-/// Names of a part's axes as they are typed.
-fn axis_names(part: Part) -> Vec<String> {
-    let names: Vec<&str> = match part {
+/// Names of a part's axes.
+fn axis_names(part: Part) -> Vec<&'static str> {
+    match part {
         Part::Field => field_axes().iter().map(|a| a.0).collect(),
         Part::Stiffness => StiffnessAxis::ALL.iter().map(|a| a.0).collect(),
         Part::Grasp => GraspAxis::ALL.iter().map(|a| a.0).collect(),
-    };
-    names.iter().map(|n| n.replace(' ', "-")).collect()
+    }
+}
+
+/// Whether `typed` is the axis called `name`, which may have spaces.
+fn is_axis(typed: &str, name: &str) -> bool {
+    typed.replace('-', " ").eq_ignore_ascii_case(name)
 }
 
 fn axis_help() -> String {
-    let of = |(name, part): &(&str, Part)| format!("{name}: {}", axis_names(*part).join(", "));
+    let of = |(name, part): &(&str, Part)| {
+        format!("{name}: {}", axis_names(*part).join(", ").replace(' ', "-").replace(",-", ", "))
+    };
     let all = Part::ALL.iter().map(of).collect::<Vec<_>>().join("; ");
     format!("One axis alone; may be given several times [default: all]. {all}")
 }
 
 /// Those of `all` that `asked` names, all of them when it is empty.
 fn picked<T: Copy>(asked: &[String], all: &[(&'static str, T)]) -> Vec<T> {
-    let named = |name: &str| asked.iter().any(|a| a.replace('-', " ").eq_ignore_ascii_case(name));
-    all.iter().filter(|(name, _)| asked.is_empty() || named(name)).map(|a| a.1).collect()
+    let named = |name: &str| asked.is_empty() || asked.iter().any(|typed| is_axis(typed, name));
+    all.iter().filter(|a| named(a.0)).map(|a| a.1).collect()
 }
 
 /// Every axis that is asked for must be one of a part that runs.
 fn check_axes(asked: &[String], wanted: impl Fn(Part) -> bool) -> Result<()> {
-    let known = |part: Part| axis_names(part);
-    let parts: Vec<Part> = Part::ALL.iter().map(|p| p.1).collect();
-    for axis in asked {
-        let same = |n: &String| n.replace('-', " ").eq_ignore_ascii_case(&axis.replace('-', " "));
-        let holders: Vec<Part> = parts.iter().copied().filter(|p| known(*p).iter().any(same)).collect();
+    let parts = || Part::ALL.iter().map(|p| p.1);
+    for typed in asked {
+        let holders: Vec<Part> = parts().filter(|p| axis_names(*p).iter().any(|name| is_axis(typed, name))).collect();
         if holders.is_empty() {
-            let all: Vec<(&'static str, ())> = field_axes()
-                .iter()
-                .map(|a| a.0)
-                .chain(StiffnessAxis::ALL.iter().map(|a| a.0))
-                .chain(GraspAxis::ALL.iter().map(|a| a.0))
-                .map(|n| (n, ()))
-                .collect();
-            let unknown = names::choose("axis", &axis.replace('-', " "), &all).err();
-            bail!(Usage(unknown.map_or_else(|| axis.clone(), |u| u.to_string())));
+            let mut known: Vec<(&str, ())> = parts().flat_map(axis_names).map(|name| (name, ())).collect();
+            known.sort_unstable();
+            known.dedup();
+            names::choose("axis", &typed.replace('-', " "), &known).map_err(|e| Usage(e.to_string()))?;
         }
         if !holders.iter().any(|p| wanted(*p)) {
             let of: Vec<&str> = holders.iter().map(|p| p.name()).collect();
-            bail!(Usage(format!("--axis {axis} is one of {}, which --part leaves out", of.join(" and "))));
+            bail!(Usage(format!("--axis {typed} is one of {}, which --part leaves out", of.join(" and "))));
         }
     }
     Ok(())
