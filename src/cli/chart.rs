@@ -2,13 +2,12 @@
 
 use super::Usage;
 use super::console::Console;
-use super::inputs::{read_landmarks, read_mask, warn_all};
+use super::inputs::{read_landmarks, read_mask, same_grid, warn_all};
 use super::outputs::Target;
 use super::peers::Peers;
 use super::stress::part;
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use palpate::error::FieldError;
 use palpate::evaluate;
 use palpate::evaluate::frontier::{is_relative, standings};
 use palpate::grasp::simulate::simulate;
@@ -16,7 +15,7 @@ use palpate::io;
 use palpate::pipeline::pressed;
 use palpate::pipeline::trials::{self, Case, Variant};
 use palpate::report::frontier::{self as report, Group};
-use palpate::types::{DenseField, Grid, Part, Scene, Trial};
+use palpate::types::{DenseField, Part, Scene, Trial};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -58,7 +57,8 @@ fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Ca
     let needed = |names: &[&str]| {
         one_of(folder, names).with_context(|| format!("{}: holds no {}", folder.display(), names.join(" or ")))
     };
-    let initial = io::read_volume(needed(&["initial.nii.gz", "fixed.nii.gz", "initial.nii", "fixed.nii"])?)?;
+    let reference = needed(&["initial.nii.gz", "fixed.nii.gz", "initial.nii", "fixed.nii"])?;
+    let initial = io::read_volume(&reference)?;
     let deformed = io::read_volume(needed(&["deformed.nii.gz", "moving.nii.gz", "deformed.nii", "moving.nii"])?)?;
     let truth = one_of(folder, &["truth.nii.gz", "truth.nii"]);
     let mask = one_of(folder, &["mask.nii.gz", "mask.nii"]);
@@ -66,33 +66,17 @@ fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Ca
     if truth.is_none() && landmarks.is_none() {
         bail!("{}: holds neither truth.nii.gz nor landmarks.csv, so nothing can be scored", folder.display());
     }
-    let reference = format!("{}'s initial volume", folder.display());
-    let same_grid = |path: &Path, grid: &Grid| match grid.same_as(initial.grid()) {
-        true => Ok(()),
-        false => Err(FieldError::GridMismatch {
-            what: path.display().to_string(),
-            found: grid.shape(),
-            reference: reference.clone(),
-            expected: initial.grid().shape(),
-        }),
-    };
+    let mask = mask.map(|m| read_mask(&m, initial.grid(), &reference)).transpose()?;
     let read_truth = |path: &PathBuf| -> Result<DenseField> {
         let field = io::read_field(path)?;
-        same_grid(path, field.grid())?;
+        same_grid(path, field.grid(), initial.grid(), &reference)?;
+        evaluate::check_numbers("truth", &field, mask.as_ref()).with_context(|| path.display().to_string())?;
         Ok(field)
     };
-    let truth_file = truth.as_ref();
-    let truth = truth_file.map(read_truth).transpose()?;
-    let mask = mask.map(|m| read_mask(&m, initial.grid(), Path::new(&reference))).transpose()?;
-    if let (Some(truth), Some(file)) = (&truth, truth_file) {
-        // Against itself: whether it can be compared with at all.
-        evaluate::metrics(truth, truth, mask.as_ref(), &[]).with_context(|| file.display().to_string())?;
-    }
+    let truth = truth.as_ref().map(read_truth).transpose()?;
     // Where there is a true field, it is what errors are taken against.
-    let landmarks = match landmarks.filter(|_| truth.is_none()) {
-        Some(file) => read_landmarks(&[file], initial.grid(), warnings)?,
-        None => Vec::new(),
-    };
+    let landmarks = landmarks.filter(|_| truth.is_none());
+    let landmarks = read_landmarks(landmarks.as_slice(), initial.grid(), warnings)?;
     Ok(Case { name: name.into(), initial, deformed, truth, mask, landmarks })
 }
 

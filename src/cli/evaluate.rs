@@ -36,8 +36,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let exact = io::read_field(truth)?;
     let mask = mask.as_ref().map(|m| read_mask(m, exact.grid(), truth)).transpose()?;
     let mut warnings = Vec::new();
-    let landmarks =
-        if landmarks.is_empty() { Vec::new() } else { read_landmarks(landmarks, exact.grid(), &mut warnings)? };
+    let landmarks = read_landmarks(landmarks, exact.grid(), &mut warnings)?;
     warn_all(console, &warnings);
     let metrics = evaluate::metrics(&measured, &exact, mask.as_ref(), &landmarks)
         .with_context(|| format!("{} against {}", name(field), name(truth)))?;

@@ -108,7 +108,8 @@ pub fn on_grid<'a>(volume: Voxels<'a>, grid: &Grid) -> Voxels<'a> {
 
 /// A mask on `grid`, which is that of `reference`.
 pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
-    let mask = on_grid_of(io::read_mask(path)?, path, grid, reference)?;
+    let mask = io::read_mask(path)?;
+    same_grid(path, mask.grid(), grid, reference)?;
     if mask.as_slice().iter().all(|v| *v == 0) {
         bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
     }
@@ -117,24 +118,25 @@ pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
 
 /// A label map on `grid`, which is that of `reference`.
 pub fn read_labels(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
-    let labels = on_grid_of(io::read_labels(path)?, path, grid, reference)?;
+    let labels = io::read_labels(path)?;
+    same_grid(path, labels.grid(), grid, reference)?;
     if labels.as_slice().iter().all(|v| *v == 0) {
         bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.display());
     }
     Ok(labels)
 }
 
-/// `mask`, read from `path`, if it lies on that grid.
-fn on_grid_of(mask: Mask, path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
-    if !grid.same_as(mask.grid()) {
+/// What was read from `path` must lie on `grid`, which is that of `reference`.
+pub fn same_grid(path: &Path, found: &Grid, grid: &Grid, reference: &Path) -> Result<()> {
+    if !grid.same_as(found) {
         bail!(FieldError::GridMismatch {
             what: path.display().to_string(),
-            found: mask.grid().shape(),
+            found: found.shape(),
             reference: reference.display().to_string(),
             expected: grid.shape(),
         });
     }
-    Ok(mask)
+    Ok(())
 }
 
 /// Landmarks of one table, or of two files of points, in the volume on `grid`; warns of those that lie outside it.

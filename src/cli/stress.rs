@@ -54,10 +54,8 @@ fn is_axis(typed: &str, name: &str) -> bool {
 }
 
 fn axis_help() -> String {
-    let of = |(name, part): &(&str, Part)| {
-        format!("{name}: {}", axis_names(*part).join(", ").replace(' ', "-").replace(",-", ", "))
-    };
-    let all = Part::ALL.iter().map(of).collect::<Vec<_>>().join("; ");
+    let typed = |part: Part| axis_names(part).iter().map(|n| n.replace(' ', "-")).collect::<Vec<_>>().join(", ");
+    let all = Part::ALL.map(|(name, part)| format!("{name}: {}", typed(part))).join("; ");
     format!("One axis alone; may be given several times [default: all]. {all}")
 }
 

@@ -1,5 +1,6 @@
 //! Speed against accuracy: methods over cases, and those that no other beats in both.
 
+use super::mean;
 use crate::types::{Standing, Trial};
 
 /// Motion below this is none (mm).
@@ -47,24 +48,18 @@ fn standing(group: &[&Trial], relative: bool) -> Option<Standing> {
         (true, _) => f64::NAN,
         // The logarithm of doing nothing is 0.
         (false, true) => 100.0 * (done.iter().map(left).sum::<f64>() / group.len() as f64).exp(),
-        (false, false) => mean(done.iter().map(|t| t.error)),
+        (false, false) => mean(&done.iter().map(|t| t.error).collect::<Vec<_>>()),
     };
     Some(Standing {
         varied: first.varied,
         method: first.method.clone(),
         settings: first.settings.clone(),
         error,
-        cpu_s: mean(done.iter().map(|t| t.cpu_s)),
+        cpu_s: mean(&done.iter().map(|t| t.cpu_s).collect::<Vec<_>>()),
         cases: group.len(),
         failures,
         on_front: false,
     })
-}
-
-/// NaN of nothing.
-fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
-    let count = values.len() as f64;
-    values.sum::<f64>() / count
 }
 
 /// Numbers of the places (cost, error) that no other place beats in one without losing in the other, cheapest first.

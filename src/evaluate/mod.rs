@@ -12,7 +12,7 @@ pub mod frontier;
 
 use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
-use crate::numerics::sampling::displacement;
+use crate::numerics::sampling::{displacement, inside};
 use crate::numerics::statistics::percentile;
 use crate::types::space::determinant;
 use crate::types::{DenseField, Grid, Landmark, Mask, Metrics};
@@ -51,7 +51,7 @@ pub fn metrics(
         });
     }
     for (volume, field) in [("truth", truth), ("measured", field)] {
-        check_numbers(volume, field, &used)?;
+        check_numbers(volume, field, mask)?;
     }
     let mut error: Vec<f64> = voxels.iter().map(|v| v.error).collect();
     // Beside voxels outside the mask that are no number there is no gradient.
@@ -82,18 +82,16 @@ pub fn landmarks(field: &DenseField, landmarks: &[Landmark]) -> Vec<f64> {
 
 /// Numbers of the landmarks whose initial place lies more than half a voxel outside `grid`, where the field is not known.
 pub fn beyond(grid: &Grid, landmarks: &[Landmark]) -> Vec<usize> {
-    let outside = |l: &Landmark| {
-        let place = grid.affine().to_voxel(l.initial).0;
-        (0..3).any(|a| !(-0.5..=grid.shape()[a] as f64 - 0.5).contains(&place[a]))
-    };
-    (0..landmarks.len()).filter(|&i| outside(&landmarks[i])).collect()
+    let within = |l: &Landmark| inside(grid.shape(), grid.affine().to_voxel(l.initial));
+    (0..landmarks.len()).filter(|&i| !within(&landmarks[i])).collect()
 }
 
-fn check_numbers(
-    volume: &'static str,
-    field: &DenseField,
-    used: &(impl Fn(&usize) -> bool + Sync),
-) -> Result<(), FieldError> {
+/// Whether a field, called `volume` in the message, is a number wherever errors count.
+///
+/// # Errors
+/// [`FieldError::Volume`] tells how many voxels of `mask` are not (of all when `None`).
+pub fn check_numbers(volume: &'static str, field: &DenseField, mask: Option<&Mask>) -> Result<(), FieldError> {
+    let used = |at: &usize| mask.is_none_or(|m| m.as_slice()[*at] != 0);
     let bad = |at: &usize| used(at) && field.at(*at).iter().any(|c| !c.is_finite());
     match (0..field.grid().len()).into_par_iter().filter(bad).count() {
         0 => Ok(()),
@@ -144,10 +142,11 @@ fn check(what: &str, found: &Grid, expected: &Grid) -> Result<(), FieldError> {
     }
 }
 
-fn length(v: [f64; 3]) -> f64 {
+pub(crate) fn length(v: [f64; 3]) -> f64 {
     v.iter().map(|c| c * c).sum::<f64>().sqrt()
 }
 
-fn mean(values: &[f64]) -> f64 {
+/// NaN of nothing.
+pub(crate) fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }

@@ -1,7 +1,7 @@
 //! Pressed bodies whose moduli are known, and the stiffness measured on them.
 
 use crate::error::{StiffnessError, SynthError};
-use crate::pipeline::trials::mean;
+use crate::evaluate::mean;
 use crate::pipeline::{cpu, stiffness};
 use crate::stiffness::patches::Place;
 use crate::synth::{Phantom, PhantomKind, PhantomParams, phantom};

@@ -2,7 +2,7 @@
 //! CPU time of this process.
 
 use crate::error::{FieldError, GraspError, SynthError};
-use crate::evaluate;
+use crate::evaluate::{self, length, mean};
 use crate::grasp::simulate::simulate;
 use crate::numerics::statistics::percentile;
 use crate::pipeline::{cpu, field};
@@ -157,7 +157,6 @@ impl Case {
 
     /// Error of doing nothing (mm): the mean motion where errors count, or the landmarks' mean distance.
     pub fn nothing(&self) -> f64 {
-        let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
         let Some(truth) = &self.truth else {
             return mean(&self.landmarks.iter().map(|l| length(l.initial.minus(l.deformed))).collect::<Vec<_>>());
         };
@@ -192,10 +191,6 @@ impl Case {
         let scored = result.and_then(|r| self.score(variant, &r.displacement, cpu_s));
         scored.unwrap_or_else(|e| Trial { failure: Some(e.to_string()), ..self.trial(variant, cpu_s) })
     }
-}
-
-pub(super) fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
 }
 
 /// The three presets on heads of the same field of view with `sides` voxels across.
