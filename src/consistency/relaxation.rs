@@ -25,11 +25,22 @@ pub struct Relaxed {
 /// Inverse temperatures of the rounds: from undecided to decided.
 const BETAS: [f64; 12] = [4.0, 4.0, 6.0, 6.0, 9.0, 9.0, 13.0, 13.0, 20.0, 20.0, 30.0, 30.0];
 
+/// Probability under which a candidate has no say with its neighbours.
+const LEAST: f64 = 1e-6;
+
 /// Relaxes the candidates (each list best correlation first).
 pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
     let mut q: Vec<Vec<f64>> =
         candidates.iter().map(|list| softmax(list.iter().map(|c| -8.0 * (1.0 - f64::from(c.ncc))))).collect();
     for beta in BETAS {
+        // Most places have one or two candidates left after a few rounds.
+        let likely: Vec<Vec<([f64; 3], f64)>> = candidates
+            .iter()
+            .zip(&q)
+            .map(|(list, q)| {
+                list.iter().zip(q).filter(|(_, p)| **p > LEAST).map(|(c, p)| (c.displacement, *p)).collect()
+            })
+            .collect();
         q = candidates
             .par_iter()
             .zip(&graph.edges)
@@ -38,8 +49,8 @@ pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
                     let pairs: f64 = edges
                         .iter()
                         .map(|&(j, allowed)| {
-                            let other = candidates[j].iter().zip(&q[j]);
-                            other.map(|(o, p)| p * penalty(c.displacement, o.displacement, allowed)).sum::<f64>()
+                            let other = likely[j].iter();
+                            other.map(|(o, p)| p * penalty(c.displacement, *o, allowed)).sum::<f64>()
                         })
                         .sum();
                     // Each pair stands in two sums of the energy.

@@ -8,6 +8,9 @@ use crate::numerics::bspline::weights;
 /// Places treated at once.
 pub const LANES: usize = 16;
 
+/// The longest run of neighbouring places that is worked out at once: where tissue is strained most are shorter.
+const RUN: usize = 8;
+
 /// Sixteen places: the cell that holds each (the index below it along each axis) and the fraction inside the cell.
 #[derive(Debug, Clone, Copy)]
 pub struct Places {
@@ -71,23 +74,14 @@ pub fn sample(
     let mut start = 0;
     while start < count {
         let first = [cx[start], cy[start], cz[start]];
-        let place = (0..3).all(|a| inside(first[a], a)).then(|| {
-            // Index of the first tap of lane 0, were it in this run.
-            let tap = (first[1] - 1) as usize * nx + (first[2] - 1) as usize * nx * ny + (first[0] - 1) as usize;
-            tap.checked_sub(start)
-        });
-        let span = 3 * nx * ny + 3 * nx + LANES + 3;
-        let Some(Some(base)) = place.filter(|b| b.is_some_and(|b| b + span <= data.len())) else {
-            out[start] = if place.is_some() {
-                single(data, shape, first, [0, 1, 2].map(|a| fraction[a][start]))
-            } else {
-                edge(start)
-            };
+        if !(0..3).all(|a| inside(first[a], a)) {
+            out[start] = edge(start);
             start += 1;
             continue;
-        };
+        }
+        let lane = start.min(LANES - RUN);
         let mut end = start + 1;
-        while end < count
+        while end < count.min(lane + RUN)
             && cx[end] - first[0] == (end - start) as i32
             && cx[end] < n[0] - 2
             && cy[end] == first[1]
@@ -95,40 +89,73 @@ pub fn sample(
         {
             end += 1;
         }
-        let data = &data[base..base + span];
-        let mut sum = [0.0f32; LANES];
-        for c in 0..4 {
-            let mut plane = [0.0f32; LANES];
-            for b in 0..4 {
-                let at = nx * (b + ny * c);
-                let row: &[f32] = &data[at..at + LANES + 3];
-                for l in 0..LANES {
-                    let along = w[0][0][l] * row[l]
-                        + w[0][1][l] * row[l + 1]
-                        + w[0][2][l] * row[l + 2]
-                        + w[0][3][l] * row[l + 3];
-                    plane[l] += w[1][b][l] * along;
+        // The first tap of the run's first place.
+        let tap = (first[1] - 1) as usize * nx + (first[2] - 1) as usize * nx * ny + (first[0] - 1) as usize;
+        match tap.checked_sub(start - lane).and_then(|base| run(data, shape, base, &w, lane)) {
+            Some(values) => out[start..end].copy_from_slice(&values[start - lane..end - lane]),
+            None => {
+                for (l, out) in (start..end).zip(&mut out[start..end]) {
+                    *out = single(data, shape, tap + l - start, [0, 1, 2].map(|a| fraction[a][l]));
                 }
             }
-            for l in 0..LANES {
-                sum[l] += w[2][c][l] * plane[l];
-            }
         }
-        out[start..end].copy_from_slice(&sum[start..end]);
         start = end;
     }
 }
 
-/// One place whose taps lie inside, in the same order of operations as a run.
+/// What the taps from `base` on give for the places of the lanes from `lane` on, were they one run; none where that would read past the
+/// end. Spelled out in arrays of eight, which the compiler keeps in registers.
 #[inline(always)]
-fn single(data: &[f32], [nx, ny, _]: [usize; 3], cell: [i32; 3], fraction: [f32; 3]) -> f32 {
+fn run(
+    data: &[f32],
+    [nx, ny, _]: [usize; 3],
+    base: usize,
+    w: &[[[f32; LANES]; 4]; 3],
+    lane: usize,
+) -> Option<[f32; RUN]> {
+    let data = data.get(base..base + 3 * nx * ny + 3 * nx + RUN + 3)?;
+    let weight = |a: usize, m: usize| eight(&w[a][m][lane..]);
+    let x = [weight(0, 0), weight(0, 1), weight(0, 2), weight(0, 3)];
+    let mut sum = [0.0; RUN];
+    for c in 0..4 {
+        let mut plane = [0.0; RUN];
+        for b in 0..4 {
+            let row = &data[nx * (b + ny * c)..][..RUN + 3];
+            let mut along = [0.0; RUN];
+            for m in 0..4 {
+                add_product(&mut along, x[m], eight(&row[m..]));
+            }
+            add_product(&mut plane, weight(1, b), along);
+        }
+        add_product(&mut sum, weight(2, c), plane);
+    }
+    Some(sum)
+}
+
+/// The first eight of a slice of that many or more.
+#[inline(always)]
+fn eight(v: &[f32]) -> [f32; RUN] {
+    let v = &v[..RUN];
+    std::array::from_fn(|l| v[l])
+}
+
+/// `sum += a * b`, lane by lane.
+#[inline(always)]
+fn add_product(sum: &mut [f32; RUN], a: [f32; RUN], b: [f32; RUN]) {
+    for l in 0..RUN {
+        sum[l] += a[l] * b[l];
+    }
+}
+
+/// One place whose taps lie inside, the first of them at `tap`, in the same order of operations as a run.
+#[inline(always)]
+fn single(data: &[f32], [nx, ny, _]: [usize; 3], tap: usize, fraction: [f32; 3]) -> f32 {
     let w = fraction.map(weights);
-    let base = cell.map(|c| (c - 1) as usize);
     let mut sum = 0.0;
     for c in 0..4 {
         let mut plane = 0.0;
         for b in 0..4 {
-            let at = base[0] + nx * (base[1] + b + ny * (base[2] + c));
+            let at = tap + nx * (b + ny * c);
             let row = &data[at..at + 4];
             plane += w[1][b] * (w[0][0] * row[0] + w[0][1] * row[1] + w[0][2] * row[2] + w[0][3] * row[3]);
         }

@@ -216,7 +216,7 @@ fn canonical(
             let finest = pyramid::finest(pair.shape, pair.spacing);
             let thorough = params.points > 0;
             let near = MatchParams::new(params, points, thorough, finest, 3, 0.05);
-            let (matches, _, report) = level::matches(&pair, Some(&field), field.lattice.clone(), near);
+            let (matches, _, report) = level::matches(&pair, Some(&field), near);
             if !first || reports.is_empty() {
                 reports.push(report);
             } else {

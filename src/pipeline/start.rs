@@ -4,6 +4,7 @@ use crate::matching::agreement::Agreement;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
+use crate::numerics::pyramid;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Counts, LevelReport};
 
@@ -120,6 +121,13 @@ const ENOUGH: usize = 20;
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
+/// Where so many of the features agree on a motion of [`FAR`] or more under which the volumes agree better than at rest, stillness is
+/// not brought to the residual beside it: over 37 pairs it never won there.
+const SURE: f64 = 0.9;
+
+/// Mean motion (voxels of the finest axis) of which that is so: smaller ones the residual finds from rest as well, or better.
+const FAR: f64 = 0.5;
+
 /// Part of the features by which those that agree must have grown in a search for another to follow: in four legs, after
 /// fewer were won the next won nothing.
 const GREW: f64 = 0.05;
@@ -179,7 +187,7 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
-/// stillness (with `rest`) and the known fields compete, and the one that ends at the better agreement goes on; None when there is
+/// stillness (with `rest`, where the matches leave room for it) and the known fields compete, and the one that ends at the better agreement goes on; None when there is
 /// none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
 /// A known field that goes on is refined twice: it begins with the noise of another frame, which takes long to forget. Of several
 /// the one that agrees best as it is goes on, so that this costs no more than to refine each once.
@@ -206,7 +214,11 @@ pub(super) fn begin(
         }
     }
     let (found, mut report) = search(None);
-    let still = rest.then(|| SplineField::still(lattice.clone()));
+    let still = rest.then(|| SplineField::still(lattice.clone())).filter(|still| {
+        let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
+        let far = |found| level::mean_length(pair, found) > FAR * pyramid::finest(pair.shape, pair.spacing);
+        !found.as_ref().is_some_and(|found| sure && far(found) && level::is_better(pair, found, still))
+    });
     let own =
         [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH))).reduce(better);
     let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());

@@ -84,8 +84,8 @@ impl Whole<'_> {
             let started = Instant::now();
             let (fitted, report) = match about {
                 None => {
-                    let (_, fitted, report) = level::matches(pair, None, lattice.clone(), wide);
-                    (fitted, report)
+                    let (_, fitted, report) = level::matches(pair, None, wide);
+                    (fitted.map(|f| level::carry(&f, lattice.clone(), |p| p)), report)
                 }
                 Some(field) => {
                     // What is wrong by then is an island, not the whole: each time half as far.
