@@ -101,8 +101,19 @@ impl Pair<'_> {
     /// The deformed volume sampled at `x + u(x)`: smoothed like `fixed_smooth`, NaN where it was not seen and outside
     /// `spans`. `coefficients` are mm along the lattice's axes.
     pub fn warp(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans) -> Vec<f32> {
+        let mut out = self.unseen();
+        self.warp_again(lattice, coefficients, spans, &mut out);
+        out
+    }
+
+    /// A volume of which nothing was seen yet: NaN.
+    pub fn unseen(&self) -> Vec<f32> {
+        vec![f32::NAN; self.fixed.len()]
+    }
+
+    /// As [`Pair::warp`], into `out`; what lies outside `spans` stays as it is there.
+    pub fn warp_again(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans, out: &mut [f32]) {
         let [nx, ny, _] = self.shape;
-        let mut out = vec![f32::NAN; self.fixed.len()];
         let sampler = self.sampler();
         let scale: [f32; 3] = std::array::from_fn(|a| (1.0 / self.spacing[a]) as f32);
         let origin = self.moving_origin.map(|o| o as f32);
@@ -131,7 +142,6 @@ impl Pair<'_> {
                 );
             }
         });
-        out
     }
 }
 

@@ -107,8 +107,9 @@ pub fn refine(
     let reach = (reach * finest) as f32;
     let mut before = begun.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
+    let mut warped = pair.unseen();
     for pass in 0..passes {
-        let warped = pair.warp(&field.lattice, &field.coefficients, &active);
+        pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
         for v in equations.blocks.iter_mut().flatten().chain(&mut equations.rhs) {

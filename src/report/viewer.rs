@@ -118,12 +118,19 @@ impl<'a> Thinned<'a> {
         }
     }
 
-    /// Voxel offset of each thinned voxel, x fastest.
-    fn offsets(&self) -> Vec<usize> {
+    /// `of` the voxel offset of each thinned voxel, x fastest.
+    fn map<T: Clone + Default + Send>(&self, of: impl Fn(usize) -> T + Sync) -> Vec<T> {
         let [nx, ny, nz] = self.shape;
         let at = |i: usize, axis: usize| i * self.steps[axis] + (self.steps[axis] - 1) / 2;
-        let row = |r: usize| (0..nx).map(move |i| self.canonical.offset([at(i, 0), at(r % ny, 1), at(r / ny, 2)]));
-        (0..ny * nz).flat_map(row).collect()
+        let mut all = vec![T::default(); nx * ny * nz];
+        all.par_chunks_mut(nx).enumerate().for_each(|(row, out)| {
+            let offset = |i: usize| self.canonical.offset([at(i, 0), at(row % ny, 1), at(row / ny, 2)]) as isize;
+            let (first, step) = (offset(0), offset(1.min(nx - 1)) - offset(0));
+            for (out, i) in out.iter_mut().zip(0..) {
+                *out = of((first + i * step) as usize);
+            }
+        });
+        all
     }
 
     /// Shape, first voxel's centre and step (mm from the first corner).
@@ -136,6 +143,7 @@ impl<'a> Thinned<'a> {
 }
 
 /// `value` in 8 bits of the scale; what is no number is at its low end.
+#[inline(always)]
 fn byte(scale: &Scale, value: f32) -> u8 {
     // Saturates, and rounds what is not below 0 to the nearest.
     (255.0 * scale.position(f64::from(value)) + 0.5) as u8
@@ -145,6 +153,7 @@ fn byte(scale: &Scale, value: f32) -> u8 {
 const END: u8 = 253;
 
 /// `value`, which an overlay shows, in 8 bits; what is not finite is not known.
+#[inline(always)]
 fn code(scale: &Scale, value: f32) -> u8 {
     match scale.position(f64::from(value)) {
         t if !t.is_finite() => END + 2,
@@ -161,13 +170,9 @@ fn with(mut lattice: Value, more: Value) -> Value {
     lattice
 }
 
-fn layers(thinned: &Thinned<'_>, all: &[Layer<'_>], byte: fn(&Scale, f32) -> u8) -> Vec<Value> {
-    if all.is_empty() {
-        return Vec::new();
-    }
-    let offsets = thinned.offsets();
+fn layers(thinned: &Thinned<'_>, all: &[Layer<'_>], byte: impl Fn(&Scale, f32) -> u8 + Sync) -> Vec<Value> {
     let one = |Layer { name, values, scale }: &Layer<'_>| {
-        let bytes: Vec<u8> = offsets.par_iter().with_min_len(1 << 12).map(|&o| byte(scale, values(o))).collect();
+        let bytes = thinned.map(|o| byte(scale, values(o)));
         let about = json!({ "name": name, "low": scale.low, "high": scale.high, "unit": scale.unit,
             "map": map_name(scale.map), "data": pack(&bytes) });
         with(thinned.lattice(), about)
@@ -212,8 +217,7 @@ impl Moment<'_> {
         maps.extend(self.overlays.iter().map(|l| l.scale.map));
         overlays.extend(layers(&coarse, self.overlays, code));
         let field = self.displacement.as_ref().map(|(field, _)| {
-            let moved: Vec<[f64; 3]> =
-                coarse.offsets().into_iter().map(|o| canonical.direct(field.at(o).map(f64::from))).collect();
+            let moved = coarse.map(|o| canonical.direct(field.at(o).map(f64::from)));
             let hundredths =
                 |v: f64| if v.is_finite() { (100.0 * v).round().clamp(-32767.0, 32767.0) as i16 } else { 0 };
             let bytes: Vec<u8> =
@@ -254,7 +258,7 @@ impl Viewer<'_> {
         let canonical = Canonical::of(self.grid);
         let (fine, coarse) = (Thinned::new(&canonical, IMAGE_VOXELS), Thinned::new(&canonical, SMOOTH_VOXELS[0]));
         let mask = self.mask.map(|mask| {
-            let inside: Vec<u8> = coarse.offsets().iter().map(|&o| u8::from(mask.as_slice()[o] > 0)).collect();
+            let inside = coarse.map(|o| u8::from(mask.as_slice()[o] > 0));
             with(coarse.lattice(), json!({ "data": pack(&inside) }))
         });
         let maps = self.moments.iter().flat_map(|m| &m.maps);
@@ -464,7 +468,7 @@ mod tests {
         assert_eq!(thinned.steps[2], 1, "thick slices stay");
         let n = thinned.shape.iter().product::<usize>();
         assert!(n <= IMAGE_VOXELS && n > IMAGE_VOXELS / 3, "{n}");
-        assert!(thinned.offsets().iter().all(|&o| o < 600 * 512 * 40));
+        assert!(thinned.map(|o| o).iter().all(|&o| o < 600 * 512 * 40));
         let flat = canonical([900, 900, 1], [0.3, 0.3, 5.0]);
         assert_eq!(Thinned::new(&flat, SMOOTH_VOXELS[0]).shape[2], 1);
     }
