@@ -296,6 +296,7 @@ fn a_phantom_refuses_flags_that_mean_nothing_for_it() {
         (&["slab", "--contrast", "4"], "--contrast belongs to"),
         (&["fingertip", "--inclusions", "2"], "--inclusions belongs to"),
         (&["inclusion", "--motion", "press", "--poisson", "0.4"], "--poisson belongs to"),
+        (&["inclusion", "--inclusions", "2", "--contrast", "4"], "--contrast belongs to one inclusion"),
     ] {
         let (_, err) = run(&[&["phantom"], arguments, &["-o", "never"]].concat(), 2);
         assert!(err.contains(flag), "should say {flag:?}: {err}");

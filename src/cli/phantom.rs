@@ -132,6 +132,8 @@ impl Options {
         if kind != PhantomKind::Inclusion {
             refuse(self.contrast, "contrast", INCLUSION)?;
             refuse(self.inclusions, "inclusions", INCLUSION)?;
+        } else if self.inclusions.is_some_and(|n| n != 1) {
+            refuse(self.contrast, "contrast", "one inclusion")?;
         }
         if p.motion != MotionKind::Elastic {
             refuse(self.poisson, "poisson", ELASTIC)?;

@@ -24,7 +24,7 @@ use palpate::pipeline::{
 };
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
-use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as frame_warnings};
+use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as all_warnings};
 use palpate::report::verdict::judge;
 use palpate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
@@ -248,7 +248,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
     let mut film = film.unwrap_or_else(|| start_film(&reference, &still, shown, range));
     add_to(&mut film, origin, &reference, &still, &|_| 0.0)?;
-    warnings.extend(frame_warnings(&tracked));
     writing += started.elapsed();
     let measuring = tracked.frames.iter().map(|f| f.seconds).sum();
     let seconds = [("read", reading.as_secs_f64()), ("measure", measuring), ("write", writing.as_secs_f64())]
@@ -273,7 +272,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
     folder.commit()?;
     drop(progress);
-    warn_all(console, &warnings);
+    warn_all(console, &all_warnings(&report));
     console.say(&format!("{}{}", text(&report), target.look()))
 }
 

@@ -5,7 +5,7 @@ use super::field::{kept_field, params};
 use crate::error::FieldError;
 use crate::pipeline::track::{Frame, run};
 use crate::report::film::Film;
-use crate::report::track::{TrackReport, summary, warnings};
+use crate::report::track::{TrackReport, summary};
 use crate::types::{DenseField, Voxels};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
@@ -86,7 +86,7 @@ pub fn track<'py>(
         film: &Film::new(&grid, grid.world(0, 0, 0), None, [0.0, 1.0]),
         look: None,
         judged: &[],
-        warnings: &warnings(&tracked).collect::<Vec<_>>(),
+        warnings: &[],
         seconds: &[("read", reading), ("measure", measuring)].map(|(stage, s)| (stage.to_string(), s)),
     };
     let summary = summary(&report);

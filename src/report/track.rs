@@ -12,7 +12,7 @@ use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, thousands};
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
-use crate::report::verdict::{Verdict, judge_frames, short2};
+use crate::report::verdict::{Verdict, judge_frames, named, short2};
 use crate::report::viewer::{Layer, Moment, PackedMoment, Viewer, elements};
 use crate::report::views::{Scales, matched};
 use crate::types::{
@@ -45,7 +45,7 @@ pub struct TrackReport<'a> {
     pub look: Option<(&'a Looks, &'a Voxels<'a>, Option<&'a Mask>)>,
     /// Frames that were measured and how each is judged as a pair.
     pub judged: &'a [(usize, Verdict)],
-    /// What the user should know.
+    /// What the user should know of the volumes; what each frame is warned of is with the frames.
     pub warnings: &'a [String],
     /// Stage names and wall seconds.
     pub seconds: &'a [(String, f64)],
@@ -212,6 +212,7 @@ fn gray([low, high]: [f64; 2]) -> Scale {
 /// The keys are those of docs/file-formats.md.
 pub fn summary(report: &TrackReport<'_>) -> Value {
     let t = report.tracked;
+    let each = of_frames(t).map(|(frame, text)| format!("frame {frame}: {text}"));
     json!({
         "version": env!("CARGO_PKG_VERSION"),
         "command": "track",
@@ -222,7 +223,7 @@ pub fn summary(report: &TrackReport<'_>) -> Value {
         "frames": t.frames,
         "points": t.trajectories.len(),
         "seconds": seconds(report.seconds),
-        "warnings": report.warnings,
+        "warnings": report.warnings.iter().cloned().chain(each).collect::<Vec<_>>(),
         "params": report.params,
     })
 }
@@ -252,11 +253,31 @@ pub fn text(report: &TrackReport<'_>) -> String {
 }
 
 /// What each frame was warned of or lost for, with its number.
-pub fn warnings(tracked: &Tracked) -> impl Iterator<Item = String> + '_ {
+fn of_frames(tracked: &Tracked) -> impl Iterator<Item = (usize, &str)> {
     tracked.frames.iter().flat_map(|f| {
         let said = f.warnings.iter().map(String::as_str).chain(f.lost.as_deref());
-        said.map(|w| format!("frame {}: {w}", f.frame))
+        said.map(|text| (f.frame, text))
     })
+}
+
+/// All that a reader is to be warned of: what the volumes gave rise to, then frame by frame, where what differs in its numbers alone is
+/// said once, for the first of the frames.
+pub fn warnings(report: &TrackReport<'_>) -> Vec<String> {
+    let wording = |text: &str| -> String { text.chars().filter(|c| !c.is_ascii_digit()).collect() };
+    let mut kinds: Vec<(String, &str, Vec<usize>)> = Vec::new();
+    for (frame, text) in of_frames(report.tracked) {
+        let key = wording(text);
+        match kinds.iter_mut().find(|k| k.0 == key) {
+            Some((.., frames)) if frames.last() == Some(&frame) => {}
+            Some((.., frames)) => frames.push(frame),
+            None => kinds.push((key, text, vec![frame])),
+        }
+    }
+    let said = kinds.into_iter().map(|(_, text, frames)| match named(&frames) {
+        Some(names) if frames.len() > 1 => format!("{names}: {text} (frame {}; the others alike)", frames[0]),
+        _ => format!("frame {}: {text}", frames[0]),
+    });
+    report.warnings.iter().cloned().chain(said).collect()
 }
 
 /// The page.
@@ -280,8 +301,9 @@ pub fn page(report: &TrackReport<'_>) -> String {
         tile(&format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "in all stages"),
         trust = trust.name(),
     );
-    if !report.warnings.is_empty() {
-        let items: String = report.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+    let warnings = warnings(report);
+    if !warnings.is_empty() {
+        let items: String = warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
         let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
     }
     let clock: Vec<String> = (0..=all).map(|f| report.clock(f)).collect();
@@ -502,6 +524,21 @@ mod tests {
         let drawn: Vec<&str> = lines.filter(|l| !l.contains("h16")).collect();
         assert_eq!(drawn.len(), 3 + 2 + 5);
         assert!(drawn.iter().all(|l| l.matches('M').count() == 2 && l.matches('L').count() == 2), "{drawn:?}");
+    }
+
+    #[test]
+    fn warnings_that_differ_in_numbers_alone_are_said_once() {
+        let mut tracked = sequence(1);
+        for (at, said) in [(0, "error of 0.1 mm"), (2, "error of 0.2 mm"), (3, "error of 0.3 mm"), (3, "folds")] {
+            tracked.frames[at].warnings.push(said.into());
+        }
+        let gathered = told(&tracked, warnings);
+        assert_eq!(
+            gathered,
+            ["frames 1, 3, 4: error of 0.1 mm (frame 1; the others alike)", "frame 2: it is blank", "frame 4: folds"]
+        );
+        // All of them stay in the summary.
+        assert_eq!(told(&tracked, summary)["warnings"].as_array().unwrap().len(), 5);
     }
 
     #[test]

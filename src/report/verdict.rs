@@ -147,7 +147,7 @@ pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Tr
 const RUNS: usize = 6;
 
 /// Frames in words, "frames 1, 3 to 5 and 9"; none without any. `which` rises.
-fn named(which: &[usize]) -> Option<String> {
+pub(super) fn named(which: &[usize]) -> Option<String> {
     let mut runs: Vec<[usize; 2]> = Vec::new();
     for &frame in which {
         match runs.last_mut() {
