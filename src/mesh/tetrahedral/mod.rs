@@ -126,40 +126,45 @@ impl Mesher {
         self.mesh_finer(fineness, Detail::default())
     }
 
-    /// With some places in more detail. Where a part gets no element, smaller cubes are tried, down to a third of the side.
+    /// With some places in more detail. Where a part gets no element, smaller cubes are tried in that part, down to half a voxel.
     ///
     /// # Errors
     /// As [`mesh_labels`].
     pub fn mesh_finer(&self, fineness: &Fineness, detail: Detail<'_>) -> Result<QuadraticMesh, MeshError> {
-        let mut fineness = *fineness;
+        let mut lost = BTreeMap::new();
         for _ in 0..FINER {
-            match self.meshed(&fineness, detail) {
-                Err(MeshError::PartLost { .. }) => {
-                    fineness.size *= 0.8;
-                    fineness.nodes *= 2;
-                }
+            match self.meshed(fineness, detail, &lost) {
+                Err(MeshError::PartLost { label }) => *lost.entry(label).or_default() += 1,
                 done => return done,
             }
         }
-        self.meshed(&fineness, detail)
+        self.meshed(fineness, detail, &lost)
     }
 
     /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this fineness itself.
     pub fn nodes(&self, fineness: &Fineness, detail: Detail<'_>) -> Option<usize> {
-        build(&self.lattice(fineness, detail), &self.levels, detail.wall).ok().map(|made| made.places.len())
+        build(&self.lattice(fineness, detail, &BTreeMap::new()), &self.levels, detail.wall)
+            .ok()
+            .map(|made| made.places.len())
     }
 
-    fn lattice(&self, fineness: &Fineness, detail: Detail<'_>) -> lattice::Lattice {
+    /// `lost`: halvings of the cubes in parts that got no element without.
+    fn lattice(&self, fineness: &Fineness, detail: Detail<'_>, lost: &BTreeMap<u8, u32>) -> lattice::Lattice {
         let mut octree = lattice::Octree::new(self.levels.bounds(), fineness.size);
-        refine(&mut octree, &self.levels, fineness);
+        refine(&mut octree, &self.levels, fineness, lost);
         let halvings = (octree.base() / detail.size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
         detail.near.iter().for_each(|p| octree.refine(*p, halvings));
         octree.tetrahedra()
     }
 
-    fn meshed(&self, fineness: &Fineness, detail: Detail<'_>) -> Result<QuadraticMesh, MeshError> {
+    fn meshed(
+        &self,
+        fineness: &Fineness,
+        detail: Detail<'_>,
+        lost: &BTreeMap<u8, u32>,
+    ) -> Result<QuadraticMesh, MeshError> {
         let mut levels = self.levels.clone();
-        let lattice = self.lattice(fineness, detail);
+        let lattice = self.lattice(fineness, detail, lost);
         let mut made = build(&lattice, &levels, detail.wall)?;
         for _ in 0..CALIBRATIONS {
             calibrate(&made, &mut levels);
@@ -180,7 +185,7 @@ impl Mesher {
 /// The bit of vertices on the wall of a [`Detail`].
 const WALL: u32 = 1 << 31;
 /// Times that smaller cubes are tried.
-const FINER: usize = 5;
+const FINER: usize = 8;
 /// Times that surfaces are moved so that volumes come out right.
 const CALIBRATIONS: usize = 2;
 
@@ -267,7 +272,7 @@ fn cut_edge(edges: &std::collections::HashSet<(u32, u32)>, a: u32, b: u32) -> bo
 }
 
 /// Divides the cubes in thin parts, as far as the estimated number of nodes stays within the limit.
-fn refine(octree: &mut lattice::Octree, levels: &Levels, fineness: &Fineness) {
+fn refine(octree: &mut lattice::Octree, levels: &Levels, fineness: &Fineness, lost: &BTreeMap<u8, u32>) {
     let base = octree.base();
     let wanted: BTreeMap<u8, f64> =
         levels.labels().iter().copied().zip(levels.thickness().iter().map(|t| t / fineness.layers)).collect();
@@ -294,8 +299,11 @@ fn refine(octree: &mut lattice::Octree, levels: &Levels, fineness: &Fineness) {
         let Some((dearest, _)) = divided.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))) else { break };
         slack.entry(dearest).and_modify(|s| *s *= 1.2);
     }
+    // What does not show in cubes of half a voxel does not show in smaller ones.
+    let most = (2.0 * base / voxel.cbrt()).log2().max(0.0) as u32;
     for (label, p) in levels.voxels() {
-        let h = halvings(label, slack[&label]);
+        let own = halvings(label, slack[&label]);
+        let h = lost.get(&label).map_or(own, |more| own.max((own + more).min(most)));
         if h > 0 {
             octree.refine(p, h);
         }
