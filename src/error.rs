@@ -85,12 +85,13 @@ pub enum MeshError {
     Collinear,
     /// No element fits into a labelled part.
     #[error(
-        "no element of the mesh falls into label {label}: it is too small for the mesh; refine it with a larger --nodes, or \
-         merge that label with its neighbour"
+        "no element of the mesh falls into label {}: it is too small for the mesh; refine it with a larger --nodes, or \
+         merge that label with its neighbour",
+        .labels.iter().map(u8::to_string).collect::<Vec<_>>().join(", ")
     )]
     PartLost {
-        /// The label.
-        label: u8,
+        /// All such labels.
+        labels: Vec<u8>,
     },
     /// All points lie in one plane (use the 2D Delaunay).
     #[error("all points lie in one plane, so there is no tetrahedron among them")]

@@ -124,6 +124,24 @@ fn a_small_part_is_meshed_finer_alone() {
     assert!(volumes(&mesh)[&2] > 0.4 * exact && mesh.nodes().len() < 5000, "{} nodes", mesh.nodes().len());
 }
 
+/// More than a few parts may be too small at once; halved one after the other, not all had their turn.
+#[test]
+fn many_small_parts_are_all_kept() {
+    let ball = |p: [f64; 3]| {
+        let (i, j) = (((p[0] - 2.0) / 6.5).floor(), ((p[1] - 2.0) / 6.5).floor());
+        let d = (p[0] - 5.2 - 6.5 * i).powi(2) + (p[1] - 5.3 - 6.5 * j).powi(2) + (p[2] - 11.2).powi(2);
+        if d < 0.64 { 2 + (4.0 * j + i) as u8 } else { 1 }
+    };
+    let map = labels([64, 64, 48], 0.5, |p| {
+        let inside = (2.0..28.0).contains(&p[0]) && (2.0..28.0).contains(&p[1]) && (2.0..20.0).contains(&p[2]);
+        if inside { ball(p) } else { 0 }
+    });
+    let fineness = Fineness { nodes: 300, ..Fineness::for_nodes(26.0 * 26.0 * 18.0, 500) };
+    let mesh = mesh_labels(&map, &fineness).unwrap();
+    report("sixteen small balls", &mesh);
+    assert_eq!(volumes(&mesh).len(), 17);
+}
+
 /// The edge of a punch lies within a side of a body, and no element may lie on both sides of it.
 #[test]
 fn a_wall_is_made_of_faces() {

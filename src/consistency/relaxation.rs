@@ -49,8 +49,7 @@ pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
                     let pairs: f64 = edges
                         .iter()
                         .map(|&(j, allowed)| {
-                            let other = likely[j].iter();
-                            other.map(|(o, p)| p * penalty(c.displacement, *o, allowed)).sum::<f64>()
+                            likely[j].iter().map(|(o, p)| p * penalty(c.displacement, *o, allowed)).sum::<f64>()
                         })
                         .sum();
                     // Each pair stands in two sums of the energy.

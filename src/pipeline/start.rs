@@ -187,8 +187,8 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
 /// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
-/// stillness (with `rest`, where the matches leave room for it) and the known fields compete, and the one that ends at the better agreement goes on; None when there is
-/// none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
+/// stillness (with `rest`, where the matches leave room for it) and the known fields compete, and the one that ends at the better
+/// agreement goes on; None when there is none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
 /// A known field that goes on is refined twice: it begins with the noise of another frame, which takes long to forget. Of several
 /// the one that agrees best as it is goes on, so that this costs no more than to refine each once.
 /// Where few matches agreed, they are sought again about it for as long as clearly more of them agree each time: the agreement of
@@ -214,13 +214,16 @@ pub(super) fn begin(
         }
     }
     let (found, mut report) = search(None);
-    let still = rest.then(|| SplineField::still(lattice.clone())).filter(|still| {
-        let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
-        let far = |found| level::mean_length(pair, found) > FAR * pyramid::finest(pair.shape, pair.spacing);
-        !found.as_ref().is_some_and(|found| sure && far(found) && level::is_better(pair, found, still))
-    });
-    let own =
-        [found, still].into_iter().flatten().map(|start| refine(start, reach(&report, FROM_SEARCH))).reduce(better);
+    let still = SplineField::still(lattice.clone());
+    let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
+    let least = FAR * pyramid::finest(pair.shape, pair.spacing);
+    let clear = |found: &SplineField| level::mean_length(pair, found) > least && level::is_better(pair, found, &still);
+    let still_too = rest && !(sure && found.as_ref().is_some_and(clear));
+    let own = [found, still_too.then_some(still)]
+        .into_iter()
+        .flatten()
+        .map(|start| refine(start, reach(&report, FROM_SEARCH)))
+        .reduce(better);
     let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
     let wins = |known: &SplineField| own.as_ref().is_none_or(|own| level::is_better(pair, known, own));
     let mut field = followed.filter(wins).map(refined).or(own)?;

@@ -126,32 +126,48 @@ impl Mesher {
         self.mesh_finer(fineness, Detail::default())
     }
 
-    /// With some places in more detail. Where a part gets no element, smaller cubes are tried in that part, down to half a voxel.
+    /// With some places in more detail. Where parts get no element, smaller cubes are tried in these, down to half a voxel.
     ///
     /// # Errors
     /// As [`mesh_labels`].
     pub fn mesh_finer(&self, fineness: &Fineness, detail: Detail<'_>) -> Result<QuadraticMesh, MeshError> {
-        let mut lost = BTreeMap::new();
-        for _ in 0..FINER {
-            match self.meshed(fineness, detail, &lost) {
-                Err(MeshError::PartLost { label }) => *lost.entry(label).or_default() += 1,
+        let mut halvings = self.halvings(fineness);
+        // What does not show in cubes of half a voxel does not show in smaller ones.
+        let voxel = self.levels.volume() / self.levels.voxels().count().max(1) as f64;
+        let finest = (2.0 * self.cubes(fineness).base() / voxel.cbrt()).log2().max(0.0) as u32;
+        let most = finest.min(lattice::MAX_LEVEL);
+        loop {
+            let lost = match self.meshed(fineness, detail, &halvings) {
+                Err(MeshError::PartLost { labels }) => labels,
                 done => return done,
+            };
+            let open: Vec<u8> = lost.iter().copied().filter(|l| halvings[l] < most).collect();
+            if open.is_empty() {
+                return Err(MeshError::PartLost { labels: lost });
             }
+            open.into_iter().for_each(|l| *halvings.entry(l).or_default() += 1);
         }
-        self.meshed(fineness, detail, &lost)
     }
 
     /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this fineness itself.
     pub fn nodes(&self, fineness: &Fineness, detail: Detail<'_>) -> Option<usize> {
-        build(&self.lattice(fineness, detail, &BTreeMap::new()), &self.levels, detail.wall)
-            .ok()
-            .map(|made| made.places.len())
+        let lattice = self.lattice(fineness, detail, &self.halvings(fineness));
+        build(&lattice, &self.levels, detail.wall).ok().map(|made| made.places.len())
     }
 
-    /// `lost`: halvings of the cubes in parts that got no element without.
-    fn lattice(&self, fineness: &Fineness, detail: Detail<'_>, lost: &BTreeMap<u8, u32>) -> lattice::Lattice {
-        let mut octree = lattice::Octree::new(self.levels.bounds(), fineness.size);
-        refine(&mut octree, &self.levels, fineness, lost);
+    fn cubes(&self, fineness: &Fineness) -> lattice::Octree {
+        lattice::Octree::new(self.levels.bounds(), fineness.size)
+    }
+
+    /// How often the cubes of each part are halved: where it is thin, as far as the estimated number of nodes stays within the limit.
+    fn halvings(&self, fineness: &Fineness) -> BTreeMap<u8, u32> {
+        halvings(&self.levels, fineness, self.cubes(fineness).base())
+    }
+
+    /// Cubes halved so often in each part.
+    fn lattice(&self, fineness: &Fineness, detail: Detail<'_>, halvings: &BTreeMap<u8, u32>) -> lattice::Lattice {
+        let mut octree = self.cubes(fineness);
+        self.levels.voxels().for_each(|(label, p)| octree.refine(p, halvings[&label]));
         let halvings = (octree.base() / detail.size).log2().round().clamp(0.0, f64::from(lattice::MAX_LEVEL)) as u32;
         detail.near.iter().for_each(|p| octree.refine(*p, halvings));
         octree.tetrahedra()
@@ -161,10 +177,10 @@ impl Mesher {
         &self,
         fineness: &Fineness,
         detail: Detail<'_>,
-        lost: &BTreeMap<u8, u32>,
+        halvings: &BTreeMap<u8, u32>,
     ) -> Result<QuadraticMesh, MeshError> {
         let mut levels = self.levels.clone();
-        let lattice = self.lattice(fineness, detail, lost);
+        let lattice = self.lattice(fineness, detail, halvings);
         let mut made = build(&lattice, &levels, detail.wall)?;
         for _ in 0..CALIBRATIONS {
             calibrate(&made, &mut levels);
@@ -184,8 +200,6 @@ impl Mesher {
 
 /// The bit of vertices on the wall of a [`Detail`].
 const WALL: u32 = 1 << 31;
-/// Times that smaller cubes are tried.
-const FINER: usize = 8;
 /// Times that surfaces are moved so that volumes come out right.
 const CALIBRATIONS: usize = 2;
 
@@ -220,8 +234,10 @@ fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) ->
     if cut.cells.len() < 4 {
         return Err(MeshError::TooFew { found: cut.places.len(), needed: 4 });
     }
-    if let Some(k) = (0..parts).find(|&k| !cut.part.contains(&(k as u8))) {
-        return Err(MeshError::PartLost { label: levels.labels()[k] });
+    let lost = (0..parts).filter(|&k| !cut.part.contains(&(k as u8)));
+    let lost: Vec<u8> = lost.map(|k| levels.labels()[k]).collect();
+    if !lost.is_empty() {
+        return Err(MeshError::PartLost { labels: lost });
     }
     let (places, tetrahedra) = curving::quadratic(&cut, &cut.part, levels);
     Ok(Made { places, tetrahedra, part: cut.part })
@@ -271,9 +287,9 @@ fn cut_edge(edges: &std::collections::HashSet<(u32, u32)>, a: u32, b: u32) -> bo
     edges.contains(&(a.min(b), a.max(b)))
 }
 
-/// Divides the cubes in thin parts, as far as the estimated number of nodes stays within the limit.
-fn refine(octree: &mut lattice::Octree, levels: &Levels, fineness: &Fineness, lost: &BTreeMap<u8, u32>) {
-    let base = octree.base();
+/// How often cubes of side `base` (mm) are halved in each part: where it is thin, as far as the estimated number of nodes stays
+/// within the limit.
+fn halvings(levels: &Levels, fineness: &Fineness, base: f64) -> BTreeMap<u8, u32> {
     let wanted: BTreeMap<u8, f64> =
         levels.labels().iter().copied().zip(levels.thickness().iter().map(|t| t / fineness.layers)).collect();
     let mut volume: BTreeMap<u8, f64> = BTreeMap::new();
@@ -299,15 +315,7 @@ fn refine(octree: &mut lattice::Octree, levels: &Levels, fineness: &Fineness, lo
         let Some((dearest, _)) = divided.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))) else { break };
         slack.entry(dearest).and_modify(|s| *s *= 1.2);
     }
-    // What does not show in cubes of half a voxel does not show in smaller ones.
-    let most = (2.0 * base / voxel.cbrt()).log2().max(0.0) as u32;
-    for (label, p) in levels.voxels() {
-        let own = halvings(label, slack[&label]);
-        let h = lost.get(&label).map_or(own, |more| own.max((own + more).min(most)));
-        if h > 0 {
-            octree.refine(p, h);
-        }
-    }
+    slack.into_iter().map(|(label, slack)| (label, halvings(label, slack))).collect()
 }
 
 /// Faces by their sorted vertices, each with the cells that have it.

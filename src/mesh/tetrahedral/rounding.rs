@@ -10,6 +10,7 @@
 //! Reconstruction, 1987).
 
 use crate::numerics::filters::gaussian;
+use crate::numerics::small::eigenvalues;
 use rayon::prelude::*;
 
 /// Half width of the band (voxels).
@@ -100,24 +101,9 @@ fn curvature(v: &[f32], o: usize, stride: [usize; 3]) -> f32 {
         }
         0.25 * (at(a, b, [true, true]) + at(a, b, [false, false]) - at(a, b, [true, false]) - at(a, b, [false, true]))
     };
-    let of = |a: usize| second(a, a);
-    steepest([of(0), of(1), of(2)], [second(0, 1), second(1, 2), second(2, 0)]) as f32
-}
-
-/// The largest absolute eigenvalue of the symmetric matrix with `diagonal` and, beside it, the entries (0, 1), (1, 2), (2, 0): the
-/// cubic solved by a cosine (Smith, Comm. ACM 4, 1961).
-fn steepest(diagonal: [f64; 3], [xy, yz, zx]: [f64; 3]) -> f64 {
-    let mean = diagonal.iter().sum::<f64>() / 3.0;
-    let [x, y, z] = diagonal.map(|d| d - mean);
-    let spread = ((x * x + y * y + z * z + 2.0 * (xy * xy + yz * yz + zx * zx)) / 6.0).sqrt();
-    if spread == 0.0 {
-        return mean.abs();
-    }
-    let determinant = x * (y * z - yz * yz) - xy * (xy * z - yz * zx) + zx * (xy * yz - y * zx);
-    let angle = (0.5 * determinant / spread.powi(3)).clamp(-1.0, 1.0).acos() / 3.0;
-    let largest = mean + 2.0 * spread * angle.cos();
-    let least = mean + 2.0 * spread * (angle + std::f64::consts::TAU / 3.0).cos();
-    largest.abs().max(least.abs())
+    let [x, y, z] = [0, 1, 2].map(|a| second(a, a));
+    let [most, _, least] = eigenvalues(&[x, y, z, second(0, 1), second(0, 2), second(1, 2)]);
+    most.abs().max(least.abs()) as f32
 }
 
 /// Distance (voxels) of each voxel on a side from the nearest centre on the other, [`FURTHEST`] at most.
@@ -148,21 +134,6 @@ fn to_other(inside: &[bool], shape: [usize; 3], side: bool) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::numerics::dense::symmetric_eigen;
-    use crate::numerics::random::Random;
-
-    #[test]
-    fn the_steepest_direction_is_an_eigenvector() {
-        let mut random = Random::new(7, 1);
-        let mut all = vec![[0.0; 6], [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], [2.0, 2.0, -3.0, 0.0, 0.0, 0.0]];
-        all.extend((0..200).map(|_| std::array::from_fn(|_| random.uniform(-1.0, 1.0))));
-        for [a, b, c, d, e, f] in all {
-            let eigen = symmetric_eigen(&[[a, d, f], [d, b, e], [f, e, c]]);
-            let expected = eigen[0].0.abs().max(eigen[2].0.abs());
-            let found = steepest([a, b, c], [d, e, f]);
-            assert!((found - expected).abs() < 1e-12, "{found} for {expected}");
-        }
-    }
 
     const SIDE: usize = 64;
 
