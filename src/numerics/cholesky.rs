@@ -54,6 +54,34 @@ impl Cholesky {
     }
 }
 
+/// The solution of `a x = b`, `a` symmetric and positive definite (row by row), within `room` (lowest, highest; zero inside): what would
+/// go past its limit stops there, and the others are solved for again. None where `a` is not positive definite.
+pub fn within(a: &[f64], b: &[f64], room: &[[f64; 2]]) -> Option<Vec<f64>> {
+    let n = b.len();
+    let mut stopped: Vec<Option<f64>> = vec![None; n];
+    loop {
+        let (mut left, mut x) = (a.to_vec(), b.to_vec());
+        for (k, at) in stopped.iter().enumerate().filter_map(|(k, at)| at.map(|at| (k, at))) {
+            for j in 0..n {
+                x[j] -= a[j * n + k] * at;
+                (left[k * n + j], left[j * n + k]) = (0.0, 0.0);
+            }
+            left[k * n + k] = 1.0;
+        }
+        stopped.iter().zip(&mut x).for_each(|(at, x)| *x = at.unwrap_or(*x));
+        Cholesky::new(left, n)?.solve(&mut x);
+        let mut all = true;
+        for ((at, x), [low, high]) in stopped.iter_mut().zip(&x).zip(room) {
+            if at.is_none() && !(low..=high).contains(&x) {
+                (*at, all) = (Some(x.clamp(*low, *high)), false);
+            }
+        }
+        if all {
+            return Some(x);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -71,5 +99,22 @@ mod tests {
         }
         assert!(Cholesky::new(vec![1.0, 2.0, 2.0, 1.0], 2).is_none());
         assert!(Cholesky::new(vec![1.0, f64::NAN, f64::NAN, 1.0], 2).is_none());
+    }
+
+    /// Within its room each unknown is free of force, at a limit it is pushed outwards.
+    #[test]
+    fn what_would_go_too_far_stops_and_the_others_follow() {
+        let a = [4.0, 1.0, 0.5, 1.0, 3.0, -0.7, 0.5, -0.7, 2.0];
+        let free = [f64::NEG_INFINITY, f64::INFINITY];
+        for b in [[9.0, 1.0, -2.0], [1.0, -8.0, 3.0], [0.5, 0.2, -0.1]] {
+            let x = within(&a, &b, &[[-1.0, 1.5], [-1.5, 1.0], free]).unwrap();
+            for (k, [low, high]) in [[-1.0, 1.5], [-1.5, 1.0], free].into_iter().enumerate() {
+                let push = b[k] - (0..3).map(|j| a[3 * k + j] * x[j]).sum::<f64>();
+                assert!((low..=high).contains(&x[k]), "{b:?} {x:?}");
+                let stopped = (x[k] == high && push > 0.0) || (x[k] == low && push < 0.0);
+                assert!(push.abs() < 1e-12 || stopped, "{b:?} {x:?} {push}");
+            }
+        }
+        assert!(within(&[1.0, 2.0, 2.0, 1.0], &[1.0, 1.0], &[free, free]).is_none());
     }
 }

@@ -179,8 +179,11 @@ impl<'a> Problem<'a> {
     /// # Errors
     /// [`StiffnessError`] when an element is inside out or the body can move freely.
     pub fn factorise(&self, x: &[f64]) -> Result<Factor<'a>, StiffnessError> {
-        let values = self.tangent(x).ok_or(StiffnessError::InsideOut)?;
-        self.body.pattern.factorise(values).map_err(|_| StiffnessError::Unsolvable)
+        self.factor_of(self.tangent(x).ok_or(StiffnessError::InsideOut)?)
+    }
+
+    fn factor_of(&self, matrix: Vec<f64>) -> Result<Factor<'a>, StiffnessError> {
+        self.body.pattern.factorise(matrix).map_err(|_| StiffnessError::Unsolvable)
     }
 
     /// Solves, from `start` where one is given. `precision` (mm) ends Newton's method.
@@ -207,19 +210,35 @@ impl<'a> Problem<'a> {
         Ok(self.newton(start.to_vec(), precision, f64::INFINITY)?.x)
     }
 
-    fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
+    /// Whether it is one linear system: a plate that is touched here and there makes it none.
+    pub fn is_linear(&self) -> bool {
+        self.law == Law::Linear && self.plate.is_none()
+    }
+
+    /// Solves a linear problem with the factor that is made for its matrix.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when the body can move freely.
+    pub fn solve_with(
+        &self,
+        factor: impl FnOnce(Vec<f64>) -> Result<Factor<'a>, StiffnessError>,
+    ) -> Result<Solution<'a>, StiffnessError> {
         let zero = vec![0.0; self.body.pattern.unknowns()];
-        if self.law == Law::Linear && self.plate.is_none() {
-            let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
-            x.iter_mut().for_each(|v| *v = -*v);
-            let factor = self.factorise(&zero)?;
-            factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
-            return Ok(Solution { x, factor, factorisations: 1 });
+        let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
+        x.iter_mut().for_each(|v| *v = -*v);
+        let factor = factor(self.tangent(&zero).ok_or(StiffnessError::InsideOut)?)?;
+        factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
+        Ok(Solution { x, factor, factorisations: 1 })
+    }
+
+    fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
+        if self.is_linear() {
+            return self.solve_with(|matrix| self.factor_of(matrix));
         }
         if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision, stale).ok()) {
             return Ok(done);
         }
-        let mut x = zero;
+        let mut x = vec![0.0; self.body.pattern.unknowns()];
         let (mut reached, mut step) = (0.0, 1.0f64);
         loop {
             let next = (reached + step).min(1.0);
