@@ -5,7 +5,7 @@ use crate::numerics::bending::{Data, Smoothness, SolveReport, solve};
 use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
-use crate::numerics::small::{Symmetric3, multiply, quadratic};
+use crate::numerics::small::{Symmetric3, cholesky_solve, multiply, quadratic};
 use rayon::prelude::*;
 
 /// One Gauss-Newton step: adds to `coefficients` the `d` that minimises
@@ -205,11 +205,15 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
     (c, lambda)
 }
 
+/// Draws worked out side by side: each holds six vectors of the lattice.
+const SIDE_BY_SIDE: usize = 2;
+
 /// Standard deviation of the coupled field at each node (mm, root of a third of the covariance's trace).
 ///
 /// The covariance is `(A + lambda L)^-1`; random vectors with just that covariance are drawn by solving for
 /// right-hand sides with covariance `A + lambda L` (perturb and optimise, Papandreou & Yuille 2010), and their squares
-/// averaged over `draws` and over neighbouring nodes.
+/// averaged over `draws` and over neighbouring nodes. Each solution starts from the affine one: where nothing bends, `lambda L`
+/// outweighs the data by so much that iterations would leave out all that an affine motion is uncertain by.
 pub fn deviation(
     smoothness: &Smoothness,
     lambda: [f32; 3],
@@ -219,8 +223,8 @@ pub fn deviation(
     seed: u64,
 ) -> Vec<f32> {
     let n = blocks.len();
-    let mut squares = vec![0.0f32; n];
-    for draw in 0..draws {
+    let affine = Affine::new(nodes, blocks);
+    let draw = |draw: usize| {
         let mut random = Random::new(seed, 1000 + draw as u64);
         let mut b = vec![0.0f32; 3 * n];
         for (component, lambda) in b.chunks_exact_mut(n).zip(lambda) {
@@ -229,21 +233,83 @@ pub fn deviation(
                 *b = lambda.sqrt() * l;
             }
         }
-        for (i, a) in blocks.iter().enumerate() {
+        let mut pulls = vec![[0.0f32; 3]; n];
+        for (i, (a, pull)) in blocks.iter().zip(&mut pulls).enumerate() {
             let (e, f) = (random.normals(), random.normals());
-            let v = cholesky_times(a, [e[0], e[1], f[0]]);
-            for c in 0..3 {
-                b[c * n + i] += v[c] as f32;
-            }
+            *pull = cholesky_times(a, [e[0], e[1], f[0]]).map(|v| v as f32);
+            (0..3).for_each(|c| b[c * n + i] += pull[c]);
         }
-        let mut x = vec![0.0f32; 3 * n];
-        solve(smoothness, lambda, blocks, Data::Blocks, false, &b, &mut x, 1e-2, 200);
-        for (i, s) in squares.iter_mut().enumerate() {
-            *s += (x[i] * x[i] + x[n + i] * x[n + i] + x[2 * n + i] * x[2 * n + i]) / (3 * draws) as f32;
+        // Of the rest an affine motion feels nothing.
+        let mut x = affine.solve(&pulls);
+        solve(smoothness, lambda, blocks, Data::Blocks, true, &b, &mut x, 1e-2, 200);
+        x
+    };
+    let mut squares = vec![0.0f32; n];
+    for first in (0..draws).step_by(SIDE_BY_SIDE) {
+        let some: Vec<Vec<f32>> = (first..(first + SIDE_BY_SIDE).min(draws)).into_par_iter().map(draw).collect();
+        for x in some {
+            for (i, s) in squares.iter_mut().enumerate() {
+                *s += (x[i] * x[i] + x[n + i] * x[n + i] + x[2 * n + i] * x[2 * n + i]) / (3 * draws) as f32;
+            }
         }
     }
     let smooth = filters::gaussian(&squares, nodes, [1.0; 3]);
     smooth.iter().map(|v| v.sqrt()).collect()
+}
+
+/// The affine motions of a lattice, which no bending energy holds, under the data alone.
+struct Affine {
+    nodes: [usize; 3],
+    /// Normal matrix: of each of the four shapes (1, x, y, z) the three components.
+    normal: [[f64; 12]; 12],
+}
+
+impl Affine {
+    fn new(nodes: [usize; 3], blocks: &[[f32; 6]]) -> Self {
+        let mut out = Self { nodes, normal: [[0.0; 12]; 12] };
+        for (i, &[xx, yy, zz, xy, xz, yz]) in blocks.iter().enumerate() {
+            let (shapes, block) = (out.shapes(i), [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]);
+            for (r, row) in out.normal.iter_mut().enumerate() {
+                for (c, v) in row.iter_mut().enumerate() {
+                    *v += shapes[r / 3] * shapes[c / 3] * f64::from(block[r % 3][c % 3]);
+                }
+            }
+        }
+        // What no data see (the shapes across a slice) stays at rest.
+        let most = (0..12).map(|k| out.normal[k][k]).fold(0.0, f64::max);
+        (0..12).for_each(|k| out.normal[k][k] += 1e-9 * most);
+        out
+    }
+
+    /// The four shapes at node `i`.
+    fn shapes(&self, i: usize) -> [f64; 4] {
+        let [nx, ny, _] = self.nodes;
+        let at = [i % nx, i / nx % ny, i / (nx * ny)];
+        let [x, y, z] = std::array::from_fn(|a| match self.nodes[a] {
+            1 => 0.0,
+            n => 2.0 * at[a] as f64 / (n - 1) as f64 - 1.0,
+        });
+        [1.0, x, y, z]
+    }
+
+    /// The motion that `pulls` at the nodes lead to (planar).
+    fn solve(&self, pulls: &[[f32; 3]]) -> Vec<f32> {
+        let n = pulls.len();
+        let mut right = [0.0; 12];
+        for (i, pull) in pulls.iter().enumerate() {
+            let shapes = self.shapes(i);
+            right.iter_mut().enumerate().for_each(|(k, v)| *v += shapes[k / 3] * f64::from(pull[k % 3]));
+        }
+        let parts = cholesky_solve(self.normal, right).unwrap_or([0.0; 12]);
+        let mut x = vec![0.0f32; 3 * n];
+        for i in 0..n {
+            let shapes = self.shapes(i);
+            for c in 0..3 {
+                x[c * n + i] = (0..4).map(|m| shapes[m] * parts[3 * m + c]).sum::<f64>() as f32;
+            }
+        }
+        x
+    }
 }
 
 /// `C e` with `C C^T` the symmetric matrix `a` (zero pivots count as no information).

@@ -187,6 +187,33 @@ pub fn mean_length(pair: &Pair<'_>, field: &SplineField) -> f64 {
     sum / count.max(1) as f64
 }
 
+/// Whether the deformed volume shows what is at `p` (voxels) in the initial one, by a field.
+pub fn sees(pair: &Pair<'_>, field: &SplineField, p: [f64; 3]) -> bool {
+    let u = field.lattice.at(&field.coefficients, p);
+    let (shape, mut at) = (pair.moving_shape, 0);
+    for a in (0..3).rev().filter(|&a| shape[a] > 1) {
+        let q = (p[a] + u[a] / pair.spacing[a] - pair.moving_origin[a]).round();
+        if !(q >= 0.0 && q < shape[a] as f64) {
+            return false;
+        }
+        at += q as usize * shape[..a].iter().product::<usize>();
+    }
+    pair.moving[at].is_finite()
+}
+
+/// The part of the mask that the deformed volume does not show (1), from every third voxel along each axis.
+pub fn unseen(pair: &Pair<'_>, field: &SplineField) -> f64 {
+    let [nx, ny, nz] = pair.shape;
+    let in_plane = |k: usize| -> [usize; 2] {
+        let every = (0..ny).step_by(3).flat_map(|j| (0..nx).step_by(3).map(move |i| [i, j, k]));
+        let inside = every.filter(|[i, j, k]| pair.mask[i + nx * (j + ny * k)] != 0);
+        inside.fold([0; 2], |[out, all], v| [out + usize::from(!sees(pair, field, v.map(|v| v as f64))), all + 1])
+    };
+    let planes: Vec<usize> = (0..nz).step_by(3).collect();
+    let [out, all] = planes.into_par_iter().map(in_plane).reduce(|| [0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+    out as f64 / all.max(1) as f64
+}
+
 /// Bending energy of a field (mm^2 per mm, all axes).
 pub fn bending(pair: &Pair<'_>, field: &SplineField) -> f64 {
     let energy = smoothness(&field.lattice, pair.spacing).energy(&field.coefficients);

@@ -103,6 +103,7 @@ pub(crate) mod tests {
                 mean_mm: 1.5,
                 max_mm: 2.2,
                 uncertainty_median_mm: 0.2,
+                unseen: 0.0,
                 seconds: vec![("features".into(), 1.0), ("matching".into(), 2.0)],
                 warnings: vec!["two of <three> slices are empty".into()],
             };

@@ -1,6 +1,7 @@
 //! summary.json of `palpate field`.
 
 use crate::report::field::FieldReport;
+use crate::report::verdict::verdict;
 use crate::types::Grid;
 use serde_json::{Map, Value, json};
 
@@ -16,7 +17,7 @@ pub fn seconds(stages: &[(String, f64)]) -> Map<String, Value> {
 
 /// The keys are those of docs/file-formats.md.
 pub fn field_summary(report: &FieldReport<'_>) -> Value {
-    let s = report.summary;
+    let (s, judged) = (report.summary, verdict(report));
     let [initial, deformed, mask] = report.names;
     let mut out = json!({
         "version": env!("CARGO_PKG_VERSION"),
@@ -33,6 +34,9 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
         "displacement_mean_mm": s.mean_mm,
         "displacement_max_mm": s.max_mm,
         "uncertainty_median_mm": s.uncertainty_median_mm,
+        "unseen": s.unseen,
+        "trust": judged.trust.name(),
+        "trust_reasons": judged.reasons,
         "seconds": seconds(&s.seconds),
         "warnings": s.warnings,
         "params": report.params,
@@ -56,7 +60,18 @@ mod tests {
         assert_eq!(value["model"], "free");
         assert_eq!(value["seconds"]["matching"], 2.0);
         assert_eq!(value["inputs"]["mask"], Value::Null);
-        for key in ["version", "command", "folds", "levels", "evidence", "warnings", "params"] {
+        for key in [
+            "version",
+            "command",
+            "folds",
+            "levels",
+            "evidence",
+            "unseen",
+            "trust",
+            "trust_reasons",
+            "warnings",
+            "params",
+        ] {
             assert!(!value[key].is_null(), "{key}");
         }
     }

@@ -213,6 +213,7 @@ fn gray([low, high]: [f64; 2]) -> Scale {
 pub fn summary(report: &TrackReport<'_>) -> Value {
     let t = report.tracked;
     let each = of_frames(t).map(|(frame, text)| format!("frame {frame}: {text}"));
+    let (trust, reasons) = judge_frames(&t.frames, report.judged);
     json!({
         "version": env!("CARGO_PKG_VERSION"),
         "command": "track",
@@ -222,6 +223,8 @@ pub fn summary(report: &TrackReport<'_>) -> Value {
         "grid": grid(report.grid),
         "frames": t.frames,
         "points": t.trajectories.len(),
+        "trust": trust.name(),
+        "trust_reasons": reasons,
         "seconds": seconds(report.seconds),
         "warnings": report.warnings.iter().cloned().chain(each).collect::<Vec<_>>(),
         "params": report.params,

@@ -40,10 +40,13 @@ pub struct Verdict {
 
 const MEDIAN: &str = "median uncertainty";
 
+/// The part of the tissue outside the deformed volume from which trust is low: what is carried over so far is off by millimetres.
+const UNSEEN: f64 = 0.25;
+
 /// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under 100 matches, folds in
-/// more than one voxel of a thousand, a median uncertainty above that edge, or one above the mean motion of a free field;
-/// high when nothing folds, the median uncertainty is under half an edge, and under a tenth of the voxels are uncertain by
-/// more than an edge.
+/// more than one voxel of a thousand, a median uncertainty above that edge, or one above the mean motion of a free field, and where
+/// more than a quarter of the tissue moves out of the deformed volume; high when nothing folds, the median uncertainty is under
+/// half an edge, under a tenth of the voxels are uncertain by more than an edge, and nothing is warned of.
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     judge(report.initial.grid(), report.mask, report.uncertainty, report.summary)
 }
@@ -76,6 +79,9 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
     } else if s.model == MotionModel::Free && s.uncertainty_median_mm > s.mean_mm {
         low.push("the motion is smaller than its uncertainty".into());
     }
+    if s.unseen > UNSEEN {
+        low.push(format!("{:.0} % of the tissue is not in the deformed volume", 100.0 * s.unseen));
+    }
     let weak = format!(
         "{} % of the voxels are uncertain by more than a voxel ({} mm){side}",
         short1(100.0 * share),
@@ -83,7 +89,7 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
     );
     let precise = s.uncertainty_median_mm <= edge / 2.0 && share < 0.1;
     let median = format!("{MEDIAN} {} mm (1 sigma)", short2(s.uncertainty_median_mm));
-    let (trust, mut reasons) = match (low.is_empty(), precise && s.folds == 0) {
+    let (trust, mut reasons) = match (low.is_empty(), precise && s.folds == 0 && s.warnings.is_empty()) {
         (false, _) => (Trust::Low, low),
         (true, true) => (Trust::High, vec![median, "no folds".into()]),
         (true, false) => (Trust::Moderate, vec![median]),
@@ -94,11 +100,16 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
     if trust == Trust::Moderate && s.folds > 0 {
         reasons.push(format!("{} voxels fold", thousands(s.folds)));
     }
+    match s.warnings.len() {
+        0 => {}
+        1 => reasons.push("there is a warning".into()),
+        n => reasons.push(format!("there are {n} warnings")),
+    }
     Verdict { headline, trust, reasons }
 }
 
 /// Judges a sequence by its worst frames, which the reasons name: `judged` has the number of each measured frame and what
-/// [`judge`] says of it. A frame that is warned of is of moderate trust at most. Trust in the sequence is low where more than
+/// [`judge`] says of it. Trust in the sequence is low where more than
 /// half of the frames are lost or of low trust, high where each frame is of high trust, else moderate.
 pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
     let of = |f: &FrameSummary| judged.iter().find(|j| j.0 == f.frame).map(|j| &j.1);
@@ -212,6 +223,9 @@ mod tests {
     #[test]
     fn a_precise_field_is_trusted_and_a_vague_one_is_not() {
         let mut case = Case::new([20, 20, 20], [1.0; 3]);
+        let warned = verdict(&case.report());
+        assert_eq!((warned.trust, warned.reasons[1].as_str()), (Trust::Moderate, "there is a warning"));
+        case.summary.warnings.clear();
         let good = verdict(&case.report());
         assert_eq!(good.trust, Trust::High, "{:?}", good.reasons);
         assert!(good.headline.contains("13,020 matches, median residual 0.12 mm"), "{}", good.headline);
@@ -219,6 +233,10 @@ mod tests {
         let vague = verdict(&case.report());
         assert_eq!(vague.trust, Trust::Low);
         assert!(vague.reasons[0].contains("2.5 mm"));
+        case.summary.uncertainty_median_mm = 0.2;
+        case.summary.unseen = 0.4;
+        let gone = verdict(&case.report());
+        assert_eq!((gone.trust, gone.reasons[0].contains("40 %")), (Trust::Low, true));
     }
 
     #[test]

@@ -28,6 +28,10 @@ const NEAR_TANGENT: f64 = 0.2;
 const SPENT: f64 = 1e-4;
 /// Largest change of ln mu in one step (contrasts of 0.02 to 600 converged from 1, in fewer steps than with half of it).
 const LONGEST: f64 = 3.0;
+/// Where a modulus still changes by more than this (ln mu) a forward solution need not be better than [`ROUGH`] times its precision.
+const FAR: f64 = 0.3;
+/// See [`FAR`].
+const ROUGH: f64 = 30.0;
 /// Bound of |ln(mu / mu_reference)| (200): beyond, a region is as good as rigid or empty.
 const BOUND: f64 = 5.3;
 /// Huber's constant (Huber 1981: 95 % efficiency for normal errors), times the root mean square length of three components.
@@ -155,7 +159,10 @@ impl Setup<'_> {
 
     pub(super) fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
         let problem = self.problem(state);
-        let solution = problem.solve(state.x.as_deref(), precision)?;
+        // What was measured to touch is nearer to the truth than what a body as it was would touch.
+        let guess = || problem.plate.as_ref().map(|p| p.guess(self.body, &self.patches[1].nodes));
+        let start = state.x.clone().or_else(guess);
+        let solution = problem.solve(start.as_deref(), precision)?;
         Ok((problem, solution))
     }
 
@@ -265,7 +272,8 @@ impl Setup<'_> {
             state.theta[r] = value;
         }
         let mut factorisations = 0;
-        let (mut problem, mut solution) = self.solve(&state, precision)?;
+        let first = if state.x.is_none() { ROUGH * precision } else { precision };
+        let (mut problem, mut solution) = self.solve(&state, first)?;
         factorisations += solution.factorisations;
         let mut residuals = self.residuals(&solution.x);
         let mut iterations = 0;
@@ -316,12 +324,13 @@ impl Setup<'_> {
             }
             let before = self.squares(&residuals, &weights) / variance + self.prior(&state);
             let mut best = None;
-            for _ in 0..4 {
+            for _ in 0..3 {
                 let shorter: Vec<f64> = step.iter().map(|s| part * s).collect();
                 let trial = self.advanced(&state, &x, &columns, &shorter);
                 let change = trial.theta.iter().zip(&factorised).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 // A factor that is not good enough goes before the next one is made: two take twice the memory.
                 tangent.take_if(|_| change > if problem.is_linear() { NEAR_TANGENT } else { SAME_TANGENT });
+                let precision = if change > FAR { ROUGH * precision } else { precision };
                 if let Ok((p, s)) = self.follow(&trial, tangent.take(), problem.springs.clone(), precision) {
                     factorisations += s.factorisations;
                     if s.factorisations > 0 {
@@ -329,7 +338,7 @@ impl Setup<'_> {
                     }
                     let rest = self.residuals(&s.x);
                     let after = self.squares(&rest, &weights) / variance + self.prior(&trial);
-                    if after <= before * (1.0 + 1e-9) || part < 0.2 {
+                    if after <= before * (1.0 + 1e-9) {
                         best = Some((trial, p, s, rest, after));
                         break;
                     }
@@ -340,7 +349,7 @@ impl Setup<'_> {
                 state.x = Some(x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             };
-            let stalled = after > before * (1.0 - 1e-7);
+            let stalled = after > before * (1.0 - SPENT);
             (state, problem, solution, residuals) = (trial, p, s, rest);
             if stalled {
                 let columns = self.sensitivities(&problem, &solution)?;

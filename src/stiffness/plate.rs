@@ -97,6 +97,18 @@ impl Plate {
         heights.fold(f64::NEG_INFINITY, f64::max)
     }
 
+    /// Displacements under which the nodes of `touching` (ascending) touch it, and no others that face it: what contact is sought from.
+    pub(super) fn guess(&self, body: &Body, touching: &[u32]) -> Vec<f64> {
+        let mut x = vec![0.0; body.pattern.unknowns()];
+        for n in sorted(self.spots.iter().flat_map(|s| s.nodes)) {
+            let (p, at) = (body.places[n as usize], body.pattern.first(n));
+            let beyond = if touching.binary_search(&n).is_ok() { self.onset } else { -self.onset };
+            let up = self.height + dot(self.tilt, p) + beyond - dot(p, self.outward);
+            (0..3).for_each(|a| x[at + a] = up * self.outward[a]);
+        }
+        x
+    }
+
     /// The plate `part` of the way from its first touch.
     pub(super) fn approaching(&self, body: &Body, part: f64) -> Self {
         let height = self.first_touch(body);

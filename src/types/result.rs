@@ -86,6 +86,8 @@ pub struct FieldSummary {
     pub max_mm: f64,
     /// Median of the uncertainty over the mask (mm, 1 sigma).
     pub uncertainty_median_mm: f64,
+    /// The part of the mask that lies outside the deformed volume after the motion, or where that is not finite (1).
+    pub unseen: f64,
     /// Stage names and wall seconds, in order.
     pub seconds: Vec<(String, f64)>,
     /// What the user should know before trusting the result.
