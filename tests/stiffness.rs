@@ -4,7 +4,7 @@
 use palpate::mesh::tetrahedral::{Detail, Fineness, Mesher, mesh_labels};
 use palpate::numerics::random::Random;
 use palpate::pipeline::pressed::Pressed;
-use palpate::pipeline::stiffness::{Inputs, run};
+use palpate::pipeline::stiffness::{Inputs, check, run};
 use palpate::stiffness::body::Body;
 use palpate::stiffness::forward::{Problem, Tie};
 use palpate::stiffness::identify::State;
@@ -410,6 +410,60 @@ fn a_homogeneous_block_in_two_labels_has_one_modulus_and_the_right_one() {
         assert!((r.ratio - 1.0).abs() < 0.03, "{r:?}");
     }
     assert!((result.model_force / force - 1.0).abs() < 0.05);
+}
+
+/// Side by side between plates without friction every ratio leads to one field: both halves bear the force, in parts that nothing shows.
+#[test]
+fn of_halves_side_by_side_only_the_mean_is_claimed() {
+    let halves = |p: [f64; 3]| if p.iter().all(|v| (2.0..18.0).contains(v)) { 1 + u8::from(p[0] > 9.0) } else { 0 };
+    let (mean, strain) = (30.0, 0.03);
+    for force_n in [Some(mean * 256.0 * strain / 1000.0), None] {
+        let params = StiffnessParams { model: LawChoice::Linear, force_n, nodes: 3000, ..Default::default() };
+        let result = identify(&labels([20, 20, 20], 1.0, halves), &squeezed(strain, 0.49), &params);
+        let said = |what: &str| result.warnings.iter().any(|w| w.contains(what));
+        assert!(
+            said("whatever the modulus of region 1") || said("whatever the modulus of region 2"),
+            "{:?}",
+            result.warnings
+        );
+        for r in &result.regions {
+            match force_n {
+                // One half could bear it all.
+                Some(_) => {
+                    assert_eq!((r.identifiable, r.bound), (false, Some("upper")), "{r:?}");
+                    assert!((r.youngs_modulus / (2.0 * mean) - 1.0).abs() < 0.15, "{r:?}");
+                }
+                None => assert!(r.label == result.reference || r.bound == Some("unknown"), "{r:?}"),
+            }
+        }
+    }
+}
+
+/// On a coarse mesh the rounded rim of a cylinder's face lies millimetres below it, and more of its nodes than not lay off the plane of all.
+#[test]
+fn a_flat_face_is_found_though_its_rim_is_rounded() {
+    for (radius, half) in [(30.0, 24.0), (24.0, 20.0)] {
+        let side = |r: f64| 2 * r as usize + 12;
+        let shape = [side(radius), side(radius), side(half)];
+        let middle = shape.map(|n| (n as f64 - 1.0) / 2.0);
+        let centred = |p: [f64; 3]| -> [f64; 3] { std::array::from_fn(|a| p[a] - middle[a]) };
+        let cylinder = |p: [f64; 3]| {
+            let q = centred(p);
+            u8::from(q[0].hypot(q[1]) < radius && q[2].abs() < half)
+        };
+        let field = DenseField::from_fn(grid(shape, 1.0), |p: WorldPoint| {
+            let q = centred(p.0);
+            [0.49 * 0.02 * q[0], 0.49 * 0.02 * q[1], -0.02 * (q[2] + half)]
+        });
+        let (held, load) = (Place::Side(Side::parse("z-").unwrap()), Place::Side(Side::parse("z+").unwrap()));
+        let (map, names) = (labels(shape, 1.0, cylinder), |l: u8| format!("region {l}"));
+        for nodes in [3_000, 8_000, 20_000] {
+            let (field, labels) = (&field, &map);
+            let inputs =
+                Inputs { field, matches: None, labels, labelled: true, held: &held, load: &load, names: &names };
+            check(&inputs, &StiffnessParams { nodes, ..Default::default() }).unwrap();
+        }
+    }
 }
 
 #[test]

@@ -170,7 +170,15 @@ fn labelled(
     clock.book("observe");
 
     progress("coarse", 0.1);
-    let choice = choose(&mut coarse, params.model, params.poisson, reference)?;
+    let mut choice = choose(&mut coarse, params.model, params.poisson, reference)?;
+    let mut hidden = Vec::new();
+    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params.poisson, reference), &choice.estimate)?
+    {
+        hidden.push(found);
+        coarse.hidden.push(found.label);
+        choice = choose(&mut coarse, params.model, params.poisson, reference)?;
+    }
+    fine.hidden.clone_from(&coarse.hidden);
     clock.book("coarse");
 
     progress("fine", 0.4);
@@ -204,7 +212,17 @@ fn labelled(
     let changes = [mesh_change.as_slice(), &ratio_change];
     let drawn = |label: &u8| geometry.is_some() && inclusions.iter().any(|i| i.label() == *label);
     let cut: Vec<bool> = fine.body.labels.iter().map(|l| !inputs.labelled && *l > 1 && !drawn(l)).collect();
-    let regions = summary::regions(&fine.body, [&moduli, &alone], inputs.names, changes, &unseen, &cut, reference);
+    let regions = summary::regions(
+        &fine.body,
+        [&moduli, &alone],
+        inputs.names,
+        changes,
+        &unseen,
+        &cut,
+        &hidden,
+        params.force_n.is_some(),
+        reference,
+    );
     clock.book("uncertainty");
 
     let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);
@@ -215,6 +233,7 @@ fn labelled(
     let area = |i: usize| touching[i].as_ref().map_or_else(|| fine.patches[i].area(&fine.body), |t| t.1);
     let mut warnings = maps::unfit(inputs.field, inputs.labels, &fine, &estimate, noise);
     warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
+    warnings.extend(maps::not_shown(&hidden, &regions, reference));
     warnings.dedup();
     let patches = [0, 1].map(|i| {
         let p = &fine.patches[i];

@@ -37,6 +37,7 @@ pub struct InputNames {
 fn modulus(r: &RegionStiffness, absolute: bool) -> String {
     let unit = if absolute { " kPa" } else { "" };
     match r.bound {
+        Some("unknown") => "not seen by the data".into(),
         Some("lower") => format!("above {}{unit} (a bound: not identifiable)", digits(r.youngs_modulus)),
         Some(_) => format!("below {}{unit} (a bound: not identifiable)", digits(r.youngs_modulus)),
         None if r.sd == 0.0 => format!("{}{unit} (reference)", digits(r.youngs_modulus)),

@@ -64,8 +64,8 @@ pub struct Setup<'a> {
     pub floor: f64,
     /// The edge of a punch, and how far it has been moved outwards (voxels).
     pub edge: Option<(Edge, f64)>,
-    /// A region whose ln(mu / mu_reference) is not free, and its value.
-    pub pinned: Option<(usize, f64)>,
+    /// Regions whose ln(mu / mu_reference) is not free, and its values.
+    pub pinned: Vec<(usize, f64)>,
 }
 
 /// Where an identification starts or ends.
@@ -117,8 +117,8 @@ pub struct Estimate {
 impl Setup<'_> {
     /// Regions whose modulus is free, ascending.
     pub fn free(&self) -> Vec<usize> {
-        let pinned = self.pinned.map(|p| p.0);
-        (0..self.body.labels.len()).filter(|&r| r != self.reference && Some(r) != pinned).collect()
+        let pinned = |r: usize| self.pinned.iter().any(|p| p.0 == r);
+        (0..self.body.labels.len()).filter(|&r| r != self.reference && !pinned(r)).collect()
     }
 
     /// The forward problem for a state.
@@ -268,9 +268,7 @@ impl Setup<'_> {
         let free = self.free();
         let parameters = free.len() + self.patches[0].parameters() + self.patches[1].parameters();
         let mut state = start;
-        if let Some((r, value)) = self.pinned {
-            state.theta[r] = value;
-        }
+        self.pinned.iter().for_each(|&(r, value)| state.theta[r] = value);
         let mut factorisations = 0;
         let first = if state.x.is_none() { ROUGH * precision } else { precision };
         let (mut problem, mut solution) = self.solve(&state, first)?;

@@ -41,6 +41,8 @@ pub struct Level {
     pub grid: Grid,
     /// The edge of a punch, and how far it has been moved outwards (voxels).
     pub edge: Option<(Edge, f64)>,
+    /// Labels of regions that the data do not show: they are taken to be as stiff as the reference.
+    pub hidden: Vec<u8>,
     /// Node places before that (mm, RAS).
     unmoved: Vec<[f64; 3]>,
 }
@@ -79,6 +81,7 @@ impl Level {
             unmoved: body.places.clone(),
             grid: *field.grid(),
             edge: None,
+            hidden: Vec::new(),
             body,
             observations,
             block,
@@ -170,7 +173,10 @@ impl Level {
             plate_prior: 0.25 * self.voxel + 3.0 * self.surface_error,
             floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
             edge: self.edge,
-            pinned: None,
+            pinned: (0..self.body.labels.len())
+                .filter(|&r| self.hidden.contains(&self.body.labels[r]))
+                .map(|r| (r, 0.0))
+                .collect(),
         }
     }
 

@@ -7,6 +7,7 @@ use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::travel;
+use crate::stiffness::summary::Hidden;
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
 
@@ -138,8 +139,12 @@ pub fn warnings(
         }
     }
     for r in regions.iter().filter(|r| !r.identifiable) {
-        let bound = r.bound.unwrap_or("lower");
-        out.push(format!("the data do not determine the modulus of {}: its value is a {bound} bound", r.name));
+        let value = match r.bound {
+            Some("unknown") => "it is shown as stiff as the largest region",
+            Some("upper") => "its value is an upper bound",
+            _ => "its value is a lower bound",
+        };
+        out.push(format!("the data do not determine the modulus of {}: {value}", r.name));
     }
     for (r, change) in regions.iter().zip(mesh_change).filter(|(r, c)| r.identifiable && c.abs() > 0.15) {
         let percent = 100.0 * change.exp_m1();
@@ -163,6 +168,25 @@ pub fn warnings(
         out.push(format!("Poisson's ratio {} is low for soft tissue, which is nearly incompressible", params.poisson));
     }
     out
+}
+
+/// Says which regions' moduli leave no trace in the field.
+pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usize) -> Vec<String> {
+    let one = |h: &Hidden| {
+        let name = regions.iter().find(|r| r.label == h.label).map_or("a region", |r| &r.name);
+        let why = match h.share {
+            share if share < 0.03 => "it bears next to nothing of the load".to_string(),
+            _ => format!(
+                "it lies beside what else bears the load and gives way with it, so only their mean is known; label it together with {}",
+                regions[reference].name
+            ),
+        };
+        format!(
+            "whatever the modulus of {name}, the field is all but the same (one e times as large moves it by {:.4} mm): {why}",
+            h.moved
+        )
+    };
+    hidden.iter().map(one).collect()
 }
 
 /// Part of a patch's area that may move with it beside it without a word: its rim is known to a voxel.

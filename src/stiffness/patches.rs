@@ -9,6 +9,7 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::dense::{solve, symmetric_eigen};
+use crate::numerics::statistics::percentile;
 use crate::stiffness::body::{Body, Facet};
 use crate::stiffness::forward::Tie;
 use crate::stiffness::observations::at_surface;
@@ -77,7 +78,7 @@ impl SurfaceMotion {
             let mut displacement = vec![None; body.places.len()];
             let mut errors: Vec<f64> = values.iter().flatten().map(|v| v.1).collect();
             nodes.iter().zip(&values).for_each(|(&n, v)| displacement[n as usize] = v.map(|v| v.0));
-            (displacement, crate::numerics::statistics::percentile(&mut errors, 50.0))
+            (displacement, percentile(&mut errors, 50.0))
         };
         let (displacement, error) = all(REACH);
         let (read, sharp_error) = all(NEAR);
@@ -322,7 +323,7 @@ pub fn find(
                     against(facet.nodes[0]).map(|u| -dot(u, facet.normal))
                 })
                 .collect();
-            let moved = crate::numerics::statistics::percentile(&mut moved, 50.0);
+            let moved = percentile(&mut moved, 50.0);
             (facets, None, if moved.is_finite() { moved } else { 0.0 })
         }
     };
@@ -373,7 +374,7 @@ fn moving_with(body: &Body, motion: &SurfaceMotion, patch: &Patch, voxel: f64) -
 fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
     let height = |p: [f64; 3]| dot(sub(p, patch.middle), patch.normal);
     let mut all: Vec<f64> = patch.nodes.iter().map(|&n| height(body.places[n as usize])).collect();
-    let face = crate::numerics::statistics::percentile(&mut all, 75.0);
+    let face = percentile(&mut all, 75.0);
     let apart = face - height(other.middle);
     let lag = |&n: &u32| {
         let p = body.places[n as usize];
@@ -429,6 +430,11 @@ fn facets_within(body: &Body, side: Side, outline: &Outline) -> Vec<usize> {
 /// A plane: a point (mm) and its outward unit normal.
 type Plane = ([f64; 3], [f64; 3]);
 
+/// Steps in which nodes off a common plane are left out, at most, and the part that stays in each (as Rousseeuw and Van Driessen 1999).
+const CONCENTRATIONS: usize = 5;
+/// See [`CONCENTRATIONS`].
+const KEPT: f64 = 0.75;
+
 /// The facets that come to lie on the plane of those pushed in the furthest, that plane, and how far they went in (mm).
 fn pressed_facets(
     body: &Body,
@@ -446,7 +452,7 @@ fn pressed_facets(
     }
     let inward = |n: u32| against(n).map_or(f64::NEG_INFINITY, |u| -dot(u, d));
     let mut all: Vec<f64> = nodes.iter().map(|&n| inward(n)).collect();
-    let most = crate::numerics::statistics::percentile(&mut all, 98.0);
+    let most = percentile(&mut all, 98.0);
     let ended = |n: u32| -> Option<[f64; 3]> {
         let (p, u) = (body.places[n as usize], motion.sharp[n as usize]?);
         Some(std::array::from_fn(|a| p[a] + u[a]))
@@ -456,6 +462,23 @@ fn pressed_facets(
         return Some((Vec::new(), None, most));
     }
     let tolerance = on_plane(voxel, motion.sharp_error);
+    // A rounded rim ends far below a face that is coarsely meshed, and draws the plane down with it: then what lies together comes first.
+    for _ in 0..CONCENTRATIONS {
+        let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
+        let found = fit_plane(&ends, d)?;
+        let height = |q: [f64; 3]| dot(sub(q, found.0), found.1);
+        let near = ends.iter().filter(|q| height(**q).abs() < 2.0 * tolerance).count();
+        if 2 * near > ends.len() {
+            break;
+        }
+        let middle = percentile(&mut ends.iter().map(|q| height(*q)).collect::<Vec<f64>>(), 50.0);
+        let off = |n: &u32| ended(*n).map_or(f64::INFINITY, |q| (height(q) - middle).abs());
+        chosen.sort_by(|a, b| off(a).total_cmp(&off(b)));
+        chosen.truncate((KEPT * chosen.len() as f64) as usize);
+        if chosen.len() < 6 {
+            break;
+        }
+    }
     let mut plane = None;
     for round in 0..8 {
         let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
@@ -626,7 +649,7 @@ fn bent(
         if on { dot(sub(sub(q, p), rigid(p)), normal).abs() } else { 0.0 }
     };
     let mut bends: Vec<f64> = nodes.iter().map(bend).collect();
-    crate::numerics::statistics::percentile(&mut bends, 75.0) >= (0.1 * voxel).max(2.0 * motion.error)
+    percentile(&mut bends, 75.0) >= (0.1 * voxel).max(2.0 * motion.error)
 }
 
 /// Facets that may touch a plane: what was not seen to pass beside it.
@@ -641,7 +664,7 @@ fn fit_rigid(seen: &[([f64; 3], [f64; 3])], middle: [f64; 3], radius: f64) -> Op
     for _ in 0..8 {
         let rest: Vec<[f64; 3]> = seen.iter().map(|(p, u)| sub(*u, rigid_motion(&rigid, middle, radius, *p))).collect();
         let mut sizes: Vec<f64> = rest.iter().map(|r| dot(*r, *r).sqrt()).collect();
-        let scale = crate::numerics::statistics::percentile(&mut sizes, 50.0).max(1e-9);
+        let scale = percentile(&mut sizes, 50.0).max(1e-9);
         let (mut m, mut b) = ([[0.0; 6]; 6], [0.0; 6]);
         for ((p, u), r) in seen.iter().zip(&rest) {
             let size = dot(*r, *r).sqrt();

@@ -1,12 +1,16 @@
 //! From an estimate to moduli with their uncertainty.
 
 use crate::error::StiffnessError;
+use crate::numerics::cholesky::Cholesky;
+use crate::numerics::statistics::percentile;
 use crate::stiffness::body::Body;
 use crate::stiffness::choice::bic;
 use crate::stiffness::geometry::Geometry;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::law::stress;
-use crate::types::stiffness::RegionStiffness;
+use crate::stiffness::patches::travel;
+use crate::types::space::dot;
+use crate::types::stiffness::{Law, RegionStiffness};
 
 /// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies within two of them).
 const VAGUE: f64 = 0.35;
@@ -17,6 +21,18 @@ const INTERFACE: [f64; 2] = [0.006, 0.005];
 const CUT: f64 = 0.15;
 /// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
 const RESOLVED: f64 = 0.1;
+/// A region is looked at more closely where a modulus e times as large moves no tissue by this part of the plates' motion.
+const DOUBTED: f64 = 0.02;
+/// It is not seen where, all moduli alike, that is less than this (two halves side by side came to 0.0003, a rod along a limb to 0.001,
+/// all that is to be seen in phantoms to 0.027 and more), or where it is so at the modulus found and hardly more if all are alike (a skin
+/// along a limb, which the rounded rim of the mesh lets in).
+const SHOWN: f64 = 0.005;
+/// Part of the body that a region moves, at most.
+const MOST_MOVED: f64 = 0.02;
+/// Precision of the solution for that (mm).
+const ALIKE: f64 = 1e-3;
+/// Part of the force from which a region that is not seen makes a bound of the others' moduli.
+const BEARS: f64 = 0.03;
 /// Contrasts beyond e^this are checked against a rigid region (12).
 const HIGH: f64 = 2.5;
 /// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and labels leave open.
@@ -86,6 +102,76 @@ pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry
     Moduli { log, covariance: (0..regions * regions).map(entry).collect(), ratio_variance }
 }
 
+/// A region of whose modulus the data show nothing.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hidden {
+    /// Its label.
+    pub label: u8,
+    /// By how much a modulus e times as large moves the tissue where it moves it most, the others and the plates fitted again (mm).
+    pub moved: f64,
+    /// The part of the force that it bears if all regions are alike (1).
+    pub share: f64,
+}
+
+/// The free region that the data show least of, if it is so little that they tell nothing: of bodies side by side between two plates
+/// without friction every ratio leads to one field, and what a fit makes of it is the model's own error at the rim.
+///
+/// It is looked for where all moduli are alike, under the linear law: a modulus that went astray would hide itself.
+///
+/// # Errors
+/// As [`Setup::run`].
+pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Hidden>, StiffnessError> {
+    let plates = travel(&setup.patches);
+    let travel = dot(plates, plates).sqrt();
+    let found = shown(setup, estimate);
+    if found.iter().all(|moved| *moved > DOUBTED * travel) {
+        return Ok(None);
+    }
+    let equal = Setup { law: Law::Linear, ..setup.clone() };
+    let start = State { theta: vec![0.0; estimate.state.theta.len()], ..estimate.state.clone() };
+    let estimate = equal.run(start, 0, ALIKE)?;
+    let shown = shown(&equal, &estimate);
+    let nothing = |&k: &usize| shown[k] < SHOWN * travel || (found[k] < SHOWN * travel && shown[k] < DOUBTED * travel);
+    let hidden = (0..shown.len()).filter(nothing).min_by(|&a, &b| shown[a].total_cmp(&shown[b]));
+    Ok(hidden.map(|k| Hidden {
+        label: setup.body.labels[setup.free()[k]],
+        moved: shown[k],
+        share: estimate.force_slope[k].clamp(0.0, 1.0),
+    }))
+}
+
+/// By how much a modulus e times as large moves the tissue, the other parameters fitted again (mm), for each free region: what a
+/// volume as large as the region, but a fiftieth of the body at most, is moved by and more.
+fn shown(setup: &Setup<'_>, estimate: &Estimate) -> Vec<f64> {
+    let (p, free) = (estimate.parameters, setup.free());
+    let one = |k: usize| {
+        let others: Vec<usize> = (0..p).filter(|&j| j != k).collect();
+        let m = others.len();
+        let mut a: Vec<f64> = others
+            .iter()
+            .flat_map(|&i| others.iter().map(move |&j| (i, j)))
+            .map(|(i, j)| estimate.information[i * p + j])
+            .collect();
+        let most = (0..m).map(|i| a[i * m + i]).fold(0.0, f64::max);
+        (0..m).for_each(|i| a[i * m + i] += 1e-12 * most);
+        let mut with: Vec<f64> = others.iter().map(|&i| estimate.information[i * p + k]).collect();
+        match Cholesky::new(a, m) {
+            Some(factor) => factor.solve(&mut with),
+            None => with.fill(0.0),
+        }
+        let moved = |i: usize| {
+            let left: [f64; 3] = std::array::from_fn(|x| {
+                estimate.rows[k][i][x] - others.iter().zip(&with).map(|(&o, w)| w * estimate.rows[o][i][x]).sum::<f64>()
+            });
+            dot(left, left).sqrt()
+        };
+        let mut all: Vec<f64> = (0..estimate.residuals.len()).map(moved).collect();
+        let part = setup.body.volumes[free[k]] / setup.body.volumes.iter().sum::<f64>();
+        percentile(&mut all, 100.0 * (1.0 - part.min(MOST_MOVED)))
+    };
+    (0..free.len()).map(one).collect()
+}
+
 /// Whether region `r` could as well be rigid (`lower`) or empty (`upper`) for all the data say: the misfit with its modulus at
 /// the bound, the others fitted again, rises by less than two standard deviations (4 in -2 ln likelihood).
 ///
@@ -98,7 +184,7 @@ pub fn unseen(
     variance: f64,
 ) -> Result<Option<&'static str>, StiffnessError> {
     let theta = estimate.state.theta[r];
-    if r == setup.reference || (variance.sqrt() < VAGUE && theta.abs() < HIGH) {
+    if !setup.free().contains(&r) || (variance.sqrt() < VAGUE && theta.abs() < HIGH) {
         return Ok(None);
     }
     let side = if theta >= 0.0 { "lower" } else { "upper" };
@@ -108,7 +194,7 @@ pub fn unseen(
     // Far enough to be as good as rigid, near enough to be solved.
     let far = theta + theta.signum() * 2.5;
     let mut fixed = setup.clone();
-    fixed.pinned = Some((r, far));
+    fixed.pinned.push((r, far));
     let start = State { x: None, ..estimate.state.clone() };
     let end = fixed.run(start, 4, 1e-4)?;
     let samples = estimate.effective;
@@ -119,6 +205,9 @@ pub fn unseen(
 /// Everything about the regions. `alone` are the moduli as if the surface were known: the part of the uncertainty that more
 /// data of the same body lower. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
 /// counts as the error of the fine one, or all of it where it is large. `cut` says which have the shape of a map.
+///
+/// What is `hidden` can bear anything from none to all of its share of the force, where one is known (`absolute`): so much are all
+/// moduli at most.
 pub fn regions(
     body: &Body,
     [moduli, alone]: [&Moduli; 2],
@@ -126,9 +215,12 @@ pub fn regions(
     [mesh_change, ratio_change]: [&[f64]; 2],
     unseen: &[Option<&'static str>],
     cut: &[bool],
+    hidden: &[Hidden],
+    absolute: bool,
     reference: usize,
 ) -> Vec<RegionStiffness> {
     let count = body.labels.len();
+    let borne = hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
     let one = |r: usize| {
         let mesh = |change: f64| if change.abs() < RESOLVED { change / 3.0 } else { change };
         let slope = if cut[r] { CUT } else { INTERFACE[1] };
@@ -138,13 +230,24 @@ pub fn regions(
         let sd = (data + mesh(mesh_change[r]).powi(2) + model).sqrt();
         let between = if r == reference { 0.0 } else { mesh(ratio_change[r]).powi(2) + interface * interface };
         let ratio_sd = (moduli.ratio_variance[r] + between).sqrt();
-        let unseen = unseen[r].or((sd > VAGUE).then_some(if moduli.log[r] >= moduli.log[reference] {
+        let hides = hidden.iter().find(|h| h.label == body.labels[r]);
+        let at_most = match hides {
+            Some(h) => Some(h.share),
+            None => (absolute && borne > BEARS).then_some(1.0 - borne),
+        };
+        let unknown = hides.is_some_and(|h| !absolute || h.share < BEARS) || at_most.is_some_and(|share| share < BEARS);
+        let limited = at_most.map(|_| if unknown { "unknown" } else { "upper" });
+        let unseen = limited.or(unseen[r]).or((sd > VAGUE).then_some(if moduli.log[r] >= moduli.log[reference] {
             "lower"
         } else {
             "upper"
         }));
         let value = match unseen {
-            None => moduli.log[r],
+            None | Some("unknown") => moduli.log[r],
+            Some(_) if limited.is_some() => {
+                moduli.log[r] - at_most.unwrap_or(1.0).ln()
+                    + 2.0 * moduli.covariance[reference * count + reference].max(0.0).sqrt()
+            }
             // Two standard deviations from the estimate, towards the side that the data exclude. What is all but rigid
             // moves in proportion to its compliance, what is all but empty to its modulus: there the deviation of the
             // logarithm is a relative one.

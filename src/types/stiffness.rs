@@ -180,7 +180,7 @@ pub struct RegionStiffness {
     pub ratio_sd: f64,
     /// Whether the data determine it.
     pub identifiable: bool,
-    /// `lower` or `upper` where it is not: the modulus lies beyond `youngs_modulus`.
+    /// `lower` or `upper` where it is not: the modulus lies beyond `youngs_modulus`; `unknown` where it may be any.
     pub bound: Option<&'static str>,
     /// Volume (mm^3).
     pub volume: f64,
