@@ -385,6 +385,20 @@ fn the_number_of_threads_changes_nothing() {
     }
 }
 
+/// Shares of the components of the error inside of 1, 2 and 3 sigma where `of` holds; 0.68, 0.95 and 0.997 would be exact.
+fn inside(p: &Phantom, result: &FieldResult, of: impl Fn([usize; 3]) -> bool) -> [f64; 3] {
+    let sigma = result.uncertainty.volume().into_vec();
+    let (mut inside, mut all, g) = ([0usize; 3], 0, p.mask.grid());
+    for at in (0..g.len()).filter(|&at| p.mask.as_slice()[at] != 0 && of(g.voxel(at))) {
+        let (u, t, s) = (result.displacement.at(at), p.truth.at(at), sigma[at]);
+        for c in 0..3 {
+            all += 1;
+            (1..=3).for_each(|k| inside[k - 1] += usize::from((u[c] - t[c]).abs() <= k as f32 * s));
+        }
+    }
+    inside.map(|n| n as f64 / all as f64)
+}
+
 #[test]
 fn the_uncertainty_is_calibrated_on_smooth_motions() {
     for (name, params) in [
@@ -394,20 +408,48 @@ fn the_uncertainty_is_calibrated_on_smooth_motions() {
     ] {
         let p = phantom(&params).unwrap();
         let (result, _) = measure_with(&p, &FieldParams::default());
-        // Shares of the components inside of 1, 2 and 3 sigma; 0.68, 0.95 and 0.997 would be exact.
-        let sigma = result.uncertainty.volume().into_vec();
-        let mut inside = [0usize; 3];
-        let mut all = 0;
-        for at in (0..p.mask.grid().len()).filter(|&at| p.mask.as_slice()[at] != 0) {
-            let (u, t, s) = (result.displacement.at(at), p.truth.at(at), sigma[at]);
-            for c in 0..3 {
-                all += 1;
-                (1..=3).for_each(|k| inside[k - 1] += usize::from((u[c] - t[c]).abs() <= k as f32 * s));
-            }
-        }
-        let share = inside.map(|n| n as f64 / all as f64);
+        let share = inside(&p, &result, |_| true);
         assert!((0.5..0.95).contains(&share[0]) && share[1] > 0.8, "{name}: {share:.3?}");
     }
+}
+
+/// Where nothing bends the bending energy outweighs the data: the uncertainty was then all but nil, the more so the noisier the images.
+#[test]
+fn an_affine_motion_is_as_uncertain_as_the_noise_makes_it() {
+    let mut sigmas = Vec::new();
+    for noise in [0.01, 0.05, 0.15] {
+        let p = phantom(&PhantomParams { noise, ..block(48, MotionKind::Affine, 2.0) }).unwrap();
+        let (result, m) = measure_with(&p, &FieldParams::default());
+        let (share, sigma) = (inside(&p, &result, |_| true), result.summary.uncertainty_median_mm);
+        assert!(share[1] > 0.7, "{noise}: {share:.3?}, sigma {sigma}, {m:?}, {:?}", result.summary.evidence);
+        sigmas.push(sigma);
+    }
+    assert!(sigmas[2] > 1.2 * sigmas[1] && sigmas[2] < 0.3, "{sigmas:?}");
+}
+
+/// What the deformed volume does not show is carried over from what it does: said so, and uncertain accordingly.
+#[test]
+fn tissue_out_of_view_is_warned_of_and_uncertain() {
+    let params = block(48, MotionKind::Smooth, 3.0);
+    let whole = params.grid().unwrap();
+    let cropped = Grid::new([48, 48, 30], *whole.affine()).unwrap();
+    let told = |r: &FieldResult| r.summary.warnings.iter().any(|w| w.contains("out of the deformed volume"));
+    let p = phantom_on(&params, whole, whole).unwrap();
+    let (seen, _) = measure_with(&p, &FieldParams::default());
+    assert!(!told(&seen) && seen.summary.unseen < 0.05, "{} {:?}", seen.summary.unseen, seen.summary.warnings);
+
+    let deformed = Volume::from_vec(cropped, p.deformed.as_slice()[..cropped.len()].to_vec()).unwrap();
+    let p = Phantom { deformed, ..p };
+    let (cut, _) = measure_with(&p, &FieldParams::default());
+    let beyond = |v: [usize; 3]| v[2] > 33;
+    let inside_mask = |of: &dyn Fn([usize; 3]) -> bool| {
+        let g = p.mask.grid();
+        (0..g.len()).filter(|&at| p.mask.as_slice()[at] != 0 && of(g.voxel(at))).count() as f64
+    };
+    let share = inside_mask(&beyond) / inside_mask(&|_| true);
+    assert!(told(&cut) && (cut.summary.unseen - share).abs() < 0.15, "{} {share}", cut.summary.unseen);
+    let held = inside(&p, &cut, beyond);
+    assert!(held[1] > 0.8, "{held:.3?}");
 }
 
 #[test]

@@ -239,6 +239,19 @@ fn the_inverse_converges_where_the_plain_fixed_point_does_not() {
     assert!((f64::from(inverse.field.at(at)[0]) + 2.5 / 3.5 * 7.5).abs() < 1e-4);
 }
 
+/// Each y of a folding field may have an x to which it leads back, and the residual is nil.
+#[test]
+fn a_field_that_folds_is_said_to_though_each_place_leads_back() {
+    let grid = Grid::new([40, 6, 6], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+    let wave = |size: f64| DenseField::from_fn(grid, move |p| [size * (p.0[0] / 2.0).sin(), 0.0, 0.0]);
+    let [mild, folding] = [1.0, 6.0].map(|size| invert(&wave(size), None));
+    assert_eq!((mild.folds, mild.not_finite), (0, 0));
+    assert!(folding.folds > 10 * 36, "{}", folding.folds);
+    let mut holed = wave(1.0);
+    holed.as_mut_slice()[100] = f32::NAN;
+    assert_eq!(invert(&holed, None).not_finite, 1);
+}
+
 #[test]
 fn a_field_then_its_inverse_is_no_motion() {
     let grid = cube(40, 40.0);

@@ -439,6 +439,40 @@ fn of_halves_side_by_side_only_the_mean_is_claimed() {
     }
 }
 
+/// A press that turns the body as a whole is the same press.
+#[test]
+fn a_turn_of_the_whole_body_changes_no_modulus() {
+    let (strain, angle) = (0.03, 15f64.to_radians());
+    let (c, s) = (angle.cos(), angle.sin());
+    let upright = squeezed(strain, 0.49);
+    let turned = DenseField::from_fn(*upright.grid(), |p: WorldPoint| {
+        let [x, y, z] = p.0;
+        let q = [x + 0.49 * strain * (x - 9.5), y + 0.49 * strain * (y - 9.5), z - strain * (z - 1.5)];
+        let r = [q[0], c * q[1] - s * q[2], s * q[1] + c * q[2]];
+        std::array::from_fn(|a| r[a] - p.0[a] + [2.0, -1.0, 3.0][a])
+    });
+    let force_n = Some(25.0 * 256.0 * strain / 1000.0);
+    let params = StiffnessParams { model: LawChoice::Linear, force_n, nodes: 1500, ..Default::default() };
+    let [one, other] = [&upright, &turned].map(|field| identify(&block(), field, &params));
+    assert!(!one.warnings.iter().any(|w| w.contains("turned")), "{:?}", one.warnings);
+    assert!(other.warnings.iter().any(|w| w.contains("turned by 15.0 degrees")), "{:?}", other.warnings);
+    let [a, b] = [&one, &other].map(|r| (r.regions[0].youngs_modulus, r.patches[1].contact));
+    assert!((a.0 / b.0 - 1.0).abs() < 1e-3 && a.1 == b.1, "{a:?} {b:?}");
+}
+
+#[test]
+fn a_body_that_ends_with_the_volume_is_warned_of() {
+    let params = StiffnessParams { model: LawChoice::Linear, nodes: 1500, ..Default::default() };
+    let cut =
+        labels([20, 20, 20], 1.0, |p| u8::from(p[1] < 18.0 && [p[0], p[2]].iter().all(|v| (2.0..18.0).contains(v))));
+    let said = |map: &Mask| {
+        let found = identify(map, &squeezed(0.03, 0.49), &params);
+        found.warnings.into_iter().find(|w| w.contains("border"))
+    };
+    assert!(said(&cut).is_some_and(|w| w.contains("(first y along")));
+    assert_eq!(said(&block()), None);
+}
+
 /// On a coarse mesh the rounded rim of a cylinder's face lies millimetres below it, and more of its nodes than not lay off the plane of all.
 #[test]
 fn a_flat_face_is_found_though_its_rim_is_rounded() {

@@ -29,8 +29,19 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     check_output_file(output, &[".nii", ".nii.gz"])?;
     let inverse = invert(&convention.read(field)?, None);
     io::write_field(output, &inverse.field)?;
-    if inverse.max_residual_mm > RESIDUAL_MM {
-        console.warn("the field folds somewhere, so it has no exact inverse there; look at its Jacobian determinant");
+    if inverse.folds > 0 {
+        console.warn(&format!(
+            "the field folds in {} voxels, so it has no inverse there or more than one; look at its Jacobian determinant",
+            inverse.folds
+        ));
+    } else if inverse.max_residual_mm > RESIDUAL_MM {
+        console.warn("the field is too steep somewhere for an exact inverse; look at its Jacobian determinant");
+    }
+    if inverse.not_finite > 0 {
+        console.warn(&format!(
+            "{} voxels of the field hold no finite displacement; what would come from there has none in the inverse",
+            inverse.not_finite
+        ));
     }
     console.say(&format!(
         "Wrote {}: undoes the field to {:.4} mm; {} voxels come from outside its grid.",

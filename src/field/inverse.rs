@@ -5,6 +5,7 @@
 //! their distance; where it is slow, a damped Newton step with the gradient of the trilinear u takes over. Beyond its
 //! grid, u is held at the value of the nearest edge. Where u folds there is no inverse: the largest residual says so.
 
+use crate::field::jacobian::count_folds;
 use crate::numerics::differences::deformation_gradient;
 use crate::numerics::sampling::{Stencil, displacement, inside};
 use crate::types::space::{Matrix3, determinant};
@@ -18,6 +19,10 @@ pub struct Inverse {
     pub field: DenseField,
     /// Largest |v(y) + u(y + v(y))| over the voxels whose initial place is on the field's grid (mm).
     pub max_residual_mm: f64,
+    /// Voxels of the field that fold or turn inside out: what lies there has no inverse, or more than one.
+    pub folds: usize,
+    /// Voxels of the field without a finite displacement: what would come from there has no inverse.
+    pub not_finite: usize,
     /// Voxels whose initial place lies off the field's grid, where v rests on the edge values.
     pub outside: usize,
 }
@@ -38,7 +43,9 @@ pub fn invert(field: &DenseField, grid: Option<&Grid>) -> Inverse {
             }
         })
         .reduce(|| (0.0, 0), |a, b| (f64::max(a.0, b.0), a.1 + b.1));
-    Inverse { field: inverse, max_residual_mm, outside }
+    let folds = count_folds(field, None).unwrap_or(0);
+    let not_finite = (0..field.grid().len()).filter(|&at| field.at(at).iter().any(|v| !v.is_finite())).count();
+    Inverse { field: inverse, max_residual_mm, folds, not_finite, outside }
 }
 
 /// v(y): from y, steps towards the x with x + u(x) = y.

@@ -11,6 +11,7 @@ use crate::stiffness::inclusion::Inclusion;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
 use crate::stiffness::rim::{Outline, rim};
+use crate::stiffness::turn::Turn;
 use crate::stiffness::{geometry, maps, summary};
 use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
 use crate::types::{Displacement, Mask, QuadraticMesh, SparseField, WorldPoint};
@@ -77,6 +78,26 @@ pub fn run(
 ) -> Result<StiffnessResult, StiffnessError> {
     params.check()?;
     whole(inputs.labels)?;
+    if let Some(turn) = Turn::of(inputs.field, inputs.labels) {
+        let (field, matches) = (turn.undone(inputs.field), inputs.matches.map(|m| turn.undone_matches(m)));
+        let still = Inputs { field: &field, matches: matches.as_ref(), ..*inputs };
+        let mut result = unturned(&still, params, progress)?;
+        result.warnings.push(format!(
+            "the body turned by {:.1} degrees as a whole; that was taken out first, and the displacements of the mesh and of the exported \
+             models are without it",
+            turn.degrees()
+        ));
+        return Ok(result);
+    }
+    unturned(inputs, params, progress)
+}
+
+/// The same for a body that did not turn.
+fn unturned(
+    inputs: &Inputs<'_>,
+    params: &StiffnessParams,
+    progress: Progress<'_>,
+) -> Result<StiffnessResult, StiffnessError> {
     if inputs.labelled {
         return labelled(inputs, params, Vec::new(), progress);
     }
@@ -100,7 +121,10 @@ pub fn check(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<(), Stiffn
     params.check()?;
     whole(inputs.labels)?;
     let mesh = Mesher::new(inputs.labels)?.mesh(&coarse_fineness(inputs.labels, params))?;
-    Level::new(&mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, None).map(|_| ())
+    let turn = Turn::of(inputs.field, inputs.labels);
+    let undone = turn.map(|t| (t.undone(inputs.field), inputs.matches.map(|m| t.undone_matches(m))));
+    let (field, matches) = undone.as_ref().map_or((inputs.field, inputs.matches), |(f, m)| (f, m.as_ref()));
+    Level::new(&mesh, field, matches, inputs.labels, inputs.held, inputs.load, None).map(|_| ())
 }
 
 /// The chain for labelled regions; `tried` is the evidence that led to them.

@@ -73,7 +73,7 @@ mod tests {
     fn the_summary_is_short_and_holds_the_counts() {
         let text = field_summary(&Case::new([8, 8, 8], [1.0; 3]).report());
         assert!(text.lines().count() <= 9, "{text}");
-        for part in ["13,020 kept of 160,000", "900.0000 -> 300.0000", "mean 1.50 mm", "trust        high"] {
+        for part in ["13,020 kept of 160,000", "900.0000 -> 300.0000", "mean 1.50 mm", "trust        moderate"] {
             assert!(text.contains(part), "{part} is missing in\n{text}");
         }
     }

@@ -245,7 +245,7 @@ mod tests {
         case.summary.folds = 100;
         case.summary.counts.kept = 31;
         let v = verdict(&case.report());
-        assert_eq!((v.trust, v.reasons.len()), (Trust::Low, 2));
+        assert_eq!((v.trust, v.reasons.len()), (Trust::Low, 3));
     }
 
     /// Frames of a sequence with so much median uncertainty and mean motion (mm).

@@ -10,6 +10,7 @@ use crate::stiffness::patches::travel;
 use crate::stiffness::summary::Hidden;
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
+use std::collections::{BTreeSet, HashSet};
 
 /// Volume of the voxels that are not 0 (mm^3).
 pub fn volume(labels: &Mask) -> f64 {
@@ -115,9 +116,56 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &
              do not fit the field, or it is noisy; do not trust the moduli",
             100.0 * misfit / travel
         ));
+    } else if misfit > MUCH * travel && misfit > ROUGH * own {
+        out.push(format!(
+            "what the model leaves over, {misfit:.3} mm, is {:.0} % of the plates' motion and {:.0} times what is rough in the field: body, \
+             patches, Poisson's ratio or law are not quite as assumed, and moduli may be off by more than stated",
+            100.0 * misfit / travel,
+            misfit / own.max(1e-9)
+        ));
     }
     out
 }
+
+/// The same that is said to be much, where it is [`ROUGH`] times what noise leaves: phantoms with the right assumptions, linear law and
+/// all, leave 0.003 to 0.015; a body of which a part was cut off 0.08.
+const MUCH: f64 = 0.03;
+/// See [`MUCH`].
+const ROUGH: f64 = 5.0;
+
+/// Part of the surface that may lie on the volume's border without a word.
+const CUT_OFF: f64 = 0.02;
+
+/// Says so where the body ends with the volume, away from the patches: nobody knows what pulls there.
+fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
+    let (body, grid) = (&level.body, labels.grid());
+    let patches: HashSet<usize> = level.patches.iter().flat_map(|p| p.facets.iter().copied()).collect();
+    let (mut on, mut all, mut sides) = (0.0, 0.0, BTreeSet::new());
+    for (f, facet) in body.surface.iter().enumerate() {
+        all += facet.area;
+        let at = grid.affine().to_voxel(WorldPoint(facet.centre)).0;
+        let border = (0..3).filter(|&a| grid.shape()[a] > 1).find_map(|a| {
+            let last = (grid.shape()[a] - 1) as f64;
+            (at[a] < 0.0 || at[a] > last).then(|| if at[a] < 0.0 { SIDES[a][0] } else { SIDES[a][1] })
+        });
+        if let Some(side) = border.filter(|_| !patches.contains(&f)) {
+            on += facet.area;
+            sides.insert(side);
+        }
+    }
+    let named: Vec<&str> = sides.into_iter().collect();
+    (on > CUT_OFF * all).then(|| {
+        format!(
+            "the body ends at the volume's border ({} along the voxels' axes, {:.0} % of its surface) and was taken to end there, free of \
+             force: if it goes on beyond, moduli are off by tens of per cent; image and label the whole of it",
+            named.join(", "),
+            100.0 * on / all
+        )
+    })
+}
+
+/// The borders of a volume.
+const SIDES: [[&str; 2]; 3] = [["first x", "last x"], ["first y", "last y"], ["first z", "last z"]];
 
 /// What to know before trusting the moduli. `area` is that of the loaded patch (mm^2).
 pub fn warnings(
@@ -164,6 +212,7 @@ pub fn warnings(
             ));
         }
     }
+    out.extend(cut_off(level, labels));
     if params.poisson < 0.4 {
         out.push(format!("Poisson's ratio {} is low for soft tissue, which is nearly incompressible", params.poisson));
     }

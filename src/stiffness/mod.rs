@@ -39,3 +39,5 @@ pub mod support;
 pub mod geometry;
 
 pub mod inclusion;
+
+pub mod turn;
