@@ -301,6 +301,9 @@ pub enum StiffnessError {
         /// Precision (mm).
         noise: f64,
     },
+    /// No force.
+    #[error("no force acts, by --forces, so there is nothing to tell moduli from")]
+    NoForce,
     /// Too few samples.
     #[error(
         "{found} places of the field lie in the body, {needed} are needed; check that field and labels belong together"

@@ -14,13 +14,14 @@ fn grid(shape: [usize; 3]) -> Grid {
     Grid::new(shape, Affine::scaled([1.0; 3], [-3.0, 5.0, 1.0]).unwrap()).unwrap()
 }
 
-/// A block squeezed by 3 % between frictionless plates, and its label map of two halves.
+/// A block squeezed by 3 % between frictionless plates, and its label map of two halves, one on the other: of halves side by side
+/// nothing but the mean would be seen.
 fn folder() -> TempDir {
     let folder = TempDir::new().unwrap();
     let g = grid([16, 16, 16]);
     let inside = |i: usize| (2..14).contains(&i);
     let block = |o: usize| g.voxel(o).into_iter().all(inside);
-    let labels = Mask::from_voxels(g, |o, _| if block(o) { 1 + u8::from(g.voxel(o)[0] > 7) } else { 0 });
+    let labels = Mask::from_voxels(g, |o, _| if block(o) { 1 + u8::from(g.voxel(o)[2] > 7) } else { 0 });
     let middle = g.world(0, 0, 0).moved([7.5; 3]).0;
     let field = DenseField::from_fn(g, |p| {
         let d: [f64; 3] = std::array::from_fn(|a| p.0[a] - middle[a]);
@@ -48,11 +49,11 @@ fn refused(folder: &Path, more: &[&str], code: i32, parts: &[&str]) {
 #[test]
 fn everything_promised_is_written() {
     let folder = folder();
-    let (out, _) = run(folder.path(), &[&BASE[..], &["--force", "0.1", "--names", "1=left,2=right"]].concat(), 0);
-    assert!(out.contains("All 2 regions are determined by the data.") && out.contains("left"), "{out}");
+    let (out, _) = run(folder.path(), &[&BASE[..], &["--force", "0.1", "--names", "1=lower,2=upper"]].concat(), 0);
+    assert!(out.contains("All 2 regions are determined by the data.") && out.contains("lower"), "{out}");
     let results = folder.path().join("results");
     let table = fs::read_to_string(results.join("regions.csv")).unwrap();
-    assert!(table.starts_with("label,name,youngs_modulus_kpa,sd_kpa,ratio,identifiable\n1,left,"), "{table}");
+    assert!(table.starts_with("label,name,youngs_modulus_kpa,sd_kpa,ratio,identifiable\n1,lower,"), "{table}");
     let summary: serde_json::Value =
         serde_json::from_str(&fs::read_to_string(results.join("summary.json")).unwrap()).unwrap();
     assert_eq!(summary["absolute"], true);
@@ -74,7 +75,7 @@ fn everything_promised_is_written() {
     }
     assert!(stages.contains_key("read") && stages.contains_key("observe"), "{stages:?}");
     assert!(page.contains("<h3>Distributions</h3>"));
-    assert!(page.contains("left") && !page.contains("NaN") && !page.contains("http"));
+    assert!(page.contains("lower") && !page.contains("NaN") && !page.contains("http"));
     for file in ["stiffness_sd.nii.gz", "residual.nii.gz", "mesh.vtu", "model.feb", "model.inp"] {
         assert!(fs::metadata(results.join(file)).unwrap().len() > 500, "{file}");
     }
@@ -229,7 +230,9 @@ fn what_is_no_sequence_is_refused() {
     let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1"]].concat(), 2);
     assert!(err.contains("1 forces for 2 frames"), "{err}");
     let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1,-1"]].concat(), 2);
-    assert!(err.contains("-1") && err.contains("above 0 N"), "{err}");
+    assert!(err.contains("-1") && err.contains("below 0"), "{err}");
+    let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0,0"]].concat(), 1);
+    assert!(err.contains("no force acts"), "{err}");
     // Each frame would find regions of its own, and their moduli would be averaged as if they were the same ones.
     for body in [&["--mask", "labels.nii.gz"][..], &[]] {
         let (_, err) = run(folder.path(), &[&["stiffness", "--sequence", ".", "-o", "results"], body].concat(), 2);

@@ -5,6 +5,7 @@ use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
 use super::stiffness::{FILES, Options, Setting, images, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
+use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
 use palpate::report::stiffness as report;
@@ -69,7 +70,10 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         let matches = matches_beside(path)?.filter(|m| setting.holds_enough(m));
         by_matches |= matches.is_some();
         let stage = format!("frame {frame}");
-        let outcome = setting.run(&field, matches.as_ref(), &params, &|_, f| progress.set(&stage, part + f / count));
+        let outcome = match force_n {
+            Some(0.0) => Err(StiffnessError::NoForce),
+            _ => setting.run(&field, matches.as_ref(), &params, &|_, f| progress.set(&stage, part + f / count)),
+        };
         if let Err(error) = &outcome {
             console.detail(&format!("frame {frame}: {error}"));
         }
@@ -162,8 +166,8 @@ fn frames(options: &Options, from: &Path, tracked: &Tracked) -> Result<Vec<Frame
         );
         bail!(Usage(text));
     }
-    if let Some(bad) = forces.iter().find(|f| !(f.is_finite() && **f > 0.0)) {
-        bail!(Usage(format!("--forces: {bad} is not above 0 N; give magnitudes, without a sign")));
+    if let Some(bad) = forces.iter().find(|f| !(f.is_finite() && **f >= 0.0)) {
+        bail!(Usage(format!("--forces: {bad} N is below 0; give magnitudes, without a sign (0: at rest)")));
     }
     let force = |frame: usize| all.iter().position(|f| *f == frame).and_then(|at| forces.get(at).copied());
     Ok(found.into_iter().map(|(frame, path)| (frame, path, force(frame))).collect())

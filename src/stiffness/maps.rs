@@ -243,23 +243,24 @@ const BESIDE: f64 = 0.07;
 /// Thickness (voxels) from which a field measured from images resolves a region: two of its lattice's steps.
 const RESOLVED: usize = 8;
 
-/// Thickness of a region where it is thickest (voxels), along the grid's axes: twice the largest number of steps to its border.
+/// Thickness of a region where it is thickest (voxels): of each of its voxels the shortest run through it along an axis of the grid.
 fn thickness(labels: &Mask, label: u8) -> usize {
     let (shape, inside) = (labels.grid().shape(), labels.as_slice());
-    let stride = [1, shape[0], shape[0] * shape[1]];
-    let thick: Vec<usize> = (0..3).filter(|&a| shape[a] > 1).collect();
-    let mut steps = vec![0u16; inside.len()];
-    let at = |index: usize, a: usize| index / stride[a] % shape[a];
-    // There and back over the volume: the city-block distance.
-    for index in (0..inside.len()).filter(|&i| inside[i] == label) {
-        let before = |a: &usize| if at(index, *a) > 0 { steps[index - stride[*a]] } else { 0 };
-        steps[index] = 1 + thick.iter().map(before).min().unwrap_or(0);
+    let mut shortest = vec![u16::MAX; inside.len()];
+    for a in (0..3).filter(|&a| shape[a] > 1) {
+        let stride: usize = shape[..a].iter().product();
+        let starts = (0..inside.len())
+            .filter(|&i| inside[i] == label && ((i / stride).is_multiple_of(shape[a]) || inside[i - stride] != label));
+        for start in starts.collect::<Vec<_>>() {
+            let room = shape[a] - start / stride % shape[a];
+            let run = (0..room).take_while(|k| inside[start + k * stride] == label).count();
+            for v in (0..run).map(|k| start + k * stride) {
+                shortest[v] = shortest[v].min(run as u16);
+            }
+        }
     }
-    for index in (0..inside.len()).rev().filter(|&i| inside[i] == label) {
-        let after = |a: &usize| if at(index, *a) + 1 < shape[*a] { steps[index + stride[*a]] } else { 0 };
-        steps[index] = steps[index].min(1 + thick.iter().map(after).min().unwrap_or(0));
-    }
-    2 * usize::from(steps.into_iter().max().unwrap_or(0))
+    let of_region = shortest.into_iter().zip(inside).filter(|(_, l)| **l == label);
+    of_region.map(|(run, _)| usize::from(run)).max().unwrap_or(0)
 }
 
 #[cfg(test)]
@@ -277,5 +278,7 @@ mod tests {
             _ => 0,
         });
         assert_eq!([1, 2, 3].map(|label| thickness(&layers, label)), [4, 8, 0]);
+        let films = Mask::from_voxels(grid, |at, _| u8::from((4..7).contains(&grid.voxel(at)[1])));
+        assert_eq!(thickness(&films, 1), 3);
     }
 }
