@@ -169,6 +169,27 @@ fn a_lost_frame_does_not_stop_the_others() {
 }
 
 #[test]
+fn a_label_out_of_a_frames_view_is_named() {
+    let s = sequence(SequenceKind::Pinch, 3);
+    let reference = s.frame(0);
+    let g = *reference.grid();
+    let [nx, ny, nz] = g.shape();
+    let cut = Grid::new([nx, ny, nz - 10], *g.affine()).unwrap();
+    let label = |at: usize| if s.mask.as_slice()[at] == 0 { 0 } else { 1 + 6 * u8::from(g.voxel(at)[2] >= nz - 10) };
+    let labels = Mask::from_voxels(g, |at, _| label(at));
+    let read = |t: usize| -> Result<_, FieldError> {
+        let whole = s.frame(t);
+        Ok(if t == 2 { Volume::from_vec(cut, whole.as_slice()[..cut.len()].to_vec()).unwrap() } else { whole })
+    };
+    let params = FieldParams::default();
+    let tracked =
+        run((3, 0), &reference, (Some(&s.mask), Some(&labels)), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+    let said = |t: usize| tracked.frames.iter().find(|f| f.frame == t).unwrap().warnings.join(" ");
+    assert!(said(2).contains("label 7 (100 %)") && !said(2).contains("label 1"), "{}", said(2));
+    assert!(!said(1).contains("label"), "{}", said(1));
+}
+
+#[test]
 fn trajectories_follow_the_true_motion() {
     let s = sequence(SequenceKind::Pen, 5);
     let (params, reference) = (FieldParams::default(), s.frame(0));

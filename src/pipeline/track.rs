@@ -9,6 +9,7 @@ use crate::field::strain::{StrainField, StrainStatistics};
 use crate::numerics::sampling::{displacement, inside};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
 use crate::types::*;
+use rayon::prelude::*;
 use std::collections::HashMap;
 use std::time::Instant;
 
@@ -108,7 +109,11 @@ pub fn run<'v, E: From<FieldError>>(
                         volume_change,
                     });
                 }
-                tracked.frames.push(summary(number, &result, started.elapsed().as_secs_f64()));
+                let mut summary = summary(number, &result, started.elapsed().as_secs_f64());
+                if labels.is_some() {
+                    summary.warnings.extend(out_of_view(&regions, &result.displacement, volume.grid()));
+                }
+                tracked.frames.push(summary);
                 keep(Frame { number, volume: &volume, result: &result, strain: &strain })?;
             }
             Err(error) => {
@@ -134,6 +139,30 @@ fn regions(reference: &Voxels<'_>, mask: Option<&Mask>, labels: Option<&Mask>) -
     let mut by_label: Vec<(u8, Vec<usize>)> = (0..=255).map(|label| (label, Vec::new())).collect();
     all.for_each(|at| by_label[usize::from(labels.as_slice()[at])].1.push(at));
     by_label.into_iter().skip(1).filter(|(_, offsets)| !offsets.is_empty()).collect()
+}
+
+/// Part of a label out of view from which it is said.
+const OUT_OF_VIEW: f64 = 0.2;
+
+/// Names the labels of which much lies outside a frame: their strain there is what tissue in view carries over.
+fn out_of_view(regions: &[(u8, Vec<usize>)], field: &DenseField, there: &Grid) -> Option<String> {
+    let grid = field.grid();
+    let outside = |&at: &usize| {
+        let [i, j, k] = grid.voxel(at);
+        let place = grid.world(i, j, k).moved(field.at(at).map(f64::from));
+        !inside(there.shape(), there.affine().to_voxel(place))
+    };
+    let share = |(label, offsets): &(u8, Vec<usize>)| {
+        let out = offsets.par_iter().filter(|at| outside(at)).count() as f64 / offsets.len() as f64;
+        (out > OUT_OF_VIEW).then(|| format!("label {label} ({:.0} %)", 100.0 * out))
+    };
+    let named: Vec<String> = regions.iter().filter_map(share).collect();
+    (!named.is_empty()).then(|| {
+        format!(
+            "out of the frame's view: {}; the strain of what is not seen is carried over from around it",
+            named.join(", ")
+        )
+    })
 }
 
 fn summary(frame: usize, result: &FieldResult, seconds: f64) -> FrameSummary {
