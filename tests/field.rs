@@ -413,6 +413,24 @@ fn the_uncertainty_is_calibrated_on_smooth_motions() {
     }
 }
 
+/// Across a slice there are no data: what a field that no data hold would do there was counted as its uncertainty, seven times too much.
+#[test]
+fn a_slice_is_as_uncertain_as_it_is_wrong_in_its_plane() {
+    for noise in [0.01, 0.03] {
+        let p = phantom(&PhantomParams { noise, ..PhantomParams::new(PhantomKind::Slice).sized(96) }).unwrap();
+        let (result, _) = measure_with(&p, &FieldParams::default());
+        let sigma = result.uncertainty.volume().into_vec();
+        let (mut wrong, mut stated, mut n) = (0.0, 0.0, 0.0);
+        for at in (0..sigma.len()).filter(|&at| p.mask.as_slice()[at] != 0) {
+            let (u, t) = (result.displacement.at(at), p.truth.at(at));
+            wrong += (0..3).map(|c| f64::from(u[c] - t[c]).powi(2)).sum::<f64>() / 2.0;
+            (stated, n) = (stated + f64::from(sigma[at]).powi(2), n + 1.0);
+        }
+        let ratio = (wrong / stated).sqrt();
+        assert!((0.3..1.3).contains(&ratio), "{noise}: {ratio:.2}, stated {:.3} mm", (stated / n).sqrt());
+    }
+}
+
 /// Where nothing bends the bending energy outweighs the data: the uncertainty was then all but nil, the more so the noisier the images.
 #[test]
 fn an_affine_motion_is_as_uncertain_as_the_noise_makes_it() {

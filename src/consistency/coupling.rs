@@ -208,7 +208,8 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
 /// Draws worked out side by side: each holds six vectors of the lattice.
 const SIDE_BY_SIDE: usize = 2;
 
-/// Standard deviation of the coupled field at each node (mm, root of a third of the covariance's trace).
+/// Standard deviation of the coupled field at each node along an axis (mm, root of the mean of the covariance's diagonal over the axes
+/// that there are data of).
 ///
 /// The covariance is `(A + lambda L)^-1`; random vectors with just that covariance are drawn by solving for
 /// right-hand sides with covariance `A + lambda L` (perturb and optimise, Papandreou & Yuille 2010), and their squares
@@ -244,12 +245,15 @@ pub fn deviation(
         solve(smoothness, lambda, blocks, Data::Blocks, true, &b, &mut x, 1e-2, 200);
         x
     };
+    // Across a slice there is neither motion nor data.
+    let seen: Vec<usize> = (0..3).filter(|&c| blocks.iter().any(|b| b[c] > 0.0)).collect();
+    let share = 1.0 / (seen.len().max(1) * draws) as f32;
     let mut squares = vec![0.0f32; n];
     for first in (0..draws).step_by(SIDE_BY_SIDE) {
         let some: Vec<Vec<f32>> = (first..(first + SIDE_BY_SIDE).min(draws)).into_par_iter().map(draw).collect();
         for x in some {
             for (i, s) in squares.iter_mut().enumerate() {
-                *s += (x[i] * x[i] + x[n + i] * x[n + i] + x[2 * n + i] * x[2 * n + i]) / (3 * draws) as f32;
+                *s += share * seen.iter().map(|c| x[c * n + i] * x[c * n + i]).sum::<f32>();
             }
         }
     }
