@@ -59,7 +59,8 @@ pub fn flags(o: &PairOutcome) -> Vec<String> {
         out.extend(list(&summary["warnings"]).iter().map(|w| format!("{stage}: {}", text(w))));
     }
     let unseen = list(&o.stiffness["regions"]).iter().filter(|r| r["identifiable"] == false);
-    out.extend(unseen.map(|r| format!("{} is only a bound", text(&r["name"]))));
+    let known = |r: &Value| if r["bound"] == "unknown" { "not seen" } else { "only a bound" };
+    out.extend(unseen.map(|r| format!("{} is {}", text(&r["name"]), known(r))));
     if o.grasp["completed"] == false {
         out.push("the grasp ended early".into());
     }

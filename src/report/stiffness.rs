@@ -260,7 +260,7 @@ fn page_with(
         "Young's modulus",
         moduli,
         Scale::from_zero(seen, unit, ColorMap::Viridis),
-        "One value a region. A region that is not identifiable shows its bound, at the end of the scale if beyond.",
+        "One value a region. A region that is not identifiable shows its bound, at the end of the scale if beyond; one that is not seen at all the largest region's.",
     )?;
     let sd = panel(
         "Standard deviation",
