@@ -255,7 +255,12 @@ pub fn regions(
             Some(_) => moduli.log[r] + (2.0 * sd).ln_1p(),
         };
         let e = value.exp();
-        let ratio = (value - moduli.log[reference]).exp();
+        // The force bounds moduli, not ratios: those of regions that are seen stand.
+        let ratio = match limited {
+            Some(_) if hides.is_some() => f64::INFINITY,
+            Some(_) => (moduli.log[r] - moduli.log[reference]).exp(),
+            None => (value - moduli.log[reference]).exp(),
+        };
         let seen = unseen.is_none();
         RegionStiffness {
             label: body.labels[r],
