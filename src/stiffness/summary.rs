@@ -29,8 +29,8 @@ const DOUBTED: f64 = 0.02;
 const SHOWN: f64 = 0.005;
 /// Part of the body that a region moves, at most.
 const MOST_MOVED: f64 = 0.02;
-/// Precision of the solution for that (mm).
-const ALIKE: f64 = 1e-3;
+/// Precision of the solution for that (part of the plates' motion).
+const ALIKE: f64 = 0.02;
 /// Part of the force from which a region that is not seen makes a bound of the others' moduli.
 const BEARS: f64 = 0.03;
 /// Contrasts beyond e^this are checked against a rigid region (12).
@@ -129,7 +129,7 @@ pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Hidde
     }
     let equal = Setup { law: Law::Linear, ..setup.clone() };
     let start = State { theta: vec![0.0; estimate.state.theta.len()], ..estimate.state.clone() };
-    let estimate = equal.run(start, 0, ALIKE)?;
+    let estimate = equal.run(start, 0, ALIKE * travel)?;
     let shown = shown(&equal, &estimate);
     let nothing = |&k: &usize| shown[k] < SHOWN * travel || (found[k] < SHOWN * travel && shown[k] < DOUBTED * travel);
     let hidden = (0..shown.len()).filter(nothing).min_by(|&a, &b| shown[a].total_cmp(&shown[b]));
