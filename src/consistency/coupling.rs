@@ -1,7 +1,7 @@
 //! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
 //! energy of a spline lattice holds the places together.
 
-use crate::numerics::bending::{Data, Smoothness, SolveReport, solve};
+use crate::numerics::bending::{Data, Smoothness, SolveReport, solve, solver};
 use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
@@ -225,6 +225,7 @@ pub fn deviation(
 ) -> Vec<f32> {
     let n = blocks.len();
     let affine = Affine::new(nodes, blocks);
+    let solve = solver(smoothness, lambda, blocks, true);
     let draw = |draw: usize| {
         let mut random = Random::new(seed, 1000 + draw as u64);
         let mut b = vec![0.0f32; 3 * n];
@@ -242,7 +243,7 @@ pub fn deviation(
         }
         // Of the rest an affine motion feels nothing.
         let mut x = affine.solve(&pulls);
-        solve(smoothness, lambda, blocks, Data::Blocks, true, &b, &mut x, 1e-2, 200);
+        solve(&b, &mut x, 1e-2, 200);
         x
     };
     // Across a slice there is neither motion nor data.

@@ -304,6 +304,17 @@ pub fn solve(
     }
 }
 
+/// As [`solve`] with the blocks as data, for many right-hand sides `b`: takes `b`, `x`, the tolerance and the limit.
+pub fn solver(
+    smoothness: &Smoothness,
+    lambda: [f32; 3],
+    blocks: &[[f32; 6]],
+    multilevel: bool,
+) -> impl Fn(&[f32], &mut [f32], f64, usize) -> SolveReport + Sync {
+    let system = System::new(smoothness, lambda, blocks, multilevel);
+    move |b, x, tolerance, limit| system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None))
+}
+
 /// The matrix `D + lambda L` with its preconditioner, in slabs of node planes.
 struct System {
     bands: Bands,
