@@ -196,7 +196,7 @@ fn labelled(
     progress("coarse", 0.1);
     let mut choice = choose(&mut coarse, params.model, params.poisson, reference)?;
     let mut hidden = Vec::new();
-    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params.poisson, reference), &choice.estimate)?
+    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params.poisson, reference), &choice.estimate)
     {
         hidden.push(found);
         coarse.hidden.push(found.label);

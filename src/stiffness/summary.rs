@@ -116,28 +116,26 @@ pub struct Hidden {
 /// The free region that the data show least of, if it is so little that they tell nothing: of bodies side by side between two plates
 /// without friction every ratio leads to one field, and what a fit makes of it is the model's own error at the rim.
 ///
-/// It is looked for where all moduli are alike, under the linear law: a modulus that went astray would hide itself.
-///
-/// # Errors
-/// As [`Setup::run`].
-pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Hidden>, StiffnessError> {
+/// It is looked for where all moduli are alike, under the linear law: a modulus that went astray would hide itself. None as well where
+/// that cannot be solved.
+pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
     let plates = travel(&setup.patches);
     let travel = dot(plates, plates).sqrt();
     let found = shown(setup, estimate);
     if found.iter().all(|moved| *moved > DOUBTED * travel) {
-        return Ok(None);
+        return None;
     }
     let equal = Setup { law: Law::Linear, ..setup.clone() };
     let start = State { theta: vec![0.0; estimate.state.theta.len()], ..estimate.state.clone() };
-    let estimate = equal.run(start, 0, ALIKE * travel)?;
+    let estimate = equal.run(start, 0, ALIKE * travel).ok()?;
     let shown = shown(&equal, &estimate);
     let nothing = |&k: &usize| shown[k] < SHOWN * travel || (found[k] < SHOWN * travel && shown[k] < DOUBTED * travel);
     let hidden = (0..shown.len()).filter(nothing).min_by(|&a, &b| shown[a].total_cmp(&shown[b]));
-    Ok(hidden.map(|k| Hidden {
+    hidden.map(|k| Hidden {
         label: setup.body.labels[setup.free()[k]],
         moved: shown[k],
         share: estimate.force_slope[k].clamp(0.0, 1.0),
-    }))
+    })
 }
 
 /// By how much a modulus e times as large moves the tissue, the other parameters fitted again (mm), for each free region: what a
