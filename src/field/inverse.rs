@@ -3,7 +3,8 @@
 //! For each y the inverse v solves v = -u(y + v), u being trilinear. The fixed point v <- -u(y + v) (Christensen and
 //! Johnson 2001; Chen et al., Medical Physics 35, 2008) converges where neighbouring displacements differ by less than
 //! their distance; where it is slow, a damped Newton step with the gradient of the trilinear u takes over. Beyond its
-//! grid, u is held at the value of the nearest edge. Where u folds there is no inverse: the largest residual says so.
+//! grid, u is held at the value of the nearest edge. Where u folds there is no inverse or more than one: folds are counted, since
+//! each y may still have an x that leads to it.
 
 use crate::field::jacobian::count_folds;
 use crate::numerics::differences::deformation_gradient;

@@ -57,6 +57,13 @@ impl Lattice {
         false
     }
 
+    /// Where node `m` stands (voxels): the outermost nodes lie beyond the grid.
+    pub fn place(&self, m: usize) -> [f64; 3] {
+        let [nx, ny, _] = self.nodes;
+        let index = [m % nx, m / nx % ny, m / (nx * ny)];
+        std::array::from_fn(|a| (index[a] as f64 - 1.0) * self.step[a] as f64)
+    }
+
     /// How many nodes act along axis `a`: 4, or 1 for a side of one voxel.
     #[inline(always)]
     fn taps(&self, a: usize) -> usize {

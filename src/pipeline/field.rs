@@ -541,15 +541,11 @@ fn halved(field: &SplineField) -> Lattice {
 /// Of each node of that lattice, whether the deformed volume does not show what is there.
 fn hidden(pair: &Pair<'_>, field: &SplineField) -> Vec<bool> {
     let coarse = halved(field);
-    let nodes = coarse.nodes;
-    let place = |m: usize| -> [f64; 3] {
-        let index = [m % nodes[0], m / nodes[0] % nodes[1], m / (nodes[0] * nodes[1])];
-        std::array::from_fn(|a| {
-            let at = (index[a] as f64 - 1.0) * coarse.step[a] as f64;
-            at.clamp(0.0, (coarse.shape[a] - 1) as f64)
-        })
+    let within = |m: usize| {
+        let at = coarse.place(m);
+        std::array::from_fn(|a| at[a].clamp(0.0, (coarse.shape[a] - 1) as f64))
     };
-    (0..coarse.len()).into_par_iter().map(|m| !level::sees(pair, field, place(m))).collect()
+    (0..coarse.len()).into_par_iter().map(|m| !level::sees(pair, field, within(m))).collect()
 }
 
 /// Posterior standard deviation of the coupled field (mm), from a lattice twice as coarse as the field's own, times
@@ -562,13 +558,10 @@ fn uncertainty(
     hidden: &[bool],
     jumps: impl Iterator<Item = ([usize; 3], f32)>,
 ) -> ScalarSpline {
-    let fine = &field.lattice;
     let coarse = halved(field);
     let mut blocks = vec![[0.0f32; 6]; coarse.len()];
     for (m, block) in field.blocks.iter().enumerate() {
-        let index = [m % fine.nodes[0], m / fine.nodes[0] % fine.nodes[1], m / (fine.nodes[0] * fine.nodes[1])];
-        let at = std::array::from_fn(|a| (index[a] as f64 - 1.0) * fine.step[a] as f64);
-        coarse.for_each_tap(at, |node, w| {
+        coarse.for_each_tap(field.lattice.place(m), |node, w| {
             for q in 0..6 {
                 blocks[node][q] += w * block[q];
             }

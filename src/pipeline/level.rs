@@ -15,12 +15,13 @@ use crate::matching::pair::Pair;
 use crate::matching::residual::{self, Baseline, normal_equations};
 use crate::numerics::bending::Smoothness;
 use crate::numerics::bspline::Lattice;
+use crate::numerics::sampling::nearest;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
 use crate::numerics::unfold::unfold;
 use crate::numerics::{filters, pyramid};
-use crate::types::{Counts, FieldParams, LevelReport};
+use crate::types::{Counts, FieldParams, LevelReport, VoxelPoint};
 use rayon::prelude::*;
 
 /// A spline field on one level, with the state of its coupling.
@@ -190,15 +191,10 @@ pub fn mean_length(pair: &Pair<'_>, field: &SplineField) -> f64 {
 /// Whether the deformed volume shows what is at `p` (voxels) in the initial one, by a field.
 pub fn sees(pair: &Pair<'_>, field: &SplineField, p: [f64; 3]) -> bool {
     let u = field.lattice.at(&field.coefficients, p);
-    let (shape, mut at) = (pair.moving_shape, 0);
-    for a in (0..3).rev().filter(|&a| shape[a] > 1) {
-        let q = (p[a] + u[a] / pair.spacing[a] - pair.moving_origin[a]).round();
-        if !(q >= 0.0 && q < shape[a] as f64) {
-            return false;
-        }
-        at += q as usize * shape[..a].iter().product::<usize>();
-    }
-    pair.moving[at].is_finite()
+    let shape = pair.moving_shape;
+    let along = |a: usize| p[a] + u[a] / pair.spacing[a] - pair.moving_origin[a];
+    let there = VoxelPoint(std::array::from_fn(|a| if shape[a] > 1 { along(a) } else { 0.0 }));
+    nearest(shape, there).is_some_and(|at| pair.moving[at].is_finite())
 }
 
 /// The part of the mask that the deformed volume does not show (1), from every third voxel along each axis.

@@ -78,21 +78,26 @@ pub fn run(
 ) -> Result<StiffnessResult, StiffnessError> {
     params.check()?;
     whole(inputs.labels)?;
-    if let Some(turn) = Turn::of(inputs.field, inputs.labels) {
-        let (field, matches) = (turn.undone(inputs.field), inputs.matches.map(|m| turn.undone_matches(m)));
-        let still = Inputs { field: &field, matches: matches.as_ref(), ..*inputs };
-        let mut result = unturned(&still, params, progress)?;
-        result.warnings.push(format!(
+    let (result, turn) = without_turn(inputs, |inputs| unturned(inputs, params, progress));
+    let mut result = result?;
+    result.warnings.extend(turn.map(|turn| {
+        format!(
             "the body turned by {:.1} degrees as a whole; that was taken out first, and the displacements of the mesh and of the exported \
              models are without it",
             turn.degrees()
-        ));
-        return Ok(result);
-    }
-    unturned(inputs, params, progress)
+        )
+    }));
+    Ok(result)
 }
 
-/// The same for a body that did not turn.
+/// What `then` makes of the inputs without a turn of the whole body, and that turn, if any.
+fn without_turn<R>(inputs: &Inputs<'_>, then: impl FnOnce(&Inputs<'_>) -> R) -> (R, Option<Turn>) {
+    let Some(turn) = Turn::of(inputs.field, inputs.labels) else { return (then(inputs), None) };
+    let (field, matches) = (turn.undone(inputs.field), inputs.matches.map(|m| turn.undone_matches(m)));
+    (then(&Inputs { field: &field, matches: matches.as_ref(), ..*inputs }), Some(turn))
+}
+
+/// [`run`] for a body that did not turn.
 fn unturned(
     inputs: &Inputs<'_>,
     params: &StiffnessParams,
@@ -121,10 +126,8 @@ pub fn check(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<(), Stiffn
     params.check()?;
     whole(inputs.labels)?;
     let mesh = Mesher::new(inputs.labels)?.mesh(&coarse_fineness(inputs.labels, params))?;
-    let turn = Turn::of(inputs.field, inputs.labels);
-    let undone = turn.map(|t| (t.undone(inputs.field), inputs.matches.map(|m| t.undone_matches(m))));
-    let (field, matches) = undone.as_ref().map_or((inputs.field, inputs.matches), |(f, m)| (f, m.as_ref()));
-    Level::new(&mesh, field, matches, inputs.labels, inputs.held, inputs.load, None).map(|_| ())
+    let level = |i: &Inputs<'_>| Level::new(&mesh, i.field, i.matches, i.labels, i.held, i.load, None).map(|_| ());
+    without_turn(inputs, level).0
 }
 
 /// The chain for labelled regions; `tried` is the evidence that led to them.

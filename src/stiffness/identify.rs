@@ -160,9 +160,9 @@ impl Setup<'_> {
     pub(super) fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
         let problem = self.problem(state);
         // What was measured to touch is nearer to the truth than what a body as it was would touch.
-        let guess = || problem.plate.as_ref().map(|p| p.guess(self.body, &self.patches[1].nodes));
-        let start = state.x.clone().or_else(guess);
-        let solution = problem.solve(start.as_deref(), precision)?;
+        let plate = problem.plate.as_ref().filter(|_| state.x.is_none());
+        let guess = plate.map(|p| p.guess(self.body, &self.patches[1].nodes));
+        let solution = problem.solve(state.x.as_deref().or(guess.as_deref()), precision)?;
         Ok((problem, solution))
     }
 
@@ -402,7 +402,7 @@ impl Setup<'_> {
     }
 
     /// How far the plates move against each other (mm).
-    fn travel(&self) -> f64 {
+    pub(super) fn travel(&self) -> f64 {
         let apart = travel(&self.patches);
         dot(apart, apart).sqrt()
     }

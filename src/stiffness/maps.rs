@@ -7,7 +7,7 @@ use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::travel;
-use crate::stiffness::summary::Hidden;
+use crate::stiffness::summary::{BEARS, Hidden};
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
 use std::collections::{BTreeSet, HashSet};
@@ -224,7 +224,7 @@ pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usiz
     let one = |h: &Hidden| {
         let name = regions.iter().find(|r| r.label == h.label).map_or("a region", |r| &r.name);
         let why = match h.share {
-            share if share < 0.03 => "it bears next to nothing of the load".to_string(),
+            share if share < BEARS => "it bears next to nothing of the load".to_string(),
             _ => format!(
                 "it lies beside what else bears the load and gives way with it, so only their mean is known; label it together with {}",
                 regions[reference].name

@@ -8,7 +8,6 @@ use crate::stiffness::choice::bic;
 use crate::stiffness::geometry::Geometry;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::law::stress;
-use crate::stiffness::patches::travel;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, RegionStiffness};
 
@@ -32,7 +31,7 @@ const MOST_MOVED: f64 = 0.02;
 /// Precision of the solution for that (part of the plates' motion).
 const ALIKE: f64 = 0.02;
 /// Part of the force from which a region that is not seen makes a bound of the others' moduli.
-const BEARS: f64 = 0.03;
+pub(super) const BEARS: f64 = 0.03;
 /// Contrasts beyond e^this are checked against a rigid region (12).
 const HIGH: f64 = 2.5;
 /// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and labels leave open.
@@ -119,8 +118,7 @@ pub struct Hidden {
 /// It is looked for where all moduli are alike, under the linear law: a modulus that went astray would hide itself. None as well where
 /// that cannot be solved.
 pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
-    let plates = travel(&setup.patches);
-    let travel = dot(plates, plates).sqrt();
+    let travel = setup.travel();
     let found = shown(setup, estimate);
     if found.iter().all(|moved| *moved > DOUBTED * travel) {
         return None;
