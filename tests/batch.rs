@@ -86,13 +86,14 @@ fn a_pair_that_fails_stops_no_other_and_a_second_run_only_does_what_is_left() {
 #[test]
 fn flaws_of_a_table_are_named_with_their_line() {
     let good = "initial.nii.gz,deformed.nii.gz";
-    let cases: [(&[&str], &str); 8] = [
+    let cases: [(&[&str], &str); 9] = [
         (&["initial,deformd", good], "did you mean 'deformed'"),
         (&["initial,deformed,colour", &format!("{good},red")], "unknown key 'colour'"),
         (&["initial,deformed"], "no pair"),
         (&["initial,deformed,name", &format!("{good},a"), &format!("{good},a")], "line 3: a is the name of line 2 too"),
         (&["initial,deformed,force_n", &format!("{good},-3")], "line 2: force_n is \"-3\""),
         (&["initial,deformed,name", &format!("{good},a/b")], "cannot name a folder"),
+        (&["initial,deformed,name", &format!("{good},batch.csv")], "line 2: \"batch.csv\" is the name of a file"),
         (&["initial,deformed", ",deformed.nii.gz"], "line 2: there is no initial volume"),
         (&["initial,deformed,mask", good], "line 2: 2 values"),
     ];

@@ -38,6 +38,21 @@ fn a_series_is_a_volume_where_its_headers_say() {
     assert_eq!((stored.format, stored.datatype, kind), ("DICOM series", "uint16", io::ImageKind::Scalar));
 }
 
+/// Twelve bits of sixteen: what stands in the other four is no part of the number.
+#[test]
+fn bits_that_are_not_used_do_not_count() {
+    for (bits, less) in
+        [((true, 12, 0), 250), ((true, 12, 0xffff), 250), ((false, 12, 0xa5a5), 0), ((true, 16, 0), 250)]
+    {
+        let folder = series((0..5).map(|n| Slice { bits, less, ..Slice::new(n) }));
+        let volume = io::read_volume(folder.path()).unwrap();
+        let wanted = |k: usize, i: usize| 0.5 * ((100 * k + i) as f32 - f32::from(less)) - 5.0;
+        for (o, v) in volume.as_slice().iter().enumerate() {
+            assert_eq!(*v, wanted(o / 12, o % 12), "{bits:?}, voxel {o}");
+        }
+    }
+}
+
 #[test]
 fn folders_with_flaws_are_named() {
     let refused = |folder: &TempDir, message: &str| {

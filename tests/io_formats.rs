@@ -4,8 +4,8 @@
 use base64::{Engine, engine::general_purpose::STANDARD};
 use palpate::error::IoError;
 use palpate::io::{
-    OutputFolder, PointTable, read_landmarks, read_matches, read_points, write_bytes, write_json, write_landmarks,
-    write_matches, write_points, write_tet_mesh, write_text, write_tri_mesh,
+    OutputFolder, PointTable, read_landmarks, read_matches, read_points, read_trajectories, write_bytes, write_json,
+    write_landmarks, write_matches, write_points, write_tet_mesh, write_text, write_tri_mesh,
 };
 use palpate::types::{Landmark, Match, SparseField, TetMesh, TriMesh, WorldPoint};
 use std::collections::BTreeMap;
@@ -108,6 +108,14 @@ fn bad_tables_are_refused_with_their_line() {
     refused(points(b""), &["line 1"]);
     refused(read_landmarks(put(&folder, "l.csv", b"fx,fy,fz,mx,my,mz\n")), &["l.csv", "no row"]);
     refused(read_matches(put(&folder, "m.csv", b"x,y,z\n1,2,3\n")), &["m.csv", "\"dx\""]);
+    for kept in ["0.5", "-1", "2"] {
+        let table = format!("x,y,z,dx,dy,dz,ncc,sigma,kept\n1,2,3,0,0,0,1,0.1,1\n1,2,3,0,0,0,1,0.1,{kept}\n");
+        refused(read_matches(put(&folder, "m.csv", table.as_bytes())), &["m.csv", "kept", "match 2"]);
+    }
+    for place in ["0,-1", "0,1.5", "-2,1", "0.5,0"] {
+        let table = format!("point,frame,x,y,z,sigma\n0,0,1,2,3,0.1\n{place},1,2,3,0.1\n");
+        refused(read_trajectories(put(&folder, "t.csv", table.as_bytes()), 0), &["t.csv", "row 2", "from 0"]);
+    }
     refused(read_points(folder.path().join("none.csv")), &["none.csv: cannot read", "check the spelling"]);
 }
 

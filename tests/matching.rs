@@ -11,8 +11,8 @@ use palpate::matching::correlation::Searchable;
 use palpate::matching::gain::GainField;
 use palpate::matching::levels::{Aligned, factors, from_level, to_level};
 use palpate::matching::lsm::{self, Template};
-use palpate::matching::pair::{Pair, Spans, dilate};
-use palpate::matching::residual::normal_equations;
+use palpate::matching::pair::{Pair, Spans, dilate, row_step};
+use palpate::matching::residual::{normal_equations, residual_sigma};
 use palpate::numerics::bspline::{Lattice, SmoothSampler};
 use palpate::numerics::filters;
 use palpate::numerics::small::{inverse, quadratic};
@@ -702,6 +702,29 @@ fn reductions_go_from_coarse_to_fine() {
     for f in factors([200, 20, 1], [1.0, 1.0, 5.0], 2, 8.0) {
         assert!(f[2] == 1 && f[1] == 1, "{f:?}");
     }
+}
+
+/// In volumes of 448 x ny x 448 voxels the rows from which the noise was told were all the first of their slice.
+#[test]
+fn rows_are_sampled_all_over_a_volume() {
+    for ny in 1..60 {
+        for wanted in 0..200 {
+            let step = row_step(wanted, ny);
+            assert!((wanted.max(1)..wanted.max(1) + ny).contains(&step), "{wanted} in {ny}: {step}");
+            let mut met: Vec<usize> = (0..ny).map(|n| n * step % ny).collect();
+            met.sort_unstable();
+            assert_eq!(met, (0..ny).collect::<Vec<_>>(), "{wanted} in {ny}: {step}");
+        }
+    }
+    let shape = [448, 4, 448];
+    let inside: Vec<u8> = (0..448 * 4 * 448).map(|o| u8::from(o / 448 % 4 > 0)).collect();
+    let (fixed, _) = texture(shape, 8.0, 6);
+    let mut pair = pair(shape, [1.0; 3], &fixed, &fixed);
+    pair.mask = inside;
+    pair.spans = Spans::new(&pair.mask, shape);
+    let noisy: Vec<f32> = pair.fixed_smooth.iter().zip(normals(fixed.len(), 5)).map(|(f, n)| f + 3.0 * n).collect();
+    let sigma = residual_sigma(&pair, &noisy, &GainField::measure(&pair, &noisy));
+    assert!((sigma / 3.0 - 1.0).abs() < 0.05, "{sigma}");
 }
 
 #[test]

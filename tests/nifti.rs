@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::io::{
-    count_non_finite, read_field, read_header, read_labels, read_mask, read_volume, write_field, write_integers,
-    write_labels, write_volume,
+    Series, count_non_finite, read_field, read_header, read_labels, read_mask, read_volume, write_field,
+    write_integers, write_labels, write_volume,
 };
 use palpate::types::{Affine, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
 use proptest::prelude::*;
@@ -346,33 +346,41 @@ fn trap_slope_is_one_on_disk_and_values_come_back_whole() {
     assert_eq!(read_volume(files.path("v.nii")).unwrap(), volume);
 }
 
+/// Rows of the affine of [`nifti_2`].
+const ROWS_2: [[f64; 4]; 3] = [[0.0, 2.0, 0.0, -1.0], [-3.0, 0.0, 0.0, 5.0], [0.0, 0.0, 4.0, 0.125]];
+
+/// A NIfTI-2 file of the int16 numbers -6 to 5, which stand for half as much and 1 more.
+fn nifti_2(dim: [i64; 8], big_endian: bool) -> Vec<u8> {
+    let mut h = vec![0u8; 544];
+    let mut put = |at: usize, mut b: Vec<u8>| {
+        if big_endian {
+            b.reverse();
+        }
+        h[at..at + b.len()].copy_from_slice(&b);
+    };
+    put(0, 540i32.to_le_bytes().to_vec());
+    put(12, 4i16.to_le_bytes().to_vec());
+    dim.iter().enumerate().for_each(|(i, v)| put(16 + 8 * i, v.to_le_bytes().to_vec()));
+    put(168, 544i64.to_le_bytes().to_vec());
+    put(176, 0.5f64.to_le_bytes().to_vec());
+    put(184, 1f64.to_le_bytes().to_vec());
+    put(348, 1i32.to_le_bytes().to_vec());
+    ROWS_2.iter().flatten().enumerate().for_each(|(i, v): (usize, &f64)| put(400 + 8 * i, v.to_le_bytes().to_vec()));
+    put(500, 2i32.to_le_bytes().to_vec());
+    h[4..12].copy_from_slice(b"n+2\0\r\n\x1a\n");
+    for v in -6..6i16 {
+        h.extend(if big_endian { v.to_be_bytes() } else { v.to_le_bytes() });
+    }
+    h
+}
+
 #[test]
 fn nifti_2_in_both_byte_orders() {
     for big_endian in [false, true] {
-        let mut h = vec![0u8; 544];
-        let mut put = |at: usize, mut b: Vec<u8>| {
-            if big_endian {
-                b.reverse();
-            }
-            h[at..at + b.len()].copy_from_slice(&b);
-        };
-        put(0, 540i32.to_le_bytes().to_vec());
-        put(12, 4i16.to_le_bytes().to_vec());
-        [3i64, 2, 3, 2, 1, 1, 1, 1].iter().enumerate().for_each(|(i, v)| put(16 + 8 * i, v.to_le_bytes().to_vec()));
-        put(168, 544i64.to_le_bytes().to_vec());
-        put(176, 0.5f64.to_le_bytes().to_vec());
-        put(184, 1f64.to_le_bytes().to_vec());
-        put(348, 1i32.to_le_bytes().to_vec());
-        let rows = [[0.0, 2.0, 0.0, -1.0], [-3.0, 0.0, 0.0, 5.0], [0.0, 0.0, 4.0, 0.125]];
-        rows.iter().flatten().enumerate().for_each(|(i, v): (usize, &f64)| put(400 + 8 * i, v.to_le_bytes().to_vec()));
-        put(500, 2i32.to_le_bytes().to_vec());
-        h[4..12].copy_from_slice(b"n+2\0\r\n\x1a\n");
-        for v in -6..6i16 {
-            h.extend(if big_endian { v.to_be_bytes() } else { v.to_le_bytes() });
-        }
+        let mut h = nifti_2([3, 2, 3, 2, 1, 1, 1, 1], big_endian);
         let volume = read(&h).unwrap();
         assert_eq!(volume.as_slice(), (-6..6).map(|v| v as f32 * 0.5 + 1.0).collect::<Vec<_>>());
-        assert_affine(&volume, rows, 0.0);
+        assert_affine(&volume, ROWS_2, 0.0);
         refused(&h[..543], "bytes");
         refused(&h[..500], "header");
         h[5] = b'!';
@@ -413,6 +421,71 @@ fn forged_dimensions_are_refused_before_anything_is_allocated() {
     let zeros = gz(&vec![0; 1 << 24]);
     (0..64).for_each(|_| bomb.extend(&zeros));
     assert_eq!(read(&bomb).unwrap().as_slice(), counting());
+}
+
+/// With 2^60 frames the number of bytes once came round to nothing, and a name was made for each frame.
+#[test]
+fn axes_whose_product_is_past_all_numbers_are_refused() {
+    let huge = i64::MAX;
+    for dim in [
+        [4, 2, 3, 2, 1 << 62, 1, 1, 1],
+        [4, 2, 3, 2, 1 << 60, 1, 1, 1],
+        [4, 2, 3, 2, 1 << 52, 1, 1, 1],
+        [5, 2, 3, 2, 1 << 32, 1 << 32, 1, 1],
+        [7, 2, 3, 2, huge, huge, huge, huge],
+    ] {
+        for bytes in [nifti_2(dim, false), gz(&nifti_2(dim, true))] {
+            let files = Files::new();
+            let path = files.put("v.nii", &bytes);
+            assert!(Series::open(&path).is_err(), "{dim:?}");
+            assert!(read_volume(&path).is_err() && read_field(&path).is_err(), "{dim:?}");
+            let _ = read_header(&path);
+        }
+    }
+}
+
+fn series(frames: i16) -> Vec<u8> {
+    let voxels = (0..12 * i32::from(frames)).flat_map(|i| (i as f32).to_le_bytes()).collect();
+    Fixture { dim: [4, 2, 3, 2, frames, 1, 1, 1], voxels, ..fixture() }.bytes()
+}
+
+/// All frames of a file in order, as numbers.
+fn frames(bytes: &[u8]) -> Result<Vec<f32>, String> {
+    let files = Files::new();
+    let mut series = Series::open(files.put("v.nii.gz", bytes)).map_err(|e| e.to_string())?;
+    let all: Result<Vec<_>, _> = (0..series.frames()).map(|at| series.read(at)).collect();
+    all.map(|v| v.iter().flat_map(|v| v.as_slice().to_vec()).collect()).map_err(|e| e.to_string())
+}
+
+#[test]
+fn the_checksum_of_a_packed_series_is_checked() {
+    let good = gz(&series(5));
+    let wanted: Vec<f32> = (0..60).map(|i| i as f32).collect();
+    assert_eq!(frames(&good).unwrap(), wanted);
+    for at in good.len() - 8..good.len() {
+        let mut bytes = good.clone();
+        bytes[at] ^= 1;
+        let why = frames(&bytes).unwrap_err();
+        assert!(why.contains("damaged"), "byte {at}: {why}");
+    }
+    for end in 0..good.len() {
+        assert!(frames(&good[..end]).is_err(), "cut after {end} bytes");
+    }
+}
+
+#[test]
+fn a_series_of_several_members_with_padding_is_read() {
+    let plain = series(3);
+    let mut bytes = [gz(&plain[..400]), gz(&plain[400..401]), gz(&[]), gz(&plain[401..])].concat();
+    bytes.extend([0; 700]);
+    let wanted: Vec<f32> = (0..36).map(|i| i as f32).collect();
+    assert_eq!(frames(&bytes).unwrap(), wanted);
+    let files = Files::new();
+    let mut series = Series::open(files.put("v.nii.gz", &bytes)).unwrap();
+    // Backwards, the last one twice.
+    for at in [2, 2, 1, 0, 2] {
+        assert_eq!(series.read(at).unwrap().as_slice(), &wanted[12 * at..12 * (at + 1)]);
+    }
 }
 
 #[test]
@@ -636,6 +709,9 @@ proptest! {
         let path = files.put("v.nii", &bytes);
         let _ = read_field(&path);
         let _ = read_labels(&path);
+        if let Ok(mut series) = Series::open(&path) {
+            let _ = series.read(0);
+        }
         if let Ok(volume) = read_volume(&path) {
             prop_assert!(volume.as_slice().len() <= 400);
         }

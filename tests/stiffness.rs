@@ -412,6 +412,28 @@ fn a_homogeneous_block_in_two_labels_has_one_modulus_and_the_right_one() {
     assert!((result.model_force / force - 1.0).abs() < 0.05);
 }
 
+/// The first frame's bound once scaled the exported models when a later frame determined the region.
+#[test]
+fn a_shared_map_and_its_models_hold_the_same_moduli() {
+    let halves =
+        labels([20; 3], 1.0, |p| if p.iter().all(|v| (2.0..18.0).contains(v)) { 1 + u8::from(p[2] > 9.0) } else { 0 });
+    let params = StiffnessParams { model: LawChoice::Linear, force_n: Some(0.192), nodes: 1000, ..Default::default() };
+    let result = identify(&halves, &squeezed(0.03, 0.49), &params);
+    let mut bounded = result.clone();
+    (bounded.regions[1].identifiable, bounded.regions[1].bound) = (false, Some("lower"));
+    bounded.regions[1].youngs_modulus *= 0.4;
+    let mut sequence = palpate::pipeline::stiffness_sequence::Sequence::default();
+    sequence.add(2, 0.3, Ok(bounded));
+    sequence.add(1, 0.2, Ok(result));
+    let shared = sequence.finish(&halves).unwrap().result;
+    for region in &shared.regions {
+        assert!(region.identifiable);
+        for (label, e) in shared.mesh.labels().iter().zip(&shared.element_modulus).filter(|l| *l.0 == region.label) {
+            assert!((e / region.youngs_modulus - 1.0).abs() < 1e-9, "region {label}: {e}, {}", region.youngs_modulus);
+        }
+    }
+}
+
 /// Side by side between plates without friction every ratio leads to one field: both halves bear the force, in parts that nothing shows.
 #[test]
 fn of_halves_side_by_side_only_the_mean_is_claimed() {
@@ -633,6 +655,14 @@ fn noisy(truth: &DenseField, noise: f64, seed: u64) -> DenseField {
 
 /// What is found without labels in a field of a phantom.
 fn without_labels(body: &Pressed, field: &DenseField, nodes: usize) -> StiffnessResult {
+    unlabelled(body, field, &unlabelled_params(body, nodes))
+}
+
+fn unlabelled_params(body: &Pressed, nodes: usize) -> StiffnessParams {
+    StiffnessParams { force_n: Some(body.force_n), nodes, ..StiffnessParams::default() }
+}
+
+fn unlabelled(body: &Pressed, field: &DenseField, params: &StiffnessParams) -> StiffnessResult {
     let known = &body.phantom.stiffness.as_ref().unwrap().labels;
     let tissue = Mask::from_voxels(*known.grid(), |at, _| u8::from(known.as_slice()[at] != 0));
     let [held, load] = ["z-", "z+"].map(|side| Place::Side(Side::parse(side).unwrap()));
@@ -645,8 +675,7 @@ fn without_labels(body: &Pressed, field: &DenseField, nodes: usize) -> Stiffness
         load: &load,
         names: &|label| format!("region {label}"),
     };
-    let params = StiffnessParams { force_n: Some(body.force_n), nodes, ..StiffnessParams::default() };
-    run(&inputs, &params, &|_, _| {}).unwrap()
+    run(&inputs, params, &|_, _| {}).unwrap()
 }
 
 #[test]
@@ -715,6 +744,19 @@ fn twice_as_stiff_is_told_within_its_bars() {
 #[ignore = "two to three minutes without the release profile: cargo test --release --test stiffness -- --ignored"]
 fn ten_times_as_stiff_is_told_within_its_bars() {
     holds_its_bars(10.0, 61);
+}
+
+#[test]
+fn one_region_by_request_is_not_called_enough() {
+    let body = inclusion(5.0, 73, 48);
+    let params = StiffnessParams { regions: 1, ..unlabelled_params(&body, 2_500) };
+    let result = unlabelled(&body, &body.phantom.truth, &params);
+    assert_eq!(result.regions.len(), 1);
+    let about = |model: &str| result.evidence.iter().find(|e| e.question == "regions" && e.model == model).unwrap();
+    assert!(about("1").chosen && about("1").reason.contains("stands out"), "{:?}", result.evidence);
+    assert!(!about("2").chosen && about("2").reason.contains("not tried"), "{:?}", result.evidence);
+    let said = palpate::report::stiffness::verdict(&result);
+    assert!(said.contains("One modulus does not explain the field"), "{said}");
 }
 
 #[test]

@@ -11,6 +11,9 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
+/// Files of a batch beside the folders of its pairs.
+const RESERVED: [&str; 3] = ["batch.csv", "regions.csv", "report.html"];
+
 /// Columns of a table of pairs; the first two are needed.
 pub const PAIR_COLUMNS: [&str; 12] = [
     "initial", "deformed", "mask", "labels", "names", "held", "load", "force_n", "scene", "name", "subject", "session",
@@ -63,6 +66,9 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
         };
         let name = text("name").unwrap_or_else(called);
         let fit = name.chars().all(|c| c.is_alphanumeric() || "-_.+".contains(c)) && !name.starts_with('.');
+        if RESERVED.contains(&name.as_str()) {
+            return Err(flaw(format!("{name:?} is the name of a file of the results"), "call the pair something else"));
+        }
         if !fit {
             return Err(flaw(format!("{name:?} cannot name a folder"), "use letters, digits, - and _"));
         }

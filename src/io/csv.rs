@@ -77,10 +77,15 @@ pub fn write_matches(path: impl AsRef<Path>, field: &SparseField) -> Result<(), 
 /// Reads what [`write_matches`] writes; the covariance becomes sigma squared along each axis.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read, a column is missing or a value is not a finite number.
+/// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number or kept neither 0 nor 1.
 pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
-    let matches = read_table(path.as_ref(), MATCH_COLUMNS)?.numbers.into_iter();
-    let matches = matches.map(|[x, y, z, dx, dy, dz, ncc, sigma, kept]| Match {
+    let path = path.as_ref();
+    let matches = read_table(path, MATCH_COLUMNS)?.numbers;
+    if let Some(row) = matches.iter().position(|m| m[8] != 0.0 && m[8] != 1.0) {
+        let what = format!("kept is {} in match {}, neither 0 nor 1", matches[row][8], row + 1);
+        return Err(format(path, what, "1 is for a match to be used, 0 for one cast out"));
+    }
+    let matches = matches.into_iter().map(|[x, y, z, dx, dy, dz, ncc, sigma, kept]| Match {
         initial: WorldPoint([x, y, z]),
         displacement: [dx, dy, dz],
         ncc: ncc as f32,

@@ -30,6 +30,8 @@ const FRAMES: Tag = (0x0028, 0x0008);
 const ROWS: Tag = (0x0028, 0x0010);
 const COLUMNS: Tag = (0x0028, 0x0011);
 const BITS: Tag = (0x0028, 0x0100);
+const BITS_STORED: Tag = (0x0028, 0x0101);
+const HIGH_BIT: Tag = (0x0028, 0x0102);
 const SIGNED: Tag = (0x0028, 0x0103);
 const INTERCEPT: Tag = (0x0028, 0x1052);
 const SLOPE: Tag = (0x0028, 0x1053);
@@ -42,6 +44,8 @@ struct Slice {
     series: String,
     shape: [usize; 2],
     kind: Kind,
+    /// Highest bits of a number that are none of it (PS3.5, 8.1.1): whatever stands there.
+    unused: usize,
     scaling: (f64, f64),
     position: [f64; 3],
     /// Along a row and down a column (LPS, unit vectors).
@@ -105,6 +109,11 @@ impl Slice {
             (Some(16), true) => Kind::I16,
             (bits, _) => return Err(Flaw::new(format!("holds {} bits a voxel", bits.unwrap_or(0)), CONVERT)),
         };
+        let bits = 8 * kind.size();
+        let used = count(&object, BITS_STORED).unwrap_or(bits);
+        if !(1..=bits).contains(&used) || count(&object, HIGH_BIT).unwrap_or(used - 1) != used - 1 {
+            return Err(Flaw::new(format!("holds {used} bits in {bits} that are not the lowest ones"), CONVERT));
+        }
         let [down, along] = numbers(&object, SPACING, "PixelSpacing")?;
         let [a, b, c, d, e, f] = numbers(&object, ORIENTATION, "ImageOrientationPatient")?;
         let one = |tag, default: f64| numbers(&object, tag, "").map_or(default, |[v]: [f64; 1]| v);
@@ -114,6 +123,7 @@ impl Slice {
             series: series.unwrap_or_default(),
             shape: [side(COLUMNS, "Columns")?, side(ROWS, "Rows")?],
             kind,
+            unused: bits - used,
             scaling: (one(SLOPE, 1.0), one(INTERCEPT, 0.0)),
             position: numbers(&object, POSITION, "ImagePositionPatient")?,
             axes: [[a, b, c], [d, e, f]],
@@ -131,8 +141,22 @@ impl Slice {
             let what = format!("needs {needed} bytes for its voxels but holds {}", pixels.len());
             Flaw::new(what, "the file is cut short: copy or export it again").at(&self.path)
         })?;
-        Ok(decode(self.kind, false, self.scaling, stored))
+        let mut numbers = stored.to_vec();
+        let unused = self.unused;
+        match self.kind {
+            _ if unused == 0 => {}
+            Kind::U8 => numbers.iter_mut().for_each(|b| *b = *b << unused >> unused),
+            Kind::I8 => numbers.iter_mut().for_each(|b| *b = (b.cast_signed() << unused >> unused).cast_unsigned()),
+            Kind::U16 => words(&mut numbers, |w| w << unused >> unused),
+            _ => words(&mut numbers, |w| (w.cast_signed() << unused >> unused).cast_unsigned()),
+        }
+        Ok(decode(self.kind, false, self.scaling, &numbers))
     }
+}
+
+/// Changes every 16-bit number.
+fn words(bytes: &mut [u8], change: impl Fn(u16) -> u16) {
+    bytes.as_chunks_mut().0.iter_mut().for_each(|b| *b = change(u16::from_le_bytes(*b)).to_le_bytes());
 }
 
 /// Stored form and values of the series in a folder; the values only when they are wanted.

@@ -4,6 +4,7 @@
 //! are joined in order into a single member, which even readers that stop after the first member accept.
 
 use super::deflate::{FINISH, deflate};
+use super::flaw::Flaw;
 use flate2::Crc;
 use flate2::bufread::GzDecoder;
 use std::io::{self, BufRead, Read, Seek, SeekFrom, Write};
@@ -12,11 +13,13 @@ use std::ops::Range;
 /// No DEFLATE stream unpacks to more than this many times its size.
 pub(super) const LARGEST_RATIO: u64 = 1032;
 /// Bytes after the voxels that are still read, to check the checksum behind them.
-const SLACK: usize = 1 << 20;
+const SLACK: u64 = 1 << 20;
+/// How every member begins.
+const MAGIC: [u8; 2] = [0x1f, 0x8b];
 
 /// Whether the bytes start as gzip does.
 pub(super) fn is_gzip(bytes: &[u8]) -> bool {
-    bytes.starts_with(&[0x1f, 0x8b])
+    bytes.starts_with(&MAGIC)
 }
 
 /// A packed part of a member.
@@ -107,21 +110,51 @@ pub(super) fn unpack(packed: &[u8], needed: usize) -> io::Result<Vec<u8>> {
     if let Some(data) = unpack_single(packed, needed) {
         return Ok(data);
     }
-    let mut data = Vec::new();
-    let mut rest = packed;
-    while data.len() < needed && is_gzip(rest) {
-        let mut member = GzDecoder::new(rest);
-        member.by_ref().take((needed - data.len()) as u64).read_to_end(&mut data)?;
-        io::copy(&mut member.by_ref().take(SLACK as u64), &mut io::sink())?;
-        rest = member.into_inner();
-    }
+    let (mut data, mut members) = (Vec::new(), Members::new(packed));
+    members.by_ref().take(needed as u64).read_to_end(&mut data)?;
+    check_end(&mut members)?;
     Ok(data)
+}
+
+/// Reads on behind the voxels so that the checksum there is checked; the bytes that were skipped.
+pub(super) fn check_end(unpacked: &mut impl Read) -> io::Result<u64> {
+    io::copy(&mut unpacked.take(SLACK), &mut io::sink())
+}
+
+/// What is wrong with a file that does not unpack.
+pub(super) fn damaged(e: &io::Error) -> Flaw {
+    Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again")
+}
+
+/// Unpacks members one after the other and checks the checksum of each; ends where no further member starts (padding).
+pub(super) struct Members<R>(Option<GzDecoder<R>>);
+
+impl<R: BufRead> Members<R> {
+    pub(super) fn new(packed: R) -> Self {
+        Self(Some(GzDecoder::new(packed)))
+    }
+}
+
+impl<R: BufRead> Read for Members<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        while let Some(mut member) = self.0.take() {
+            let count = member.read(buffer);
+            if !matches!(count, Ok(0)) || buffer.is_empty() {
+                self.0 = Some(member);
+                return count;
+            }
+            let mut rest = member.into_inner();
+            // One byte is all that a buffer is sure to hold.
+            self.0 = rest.fill_buf()?.starts_with(&MAGIC[..1]).then(|| GzDecoder::new(rest));
+        }
+        Ok(0)
+    }
 }
 
 /// The fast path: one member that ends the file, whose last four bytes say how long it is.
 fn unpack_single(packed: &[u8], needed: usize) -> Option<Vec<u8>> {
     let size = u32::from_le_bytes(*packed.last_chunk()?) as usize;
-    if !(needed..=needed + SLACK).contains(&size) {
+    if !(needed..=needed + SLACK as usize).contains(&size) {
         return None;
     }
     Vec::<u8>::new().try_reserve_exact(size).ok()?;

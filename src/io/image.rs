@@ -85,7 +85,7 @@ pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoErro
         Format::Nifti => {
             let (stored, intent) = nifti::read::header(path)?;
             let kind = match stored.axes.get(3..).unwrap_or(&[]) {
-                rest if rest.iter().product::<usize>() == 1 => ImageKind::Scalar,
+                rest if rest.iter().all(|&n| n == 1) => ImageKind::Scalar,
                 [1, 3, ..] => ImageKind::Field,
                 [3] if intent == 2006 => ImageKind::Field,
                 [_] => ImageKind::Series,

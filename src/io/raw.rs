@@ -4,7 +4,7 @@ use super::flaw::Flaw;
 use super::gzip::{self, LARGEST_RATIO};
 use super::image::Stored;
 use super::os;
-use super::voxels::{Kind, decode};
+use super::voxels::{Kind, count, decode};
 use crate::error::IoError;
 use crate::types::{Affine, Grid};
 use std::fs::File;
@@ -101,7 +101,7 @@ impl RawImage {
 
     /// Bytes of all numbers.
     fn needed(&self) -> u64 {
-        (self.grid.len() * self.components).saturating_mul(self.kind.size()) as u64
+        count(&[self.grid.len(), self.components, self.kind.size()]) as u64
     }
 
     /// The file holds at most so many bytes where all numbers need more.

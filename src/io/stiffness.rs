@@ -6,6 +6,7 @@
 use super::atomic::write_atomic;
 use super::csv::write_table;
 use crate::error::IoError;
+use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Law, Prescribed, RegionStiffness, SharedStiffness, StiffnessResult};
 use std::io::{self, Write};
 use std::path::Path;
@@ -93,18 +94,42 @@ fn components(p: &Prescribed) -> Vec<(usize, f64)> {
     }
 }
 
-/// Nodes and axes that hold the body where every plate slides along the same plane: without force, as nothing else does.
+/// Nodes and axes that hold the body where what is prescribed leaves it free to move as a rigid body (plates that slide):
+/// without force, as nothing else acts along them. Each holds what is still free better than any other would.
 fn pins(result: &StiffnessResult) -> Vec<(u32, usize)> {
-    let Some(first) = result.prescribed.first() else { return Vec::new() };
-    let Some(normal) = axis_of(first).filter(|a| result.prescribed.iter().all(|p| axis_of(p) == Some(*a))) else {
-        return Vec::new();
+    let place = |p: &Prescribed| result.mesh.nodes()[p.node as usize];
+    let Some(first) = result.prescribed.first().map(place) else { return Vec::new() };
+    let arm = |p: &Prescribed| place(p).minus(first);
+    let size = result.prescribed.iter().map(|p| dot(arm(p), arm(p))).fold(0.0, f64::max).sqrt().max(f64::MIN_POSITIVE);
+    // How a component of a node moves with a translation of the body and a rotation about the first node; what is left of
+    // it beside the motions that are held already (orthonormal).
+    let left = |held: &[[f64; 6]], p: &Prescribed, a: usize| {
+        let mut axis = [0.0; 3];
+        axis[a] = 1.0;
+        let turn = cross(arm(p), axis).map(|v| v / size);
+        let mut row: [f64; 6] = std::array::from_fn(|i| if i < 3 { axis[i] } else { turn[i - 3] });
+        for h in held {
+            let along: f64 = h.iter().zip(&row).map(|(h, r)| h * r).sum();
+            row.iter_mut().zip(h).for_each(|(r, h)| *r -= along * h);
+        }
+        (row.iter().map(|r| r * r).sum::<f64>().sqrt(), row)
     };
-    let [u, v] = [(normal + 1) % 3, (normal + 2) % 3];
-    let place = |p: &Prescribed| result.mesh.nodes()[p.node as usize].0;
-    let apart = |p: &Prescribed, a: usize| (place(p)[a] - place(first)[a]).abs();
-    let far = result.prescribed.iter().max_by(|a, b| apart(a, u).total_cmp(&apart(b, u)));
-    // Held at one node along both axes, and against turning at the one furthest off along the first axis.
-    [(first.node, u), (first.node, v)].into_iter().chain(far.map(|p| (p.node, v))).collect()
+    let mut held: Vec<[f64; 6]> = Vec::new();
+    for (p, a) in result.prescribed.iter().flat_map(|p| components(p).into_iter().map(move |c| (p, c.0))) {
+        let (length, row) = left(&held, p, a);
+        if length > 1e-3 && held.len() < 6 {
+            held.push(row.map(|r| r / length));
+        }
+    }
+    let mut out = Vec::new();
+    while held.len() < 6 {
+        let all = result.prescribed.iter().flat_map(|p| (0..3).map(move |a| (p, a)));
+        let best = all.map(|(p, a)| (left(&held, p, a), p.node, a)).max_by(|x, y| x.0.0.total_cmp(&y.0.0));
+        let Some(((length, row), node, a)) = best.filter(|b| b.0.0 > 1e-6) else { break };
+        held.push(row.map(|r| r / length));
+        out.push((node, a));
+    }
+    out
 }
 
 /// Writes the model for Abaqus and CalculiX: C3D10 elements, `*ELASTIC` or `*HYPERELASTIC, NEO HOOKE`, one static step with
@@ -213,6 +238,10 @@ pub fn write_feb(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(),
             let all: Vec<String> = group.iter().map(|p| (p.node + 1).to_string()).collect();
             writeln!(w, "\t\t<NodeSet name=\"{name}\">{}</NodeSet>", all.join(","))?;
         }
+        let pins = pins(result);
+        for (i, (node, _)) in (1..).zip(&pins) {
+            writeln!(w, "\t\t<NodeSet name=\"pin{i}\">{}</NodeSet>", node + 1)?;
+        }
         writeln!(w, "\t</Mesh>\n\t<MeshDomains>")?;
         for (label, _, _) in &materials {
             writeln!(w, "\t\t<SolidDomain name=\"region{label}\" mat=\"material{label}\"/>")?;
@@ -242,6 +271,14 @@ pub fn write_feb(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(),
                      <value lc=\"1\" type=\"map\">{name}_{axis}</value><relative>0</relative></bc>"
                 )?;
             }
+        }
+        for (i, (node, a)) in (1..).zip(&pins) {
+            let (axis, value) = (names[*a], result.displacement[*node as usize][*a]);
+            writeln!(
+                w,
+                "\t\t<bc name=\"pin{i}\" type=\"prescribed displacement\" node_set=\"pin{i}\"><dof>{axis}</dof>\
+                 <value lc=\"1\">{value:.9e}</value><relative>0</relative></bc>"
+            )?;
         }
         writeln!(
             w,

@@ -31,10 +31,17 @@ pub fn write_trajectories(
 /// Reads the points that were measured in each frame, as matches from the reference frame's places.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read, a column is missing or a value is not a finite number.
+/// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number, or a point or frame no whole one.
 pub fn read_trajectories(path: impl AsRef<Path>, reference: usize) -> Result<BTreeMap<usize, SparseField>, IoError> {
-    let table = read_table(path.as_ref(), ["point", "frame", "x", "y", "z", "sigma"])?;
+    let path = path.as_ref();
+    let table = read_table(path, ["point", "frame", "x", "y", "z", "sigma"])?;
     let state = table.other_columns.iter().position(|c| c.eq_ignore_ascii_case("state"));
+    let whole = |v: f64| v >= 0.0 && v.fract() == 0.0;
+    if let Some(row) = table.numbers.iter().position(|n| !whole(n[0]) || !whole(n[1])) {
+        let [point, frame, ..] = table.numbers[row];
+        let what = format!("point is {point} and frame {frame} in row {}: both are counted from 0", row + 1);
+        return Err(super::format(path, what, "give whole numbers, as palpate track writes them"));
+    }
     let mut start = BTreeMap::new();
     for &[point, frame, x, y, z, _] in &table.numbers {
         if frame as usize == reference {

@@ -17,6 +17,11 @@ pub(super) enum Kind {
     F64,
 }
 
+/// Product of the lengths of axes, `usize::MAX` where it is more: what no file can hold.
+pub(super) fn count(axes: &[usize]) -> usize {
+    axes.iter().fold(1, |n: usize, &length| n.saturating_mul(length))
+}
+
 impl Kind {
     /// Bytes of one number.
     pub(super) fn size(self) -> usize {

@@ -6,7 +6,7 @@
 //! sums of the blocks are smoothed over their neighbours and interpolated linearly. For the passes, what smoothing flattens of a bias is
 //! measured again on the corrected blocks and put back (twicing; Tukey 1977): what was left of it looked like motion.
 
-use crate::matching::pair::Pair;
+use crate::matching::pair::{Pair, row_step};
 use crate::numerics::filters::gradient_rows;
 use crate::numerics::pyramid;
 use crate::numerics::simd::dispatch;
@@ -54,7 +54,7 @@ pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 
     let room = || std::array::from_fn(|_| vec![0.0f32; nx]);
     let rows = mask.len() / nx;
     let (mut sum, mut count, mut g) = (0.0f64, 0usize, room());
-    for row in (0..rows).step_by((rows / SAMPLED).max(1)) {
+    for row in (0..rows).step_by(row_step(rows / SAMPLED, ny)) {
         squares(row, &mut g);
         for (square, _) in g[3].iter().zip(&mask[row * nx..]).filter(|(s, m)| **m != 0 && s.is_finite()) {
             (sum, count) = (sum + f64::from(*square), count + 1);

@@ -145,6 +145,18 @@ impl Pair<'_> {
     }
 }
 
+/// Step of at least `wanted` (and 1) through the rows `(j, k)` of a volume of `ny` rows a slice, as they lie in memory, that meets
+/// every `j` alike: it has no divisor in common with `ny`, which else could give the same few rows of each slice.
+pub fn row_step(wanted: usize, ny: usize) -> usize {
+    let divisor = |mut a: usize, mut b: usize| {
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a
+    };
+    (wanted.max(1)..).find(|&step| divisor(step, ny) == 1).unwrap_or(1)
+}
+
 /// One run of voxels along each row of a volume, wide enough for all that matters there.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spans {

@@ -7,7 +7,7 @@
 //! overshoot) and no pair of nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`.
 
 use crate::matching::gain::GainField;
-use crate::matching::pair::Pair;
+use crate::matching::pair::{Pair, row_step};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
@@ -31,7 +31,7 @@ pub struct NormalEquations {
 pub fn residual_sigma(pair: &Pair<'_>, warped: &[f32], gain: &GainField) -> f32 {
     let [nx, ny, nz] = pair.shape;
     let rows = ny * nz;
-    let stride = (pair.fixed.len() / 200_000).max(1);
+    let stride = row_step(pair.fixed.len() / 200_000, ny);
     let (mut a, mut b) = (vec![0.0; nx], vec![0.0; nx]);
     let mut r = Vec::new();
     for row in (0..rows).step_by(stride) {

@@ -71,14 +71,16 @@ pub(super) fn regions(
     let noise = maps::noise(inputs.field, inputs.labels, |d, s, k| f64::from(noise_sigma(d, s, k)));
     let mut support = Support::new(&one, &choice, noise);
     let mut labels = inputs.labels.clone();
-    if support.may_hold_more() {
+    if support.may_hold_more() && params.regions == 1 {
+        support.none(2, "not tried: at most one region is asked for");
+    } else if support.may_hold_more() {
         progress("map", 0.2);
         let setup = one.setup(choice.law, params.poisson, 0);
         let map = unlabelled::map(&setup, &choice.estimate.state, support.target())?;
         for count in 2..=params.regions {
             progress("regions", 0.6 + 0.4 * count as f64 / (params.regions + 1) as f64);
             let Some(mut candidate) = unlabelled::regions(&map, inputs.labels, count) else {
-                support.none(count);
+                support.none(count, "the map does not fall into so many regions");
                 break;
             };
             let mut more = level(&candidate)?;

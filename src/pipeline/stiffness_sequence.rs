@@ -55,12 +55,11 @@ impl Sequence {
             if result.absolute { (0..count).map(|r| combine(&of(r), 0)).collect() } else { ratios.clone() };
         for ((region, gain), ratio) in result.regions.iter_mut().zip(&gains).zip(&ratios) {
             let (Some(gain), Some(ratio)) = (gain.last(), ratio.last()) else { continue };
-            let scale = gain.value / region.youngs_modulus;
             (region.identifiable, region.bound) = (true, None);
             (region.youngs_modulus, region.sd) = (gain.value, gain.sd);
             (region.ratio, region.ratio_sd) = (ratio.value, ratio.sd);
             let of_region = result.mesh.labels().iter().zip(&mut result.element_modulus);
-            of_region.filter(|(l, _)| **l == region.label).for_each(|(_, e)| *e *= scale);
+            of_region.filter(|(l, _)| **l == region.label).for_each(|(_, e)| *e = gain.value);
         }
         let names: Vec<u8> = result.regions.iter().map(|r| r.label).collect();
         result.map = maps::by_label(labels, &names, &|r| result.regions[r].youngs_modulus);

@@ -61,7 +61,8 @@ pub fn verdict(result: &StiffnessResult) -> String {
     let count = result.regions.len();
     let mut out = match (count, result.labelled) {
         (1, false) if asks_for_more(result) => {
-            "One modulus does not explain the field, and no second region was found that does.".to_string()
+            "One modulus does not explain the field, and no second region was accepted (the evidence says why)."
+                .to_string()
         }
         (1, false) => "The data do not support a second region: one modulus explains the field.".to_string(),
         (n, false) => format!("The data support {n} regions."),

@@ -110,8 +110,8 @@ impl Support {
         self.noise[1].hypot(0.5 * self.geometry)
     }
 
-    /// No such regions came out of the map.
-    pub fn none(&mut self, count: usize) {
+    /// There is no estimate with so many regions.
+    pub fn none(&mut self, count: usize, why: &str) {
         self.evidence.push(Evidence {
             question: "regions",
             model: count.to_string(),
@@ -119,7 +119,7 @@ impl Support {
             residual_mm: self.rms,
             bic: f64::INFINITY,
             chosen: false,
-            reason: "the map does not fall into so many regions".into(),
+            reason: why.into(),
         });
         self.close();
     }

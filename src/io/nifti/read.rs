@@ -5,7 +5,7 @@ use super::header::{Header, LONGEST};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
 use crate::io::image::Stored;
-use crate::io::voxels::{self, Kind};
+use crate::io::voxels::{self, Kind, count};
 use crate::io::{gzip, os};
 use crate::types::Grid;
 use std::fs::{self, File};
@@ -53,7 +53,7 @@ fn scalar_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
         let what = format!("is a vector field (dim {:?}, intent {}), not a scalar volume", axes, h.intent);
         return Err(Flaw::new(what, "give an image here; fields go to --field or to `palpate warp`"));
     }
-    match axes[3..].iter().product::<usize>() {
+    match count(&axes[3..]) {
         1 => Ok(1),
         n => Err(Flaw::new(
             format!("is a series of {n} volumes (dim {:?}), one is needed", &axes[..h.dim[0] as usize]),
@@ -155,9 +155,7 @@ fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
         true => {
             let mut packed = Vec::new();
             file.read_to_end(&mut packed).map_err(os(path, "read"))?;
-            let data = gzip::unpack(&packed, end).map_err(|e| {
-                Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again").at(path)
-            })?;
+            let data = gzip::unpack(&packed, end).map_err(|e| gzip::damaged(&e).at(path))?;
             plan.end_within(data.len() as u64).map_err(|flaw| flaw.at(path))?;
             decode(&plan, &data[plan.start as usize..end])
         }
@@ -199,7 +197,7 @@ impl Plan {
             big_endian: header.big_endian,
             scaling: header.scaling()?,
             start: header.data_offset()?,
-            bytes: (grid.len() * components * kind.size()) as u64,
+            bytes: count(&[grid.len(), components, kind.size()]) as u64,
             intent: Intent { code: header.intent, niftyreg: header.niftyreg, kind: header.intent_p1 },
         })
     }

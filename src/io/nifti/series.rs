@@ -4,9 +4,10 @@ use super::header::Header;
 use super::read::{Opened, Plan, decode, open};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
+use crate::io::gzip::{self, Members};
 use crate::io::os;
+use crate::io::voxels::count;
 use crate::types::{Grid, Volume};
-use flate2::bufread::MultiGzDecoder;
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -24,13 +25,13 @@ pub struct Series {
 enum Source {
     Plain(File),
     /// With the number of bytes that were unpacked so far.
-    Packed(Box<MultiGzDecoder<BufReader<File>>>, u64),
+    Packed(Box<Members<BufReader<File>>>, u64),
 }
 
 impl Source {
     /// From the file's start.
     fn packed(file: File) -> Self {
-        Self::Packed(Box::new(MultiGzDecoder::new(BufReader::with_capacity(1 << 18, file))), 0)
+        Self::Packed(Box::new(Members::new(BufReader::with_capacity(1 << 18, file))), 0)
     }
 }
 
@@ -87,9 +88,7 @@ impl Series {
         let length = self.plan.bytes / self.frames as u64;
         let from = self.plan.start + at as u64 * length;
         let mut data = Vec::new();
-        let damaged = |e: io::Error| {
-            Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again").at(path)
-        };
+        let damaged = |e: io::Error| gzip::damaged(&e).at(path);
         if matches!(self.source, Source::Packed(_, done) if done > from) {
             self.source = Source::packed(File::open(path).map_err(os(path, "read"))?);
         }
@@ -102,6 +101,9 @@ impl Series {
                 io::copy(&mut unpacked.by_ref().take(from - *done), &mut io::sink()).map_err(damaged)?;
                 unpacked.by_ref().take(length).read_to_end(&mut data).map_err(damaged)?;
                 *done = from + length;
+                if at + 1 == self.frames {
+                    *done += gzip::check_end(unpacked.as_mut()).map_err(damaged)?;
+                }
             }
         }
         if data.len() as u64 != length {
@@ -115,7 +117,7 @@ impl Series {
 
 /// The frames stand where a field has its components: both are volumes one after the other.
 fn layout(_: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
-    match axes[4..].iter().product::<usize>() {
+    match count(&axes[4..]) {
         1 => Ok(axes[3]),
         _ => Err(Flaw::new(
             format!("has axes {axes:?}: more than space and time"),
