@@ -367,6 +367,40 @@ fn a_block_that_is_not_finite_is_survived_with_a_warning() {
     assert!(result.summary.warnings.iter().any(|w| w.contains("216 voxels") && w.contains("not finite")));
 }
 
+/// A slice that a scanner or a converter dropped was matched as if it were tissue: a thigh came out 7 mm off.
+#[test]
+fn lost_slices_are_left_out_and_said() {
+    let whole = phantom(&block(40, MotionKind::Smooth, 2.0)).unwrap();
+    let (clean, _) = measure_with(&whole, &FieldParams::default());
+    let error = |field: &DenseField| evaluate::metrics(field, &whole.truth, Some(&whole.mask), &[]).unwrap().mean_mm;
+    let least = error(&clean.displacement);
+    assert!(!clean.summary.warnings.iter().any(|w| w.contains("as lost")), "{:?}", clean.summary.warnings);
+    let g = *whole.initial.grid();
+    let lose = |v: &mut Volume, axis: usize, slices: std::ops::Range<usize>| {
+        for (at, v) in v.as_mut_slice().iter_mut().enumerate() {
+            *v *= f32::from(!slices.contains(&g.voxel(at)[axis]));
+        }
+    };
+    for (axis, slices) in [(2, 19..20), (1, 15..17)] {
+        for of_initial in [true, false] {
+            let mut p = whole.clone();
+            let (volume, name) = if of_initial { (&mut p.initial, "initial") } else { (&mut p.deformed, "deformed") };
+            lose(volume, axis, slices.clone());
+            let (result, _) = measure_with(&p, &FieldParams::default());
+            let off = error(&result.displacement);
+            assert!(off < 1.3 * least, "{slices:?} of {name}: {off} for {least}");
+            let said =
+                |w: &String| w.contains(name) && w.contains("as lost") && w.starts_with(&slices.len().to_string());
+            assert!(result.summary.warnings.iter().any(said), "{:?}", result.summary.warnings);
+        }
+    }
+    // What lies empty at the ends is background.
+    let mut p = whole.clone();
+    lose(&mut p.initial, 2, 0..3);
+    let (result, _) = measure_with(&p, &FieldParams::default());
+    assert!(!result.summary.warnings.iter().any(|w| w.contains("as lost")), "{:?}", result.summary.warnings);
+}
+
 #[test]
 fn the_number_of_threads_changes_nothing() {
     let cases = [block(40, MotionKind::Smooth, 2.0), PhantomParams::new(PhantomKind::Slice).sized(64)];

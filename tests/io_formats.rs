@@ -273,6 +273,27 @@ fn a_folder_with_files_needs_force() {
 }
 
 #[test]
+fn what_an_earlier_run_left_goes_with_the_commit_alone() {
+    let folder = tempdir().unwrap();
+    let frame = |file: &str| file.starts_with("frame_");
+    for name in ["frame_0", "frame_1", "frame_2", "notes"] {
+        put(&folder, name, b"old");
+    }
+    std::fs::create_dir(folder.path().join("frame_9")).unwrap();
+    let mut output = OutputFolder::create(folder.path(), true).unwrap();
+    output.supersede(frame).unwrap();
+    output.write("frame_1", |p| write_text(p, "new")).unwrap();
+    drop(output);
+    assert_eq!(names(folder.path()), ["frame_0", "frame_1", "frame_2", "frame_9", "notes"]);
+    let mut output = OutputFolder::create(folder.path(), true).unwrap();
+    output.supersede(frame).unwrap();
+    output.write("frame_1", |p| write_text(p, "new")).unwrap();
+    output.commit().unwrap();
+    assert_eq!(names(folder.path()), ["frame_1", "frame_9", "notes"]);
+    assert_eq!(std::fs::read(folder.path().join("frame_1")).unwrap(), b"new");
+}
+
+#[test]
 fn a_hidden_folder_of_a_killed_run_does_not_count() {
     let folder = tempdir().unwrap();
     std::fs::create_dir(folder.path().join(".palpate-killed")).unwrap();

@@ -221,6 +221,52 @@ fn a_blank_file_among_others_is_lost_and_they_go_on() {
 }
 
 #[test]
+fn a_second_run_leaves_no_frame_of_the_first() {
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let [blank, out, notes] = ["blank.nii", "out", "out/strain_notes.txt"].map(path);
+    fs::write(&blank, Nifti::filled([28, 34, 26], 7.0).bytes()).unwrap();
+    let (a, b, c) = ("frame_000.nii.gz", "frame_001.nii.gz", "frame_002.nii.gz");
+    run(&["track", a, b, c, "-o", &out], 0);
+    fs::write(&notes, "mine").unwrap();
+    run(&["track", a, &blank, b, "-o", &out, "--force"], 0);
+    let is_there = |name: &str| Path::new(&out).join(name).exists();
+    for name in ["displacement_001.nii.gz", "strain_001.nii.gz", "matches_001.csv"] {
+        assert!(!is_there(name), "{name} is of the first run");
+    }
+    assert!(is_there("displacement_002.nii.gz") && is_there("displacement_000.nii.gz") && is_there("strain_notes.txt"));
+    run(&["track", a, b, "-o", &out, "--force"], 0);
+    assert!(is_there("displacement_001.nii.gz") && !is_there("displacement_002.nii.gz"));
+}
+
+#[test]
+fn a_shells_order_and_labels_outside_the_mask_are_said() {
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
+    let named = ["f_0.nii.gz", "f_1.nii.gz", "f_10.nii.gz", "f_2.nii.gz"].map(path);
+    for (from, to) in frames().iter().zip(&named) {
+        fs::copy(pinch().join(from), to).unwrap();
+    }
+    let out = path("out");
+    let dry = |files: &[&str], more: &[&str]| run(&[&["track"], files, more, &["--dry-run", "-o", &out]].concat(), 0).1;
+    let [f0, f1, f10, f2] = named.each_ref().map(String::as_str);
+    assert!(dry(&[f0, f1, f10, f2], &[]).contains("f_10.nii.gz comes before f_2.nii.gz"));
+    for files in [[f0, f1, f2, f10], [f10, f2, f1, f0]] {
+        assert!(!dry(&files, &[]).contains("comes before"));
+    }
+    let labels = io::read_labels(pinch().join("labels.nii.gz")).unwrap();
+    let grid = *labels.grid();
+    let half = grid.shape()[0] / 2;
+    let mask =
+        palpate::types::Mask::from_voxels(grid, |o, _| u8::from(labels.as_slice()[o] > 0 && grid.voxel(o)[0] < half));
+    let mask_file = path("mask.nii.gz");
+    io::write_labels(&mask_file, &mask, "").unwrap();
+    let with = |mask: &str| dry(&[f0, f1], &["--mask", mask, "--labels", "labels.nii.gz"]);
+    assert!(with(&mask_file).contains("outside the mask: label 1 ("), "{}", with(&mask_file));
+    assert!(!with("mask.nii.gz").contains("outside the mask"));
+}
+
+#[test]
 fn a_dry_run_tells_what_would_be_lost_and_refuses_what_a_run_does() {
     let folder = TempDir::new().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();

@@ -187,6 +187,8 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         return plan(options, params, &source.field, &setting, &[], console);
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
+    // Of a sequence.
+    folder.supersede(|file| file == "frames.csv")?;
     let read = started.elapsed().as_secs_f64();
 
     let result = setting.run(&field, matches.as_ref(), params, &|s, f| progress.set(s, f));

@@ -168,6 +168,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let first = source.path(origin);
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_labels(l, &grid, first)).transpose()?;
+    warnings.extend(out_of_order(volumes));
+    warnings.extend(inside.as_ref().zip(regions.as_ref()).and_then(|(mask, labels)| outside_the_mask(mask, labels)));
     if *dry_run {
         drop(progress);
         let plan = plan(&mut source, (origin, &reference), inside.as_ref(), &params, &mut warnings)?;
@@ -176,6 +178,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&plan);
     }
     let mut folder = target.create()?;
+    folder.supersede(of_a_frame)?;
     let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
     let mut film = None;
     let mut looks = Looks::new(frames, &grid);
@@ -276,6 +279,55 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     console.say(&format!("{}{}", text(&report), target.look()))
 }
 
+/// Says so where files come in the order of their letters but not of their numbers: a shell lists frame_10 before frame_2.
+fn out_of_order(volumes: &[PathBuf]) -> Option<String> {
+    let names: Vec<String> = volumes.iter().map(|v| name(v)).collect();
+    let (first, second) = names.iter().zip(&names[1..]).find(|(a, b)| numbers(a) > numbers(b))?;
+    names.is_sorted().then(|| {
+        format!(
+            "{first} comes before {second}: volumes count in the order they are given, and this is that of letters, not of numbers; is it \
+             that of time? (ls -v sorts by numbers)"
+        )
+    })
+}
+
+/// A name in parts, with numbers as numbers.
+fn numbers(name: &str) -> Vec<(String, u64)> {
+    let mut parts = vec![(String::new(), 0u64)];
+    let mut in_number = false;
+    for c in name.chars() {
+        if in_number && !c.is_ascii_digit() {
+            parts.push((String::new(), 0));
+        }
+        in_number = c.is_ascii_digit();
+        if let Some((text, number)) = parts.last_mut() {
+            match c.to_digit(10) {
+                Some(d) => *number = number.saturating_mul(10).saturating_add(d.into()),
+                None => text.push(c),
+            }
+        }
+    }
+    parts
+}
+
+/// Part of a label outside the mask from which it is said.
+const OUTSIDE: f64 = 0.1;
+
+/// Names the labels of which much lies outside the mask, where nothing is measured.
+fn outside_the_mask(mask: &Mask, labels: &Mask) -> Option<String> {
+    let mut counts = [[0usize; 2]; 256];
+    for (&label, &inside) in labels.as_slice().iter().zip(mask.as_slice()) {
+        counts[usize::from(label)][usize::from(inside != 0)] += 1;
+    }
+    let said = |(label, [out, within]): (usize, &[usize; 2])| {
+        let share = *out as f64 / (out + within).max(1) as f64;
+        (share > OUTSIDE).then(|| format!("label {label} ({:.0} %)", 100.0 * share))
+    };
+    let named: Vec<String> = counts.iter().enumerate().skip(1).filter_map(said).collect();
+    (!named.is_empty())
+        .then(|| format!("outside the mask: {}; strain.csv tells of what lies inside it alone", named.join(", ")))
+}
+
 /// The frames in the order in which they are measured.
 fn order(frames: usize, origin: usize) -> impl Iterator<Item = usize> {
     (origin + 1..frames).chain((0..origin).rev())
@@ -323,6 +375,13 @@ fn files(frames: usize, origin: usize) -> Vec<String> {
     let each = (0..frames).map(|t| format!("displacement_{t:03}.nii.gz"));
     let rest = order(frames, origin).flat_map(|t| [format!("strain_{t:03}.nii.gz"), format!("matches_{t:03}.csv")]);
     fixed.map(String::from).into_iter().chain(each).chain(rest).collect()
+}
+
+/// Whether a file has the name of what is written for one frame.
+fn of_a_frame(file: &str) -> bool {
+    let number = |(before, after)| file.strip_prefix(before).and_then(|f: &str| f.strip_suffix(after));
+    let kinds = [("displacement_", ".nii.gz"), ("strain_", ".nii.gz"), ("matches_", ".csv")];
+    kinds.into_iter().filter_map(number).any(|n| n.len() >= 3 && n.bytes().all(|b| b.is_ascii_digit()))
 }
 
 /// A film whose planes cross where the first measured frame moves most.

@@ -18,6 +18,8 @@ pub struct OutputFolder {
     path: PathBuf,
     staging: Option<(TempDir, Live)>,
     names: Vec<String>,
+    /// Files of an earlier run, which go unless they are written anew.
+    earlier: Vec<String>,
     /// Folders made here, outermost first.
     created: Vec<(PathBuf, Live)>,
 }
@@ -31,7 +33,8 @@ impl OutputFolder {
         let path = path.as_ref();
         Self::check(path, force)?;
         let missing = |p: &&Path| !p.as_os_str().is_empty() && !p.exists();
-        let mut folder = Self { path: path.into(), staging: None, names: Vec::new(), created: Vec::new() };
+        let mut folder =
+            Self { path: path.into(), staging: None, names: Vec::new(), earlier: Vec::new(), created: Vec::new() };
         let mut to_create: Vec<&Path> = path.ancestors().take_while(missing).collect();
         while let Some(next) = to_create.pop() {
             let live = Live::folder(next).map_err(os(next, "create the folder"))?;
@@ -91,6 +94,20 @@ impl OutputFolder {
         Ok(())
     }
 
+    /// Names the files in the folder that results of this kind consist of: those that an earlier run left and this one does not
+    /// write would pass for results of this one, and are removed by [`OutputFolder::commit`].
+    ///
+    /// # Errors
+    /// [`IoError`] when the folder cannot be read.
+    pub fn supersede(&mut self, ours: impl Fn(&str) -> bool) -> Result<(), IoError> {
+        for entry in fs::read_dir(&self.path).map_err(os(&self.path, "read the folder"))? {
+            let entry = entry.map_err(os(&self.path, "read the folder"))?;
+            let file = entry.file_type().is_ok_and(|t| t.is_file());
+            self.earlier.extend(entry.file_name().into_string().ok().filter(|name| file && ours(name)));
+        }
+        Ok(())
+    }
+
     /// Moves all files to their final names, and returns these in the order of writing. What stood under them goes only
     /// when all are there.
     ///
@@ -100,14 +117,17 @@ impl OutputFolder {
         let Some((staging, _)) = &self.staging else { return Ok(Vec::new()) };
         let targets: Vec<PathBuf> = self.names.iter().map(|name| self.path.join(name)).collect();
         let earlier = staging.path().join("earlier");
+        let gone = self.earlier.iter().filter(|name| !self.names.contains(name));
         as_a_whole(|| {
             let mut back = Vec::new();
-            for (name, target) in self.names.iter().zip(&targets) {
-                if let Err(error) = replace(&staging.path().join(name), target, &earlier.join(name), &mut back) {
+            let new = self.names.iter().map(|name| (name, true)).chain(gone.map(|name| (name, false)));
+            for (name, new) in new {
+                let (staged, target) = (staging.path().join(name), self.path.join(name));
+                if let Err(error) = replace(new.then_some(&staged), &target, &earlier.join(name), &mut back) {
                     for (from, to) in back.iter().rev() {
                         let _ = fs::rename(from, to);
                     }
-                    return Err(os(target, "create")(error));
+                    return Err(os(&target, "create")(error));
                 }
             }
             Ok(())
@@ -117,8 +137,13 @@ impl OutputFolder {
     }
 }
 
-/// Moves `new` to `target`, what stands there to `earlier` first; `back` gets the renames that undo it, in order.
-fn replace(new: &Path, target: &Path, earlier: &Path, back: &mut Vec<(PathBuf, PathBuf)>) -> std::io::Result<()> {
+/// Moves `new`, if there is any, to `target`, what stands there to `earlier` first; `back` gets the renames that undo it, in order.
+fn replace(
+    new: Option<&PathBuf>,
+    target: &Path,
+    earlier: &Path,
+    back: &mut Vec<(PathBuf, PathBuf)>,
+) -> std::io::Result<()> {
     if target.exists() {
         if let Some(folder) = earlier.parent() {
             fs::create_dir_all(folder)?;
@@ -126,8 +151,10 @@ fn replace(new: &Path, target: &Path, earlier: &Path, back: &mut Vec<(PathBuf, P
         fs::rename(target, earlier)?;
         back.push((earlier.into(), target.into()));
     }
-    fs::rename(new, target)?;
-    back.push((target.into(), new.into()));
+    if let Some(new) = new {
+        fs::rename(new, target)?;
+        back.push((target.into(), new.clone()));
+    }
     Ok(())
 }
 

@@ -3,7 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::quantile;
-use crate::types::{Grid, Mask, Volume, Voxels};
+use crate::types::{Grid, Mask, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
@@ -16,11 +16,25 @@ pub struct Checked<'a> {
     pub deformed: Voxels<'a>,
     /// Voxels of the two that are not finite.
     pub not_finite: [usize; 2],
+    /// Slices of the two that are lost, as places along an axis (mm, RAS).
+    pub lost: [Vec<LostSlice>; 2],
+}
+
+/// A slice that holds one value throughout, with tissue going on at both its sides.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LostSlice {
+    /// Across which axis it lies.
+    pub axis: usize,
+    /// Its number along that axis.
+    pub at: usize,
+    /// Where its middle lies along that axis of the world (mm).
+    pub place: f64,
 }
 
 /// Checks the two volumes and the mask, and makes them fit to work on.
 ///
-/// A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
+/// A slice inside the body that holds one value throughout is lost: left out of the mask in the initial volume, not finite in the
+/// deformed one. A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
 /// initial volume and stay unseen in the deformed one. Volumes whose intensities are so large, so small or so far from 0 that
 /// single precision loses them are shifted and scaled by a power of two, and so is a deformed volume whose spread is another than the
 /// initial one's.
@@ -49,12 +63,15 @@ pub fn inputs<'a>(
         return Err(FieldError::Volume { volume: "mask", what, hint });
     }
     let not_finite = ranges.each_ref().map(|r| r.not_finite);
-    let fill = |volume: &'a Voxels<'a>, bad| if bad == 0 { volume.view() } else { filled(volume) };
-    let (mut first, second) = (fill(initial, not_finite[0]), fill(deformed, not_finite[1]));
+    let lost = [initial, deformed].map(lost_slices);
+    let [given, seen] = [(initial, &lost[0]), (deformed, &lost[1])].map(|(volume, lost)| without(volume, lost));
+    let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume) } else { volume };
+    let [bad, worse] = [0, 1].map(|v| not_finite[v] > 0 || !lost[v].is_empty());
+    let (mut first, second) = (fill(bridged(initial, &lost[0]), not_finite[0] > 0), fill(seen, worse));
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
-    if not_finite[0] > 0 {
+    if bad {
         first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
-        for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
+        for (m, v) in mask.as_mut_slice().iter_mut().zip(given.as_slice()) {
             if !v.is_finite() {
                 *m = 0;
             }
@@ -62,7 +79,95 @@ pub fn inputs<'a>(
     }
     let (initial, spread) = in_range(first, &ranges[0], None);
     let (deformed, _) = in_range(second, &ranges[1], Some(spread));
-    Ok(Checked { mask, initial, deformed, not_finite })
+    Ok(Checked { mask, initial, deformed, not_finite, lost })
+}
+
+/// Slices across each axis that hold one value throughout while the slices next to them that do not show tissue in the
+/// same places: an acquisition or a conversion that dropped them.
+fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
+    let (grid, values) = (volume.grid(), volume.as_slice());
+    let shape = grid.shape();
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let across = |axis: usize| {
+        let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+        // Voxels of a slice, along the faster axis of memory first.
+        let [u, v] = [u.min(v), u.max(v)];
+        let slice = move |at: usize| {
+            (0..shape[v])
+                .flat_map(move |j| (0..shape[u]).map(move |i| at * stride[axis] + j * stride[v] + i * stride[u]))
+        };
+        let constant = |at: usize| slice(at).all(|o| values[o] == values[at * stride[axis]]);
+        let varies: Vec<bool> = (0..shape[axis]).into_par_iter().map(|at| !constant(at)).collect();
+        let between = |at: usize| {
+            let below = varies[..at].iter().rposition(|v| *v)?;
+            let above = at + varies[at..].iter().position(|v| *v)?;
+            let value = values[at * stride[axis]];
+            let shown = |at: usize| slice(at).map(move |o| values[o] != value);
+            let [mut both, mut either] = [0, 0];
+            for (a, b) in shown(below).zip(shown(above)) {
+                (both, either) = (both + usize::from(a && b), either + usize::from(a || b));
+            }
+            let middle = std::array::from_fn(|a| if a == axis { at } else { shape[a] / 2 });
+            let [x, y, z] = middle;
+            (2 * both > either).then(|| LostSlice { axis, at, place: grid.world(x, y, z).0[axis] })
+        };
+        (0..shape[axis]).filter(|&at| !varies[at]).filter_map(between).collect::<Vec<_>>()
+    };
+    (0..3).filter(|&a| shape[a] > 2).flat_map(across).collect()
+}
+
+/// The volume with lost slices drawn over linearly from the ones next to them, so that no edge stands where nothing is measured.
+fn bridged<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
+    let mut out = volume.view();
+    let (grid, values) = (volume.grid(), volume.as_slice());
+    let shape = grid.shape();
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    for slice in lost {
+        let good = |at: &usize| !lost.iter().any(|l| (l.axis, l.at) == (slice.axis, *at));
+        let (Some(below), Some(above)) = ((0..slice.at).rev().find(good), (slice.at..shape[slice.axis]).find(good))
+        else {
+            continue;
+        };
+        let part = (slice.at - below) as f32 / (above - below) as f32;
+        let [down, up] = [slice.at - below, above - slice.at].map(|n| n * stride[slice.axis]);
+        for (o, value) in out.as_mut_slice().iter_mut().enumerate() {
+            if grid.voxel(o)[slice.axis] == slice.at {
+                *value = (1.0 - part) * values[o - down] + part * values[o + up];
+            }
+        }
+    }
+    out
+}
+
+/// The volume with lost slices as voxels that are not finite.
+fn without<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
+    let mut out = volume.view();
+    let grid = *volume.grid();
+    for slice in lost {
+        for (o, value) in out.as_mut_slice().iter_mut().enumerate() {
+            if grid.voxel(o)[slice.axis] == slice.at {
+                *value = f32::NAN;
+            }
+        }
+    }
+    out
+}
+
+/// What to say of lost slices.
+pub fn said_of(lost: &[Vec<LostSlice>; 2]) -> Vec<String> {
+    let of = |(lost, volume): (&Vec<LostSlice>, &str)| {
+        let first = lost.first()?;
+        let (what, holds) = if lost.len() == 1 { ("slice", "holds") } else { ("slices", "hold") };
+        Some(format!(
+            "{} {what} of the {volume} volume {holds} one value throughout while tissue goes on at both sides ({} = {:.1} mm{}): left \
+             out as lost; export the volume again, or image it again",
+            lost.len(),
+            ["x", "y", "z"][first.axis],
+            first.place,
+            if lost.len() > 1 { " and others" } else { "" }
+        ))
+    };
+    lost.iter().zip(["initial", "deformed"]).filter_map(of).collect()
 }
 
 /// A volume, "initial" or "deformed", has at least two axes.
@@ -108,7 +213,7 @@ impl Range {
 const AROUND: usize = 13;
 
 /// With numbers in single voxels that have none, from the finite ones around them.
-fn filled(volume: &Voxels<'_>) -> Volume {
+fn filled<'a>(volume: &Voxels<'_>) -> Voxels<'a> {
     let values = volume.as_slice();
     let (grid, mut out) = (*volume.grid(), volume.clone().into_volume());
     let new = out.as_mut_slice();

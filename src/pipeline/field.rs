@@ -141,7 +141,7 @@ fn canonical(
     progress("pyramid", 0.0);
     let mut clock = Clock(Vec::new(), Instant::now());
     let given = mask.is_some();
-    let Checked { mask, initial: clean, deformed: seen, not_finite } = check::inputs(initial, deformed, mask)?;
+    let Checked { mask, initial: clean, deformed: seen, not_finite, lost } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
@@ -321,6 +321,7 @@ fn canonical(
         // A known field takes the search as far as it goes itself.
         warnings: warnings(counts, folds, not_finite, length.1, if starts.is_empty() { search } else { f64::INFINITY })
             .into_iter()
+            .chain(check::said_of(&lost))
             .chain(vague(choice.model, uncertainty_mean_mm, length.0, &grid))
             .chain(doubted.map(in_doubt))
             .chain(unlike)
