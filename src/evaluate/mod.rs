@@ -14,7 +14,7 @@ use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::sampling::{displacement, inside};
 use crate::numerics::statistics::percentile;
-use crate::types::space::determinant;
+use crate::types::space::{determinant, length};
 use crate::types::{DenseField, Grid, Landmark, Mask, Metrics};
 use rayon::prelude::*;
 
@@ -140,10 +140,6 @@ fn check(what: &str, found: &Grid, expected: &Grid) -> Result<(), FieldError> {
             expected: expected.shape(),
         }),
     }
-}
-
-pub(crate) fn length(v: [f64; 3]) -> f64 {
-    v.iter().map(|c| c * c).sum::<f64>().sqrt()
 }
 
 /// NaN of nothing.

@@ -9,7 +9,7 @@
 use crate::field::jacobian::count_folds;
 use crate::numerics::differences::deformation_gradient;
 use crate::numerics::sampling::{Stencil, displacement, inside};
-use crate::types::space::{Matrix3, determinant};
+use crate::types::space::{Matrix3, determinant, length};
 use crate::types::{DenseField, Grid, WorldPoint};
 use rayon::prelude::*;
 
@@ -84,10 +84,6 @@ fn trial(field: &DenseField, x: WorldPoint, y: WorldPoint, step: [f64; 3], facto
 /// y - x - u(x) (mm).
 fn residual(field: &DenseField, x: WorldPoint, y: WorldPoint) -> [f64; 3] {
     y.minus(x.moved(displacement(field, x)))
-}
-
-fn length(v: [f64; 3]) -> f64 {
-    v.iter().map(|c| c * c).sum::<f64>().sqrt()
 }
 
 /// The solution s of (I + grad u(x)) s = r by Cramer's rule, `None` where it is singular or reverses orientation.

@@ -59,7 +59,11 @@ impl OutputFolder {
             let ours = |e: &fs::DirEntry| e.file_name().to_string_lossy().starts_with(TEMPORARY);
             let mut entries = fs::read_dir(path).map_err(os(path, "read the folder"))?;
             if entries.any(|e| !e.is_ok_and(|e| ours(&e))) {
-                return Err(format(path, "the folder is not empty", "choose another --output, or add --force"));
+                return Err(format(
+                    path,
+                    "the folder is not empty",
+                    "choose another --output, or let files be replaced (--force; of palpate stiffness: --overwrite)",
+                ));
             }
         }
         Ok(())

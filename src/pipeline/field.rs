@@ -639,17 +639,28 @@ const LENGTH: f64 = 1.35;
 /// no use lay at 0.97 and 0.99 of it; of 984 with other seeds none under 1.
 const NEARLY: f64 = 0.95;
 
-/// Says so where a free field is expected to be off by about half of the motion or a voxel, or more: beyond that it is of
-/// little use (docs/failures.md shows how often this is right). The field's own length holds its errors, as squares.
+/// Says so where the field is expected to be off by about half of the motion or a voxel, or more: beyond that it is of
+/// little use (docs/failures.md shows how often this is right). A free field's own length holds its errors, as squares; under a
+/// smaller model that much bending would not have shown, and where nothing is seen to move a voxel alone counts.
 fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
     let edge = pyramid::finest(grid.shape(), grid.spacing());
     let expected = LENGTH * sigma;
-    let motion = (length * length - expected * expected).max(0.0).sqrt();
-    (model == MotionModel::Free && expected > NEARLY * (0.5 * motion).min(edge)).then(|| {
-        format!(
+    let motion = match model {
+        MotionModel::Free => (length * length - expected * expected).max(0.0).sqrt(),
+        MotionModel::Rigid | MotionModel::Affine => length,
+        MotionModel::Identity => f64::INFINITY,
+    };
+    (expected > NEARLY * (0.5 * motion).min(edge)).then(|| match model {
+        MotionModel::Free => format!(
             "the mean error to expect, {expected:.2} mm, is about half of the mean motion ({length:.2} mm, this error in it) or a voxel \
              ({edge:.2} mm), or more: there is too little texture or too much noise for it; use only places of small uncertainty"
-        )
+        ),
+        _ => format!(
+            "the smallest model that explains the volumes was taken ({}), but bending by {expected:.2} mm would not have shown: about half of the \
+             mean motion ({length:.2} mm) or a voxel ({edge:.2} mm), or more; do not read its strain as measured, and image with less noise or a \
+             larger motion",
+            format!("{model:?}").to_lowercase()
+        ),
     })
 }
 

@@ -42,7 +42,7 @@ fn redrawn(
         return Ok(None);
     }
     let setup = level.setup(law, poisson, level.largest());
-    let Some(fit) = geometry::fit(&setup, estimate, grid, &inclusions)? else { return Ok(None) };
+    let Some(fit) = geometry::fit(&setup, estimate, grid, (&[], &inclusions))? else { return Ok(None) };
     if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
         return Ok(None);
     }

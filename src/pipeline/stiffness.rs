@@ -8,6 +8,7 @@ use crate::pipeline::search;
 use crate::stiffness::choice::{choose, settle};
 use crate::stiffness::identify::State;
 use crate::stiffness::inclusion::Inclusion;
+use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
 use crate::stiffness::rim::{Outline, rim};
@@ -219,7 +220,8 @@ fn labelled(
     let setup = fine.setup(choice.law, params.poisson, reference);
     let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
     let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
-    let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid(), &inclusions)?;
+    let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Vec::new() };
+    let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid(), (&interfaces, &inclusions))?;
     let corrected = |step: &[f64]| {
         let x = estimate.state.x.as_deref().unwrap_or_default();
         setup.advanced(&estimate.state, x, &estimate.columns, step)
@@ -260,6 +262,7 @@ fn labelled(
     let area = |i: usize| touching[i].as_ref().map_or_else(|| fine.patches[i].area(&fine.body), |t| t.1);
     let mut warnings = maps::unfit(inputs.field, inputs.labels, &fine, &estimate, noise);
     warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
+    warnings.extend(params.force_n.and_then(|force| maps::leaning(force, setup.leaning(&estimate.state))));
     warnings.extend(maps::not_shown(&hidden, &regions, reference));
     warnings.dedup();
     let patches = [0, 1].map(|i| {

@@ -68,10 +68,17 @@ impl Sequence {
         if lost > 0 {
             result.warnings.push(format!("{lost} frames tell nothing; frames.csv says why"));
         }
-        for (region, gain) in result.regions.iter().zip(&gains) {
+        for (r, (region, gain)) in result.regions.iter().zip(&gains).enumerate() {
             if let Some(last) = gain.last().filter(|g| g.disagreement > 2.0) {
+                let off = |f: &FrameStiffness| {
+                    let own = f.regions.as_ref().ok()?.get(r).filter(|own| own.identifiable)?;
+                    let value = if result.absolute { own.youngs_modulus } else { own.ratio };
+                    Some(((value / last.value).ln().abs(), f.frame))
+                };
+                let worst = self.frames.iter().filter_map(off).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |w| w.1);
                 result.warnings.push(format!(
-                    "{}: frames differ by {:.1} times what they claim; its standard deviation was raised by that",
+                    "{}: frames differ by {:.1} times what they claim, frame {worst} most (frames.csv); its standard deviation was raised by that: \
+                     check that frame, and that --forces stand in the frames' order and count from the reference",
                     region.name, last.disagreement
                 ));
             }

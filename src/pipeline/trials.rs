@@ -2,7 +2,7 @@
 //! CPU time of this process.
 
 use crate::error::{FieldError, GraspError, SynthError};
-use crate::evaluate::{self, length, mean};
+use crate::evaluate::{self, mean};
 use crate::grasp::simulate::simulate;
 use crate::numerics::statistics::percentile;
 use crate::pipeline::{cpu, field};
@@ -10,6 +10,7 @@ use crate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom};
 use crate::types::grasp::GraspRun;
 use crate::types::params::{Interpolation, Preset};
 use crate::types::scene::{Formulation, Method};
+use crate::types::space::length;
 use crate::types::{DenseField, FieldParams, Landmark, Mask, Part, Scene, Trial, Volume};
 
 /// A pair of volumes with a known answer.

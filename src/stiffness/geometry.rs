@@ -13,15 +13,18 @@ use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
 use crate::stiffness::inclusion::{Inclusion, SHAPES};
+use crate::stiffness::interface::Interface;
 use crate::stiffness::observations::{find, read};
 use crate::stiffness::patches::Patch;
-use crate::types::space::dot;
+use crate::types::space::{dot, length};
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
 /// One standard deviation of a flat face (voxels): uniform over one voxel.
 const FACE: f64 = 0.288_675;
 /// One standard deviation of the edge of a punch (voxels).
 const EDGE: f64 = 3.0;
+/// One standard deviation with which a mesh keeps to a flat interface (voxels): surfaces are moved by hundredths until volumes agree.
+const MESHED: f64 = 0.02;
 /// Free surface beside a punch at least (voxels).
 const BESIDE: f64 = 3.0;
 /// Least part of the box's face that a flat face fills.
@@ -41,6 +44,8 @@ enum Part<'a> {
     Face(usize, bool),
     /// The edge of the loaded patch.
     Edge(Edge),
+    /// A flat border between two labels.
+    Interface(&'a Interface),
     /// The surface of a region that was found without labels: how its shapes move the nodes (mm), which one, and one standard
     /// deviation (mm).
     Inclusion(&'a [[[f64; 3]; SHAPES]], usize, f64),
@@ -50,7 +55,7 @@ impl Part<'_> {
     /// One standard deviation (voxels) on voxels of `voxel` mm.
     fn sigma(self, voxel: f64) -> f64 {
         match self {
-            Part::Face(..) => FACE,
+            Part::Face(..) | Part::Interface(_) => FACE,
             Part::Edge(_) => EDGE,
             Part::Inclusion(.., sigma) => sigma / voxel,
         }
@@ -61,6 +66,7 @@ impl Part<'_> {
         match self {
             Part::Face(axis, upper) => Some(format!("{}{axis}", if upper { '+' } else { '-' })),
             Part::Edge(_) => Some("edge".into()),
+            Part::Interface(interface) => Some(interface.name()),
             Part::Inclusion(..) => None,
         }
     }
@@ -72,6 +78,9 @@ impl Part<'_> {
             Part::Edge(edge) => {
                 let wider = offset * grid.least_spacing();
                 body.with_places(body.places.iter().map(|p| edge.widened(*p, wider)).collect())
+            }
+            Part::Interface(interface) => {
+                body.with_places(body.places.iter().map(|p| interface.moved(*p, grid, offset)).collect())
             }
             Part::Inclusion(nodes, shape, _) => {
                 let by = offset * grid.least_spacing();
@@ -131,15 +140,10 @@ impl Edge {
     }
 }
 
-/// Length of a vector.
-pub(super) fn length(v: [f64; 3]) -> f64 {
-    dot(v, v).sqrt()
-}
-
 /// What the offsets change.
 #[derive(Debug, Clone, Default)]
 pub struct Geometry {
-    /// Faces, as `+0` ... by voxel axis, and `edge`, and their offsets outwards (voxels).
+    /// Faces, as `+0` ... by voxel axis, `edge`, and interfaces ([`Interface::name`]), and their offsets outwards or up the axis (voxels).
     pub faces: Vec<(String, f64)>,
     /// Offsets of the inclusions' shapes (voxels), one inclusion after the other.
     pub shapes: Vec<f64>,
@@ -151,7 +155,8 @@ pub struct Geometry {
     pub force_slope: Vec<f64>,
 }
 
-/// Fits the offsets about an estimate; none when the body has no flat face, no punch and no `inclusions` whose shape is open.
+/// Fits the offsets about an estimate; none when the body has no flat face, no punch and no `interfaces` or `inclusions` whose place or shape
+/// is open.
 ///
 /// # Errors
 /// As [`Setup::run`].
@@ -159,13 +164,19 @@ pub fn fit(
     setup: &Setup<'_>,
     estimate: &Estimate,
     grid: &Grid,
-    inclusions: &[Inclusion],
+    (interfaces, inclusions): (&[Interface], &[Inclusion]),
 ) -> Result<Option<Geometry>, StiffnessError> {
     let mut parts = flat_faces(setup.body, grid);
     parts.extend(setup.edge.map(|(edge, _)| Part::Edge(edge)));
     let moving: Vec<_> = inclusions.iter().map(|i| (i.shapes(&setup.body.places), i.prior())).collect();
     parts.extend(moving.iter().flat_map(|(nodes, sigma)| (0..SHAPES).map(|k| Part::Inclusion(nodes, k, *sigma))));
-    offsets(setup, estimate, grid, &parts)
+    let without = parts.len();
+    parts.extend(interfaces.iter().map(Part::Interface));
+    // Labels that are wrong by more than a voxel do not take the faces with them.
+    match offsets(setup, estimate, grid, &parts)? {
+        None if parts.len() > without => offsets(setup, estimate, grid, &parts[..without]),
+        found => Ok(found),
+    }
 }
 
 /// How much further outwards the edge of the punch lies (voxels), for all that the data say; none where there is no such edge.
@@ -242,8 +253,14 @@ fn offsets(
         .collect();
     let blocks = grouped_normal(setup.observations, &rows, &rest, &weights);
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
-    let (covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
+    let (mut covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
     let first = p - parts.len();
+    // What the mesh itself is off by, however well the data tell the place: all else follows it as it would another place.
+    let by_data = covariance.clone();
+    for k in (first..p).filter(|k| matches!(parts[k - first], Part::Interface(_))) {
+        let follows: Vec<f64> = (0..p).map(|i| MESHED * by_data[i * p + k] / by_data[k * p + k]).collect();
+        covariance.iter_mut().enumerate().for_each(|(at, v)| *v += follows[at / p] * follows[at % p]);
+    }
     if step[first..].iter().zip(parts).any(|(v, part)| (v + moved(part)).abs() > 3.5 * part.sigma(voxel)) {
         // So far beyond what a voxel map leaves open it is not the shape that is wrong.
         return Ok(None);

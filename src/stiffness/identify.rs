@@ -14,7 +14,7 @@ use crate::stiffness::geometry::Edge;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::{Patch, travel};
-use crate::types::space::dot;
+use crate::types::space::{dot, length};
 use crate::types::stiffness::{Contact, Law};
 
 /// Steps below this (in ln E, and of the plates over their travel) are taken to first order: what that leaves out is 0.1 %.
@@ -222,6 +222,19 @@ impl Setup<'_> {
         let n = self.patches[1].normal;
         let counter = if problem.plate.is_some() { along(&held, n) } else { -along(&loaded, n) };
         [counter, -along(&held, self.patches[0].normal)]
+    }
+
+    /// By how many times the whole force on the plate is more than its part across it (1 at least), which is what [`Setup::forces`] takes.
+    pub fn leaning(&self, state: &State) -> f64 {
+        let Some(x) = &state.x else { return 1.0 };
+        let problem = self.problem(state);
+        // What presses a curved body is known by what holds it.
+        let side = usize::from(problem.plate.is_none());
+        let mut whole = [0.0; 3];
+        for tie in self.patches[side].ties(self.body, &state.plates[side]) {
+            whole.iter_mut().zip(problem.pull(&tie, x)).for_each(|(v, f)| *v += f);
+        }
+        length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
     }
 
     /// Residuals (mm) and Huber weights times 1 / sigma^2; `scale` is the robust standard deviation in units of sigma.

@@ -8,8 +8,7 @@
 
 use crate::numerics::filters::gaussian;
 use crate::numerics::neighbours::Neighbours;
-use crate::stiffness::geometry::length;
-use crate::types::space::dot;
+use crate::types::space::{dot, length};
 use crate::types::{Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 

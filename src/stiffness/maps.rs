@@ -2,12 +2,12 @@
 
 use crate::stiffness::body::{Body, sorted};
 use crate::stiffness::forward::Tie;
-use crate::stiffness::geometry::length;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::travel;
 use crate::stiffness::summary::{BEARS, Hidden};
+use crate::types::space::length;
 use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
 use std::collections::{BTreeSet, HashSet};
@@ -91,6 +91,21 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2
         out.extend(sorted(nodes.iter().chain(guided).copied()).into_iter().map(one));
     }
     out
+}
+
+/// Excess of the whole force over its part across the plate from which it is said.
+const LEANING: f64 = 0.01;
+
+/// Says so where the plate also pushes the body sideways, so that it matters which part of the force is known.
+pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
+    (whole > 1.0 + LEANING).then(|| {
+        format!(
+            "the plate pushes sideways as well: with {force_n} N across it, which is what --force is taken for, the whole force is {:.3} N; if {force_n} N \
+             is the whole force, moduli are {:.1} % lower",
+            force_n * whole,
+            100.0 * (1.0 - 1.0 / whole)
+        )
+    })
 }
 
 /// Part of the plates' motion that the model may leave over without a word.

@@ -40,4 +40,6 @@ pub mod geometry;
 
 pub mod inclusion;
 
+pub mod interface;
+
 pub mod turn;

@@ -3,7 +3,7 @@
 use crate::numerics::random::Random;
 use crate::synth::body::{centre, extent, rotation};
 use crate::synth::noise::{COARSE, SmoothNoise};
-use crate::types::space::Matrix3;
+use crate::types::space::{Matrix3, cross, dot, length};
 use crate::types::{Grid, WorldPoint};
 use rayon::prelude::*;
 
@@ -230,18 +230,6 @@ pub(super) fn press(p: [f64; 3], contact: [f64; 3], inward: [f64; 3], radius: f6
 
 pub(super) fn add(a: [f64; 3], b: [f64; 3], factor: f64) -> [f64; 3] {
     std::array::from_fn(|i| a[i] + factor * b[i])
-}
-
-pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-fn length(v: [f64; 3]) -> f64 {
-    dot(v, v).sqrt()
 }
 
 fn unit(v: [f64; 3]) -> [f64; 3] {

@@ -54,6 +54,12 @@ pub fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
+/// The length of a vector.
+#[inline]
+pub fn length(v: [f64; 3]) -> f64 {
+    dot(v, v).sqrt()
+}
+
 /// `a b`.
 fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])

@@ -266,7 +266,7 @@ pub struct StiffnessResult {
     pub displacement: Vec<[f64; 3]>,
     /// Nodes that are held or loaded, with what is prescribed there.
     pub prescribed: Vec<Prescribed>,
-    /// Flat faces of the body (side and voxel axis) and how far outwards the data put them (voxels).
+    /// Flat faces of the body (side and voxel axis) and between labels, and how far outwards (up the axis) the data put them (voxels).
     pub faces: Vec<(String, f64)>,
     /// Force of the model on the loaded patch for the moduli found (N; kPa mm^2 / 1000 without a force).
     pub model_force: f64,

@@ -6,6 +6,7 @@ use crate::synth::elastic::blocks::{Ball, block_with_balls, dome, layered_block}
 use crate::synth::elastic::hexahedra::{CURVED, HexMesh, Surfaces};
 use crate::synth::noise::Texture;
 use crate::synth::params::{PhantomKind, PhantomParams};
+use crate::types::space::length;
 use crate::types::{Grid, WorldPoint};
 use serde::Serialize;
 
@@ -279,8 +280,4 @@ fn fingertip(middle: [f64; 3], half: [f64; 3], random: &mut Random) -> (Vec<Regi
 
 fn difference(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|i| a[i] - b[i])
-}
-
-fn length(v: [f64; 3]) -> f64 {
-    v.iter().map(|c| c * c).sum::<f64>().sqrt()
 }
