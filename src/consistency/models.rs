@@ -136,7 +136,7 @@ fn step<const N: usize>(
     cholesky_solve(h, b).unwrap_or([0.0; N])
 }
 
-/// Robust information-weighted rigid fit: ten Gauss-Newton steps on (rotation vector, shift).
+/// Robust information-weighted rigid fit: twelve Gauss-Newton steps on (rotation vector, shift).
 fn fit_rigid(matches: &[Measured], information: &[Symmetric3]) -> AffineMotion {
     let mut motion = AffineMotion::IDENTITY;
     for round in 0..12 {

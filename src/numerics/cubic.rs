@@ -24,7 +24,8 @@ impl Places {
     /// All at the origin.
     pub const ORIGIN: Self = Self { cell: [[0; LANES]; 3], fraction: [[0.0; LANES]; 3] };
 
-    /// Sets places `p` (voxels) along axis `a`. NaN and places beyond 2^31 go to cell `i32::MIN` or `i32::MAX`.
+    /// Sets places `p` (voxels) along axis `a`. Places beyond 2^31 go to cell `i32::MIN` or `i32::MAX`, NaN to 0 with
+    /// a fraction that is NaN.
     #[inline(always)]
     pub fn set(&mut self, a: usize, p: &[f32; LANES]) {
         for l in 0..LANES {

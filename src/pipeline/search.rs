@@ -2,7 +2,6 @@
 
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::mesh_labels;
-use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::stiffness::{Inputs, Progress, coarse_fineness};
 use crate::stiffness::choice::choose;
 use crate::stiffness::geometry;
@@ -68,7 +67,7 @@ pub(super) fn regions(
     };
     let mut one = level(inputs.labels)?;
     let choice = choose(&mut one, params.model, params.poisson, 0)?;
-    let noise = maps::noise(inputs.field, inputs.labels, |d, s, k| f64::from(noise_sigma(d, s, k)));
+    let noise = maps::noise(inputs.field, inputs.labels);
     let mut support = Support::new(&one, &choice, noise);
     let mut labels = inputs.labels.clone();
     if support.may_hold_more() && params.regions == 1 {

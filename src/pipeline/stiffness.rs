@@ -3,7 +3,6 @@
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::nearest;
-use crate::numerics::statistics::noise_sigma;
 use crate::pipeline::search;
 use crate::stiffness::choice::{choose, settle};
 use crate::stiffness::identify::State;
@@ -227,7 +226,7 @@ fn labelled(
         setup.advanced(&estimate.state, x, &estimate.columns, step)
     };
     let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
-    let noise = maps::noise(inputs.field, inputs.labels, |data, shape, keep| f64::from(noise_sigma(data, shape, keep)));
+    let noise = maps::noise(inputs.field, inputs.labels);
     let alone = summary::moduli(&setup, &estimate, None, params.force_n);
     let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n)
         .widened(&alone, summary::coherent(&estimate, fine.sample_noise(noise)));

@@ -237,7 +237,7 @@ impl Setup<'_> {
         length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
     }
 
-    /// Residuals (mm) and Huber weights times 1 / sigma^2; `scale` is the robust standard deviation in units of sigma.
+    /// Measured less modelled displacement (mm, RAS) of each observation.
     fn residuals(&self, x: &[f64]) -> Vec<[f64; 3]> {
         use rayon::prelude::*;
         let one = |o: &Observation| {

@@ -10,6 +10,7 @@
 //! so the tangent is symmetric. Eliminating p gives W = mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2 (Bonet and Wood, Nonlinear
 //! Continuum Mechanics, 2008, eq. 6.27).
 
+use crate::numerics::dense::symmetric_eigen;
 use crate::stiffness::body::SIDE;
 use crate::stiffness::elements::Point;
 use crate::types::space::{Matrix3, determinant};
@@ -166,25 +167,9 @@ pub fn tangent(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> O
     Some(k)
 }
 
-/// Cauchy stress (kPa) at the middle of a straight-sided copy of the element, and the largest principal stretch less 1.
-pub fn stress(law: Law, q: &Point, m: Material, x: &[f64; SIDE]) -> Option<(Matrix3, f64)> {
+/// The largest principal strain (1) at a point of the element, of the symmetric part of the displacement's gradient, by size.
+pub fn largest_principal_strain(q: &Point, x: &[f64; SIDE]) -> f64 {
     let g = gradient(q, x);
-    let s = state(law, &g)?;
-    let p: f64 = (0..4).map(|i| q.pressure[i] * x[30 + i]).sum();
-    let first: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| m.mu * s.shear[i][j] + p * s.volume[i][j]));
-    let strain: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (g[i][j] + g[j][i])));
-    let eigen = crate::numerics::dense::symmetric_eigen(&strain);
-    let largest = eigen.iter().map(|e| e.0.abs()).fold(0.0, f64::max);
-    match law {
-        Law::Linear => Some((first, largest)),
-        Law::NeoHookean => {
-            let mut f = g;
-            (0..3).for_each(|i| f[i][i] += 1.0);
-            let det = determinant(&f);
-            let cauchy = std::array::from_fn(|i| {
-                std::array::from_fn(|j| (0..3).map(|k| first[i][k] * f[j][k]).sum::<f64>() / det)
-            });
-            Some((cauchy, largest))
-        }
-    }
+    let strain: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (g[i][j] + g[j][i])));
+    symmetric_eigen(&strain).iter().map(|e| e.0.abs()).fold(0.0, f64::max)
 }

@@ -43,7 +43,7 @@ pub struct Level {
     pub edge: Option<(Edge, f64)>,
     /// Labels of regions that the data do not show: they are taken to be as stiff as the reference.
     pub hidden: Vec<u8>,
-    /// Node places before that (mm, RAS).
+    /// Node places before the edge was moved (mm, RAS).
     unmoved: Vec<[f64; 3]>,
 }
 

@@ -1,5 +1,6 @@
 //! Results back on voxels and nodes.
 
+use crate::numerics::statistics::noise_sigma;
 use crate::stiffness::body::{Body, sorted};
 use crate::stiffness::forward::Tie;
 use crate::stiffness::identify::{Estimate, Setup, State};
@@ -49,13 +50,8 @@ pub fn residual(labels: &Mask, observations: &[Observation], residuals: &[[f64; 
     out
 }
 
-/// Standard deviation of what is rough in a field (mm, a component), the mean over the components; `sigma` measures it in
-/// one volume.
-pub fn noise(
-    field: &Displacement<'_>,
-    labels: &Mask,
-    sigma: impl Fn(&[f32], [usize; 3], &dyn Fn(usize) -> bool) -> f64,
-) -> f64 {
+/// Standard deviation of what is rough in a field (mm, a component), the mean over the components.
+pub fn noise(field: &Displacement<'_>, labels: &Mask) -> f64 {
     let shape = field.grid().shape();
     let inside = labels.as_slice();
     let stride = [1, shape[0], shape[0] * shape[1]];
@@ -63,7 +59,7 @@ pub fn noise(
         let near = |s: usize| inside[o.saturating_sub(s)] > 0 && inside[(o + s).min(inside.len() - 1)] > 0;
         inside[o] > 0 && stride.iter().all(|&s| near(s))
     };
-    (0..3).map(|c| sigma(field.component(c), shape, &keep)).sum::<f64>() / 3.0
+    (0..3).map(|c| f64::from(noise_sigma(field.component(c), shape, keep))).sum::<f64>() / 3.0
 }
 
 /// The model's displacement of each node (mm, RAS).
