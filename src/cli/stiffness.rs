@@ -62,7 +62,7 @@ pub struct Options {
     /// Where it is pressed, in the same way
     #[arg(long, value_name = "AXIS|FILE", default_value = "z+", allow_hyphen_values = true)]
     pub(super) load: String,
-    /// Force with which the loaded patch is pressed, across it (along its normal), in N; without, moduli are ratios
+    /// Total force on the loaded patch in N, its magnitude; without, moduli are ratios
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<f64>,
     /// Poisson's ratio of all regions

@@ -224,7 +224,7 @@ impl Setup<'_> {
         [counter, -along(&held, self.patches[0].normal)]
     }
 
-    /// By how many times the whole force on the plate is more than its part across it (1 at least), which is what [`Setup::forces`] takes.
+    /// By how many times the whole force on the plate is more than its part across it (1 at least), which is what `forces` gives.
     pub fn leaning(&self, state: &State) -> f64 {
         let Some(x) = &state.x else { return 1.0 };
         let problem = self.problem(state);

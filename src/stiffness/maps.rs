@@ -92,14 +92,15 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2
 /// Excess of the whole force over its part across the plate from which it is said.
 const LEANING: f64 = 0.01;
 
-/// Says so where the plate also pushes the body sideways, so that it matters which part of the force is known.
+/// Says so where the plate also pushes the body sideways, so that it matters which force is known; `whole` is it over its part
+/// across the plate.
 pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
     (whole > 1.0 + LEANING).then(|| {
         format!(
-            "the plate pushes sideways as well: with {force_n} N across it, which is what --force is taken for, the whole force is {:.3} N; if {force_n} N \
-             is the whole force, moduli are {:.1} % lower",
-            force_n * whole,
-            100.0 * (1.0 - 1.0 / whole)
+            "the plate pushes sideways as well: {force_n} N are taken for the whole force, of which {:.4} N act across the plate; if a load cell along \
+             its axis read {force_n} N, moduli are {:.1} % higher",
+            force_n / whole,
+            100.0 * (whole - 1.0)
         )
     })
 }

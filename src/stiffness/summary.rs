@@ -70,7 +70,7 @@ impl Moduli {
     }
 }
 
-/// The moduli of an estimate; `force_n` sets the scale, `geometry` corrects for the faces' offsets.
+/// The moduli of an estimate; `force_n`, the whole force on the plate (N), sets the scale, `geometry` corrects for the faces' offsets.
 pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry>, force_n: Option<f64>) -> Moduli {
     let regions = setup.body.labels.len();
     let none = vec![0.0; estimate.parameters];
@@ -89,7 +89,8 @@ pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry
         for (k, slope) in slopes.enumerate() {
             (0..regions).for_each(|r| gradient[r * p + k] -= slope);
         }
-        shift = (1000.0 * force / estimate.force[0] * 2.0 * (1.0 + setup.poisson)).ln();
+        let whole = estimate.force[0] * setup.leaning(&estimate.state);
+        shift = (1000.0 * force / whole * 2.0 * (1.0 + setup.poisson)).ln();
     }
     let change = |r: usize| (0..p).map(|k| gradient[r * p + k] * step[k]).sum::<f64>();
     let log = (0..regions).map(|r| estimate.state.theta[r] + shift + change(r)).collect();
