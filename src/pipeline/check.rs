@@ -82,34 +82,40 @@ pub fn inputs<'a>(
     Ok(Checked { mask, initial, deformed, not_finite, lost })
 }
 
+/// So many slices in a row may be lost: more of one value lie between two bodies.
+const IN_A_ROW: usize = 4;
+
+/// The voxels of slice `at` across an axis, in the order of memory.
+fn slice(shape: [usize; 3], axis: usize, at: usize) -> impl Iterator<Item = usize> {
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let [u, v] = [usize::from(axis == 0), 2 - usize::from(axis == 2)];
+    (0..shape[v]).flat_map(move |j| (0..shape[u]).map(move |i| at * stride[axis] + j * stride[v] + i * stride[u]))
+}
+
 /// Slices across each axis that hold one value throughout while the slices next to them that do not show tissue in the
 /// same places: an acquisition or a conversion that dropped them.
 fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
     let (grid, values) = (volume.grid(), volume.as_slice());
     let shape = grid.shape();
-    let stride = [1, shape[0], shape[0] * shape[1]];
     let across = |axis: usize| {
-        let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
-        // Voxels of a slice, along the faster axis of memory first.
-        let [u, v] = [u.min(v), u.max(v)];
-        let slice = move |at: usize| {
-            (0..shape[v])
-                .flat_map(move |j| (0..shape[u]).map(move |i| at * stride[axis] + j * stride[v] + i * stride[u]))
+        let value = |at: usize| slice(shape, axis, at).next().map_or(f32::NAN, |first| values[first]);
+        let constant = |at: usize| {
+            let first = value(at);
+            slice(shape, axis, at).all(|o| values[o] == first)
         };
-        let constant = |at: usize| slice(at).all(|o| values[o] == values[at * stride[axis]]);
         let varies: Vec<bool> = (0..shape[axis]).into_par_iter().map(|at| !constant(at)).collect();
         let between = |at: usize| {
             let below = varies[..at].iter().rposition(|v| *v)?;
             let above = at + varies[at..].iter().position(|v| *v)?;
-            let value = values[at * stride[axis]];
-            let shown = |at: usize| slice(at).map(move |o| values[o] != value);
+            let background = value(at);
+            let shown = |other: usize| slice(shape, axis, other).map(move |o| values[o] != background);
             let [mut both, mut either] = [0, 0];
             for (a, b) in shown(below).zip(shown(above)) {
                 (both, either) = (both + usize::from(a && b), either + usize::from(a || b));
             }
-            let middle = std::array::from_fn(|a| if a == axis { at } else { shape[a] / 2 });
-            let [x, y, z] = middle;
-            (2 * both > either).then(|| LostSlice { axis, at, place: grid.world(x, y, z).0[axis] })
+            let [x, y, z] = std::array::from_fn(|a| if a == axis { at } else { shape[a] / 2 });
+            let lost = LostSlice { axis, at, place: grid.world(x, y, z).0[axis] };
+            (above - below <= IN_A_ROW + 1 && 2 * both > either).then_some(lost)
         };
         (0..shape[axis]).filter(|&at| !varies[at]).filter_map(between).collect::<Vec<_>>()
     };
@@ -119,21 +125,16 @@ fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
 /// The volume with lost slices drawn over linearly from the ones next to them, so that no edge stands where nothing is measured.
 fn bridged<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     let mut out = volume.view();
-    let (grid, values) = (volume.grid(), volume.as_slice());
-    let shape = grid.shape();
+    let shape = volume.grid().shape();
     let stride = [1, shape[0], shape[0] * shape[1]];
-    for slice in lost {
-        let good = |at: &usize| !lost.iter().any(|l| (l.axis, l.at) == (slice.axis, *at));
-        let (Some(below), Some(above)) = ((0..slice.at).rev().find(good), (slice.at..shape[slice.axis]).find(good))
-        else {
-            continue;
-        };
-        let part = (slice.at - below) as f32 / (above - below) as f32;
-        let [down, up] = [slice.at - below, above - slice.at].map(|n| n * stride[slice.axis]);
-        for (o, value) in out.as_mut_slice().iter_mut().enumerate() {
-            if grid.voxel(o)[slice.axis] == slice.at {
-                *value = (1.0 - part) * values[o - down] + part * values[o + up];
-            }
+    for &LostSlice { axis, at, .. } in lost {
+        let good = |other: &usize| !lost.iter().any(|l| (l.axis, l.at) == (axis, *other));
+        let (Some(below), Some(above)) = ((0..at).rev().find(good), (at..shape[axis]).find(good)) else { continue };
+        let part = (at - below) as f32 / (above - below) as f32;
+        let [down, up] = [at - below, above - at].map(|n| n * stride[axis]);
+        let (values, new) = (volume.as_slice(), out.as_mut_slice());
+        for o in slice(shape, axis, at) {
+            new[o] = (1.0 - part) * values[o - down] + part * values[o + up];
         }
     }
     out
@@ -142,13 +143,10 @@ fn bridged<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
 /// The volume with lost slices as voxels that are not finite.
 fn without<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     let mut out = volume.view();
-    let grid = *volume.grid();
-    for slice in lost {
-        for (o, value) in out.as_mut_slice().iter_mut().enumerate() {
-            if grid.voxel(o)[slice.axis] == slice.at {
-                *value = f32::NAN;
-            }
-        }
+    let shape = volume.grid().shape();
+    for &LostSlice { axis, at, .. } in lost {
+        let new = out.as_mut_slice();
+        slice(shape, axis, at).for_each(|o| new[o] = f32::NAN);
     }
     out
 }
