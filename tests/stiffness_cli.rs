@@ -259,8 +259,10 @@ fn what_is_no_sequence_is_refused() {
     let base = ["stiffness", "--sequence", ".", "--labels", "labels.nii.gz", "-o", "results"];
     let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1"]].concat(), 2);
     assert!(err.contains("1 forces for 2 frames"), "{err}");
-    let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0.1,-1"]].concat(), 2);
-    assert!(err.contains("-1") && err.contains("below 0"), "{err}");
+    for forces in ["0.1,-1", "-1,0.1"] {
+        let (_, err) = run(folder.path(), &[&base[..], &["--forces", forces]].concat(), 2);
+        assert!(err.contains("-1") && err.contains("below 0"), "{err}");
+    }
     let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0,0"]].concat(), 1);
     assert!(err.contains("no force acts"), "{err}");
     // Each frame would find regions of its own, and their moduli would be averaged as if they were the same ones.

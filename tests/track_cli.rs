@@ -174,6 +174,7 @@ fn what_cannot_be_tracked_is_refused() {
     for (arguments, code, parts) in [
         (vec![a], 2, ["frame_000.nii.gz", "two or more"]),
         (vec![a, b, "--reference", "2"], 2, ["--reference is 2", "2 volumes"]),
+        (vec![a, b, "--reference", "-1"], 2, ["--reference", "'-1'"]),
         (vec![a, "missing.nii"], 1, ["missing.nii", "check the spelling"]),
         (vec![a, b, "missing.nii", "--dry-run"], 1, ["missing.nii", "check the spelling"]),
         // By their headers, before anything is measured.

@@ -41,7 +41,7 @@ pub struct Options {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["field", "matches", "force", "mask"])]
     sequence: Option<PathBuf>,
     /// Sequence: total force in each frame but the reference, in order, lost ones too, in N (0: at rest); without, moduli are ratios
-    #[arg(long, value_name = "N,N,...", requires = "sequence", value_delimiter = ',')]
+    #[arg(long, value_name = "N,N,...", requires = "sequence", value_delimiter = ',', allow_hyphen_values = true)]
     pub(super) forces: Vec<f64>,
     /// Matches to use inside the body, with their precision, in place of the field, which smoothness flattens; none for the
     /// field itself [default: matches.csv of the same results of palpate field, if any]

@@ -38,7 +38,7 @@ pub struct Options {
     #[command(flatten)]
     target: Target,
     /// Number of the volume that the others are measured against, counted from 0
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
     reference: usize,
     /// Where to measure: a mask on the reference's grid, 0 outside
     #[arg(long, value_name = "M")]
