@@ -3,7 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::quantile;
-use crate::types::{Grid, Mask, Voxels};
+use crate::types::{Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
@@ -64,18 +64,21 @@ pub fn inputs<'a>(
     }
     let not_finite = ranges.each_ref().map(|r| r.not_finite);
     let lost = [initial, deformed].map(lost_slices);
-    let [given, seen] = [(initial, &lost[0]), (deformed, &lost[1])].map(|(volume, lost)| without(volume, lost));
     let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume) } else { volume };
-    let [bad, worse] = [0, 1].map(|v| not_finite[v] > 0 || !lost[v].is_empty());
-    let (mut first, second) = (fill(bridged(initial, &lost[0]), not_finite[0] > 0), fill(seen, worse));
+    let mut first = fill(bridged(initial, &lost[0]), not_finite[0] > 0);
+    let second = fill(without(deformed, &lost[1]), not_finite[1] > 0 || !lost[1].is_empty());
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
-    if bad {
+    if not_finite[0] > 0 {
         first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
-        for (m, v) in mask.as_mut_slice().iter_mut().zip(given.as_slice()) {
+        for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
             if !v.is_finite() {
                 *m = 0;
             }
         }
+    }
+    for &LostSlice { axis, at, .. } in &lost[0] {
+        let mask = mask.as_mut_slice();
+        slice(first.grid().shape(), axis, at).for_each(|o| mask[o] = 0);
     }
     let (initial, spread) = in_range(first, &ranges[0], None);
     let (deformed, _) = in_range(second, &ranges[1], Some(spread));
@@ -107,6 +110,9 @@ fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
         let between = |at: usize| {
             let below = varies[..at].iter().rposition(|v| *v)?;
             let above = at + varies[at..].iter().position(|v| *v)?;
+            if above - below > IN_A_ROW + 1 {
+                return None;
+            }
             let background = value(at);
             let shown = |other: usize| slice(shape, axis, other).map(move |o| values[o] != background);
             let [mut both, mut either] = [0, 0];
@@ -115,7 +121,7 @@ fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
             }
             let [x, y, z] = std::array::from_fn(|a| if a == axis { at } else { shape[a] / 2 });
             let lost = LostSlice { axis, at, place: grid.world(x, y, z).0[axis] };
-            (above - below <= IN_A_ROW + 1 && 2 * both > either).then_some(lost)
+            (2 * both > either).then_some(lost)
         };
         (0..shape[axis]).filter(|&at| !varies[at]).filter_map(between).collect::<Vec<_>>()
     };
@@ -211,7 +217,7 @@ impl Range {
 const AROUND: usize = 13;
 
 /// With numbers in single voxels that have none, from the finite ones around them.
-fn filled<'a>(volume: &Voxels<'_>) -> Voxels<'a> {
+fn filled(volume: &Voxels<'_>) -> Volume {
     let values = volume.as_slice();
     let (grid, mut out) = (*volume.grid(), volume.clone().into_volume());
     let new = out.as_mut_slice();

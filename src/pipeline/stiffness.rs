@@ -253,7 +253,6 @@ fn labelled(
     );
     clock.book("uncertainty");
 
-    let leaning = setup.leaning(&estimate.state);
     let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);
     let map = of_region(&|r| regions[r].youngs_modulus);
     let map_sd = of_region(&|r| regions[r].sd);
@@ -262,7 +261,7 @@ fn labelled(
     let area = |i: usize| touching[i].as_ref().map_or_else(|| fine.patches[i].area(&fine.body), |t| t.1);
     let mut warnings = maps::unfit(inputs.field, inputs.labels, &fine, &estimate, noise);
     warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
-    warnings.extend(params.force_n.and_then(|force| maps::leaning(force, leaning)));
+    warnings.extend(params.force_n.and_then(|force| maps::leaning(force, estimate.leaning)));
     warnings.extend(maps::not_shown(&hidden, &regions, reference));
     warnings.dedup();
     let patches = [0, 1].map(|i| {
@@ -299,7 +298,7 @@ fn labelled(
         displacement: maps::node_displacement(&fine.body, &state),
         prescribed: maps::prescribed(&setup, &state, touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice()))),
         faces: geometry.map(|g| g.faces).unwrap_or_default(),
-        model_force: estimate.force[0] * leaning * scale / 1000.0,
+        model_force: estimate.force[0] * estimate.leaning * scale / 1000.0,
         mesh_change,
         strain,
         warnings,

@@ -13,7 +13,7 @@ use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
 use crate::stiffness::inclusion::{Inclusion, SHAPES};
-use crate::stiffness::interface::Interface;
+use crate::stiffness::interface::{Interface, fade};
 use crate::stiffness::observations::{find, read};
 use crate::stiffness::patches::Patch;
 use crate::types::space::{dot, length};
@@ -133,9 +133,9 @@ impl Edge {
     /// Where `p` comes to lie when the punch is wider by `offset` (mm) all around: what is below moves less and less.
     pub fn widened(&self, p: [f64; 3], offset: f64) -> [f64; 3] {
         let (across, height) = self.apart(p);
-        let beyond = ((length(across) - self.radius) / self.beside).clamp(0.0, 1.0);
+        let beyond = ((length(across) - self.radius) / self.beside).max(0.0);
         let below = (height.abs() / self.radius).min(1.0);
-        let part = (1.0 - beyond).powi(2) * (1.0 + 2.0 * beyond) * (1.0 - below).powi(2);
+        let part = fade(beyond) * (1.0 - below).powi(2);
         std::array::from_fn(|a| p[a] + offset * part * across[a] / self.radius)
     }
 }

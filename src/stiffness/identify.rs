@@ -100,8 +100,10 @@ pub struct Estimate {
     pub raw: f64,
     /// How many independent samples (components) the data are worth.
     pub effective: f64,
-    /// Force on the loaded and on the held plate for a reference shear modulus of 1 kPa (kPa mm^2).
+    /// Force across the loaded and across the held plate for a reference shear modulus of 1 kPa (kPa mm^2).
     pub force: [f64; 2],
+    /// By how many times the whole force on the loaded plate is more than that, which is its part across the plate (1 at least).
+    pub leaning: f64,
     /// Derivative of the logarithm of the force on the loaded plate by each parameter.
     pub force_slope: Vec<f64>,
     /// The solution's derivative by each parameter, one after the other.
@@ -214,26 +216,24 @@ impl Setup<'_> {
         out
     }
 
-    /// Force (kPa mm^2) with which each plate pushes the body (loaded, held). That of a plate on a curved body is what the ties
-    /// hold against it: linear in `x`, so it needs no better solution than that.
-    pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
-        let [held, loaded] = [0, 1].map(|i| self.patches[i].ties(self.body, &state.plates[i]));
-        let along = |ties: &[Tie], normal| ties.iter().map(|t| dot(problem.pull(t, x), normal)).sum::<f64>();
-        let n = self.patches[1].normal;
-        let counter = if problem.plate.is_some() { along(&held, n) } else { -along(&loaded, n) };
-        [counter, -along(&held, self.patches[0].normal)]
+    /// What the ties of a patch (held 0, loaded 1) pull with together (kPa mm^2).
+    fn reaction(&self, problem: &Problem<'_>, state: &State, x: &[f64], patch: usize) -> [f64; 3] {
+        let ties = self.patches[patch].ties(self.body, &state.plates[patch]);
+        ties.iter().map(|t| problem.pull(t, x)).fold([0.0; 3], |sum, f| std::array::from_fn(|a| sum[a] + f[a]))
     }
 
-    /// By how many times the whole force on the plate is more than its part across it (1 at least), which is what `forces` gives.
-    pub fn leaning(&self, state: &State) -> f64 {
-        let Some(x) = &state.x else { return 1.0 };
-        let problem = self.problem(state);
-        // What presses a curved body is known by what holds it.
-        let side = usize::from(problem.plate.is_none());
-        let mut whole = [0.0; 3];
-        for tie in self.patches[side].ties(self.body, &state.plates[side]) {
-            whole.iter_mut().zip(problem.pull(&tie, x)).for_each(|(v, f)| *v += f);
-        }
+    /// Force (kPa mm^2) with which each plate pushes the body across it (loaded, held). That of a plate on a curved body is what the ties
+    /// hold against it: linear in `x`, so it needs no better solution than that.
+    pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
+        let held = self.reaction(problem, state, x, 0);
+        let n = self.patches[1].normal;
+        let counter = if problem.plate.is_some() { dot(held, n) } else { -dot(self.reaction(problem, state, x, 1), n) };
+        [counter, -dot(held, self.patches[0].normal)]
+    }
+
+    /// By how many times the whole force on the loaded plate is more than its part across it (1 at least), told as in `forces`.
+    fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
+        let whole = self.reaction(problem, state, x, usize::from(problem.plate.is_none()));
         length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
     }
 
@@ -473,7 +473,8 @@ impl Setup<'_> {
         let raw = self.squares(&residuals, &weights);
         let squares = raw.max(samples * self.floor * self.floor);
         let (covariance, information, inflation) = covariance(&blocks, &self.prior_terms(&state), squares, samples)?;
-        let force = self.forces(problem, &state, state.x.as_deref().unwrap_or_default());
+        let x = state.x.as_deref().unwrap_or_default();
+        let (force, leaning) = (self.forces(problem, &state, x), self.leaning(problem, &state, x));
         let force_slope = self.force_slope(problem, &columns, force[0]);
         let rms = (residuals.iter().map(|r| dot(*r, *r)).sum::<f64>() / samples).sqrt();
         Ok(Estimate {
@@ -487,6 +488,7 @@ impl Setup<'_> {
             raw: raw / squares.max(f64::MIN_POSITIVE),
             effective: samples / inflation,
             force,
+            leaning,
             force_slope,
             columns,
             rows,

@@ -116,7 +116,7 @@ fn others(axis: usize) -> [usize; 2] {
 }
 
 /// From 1 at 0 to 0 at 1, smoothly.
-fn fade(t: f64) -> f64 {
+pub(super) fn fade(t: f64) -> f64 {
     let t = t.min(1.0);
     (1.0 - t).powi(2) * (1.0 + 2.0 * t)
 }

@@ -89,7 +89,7 @@ pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry
         for (k, slope) in slopes.enumerate() {
             (0..regions).for_each(|r| gradient[r * p + k] -= slope);
         }
-        let whole = estimate.force[0] * setup.leaning(&estimate.state);
+        let whole = estimate.force[0] * estimate.leaning;
         shift = (1000.0 * force / whole * 2.0 * (1.0 + setup.poisson)).ln();
     }
     let change = |r: usize| (0..p).map(|k| gradient[r * p + k] * step[k]).sum::<f64>();
