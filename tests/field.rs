@@ -131,8 +131,8 @@ fn in_a_small_mask_stillness_does_not_pass_for_motion() {
     }
 }
 
-/// Two volumes of 48 voxels a side of one texture, the first pushed about by waves of nine voxels, with exact truth.
-fn creased(noise: f32) -> (Volume, Volume, DenseField) {
+/// Two volumes of `shape` voxels (1 mm) of one texture, in the first as `moved` takes it to the second, with exact truth.
+fn carried(shape: [usize; 3], moved: impl Fn([f64; 3]) -> [f64; 3] + Sync, noise: f32) -> (Volume, Volume, DenseField) {
     let mut random = Random::new(7, 0);
     let waves: Vec<([f64; 3], f64)> = (0..60)
         .map(|_| {
@@ -144,9 +144,7 @@ fn creased(noise: f32) -> (Volume, Volume, DenseField) {
         let sum: f64 = waves.iter().map(|(k, phase)| (k[0] * p[0] + k[1] * p[1] + k[2] * p[2] + phase).cos()).sum();
         (300.0 + 20.0 * sum) as f32
     };
-    let crease = |v: f64| 1.1 * (v * std::f64::consts::TAU / 9.0).sin();
-    let moved = |[x, y, z]: [f64; 3]| [crease(y), crease(z), crease(x)];
-    let grid = Grid::new([48; 3], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+    let grid = Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
     let at = |o: usize| grid.voxel(o).map(|v| v as f64);
     let mut speckle = || noise * random.normals()[0] as f32;
     let initial = (0..grid.len()).map(|o| {
@@ -157,6 +155,32 @@ fn creased(noise: f32) -> (Volume, Volume, DenseField) {
     let deformed: Vec<f32> = (0..grid.len()).map(|o| texture(at(o)) + speckle()).collect();
     let truth = DenseField::from_fn(grid, |p| moved(p.0));
     (Volume::from_vec(grid, initial).unwrap(), Volume::from_vec(grid, deformed).unwrap(), truth)
+}
+
+/// Pushed about by waves of nine voxels.
+fn creased(noise: f32) -> (Volume, Volume, DenseField) {
+    let crease = |v: f64| 1.1 * (v * std::f64::consts::TAU / 9.0).sin();
+    carried([48; 3], |[x, y, z]| [crease(y), crease(z), crease(x)], noise)
+}
+
+/// A spine whose core slid by 18 mm in a volume 90 mm wide was 6 mm off: 13.5 mm were looked over.
+#[test]
+fn motion_that_reaches_the_search_range_is_looked_for_farther() {
+    // A core that slides by 13 voxels where 6 are looked over.
+    let slid = |[x, y, z]: [f64; 3]| {
+        let inside = ((x - 20.0) / 13.0).powi(2) + ((z - 24.0) / 15.0).powi(2) < 1.0;
+        [0.0, if inside { 13.0 * (-((y - 45.0) / 40.0).powi(2)).exp() } else { 0.0 }, 0.0]
+    };
+    let (initial, deformed, truth) = carried([40, 90, 48], slid, 4.0);
+    let measured = |search_mm: f64| {
+        let params = FieldParams { search_mm, ..FieldParams::default() };
+        let result = run(&initial, &deformed, None, &params, &|_, _| {}).unwrap();
+        (evaluate::metrics(&result.displacement, &truth, None, &[]).unwrap(), result.summary)
+    };
+    let (narrow, _) = measured(6.0);
+    let (wide, summary) = measured(0.0);
+    assert!(wide.mean_mm < 0.5 * narrow.mean_mm, "{wide:?} {narrow:?}");
+    assert!(summary.evidence.iter().any(|e| e.starts_with("search range") && e.ends_with("taken")));
 }
 
 #[test]

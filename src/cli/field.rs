@@ -41,7 +41,7 @@ pub struct Tuning {
     /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
     #[arg(long, value_name = "N")]
     points: Option<usize>,
-    /// Largest motion to look for, up to 200 mm [default: by size]
+    /// Largest motion to look for, up to 200 mm [default: by size, twice as far where motion reaches it]
     #[arg(long, value_name = "MM")]
     search: Option<f64>,
     /// Seed of whatever is drawn at random [default: 1]

@@ -14,6 +14,7 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::median;
 use crate::pipeline::check::{self, Checked};
+use crate::pipeline::farther;
 use crate::pipeline::finer::{finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::start::Begun;
@@ -143,8 +144,8 @@ fn canonical(
     let given = mask.is_some();
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
-    let search = search_mm(&grid, params.search_mm);
-    let aligned = Aligned::new(&clean, &seen, &mask, search)?;
+    let mut search = search_mm(&grid, params.search_mm);
+    let aligned = Aligned::new(&clean, &seen, &mask, farther::TWICE * search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
     clock.book("pyramid");
@@ -195,6 +196,17 @@ fn canonical(
                         (own, wider) => own.or(wider),
                     };
                 }
+                if params.search_mm == 0.0 && farther::is_open(&pair, search, found.as_ref()) {
+                    let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
+                    let coarser = all.len() - factors.len();
+                    let here = (&all[..=coarser], &pair, &lattice);
+                    let wide = farther::farther(&whole, &aligned, here, found.as_ref(), passes, &mut matched);
+                    asked.push(farther::why(search, found.as_ref(), wide.as_ref()));
+                    if wide.is_some() {
+                        search *= farther::TWICE;
+                        found = wide;
+                    }
+                }
                 let found = found.ok_or_else(|| too_few(&grid, 0, search))?;
                 reports.extend(found.report.clone());
                 reach = found.reach();
@@ -205,7 +217,8 @@ fn canonical(
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
             let best = finer(&pair, field, (params.node_spacing, passes), params.seed, refine);
-            (field, left, gain, asked) = (best.field, best.left, best.gain, best.said);
+            (field, left, gain) = (best.field, best.left, best.gain);
+            asked.extend(best.said);
         }
         clock.skip("matching", matched);
         clock.book("residual");
@@ -704,7 +717,7 @@ fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max_mm: f64, s
     if folds > 0 {
         out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));
     }
-    if max_mm > 0.9 * search {
+    if max_mm > farther::NEAR * search {
         let at = if max_mm > search { "past" } else { "near" };
         out.push(format!(
             "the motion reaches {max_mm:.1} mm, {at} the search range of {search:.1} mm; try a wider --search"

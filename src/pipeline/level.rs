@@ -175,17 +175,18 @@ pub fn gained(pair: &Pair<'_>, from: &SplineField, to: &SplineField) -> f64 {
     residual::excess(pair, &warp(from), &Baseline::new(pair, warp(to))) * f64::from(independent(pair))
 }
 
-/// Mean length of a field over the mask (mm), from every third voxel along each axis.
-pub fn mean_length(pair: &Pair<'_>, field: &SplineField) -> f64 {
+/// Mean and largest length of a field over the mask (mm), from every third voxel along each axis.
+pub fn lengths(pair: &Pair<'_>, field: &SplineField) -> [f64; 2] {
     let [nx, ny, nz] = pair.shape;
-    let (mut sum, mut count) = (0.0, 0usize);
+    let (mut sum, mut count, mut largest) = (0.0, 0usize, 0.0f64);
     for (j, k) in (0..nz).step_by(3).flat_map(|k| (0..ny).step_by(3).map(move |j| (j, k))) {
         for i in (0..nx).step_by(3).filter(|i| pair.mask[i + nx * (j + ny * k)] != 0) {
             let u = field.lattice.at(&field.coefficients, [i, j, k].map(|v| v as f64));
-            (sum, count) = (sum + distance(u, [0.0; 3]), count + 1);
+            let length = distance(u, [0.0; 3]);
+            (sum, count, largest) = (sum + length, count + 1, largest.max(length));
         }
     }
-    sum / count.max(1) as f64
+    [sum / count.max(1) as f64, largest]
 }
 
 /// Whether the deformed volume shows what is at `p` (voxels) in the initial one, by a field.

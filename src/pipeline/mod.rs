@@ -31,6 +31,7 @@ pub mod pressed;
 
 pub mod stress;
 
+mod farther;
 mod finer;
 mod search;
 mod start;

@@ -152,6 +152,16 @@ impl Begun {
         self.report.as_ref().is_some_and(is_loose)
     }
 
+    /// The part of the features that agreed (0 to 1); nothing where none was sought.
+    pub fn share(&self) -> f64 {
+        self.report.as_ref().map_or(0.0, |r| r.counts.kept_share())
+    }
+
+    /// The same, remembered for the next frame by how the volumes agree on the level of `pair`.
+    pub fn seen(self, pair: &Pair<'_>) -> Self {
+        Self { searched: Searched::of(pair, &self.field), ..self }
+    }
+
     /// The features and those that agreed, where these are too few to go by.
     pub fn doubted(&self) -> Option<Counts> {
         self.report.as_ref().map(|r| r.counts).filter(|c| c.kept_share() < BORNE_OUT)
@@ -217,7 +227,7 @@ pub(super) fn begin(
     let still = SplineField::still(lattice.clone());
     let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
     let least = FAR * pyramid::finest(pair.shape, pair.spacing);
-    let clear = |found: &SplineField| level::mean_length(pair, found) > least && level::is_better(pair, found, &still);
+    let clear = |found: &SplineField| level::lengths(pair, found)[0] > least && level::is_better(pair, found, &still);
     let still_too = rest && !(sure && found.as_ref().is_some_and(clear));
     let own = [found, still_too.then_some(still)]
         .into_iter()

@@ -34,6 +34,7 @@ const BENT: f64 = 1.6;
 const FEWEST: usize = 8;
 
 /// How a whole volume is searched.
+#[derive(Clone, Copy)]
 pub(super) struct Whole<'a> {
     pub params: &'a FieldParams,
     /// The largest motion looked for (mm).

@@ -38,7 +38,8 @@ pub struct FieldParams {
     /// Voxels of the mask for each automatic point (1); 27 to 1000. Measured: more points than one in 64 voxels gain
     /// nothing, since their patches overlap.
     pub voxels_per_point: usize,
-    /// Largest motion looked for (mm); 0 = 15 % of the volume's smallest side, 2 voxels to 30 mm.
+    /// Largest motion looked for (mm); 0 = 15 % of the volume's smallest side, 2 voxels to 30 mm, and twice as far
+    /// where the motion reaches that.
     pub search_mm: f64,
     /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000 voxels of tissue.
     pub finest: usize,
