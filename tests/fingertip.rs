@@ -43,7 +43,8 @@ fn a_hemisphere_presses_as_pi_e_d_squared() {
     assert_eq!(out.pad.model, PadModel::Uniform);
     assert!((out.pad.effective_kpa - 40.0).abs() < 1e-6, "{}", out.pad.effective_kpa);
     assert!((out.pad.hemisphere_kpa / 40.0 - 1.0).abs() < 0.1, "{}", out.pad.hemisphere_kpa);
-    assert!((out.pad.radius_mm / radius - 1.0).abs() < 0.15, "{}", out.pad.radius_mm);
+    // Half a voxel at the apex; a paraboloid over so deep a cap would give 8.5.
+    assert!((out.pad.radius_mm / radius - 1.0).abs() < 0.04, "{}", out.pad.radius_mm);
 }
 
 #[test]

@@ -696,6 +696,62 @@ fn control_that_is_unstable_itself_is_not_blamed_on_the_step() {
     assert!(result.events.iter().all(|e| e.kind != EventKind::BadStep), "{:?}", result.events);
 }
 
+/// What blows up in each fiftieth of a step as well was taken for the grasp's own growth: 0.3 s passed as stable, and so did 1 ms with
+/// fingers that need 0.014.
+#[test]
+fn steps_far_beyond_the_limit_are_refused_too() {
+    for step in [5e-3, 0.05, 0.3, 1.0] {
+        for method in [Method::Rk4, Method::SemiImplicitEuler] {
+            let mut scene = short();
+            (scene.integrator.step, scene.integrator.output_every, scene.integrator.method) = (step, 1.0, method);
+            let result = simulate(&scene, &|_| {});
+            assert!(matches!(result, Err(GraspError::BadStep { .. })), "{step} {method:?}");
+        }
+    }
+    let mut light = short();
+    (light.finger.inertia, light.integrator.step) = (5e-6, 1e-3);
+    let Err(GraspError::BadStep { stable, .. }) = simulate(&light, &|_| {}) else { panic!() };
+    assert!(stable < 1e-4, "{stable}");
+    let mut tight = short();
+    (tight.integrator.formulation, tight.integrator.baumgarte) = (Formulation::Multipliers, 3e5);
+    assert!(matches!(simulate(&tight, &|_| {}), Err(GraspError::BadGain { .. })));
+}
+
+/// A tip whose springs are not alike began where alike ones would rest, and sank from there.
+#[test]
+fn a_tabulated_tip_begins_in_equilibrium() {
+    let mut scene = short();
+    scene.motions.clear();
+    scene.fingertip.model = FingertipModel::Tabulated;
+    scene.fingertip.profile = vec![[0.0, 0.25 * E], [1e-3, 0.5 * E], [2e-3, 2.0 * E]];
+    scene.initial.rest = 0.5;
+    let result = run(&scene);
+    let [first, last] = [result.samples[0], result.samples[result.samples.len() - 1]];
+    let half = 0.5 * scene.object.mass * scene.gravity;
+    for i in 0..2 {
+        assert!((first.tangential_force[i].abs() / half.abs() - 1.0).abs() < 1e-9, "{first:?}");
+        assert!((first.pose[i] - last.pose[i]).abs() < 1e-9, "{first:?} {last:?}");
+    }
+    // Where springs are too soft all through, it is refused as tips of one modulus are.
+    scene.fingertip.profile = vec![[0.0, 0.02 * E], [2e-3, 0.02 * E]];
+    assert!(matches!(simulate(&scene, &|_| {}), Err(GraspError::NoStart { .. })));
+}
+
+#[test]
+fn joints_that_stay_behind_and_tips_pressed_past_their_profile_are_said() {
+    let mut scene = short();
+    assert_eq!(pipeline::grasp::notes(&scene, &run(&scene)), Vec::<String>::new());
+    scene.finger.gains.ki = 0.0;
+    scene.finger.gains.kp = 2.0;
+    let notes = pipeline::grasp::notes(&scene, &run(&scene));
+    assert!(notes.len() == 1 && notes[0].contains("was told to be at"), "{notes:?}");
+    let mut scene = short();
+    scene.fingertip.model = FingertipModel::Tabulated;
+    scene.fingertip.profile = vec![[0.0, E], [1e-3, E]];
+    let notes = pipeline::grasp::notes(&scene, &run(&scene));
+    assert!(notes.len() == 1 && notes[0].contains("ends at 1.00 mm"), "{notes:?}");
+}
+
 #[test]
 fn a_step_that_becomes_too_long_on_the_way_is_found() {
     // Stiff tips, light object, little damping: stable at the pinch, not when pressed more.

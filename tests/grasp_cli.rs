@@ -136,6 +136,10 @@ fn bad_scenes_are_refused_with_a_hint() {
     refused(|s| format!("{s}\n[[sweep]]\nkey = \"thing.mass\"\nvalues = [1]\n"), &["no table 'thing'"]);
     refused(|s| format!("{s}\n[[sweep]]\nkey = \"motion.9.hold\"\nvalues = [1]\n"), &["'9'"]);
     refused(|s| format!("{s}\n[[sweep]]\nkey = \"object.mass\"\nvalues = []\n"), &["no values"]);
+    refused(
+        |s| format!("{s}\n[[sweep]]\nkey = \"fingertip.file\"\nvalues = [\"a\"]\n"),
+        &["fingertip.file", "is read once"],
+    );
     refused(|s| format!("{s}\n[[sweep]]\nkey = \"object.mass\"\nvalues = [0.1, -1]\n"), &["object.mass is -1"]);
     // A key of the wrong table, and no file at all.
     let folder = folder(str::to_string);
@@ -254,4 +258,22 @@ fn a_scene_that_would_be_overwritten() {
     fs::rename(folder.path().join("scene.toml"), folder.path().join("report.html")).unwrap();
     let (_, err) = run(folder.path(), &["grasp", "report.html", "-o", ".", "--force"], 2);
     assert!(err.contains("would be overwritten"), "{err}");
+}
+
+/// All rows said `completed` while their runs slipped; and a swept key that a flag replaced gave rows named after what they were not.
+#[test]
+fn a_sweep_says_what_slipped_and_does_not_fight_with_flags() {
+    let folder = folder(|s| format!("{s}\n[[sweep]]\nkey = \"object.friction\"\nvalues = [0.1, 5.0]\n"));
+    let (out, _) = run(folder.path(), &["grasp", "scene.toml", "-o", "one"], 0);
+    assert!(out.contains("2 scenes, 2 ran to their end, 1 of them with slip"), "{out}");
+    let table = fs::read_to_string(folder.path().join("one/sweep.csv")).unwrap();
+    let outcome = |case: &str| {
+        let mut rows = table.lines().filter(|l| l.starts_with(case));
+        rows.next().unwrap().split(',').nth(2).unwrap().to_string()
+    };
+    assert_eq!([outcome("1,"), outcome("2,")], ["slip", "completed"]);
+    let models = "\n[[sweep]]\nkey = \"fingertip.model\"\nvalues = [\"parallel\", \"radial\"]\n";
+    fs::write(folder.path().join("scene.toml"), format!("{SCENE}{models}")).unwrap();
+    let (_, err) = run(folder.path(), &["grasp", "scene.toml", "-o", "two", "--model", "radial"], 1);
+    assert!(err.contains("[[sweep]] changes fingertip.model"), "{err}");
 }

@@ -76,8 +76,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     progress.set("write", 1.0);
     let started = Instant::now();
     let run = &outcome.run;
-    let warnings: Vec<String> =
-        run.events.iter().take(8).map(|e| format!("{name}: {}", grasp::event_line(e))).collect();
+    let notes = pipeline::grasp::notes(&file.scene, run);
+    let events = run.events.iter().take(8).map(grasp::event_line);
+    let warnings: Vec<String> = events.chain(notes.iter().cloned()).map(|w| format!("{name}: {w}")).collect();
     folder.write("trajectory.csv", |p| io::write_trajectory(p, &run.samples))?;
     folder.write("motions.csv", |p| io::write_motions(p, &run.motions))?;
     if !file.sweep.is_empty() {
@@ -94,7 +95,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         stable_steps: &outcome.stable_steps,
         sweep: &sweep,
         seconds: &seconds,
-        warnings: &[],
+        warnings: &notes,
     };
     folder.write("summary.json", |p| io::write_json(p, &grasp::summary(&report)))?;
     folder.write("report.html", |p| io::write_text(p, &grasp::page(&report)))?;

@@ -27,10 +27,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     progress.set("skin", 0.0);
     let outcome = pipeline::skin::run(&scene);
     let name = name(path);
-    let mut warnings = Vec::new();
-    if outcome.block.is_none() {
-        warnings.push(format!("{name}: the block has no solution; its values are too far apart"));
-    }
+    let warnings: Vec<String> =
+        pipeline::skin::notes(&scene, &outcome).into_iter().map(|w| format!("{name}: {w}")).collect();
     let report = SkinReport {
         name: &name,
         scene: &scene,

@@ -234,25 +234,51 @@ fn profile(depths: &[f64], force: &[f64], mean: f64) -> Vec<[f64; 2]> {
 /// Relative residual of the forces below which a smaller model is enough.
 const ENOUGH: f64 = 0.02;
 
-/// Radius of the surface about its foremost place (mm): gap = |place - apex|^2 / (2 R), least squares over the columns
-/// that a press of `deepest` mm touches.
+/// Rounds of the fit of a sphere.
+const SPHERES: usize = 20;
+
+/// Radius (mm) of the sphere whose surface is nearest to that of the columns which a press of `deepest` mm touches: least squares of the
+/// gap along the press, from the paraboloid's on (Gauss and Newton). A paraboloid alone would give R less half of the deepest gap.
 fn radius(columns: &[Column], deepest: f64) -> f64 {
-    // gap = a r^2 + b x + c y + d; R = 1 / (2 a).
-    let mut m = [[0.0; 4]; 4];
-    let mut rhs = [0.0; 4];
     let near: Vec<&Column> = columns.iter().filter(|c| c.gap <= deepest).collect();
     let n = near.len().max(1) as f64;
     let middle = [0, 1].map(|a| near.iter().map(|c| c.place[a]).sum::<f64>() / n);
-    for c in near {
-        let [x, y] = [0, 1].map(|a| c.place[a] - middle[a]);
-        let basis = [x * x + y * y, x, y, 1.0];
-        for r in 0..4 {
-            rhs[r] += basis[r] * c.gap;
-            for s in 0..4 {
-                m[r][s] += basis[r] * basis[s];
+    // gap = g + k s^2 / (1 + w) with s the distance from (x, y), w^2 = 1 - k^2 s^2 and k = 1 / R; w is 1 at first.
+    let (mut k, mut at, mut g) = (0.0f64, [0.0; 2], 0.0);
+    for round in 0..SPHERES {
+        let (mut m, mut rhs) = ([[0.0; 4]; 4], [0.0; 4]);
+        for c in &near {
+            let [x, y] = [0, 1].map(|a| c.place[a] - middle[a] - at[a]);
+            let square = x * x + y * y;
+            let w = (1.0 - k * k * square).max(0.05).sqrt();
+            let off = c.gap - g - k * square / (1.0 + w);
+            // At first k is 0, and the place's terms those of a linear slope.
+            let row = if round == 0 {
+                [0.5 * square, x, y, 1.0]
+            } else {
+                [square / (w * (1.0 + w)), -k * x / w, -k * y / w, 1.0]
+            };
+            for r in 0..4 {
+                rhs[r] += row[r] * off;
+                (0..4).for_each(|s| m[r][s] += row[r] * row[s]);
             }
         }
+        let Some(step) = crate::numerics::dense::solve(&m, &rhs) else { break };
+        if round == 0 {
+            // A slope is a place beside the middle.
+            k = step[0];
+            if k <= 0.0 {
+                return f64::INFINITY;
+            }
+            at = [-step[1] / k, -step[2] / k];
+            g = step[3] - 0.5 * k * (at[0] * at[0] + at[1] * at[1]);
+            continue;
+        }
+        (k, g) = ((k + step[0]).max(0.5 * k), g + step[3]);
+        at = [at[0] + step[1], at[1] + step[2]];
+        if step[0].abs() < 1e-9 * k {
+            break;
+        }
     }
-    let curvature = crate::numerics::dense::solve(&m, &rhs).map_or(0.0, |x| x[0]);
-    if curvature > 0.0 { 0.5 / curvature } else { f64::INFINITY }
+    if k > 0.0 { 1.0 / k } else { f64::INFINITY }
 }

@@ -13,7 +13,7 @@
 
 use crate::grasp::models::Tilt;
 use crate::numerics::trig::sin_cos;
-use crate::types::{FingertipModel, Scene};
+use crate::types::Scene;
 
 /// Pose and joint angles (m, rad): x, y, theta, theta_1, theta_2.
 pub type Coordinates = [f64; 5];
@@ -32,12 +32,10 @@ pub struct Geometry {
 }
 
 impl Geometry {
-    /// Of a scene. Rigid tips cannot be pressed in, so their joints stand apart until they just touch.
+    /// Of a scene.
     pub fn of(scene: &Scene) -> Self {
         let (radius, half_width) = (scene.fingertip.radius, 0.5 * scene.object.width);
-        let rigid = scene.fingertip.model == FingertipModel::Rigid;
-        let half_span = if rigid { radius + half_width } else { scene.finger.half_span };
-        Self { radius, link: scene.finger.link, half_span, half_width }
+        Self { radius, link: scene.finger.link, half_span: scene.half_span(), half_width }
     }
 
     /// Tip centres O1, O2 (m) at joint angles (rad).

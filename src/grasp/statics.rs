@@ -3,8 +3,8 @@
 use crate::grasp::constraints::{Contact, Coordinates, Geometry};
 use crate::grasp::models::{Tip, in_range};
 use crate::numerics::dense::{self, Square, symmetric_eigen};
-use crate::types::Scene;
 use crate::types::grasp::Sample;
+use crate::types::{FingertipModel, Scene};
 use std::f64::consts::PI;
 
 /// Energy of the object between two tips, joints fixed.
@@ -179,13 +179,22 @@ impl<'a> Statics<'a> {
     }
 
     /// The closed form at joint angles 0 (docs/grasp.md): x = theta = 0, and for tips that deform along the face
-    /// y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the force that soft ones have at d_0.
+    /// y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the force that soft ones have at d_0. That of tabulated
+    /// tips is found next to it; its eigenvalue is not a number where there is none.
     pub fn pinch(&self, scene: &Scene) -> Equilibrium {
         let d = scene.initial.normal_displacement;
         let stiffness = PI * scene.fingertip.youngs_modulus;
         let sag = if self.tip.holds_tangent() { 0.0 } else { self.weight / (4.0 * stiffness * d) };
         let (grip, half) = (stiffness * d * d, 0.5 * self.weight);
-        self.at([0.0, sag - self.geometry.link, 0.0, 0.0, 0.0], [grip, grip, half, half])
+        let forces = [grip, grip, half, half];
+        if scene.fingertip.model != FingertipModel::Tabulated {
+            return self.at([0.0, sag - self.geometry.link, 0.0, 0.0, 0.0], forces);
+        }
+        // Springs that are not alike have no closed form, but the same at the stiffness that they have along the face there.
+        let level = [0.0, -self.geometry.link, 0.0, 0.0, 0.0];
+        let along = self.tip.curvature(d, 0.0, self.geometry.contact(&level).tilt(0))[1][1];
+        let guess = self.at([0.0, self.weight / (2.0 * along) - self.geometry.link, 0.0, 0.0, 0.0], forces);
+        self.equilibrium([0.0; 2], &guess).unwrap_or(Equilibrium { smallest_eigenvalue: f64::NAN, ..guess })
     }
 
     /// All that belongs to an equilibrium at `q`; `multipliers` are the forces of held rows.

@@ -38,8 +38,32 @@ pub fn growth<P: Stepper, const N: usize, S: System<N>>(system: &S, phase: &Phas
     spectral_radius(&matrix)
 }
 
-/// Parts of a step by which the motion's own growth is measured.
-const PARTS: u16 = 50;
+/// Parts of a step by which the motion's own growth is measured at first.
+const PARTS: f64 = 50.0;
+
+/// Times that they are halved at most.
+const HALVINGS: usize = 24;
+
+/// Part of the exponent by which the growth of halved parts may differ for it to be the motion's own.
+const SETTLED: f64 = 0.005;
+
+/// By how much the motion itself grows in `h` seconds about `state`, from parts so short that halving them changes nothing; None where it
+/// does not. Longer parts would blow up by themselves, and what blows up in parts excused the step that blew up as a whole.
+fn own_growth<const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> Option<f64> {
+    let mut parts = PARTS;
+    let mut before = f64::NAN;
+    for _ in 0..HALVINGS {
+        let exponent = parts * growth::<Rk4, N, S>(system, phase, h / parts, state).ln();
+        if exponent <= LIMIT.ln() {
+            return None;
+        }
+        if (exponent - before).abs() <= SETTLED * exponent {
+            return Some(exponent.exp());
+        }
+        (before, parts) = (exponent, 2.0 * parts);
+    }
+    None
+}
 
 /// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp itself is unstable (by
 /// its control, say) and the step follows that growth to 2 %, the step is not to blame, and 1 is given back.
@@ -55,11 +79,13 @@ pub fn growth_of<const N: usize, S: System<N>>(
         Method::SemiImplicitEuler => growth::<SemiImplicitEuler, N, S>(system, phase, h, state),
         Method::Adaptive => 0.0,
     };
-    if found <= LIMIT {
+    if found <= LIMIT || !found.is_finite() {
         return found;
     }
-    let own = growth::<Rk4, N, S>(system, phase, h / f64::from(PARTS), state).powi(PARTS.into());
-    if own > LIMIT && found <= 1.02 * own { 1.0 } else { found }
+    match own_growth(system, phase, h, state) {
+        Some(own) if found <= 1.02 * own && own.is_finite() => 1.0,
+        _ => found,
+    }
 }
 
 /// Largest value between `low` and `high` up to which `stable` holds, to 1 %; `low` where it does not hold even there.

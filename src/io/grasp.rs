@@ -69,7 +69,8 @@ pub fn write_motions(path: impl AsRef<Path>, motions: &[MotionRow]) -> Result<()
     write_table(path.as_ref(), &MotionRow::COLUMNS, motions.iter().map(motion_row))
 }
 
-/// Writes an ensemble: case, its keys, how it ended (`completed`, the event, or the error), when (s), then
+/// Writes an ensemble: case, its keys, how it ended (`completed`, the event that ended it, `slip` where a tip slipped on the way, or the
+/// error), when (s), then
 /// [`MotionRow::COLUMNS`], a row a motion; a case without motions has one row with empty places.
 ///
 /// # Errors
@@ -91,9 +92,10 @@ pub fn write_sweep(
         start.extend(case.values.iter().map(|v| v.1.clone()));
         let (outcome, time, motions) = match result {
             Ok(run) => {
-                let end = run.events.iter().find(|e| e.kind.ends_run());
+                let flaw = run.flaw();
                 let last = run.samples.last().map_or(0.0, |s| s.time);
-                (end.map_or("completed", |e| e.kind.name()).to_string(), end.map_or(last, |e| e.time), &run.motions[..])
+                let outcome = flaw.map_or("completed", |e| e.kind.name()).to_string();
+                (outcome, flaw.map_or(last, |e| e.time), &run.motions[..])
             }
             Err(error) => (error.to_string(), 0.0, &[][..]),
         };

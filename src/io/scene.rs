@@ -25,6 +25,19 @@ pub struct SceneOverrides {
     pub step: Option<f64>,
 }
 
+impl SceneOverrides {
+    /// `key` where it is replaced.
+    fn replaced<'k>(&self, key: &'k str) -> Option<&'k str> {
+        let replaced = match key {
+            "fingertip.model" => self.model.is_some(),
+            "integrator.formulation" => self.formulation.is_some(),
+            "integrator.step" => self.step.is_some(),
+            _ => false,
+        };
+        replaced.then_some(key)
+    }
+}
+
 /// What a scene file holds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SceneFile {
@@ -64,6 +77,10 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
     check_keys(path, &table)?;
     let fingertip_file = merge_fingertip(path, &mut table)?;
     let sweeps = take_sweeps(path, &mut table)?;
+    if let Some(key) = sweeps.iter().find_map(|(key, _)| overrides.replaced(key)) {
+        let what = format!("[[sweep]] changes {key}, which is set from outside for all scenes");
+        return Err(format(path, what, "leave that flag out, or that [[sweep]] table"));
+    }
     let scene = scene(path, table.clone(), overrides)?;
     let count = sweeps.iter().try_fold(1usize, |n, (_, values)| n.checked_mul(values.len()));
     if count.is_none_or(|n| n > MOST_CASES) {
@@ -191,6 +208,12 @@ fn set(path: &Path, table: &mut Table, key: &str, value: &Value) -> Result<(), I
     };
     if inner.is_empty() {
         return Err(wrong("names no key of a table".into(), "write table.key, such as object.mass"));
+    }
+    if key == "fingertip.file" {
+        return Err(wrong(
+            "is read once, before the sweep".into(),
+            "sweep its values, such as fingertip.youngs_modulus",
+        ));
     }
     let Some((_, keys)) = KEYS.iter().find(|(name, _)| !name.is_empty() && name == first) else {
         let tables: Vec<&str> = KEYS[1..9].iter().map(|k| k.0).collect();

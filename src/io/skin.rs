@@ -83,6 +83,10 @@ pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
         let element = l.element.parse().map_err(|e: crate::error::UnknownName| {
             format(path, e.to_string(), format!("correct layer '{name}' element"))
         })?;
+        if layers.iter().any(|l: &Layer| l.name == name) {
+            let what = format!("two layers are called '{name}', and response.csv has a column for each name");
+            return Err(format(path, what, "give each [[layer]] a name of its own"));
+        }
         layers.push(Layer {
             name,
             thickness: l.thickness,

@@ -5,7 +5,7 @@ use crate::grasp::models::tip;
 use crate::grasp::simulate::{self, simulate};
 use crate::grasp::statics::Statics;
 use crate::grasp::{freedom, pinch, posture, stability, stepping};
-use crate::types::grasp::{GraspAnalysis, GraspRun, StableStep};
+use crate::types::grasp::{GraspAnalysis, GraspRun, MotionRow, StableStep};
 use crate::types::scene::{Push, SweepCase};
 use crate::types::{FingertipModel, Scene};
 use rayon::prelude::*;
@@ -49,6 +49,42 @@ pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspE
     let stable_steps = stable_steps(scene);
     seconds.push(("stable steps".into(), started.elapsed().as_secs_f64()));
     Ok(GraspOutcome { run, without_tangential, stable_steps, seconds })
+}
+
+/// How far a joint may be from its target when a hold ends (rad).
+const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
+
+/// How far past the end of a tabulated tip's profile it may be pressed.
+const PAST: f64 = 1.02;
+
+/// What a user should know of a run beside its events: joints that do not come to where they are told to, and tips that are pressed in
+/// further than their profile was measured.
+pub fn notes(scene: &Scene, run: &GraspRun) -> Vec<String> {
+    let mut out = Vec::new();
+    let off = |row: &MotionRow, i: usize| (row.reached.joints[i] - row.target[i]).abs();
+    let all = run.motions.iter().flat_map(|row| [(row, 0), (row, 1)]).filter(|&(row, i)| off(row, i) > SHORT);
+    if let Some((row, i)) = all.reduce(|a, b| if off(b.0, b.1) > off(a.0, a.1) { b } else { a }) {
+        let [reached, target] = [row.reached.joints[i], row.target[i]].map(f64::to_degrees);
+        let when = if row.step == 0 { "the rest".into() } else { format!("the hold of motion {}", row.step) };
+        out.push(format!(
+            "at the end of {when} joint {} is at {reached:.2} degrees and was told to be at {target:.2}: finger.gains are too weak for the load, or \
+             the hold is too short (motions.csv has what was ordered)",
+            i + 1
+        ));
+    }
+    let tip = &scene.fingertip;
+    let deepest = run.samples.iter().flat_map(|s| s.normal).fold(0.0, f64::max);
+    if let Some([end, _]) =
+        tip.profile.last().filter(|p| tip.model == FingertipModel::Tabulated && deepest > PAST * p[0])
+    {
+        out.push(format!(
+            "a tip is pressed in by {:.2} mm, and fingertip.profile_depth ends at {:.2} mm: further in its last modulus is taken, which nothing was \
+             measured for",
+            1e3 * deepest,
+            1e3 * end
+        ));
+    }
+    out
 }
 
 /// Runs all cases of an ensemble in parallel; results are in the order of the cases.

@@ -21,6 +21,36 @@ pub struct SkinOutcome {
     pub seconds: Vec<(String, f64)>,
 }
 
+/// Precision of the column beyond which it is said.
+const ROUGH: f64 = 1e-6;
+
+/// What a user should know of a scene and its response.
+pub fn notes(scene: &SkinScene, outcome: &SkinOutcome) -> Vec<String> {
+    let mut out = Vec::new();
+    if outcome.block.is_none() {
+        out.push("the block has no solution; its values are too far apart".into());
+    }
+    let precision = column::precision(scene);
+    if precision > ROUGH {
+        out.push(format!(
+            "the column may be off by {precision:.0e} of its largest values by rounding: some layer yields faster than the load lasts by a factor of \
+             {:.0e}; leave out the dashpot that does so",
+            precision / f64::EPSILON
+        ));
+    }
+    for (at, layer) in scene.layers.iter().enumerate() {
+        let most = outcome.column.iter().map(|s| s.strain[at]).fold(0.0, f64::max);
+        if most >= 1.0 {
+            out.push(format!(
+                "layer '{}' is compressed by {:.0} % of its thickness: no tissue can be; the load is past what springs and dashpots describe",
+                layer.name,
+                100.0 * most
+            ));
+        }
+    }
+    out
+}
+
 /// Runs a checked scene.
 pub fn run(scene: &SkinScene) -> SkinOutcome {
     let mut seconds = Vec::new();

@@ -37,6 +37,7 @@ pub fn grasp<'py>(
     let ended = results.into_iter().map(|r| r.map_err(|e| e.to_string()));
     let sweep: Vec<_> = file.sweep.into_iter().zip(ended).collect();
     let run = &outcome.run;
+    let notes = pipeline::grasp::notes(&file.scene, run);
     let report = GraspReport {
         name: &name,
         scene: &file.scene,
@@ -45,7 +46,7 @@ pub fn grasp<'py>(
         stable_steps: &outcome.stable_steps,
         sweep: &sweep,
         seconds: &outcome.seconds,
-        warnings: &[],
+        warnings: &notes,
     };
     let out = PyDict::new(py);
     out.set_item("summary", arrays::python(py, &summary(&report))?)?;

@@ -64,6 +64,9 @@ pub fn flags(o: &PairOutcome) -> Vec<String> {
     if o.grasp["completed"] == false {
         out.push("the grasp ended early".into());
     }
+    if list(&o.grasp["events"]).iter().any(|e| e["kind"] == "slip") {
+        out.push("the grasp slips".into());
+    }
     out
 }
 

@@ -97,8 +97,11 @@ pub fn text(report: &GraspReport<'_>) -> String {
         let _ = writeln!(out, "  event        {}", event_line(e));
     }
     if !report.sweep.is_empty() {
-        let held = report.sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.completed)).count();
-        let _ = writeln!(out, "  sweep        {} scenes, {held} ran to their end", report.sweep.len());
+        let done = report.sweep.iter().filter_map(|(_, r)| r.as_ref().ok()).filter(|r| r.completed);
+        let (all, slipped) =
+            done.fold((0, 0), |(all, slipped), r| (all + 1, slipped + usize::from(r.flaw().is_some())));
+        let scenes = report.sweep.len();
+        let _ = writeln!(out, "  sweep        {scenes} scenes, {all} ran to their end, {slipped} of them with slip");
     }
     let _ = writeln!(out, "  time         {:.3} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
     out
@@ -367,8 +370,7 @@ fn ensemble(sweep: &[(SweepCase, Result<GraspRun, String>)]) -> String {
             row.extend(case.values.iter().map(|v| escape(&v.1)));
             match result {
                 Ok(run) => {
-                    let end = run.events.iter().find(|e| e.kind.ends_run());
-                    row.push(end.map_or("completed".into(), |e| escape(&event_line(e))));
+                    row.push(run.flaw().map_or("completed".into(), |e| escape(&event_line(e))));
                     row.push(run.motions.iter().filter(|m| m.step > 0).count().to_string());
                     let last = run.motions.last().map(|m| m.reached);
                     row.push(last.map_or("-".into(), |s| fixed2(s.pose[2].to_degrees())));
@@ -397,7 +399,7 @@ pub(super) fn scene_table(scene: &Scene) -> String {
             format!("{}, radius {}, E {} kPa", tip.model.name(), mm(tip.radius), short(tip.youngs_modulus / 1e3)),
         ),
         ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
-        ("Link, half span", format!("{}, {}", mm(finger.link), mm(finger.half_span))),
+        ("Link, half span", format!("{}, {}", mm(finger.link), mm(scene.half_span()))),
         ("Object", format!("{} x {}, {} kg", mm(object.width), mm(object.height), short(object.mass))),
         ("Friction", object.friction.map_or("not checked".into(), short)),
         ("First displacement", mm(scene.initial.normal_displacement)),

@@ -67,11 +67,14 @@ fn push_turn(analysis: &GraspAnalysis) -> (f64, f64) {
 }
 
 /// How the push went, in words.
-fn push_words(analysis: &GraspAnalysis) -> String {
+fn push_words(analysis: &GraspAnalysis, friction: bool) -> String {
     let (most, left) = push_turn(analysis);
     match analysis.push.events.first() {
         Some(e) => format!("turned up to {most:.2} degrees; {}", event_line(e)),
-        None => format!("turned up to {most:.2} degrees without slip and came back to within {left:.1e} degrees"),
+        None => {
+            let slip = if friction { "without slip" } else { "(slip is not checked: no object.friction)" };
+            format!("turned up to {most:.2} degrees {slip} and came back to within {left:.1e} degrees")
+        }
     }
 }
 
@@ -91,7 +94,7 @@ pub fn text(report: &AnalysisReport<'_>) -> String {
             f.controls()
         );
     }
-    let _ = writeln!(out, "  push         {}", push_words(a));
+    let _ = writeln!(out, "  push         {}", push_words(a, report.scene.object.friction.is_some()));
     let _ = writeln!(
         out,
         "  pinch map    {:.0} % of the joint angles to {:.0} degrees hold",
@@ -314,7 +317,7 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
          <article><h3>Scene</h3>{}</article></div><div class=\"plots\">{}</div></section>\
          <section><h2>Numbers</h2><div class=\"grid\"><article><h3>Stable steps</h3><p>At the pinch and at all postures of the \
          scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
-        escape(&push_words(a)),
+        escape(&push_words(a, report.scene.object.friction.is_some())),
         animation(report.pushed, &a.push.samples),
         scene_table(report.scene),
         time_plots(&pushed),

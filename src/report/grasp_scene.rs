@@ -15,7 +15,7 @@ const SCRIPT: &str = include_str!("grasp.js");
 /// Lengths of a scene in mm: radius, link, half span, object's width and height.
 fn lengths(scene: &Scene) -> [f64; 5] {
     let object = &scene.object;
-    [scene.fingertip.radius, scene.finger.link, scene.finger.half_span, object.width, object.height].map(|v| 1e3 * v)
+    [scene.fingertip.radius, scene.finger.link, scene.half_span(), object.width, object.height].map(|v| 1e3 * v)
 }
 
 /// The largest contact force over samples (N), at least 1e-9.
@@ -129,7 +129,7 @@ pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
         let forces: Vec<String> = p.iter().chain(&q).map(|v| format!("{v:.1}")).collect();
         let _ = write!(frames, "{}],", forces.join(","));
     }
-    let span = 1e3 * scene.finger.half_span;
+    let span = 1e3 * scene.half_span();
     format!(
         r#"<div class="animation" data-span="{span:.3}" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">Play</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
         frames.trim_end_matches(','),

@@ -6,8 +6,8 @@
 //! let go, it is zero. In each phase of the load this is linear with constant coefficients, so `exp(A h)` takes it from
 //! any time to any other without a step error.
 
-use crate::skin::exponential::exponential;
-use crate::types::skin::{Layer, SkinSample, SkinScene};
+use crate::skin::exponential::{exponential, rounding};
+use crate::types::skin::{Layer, SkinLoad, SkinSample, SkinScene};
 
 /// Samples in the ramp, the hold and the time after.
 const SAMPLES: [usize; 3] = [40, 80, 120];
@@ -145,6 +145,18 @@ impl Phase {
             impulse: state[self.size - 2],
         }
     }
+}
+
+/// Part of the largest value by which rounding alone may be off at the end of the longest phase of the load (1): it grows with how much
+/// faster the fastest layer is.
+pub fn precision(scene: &SkinScene) -> f64 {
+    let SkinLoad { ramp, hold, end, .. } = scene.load;
+    let loaded = Phase::new(&scene.layers, false, Some(0.0));
+    let free = Phase::new(&scene.layers, true, None);
+    [(&loaded, ramp.max(hold)), (&free, end - ramp - hold)]
+        .map(|(phase, h)| rounding(&phase.matrix, phase.size, h))
+        .into_iter()
+        .fold(0.0, f64::max)
 }
 
 /// The response of a column to the scene's load; exact at each sample. A scene must have been checked.

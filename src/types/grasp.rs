@@ -156,6 +156,14 @@ pub struct GraspRun {
     pub completed: bool,
 }
 
+impl GraspRun {
+    /// What ended the run, or else the first slip: what comes after that the model knows nothing of. None where it came to its end
+    /// and nothing slipped.
+    pub fn flaw(&self) -> Option<&Event> {
+        self.events.iter().find(|e| e.kind.ends_run()).or(self.events.first())
+    }
+}
+
 /// How the energy lies about an equilibrium.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]

@@ -225,6 +225,14 @@ const MOST_STEPS: f64 = 2e9;
 const MOST_SAMPLES: f64 = 2e6;
 
 impl Scene {
+    /// Half the distance between the joints (m). Rigid tips cannot be pressed in, so theirs stand apart until they just touch.
+    pub fn half_span(&self) -> f64 {
+        match self.fingertip.model {
+            FingertipModel::Rigid => self.fingertip.radius + 0.5 * self.object.width,
+            _ => self.finger.half_span,
+        }
+    }
+
     /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest (docs/grasp.md).
     pub fn reference() -> Self {
         let motion = |degrees: [f64; 2]| Motion { target: degrees.map(f64::to_radians), duration: 0.5, hold: 1.0 };
