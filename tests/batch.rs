@@ -226,3 +226,47 @@ fn the_whole_chain_runs_and_is_gathered() {
     run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--nodes", "1500"], 0);
     assert_eq!(statuses(folder.path()), ["sub-1 skipped", "sub-2 done"]);
 }
+
+/// Results stood for other parameters than their table asked for: a changed --config or detached file of voxels was not seen.
+#[test]
+fn what_a_pair_was_made_from_is_seen_to_change() {
+    let folder = folder(&["name,initial,deformed", "one,initial.nhdr,deformed.nii.gz"]);
+    let at = |name: &str| folder.path().join(name);
+    let volume = palpate::io::read_volume(at("initial.nii.gz")).unwrap();
+    let raw: Vec<u8> = volume.as_slice().iter().flat_map(|v| v.to_le_bytes()).collect();
+    fs::write(at("initial.raw"), &raw).unwrap();
+    let (g, rows) = (volume.grid().shape(), volume.grid().affine().rows());
+    let axis = |a: usize| format!("({},{},{})", rows[0][a], rows[1][a], rows[2][a]);
+    let head = format!(
+        "NRRD0004\ntype: float\ndimension: 3\nspace: right-anterior-superior\nsizes: {} {} {}\nspace directions: {} {} {}\n\
+         endian: little\nencoding: raw\nspace origin: {}\ndata file: initial.raw\n\n",
+        g[0],
+        g[1],
+        g[2],
+        axis(0),
+        axis(1),
+        axis(2),
+        axis(3)
+    );
+    fs::write(at("initial.nhdr"), head).unwrap();
+    let config = |preset: &str| fs::write(at("c.toml"), format!("preset = \"{preset}\"\n")).unwrap();
+    config("fast");
+    let again = || {
+        run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--config", "c.toml"], 0);
+        statuses(folder.path())
+    };
+    assert_eq!(again(), ["one done"]);
+    assert_eq!(again(), ["one skipped"]);
+    std::thread::sleep(Duration::from_millis(20));
+    config("accurate");
+    assert_eq!(again(), ["one done"]);
+    std::thread::sleep(Duration::from_millis(20));
+    fs::write(at("initial.raw"), &raw).unwrap();
+    assert_eq!(again(), ["one done"]);
+    // One that fails when it is run again is not done because older results stand there.
+    let deformed = fs::read(at("deformed.nii.gz")).unwrap();
+    fs::write(at("deformed.nii.gz"), &deformed[..deformed.len() / 2]).unwrap();
+    run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--config", "c.toml"], 1);
+    run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--config", "c.toml", "--collect"], 1);
+    assert_eq!(statuses(folder.path()), ["one failed"]);
+}

@@ -78,7 +78,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     io::make_folder(output)?;
     let outcomes: Vec<PairOutcome> = match collect {
-        true => pairs.iter().map(|pair| collected(pair, output)).collect(),
+        true => pairs.iter().map(|pair| collected(pair, output, tuning)).collect(),
         false => {
             let free = io::memory_left();
             let budget = memory.map(|gb| (1e9 * gb) as u64).or(free.map(|b| (SHARE * b as f64) as u64));
@@ -135,11 +135,13 @@ fn gather(folder: &Path, outcome: &mut PairOutcome) {
 }
 
 /// A pair whose results someone else has made.
-fn collected(pair: &Pair, output: &Path) -> PairOutcome {
+fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
     let folder = output.join(&pair.name);
     let mut outcome = PairOutcome { status: Status::Done, ..PairOutcome::waiting(pair) };
-    for stage in stages(pair, &folder, &[], 0) {
-        if !stage.marker.exists() {
+    // Made by a batch, a stage counts where its record stands: one that failed when it was run again has left older results.
+    let recorded = io::read_json(folder.join(RECORD)).ok().and_then(|r| r["stages"].as_array().map(Vec::len));
+    for (k, stage) in stages(pair, &folder, tuning, 0).into_iter().enumerate() {
+        if !stage.marker.exists() || recorded.is_some_and(|n| n <= k) {
             let log = io::read_text(folder.join(format!("{}.log", stage.name))).unwrap_or_default();
             outcome.status = Status::Failed;
             outcome.stage = stage.name;
@@ -152,7 +154,7 @@ fn collected(pair: &Pair, output: &Path) -> PairOutcome {
 }
 
 /// What is to be run for a pair: each stage as far as the table's columns go.
-fn stages(pair: &Pair, folder: &Path, tuning: &[String], nodes: usize) -> Vec<Stage> {
+fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stage> {
     let text = |p: &Path| p.display().to_string();
     let at = |part: &str| text(&folder.join(part));
     let flag = |key: &str, value: Option<String>| value.map(|v| format!("--{key}={v}"));
@@ -161,11 +163,11 @@ fn stages(pair: &Pair, folder: &Path, tuning: &[String], nodes: usize) -> Vec<St
 
     let mut field = owned(&["field", &text(&pair.initial), &text(&pair.deformed), "--force", "-o", &at("field")]);
     field.extend(flag("mask", pair.mask.as_deref().map(text)));
-    field.extend(tuning.iter().cloned());
+    field.extend(tuning.arguments());
     let mut out = vec![Stage {
         name: "field",
         arguments: field,
-        inputs: files(&[Some(&pair.initial), Some(&pair.deformed), pair.mask.as_ref()]),
+        inputs: files(&[Some(&pair.initial), Some(&pair.deformed), pair.mask.as_ref(), tuning.config()]),
         marker: folder.join("field/summary.json"),
     }];
     let Some(labels) = &pair.labels else { return out };
@@ -317,9 +319,7 @@ impl Batch<'_> {
         let path = folder.join(RECORD);
         let earlier = io::read_json(&path).unwrap_or_default();
         let (mut records, mut ran): (Vec<Value>, bool) = (Vec::new(), false);
-        for (k, stage) in
-            stages(pair, folder, &self.options.tuning.arguments(), self.options.nodes).into_iter().enumerate()
-        {
+        for (k, stage) in stages(pair, folder, &self.options.tuning, self.options.nodes).into_iter().enumerate() {
             let told = |e: &dyn std::fmt::Display| (stage.name, e.to_string());
             let record = record(&stage).map_err(|e| told(&e))?;
             if ran || !stage.marker.exists() || earlier["stages"][k] != record {

@@ -64,6 +64,11 @@ impl Tuning {
         out
     }
 
+    /// The file of parameters, where one is given.
+    pub fn config(&self) -> Option<&PathBuf> {
+        self.config.as_ref()
+    }
+
     /// Parameters in range.
     pub fn params(&self) -> Result<FieldParams> {
         let mut params = match &self.config {

@@ -13,6 +13,9 @@ use palpate::numerics::sampling::Interpolation;
 use palpate::types::{DenseField, Grid, WorldPoint};
 use std::path::{Path, PathBuf};
 
+/// The largest whole number up to which single precision has all.
+const WHOLE: f32 = 16_777_216.0;
+
 #[derive(Debug, Args)]
 #[command(
     after_help = "An image is read at x + u(x), so the deformed volume comes to look like the initial one. A point \
@@ -71,9 +74,19 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
                 }
                 Some(Err(error @ IoError::Os { .. })) => return Err(error.into()),
                 _ => {
-                    let image = io::read_volume(image)?;
+                    let path = image;
+                    let image = io::read_volume(path)?;
+                    let exact = *interpolation == Interpolation::Nearest;
+                    if let Some(v) = image.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > WHOLE) {
+                        bail!(
+                            "{}: holds {v}, and numbers beyond {WHOLE} cannot be told apart in single precision; give labels smaller numbers",
+                            path.display()
+                        );
+                    }
                     let warped = warp_image(&image, &field, grid.as_ref(), *interpolation, 0.0);
-                    io::write_volume(output, &warped, "palpate: warped")?;
+                    // No value appears that was not there.
+                    let write = if exact { io::write_exact } else { io::write_volume };
+                    write(output, &warped, "palpate: warped")?;
                 }
             }
             console.say(&format!("Wrote {}.", output.display()))
@@ -90,15 +103,18 @@ fn grid_of(path: &Path, convention: &Convention) -> Result<Grid> {
     }
 }
 
-/// Points outside the field's grid keep their line, with NaN for a place.
+/// Points outside the field's grid keep their line in a table, with NaN for a place; a point list of Slicer has none of those.
 fn move_points(points: &Path, field: &DenseField, output: &Path, console: &Console) -> Result<()> {
     let mut table = io::read_points(points)?;
     let moved = warp_points(&table.points, field);
+    let listed = output.extension().is_some_and(|e| e == "json");
     let lost = moved.iter().filter(|p| p.is_none()).count();
     if lost > 0 {
-        console.warn(&format!("{lost} of {} points lie outside the field's grid and became NaN", moved.len()));
+        let became = if listed { "were left out" } else { "became NaN" };
+        console.warn(&format!("{lost} of {} points lie outside the field's grid and {became}", moved.len()));
     }
     table.points = moved.into_iter().map(|p| p.unwrap_or(WorldPoint([f64::NAN; 3]))).collect();
     io::write_points(output, &table)?;
-    console.say(&format!("Wrote {}: {} points.", output.display(), table.points.len()))
+    let kept = table.points.len() - if listed { lost } else { 0 };
+    console.say(&format!("Wrote {}: {kept} points.", output.display()))
 }

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
 /// Files of a batch beside the folders of its pairs.
-const RESERVED: [&str; 3] = ["batch.csv", "regions.csv", "report.html"];
+const RESERVED: [&str; 4] = ["batch.csv", "regions.csv", "summary.json", "report.html"];
 
 /// Columns of a table of pairs; the first two are needed.
 pub const PAIR_COLUMNS: [&str; 12] = [
@@ -110,7 +110,9 @@ pub fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String
 /// [`IoError`] when it is not there or cannot be read.
 pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
     let path = path.as_ref();
-    let files: Vec<PathBuf> = if path.is_dir() { super::list(path)? } else { vec![path.to_path_buf()] };
+    let beside = super::image::voxels_beside(path);
+    let own = if path.is_dir() { super::list(path)? } else { vec![path.to_path_buf()] };
+    let files: Vec<PathBuf> = own.into_iter().chain(beside).collect();
     let mut whole = (0, 0);
     for file in files {
         let meta = fs::metadata(&file).map_err(os(&file, "read"))?;

@@ -10,7 +10,7 @@ use crate::error::IoError;
 use crate::types::{Grid, Mask, Volume, Voxels};
 use std::fs::{self, File};
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Formats by their first bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -139,6 +139,12 @@ fn raw(path: &Path, format: Format) -> Result<RawImage, IoError> {
         Format::Nrrd => nrrd::header(path),
         _ => metaimage::header(path),
     }
+}
+
+/// The file of voxels that a `.nhdr` or `.mhd` names; none where there is no other, or the header cannot be read.
+pub(super) fn voxels_beside(path: &Path) -> Option<PathBuf> {
+    let format = Format::of(path).ok().filter(|f| matches!(f, Format::Nrrd | Format::MetaImage))?;
+    raw(path, format).ok().map(|image| image.file).filter(|file| file != path)
 }
 
 /// Reads a scalar volume, in the file's intensity unit after its scaling: a file, or a folder with one DICOM series.

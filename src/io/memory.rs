@@ -1,5 +1,6 @@
 //! How much memory this process may still take.
 
+use super::flaw::Flaw;
 use std::fs;
 use std::path::Path;
 
@@ -9,6 +10,17 @@ pub fn memory_left() -> Option<u64> {
     let machine = meminfo(&fs::read_to_string("/proc/meminfo").ok()?);
     let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     machine.into_iter().chain(group_left(Path::new("/sys/fs/cgroup"), &groups)).chain(addresses_left()).min()
+}
+
+/// Refuses to read what memory does not hold, before it is asked for.
+pub(super) fn fits(bytes: u64) -> Result<(), Flaw> {
+    let left = memory_left().unwrap_or(u64::MAX);
+    if bytes <= left {
+        return Ok(());
+    }
+    let gb = |n: u64| n as f64 / 1e9;
+    let what = format!("needs {:.2} GB of memory, and {:.2} GB are left", gb(bytes), gb(left));
+    Err(Flaw::new(what, "close other programs, or crop or halve the volume"))
 }
 
 /// `MemAvailable` of /proc/meminfo (bytes).

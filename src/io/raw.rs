@@ -3,6 +3,7 @@
 use super::flaw::Flaw;
 use super::gzip::{self, LARGEST_RATIO};
 use super::image::Stored;
+use super::memory::fits;
 use super::os;
 use super::voxels::{Kind, count, decode};
 use crate::error::IoError;
@@ -136,6 +137,7 @@ impl RawImage {
         let path = &self.file;
         let needed = self.needed();
         let (mut file, start) = self.open()?;
+        fits(needed + 4 * (self.grid.len() * self.components) as u64).map_err(|flaw| flaw.at(path))?;
         let damaged = |e: std::io::Error| {
             Flaw::new(format!("its packed voxels are damaged or cut short ({e})"), "copy or export it again").at(path)
         };

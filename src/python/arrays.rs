@@ -145,14 +145,20 @@ pub fn python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>
     py.import("json")?.call_method1("loads", (value.to_string(),))
 }
 
+/// Most threads that can be asked for, as on the command line.
+const MOST_THREADS: i64 = 1024;
+
 /// Runs `work` without the interpreter, on `threads` threads (all cores without a number), and tells `callback` how far it is.
 /// What the callback raises is raised when the work is done.
 pub fn run<R: Send>(
     py: Python<'_>,
     callback: Callback,
-    threads: Option<usize>,
+    threads: Option<i64>,
     work: impl FnOnce(&(dyn Fn(&str, f64) + Sync)) -> R + Send,
 ) -> PyResult<R> {
+    if let Some(n) = threads.filter(|n| !(1..=MOST_THREADS).contains(n)) {
+        return Err(told(format!("threads is {n}, but must be 1 to {MOST_THREADS}")));
+    }
     let raised: Mutex<Option<PyErr>> = Mutex::new(None);
     let tell = |stage: &str, part: f64| {
         let Some(callback) = &callback else { return };
@@ -164,7 +170,7 @@ pub fn run<R: Send>(
             }
         });
     };
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(0)).build().map_err(told)?;
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(0) as usize).build().map_err(told)?;
     let result = py.detach(|| pool.install(|| work(&tell)));
     match raised.into_inner() {
         Ok(Some(error)) => Err(error),

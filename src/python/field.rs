@@ -52,7 +52,7 @@ pub fn field<'py>(
     params: &str,
     names: [String; 3],
     progress: Callback,
-    threads: Option<usize>,
+    threads: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = self::params(params)?;
     let (fixed, moving) = (arrays::volume(&initial)?, arrays::volume(&deformed)?);

@@ -20,7 +20,7 @@ pub fn grasp<'py>(
     formulation: Option<&str>,
     step: Option<f64>,
     progress: Callback,
-    threads: Option<usize>,
+    threads: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let overrides = SceneOverrides {
         model: model.map(str::parse).transpose().map_err(told)?,

@@ -55,7 +55,7 @@ pub fn stiffness<'py>(
     regions: usize,
     called: [String; 2],
     progress: Callback,
-    threads: Option<usize>,
+    threads: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let model: LawChoice = model.parse().map_err(told)?;
     let params = StiffnessParams { poisson, model, force_n: force, nodes, regions };

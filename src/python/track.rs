@@ -26,7 +26,7 @@ pub fn track<'py>(
     regions: [String; 2],
     step_s: Option<f64>,
     progress: Callback,
-    threads: Option<usize>,
+    threads: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = self::params(params)?;
     let frames = volumes.len();

@@ -157,11 +157,11 @@ impl Spread {
 
 /// Number of pairs, and counts, medians and quartiles of each region; the keys are those of docs/file-formats.md.
 pub fn summary(outcomes: &[PairOutcome]) -> Value {
-    let number = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
+    let quartile = |s: &Spread, q: f64| (s.seen() > 0).then(|| s.at(q)).filter(|v| v.is_finite());
     let spread = |s: &Spread| {
         json!({
             "region": s.region, "unit": s.unit, "pairs": s.values.len(), "identifiable": s.seen(),
-            "quartile_1": number(s.at(0.25)), "median": number(s.at(0.5)), "quartile_3": number(s.at(0.75)),
+            "quartile_1": quartile(s, 0.25), "median": quartile(s, 0.5), "quartile_3": quartile(s, 0.75),
         })
     };
     json!({

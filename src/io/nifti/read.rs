@@ -5,6 +5,7 @@ use super::header::{Header, LONGEST};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
 use crate::io::image::Stored;
+use crate::io::memory::fits;
 use crate::io::voxels::{self, Kind, count};
 use crate::io::{gzip, os};
 use crate::types::Grid;
@@ -150,6 +151,8 @@ fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
     let opened = open(path)?;
     let plan = Plan::new(&opened.head, layout).map_err(|flaw| flaw.at(path))?;
     let end = plan.end_within(opened.most()).map_err(|flaw| flaw.at(path))?;
+    // As they are stored, and as numbers.
+    fits(end as u64 + 4 * plan.bytes / plan.kind.size() as u64).map_err(|flaw| flaw.at(path))?;
     let Opened { mut file, packed, .. } = opened;
     let values = match packed {
         true => {

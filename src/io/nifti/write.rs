@@ -36,6 +36,15 @@ pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) 
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| stored(v).to_le_bytes()).map(drop)
 }
 
+/// Writes a scalar volume as float32, bit for bit.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_exact(path: impl AsRef<Path>, volume: &Volume, description: &str) -> Result<(), IoError> {
+    let form = Form { description, ..Form::FLOATS };
+    write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v: f32| v.to_le_bytes()).map(drop)
+}
+
 /// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it packs well.
 ///
 /// # Errors

@@ -65,12 +65,21 @@ def _data(image: Any) -> Any:
     return image.dataobj if hasattr(image, "dataobj") else image.get_fdata()
 
 
+def _affine(image: Any) -> np.ndarray:
+    """The affine of an image of nibabel in mm, whatever unit of length its header names."""
+    affine = np.array(image.affine, dtype=np.float64)
+    units = getattr(getattr(image, "header", None), "get_xyzt_units", None)
+    unit = units()[0] if units is not None else "mm"
+    affine[:3] *= {"meter": 1e3, "micron": 1e-3}.get(unit, 1.0)
+    return affine
+
+
 def _image(given: Image, what: str) -> Tuple[np.ndarray, List[List[float]]]:
     """``given`` as an array in Fortran order and three rows of its affine."""
     if isinstance(given, (str, _os.PathLike)):
         return _palpate.read_volume(given)
     if hasattr(given, "affine"):
-        return _fortran(_data(given), 3, what), _rows(given.affine)
+        return _fortran(_data(given), 3, what), _rows(_affine(given))
     if isinstance(given, (tuple, list)) and len(given) == 2:
         return _fortran(given[0], 3, what), _rows(given[1])
     raise PalpateError(f"{what}: is no volume; give a path, (array, affine), or an image of nibabel")
@@ -330,7 +339,7 @@ def _frames(volumes: Any) -> Tuple[List[Image], List[str], Optional[float]]:
     if path:
         frames, affine, step = _palpate.read_series(volumes)
     else:
-        data, affine = volumes if pair else (_data(volumes), volumes.affine)
+        data, affine = volumes if pair else (_data(volumes), _affine(volumes))
         array = np.asarray(data)
         frames = [array[..., t] for t in range(array.shape[3])] if array.ndim == 4 else [array]
     names = [f"{called}[{t}]" for t in range(len(frames))] if len(frames) > 1 else [called]
