@@ -60,6 +60,26 @@ def test_field_equals_the_command_line_for_images_arrays_and_paths(shell, pair):
     assert arrays.inputs == {"initial": "initial", "deformed": "deformed", "mask": "mask"}
 
 
+def test_images_in_another_unit_of_length_are_the_same_to_it(pair):
+    """A header in micrometres made a motion a thousand times as large, without a word."""
+    micro = []
+    for image in images(pair, "initial", "deformed", "mask"):
+        affine = np.diag([1e3, 1e3, 1e3, 1]) @ image.affine
+        scaled = nibabel.Nifti1Image(np.asarray(image.dataobj), affine)
+        scaled.header.set_xyzt_units("micron", "sec")
+        micro.append(scaled)
+    plain = palpate.field(*images(pair, "initial", "deformed", "mask"))
+    found = palpate.field(*micro)
+    assert np.allclose(found.affine, plain.affine, atol=1e-4)
+    assert np.allclose(found.displacement, plain.displacement, atol=1e-3)
+
+
+@pytest.mark.parametrize("threads", [-1, 0, 100000])
+def test_threads_past_reason_are_refused(pair, threads):
+    with pytest.raises(palpate.PalpateError, match="must be 1 to 1024"):
+        palpate.field(*images(pair, "initial", "deformed"), threads=threads)
+
+
 def test_summary_is_had_by_name(shell, pair):
     found = palpate.field(*images(pair, "initial", "deformed", "mask"), preset="fast", seed=3)
     assert found.params["preset"] == "fast" and found.params["seed"] == 3
