@@ -588,6 +588,21 @@ fn volumes_labels_and_fields_come_back_on_the_same_grid() {
     }
 }
 
+/// Steps of 2^-12 mm were a quarter of a voxel of a micrometre: a field had 20 values.
+#[test]
+fn a_field_of_small_voxels_keeps_a_thousandth_of_them() {
+    for edge in [1e-3, 0.02, 0.2, 1.0] {
+        let files = Files::new();
+        let grid = Grid::new([5, 4, 3], Affine::scaled([edge, edge, 3.0 * edge], [0.0; 3]).unwrap()).unwrap();
+        let field = DenseField::from_fn(grid, |p| p.0.map(|x| 0.3 * (x / edge).sin() * edge));
+        write_field(files.path("f.nii.gz"), &field).unwrap();
+        let back = read_field(files.path("f.nii.gz")).unwrap();
+        for (a, b) in back.as_slice().iter().zip(field.as_slice()) {
+            assert!(f64::from((a - b).abs()) <= 2f64.powi(-13).min(1e-3 * edge), "{edge}: {a} {b}");
+        }
+    }
+}
+
 #[test]
 fn integers_that_do_not_fit_are_refused() {
     let grid = grid([1, 1, 2], oblique());

@@ -151,7 +151,8 @@ fn write_volumes(folder: &mut OutputFolder, result: &FieldResult) -> Result<Opti
     folder.write("jacobian.nii.gz", |p| io::write_steps(p, &jacobian, "palpate: Jacobian determinant", 13))?;
     let jacobian = small.then_some(jacobian);
     let uncertainty = result.uncertainty.volume();
-    folder.write("uncertainty.nii.gz", |p| io::write_steps(p, &uncertainty, "palpate: 1 sigma of u, mm", 12))?;
+    let bits = io::length_bits(uncertainty.grid());
+    folder.write("uncertainty.nii.gz", |p| io::write_steps(p, &uncertainty, "palpate: 1 sigma of u, mm", bits))?;
     let kept = jacobian.map(|jacobian| [jacobian, uncertainty]);
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
     folder.write("mesh.vtu", |p| match &result.mesh {

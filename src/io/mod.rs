@@ -87,8 +87,8 @@ pub use live::abandon;
 pub use markups::write_markups;
 pub use memory::memory_left;
 pub use nifti::{
-    PackedField, Series, stored, stored_displacement, stored_steps, write_exact, write_field, write_field_series,
-    write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
+    PackedField, Series, length_bits, stored, stored_length, stored_steps, write_exact, write_field,
+    write_field_series, write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};

@@ -37,7 +37,8 @@ pub fn kept(mut volume: Volume, stored: impl Fn(f32) -> f32) -> Volume {
 
 /// The same for a displacement.
 pub fn kept_field(mut field: DenseField) -> DenseField {
-    field.as_mut_slice().iter_mut().for_each(|v| *v = io::stored_displacement(*v));
+    let stored = io::stored_length(field.grid());
+    field.as_mut_slice().iter_mut().for_each(|v| *v = stored(*v));
     field
 }
 
@@ -86,7 +87,8 @@ pub fn field<'py>(
         let summary = json::field_summary(&report);
         let warped = kept(warped, io::stored);
         let jacobian = kept(jacobian, io::stored_steps(13));
-        let uncertainty = kept(uncertainty, io::stored_steps(12));
+        let stored = io::stored_length(uncertainty.grid());
+        let uncertainty = kept(uncertainty, stored);
         let matches = io::stored_matches(&result.matches);
         Ok::<_, FieldError>((result, matches, warped, jacobian, uncertainty, summary))
     })?;

@@ -20,8 +20,9 @@ const CHUNK: usize = 1 << 18;
 const BATCH: usize = 6;
 /// Bits of a float32's mantissa that a volume keeps (of 23).
 const MANTISSA_BITS: u32 = 15;
-/// Displacements are multiples of 1 / this (mm): 2^-12 mm.
-const STEPS_PER_MM: f32 = 4096.0;
+/// Lengths are multiples of 2^-12 mm where no voxel edge is under a quarter of a millimetre.
+const LENGTH_BITS: i32 = 12;
+const COARSE: f64 = 0.25;
 
 /// Writes a scalar volume as float32; `description` (up to 79 bytes) goes into the header.
 ///
@@ -81,7 +82,8 @@ pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) ->
 
 /// Writes a displacement field (mm) as ITK, ANTs and Slicer read it: (nx, ny, nz, 1, 3), intent 1007, float32, LPS.
 ///
-/// Components are rounded to multiples of 2^-12 mm (error at most 2^-13 mm, 0.12 um), so that they pack.
+/// Components are rounded to multiples of 2^-12 mm (error at most 2^-13 mm, 0.12 um), or of a thousandth of the finest voxel edge where
+/// that is less ([`stored_length`]), so that they pack.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -95,10 +97,11 @@ pub fn write_field(path: impl AsRef<Path>, field: &DenseField) -> Result<(), IoE
 /// As [`write_volume`].
 pub fn write_series_field(path: impl AsRef<Path>, field: &DenseField) -> Result<PackedField, IoError> {
     let form = Form { description: DISPLACEMENT, ..Form::VECTORS };
+    let stored = stored_length(field.grid());
     let components = [field.component(0), field.component(1), field.component(2)];
     let runs = write(path.as_ref(), field.grid(), form, &components, |c, v| {
         let lps = if c < 2 { -v } else { v };
-        stored_displacement(lps).to_le_bytes()
+        stored(lps).to_le_bytes()
     })?;
     Ok(PackedField { path: path.as_ref().into(), runs })
 }
@@ -169,15 +172,23 @@ pub fn write_tensors(
     .map(drop)
 }
 
-/// A component of a displacement (mm) as [`write_field`] keeps it.
-pub fn stored_displacement(v: f32) -> f32 {
-    // Adding 0 turns -0 into 0.
-    (v * STEPS_PER_MM).round_ties_even() / STEPS_PER_MM + 0.0
+/// A length (mm) as [`write_field`] keeps it on `grid`: of 10 um voxels 2^-12 mm would be 2 %.
+pub fn stored_length(grid: &Grid) -> impl Fn(f32) -> f32 + Copy + Sync + use<> {
+    stored_steps(length_bits(grid))
+}
+
+/// The same as a number of bits (see [`write_steps`]).
+pub fn length_bits(grid: &Grid) -> i32 {
+    let shape = grid.shape();
+    let edges = (0..3).filter(|&a| shape[a] > 1).map(|a| grid.spacing()[a]);
+    let finer = (COARSE / edges.fold(f64::INFINITY, f64::min)).log2().ceil();
+    LENGTH_BITS + finer.clamp(0.0, 24.0) as i32
 }
 
 /// A value as [`write_steps`] keeps it.
 pub fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
     let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
+    // Adding 0 turns -0 into 0.
     move |v| (v * up).round_ties_even() * down + 0.0
 }
 
