@@ -6,6 +6,7 @@ use palpate::evaluate;
 use palpate::numerics::random::Random;
 use palpate::numerics::sampling::displacement;
 use palpate::pipeline::field::{FieldResult, run};
+use palpate::pipeline::plan;
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, Trouble, phantom, phantom_on, troubled};
 use palpate::types::params::{Interpolation, Preset};
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, Mesh, Metrics, MotionModel, Volume};
@@ -569,6 +570,14 @@ fn what_cannot_be_measured_is_refused_with_a_reason() {
     let line = Grid::new([64, 1, 1], *g.affine()).unwrap();
     let line = Volume::from_vec(line, (0..64).map(|v| v as f32).collect()).unwrap();
     assert!(said(&line, b, None).contains("a line of voxels"));
+    // The plan of a run refuses as the run does.
+    for few in [2, 3, 4] {
+        let thin = Grid::new([g.shape()[0], g.shape()[1], few], *g.affine()).unwrap();
+        let cut = |v: &Volume| Volume::from_vec(thin, v.as_slice()[..thin.len()].to_vec()).unwrap();
+        let message = said(&cut(a), &cut(b), None);
+        assert!(message.contains("a patch needs 5"), "{message}");
+        assert_eq!(plan::field(&cut(a), &cut(b), None, &params).unwrap_err().to_string(), message);
+    }
     // A slope has no corner.
     let slope = Volume::from_voxels(g, |_, x| x.0[0] as f32 + 100.0);
     let message = said(&slope, &slope, None);

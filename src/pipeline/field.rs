@@ -409,10 +409,9 @@ fn in_doubt(counts: Counts) -> String {
     )
 }
 
-fn too_few(grid: &Grid, found: usize, search: f64) -> FieldError {
+pub(super) fn too_few(grid: &Grid, found: usize, search: f64) -> FieldError {
     let shape = grid.shape();
-    let thin = (0..3).find(|&a| (2..SLICES).contains(&shape[a]));
-    let hint = match thin {
+    let hint = match thin(grid) {
         Some(a) => format!(
             "there are {} voxels along {}, and a patch needs {SLICES}: give more slices, or one alone, which is measured in its plane",
             shape[a],
@@ -421,6 +420,11 @@ fn too_few(grid: &Grid, found: usize, search: f64) -> FieldError {
         None => format!("widen --search (now {search:.0} mm), check the mask, or check that both show the same tissue"),
     };
     FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
+}
+
+/// The axis along which there are voxels, but too few for a patch.
+pub(super) fn thin(grid: &Grid) -> Option<usize> {
+    (0..3).find(|&a| (2..SLICES).contains(&grid.shape()[a]))
 }
 
 /// Voxels along an axis that the smallest patch and its surroundings take.

@@ -4,7 +4,7 @@ use crate::error::FieldError;
 use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
+use crate::pipeline::field::{finest_level, inside, search_mm, thin, too_few, worked_on};
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
@@ -36,6 +36,9 @@ pub fn field(
     let Checked { mask, initial: clean, .. } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
+    if thin(&grid).is_some() {
+        return Err(too_few(&grid, 0, search));
+    }
     Aligned::new(&clean, deformed, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
@@ -53,10 +56,10 @@ pub fn field(
 }
 
 /// Makes the checks of [`field`] that the two grids are enough for: both volumes have two axes or more, and overlap as far as
-/// the search reaches. A slice for a volume is refused too: nothing is found in it that could be matched in space.
+/// the search reaches. A slice for a volume is refused too, and so are two to four: nothing is found in them that could be matched in space.
 ///
 /// # Errors
-/// [`FieldError::Volume`] and [`FieldError::NoOverlap`].
+/// [`FieldError::Volume`], [`FieldError::TooFew`] and [`FieldError::NoOverlap`].
 pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<(), FieldError> {
     check::no_line("initial", initial)?;
     check::no_line("deformed", deformed)?;
@@ -66,7 +69,11 @@ pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<()
             ("is one slice, the initial volume is more".into(), "give volumes only, or slices only".into());
         return Err(FieldError::Volume { volume: "deformed", what, hint });
     }
-    overlap(initial, deformed, search_mm(initial, params.search_mm)).map(drop)
+    let search = search_mm(initial, params.search_mm);
+    if thin(initial).is_some() {
+        return Err(too_few(initial, 0, search));
+    }
+    overlap(initial, deformed, search).map(drop)
 }
 
 /// Memory of a field run on these grids (bytes): 14 MB, 18 bytes a voxel of both volumes up to 20 million voxels and 13
