@@ -79,6 +79,9 @@ fn info_knows_what_each_file_is() {
     }
     fs::write(folder.path().join("odd.toml"), "colour = 3\n").unwrap();
     let (_, err) = run(folder.path(), &["info", "odd.toml"], 1);
+    // What can be read is told beside it.
+    let (out, again) = run(folder.path(), &["info", "odd.toml", "mask.nii.gz"], 1);
+    assert!(out.starts_with("mask.nii.gz") && again == err, "{out}{again}");
     assert!(err.contains("odd.toml") && err.contains("unknown key 'colour'"), "{err}");
 }
 

@@ -23,15 +23,25 @@ pub struct Options {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let mut all = Vec::new();
+    let (mut all, mut unread) = (Vec::new(), Vec::new());
     for path in &options.files {
-        all.push(facts(path)?);
+        match facts(path) {
+            Ok(facts) => all.push(facts),
+            Err(error) => unread.push(error),
+        }
     }
-    if options.json {
+    // What can be read is told, whatever stands beside it.
+    if all.is_empty() {
+        // Nothing to tell.
+    } else if options.json {
         let list: Vec<Value> = all.iter().map(Facts::json).collect();
-        return console.say(&serde_json::to_string_pretty(&list)?);
+        console.say(&serde_json::to_string_pretty(&list)?)?;
+    } else {
+        console.say(&all.iter().map(Facts::text).collect::<Vec<_>>().join("\n"))?;
     }
-    console.say(&all.iter().map(Facts::text).collect::<Vec<_>>().join("\n"))
+    let last = unread.pop();
+    unread.iter().for_each(|error| console.error(error));
+    last.map_or(Ok(()), Err)
 }
 
 fn facts(path: &Path) -> Result<Facts> {
