@@ -34,7 +34,7 @@ pub(super) fn farther(
     passes: usize,
     seconds: &mut f64,
 ) -> Option<Begun> {
-    let far = Whole { range: TWICE * whole.range, alone: factors.len() == 1 && whole.alone, ..*whole };
+    let far = Whole { range: TWICE * whole.range, ..*whole };
     let mut found: Option<Begun> = None;
     let last = factors.len() - 1;
     for (l, &factor) in factors.iter().enumerate() {

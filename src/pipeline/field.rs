@@ -166,9 +166,7 @@ fn canonical(
         let passes = if last { params.passes } else { params.coarse_passes };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
         let matching = || progress("matching", done(0.0));
-        let alone = factors.len() == 1;
-        let whole =
-            Whole { params, range: search, alone, flat: grid.is_single_slice(), matching: &matching, tick: &tick };
+        let whole = Whole { params, range: search, flat: grid.is_single_slice(), matching: &matching, tick: &tick };
         let mut matched = 0.0;
         let mut field = match &state {
             Some((coarse, from)) => {

@@ -30,10 +30,6 @@ const LEAST_REACH: f64 = 6.0;
 /// follow, 13.
 const BENT: f64 = 1.6;
 
-/// How much less stiff than elsewhere the passes start where there is one level alone, since few of them follow: smooth motion of blocks
-/// of 48 voxels was found to 0.25 mm for 0.31 (`fast` 0.26 for 0.36); 46 narrow or small pairs made from scans to 0.992 of the error.
-const EASED: f64 = 10.0;
-
 /// Fewest matches that a search may start from; it competes with stillness.
 const FEWEST: usize = 8;
 
@@ -43,8 +39,6 @@ pub(super) struct Whole<'a> {
     pub params: &'a FieldParams,
     /// The largest motion looked for (mm).
     pub range: f64,
-    /// Whether the level that is searched is the only one.
-    pub alone: bool,
     /// Whether the volumes are one slice.
     pub flat: bool,
     /// Called as matching begins.
@@ -92,12 +86,7 @@ impl Whole<'_> {
             let (fitted, report) = match about {
                 None => {
                     let (_, fitted, report) = level::matches(pair, None, wide);
-                    let carried = fitted.map(|f| {
-                        let field = level::carry(&f, lattice.clone(), |p| p);
-                        let less = if self.alone { EASED } else { 1.0 };
-                        SplineField { lambda: field.lambda.map(|l| l / less), ..field }
-                    });
-                    (carried, report)
+                    (fitted.map(|f| level::carry(&f, lattice.clone(), |p| p)), report)
                 }
                 Some(field) => {
                     // What is wrong by then is an island, not the whole: each time half as far.
