@@ -392,6 +392,39 @@ fn a_block_that_is_not_finite_is_survived_with_a_warning() {
     assert!(result.summary.warnings.iter().any(|w| w.contains("216 voxels") && w.contains("not finite")));
 }
 
+/// A mask that cut through tissue in one volume, or in both at other places, moved with high trust: a leg at rest was 1.8 mm off.
+#[test]
+fn a_background_that_was_cut_through_tissue_is_not_seen() {
+    let whole = phantom(&block(64, MotionKind::Smooth, 2.0)).unwrap();
+    let middle = whole.initial.grid().shape().map(|n| (n as f64 - 1.0) / 2.0);
+    let cut = |v: &Volume, radius: f64| {
+        let (mut out, g) = (v.clone(), *v.grid());
+        for (at, v) in out.as_mut_slice().iter_mut().enumerate() {
+            let p = g.voxel(at);
+            *v *= f32::from((0..3).map(|a| (p[a] as f64 - middle[a]).powi(2)).sum::<f64>() < radius * radius);
+        }
+        out
+    };
+    let measured = |initial: &Volume, deformed: &Volume| {
+        let result = run(initial, deformed, None, &FieldParams::default(), &|_, _| {}).unwrap();
+        let (mut mask, g) = (whole.mask.clone(), *whole.mask.grid());
+        for (at, m) in mask.as_mut_slice().iter_mut().enumerate() {
+            let p = g.voxel(at);
+            *m *= u8::from((0..3).map(|a| (p[a] as f64 - middle[a]).powi(2)).sum::<f64>() < 20.0f64.powi(2));
+        }
+        (evaluate::metrics(&result.displacement, &whole.truth, Some(&mask), &[]).unwrap().mean_mm, result.summary)
+    };
+    let (clean, plain) = measured(&whole.initial, &whole.deformed);
+    let told = |s: &palpate::types::FieldSummary| s.evidence.iter().any(|e| e.starts_with("background: 0 by a cut"));
+    assert!(!told(&plain), "{:?}", plain.evidence);
+    for (initial, deformed) in
+        [(whole.initial.clone(), cut(&whole.deformed, 27.0)), (cut(&whole.initial, 29.0), cut(&whole.deformed, 26.0))]
+    {
+        let (off, summary) = measured(&initial, &deformed);
+        assert!(told(&summary) && off < 2.0 * clean + 0.05, "{off} for {clean}: {:?}", summary.evidence);
+    }
+}
+
 /// A slice that a scanner or a converter dropped was matched as if it were tissue: a thigh came out 7 mm off.
 #[test]
 fn lost_slices_are_left_out_and_said() {

@@ -142,7 +142,8 @@ fn canonical(
     progress("pyramid", 0.0);
     let mut clock = Clock(Vec::new(), Instant::now());
     let given = mask.is_some();
-    let Checked { mask, initial: clean, deformed: seen, not_finite, lost } = check::inputs(initial, deformed, mask)?;
+    let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
+        check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let mut search = search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, farther::TWICE * search)?;
@@ -253,6 +254,7 @@ fn canonical(
     let flat = grid.is_single_slice();
     let mut choice = smallest(&matches, &pair, &field, params.seed);
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
+    choice.evidence.extend(check::why_unseen(cut));
     choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
     let spacing = pair.spacing;

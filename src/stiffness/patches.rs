@@ -389,7 +389,8 @@ fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
     patch.rim = patch.nodes.iter().map(lag).collect();
 }
 
-/// Facets whose nodes lie within a voxel of the end of the undeformed body.
+/// Facets of which half the nodes or more lie within a voxel of the end of the undeformed body. Those that all lie there are too few where
+/// the body lies askew in its voxels, so that the mesh rounds its rims: 1,034 of 1,440 mm^2 of a base turned by 35 degrees.
 pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
     let d = side.direction();
     let facing = |f: &usize| dot(body.surface[*f].normal, d) > 0.7;
@@ -401,7 +402,10 @@ pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
         .fold(f64::NEG_INFINITY, f64::max);
     (0..body.surface.len())
         .filter(facing)
-        .filter(|&f| body.surface[f].nodes.iter().all(|&n| height(n) > end - voxel))
+        .filter(|&f| {
+            2 * body.surface[f].nodes.iter().filter(|&&n| height(n) > end - voxel).count()
+                >= body.surface[f].nodes.len()
+        })
         .collect()
 }
 
