@@ -37,9 +37,9 @@ pub struct LostSlice {
 ///
 /// A slice inside the body that holds one value throughout is lost: left out of the mask in the initial volume, not finite in the
 /// deformed one. A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
-/// initial volume and stay unseen in the deformed one. So does a background that was set to 0 by a cut through tissue. Volumes whose intensities are so large, so small or so far from 0 that
-/// single precision loses them are shifted and scaled by a power of two, and so is a deformed volume whose spread is another than the
-/// initial one's.
+/// initial volume and stay unseen in the deformed one, and so does a background that was set to 0 by a cut through tissue. Volumes whose
+/// intensities are so large, so small or so far from 0 that single precision loses them are shifted and scaled by a power of two, and so is
+/// a deformed volume whose spread is another than the initial one's.
 ///
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.

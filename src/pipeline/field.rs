@@ -199,7 +199,7 @@ fn canonical(
                 }
                 if params.search_mm == 0.0 && farther::is_open(&pair, search, found.as_ref()) {
                     let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
-                    let coarser = all.len() - factors.len();
+                    let coarser = all.len().saturating_sub(factors.len());
                     let here = (&all[..=coarser], &pair, &lattice);
                     let wide = farther::farther(&whole, &aligned, here, found.as_ref(), passes, &mut matched);
                     asked.push(farther::why(search, found.as_ref(), wide.as_ref()));
