@@ -31,13 +31,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         }
     }
     // What can be read is told, whatever stands beside it.
-    if all.is_empty() {
-        // Nothing to tell.
-    } else if options.json {
-        let list: Vec<Value> = all.iter().map(Facts::json).collect();
-        console.say(&serde_json::to_string_pretty(&list)?)?;
-    } else {
-        console.say(&all.iter().map(Facts::text).collect::<Vec<_>>().join("\n"))?;
+    if !all.is_empty() {
+        let said = match options.json {
+            true => serde_json::to_string_pretty(&all.iter().map(Facts::json).collect::<Vec<Value>>())?,
+            false => all.iter().map(Facts::text).collect::<Vec<_>>().join("\n"),
+        };
+        console.say(&said)?;
     }
     let last = unread.pop();
     unread.iter().for_each(|error| console.error(error));

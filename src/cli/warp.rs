@@ -74,16 +74,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
                 }
                 Some(Err(error @ IoError::Os { .. })) => return Err(error.into()),
                 _ => {
-                    let path = image;
-                    let image = io::read_volume(path)?;
+                    let volume = io::read_volume(image)?;
                     let exact = *interpolation == Interpolation::Nearest;
-                    if let Some(v) = image.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > WHOLE) {
+                    if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > WHOLE) {
                         bail!(
                             "{}: holds {v}, and numbers beyond {WHOLE} cannot be told apart in single precision; give labels smaller numbers",
-                            path.display()
+                            image.display()
                         );
                     }
-                    let warped = warp_image(&image, &field, grid.as_ref(), *interpolation, 0.0);
+                    let warped = warp_image(&volume, &field, grid.as_ref(), *interpolation, 0.0);
                     // No value appears that was not there.
                     let write = if exact { io::write_exact } else { io::write_volume };
                     write(output, &warped, "palpate: warped")?;
@@ -107,7 +106,7 @@ fn grid_of(path: &Path, convention: &Convention) -> Result<Grid> {
 fn move_points(points: &Path, field: &DenseField, output: &Path, console: &Console) -> Result<()> {
     let mut table = io::read_points(points)?;
     let moved = warp_points(&table.points, field);
-    let listed = output.extension().is_some_and(|e| e == "json");
+    let listed = io::is_slicer(output);
     let lost = moved.iter().filter(|p| p.is_none()).count();
     if lost > 0 {
         let became = if listed { "were left out" } else { "became NaN" };

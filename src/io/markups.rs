@@ -37,7 +37,7 @@ struct ControlPoint {
 }
 
 /// Whether `path` is one of Slicer's formats, by its name.
-pub(super) fn is_slicer(path: &Path) -> bool {
+pub fn is_slicer(path: &Path) -> bool {
     let name = path.to_string_lossy().to_lowercase();
     name.ends_with(".fcsv") || name.ends_with(".json")
 }

@@ -84,7 +84,7 @@ pub use image::{
     read_volume_header,
 };
 pub use live::abandon;
-pub use markups::write_markups;
+pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
 pub use nifti::{
     PackedField, Series, length_bits, stored, stored_length, stored_steps, write_exact, write_field,

@@ -26,15 +26,14 @@ pub struct SceneOverrides {
 }
 
 impl SceneOverrides {
-    /// `key` where it is replaced.
-    fn replaced<'k>(&self, key: &'k str) -> Option<&'k str> {
-        let replaced = match key {
+    /// Whether they replace the value of a key.
+    fn replace(&self, key: &str) -> bool {
+        match key {
             "fingertip.model" => self.model.is_some(),
             "integrator.formulation" => self.formulation.is_some(),
             "integrator.step" => self.step.is_some(),
             _ => false,
-        };
-        replaced.then_some(key)
+        }
     }
 }
 
@@ -77,7 +76,7 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
     check_keys(path, &table)?;
     let fingertip_file = merge_fingertip(path, &mut table)?;
     let sweeps = take_sweeps(path, &mut table)?;
-    if let Some(key) = sweeps.iter().find_map(|(key, _)| overrides.replaced(key)) {
+    if let Some((key, _)) = sweeps.iter().find(|(key, _)| overrides.replace(key)) {
         let what = format!("[[sweep]] changes {key}, which is set from outside for all scenes");
         return Err(format(path, what, "leave that flag out, or that [[sweep]] table"));
     }

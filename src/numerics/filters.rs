@@ -4,6 +4,18 @@
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 
+/// Mean and number of the finite values among the 26 around place `at` (8 in one slice); none where there is no such value.
+pub fn mean_beside(data: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Option<(f32, usize)> {
+    let near = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
+    let (mut sum, mut count) = (0.0, 0);
+    for (j, k) in near(at / (nx * ny), nz).flat_map(|k| near(at / nx % ny, ny).map(move |j| (j, k))) {
+        for v in near(at % nx, nx).map(|i| data[i + nx * (j + ny * k)]).filter(|v| v.is_finite()) {
+            (sum, count) = (sum + f64::from(v), count + 1);
+        }
+    }
+    (count > 0).then(|| ((sum / count as f64) as f32, count))
+}
+
 /// A symmetric kernel, centre first: `[c0, c1, c2 ...]` stands for `... c2 c1 c0 c1 c2 ...`.
 pub type HalfKernel = Vec<f32>;
 

@@ -14,6 +14,7 @@
 use crate::error::UnknownName;
 use crate::numerics::bspline;
 use crate::numerics::cubic::{self, LANES, Places};
+use crate::numerics::filters::mean_beside;
 use crate::types::names::choose;
 use crate::types::{Displacement, Volume, VoxelPoint, Voxels, WorldPoint};
 use rayon::prelude::*;
@@ -173,9 +174,11 @@ impl<'a> Sampler<'a> {
     /// Whether one of the eight voxels around a position had no number.
     #[inline]
     fn misses(&self, p: VoxelPoint) -> bool {
-        let around = || Stencil::new(self.shape, p);
-        let holds = |s: Stencil| s.index.iter().zip(s.weight).any(|(&at, w)| w > SLACK && self.missing[at]);
-        !self.missing.is_empty() && holds(around())
+        if self.missing.is_empty() {
+            return false;
+        }
+        let around = Stencil::new(self.shape, p);
+        around.index.iter().zip(around.weight).any(|(&at, w)| w > SLACK && self.missing[at])
     }
 
     /// The values at the first `out.len()` (at most [`LANES`]) of some places (voxels), fast where they follow each other
@@ -228,31 +231,18 @@ impl<'a> Sampler<'a> {
     }
 }
 
-/// Puts the mean of the finite voxels beside it (of all, where there is none) where a value is not finite, and says where; empty where
-/// all are.
-fn fill(values: &mut [f32], [nx, ny, nz]: [usize; 3]) -> Vec<bool> {
+/// Puts the mean of the finite voxels beside it (of all, where there is none) where a value is not finite, and says where; empty where all are.
+fn fill(values: &mut [f32], shape: [usize; 3]) -> Vec<bool> {
     if values.par_iter().all(|v| v.is_finite()) {
         return Vec::new();
     }
     let missing: Vec<bool> = values.iter().map(|v| !v.is_finite()).collect();
-    let mean = |all: &mut dyn Iterator<Item = f32>| {
-        let (sum, count) = all.filter(|v| v.is_finite()).fold((0.0, 0usize), |(s, n), v| (s + f64::from(v), n + 1));
-        (count > 0).then(|| (sum / count as f64) as f32)
-    };
-    let everywhere = mean(&mut values.iter().copied()).unwrap_or(0.0);
-    let new: Vec<f32> = (0..values.len())
-        .filter(|&at| missing[at])
-        .map(|at| {
-            let [x, y, z] = [at % nx, at / nx % ny, at / (nx * ny)];
-            let near = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
-            let row = |(j, k): (usize, usize)| near(x, nx).map(move |i| i + nx * (j + ny * k));
-            let beside = near(z, nz).flat_map(|k| near(y, ny).map(move |j| (j, k))).flat_map(row);
-            mean(&mut beside.map(|at| values[at])).unwrap_or(everywhere)
-        })
-        .collect();
-    for (at, v) in (0..values.len()).filter(|&at| missing[at]).zip(new) {
-        values[at] = v;
-    }
+    let holes = || (0..missing.len()).filter(|&at| missing[at]);
+    let finite = values.iter().filter(|v| v.is_finite());
+    let (sum, count) = finite.fold((0.0, 0usize), |(sum, n), v| (sum + f64::from(*v), n + 1));
+    let everywhere = (sum / count.max(1) as f64) as f32;
+    let new: Vec<f32> = holes().map(|at| mean_beside(values, shape, at).map_or(everywhere, |m| m.0)).collect();
+    holes().zip(new).for_each(|(at, v)| values[at] = v);
     missing
 }
 

@@ -2,7 +2,9 @@
 
 use crate::error::FieldError;
 use crate::matching::levels::foreground;
+use crate::numerics::filters::mean_beside;
 use crate::numerics::statistics::quantile;
+use crate::pipeline::field::FEWEST;
 use crate::types::{Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
 
@@ -64,13 +66,16 @@ pub fn inputs<'a>(
         let (what, hint) = ("is empty".into(), "give a mask that is not 0 in the tissue, or none".into());
         return Err(FieldError::Volume { volume: "mask", what, hint });
     }
+    enough_slices(initial.grid())?;
     let not_finite = ranges.each_ref().map(|r| r.not_finite);
     let lost = [initial, deformed].map(lost_slices);
     let cut = [initial, deformed].map(cut_background);
-    let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume) } else { volume };
+    // In one slice there are 8 around a voxel, not 26.
+    let least = |volume: &Voxels<'_>| if volume.grid().shape().contains(&1) { AROUND / 3 } else { AROUND };
+    let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume, least(&volume)) } else { volume };
     let mut first = fill(unseen_background(bridged(initial, &lost[0]), cut[0]), not_finite[0] > 0 || cut[0].is_some());
     let bad = not_finite[1] > 0 || !lost[1].is_empty() || cut[1].is_some();
-    let second = fill(unseen_background(without(deformed, &lost[1]), cut[1]), bad);
+    let second = fill(without(unseen_background(deformed.view(), cut[1]), &lost[1]), bad);
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
     if not_finite[0] > 0 || cut[0].is_some() {
         first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
@@ -143,7 +148,7 @@ fn unseen_background<'a>(mut volume: Voxels<'a>, cut: Option<f64>) -> Voxels<'a>
     if cut.is_some() {
         volume.as_mut_slice().par_iter_mut().filter(|v| **v == 0.0).for_each(|v| *v = f32::NAN);
         for _ in 0..DRAWN_ON {
-            volume = grown(&volume);
+            volume = filled(&volume, 1);
         }
     }
     volume
@@ -153,29 +158,6 @@ fn unseen_background<'a>(mut volume: Voxels<'a>, cut: Option<f64>) -> Voxels<'a>
 /// blocks that were cut, 0, 1, 2 and 3 left 0.13, 0.08, 0.12 and 0.34 mm of a press, 0.59, 0.49, 0.45 and 0.61 of 6 mm; without any of them
 /// small bodies keep too few matches.
 const DRAWN_ON: usize = 2;
-
-/// With the mean of the finite voxels around each that has no number, where there is one.
-fn grown<'a>(volume: &Voxels<'a>) -> Voxels<'a> {
-    let values = volume.as_slice();
-    let (grid, mut out) = (*volume.grid(), volume.clone());
-    let [nx, ny, nz] = grid.shape();
-    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, new)| {
-        let (j, k) = (row % ny, row / ny);
-        let near = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
-        for (i, new) in new.iter_mut().enumerate().filter(|(_, v)| !v.is_finite()) {
-            let (mut sum, mut count) = (0.0f32, 0u8);
-            for (y, z) in near(k, nz).flat_map(|z| near(j, ny).map(move |y| (y, z))) {
-                for x in near(i, nx).map(|x| values[x + nx * (y + ny * z)]).filter(|x| x.is_finite()) {
-                    (sum, count) = (sum + x, count + 1);
-                }
-            }
-            if count > 0 {
-                *new = sum / f32::from(count);
-            }
-        }
-    });
-    out
-}
 
 /// What to say of a background that was cut.
 pub fn why_unseen(cut: [Option<f64>; 2]) -> Option<String> {
@@ -249,14 +231,13 @@ fn bridged<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
 }
 
 /// The volume with lost slices as voxels that are not finite.
-fn without<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
-    let mut out = volume.view();
+fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     let shape = volume.grid().shape();
     for &LostSlice { axis, at, .. } in lost {
-        let new = out.as_mut_slice();
+        let new = volume.as_mut_slice();
         slice(shape, axis, at).for_each(|o| new[o] = f32::NAN);
     }
-    out
+    volume
 }
 
 /// What to say of lost slices.
@@ -290,6 +271,24 @@ pub fn no_line(volume: &'static str, grid: &Grid) -> Result<(), FieldError> {
     }
 }
 
+/// Voxels along an axis that the smallest patch and its surroundings take.
+const SLICES: usize = 5;
+
+/// A volume has one slice, which is measured in its plane, or enough of them for a patch.
+///
+/// # Errors
+/// [`FieldError::TooFew`] when there are two to four along an axis: no match can be found.
+pub fn enough_slices(grid: &Grid) -> Result<(), FieldError> {
+    let shape = grid.shape();
+    let Some(a) = (0..3).find(|&a| (2..SLICES).contains(&shape[a])) else { return Ok(()) };
+    let hint = format!(
+        "there are {} voxels along {}, and a patch needs {SLICES}: give more slices, or one alone, which is measured in its plane",
+        shape[a],
+        ['x', 'y', 'z'][a]
+    );
+    Err(FieldError::TooFew { found: 0, what: "matches survive", needed: FEWEST, hint })
+}
+
 /// What a volume's voxels reach.
 struct Range {
     /// Of the finite voxels.
@@ -315,28 +314,16 @@ impl Range {
     }
 }
 
-/// Finite neighbours that a voxel without a number needs to get one.
+/// Finite neighbours that a single voxel without a number needs to get one.
 const AROUND: usize = 13;
 
-/// With numbers in single voxels that have none, from the finite ones around them.
-fn filled(volume: &Voxels<'_>) -> Volume {
-    let values = volume.as_slice();
-    let (grid, mut out) = (*volume.grid(), volume.clone().into_volume());
-    let new = out.as_mut_slice();
-    let shape = grid.shape();
-    // In one slice there are 8 around a voxel, not 26.
-    let least = if shape.contains(&1) { AROUND / 3 } else { AROUND };
-    for at in (0..values.len()).filter(|&at| !values[at].is_finite()) {
-        let v = grid.voxel(at);
-        let near = |a: usize| v[a].saturating_sub(1)..(v[a] + 2).min(shape[a]);
-        let (mut sum, mut count) = (0.0, 0);
-        for (j, k) in near(2).flat_map(|k| near(1).map(move |j| (j, k))) {
-            for x in near(0).map(|i| values[grid.index(i, j, k)]).filter(|x| x.is_finite()) {
-                (sum, count) = (sum + f64::from(x), count + 1);
-            }
-        }
-        new[at] = if count >= least { (sum / count as f64) as f32 } else { f32::NAN };
-    }
+/// With the mean of the finite voxels around it in each that has no number and at least `least` of them.
+fn filled(volume: &Voxels<'_>, least: usize) -> Volume {
+    let (values, shape) = (volume.as_slice(), volume.grid().shape());
+    let mut out = volume.clone().into_volume();
+    out.as_mut_slice().par_iter_mut().enumerate().filter(|(_, v)| !v.is_finite()).for_each(|(at, v)| {
+        *v = mean_beside(values, shape, at).filter(|m| m.1 >= least).map_or(f32::NAN, |m| m.0);
+    });
     out
 }
 

@@ -53,7 +53,7 @@ pub struct FieldResult {
 }
 
 /// Fewest matches that a result may rest on.
-const FEWEST: usize = 20;
+pub(super) const FEWEST: usize = 20;
 
 /// Stage names and their wall seconds.
 struct Clock(Vec<(String, f64)>, Instant);
@@ -208,7 +208,7 @@ fn canonical(
                         found = wide;
                     }
                 }
-                let found = found.ok_or_else(|| too_few(&grid, 0, search))?;
+                let found = found.ok_or_else(|| too_few(0, search))?;
                 reports.extend(found.report.clone());
                 reach = found.reach();
                 begun.insert(found).field.clone()
@@ -242,11 +242,11 @@ fn canonical(
         state = Some((field, factor));
     }
     let (Some((field, factor)), Some((matches, pair, points))) = (state, fine) else {
-        return Err(too_few(&grid, 0, search));
+        return Err(too_few(0, search));
     };
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
-        return Err(too_few(&grid, kept, search));
+        return Err(too_few(kept, search));
     }
 
     // The smallest motion that explains the matches.
@@ -409,26 +409,10 @@ fn in_doubt(counts: Counts) -> String {
     )
 }
 
-pub(super) fn too_few(grid: &Grid, found: usize, search: f64) -> FieldError {
-    let shape = grid.shape();
-    let hint = match thin(grid) {
-        Some(a) => format!(
-            "there are {} voxels along {}, and a patch needs {SLICES}: give more slices, or one alone, which is measured in its plane",
-            shape[a],
-            ['x', 'y', 'z'][a]
-        ),
-        None => format!("widen --search (now {search:.0} mm), check the mask, or check that both show the same tissue"),
-    };
+fn too_few(found: usize, search: f64) -> FieldError {
+    let hint = format!("widen --search (now {search:.0} mm), check the mask, or check that both show the same tissue");
     FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
 }
-
-/// The axis along which there are voxels, but too few for a patch.
-pub(super) fn thin(grid: &Grid) -> Option<usize> {
-    (0..3).find(|&a| (2..SLICES).contains(&grid.shape()[a]))
-}
-
-/// Voxels along an axis that the smallest patch and its surroundings take.
-const SLICES: usize = 5;
 
 /// Where the number of points comes from.
 fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {

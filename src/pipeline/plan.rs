@@ -4,7 +4,7 @@ use crate::error::FieldError;
 use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::field::{finest_level, inside, search_mm, thin, too_few, worked_on};
+use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
@@ -36,9 +36,6 @@ pub fn field(
     let Checked { mask, initial: clean, .. } = check::inputs(initial, deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
-    if thin(&grid).is_some() {
-        return Err(too_few(&grid, 0, search));
-    }
     Aligned::new(&clean, deformed, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
@@ -69,11 +66,8 @@ pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<()
             ("is one slice, the initial volume is more".into(), "give volumes only, or slices only".into());
         return Err(FieldError::Volume { volume: "deformed", what, hint });
     }
-    let search = search_mm(initial, params.search_mm);
-    if thin(initial).is_some() {
-        return Err(too_few(initial, 0, search));
-    }
-    overlap(initial, deformed, search).map(drop)
+    check::enough_slices(initial)?;
+    overlap(initial, deformed, search_mm(initial, params.search_mm)).map(drop)
 }
 
 /// Memory of a field run on these grids (bytes): 14 MB, 18 bytes a voxel of both volumes up to 20 million voxels and 13

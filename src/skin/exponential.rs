@@ -3,9 +3,7 @@
 /// `exp(a h)` of an `n` x `n` matrix (rows): balanced, scaled to norm 1/2, Taylor to degree 18 (error below 1e-22), squared back
 /// (Moler & Van Loan 2003, method 3).
 pub(super) fn exponential(a: &[f64], n: usize, h: f64) -> Vec<f64> {
-    let scaled: Vec<f64> = a.iter().map(|v| v * h).collect();
-    let size = balance(&scaled, n);
-    let balanced: Vec<f64> = (0..n * n).map(|at| scaled[at] * size[at % n] / size[at / n]).collect();
+    let (size, balanced) = balanced(a, n, h);
     let norm = norm(&balanced, n);
     let squarings = if norm > 0.5 { (norm / 0.5).log2().ceil() as i32 } else { 0 };
     let scaled: Vec<f64> = balanced.iter().map(|v| v / 2f64.powi(squarings)).collect();
@@ -25,10 +23,15 @@ pub(super) fn exponential(a: &[f64], n: usize, h: f64) -> Vec<f64> {
 
 /// Part of all by which rounding alone may be off in `exp(a h)`: each squaring doubles it.
 pub(super) fn rounding(a: &[f64], n: usize, h: f64) -> f64 {
+    f64::EPSILON * norm(&balanced(a, n, h).1, n).max(1.0)
+}
+
+/// `a h` in quantities of [`balance`]d sizes, and these sizes.
+fn balanced(a: &[f64], n: usize, h: f64) -> (Vec<f64>, Vec<f64>) {
     let scaled: Vec<f64> = a.iter().map(|v| v * h).collect();
     let size = balance(&scaled, n);
-    let balanced: Vec<f64> = (0..n * n).map(|at| scaled[at] * size[at % n] / size[at / n]).collect();
-    f64::EPSILON * norm(&balanced, n).max(1.0)
+    let balanced = (0..n * n).map(|at| scaled[at] * size[at % n] / size[at / n]).collect();
+    (size, balanced)
 }
 
 fn norm(a: &[f64], n: usize) -> f64 {
