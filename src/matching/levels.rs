@@ -1,6 +1,7 @@
 //! The coarse-to-fine pyramid: both volumes on one lattice at several voxel sizes.
 
 use crate::error::{FieldError, SpaceError};
+use crate::matching::brightness::Brightness;
 use crate::matching::gain::weigh;
 use crate::matching::pair::{Pair, Spans};
 use crate::numerics::sampling::Sampler;
@@ -70,15 +71,25 @@ impl<'a> Aligned<'a> {
 
     /// The pair with blocks of `factor` voxels averaged.
     pub fn level(&self, factor: [usize; 3]) -> Pair<'_> {
-        self.level_within(&self.mask, factor)
+        self.level_under(factor, None)
+    }
+
+    /// The same with the deformed volume as bright as the initial one.
+    pub fn level_under(&self, factor: [usize; 3], light: Option<&Brightness>) -> Pair<'_> {
+        self.level_within(&self.mask, factor, light)
     }
 
     /// The same inside another mask on the initial volume's grid.
-    pub fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
+    pub fn level_within(&self, mask: &[u8], factor: [usize; 3], light: Option<&Brightness>) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
         let mut mask = pyramid::reduce_mask(mask, self.shape, factor);
-        let moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
+        let mut moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
+        let moving_shape = pyramid::reduced_shape(self.moving_shape, factor);
+        let moving_origin = std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64);
+        if let Some(light) = light {
+            light.even_out(moving.to_mut(), moving_shape, moving_origin, factor);
+        }
         let spacing = std::array::from_fn(|a| self.spacing[a] * factor[a] as f64);
         let noise = noise_sigma(&fixed, shape, |i| mask[i] != 0);
         let fixed_smooth = filters::bspline(&fixed, shape);
@@ -93,8 +104,8 @@ impl<'a> Aligned<'a> {
             fixed_smooth,
             fixed,
             mask,
-            moving_shape: pyramid::reduced_shape(self.moving_shape, factor),
-            moving_origin: std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64),
+            moving_shape,
+            moving_origin,
             moving,
         }
     }

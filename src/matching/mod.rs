@@ -19,6 +19,8 @@ pub mod candidates;
 
 pub mod lsm;
 
+pub mod brightness;
+
 pub mod gain;
 
 pub mod residual;

@@ -1,5 +1,6 @@
 //! A search twice as far, where the motion reaches the end of what was looked over.
 
+use crate::matching::brightness::Brightness;
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
@@ -28,7 +29,7 @@ pub(super) fn is_open(pair: &Pair<'_>, range: f64, found: Option<&Begun>) -> boo
 /// neighbours that agree less than before are an island.
 pub(super) fn farther(
     whole: &Whole<'_>,
-    aligned: &Aligned<'_>,
+    (aligned, light): (&Aligned<'_>, Option<&Brightness>),
     (factors, pair, lattice): (&[[usize; 3]], &Pair<'_>, &Lattice),
     own: Option<&Begun>,
     passes: usize,
@@ -42,7 +43,7 @@ pub(super) fn farther(
         let (pair, lattice) = if l == last {
             (pair, lattice)
         } else {
-            coarser = aligned.level(factor);
+            coarser = aligned.level_under(factor, light);
             coarse_lattice = level::lattice(&coarser, 3);
             (&coarser, &coarse_lattice)
         };

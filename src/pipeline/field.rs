@@ -17,6 +17,7 @@ use crate::pipeline::check::{self, Checked};
 use crate::pipeline::farther;
 use crate::pipeline::finer::{finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::light::Light;
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
 use crate::pipeline::whole::{self, Whole};
@@ -157,10 +158,11 @@ fn canonical(
     let mut fine = None;
     let mut begun = None;
     let mut reach = f64::INFINITY;
+    let mut light = Light::default();
     let (mut left, mut gain, mut asked) = (0.0, 1.0, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
-        let pair = aligned.level(factor);
+        let mut pair = aligned.level_under(factor, light.taken());
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
         let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
@@ -174,7 +176,7 @@ fn canonical(
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
                 let loose = begun.as_ref().filter(|b: &&Begun| l == 1 && b.is_loose());
-                let coarsest = loose.map(|_| (aligned.level(*from), *from));
+                let coarsest = loose.map(|_| (aligned.level_under(*from, light.taken()), *from));
                 let closer = coarsest.and_then(|(coarse, from)| {
                     whole.closer((&pair, factor), &field, (&coarse, from), passes, &mut matched)
                 });
@@ -187,10 +189,13 @@ fn canonical(
                 field
             }
             None => {
+                if light.look_at_rest(&pair, factor, grid.shape(), &SplineField::still(lattice.clone())) {
+                    pair = aligned.level_under(factor, light.taken());
+                }
                 let effort = (passes, whole::POINTS);
                 let mut found = whole.begin((&pair, factor), &lattice, (starts, true), effort, &mut matched);
                 if given && found.as_ref().is_none_or(Begun::is_unsure) {
-                    let tissue = aligned.level_within(&around(&mask, &clean), factor);
+                    let tissue = aligned.level_within(&around(&mask, &clean), factor, light.taken());
                     let wider = whole.begin((&tissue, factor), &lattice, (&[], true), effort, &mut matched);
                     found = match (found, wider) {
                         (Some(own), Some(wider)) => Some(Begun::surer(&pair, own, wider)),
@@ -201,7 +206,8 @@ fn canonical(
                     let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
                     let coarser = all.len().saturating_sub(factors.len());
                     let here = (&all[..=coarser], &pair, &lattice);
-                    let wide = farther::farther(&whole, &aligned, here, found.as_ref(), passes, &mut matched);
+                    let wide =
+                        farther::farther(&whole, (&aligned, light.taken()), here, found.as_ref(), passes, &mut matched);
                     asked.push(farther::why(search, found.as_ref(), wide.as_ref()));
                     if wide.is_some() {
                         search *= farther::TWICE;
@@ -214,6 +220,10 @@ fn canonical(
                 begun.insert(found).field.clone()
             }
         };
+        if (first || !last) && light.look(&pair, factor, grid.shape(), &field) && last {
+            pair = aligned.level_under(factor, light.taken());
+            level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
+        }
         if last {
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
@@ -255,6 +265,7 @@ fn canonical(
     let mut choice = smallest(&matches, &pair, &field, params.seed);
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
     choice.evidence.extend(check::why_unseen(cut));
+    choice.evidence.extend(light.why());
     choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
     let spacing = pair.spacing;

@@ -33,6 +33,7 @@ pub mod stress;
 
 mod farther;
 mod finer;
+mod light;
 mod search;
 mod start;
 mod whole;
