@@ -220,7 +220,9 @@ fn canonical(
                 begun.insert(found).field.clone()
             }
         };
-        if (first || !last) && light.look(&pair, factor, grid.shape(), &field) && last {
+        // What a coarser level saw of the brightness serves the finest one.
+        let more = (first || !last) && light.look(&pair, factor, grid.shape(), &field);
+        if more && last {
             pair = aligned.level_under(factor, light.taken());
             level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
         }
