@@ -1,8 +1,16 @@
-//! Brightness that differs smoothly between the two volumes (a coil's profile, a bias field), taken out of the deformed one.
+//! Brightness that differs between the two volumes by place (a coil's profile, a bias field) or by itself (another contrast), taken out of
+//! the deformed one.
 //!
-//! The logarithm of the initial over the deformed volume's brightness, in blocks of voxels under the field found so far, is fitted by a
-//! polynomial of place with Cauchy weights (Holland and Welsch 1977): blocks that are off because the field is off there hardly count. What
-//! varies less smoothly is left to [`crate::matching::gain`].
+//! With f and w the mean brightness of a block of voxels in both volumes, under the field found so far,
+//!
+//! ```text
+//! ln f - ln w = P + Q((ln f + ln w + P) / 2)
+//! ```
+//!
+//! P is a polynomial of the block's place in the deformed volume, Q one of its brightness (of both volumes alike: of one alone what the
+//! field still misses would flatten the contrast), with Cauchy weights (Holland and Welsch 1977): blocks that are off because the field is off
+//! there hardly count. Either alone serves where both explain little more. What varies less
+//! smoothly is left to [`crate::matching::gain`].
 
 use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
@@ -35,89 +43,98 @@ const HALF: f64 = 2.0;
 /// Logarithms that differ by less are equal.
 const EQUAL: f64 = 1e-6;
 
+/// How far past the range of the tissue Q is followed, in halves of it.
+const PAST: f64 = 2.5;
+
+/// Steps of the table of Q.
+const TABLE: usize = 256;
+
+/// Rounds in which what Q leads to settles.
+const SETTLED: usize = 40;
+
 /// How far past the values that were measured the polynomial is followed (logarithm).
 const BEYOND: f64 = 0.1;
 
-/// Logarithm of the initial over the deformed volume's brightness, a polynomial over the places of the deformed one.
+/// Powers of the logarithm of brightness.
+const TONES: usize = 3;
+
+/// The deformed volume's way to the initial one's brightness.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Brightness {
     /// The initial volume's voxels, which are mapped to -1 to 1.
     shape: [usize; 3],
-    /// Powers along each axis, and the term's coefficient.
-    terms: Vec<([usize; 3], f64)>,
-    /// Lowest and highest value where it was measured.
+    /// P: powers along each axis, and the term's coefficient.
+    place: Vec<([usize; 3], f64)>,
+    /// Q for logarithms of the deformed volume's brightness (P in it) evenly over `tones`; none where place alone explains it.
+    tone: Vec<f64>,
+    tones: [f64; 2],
+    /// Lowest and highest P where it was measured.
     range: [f64; 2],
-    /// Places where it was measured.
-    places: Vec<[f64; 3]>,
-    /// Robust standard deviation of the blocks' logarithms as they are, and of what the polynomial leaves.
+    /// The blocks' robust standard deviation of the logarithm as it is, and of what is left.
     pub deviation: [f64; 2],
+    /// By what factor P varies over the tissue, from the tenth to the 90th percentile.
+    pub variation: f64,
 }
 
 /// A block of voxels under a field.
 struct Block {
     /// Place in the deformed volume (voxels of the full initial lattice).
     at: [f64; 3],
-    /// Logarithm of initial over deformed brightness.
-    ratio: f64,
+    /// Logarithm of the brightness in both volumes.
+    log: [f64; 2],
     weight: f64,
 }
 
 impl Brightness {
-    /// From a level of `factor` under a field on it; `shape` is the full initial volume's. None where there are too few blocks for it, or
-    /// values that are not of brightness (negative ones).
-    pub fn measure(pair: &Pair<'_>, factor: [usize; 3], shape: [usize; 3], field: (&Lattice, &[f32])) -> Option<Self> {
+    /// From a level of `factor` under a field on it; `shape` is the full initial volume's. P and Q are taken together where they leave less than
+    /// `both` of what the better one leaves alone. None where there are too few blocks for it, or values that are not of brightness
+    /// (negative ones).
+    pub fn measure(
+        pair: &Pair<'_>,
+        (factor, shape): ([usize; 3], [usize; 3]),
+        field: (&Lattice, &[f32]),
+        both: f64,
+    ) -> Option<Self> {
         let blocks = blocks(pair, factor, field)?;
-        let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| blocks.len() >= BLOCKS_A_TERM * p.len())?;
-        let basis = |at: [f64; 3]| -> Vec<f64> { powers.iter().map(|p| monomial(scaled(shape, at), *p)).collect() };
-        let rows: Vec<Vec<f64>> = blocks.iter().map(|b| basis(b.at)).collect();
-        let spread = |terms: &[f64]| {
-            let mut left: Vec<f32> =
-                rows.iter().zip(&blocks).map(|(row, b)| (b.ratio - dot(row, terms)) as f32).collect();
-            let middle = median(&mut left);
-            left.iter_mut().for_each(|v| *v = (*v - middle).abs());
-            1.4826 * f64::from(median(&mut left))
+        let room = blocks.len() / BLOCKS_A_TERM;
+        let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
+        let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1])).collect();
+        let [low, high] = [2.0, 98.0].map(|q| percentile(&mut logs, q));
+        let scale = [0.5 * (low + high), (0.5 * (high - low)).max(EQUAL)];
+        let fitted = |place: bool, tone: bool| {
+            let powers = if place { powers.clone() } else { vec![[0; 3]] };
+            let n = powers.len();
+            let by_place = |b: &Block| powers.iter().map(|p| monomial(scaled(shape, b.at), *p)).collect();
+            let (terms, left) = robust(&blocks, by_place, tone.then_some(scale))?;
+            let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
+            let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(*v), r[1].max(*v)]);
+            let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
+            let [tone_low, tone_high] = [-PAST, PAST].map(|t| scale[0] + t * scale[1] - of_tone(&terms[n..], t) / 2.0);
+            let step = (tone_high - tone_low) / TABLE as f64;
+            let tone = (0..=TABLE).map(|i| seen(&terms[n..], scale, tone_low + i as f64 * step));
+            Some(Self {
+                shape,
+                place: powers.iter().copied().zip(terms.iter().copied()).collect(),
+                tone: if tone_low < tone_high && terms.len() > n { tone.collect() } else { Vec::new() },
+                tones: [tone_low, tone_high],
+                range,
+                deviation: [spread(blocks.iter().map(|b| b.log[0] - b.log[1])), left],
+                variation: (high - low).exp(),
+            })
         };
-        let mut terms = vec![0.0; powers.len()];
-        let before = spread(&terms);
-        let mut weights: Vec<f64> = blocks.iter().map(|b| b.weight).collect();
-        let mut after = before;
-        for _ in 0..ROUNDS {
-            terms = fit(&rows, &blocks, &weights)?;
-            after = spread(&terms);
-            for ((w, row), b) in weights.iter_mut().zip(&rows).zip(&blocks) {
-                let off = (b.ratio - dot(row, &terms)) / (HALF * after).max(EQUAL);
-                *w = b.weight / (1.0 + off * off);
-            }
-        }
-        let values = rows.iter().map(|row| dot(row, &terms));
-        Some(Self {
-            shape,
-            range: values.fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)]),
-            terms: powers.into_iter().zip(terms).collect(),
-            places: blocks.iter().map(|b| b.at).collect(),
-            deviation: [before, after],
-        })
+        let (place, tone, all) = (fitted(true, false)?, fitted(false, true)?, fitted(true, true)?);
+        let alone = if tone.deviation[1] < place.deviation[1] { tone } else { place };
+        Some(if all.deviation[1] <= both * alone.deviation[1] { all } else { alone })
     }
 
-    /// With what was measured after `self` was taken out.
-    pub fn and(self, more: Self) -> Self {
-        let mut terms = self.terms;
-        for (power, term) in more.terms {
-            match terms.iter_mut().find(|t| t.0 == power) {
-                Some(t) => t.1 += term,
-                None => terms.push((power, term)),
-            }
-        }
-        let range = std::array::from_fn(|i| self.range[i] + more.range[i]);
-        Self { terms, range, places: more.places, deviation: [self.deviation[0], more.deviation[1]], ..self }
+    /// Whether it goes by the brightness itself: another contrast.
+    pub fn is_of_tone(&self) -> bool {
+        !self.tone.is_empty()
     }
 
-    /// By what factor it varies over the tissue (from the tenth to the 90th percentile).
-    pub fn variation(&self) -> f64 {
-        let at = |p: &[f64; 3]| self.terms.iter().map(|(power, t)| t * monomial(scaled(self.shape, *p), *power)).sum();
-        let mut values: Vec<f64> = self.places.iter().map(at).collect();
-        let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
-        (high - low).exp()
+    /// Whether it goes by place.
+    pub fn is_of_place(&self) -> bool {
+        self.place.len() > 1
     }
 
     /// Brings a deformed volume, on a level of `factor` where it starts at `origin` (voxels of the level's initial lattice), to the initial
@@ -129,15 +146,29 @@ impl Brightness {
         values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
             let at = scaled(self.shape, [0.0, full(row % ny, 1), full(row / ny, 2)]);
             let mut along = [0.0; DEGREE + 1];
-            for ([x, y, z], t) in &self.terms {
+            for ([x, y, z], t) in &self.place {
                 along[*x] += t * monomial(at, [0, *y, *z]);
             }
             for (i, v) in values.iter_mut().enumerate() {
                 let x = scaled(self.shape, [full(i, 0), 0.0, 0.0])[0];
-                let log = along.iter().rev().fold(0.0, |sum, c| sum * x + c);
-                *v *= log.clamp(low, high).exp() as f32;
+                let log = along.iter().rev().fold(0.0, |sum, c| sum * x + c).clamp(low, high);
+                *v *= (log + self.of_tone(*v, log)).exp() as f32;
             }
         });
+    }
+
+    /// Q of a brightness that P changes by `log`.
+    #[inline(always)]
+    fn of_tone(&self, value: f32, log: f64) -> f64 {
+        if self.tone.is_empty() {
+            return 0.0;
+        }
+        let [low, high] = self.tones;
+        let tone = f64::from(value.max(f32::MIN_POSITIVE)).ln() + log;
+        let at = ((tone - low) / (high - low)).clamp(0.0, 1.0) * TABLE as f64;
+        let i = (at as usize).min(TABLE - 1);
+        let t = at - i as f64;
+        (1.0 - t) * self.tone[i] + t * self.tone[i + 1]
     }
 }
 
@@ -157,8 +188,59 @@ fn scaled(shape: [usize; 3], at: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|a| if shape[a] > 1 { 2.0 * at[a] / (shape[a] - 1) as f64 - 1.0 } else { 0.0 })
 }
 
+/// A logarithm of brightness, -1 to 1 over the range of the tissue, and little past it.
+fn toned(scale: [f64; 2], log: f64) -> f64 {
+    ((log - scale[0]) / scale[1]).clamp(-PAST, PAST)
+}
+
+/// Q at a scaled brightness; straight on past the range of the tissue.
+fn of_tone(terms: &[f64], t: f64) -> f64 {
+    let inside = t.clamp(-1.0, 1.0);
+    let value = inside * terms.iter().rev().fold(0.0, |sum, c| sum * inside + c);
+    let slope = terms.iter().enumerate().rev().fold(0.0, |sum, (i, c)| sum * inside + (i + 1) as f64 * c);
+    value + slope * (t - inside)
+}
+
+/// Q for a logarithm of the deformed volume's brightness: at the middle between that and the initial one's that it leads to.
+fn seen(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
+    (0..SETTLED).fold(0.0, |q, _| 0.5 * (q + of_tone(terms, toned(scale, log + q / 2.0))))
+}
+
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Robust standard deviation.
+fn spread(values: impl Iterator<Item = f64>) -> f64 {
+    let mut off: Vec<f32> = values.map(|v| v as f32).collect();
+    let middle = median(&mut off);
+    off.iter_mut().for_each(|v| *v = (*v - middle).abs());
+    1.4826 * f64::from(median(&mut off))
+}
+
+/// Terms of place, then of tone where the brightness is scaled for them, with Cauchy weights; and the robust standard deviation of what
+/// they leave.
+fn robust(blocks: &[Block], by_place: impl Fn(&Block) -> Vec<f64>, scale: Option<[f64; 2]>) -> Option<(Vec<f64>, f64)> {
+    let mut rows: Vec<Vec<f64>> = blocks.iter().map(by_place).collect();
+    let n = rows.first()?.len();
+    let mut weights: Vec<f64> = blocks.iter().map(|b| b.weight).collect();
+    let mut best = (vec![0.0; n], 0.0);
+    for _ in 0..ROUNDS {
+        for (row, b) in rows.iter_mut().zip(blocks) {
+            let middle = 0.5 * (b.log[0] + b.log[1] + dot(&row[..n], &best.0[..n]));
+            row.truncate(n);
+            let powers = |s| (1..=TONES).map(move |p| toned(s, middle).clamp(-1.2, 1.2).powi(p as i32));
+            row.extend(scale.into_iter().flat_map(powers));
+        }
+        let terms = fit(&rows, blocks, &weights)?;
+        let left = || rows.iter().zip(blocks).map(|(row, b)| b.log[0] - b.log[1] - dot(row, &terms));
+        let deviation = spread(left());
+        for ((w, off), b) in weights.iter_mut().zip(left()).zip(blocks) {
+            *w = b.weight / (1.0 + (off / (HALF * deviation).max(EQUAL)).powi(2));
+        }
+        best = (terms, deviation);
+    }
+    Some(best)
 }
 
 /// Weighted least squares; a trace of ridge where blocks do not tell all terms apart.
@@ -167,7 +249,7 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
     let (mut a, mut b) = (vec![0.0; n * n], vec![0.0; n]);
     for ((row, block), w) in rows.iter().zip(blocks).zip(weights) {
         for i in 0..n {
-            b[i] += w * row[i] * block.ratio;
+            b[i] += w * row[i] * (block.log[0] - block.log[1]);
             (0..=i).for_each(|j| a[i * n + j] += w * row[i] * row[j]);
         }
     }
@@ -194,7 +276,7 @@ fn blocks(pair: &Pair<'_>, factor: [usize; 3], (lattice, coefficients): (&Lattic
     let block = |&&(p, weight, [f, w]): &&([f64; 3], f64, [f64; 2])| {
         let u = lattice.at(coefficients, p);
         let there = std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]);
-        Block { at: from_level(there, factor), ratio: (f / w).ln(), weight }
+        Block { at: from_level(there, factor), log: [f, w].map(f64::ln), weight }
     };
     Some(positive.iter().filter(|s| s.2[0] > least).map(block).collect())
 }

@@ -1,9 +1,8 @@
 //! The coarse-to-fine pyramid: both volumes on one lattice at several voxel sizes.
 
 use crate::error::{FieldError, SpaceError};
-use crate::matching::brightness::Brightness;
 use crate::matching::gain::weigh;
-use crate::matching::pair::{Pair, Spans};
+use crate::matching::pair::{Pair, Spans, about_mean};
 use crate::numerics::sampling::Sampler;
 use crate::numerics::statistics::{noise_sigma, quantile};
 use crate::numerics::{filters, pyramid};
@@ -71,32 +70,32 @@ impl<'a> Aligned<'a> {
 
     /// The pair with blocks of `factor` voxels averaged.
     pub fn level(&self, factor: [usize; 3]) -> Pair<'_> {
-        self.level_under(factor, None)
+        self.level_within(&self.mask, factor)
     }
 
-    /// The same with the deformed volume as bright as the initial one.
-    pub fn level_under(&self, factor: [usize; 3], light: Option<&Brightness>) -> Pair<'_> {
-        self.level_within(&self.mask, factor, light)
+    /// Voxels of the initial volume.
+    pub fn shape(&self) -> [usize; 3] {
+        self.shape
+    }
+
+    /// The deformed volume of that level.
+    pub fn deformed(&self, factor: [usize; 3]) -> Cow<'_, [f32]> {
+        pyramid::reduce(&self.moving, self.moving_shape, factor)
     }
 
     /// The same inside another mask on the initial volume's grid.
-    pub fn level_within(&self, mask: &[u8], factor: [usize; 3], light: Option<&Brightness>) -> Pair<'_> {
+    pub fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
         let mut mask = pyramid::reduce_mask(mask, self.shape, factor);
-        let mut moving = pyramid::reduce(&self.moving, self.moving_shape, factor);
-        let moving_shape = pyramid::reduced_shape(self.moving_shape, factor);
-        let moving_origin = std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64);
-        if let Some(light) = light {
-            light.even_out(moving.to_mut(), moving_shape, moving_origin, factor);
-        }
+        let moving = self.deformed(factor);
         let spacing = std::array::from_fn(|a| self.spacing[a] * factor[a] as f64);
         let noise = noise_sigma(&fixed, shape, |i| mask[i] != 0);
         let fixed_smooth = filters::bspline(&fixed, shape);
         weigh(&mut mask, &fixed_smooth, shape, spacing, noise);
         Pair {
             shape,
-            centres: [mean(&fixed), mean(&moving)],
+            centres: [&fixed, &moving].map(|v| about_mean(v)),
             inside: mask.iter().filter(|&&m| m != 0).count(),
             spans: Spans::new(&mask, shape),
             noise,
@@ -104,18 +103,11 @@ impl<'a> Aligned<'a> {
             fixed_smooth,
             fixed,
             mask,
-            moving_shape,
-            moving_origin,
+            moving_shape: pyramid::reduced_shape(self.moving_shape, factor),
+            moving_origin: std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64),
             moving,
         }
     }
-}
-
-/// Mean of the finite values among at most about 100,000.
-fn mean(values: &[f32]) -> f32 {
-    let sample = values.iter().step_by((values.len() / 100_000).max(1)).filter(|v| v.is_finite());
-    let (sum, n) = sample.fold((0.0, 0usize), |(s, n), v| (s + f64::from(*v), n + 1));
-    (sum / n.max(1) as f64) as f32
 }
 
 /// Position on a level of `factor` of a full-resolution voxel position.

@@ -1,5 +1,6 @@
 //! The two volumes on one lattice, as the matching works on them.
 
+use crate::matching::brightness::Brightness;
 use crate::numerics::bspline::{Lattice, SmoothSampler};
 use crate::numerics::pyramid;
 use crate::numerics::simd::dispatch;
@@ -43,10 +44,19 @@ pub struct Pair<'a> {
     pub moving: Cow<'a, [f32]>,
 }
 
-impl Pair<'_> {
+impl<'a> Pair<'a> {
     /// The same, with its own copy of the volumes.
     pub fn into_owned(self) -> Pair<'static> {
         Pair { fixed: self.fixed.into_owned().into(), moving: self.moving.into_owned().into(), ..self }
+    }
+
+    /// With the deformed volume of this level of `factor`, as it is, brought to the initial one's brightness.
+    pub fn evened(&mut self, deformed: Cow<'a, [f32]>, light: Option<&Brightness>, factor: [usize; 3]) {
+        self.moving = deformed;
+        if let Some(light) = light {
+            light.even_out(self.moving.to_mut(), self.moving_shape, self.moving_origin, factor);
+        }
+        self.centres[1] = about_mean(&self.moving);
     }
 
     /// Position in the deformed volume's own voxels.
@@ -143,6 +153,13 @@ impl Pair<'_> {
             }
         });
     }
+}
+
+/// Mean of the finite values among at most about 100,000.
+pub fn about_mean(values: &[f32]) -> f32 {
+    let sample = values.iter().step_by((values.len() / 100_000).max(1)).filter(|v| v.is_finite());
+    let (sum, n) = sample.fold((0.0, 0usize), |(s, n), v| (s + f64::from(*v), n + 1));
+    (sum / n.max(1) as f64) as f32
 }
 
 /// Step of at least `wanted` (and 1) through the rows `(j, k)` of a volume of `ny` rows a slice, as they lie in memory, that meets

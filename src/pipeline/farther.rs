@@ -1,10 +1,10 @@
 //! A search twice as far, where the motion reaches the end of what was looked over.
 
-use crate::matching::brightness::Brightness;
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::level;
+use crate::pipeline::light::Light;
 use crate::pipeline::start::Begun;
 use crate::pipeline::whole::{POINTS, Whole};
 
@@ -29,7 +29,7 @@ pub(super) fn is_open(pair: &Pair<'_>, range: f64, found: Option<&Begun>) -> boo
 /// neighbours that agree less than before are an island.
 pub(super) fn farther(
     whole: &Whole<'_>,
-    (aligned, light): (&Aligned<'_>, Option<&Brightness>),
+    (aligned, light): (&Aligned<'_>, &Light),
     (factors, pair, lattice): (&[[usize; 3]], &Pair<'_>, &Lattice),
     own: Option<&Begun>,
     passes: usize,
@@ -43,7 +43,7 @@ pub(super) fn farther(
         let (pair, lattice) = if l == last {
             (pair, lattice)
         } else {
-            coarser = aligned.level_under(factor, light);
+            coarser = light.level(aligned, factor);
             coarse_lattice = level::lattice(&coarser, 3);
             (&coarser, &coarse_lattice)
         };

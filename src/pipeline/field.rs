@@ -162,7 +162,7 @@ fn canonical(
     let (mut left, mut gain, mut asked) = (0.0, 1.0, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
-        let mut pair = aligned.level_under(factor, light.taken());
+        let mut pair = light.level(&aligned, factor);
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
         let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
@@ -176,7 +176,7 @@ fn canonical(
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
                 let loose = begun.as_ref().filter(|b: &&Begun| l == 1 && b.is_loose());
-                let coarsest = loose.map(|_| (aligned.level_under(*from, light.taken()), *from));
+                let coarsest = loose.map(|_| (light.level(&aligned, *from), *from));
                 let closer = coarsest.and_then(|(coarse, from)| {
                     whole.closer((&pair, factor), &field, (&coarse, from), passes, &mut matched)
                 });
@@ -189,13 +189,11 @@ fn canonical(
                 field
             }
             None => {
-                if light.look_at_rest(&pair, factor, grid.shape(), &SplineField::still(lattice.clone())) {
-                    pair = aligned.level_under(factor, light.taken());
-                }
+                light.look_at_rest(&mut pair, (&aligned, factor), &SplineField::still(lattice.clone()));
                 let effort = (passes, whole::POINTS);
                 let mut found = whole.begin((&pair, factor), &lattice, (starts, true), effort, &mut matched);
                 if given && found.as_ref().is_none_or(Begun::is_unsure) {
-                    let tissue = aligned.level_within(&around(&mask, &clean), factor, light.taken());
+                    let tissue = light.level_within(&aligned, &around(&mask, &clean), factor);
                     let wider = whole.begin((&tissue, factor), &lattice, (&[], true), effort, &mut matched);
                     found = match (found, wider) {
                         (Some(own), Some(wider)) => Some(Begun::surer(&pair, own, wider)),
@@ -206,8 +204,7 @@ fn canonical(
                     let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
                     let coarser = all.len().saturating_sub(factors.len());
                     let here = (&all[..=coarser], &pair, &lattice);
-                    let wide =
-                        farther::farther(&whole, (&aligned, light.taken()), here, found.as_ref(), passes, &mut matched);
+                    let wide = farther::farther(&whole, (&aligned, &light), here, found.as_ref(), passes, &mut matched);
                     asked.push(farther::why(search, found.as_ref(), wide.as_ref()));
                     if wide.is_some() {
                         search *= farther::TWICE;
@@ -221,9 +218,9 @@ fn canonical(
             }
         };
         // What a coarser level saw of the brightness serves the finest one.
-        let more = (first || !last) && light.look(&pair, factor, grid.shape(), &field);
+        let open = first || !last || light.is_unknown();
+        let more = open && light.look(&mut pair, (&aligned, factor), &field);
         if more && last {
-            pair = aligned.level_under(factor, light.taken());
             level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
         }
         if last {
