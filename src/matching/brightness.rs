@@ -34,7 +34,14 @@ const ABOVE_NOISE: f64 = 5.0;
 /// Part of the blocks that may be 0 or negative, in volumes of brightness.
 const NOT_POSITIVE: f64 = 0.02;
 
-/// Rounds of weights.
+/// Blocks at most: every so many of them where there are more. Some 25 times the terms.
+const BLOCKS: usize = 1000;
+
+/// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that tell it.
+const DARKEST: f64 = 0.5;
+const SAMPLED: usize = 100_000;
+
+/// Rounds of weights, and of P in Q: the two settle slowly together.
 const ROUNDS: usize = 12;
 
 /// Where the Cauchy weight is a half, in deviations of what is left.
@@ -61,6 +68,7 @@ const TONES: usize = 3;
 /// The deformed volume's way to the initial one's brightness.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Brightness {
+    zero: Zero,
     /// The initial volume's voxels, which are mapped to -1 to 1.
     shape: [usize; 3],
     /// P: powers along each axis, and the term's coefficient.
@@ -76,7 +84,31 @@ pub struct Brightness {
     pub variation: f64,
 }
 
+/// Where brightness begins in the initial and in the deformed volume, and whether it grows with the values (1) or against them (-1).
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Zero {
+    at: [f64; 2],
+    sign: f64,
+}
+
+impl Zero {
+    /// What may be it: 0 where hardly a value lies below, else the volumes' darkest or brightest values.
+    fn of(pair: &Pair<'_>) -> Vec<Self> {
+        let sample = |v: &[f32]| -> Vec<f64> {
+            v.iter().step_by((v.len() / SAMPLED).max(1)).filter(|v| v.is_finite()).map(|v| f64::from(*v)).collect()
+        };
+        let mut samples = [sample(&pair.fixed), sample(&pair.moving)];
+        let below = |s: &Vec<f64>| s.iter().filter(|v| **v < 0.0).count() as f64 <= NOT_POSITIVE * s.len() as f64;
+        if samples.iter().all(below) {
+            return vec![Self { at: [0.0; 2], sign: 1.0 }];
+        }
+        let ends = [(DARKEST, 1.0), (100.0 - DARKEST, -1.0)];
+        ends.map(|(q, sign)| Self { at: samples.each_mut().map(|s| percentile(s, q)), sign }).to_vec()
+    }
+}
+
 /// A block of voxels under a field.
+#[derive(Clone, Copy)]
 struct Block {
     /// Place in the deformed volume (voxels of the full initial lattice).
     at: [f64; 3],
@@ -87,15 +119,28 @@ struct Block {
 
 impl Brightness {
     /// From a level of `factor` under a field on it; `shape` is the full initial volume's. P and Q are taken together where they leave less than
-    /// `both` of what the better one leaves alone. None where there are too few blocks for it, or values that are not of brightness
-    /// (negative ones).
+    /// `both` of what the better one leaves alone. None where there are too few blocks for it.
     pub fn measure(
         pair: &Pair<'_>,
         (factor, shape): ([usize; 3], [usize; 3]),
         field: (&Lattice, &[f32]),
         both: f64,
     ) -> Option<Self> {
-        let blocks = blocks(pair, factor, field)?;
+        let found =
+            Zero::of(pair).into_iter().filter_map(|zero| Self::from(pair, (factor, shape), field, (zero, both)));
+        let left = |b: &Self| b.deviation[1] / b.deviation[0].max(EQUAL);
+        found.min_by(|a, b| left(a).total_cmp(&left(b)))
+    }
+
+    /// The same with brightness from `zero` on.
+    fn from(
+        pair: &Pair<'_>,
+        (factor, shape): ([usize; 3], [usize; 3]),
+        field: (&Lattice, &[f32]),
+        (zero, both): (Zero, f64),
+    ) -> Option<Self> {
+        let all = blocks(pair, factor, field, zero)?;
+        let blocks: Vec<Block> = all.iter().step_by(all.len().div_ceil(BLOCKS).max(1)).copied().collect();
         let room = blocks.len() / BLOCKS_A_TERM;
         let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
         let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1])).collect();
@@ -113,6 +158,7 @@ impl Brightness {
             let step = (tone_high - tone_low) / TABLE as f64;
             let tone = (0..=TABLE).map(|i| seen(&terms[n..], scale, tone_low + i as f64 * step));
             Some(Self {
+                zero,
                 shape,
                 place: powers.iter().copied().zip(terms.iter().copied()).collect(),
                 tone: if tone_low < tone_high && terms.len() > n { tone.collect() } else { Vec::new() },
@@ -143,6 +189,7 @@ impl Brightness {
         let [nx, ny, _] = shape;
         let full = |at: usize, a: usize| (at as f64 + origin[a] + 0.5) * factor[a] as f64 - 0.5;
         let [low, high] = [self.range[0] - BEYOND, self.range[1] + BEYOND];
+        let Zero { at: [zero, seen], sign } = self.zero;
         values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
             let at = scaled(self.shape, [0.0, full(row % ny, 1), full(row / ny, 2)]);
             let mut along = [0.0; DEGREE + 1];
@@ -152,19 +199,20 @@ impl Brightness {
             for (i, v) in values.iter_mut().enumerate() {
                 let x = scaled(self.shape, [full(i, 0), 0.0, 0.0])[0];
                 let log = along.iter().rev().fold(0.0, |sum, c| sum * x + c).clamp(low, high);
-                *v *= (log + self.of_tone(*v, log)).exp() as f32;
+                let bright = sign * (f64::from(*v) - seen);
+                *v = (zero + sign * bright * (log + self.of_tone(bright, log)).exp()) as f32;
             }
         });
     }
 
     /// Q of a brightness that P changes by `log`.
     #[inline(always)]
-    fn of_tone(&self, value: f32, log: f64) -> f64 {
+    fn of_tone(&self, bright: f64, log: f64) -> f64 {
         if self.tone.is_empty() {
             return 0.0;
         }
         let [low, high] = self.tones;
-        let tone = f64::from(value.max(f32::MIN_POSITIVE)).ln() + log;
+        let tone = bright.max(f64::MIN_POSITIVE).ln() + log;
         let at = ((tone - low) / (high - low)).clamp(0.0, 1.0) * TABLE as f64;
         let i = (at as usize).min(TABLE - 1);
         let t = at - i as f64;
@@ -260,7 +308,12 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
 }
 
 /// The blocks that lie in the mask by half at least and stand out of the noise; none where too many are not positive.
-fn blocks(pair: &Pair<'_>, factor: [usize; 3], (lattice, coefficients): (&Lattice, &[f32])) -> Option<Vec<Block>> {
+fn blocks(
+    pair: &Pair<'_>,
+    factor: [usize; 3],
+    (lattice, coefficients): (&Lattice, &[f32]),
+    zero: Zero,
+) -> Option<Vec<Block>> {
     let warped = pair.warp(lattice, coefficients, &pair.spans);
     let side = pair.in_voxels(BLOCK);
     let along = |a: usize| (0..pair.shape[a]).step_by(side[a]);
@@ -268,6 +321,8 @@ fn blocks(pair: &Pair<'_>, factor: [usize; 3], (lattice, coefficients): (&Lattic
         along(2).flat_map(|k| along(1).flat_map(move |j| along(0).map(move |i| [i, j, k]))).collect();
     let shown: Vec<([f64; 3], f64, [f64; 2])> =
         starts.into_par_iter().filter_map(|first| means(pair, &warped, first, side)).collect();
+    let bright = |m: [f64; 2]| std::array::from_fn(|i| zero.sign * (m[i] - zero.at[i]));
+    let shown: Vec<([f64; 3], f64, [f64; 2])> = shown.into_iter().map(|(p, w, m)| (p, w, bright(m))).collect();
     let positive: Vec<_> = shown.iter().filter(|s| s.2[0] > 0.0 && s.2[1] > 0.0).collect();
     if (shown.len() - positive.len()) as f64 > NOT_POSITIVE * shown.len() as f64 {
         return None;
