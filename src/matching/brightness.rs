@@ -34,8 +34,10 @@ const ABOVE_NOISE: f64 = 5.0;
 /// Part of the blocks that may be 0 or negative, in volumes of brightness.
 const NOT_POSITIVE: f64 = 0.02;
 
-/// Blocks at most: every so many of them where there are more. Some 25 times the terms.
+/// Blocks at most, about 25 times the terms; where there are more, those whose number times the golden ratio has the least fractions, which
+/// meets rows and slices alike.
 const BLOCKS: usize = 1000;
+const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that tell it.
 const DARKEST: f64 = 0.5;
@@ -108,7 +110,6 @@ impl Zero {
 }
 
 /// A block of voxels under a field.
-#[derive(Clone, Copy)]
 struct Block {
     /// Place in the deformed volume (voxels of the full initial lattice).
     at: [f64; 3],
@@ -140,7 +141,9 @@ impl Brightness {
         (zero, both): (Zero, f64),
     ) -> Option<Self> {
         let all = blocks(pair, factor, field, zero)?;
-        let blocks: Vec<Block> = all.iter().step_by(all.len().div_ceil(BLOCKS).max(1)).copied().collect();
+        let share = BLOCKS as f64 / all.len().max(1) as f64;
+        let blocks: Vec<Block> =
+            all.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share).map(|(_, b)| b).collect();
         let room = blocks.len() / BLOCKS_A_TERM;
         let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
         let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1])).collect();
