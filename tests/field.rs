@@ -463,7 +463,7 @@ fn a_coil_profile_or_another_contrast_in_one_volume_is_not_taken_for_motion() {
         let root = |v: f64| 100.0 * v.max(0.0).cbrt();
         let seen: [(&str, f64, &dyn Fn(f64, usize) -> f64); 3] = [
             ("by place", 1.05, &coil),
-            ("by contrast", 1.3, &|v, _| root(v)),
+            ("by contrast", 1.7, &|v, _| root(v)),
             ("and by contrast", 1.8, &|v, at| coil(root(v), at)),
         ];
         for (what, worse, seen) in seen {

@@ -567,6 +567,17 @@ fn brightness_by_place_and_by_contrast_is_found_and_taken_out() {
 }
 
 #[test]
+fn what_a_volume_is_scaled_by_is_no_matter_for_its_contrast() {
+    for scale in [1e-3, 1.0, 1e4] {
+        let pair = lit([48, 40, 44], [1.0; 3], |v, p| scale * v.sqrt() / (0.01 * p[0]).exp());
+        let found = brightness(&pair).unwrap();
+        let [before, after] = found.deviation;
+        assert!(found.is_of_tone() && found.is_of_place() && after < 0.1 * before, "{scale} {before} {after}");
+        assert!(uneven(&pair, &found) < 0.03, "{scale} {}", uneven(&pair, &found));
+    }
+}
+
+#[test]
 fn brightness_belongs_to_places_of_the_deformed_volume_on_every_level() {
     // A deformed volume of its own shape, which starts 4 voxels before the initial one, tissue that moves by 3, a brightness that stays.
     let (shape, there) = ([48, 44, 40], [56, 44, 40]);

@@ -146,14 +146,16 @@ impl Brightness {
             all.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share).map(|(_, b)| b).collect();
         let room = blocks.len() / BLOCKS_A_TERM;
         let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
-        let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1])).collect();
+        let mut ratios: Vec<f64> = blocks.iter().map(|b| b.log[0] - b.log[1]).collect();
+        let usual = percentile(&mut ratios, 50.0);
+        let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1] + usual)).collect();
         let [low, high] = [2.0, 98.0].map(|q| percentile(&mut logs, q));
         let scale = [0.5 * (low + high), (0.5 * (high - low)).max(EQUAL)];
         let fitted = |place: bool, tone: bool| {
             let powers = if place { powers.clone() } else { vec![[0; 3]] };
             let n = powers.len();
             let by_place = |b: &Block| powers.iter().map(|p| monomial(scaled(shape, b.at), *p)).collect();
-            let (terms, left) = robust(&blocks, by_place, tone.then_some(scale))?;
+            let (terms, left) = robust(&blocks, by_place, usual, tone.then_some(scale))?;
             let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
             let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(*v), r[1].max(*v)]);
             let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
@@ -270,12 +272,18 @@ fn spread(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Terms of place, then of tone where the brightness is scaled for them, with Cauchy weights; and the robust standard deviation of what
-/// they leave.
-fn robust(blocks: &[Block], by_place: impl Fn(&Block) -> Vec<f64>, scale: Option<[f64; 2]>) -> Option<(Vec<f64>, f64)> {
+/// they leave. `usual` is the middle of the logarithms' differences, where P starts.
+fn robust(
+    blocks: &[Block],
+    by_place: impl Fn(&Block) -> Vec<f64>,
+    usual: f64,
+    scale: Option<[f64; 2]>,
+) -> Option<(Vec<f64>, f64)> {
     let mut rows: Vec<Vec<f64>> = blocks.iter().map(by_place).collect();
     let n = rows.first()?.len();
     let mut weights: Vec<f64> = blocks.iter().map(|b| b.weight).collect();
     let mut best = (vec![0.0; n], 0.0);
+    best.0[0] = usual;
     for _ in 0..ROUNDS {
         for (row, b) in rows.iter_mut().zip(blocks) {
             let middle = 0.5 * (b.log[0] + b.log[1] + dot(&row[..n], &best.0[..n]));
