@@ -598,7 +598,7 @@ fn brightness_belongs_to_places_of_the_deformed_volume_on_every_level() {
         let found = Brightness::measure(&pair, (factor, shape), (&lattice, &c), 0.95).unwrap();
         for factor in [[1; 3], [2; 3]] {
             let mut pair = both.level(factor);
-            pair.evened(both.deformed(factor), Some(&found), factor);
+            pair.even_out(&found, factor);
             let (lattice, c) = moved(&pair, 3.0);
             let warped = pair.warp(&lattice, &c, &pair.spans);
             let seen = warped.iter().zip(&pair.fixed_smooth).filter(|(w, _)| w.is_finite());

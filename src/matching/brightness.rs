@@ -16,7 +16,7 @@ use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::cholesky::Cholesky;
-use crate::numerics::statistics::{median, percentile};
+use crate::numerics::statistics::{percentile, robust_deviation};
 use rayon::prelude::*;
 
 /// Edge of a block (the finest axis' voxels).
@@ -54,6 +54,9 @@ const EQUAL: f64 = 1e-6;
 
 /// How far past the range of the tissue Q is followed, in halves of it.
 const PAST: f64 = 2.5;
+
+/// How far past it blocks are fitted, in halves of it.
+const FITTED: f64 = 1.2;
 
 /// Steps of the table of Q.
 const TABLE: usize = 256;
@@ -127,27 +130,22 @@ impl Brightness {
         field: (&Lattice, &[f32]),
         both: f64,
     ) -> Option<Self> {
-        let found =
-            Zero::of(pair).into_iter().filter_map(|zero| Self::from(pair, (factor, shape), field, (zero, both)));
+        let seen = seen_blocks(pair, field);
+        let found = Zero::of(pair).into_iter().filter_map(|zero| {
+            let blocks = blocks(&seen, zero, (pair, factor))?;
+            Self::of(&blocks, shape, (zero, both))
+        });
         let left = |b: &Self| b.deviation[1] / b.deviation[0].max(EQUAL);
         found.min_by(|a, b| left(a).total_cmp(&left(b)))
     }
 
-    /// The same with brightness from `zero` on.
-    fn from(
-        pair: &Pair<'_>,
-        (factor, shape): ([usize; 3], [usize; 3]),
-        field: (&Lattice, &[f32]),
-        (zero, both): (Zero, f64),
-    ) -> Option<Self> {
-        let all = blocks(pair, factor, field, zero)?;
-        let share = BLOCKS as f64 / all.len().max(1) as f64;
-        let blocks: Vec<Block> =
-            all.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share).map(|(_, b)| b).collect();
+    /// From blocks of brightness from `zero` on.
+    fn of(blocks: &[Block], shape: [usize; 3], (zero, both): (Zero, f64)) -> Option<Self> {
         let room = blocks.len() / BLOCKS_A_TERM;
         let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
         let mut ratios: Vec<f64> = blocks.iter().map(|b| b.log[0] - b.log[1]).collect();
         let usual = percentile(&mut ratios, 50.0);
+        let before = robust_deviation(ratios.into_iter());
         let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1] + usual)).collect();
         let [low, high] = [2.0, 98.0].map(|q| percentile(&mut logs, q));
         let scale = [0.5 * (low + high), (0.5 * (high - low)).max(EQUAL)];
@@ -155,7 +153,7 @@ impl Brightness {
             let powers = if place { powers.clone() } else { vec![[0; 3]] };
             let n = powers.len();
             let by_place = |b: &Block| powers.iter().map(|p| monomial(scaled(shape, b.at), *p)).collect();
-            let (terms, left) = robust(&blocks, by_place, usual, tone.then_some(scale))?;
+            let (terms, left) = robust(blocks, by_place, usual, tone.then_some(scale))?;
             let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
             let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(*v), r[1].max(*v)]);
             let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
@@ -169,7 +167,7 @@ impl Brightness {
                 tone: if tone_low < tone_high && terms.len() > n { tone.collect() } else { Vec::new() },
                 tones: [tone_low, tone_high],
                 range,
-                deviation: [spread(blocks.iter().map(|b| b.log[0] - b.log[1])), left],
+                deviation: [before, left],
                 variation: (high - low).exp(),
             })
         };
@@ -192,17 +190,21 @@ impl Brightness {
     /// one's brightness.
     pub fn even_out(&self, values: &mut [f32], shape: [usize; 3], origin: [f64; 3], factor: [usize; 3]) {
         let [nx, ny, _] = shape;
-        let full = |at: usize, a: usize| (at as f64 + origin[a] + 0.5) * factor[a] as f64 - 0.5;
+        let at = |voxel: [usize; 3]| {
+            let p = std::array::from_fn(|a| voxel[a] as f64 + origin[a]);
+            scaled(self.shape, from_level(p, factor))
+        };
         let [low, high] = [self.range[0] - BEYOND, self.range[1] + BEYOND];
         let Zero { at: [zero, seen], sign } = self.zero;
         values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
-            let at = scaled(self.shape, [0.0, full(row % ny, 1), full(row / ny, 2)]);
+            let (j, k) = (row % ny, row / ny);
+            let first = at([0, j, k]);
             let mut along = [0.0; DEGREE + 1];
             for ([x, y, z], t) in &self.place {
-                along[*x] += t * monomial(at, [0, *y, *z]);
+                along[*x] += t * monomial(first, [0, *y, *z]);
             }
             for (i, v) in values.iter_mut().enumerate() {
-                let x = scaled(self.shape, [full(i, 0), 0.0, 0.0])[0];
+                let x = at([i, j, k])[0];
                 let log = along.iter().rev().fold(0.0, |sum, c| sum * x + c).clamp(low, high);
                 let bright = sign * (f64::from(*v) - seen);
                 *v = (zero + sign * bright * (log + self.of_tone(bright, log)).exp()) as f32;
@@ -263,14 +265,6 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Robust standard deviation.
-fn spread(values: impl Iterator<Item = f64>) -> f64 {
-    let mut off: Vec<f32> = values.map(|v| v as f32).collect();
-    let middle = median(&mut off);
-    off.iter_mut().for_each(|v| *v = (*v - middle).abs());
-    1.4826 * f64::from(median(&mut off))
-}
-
 /// Terms of place, then of tone where the brightness is scaled for them, with Cauchy weights; and the robust standard deviation of what
 /// they leave. `usual` is the middle of the logarithms' differences, where P starts.
 fn robust(
@@ -288,12 +282,12 @@ fn robust(
         for (row, b) in rows.iter_mut().zip(blocks) {
             let middle = 0.5 * (b.log[0] + b.log[1] + dot(&row[..n], &best.0[..n]));
             row.truncate(n);
-            let powers = |s| (1..=TONES).map(move |p| toned(s, middle).clamp(-1.2, 1.2).powi(p as i32));
+            let powers = |s| (1..=TONES).map(move |p| toned(s, middle).clamp(-FITTED, FITTED).powi(p as i32));
             row.extend(scale.into_iter().flat_map(powers));
         }
         let terms = fit(&rows, blocks, &weights)?;
         let left = || rows.iter().zip(blocks).map(|(row, b)| b.log[0] - b.log[1] - dot(row, &terms));
-        let deviation = spread(left());
+        let deviation = robust_deviation(left());
         for ((w, off), b) in weights.iter_mut().zip(left()).zip(blocks) {
             *w = b.weight / (1.0 + (off / (HALF * deviation).max(EQUAL)).powi(2));
         }
@@ -318,33 +312,45 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
     Some(b)
 }
 
-/// The blocks that lie in the mask by half at least and stand out of the noise; none where too many are not positive.
-fn blocks(
-    pair: &Pair<'_>,
-    factor: [usize; 3],
-    (lattice, coefficients): (&Lattice, &[f32]),
-    zero: Zero,
-) -> Option<Vec<Block>> {
+/// A block of voxels as both volumes show it under a field.
+struct Seen {
+    /// Place in the deformed volume (voxels of the level's initial lattice).
+    at: [f64; 3],
+    weight: f64,
+    /// Mean value in both volumes.
+    mean: [f64; 2],
+}
+
+/// The blocks that lie in the mask by half at least.
+fn seen_blocks(pair: &Pair<'_>, (lattice, coefficients): (&Lattice, &[f32])) -> Vec<Seen> {
     let warped = pair.warp(lattice, coefficients, &pair.spans);
     let side = pair.in_voxels(BLOCK);
     let along = |a: usize| (0..pair.shape[a]).step_by(side[a]);
     let starts: Vec<[usize; 3]> =
         along(2).flat_map(|k| along(1).flat_map(move |j| along(0).map(move |i| [i, j, k]))).collect();
-    let shown: Vec<([f64; 3], f64, [f64; 2])> =
-        starts.into_par_iter().filter_map(|first| means(pair, &warped, first, side)).collect();
-    let bright = |m: [f64; 2]| std::array::from_fn(|i| zero.sign * (m[i] - zero.at[i]));
-    let shown: Vec<([f64; 3], f64, [f64; 2])> = shown.into_iter().map(|(p, w, m)| (p, w, bright(m))).collect();
-    let positive: Vec<_> = shown.iter().filter(|s| s.2[0] > 0.0 && s.2[1] > 0.0).collect();
-    if (shown.len() - positive.len()) as f64 > NOT_POSITIVE * shown.len() as f64 {
+    let seen = |first| {
+        let (p, weight, mean) = means(pair, &warped, first, side)?;
+        let u = lattice.at(coefficients, p);
+        Some(Seen { at: std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]), weight, mean })
+    };
+    starts.into_par_iter().filter_map(seen).collect()
+}
+
+/// Those that stand out of the noise, thinned out; none where too many are not positive.
+fn blocks(seen: &[Seen], zero: Zero, (pair, factor): (&Pair<'_>, [usize; 3])) -> Option<Vec<Block>> {
+    let bright = |s: &Seen| -> [f64; 2] { std::array::from_fn(|i| zero.sign * (s.mean[i] - zero.at[i])) };
+    let positive: Vec<(&Seen, [f64; 2])> =
+        seen.iter().map(|s| (s, bright(s))).filter(|(_, b)| b.iter().all(|v| *v > 0.0)).collect();
+    if (seen.len() - positive.len()) as f64 > NOT_POSITIVE * seen.len() as f64 {
         return None;
     }
     let least = ABOVE_NOISE * f64::from(pair.noise);
-    let block = |&&(p, weight, [f, w]): &&([f64; 3], f64, [f64; 2])| {
-        let u = lattice.at(coefficients, p);
-        let there = std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]);
-        Block { at: from_level(there, factor), log: [f, w].map(f64::ln), weight }
-    };
-    Some(positive.iter().filter(|s| s.2[0] > least).map(block).collect())
+    let clear: Vec<_> = positive.into_iter().filter(|(_, b)| b[0] > least).collect();
+    let share = BLOCKS as f64 / clear.len().max(1) as f64;
+    let thinned = clear.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share);
+    let block =
+        |(s, b): (&Seen, [f64; 2])| Block { at: from_level(s.at, factor), log: b.map(f64::ln), weight: s.weight };
+    Some(thinned.map(|(_, s)| block(s)).collect())
 }
 
 /// Centre (voxels), weight and mean brightness in both volumes of the block that starts at `first`; none where less than half of it is

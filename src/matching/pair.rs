@@ -50,12 +50,15 @@ impl<'a> Pair<'a> {
         Pair { fixed: self.fixed.into_owned().into(), moving: self.moving.into_owned().into(), ..self }
     }
 
-    /// With the deformed volume of this level of `factor`, as it is, brought to the initial one's brightness.
-    pub fn evened(&mut self, deformed: Cow<'a, [f32]>, light: Option<&Brightness>, factor: [usize; 3]) {
+    /// Puts `deformed` in the place of the deformed volume.
+    pub fn put(&mut self, deformed: Cow<'a, [f32]>) {
+        self.centres[1] = about_mean(&deformed);
         self.moving = deformed;
-        if let Some(light) = light {
-            light.even_out(self.moving.to_mut(), self.moving_shape, self.moving_origin, factor);
-        }
+    }
+
+    /// Brings the deformed volume of this level of `factor` to the initial one's brightness.
+    pub fn even_out(&mut self, light: &Brightness, factor: [usize; 3]) {
+        light.even_out(self.moving.to_mut(), self.moving_shape, self.moving_origin, factor);
         self.centres[1] = about_mean(&self.moving);
     }
 

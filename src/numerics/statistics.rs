@@ -21,6 +21,14 @@ pub fn deviation(values: impl Iterator<Item = f32> + Clone) -> f64 {
     (values.map(|v| (f64::from(v) - mean).powi(2)).sum::<f64>() / count).sqrt()
 }
 
+/// Robust standard deviation (1.4826 times the median distance from the median); NaN for no values.
+pub fn robust_deviation(values: impl Iterator<Item = f64>) -> f64 {
+    let mut off: Vec<f32> = values.map(|v| v as f32).collect();
+    let middle = median(&mut off);
+    off.iter_mut().for_each(|v| *v = (*v - middle).abs());
+    1.4826 * f64::from(median(&mut off))
+}
+
 /// The `q`-th percentile (0 to 100) with linear interpolation between order statistics, as numpy does by default.
 ///
 /// Reorders `values`; NaN sorts last. An empty slice gives NaN.

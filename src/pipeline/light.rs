@@ -35,17 +35,17 @@ pub(super) struct Light {
 impl Light {
     /// The pair of a level, with what is known taken out.
     pub fn level<'a>(&self, aligned: &'a Aligned<'_>, factor: [usize; 3]) -> Pair<'a> {
-        self.out_of(aligned, aligned.level(factor), factor)
+        self.out_of(aligned.level(factor), factor)
     }
 
     /// The same inside another mask on the initial volume's grid.
     pub fn level_within<'a>(&self, aligned: &'a Aligned<'_>, mask: &[u8], factor: [usize; 3]) -> Pair<'a> {
-        self.out_of(aligned, aligned.level_within(mask, factor), factor)
+        self.out_of(aligned.level_within(mask, factor), factor)
     }
 
-    fn out_of<'a>(&self, aligned: &'a Aligned<'_>, mut pair: Pair<'a>, factor: [usize; 3]) -> Pair<'a> {
-        if self.taken.is_some() {
-            pair.evened(aligned.deformed(factor), self.taken.as_ref(), factor);
+    fn out_of<'a>(&self, mut pair: Pair<'a>, factor: [usize; 3]) -> Pair<'a> {
+        if let Some(taken) = &self.taken {
+            pair.even_out(taken, factor);
         }
         pair
     }
@@ -85,7 +85,7 @@ impl Light {
     ) -> bool {
         let before = self.taken.take();
         if before.is_some() {
-            pair.evened(aligned.deformed(factor), None, factor);
+            pair.put(aligned.deformed(factor));
         }
         let found = Brightness::measure(pair, (factor, aligned.shape()), (&field.lattice, &field.coefficients), both);
         let matters = |b: &Brightness| b.deviation[0] > MATTERS && b.deviation[1] <= leaves * b.deviation[0];
@@ -93,8 +93,8 @@ impl Light {
             Some(found) if matters(&found) => self.taken = Some(found),
             found => self.left = found,
         }
-        if self.taken.is_some() {
-            pair.evened(aligned.deformed(factor), self.taken.as_ref(), factor);
+        if let Some(taken) = &self.taken {
+            pair.even_out(taken, factor);
         }
         before.is_some() || self.taken.is_some()
     }
