@@ -482,6 +482,28 @@ fn a_coil_profile_or_another_contrast_in_one_volume_is_not_taken_for_motion() {
     }
 }
 
+/// One half brighter, as from one element of a coil: a polynomial across the step was taken out, and a head at rest became a free motion of high trust.
+#[test]
+fn a_step_in_brightness_is_left_to_the_local_gain() {
+    let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
+    for (motion, amplitude) in [(MotionKind::None, 1.0), (MotionKind::Translate, 3.0), (MotionKind::Rotate, 5.0)] {
+        let p = phantom(&PhantomParams { motion, amplitude, ..head.clone() }).unwrap();
+        let (even, plain) = measure_with(&p, &FieldParams::default());
+        let mut step = p.clone();
+        let grid = *p.deformed.grid();
+        let middle = grid.shape()[0] / 2;
+        let brighter = |at: usize| if grid.voxel(at)[0] < middle { 1.5 } else { 1.0 };
+        step.deformed.as_mut_slice().iter_mut().enumerate().for_each(|(at, v)| *v *= brighter(at));
+        let (bright, m) = measure_with(&step, &FieldParams::default());
+        let said = |e: &&String| e.starts_with("brightness");
+        let told = bright.summary.evidence.iter().find(said).unwrap();
+        assert!(told.contains("left as it is"), "{motion:?}: {told}");
+        assert_eq!(bright.summary.model, even.summary.model, "{motion:?}");
+        let most = 1.5 * plain.mean_mm + 0.03;
+        assert!(m.mean_mm <= most, "{motion:?}: {} for {}", m.mean_mm, plain.mean_mm);
+    }
+}
+
 /// A slice that a scanner or a converter dropped was matched as if it were tissue: a thigh came out 7 mm off.
 #[test]
 fn lost_slices_are_left_out_and_said() {

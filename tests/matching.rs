@@ -625,11 +625,48 @@ fn blocks_that_are_off_hardly_count() {
     assert!(brightness(&even).is_none_or(|b| b.variation.is_finite() && b.deviation[0] < 1e-6));
 }
 
+/// A polynomial across a step (one half of a head 1.4 times as bright) left little of it and did harm: 0.008 -> 0.208 mm.
+#[test]
+fn a_step_in_brightness_is_told_from_a_profile() {
+    let profile = |v: f64, p: [f64; 3]| v / (0.8 * (p[0] / 47.0).powi(2) - 0.5 * p[1] / 39.0).exp();
+    let uneven = brightness(&lit([48, 40, 44], [1.0; 3], profile)).unwrap().uneven;
+    assert!(uneven < 0.1, "a profile: {uneven}");
+    for by in [1.4, 3.0] {
+        let step = brightness(&lit([48, 40, 44], [1.0; 3], |v, p| if p[0] < 24.0 { v * by } else { v })).unwrap();
+        assert!(step.uneven > 1.0, "{by}: {}", step.uneven);
+    }
+}
+
+/// A leg that the deformed volume does not show, or noise where a coil is far, was taken for a profile: 0.000 -> 0.298 mm, 0.31 -> 1.12.
+#[test]
+fn what_is_dark_in_the_deformed_volume_tells_nothing_of_its_brightness() {
+    let pair = lit([48; 3], [1.0; 3], |v, p| v / (0.01 * p[0]).exp());
+    let mut random = palpate::numerics::random::Random::new(5, 0);
+    let mut noisy = |v: &f32, sigma: f64| {
+        let [a, b] = random.normals();
+        (f64::from(*v) + sigma * a).hypot(sigma * b) as f32
+    };
+    let f: Vec<f32> = pair.fixed.iter().map(|v| noisy(v, 6.0)).collect();
+    let seen = |(at, v): (usize, &f32)| if at / 2304 < 20 { noisy(&0.0, 6.0) } else { noisy(v, 6.0) };
+    let m: Vec<f32> = pair.moving.iter().enumerate().map(seen).collect();
+    let found = brightness(&crate::pair([48; 3], [1.0; 3], &f, &m)).unwrap();
+    assert!((found.variation / (0.01f64 * 0.8 * 44.0).exp() - 1.0).abs() < 0.05, "{}", found.variation);
+    assert!(found.deviation[1] < 0.1 * found.deviation[0], "{:?}", found.deviation);
+}
+
+#[test]
+fn a_brightness_that_falls_with_the_other_is_no_contrast() {
+    for power in [0.3, 0.8, 1.0] {
+        let found = brightness(&lit([48, 40, 44], [1.0; 3], |v, _| 200.0 * (v / 200.0).powf(-power))).unwrap();
+        assert!(!found.is_of_tone() && found.deviation[1] > 0.6 * found.deviation[0], "{power}: {:?}", found.deviation);
+    }
+}
+
 #[test]
 fn brightness_below_zero_or_upside_down_is_found_too() {
     // Air in the first slices tells where brightness begins.
     let air = |v: f64, p: [f64; 3]| if p[2] < 4.0 { 0.0 } else { v / (0.01 * p[0]).exp() };
-    for (sign, offset) in [(1.0, 0.0), (1.0, -500.0), (-1.0, 0.0)] {
+    for (sign, offset) in [(1.0, 0.0), (1.0, -500.0), (-1.0, 0.0), (1.0, 1000.0)] {
         let mut pair = lit([48; 3], [1.0; 3], air);
         let f: Vec<f32> = pair.fixed.iter().enumerate().map(|(at, v)| if at / 2304 < 4 { 0.0 } else { *v }).collect();
         let map = |v: &f32| sign * v + offset;

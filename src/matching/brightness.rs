@@ -16,7 +16,8 @@ use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::cholesky::Cholesky;
-use crate::numerics::statistics::{percentile, robust_deviation};
+use crate::numerics::neighbours::Neighbours;
+use crate::numerics::statistics::{noise_sigma, percentile, robust_deviation};
 use rayon::prelude::*;
 
 /// Edge of a block (the finest axis' voxels).
@@ -31,6 +32,10 @@ const BLOCKS_A_TERM: usize = 8;
 /// Brightness of a block, over the noise, from which its logarithm is believed.
 const ABOVE_NOISE: f64 = 5.0;
 
+/// How far above the noise of a voxel (not of a level's averages: magnitudes have a floor of 1.25 deviations that no average lowers) the deformed
+/// volume's blocks must be. Darker ones are air, a hole or a coil's far end, and their ratio says nothing.
+const ABOVE_FLOOR: f64 = 3.0;
+
 /// Part of the blocks that may be 0 or negative, in volumes of brightness.
 const NOT_POSITIVE: f64 = 0.02;
 
@@ -39,8 +44,10 @@ const NOT_POSITIVE: f64 = 0.02;
 const BLOCKS: usize = 1000;
 const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
-/// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that tell it.
+/// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that tell it. Where it is more than `OFFSET` of the
+/// percentile at the other end of both volumes, it may be that although no value is negative.
 const DARKEST: f64 = 0.5;
+const OFFSET: f64 = 0.2;
 const SAMPLED: usize = 100_000;
 
 /// Rounds of weights, and of P in Q: the two settle slowly together.
@@ -67,6 +74,13 @@ const SETTLED: usize = 40;
 /// How far past the values that were measured the polynomial is followed (logarithm).
 const BEYOND: f64 = 0.1;
 
+/// Steepest Q: a cube root has 1, a fourth root 1.2, and at 2 another brightness no longer grows with the first.
+const STEEPEST: f64 = 1.5;
+
+/// Blocks about each whose middle difference is compared with their neighbours', and the neighbours.
+const AROUND: usize = 12;
+const BESIDE: usize = 6;
+
 /// Powers of the logarithm of brightness.
 const TONES: usize = 3;
 
@@ -85,6 +99,9 @@ pub struct Brightness {
     range: [f64; 2],
     /// The blocks' robust standard deviation of the logarithm as it is, and of what is left.
     pub deviation: [f64; 2],
+    /// What is left of how the logarithm varies between neighbours, as a part of it: by how much they differ (median), each the middle of the
+    /// blocks about it. The local gain takes what is the same nearby; a polynomial across a step trades that for a slope.
+    pub uneven: f64,
     /// By what factor P varies over the tissue, from the tenth to the 90th percentile.
     pub variation: f64,
 }
@@ -103,12 +120,16 @@ impl Zero {
             v.iter().step_by((v.len() / SAMPLED).max(1)).filter(|v| v.is_finite()).map(|v| f64::from(*v)).collect()
         };
         let mut samples = [sample(&pair.fixed), sample(&pair.moving)];
-        let below = |s: &Vec<f64>| s.iter().filter(|v| **v < 0.0).count() as f64 <= NOT_POSITIVE * s.len() as f64;
-        if samples.iter().all(below) {
-            return vec![Self { at: [0.0; 2], sign: 1.0 }];
+        let positive = |s: &Vec<f64>| s.iter().filter(|v| **v < 0.0).count() as f64 <= NOT_POSITIVE * s.len() as f64;
+        let all = samples.iter().all(positive);
+        let [darkest, brightest] = [DARKEST, 100.0 - DARKEST].map(|q| samples.each_mut().map(|s| percentile(s, q)));
+        let zero = Self { at: [0.0; 2], sign: 1.0 };
+        let from_darkest = Self { at: darkest, sign: 1.0 };
+        match all {
+            true if darkest.iter().zip(brightest).all(|(low, high)| *low > OFFSET * high) => vec![zero, from_darkest],
+            true => vec![zero],
+            false => vec![from_darkest, Self { at: brightest, sign: -1.0 }],
         }
-        let ends = [(DARKEST, 1.0), (100.0 - DARKEST, -1.0)];
-        ends.map(|(q, sign)| Self { at: samples.each_mut().map(|s| percentile(s, q)), sign }).to_vec()
     }
 }
 
@@ -131,8 +152,11 @@ impl Brightness {
         both: f64,
     ) -> Option<Self> {
         let seen = seen_blocks(pair, field);
+        let noise = noise_sigma(&pair.moving, pair.moving_shape, |_| true);
+        let above = (factor.iter().product::<usize>() as f64).sqrt() * ABOVE_FLOOR;
+        let least = [f64::from(pair.noise) * ABOVE_NOISE, f64::from(noise) * above.max(ABOVE_NOISE)];
         let found = Zero::of(pair).into_iter().filter_map(|zero| {
-            let blocks = blocks(&seen, zero, (pair, factor))?;
+            let blocks = blocks(&seen, (zero, least), factor)?;
             Self::of(&blocks, shape, (zero, both))
         });
         let left = |b: &Self| b.deviation[1] / b.deviation[0].max(EQUAL);
@@ -155,6 +179,9 @@ impl Brightness {
             let by_place = |b: &Block| powers.iter().map(|p| monomial(scaled(shape, b.at), *p)).collect();
             let (terms, left) = robust(blocks, by_place, usual, tone.then_some(scale))?;
             let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
+            if steepest(&terms[n..]) > STEEPEST * scale[1] {
+                return None;
+            }
             let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(*v), r[1].max(*v)]);
             let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
             let [tone_low, tone_high] = [-PAST, PAST].map(|t| scale[0] + t * scale[1] - of_tone(&terms[n..], t) / 2.0);
@@ -164,16 +191,29 @@ impl Brightness {
                 zero,
                 shape,
                 place: powers.iter().copied().zip(terms.iter().copied()).collect(),
-                tone: if tone_low < tone_high && terms.len() > n { tone.collect() } else { Vec::new() },
+                tone: if terms.len() > n { tone.collect() } else { Vec::new() },
                 tones: [tone_low, tone_high],
                 range,
                 deviation: [before, left],
+                uneven: 1.0,
                 variation: (high - low).exp(),
             })
         };
-        let (place, tone, all) = (fitted(true, false)?, fitted(false, true)?, fitted(true, true)?);
-        let alone = if tone.deviation[1] < place.deviation[1] { tone } else { place };
-        Some(if all.deviation[1] <= both * alone.deviation[1] { all } else { alone })
+        let (place, tone, all) = (fitted(true, false)?, fitted(false, true), fitted(true, true));
+        let alone = tone.filter(|tone| tone.deviation[1] < place.deviation[1]).unwrap_or(place);
+        let best = all.filter(|all| all.deviation[1] <= both * alone.deviation[1]).unwrap_or(alone);
+        let ratios = |b: &Block| b.log[0] - b.log[1];
+        let [as_it_is, left] = [
+            between_neighbours(blocks, ratios),
+            between_neighbours(blocks, |b| ratios(b) - best.logarithm(scaled(shape, b.at), b.log[1])),
+        ];
+        Some(Self { uneven: left / as_it_is.max(EQUAL), ..best })
+    }
+
+    /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume.
+    fn logarithm(&self, at: [f64; 3], tone: f64) -> f64 {
+        let place: f64 = self.place.iter().map(|(p, t)| t * monomial(at, *p)).sum();
+        place + self.of_tone(tone.exp(), place)
     }
 
     /// Whether it goes by the brightness itself: another contrast.
@@ -261,6 +301,27 @@ fn seen(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
     (0..SETTLED).fold(0.0, |q, _| 0.5 * (q + of_tone(terms, toned(scale, log + q / 2.0))))
 }
 
+/// The steepest that Q is, either way, in the range of the tissue.
+fn steepest(terms: &[f64]) -> f64 {
+    let slope = |t: f64| terms.iter().enumerate().rev().fold(0.0, |sum, (i, c)| sum * t + (i + 1) as f64 * c);
+    (-10..=10).map(|t| slope(f64::from(t) / 10.0).abs()).fold(0.0, f64::max)
+}
+
+/// By how much a value of blocks differs between neighbours (median), each the middle of the blocks about it.
+fn between_neighbours(blocks: &[Block], value: impl Fn(&Block) -> f64) -> f64 {
+    let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at).collect();
+    let tree = Neighbours::new(&places);
+    let near: Vec<Vec<usize>> = places.iter().map(|p| tree.within(*p, f64::INFINITY, AROUND)).collect();
+    let values: Vec<f64> = blocks.iter().map(value).collect();
+    let middle = |near: &Vec<usize>| percentile(&mut near.iter().map(|&i| values[i]).collect::<Vec<_>>(), 50.0);
+    let smooth: Vec<f64> = near.iter().map(middle).collect();
+    let steps = near.iter().zip(&smooth).flat_map(|(near, here)| {
+        let smooth = &smooth;
+        near.iter().skip(1).take(BESIDE).map(move |&i| (smooth[i] - here).abs())
+    });
+    percentile(&mut steps.collect::<Vec<_>>(), 50.0)
+}
+
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
@@ -337,15 +398,15 @@ fn seen_blocks(pair: &Pair<'_>, (lattice, coefficients): (&Lattice, &[f32])) -> 
 }
 
 /// Those that stand out of the noise, thinned out; none where too many are not positive.
-fn blocks(seen: &[Seen], zero: Zero, (pair, factor): (&Pair<'_>, [usize; 3])) -> Option<Vec<Block>> {
+fn blocks(seen: &[Seen], (zero, least): (Zero, [f64; 2]), factor: [usize; 3]) -> Option<Vec<Block>> {
     let bright = |s: &Seen| -> [f64; 2] { std::array::from_fn(|i| zero.sign * (s.mean[i] - zero.at[i])) };
     let positive: Vec<(&Seen, [f64; 2])> =
         seen.iter().map(|s| (s, bright(s))).filter(|(_, b)| b.iter().all(|v| *v > 0.0)).collect();
     if (seen.len() - positive.len()) as f64 > NOT_POSITIVE * seen.len() as f64 {
         return None;
     }
-    let least = ABOVE_NOISE * f64::from(pair.noise);
-    let clear: Vec<_> = positive.into_iter().filter(|(_, b)| b[0] > least).collect();
+    let clear: Vec<_> =
+        positive.into_iter().filter(|(_, b)| b.iter().zip(least).all(|(b, least)| *b > least)).collect();
     let share = BLOCKS as f64 / clear.len().max(1) as f64;
     let thinned = clear.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share);
     let block =
