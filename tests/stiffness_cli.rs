@@ -462,3 +462,19 @@ fn a_body_in_two_pieces_is_refused() {
     io::write_labels(&path, &labels, "").unwrap();
     refused(folder.path(), &[], 1, &["2 pieces", "keep the largest component"]);
 }
+
+#[test]
+fn regions_that_are_looked_for_are_announced_and_written() {
+    let folder = folder();
+    let base = ["stiffness", "--field", "field.nii.gz", "--mask", "labels.nii.gz", "--nodes", "500", "-o", "results"];
+    let (plan, _) = run(folder.path(), &[&base[..], &["--dry-run"]].concat(), 0);
+    assert!(plan.contains("1,728 voxels; up to 4 regions are looked for") && plan.contains("regions.nii.gz"), "{plan}");
+    let (plan, _) = run(folder.path(), &[&BASE[..], &["--dry-run"]].concat(), 0);
+    assert!(plan.contains("1 (864 voxels), 2 (864 voxels)") && !plan.contains("regions.nii.gz"), "{plan}");
+    run(folder.path(), &base, 0);
+    let found = io::read_volume(folder.path().join("results/regions.nii.gz")).unwrap();
+    assert_eq!(found.as_slice().iter().filter(|v| **v == 1.0).count(), 1728);
+    // Of a run with labels it would be a stranger.
+    run(folder.path(), &[&BASE[..], &["--overwrite"]].concat(), 0);
+    assert!(!folder.path().join("results/regions.nii.gz").exists());
+}

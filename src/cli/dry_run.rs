@@ -85,27 +85,38 @@ pub fn track(
     Ok(out)
 }
 
-/// The plan of `palpate stiffness`; `frames` are the forces of a sequence, whose first field `path` is.
+/// The labels and their voxels, or of a mask that regions will be looked for.
+fn body(labels: &Mask, labelled: bool, most: usize) -> (&'static str, String) {
+    let mut voxels = [0usize; 256];
+    labels.as_slice().iter().for_each(|&l| voxels[usize::from(l)] += 1);
+    if !labelled {
+        let sought = if most > 1 { format!("up to {most} regions are looked for") } else { "one region".into() };
+        return ("mask", format!("{} voxels; {sought}", thousands(voxels[1..].iter().sum())));
+    }
+    let known = (1..256).filter(|&l| voxels[l] > 0);
+    let regions: Vec<String> = known.map(|l| format!("{l} ({} voxels)", thousands(voxels[l]))).collect();
+    ("labels", regions.join(", "))
+}
+
+/// The plan of `palpate stiffness` for labels, or a mask where not `labelled`; `frames` are the forces of a sequence, whose first
+/// field `path` is.
 pub fn stiffness(
     path: &Path,
-    labels: &Mask,
+    (labels, labelled): (&Mask, bool),
     params: &StiffnessParams,
     [held, load]: [&str; 2],
     frames: &[Option<f64>],
     output: &Path,
     files: &[&str],
 ) -> String {
-    let mut voxels = [0usize; 256];
-    labels.as_slice().iter().for_each(|&l| voxels[usize::from(l)] += 1);
-    let regions: Vec<String> =
-        (1..256).filter(|&l| voxels[l] > 0).map(|l| format!("{l} ({} voxels)", thousands(voxels[l]))).collect();
     let mut out = String::from("Would look for Young's modulus:\n");
     let field = format!("{}: {}", name(path), grid(labels.grid()));
     match frames.len() {
         0 => line(&mut out, "field", &field),
         n => line(&mut out, "fields", &format!("{field}, and {} more; one map for all", n - 1)),
     }
-    line(&mut out, "labels", &regions.join(", "));
+    let (what, shown) = body(labels, labelled, params.regions);
+    line(&mut out, what, &shown);
     line(&mut out, "held", held);
     line(&mut out, "loaded", load);
     let known: Vec<f64> = frames.iter().flatten().copied().collect();

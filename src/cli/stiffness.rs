@@ -32,6 +32,9 @@ pub(super) const FILES: [&str; 9] = [
     "report.html",
 ];
 
+/// What is written beside it where regions were looked for.
+pub(super) const FOUND: &str = "regions.nii.gz";
+
 #[derive(Debug, Args)]
 pub struct Options {
     /// Displacement field, initial to deformed (5-D NIfTI, LPS mm), or a folder of palpate field
@@ -155,9 +158,21 @@ pub(super) fn plan(
 ) -> Result<()> {
     OutputFolder::check(&options.output, options.overwrite)?;
     let sides = [options.held.as_str(), &options.load];
-    let more: &[&str] = if frames.is_empty() { &[] } else { &["frames.csv"] };
+    let more: &[&str] = match (frames.is_empty(), setting.labelled) {
+        (false, _) => &["frames.csv"],
+        (true, false) => &[FOUND],
+        (true, true) => &[],
+    };
     let files = [&FILES[..], more].concat();
-    console.say(&dry_run::stiffness(field, &setting.labels, params, sides, frames, &options.output, &files))
+    console.say(&dry_run::stiffness(
+        field,
+        (&setting.labels, setting.labelled),
+        params,
+        sides,
+        frames,
+        &options.output,
+        &files,
+    ))
 }
 
 fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
@@ -168,7 +183,8 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         .flatten()
         .chain(patches.iter().chain(&options.images).map(PathBuf::as_path))
         .collect();
-    check_distinct(&given, &FILES.map(|f| options.output.join(f)))?;
+    let results: Vec<PathBuf> = FILES.iter().chain(&[FOUND]).map(|f| options.output.join(f)).collect();
+    check_distinct(&given, &results)?;
 
     let started = Instant::now();
     let progress = console.progress();
@@ -188,7 +204,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     // Of a sequence.
-    folder.supersede(|file| file == "frames.csv")?;
+    folder.supersede(|file| file == "frames.csv" || file == FOUND)?;
     let read = started.elapsed().as_secs_f64();
 
     let result = setting.run(&field, matches.as_ref(), params, &|s, f| progress.set(s, f));
@@ -348,6 +364,9 @@ pub(super) fn write(folder: &mut OutputFolder, result: &mut StiffnessResult) -> 
     })?;
     folder
         .write("residual.nii.gz", |p| io::write_volume(p, &result.residual, "palpate: length of the residual, mm"))?;
+    if let Some(found) = &result.found {
+        folder.write(FOUND, |p| io::write_labels(p, found, "palpate: regions found without labels"))?;
+    }
     folder.write("regions.csv", |p| io::write_regions(p, &result.regions, result.absolute))?;
     let modulus: Vec<f32> = result.element_modulus.iter().map(|&e| e as f32).collect();
     let label: Vec<f32> = result.mesh.labels().iter().map(|&l| f32::from(l)).collect();

@@ -3,7 +3,7 @@
 use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
-use super::stiffness::{FILES, Options, Setting, images, patch_files, plan, write};
+use super::stiffness::{FILES, FOUND, Options, Setting, images, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
@@ -20,7 +20,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let patches = patch_files(options);
     let others = patches.iter().chain(&options.images).map(PathBuf::as_path);
     let given: Vec<&Path> = frames.iter().map(|f| f.1.as_path()).chain([body]).chain(others).collect();
-    let files: Vec<PathBuf> = FILES.iter().chain(&["frames.csv"]).map(|f| options.output.join(f)).collect();
+    let files: Vec<PathBuf> = FILES.iter().chain(&["frames.csv", FOUND]).map(|f| options.output.join(f)).collect();
     check_distinct(&given, &files)?;
 
     let progress = console.progress();
@@ -58,6 +58,8 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let rank = |m: f64| if m.is_finite() { m } else { -1.0 };
     order.sort_by(|a, b| rank(b.1).total_cmp(&rank(a.1)).then(a.0.cmp(&b.0)));
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
+    // Of a mask.
+    folder.supersede(|file| file == FOUND)?;
 
     let mut sequence = Sequence::default();
     let mut by_matches = false;

@@ -11,6 +11,7 @@ use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::Place;
 use crate::stiffness::rim::{Outline, rim};
+use crate::stiffness::summary::Shape;
 use crate::stiffness::turn::Turn;
 use crate::stiffness::{geometry, maps, summary};
 use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
@@ -109,6 +110,9 @@ fn unturned(
     let found = search::regions(inputs, params, &|s, f| progress(s, 0.5 * f))?;
     let inputs = Inputs { labels: &found.labels, ..*inputs };
     let mut result = labelled(&inputs, params, found.evidence, &|s, f| progress(s, 0.5 + 0.5 * f))?;
+    result.warnings.extend(found.left_over.and_then(maps::left_over));
+    result.left_over = found.left_over;
+    result.found = Some(found.labels);
     result.seconds.insert(0, ("search".into(), found.seconds));
     Ok(result)
 }
@@ -239,14 +243,19 @@ fn labelled(
         .collect::<Result<Vec<_>, _>>()?;
     let changes = [mesh_change.as_slice(), &ratio_change];
     let drawn = |label: &u8| geometry.is_some() && inclusions.iter().any(|i| i.label() == *label);
-    let cut: Vec<bool> = fine.body.labels.iter().map(|l| !inputs.labelled && *l > 1 && !drawn(l)).collect();
+    let shape = |label: &u8| match (inputs.labelled || *label == 1, drawn(label)) {
+        (true, _) => Shape::Given,
+        (false, true) => Shape::Drawn,
+        (false, false) => Shape::Cut,
+    };
+    let shapes: Vec<Shape> = fine.body.labels.iter().map(shape).collect();
     let regions = summary::regions(
         &fine.body,
         [&moduli, &alone],
         inputs.names,
         changes,
         &unseen,
-        &cut,
+        &shapes,
         &hidden,
         params.force_n.is_some(),
         reference,
@@ -305,6 +314,8 @@ fn labelled(
         seconds: clock.seconds,
         samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
         labelled: inputs.labelled,
+        left_over: None,
+        found: None,
         regions,
         mesh: fine.moved(fine_mesh)?,
     })

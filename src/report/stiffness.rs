@@ -13,7 +13,9 @@ use crate::report::tables::table;
 use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Moment, Viewer};
 use crate::report::{chart, json};
-use crate::types::stiffness::{Evidence, FrameStiffness, Gain, RegionStiffness, SharedStiffness, StiffnessResult};
+use crate::types::stiffness::{
+    Evidence, FrameStiffness, Gain, LeftOver, RegionStiffness, SharedStiffness, StiffnessResult,
+};
 use crate::types::{DenseField, Mask, Volume, WorldPoint};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -64,7 +66,7 @@ pub fn verdict(result: &StiffnessResult) -> String {
             "One modulus does not explain the field, and no second region was accepted (the evidence says why)."
                 .to_string()
         }
-        (1, false) => "The data do not support a second region: one modulus explains the field.".to_string(),
+        (1, false) => one_region(result.left_over),
         (n, false) => format!("The data support {n} regions."),
         (1, true) => "One region.".into(),
         (n, true) if seen == n => format!("All {n} regions are determined by the data."),
@@ -74,6 +76,21 @@ pub fn verdict(result: &StiffnessResult) -> String {
         out.push_str(" No force was given, so moduli are ratios.");
     }
     out
+}
+
+/// What it means that a second region was not looked for.
+fn one_region(left: Option<LeftOver>) -> String {
+    let Some(left) = left else {
+        return "The data do not support a second region: one modulus explains the field.".into();
+    };
+    let but = match left.may_be_surface() {
+        true => "which a surface half a voxel off may do as well as something softer or stiffer in it",
+        false => "in which something softer or stiffer may be hidden",
+    };
+    format!(
+        "The data do not support a second region, but one modulus leaves {:.4} mm beyond the noise, {but}.",
+        left.misfit_mm
+    )
 }
 
 /// Whether a misfit stands out of noise and geometry with one region, by the evidence.
@@ -112,13 +129,19 @@ pub fn text(result: &StiffnessResult) -> String {
     out
 }
 
-/// One model tried, in a line.
+/// Residual (mm) and criterion of a model; empty where it was not tried.
+fn figures(e: &Evidence) -> [String; 2] {
+    let shown = |v: f64, digits: usize| if v.is_finite() { format!("{v:.digits$}") } else { String::new() };
+    [shown(e.residual_mm, 4), shown(e.bic, 0)]
+}
+
+/// One model, in a line.
 pub fn evidence_line(e: &Evidence) -> String {
     let mark = if e.chosen { "chosen" } else { "not chosen" };
-    format!(
-        "{}: {}: residual {:.4} mm, criterion {:.0}, {mark} ({})",
-        e.question, e.model, e.residual_mm, e.bic, e.reason
-    )
+    let [residual, criterion] = figures(e);
+    let tried =
+        if e.bic.is_finite() { format!("residual {residual} mm, criterion {criterion}, ") } else { String::new() };
+    format!("{}: {}: {tried}{mark} ({})", e.question, e.model, e.reason)
 }
 
 /// summary.json; the keys are those of docs/file-formats.md.
@@ -158,6 +181,7 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
         "samples": result.samples[0],
         "effective_samples": result.samples[1],
         "evidence": result.evidence,
+        "left_over": result.left_over,
         "patches": { "held": result.patches[0], "loaded": result.patches[1] },
         "face_offsets_voxels": result.faces.iter().map(|(n, v)| (n.clone(), json!(v))).collect::<Map<String, Value>>(),
         "mesh": { "nodes": result.mesh.nodes().len(), "elements": result.mesh.tetrahedra().len() },
@@ -374,11 +398,12 @@ fn region_table(result: &StiffnessResult) -> String {
 
 fn evidence_table(result: &StiffnessResult) -> String {
     let row = |e: &Evidence| {
+        let [residual, criterion] = figures(e);
         vec![
             format!("{}: {}", e.question, escape(&e.model)),
             e.parameters.to_string(),
-            format!("{:.4}", e.residual_mm),
-            format!("{:.0}", e.bic),
+            residual,
+            criterion,
             if e.chosen { "chosen" } else { "" }.into(),
             escape(&e.reason),
         ]

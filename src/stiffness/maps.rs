@@ -9,7 +9,7 @@ use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::travel;
 use crate::stiffness::summary::{BEARS, Hidden};
 use crate::types::space::length;
-use crate::types::stiffness::{Contact, Prescribed, RegionStiffness, StiffnessParams};
+use crate::types::stiffness::{Contact, LeftOver, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Volume, WorldPoint};
 use std::collections::{BTreeSet, HashSet};
 
@@ -105,6 +105,17 @@ pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
     })
 }
 
+/// Says so where one region leaves more than noise, and more than a badly known surface explains.
+pub fn left_over(left: LeftOver) -> Option<String> {
+    (!left.may_be_surface()).then(|| {
+        format!(
+            "one modulus leaves {:.4} mm beyond the noise and no second region could be made out: that may be something softer or stiffer, \
+             or noise that is smooth over several voxels; the modulus is off by more than stated if anything is hidden there",
+            left.misfit_mm
+        )
+    })
+}
+
 /// Part of the plates' motion that the model may leave over without a word.
 const LEFT: f64 = 0.1;
 
@@ -131,7 +142,8 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &
     } else if misfit > MUCH * travel && misfit > ROUGH * own {
         out.push(format!(
             "what the model leaves over, {misfit:.3} mm, is {:.0} % of the plates' motion and {:.0} times what is rough in the field: body, \
-             patches, Poisson's ratio or law are not quite as assumed, and moduli may be off by more than stated",
+             patches, Poisson's ratio or law are not quite as assumed, or noise is smooth over several voxels, and moduli may be off by more \
+             than stated",
             100.0 * misfit / travel,
             misfit / own.max(1e-9)
         ));

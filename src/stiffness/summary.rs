@@ -18,8 +18,33 @@ const VAGUE: f64 = 0.35;
 const INTERFACE: [f64; 2] = [0.006, 0.005];
 /// In place of the latter where a region was found without labels and has the shape that the map gave it. From six phantoms.
 const CUT: f64 = 0.15;
+/// The same where its shape was drawn anew: nine functions leave more of it open than labels do. From bodies of an independent solver.
+const DRAWN: f64 = 0.02;
 /// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
 const RESOLVED: f64 = 0.1;
+
+/// Where the shape of a region comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shape {
+    /// From labels.
+    Given,
+    /// From the map without labels.
+    Cut,
+    /// Drawn anew from there, and open.
+    Drawn,
+}
+
+impl Shape {
+    /// Standard deviation of ln E for each unit of |ln contrast|, for what the shape is not known to (1).
+    fn slope(self) -> f64 {
+        match self {
+            Shape::Given => INTERFACE[1],
+            Shape::Cut => CUT,
+            Shape::Drawn => DRAWN,
+        }
+    }
+}
+
 /// A region is looked at more closely where a modulus e times as large moves no tissue by this part of the plates' motion.
 const DOUBTED: f64 = 0.02;
 /// It is not seen where, all moduli alike, that is less than this (two halves side by side came to 0.0003, a rod along a limb to 0.001,
@@ -201,7 +226,7 @@ pub fn unseen(
 
 /// Everything about the regions. `alone` are the moduli as if the surface were known: the part of the uncertainty that more
 /// data of the same body lower. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
-/// counts as the error of the fine one, or all of it where it is large. `cut` says which have the shape of a map.
+/// counts as the error of the fine one, or all of it where it is large. `shapes` says where each region's came from.
 ///
 /// What is `hidden` can bear anything from none to all of its share of the force, where one is known (`absolute`): so much are all
 /// moduli at most.
@@ -211,7 +236,7 @@ pub fn regions(
     names: &dyn Fn(u8) -> String,
     [mesh_change, ratio_change]: [&[f64]; 2],
     unseen: &[Option<&'static str>],
-    cut: &[bool],
+    shapes: &[Shape],
     hidden: &[Hidden],
     absolute: bool,
     reference: usize,
@@ -220,7 +245,7 @@ pub fn regions(
     let borne = hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
     let one = |r: usize| {
         let mesh = |change: f64| if change.abs() < RESOLVED { change / 3.0 } else { change };
-        let slope = if cut[r] { CUT } else { INTERFACE[1] };
+        let slope = shapes[r].slope();
         let interface = INTERFACE[0] + slope * (moduli.log[r] - moduli.log[reference]).abs();
         let data = moduli.covariance[r * count + r].max(0.0);
         let model = if data > 0.0 { interface * interface } else { 0.0 };

@@ -1,8 +1,10 @@
 //! Whether the data support one more region.
 //!
-//! Three things must hold. *Discrepancy*: with the field's own roughness s (white noise of a voxel), the present model's misfit
-//! beyond the noise must show: sqrt(s^2 + misfit^2) > 1.1 s; the noise of a measured field is not known to better than
-//! that. *Geometry*: the misfit must exceed what a surface known to half a voxel explains, half a voxel times the strain.
+//! Three things must hold. *Discrepancy*: the present model's misfit beyond the noise must show. Samples are means over voxels;
+//! with their noise n, sqrt(n^2 + misfit^2) > 1.1 n, since the noise of a measured field is not known to better than that.
+//! Nor is it known to be white: with the field's own roughness s (a voxel), misfit^2 > s^2 / 10. A tenth of a voxel's
+//! power that is smooth over a few voxels is not seen in its roughness and does not average out. *Geometry*: the misfit
+//! must exceed what a surface known to half a voxel explains, half a voxel times the strain.
 //! *Evidence*: the Bayesian information criterion, by effective samples, must fall by more than 10 and the misfit by a
 //! fifth, and the new region's modulus must differ from the first one's by two standard deviations and by a quarter.
 
@@ -13,10 +15,12 @@ use crate::stiffness::inclusion::SHAPES;
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::travel;
 use crate::types::space::dot;
-use crate::types::stiffness::{Evidence, Law};
+use crate::types::stiffness::{Evidence, Law, LeftOver};
 
-/// How far a residual must stand out of the noise (1).
+/// How far a residual must stand out of the noise of a sample (1).
 const DISCREPANCY: f64 = 1.1;
+/// The part of the power of a voxel's noise that a misfit must have (1).
+const TRACE: f64 = 0.1;
 
 /// The case for more regions, so far.
 #[derive(Debug)]
@@ -41,6 +45,14 @@ pub struct Support {
 /// As [`crate::stiffness::identify::Setup::run`].
 pub fn identify(level: &Level, law: Law, poisson: f64, from: (&Level, &State)) -> Result<Estimate, StiffnessError> {
     level.setup(law, poisson, level.largest()).run(level.carry(from.0, from.1), 12, 1e-4)
+}
+
+/// Why a model is not taken whose criterion falls by `gain`.
+fn too_little(gain: f64) -> String {
+    match gain >= 0.0 {
+        true => format!("the criterion falls by {gain:.0} only, {MARGIN} are needed"),
+        false => format!("the criterion rises by {:.0}, and should fall by {MARGIN}", -gain),
+    }
 }
 
 impl Support {
@@ -85,11 +97,20 @@ impl Support {
     }
 
     fn refusal(&self) -> Option<String> {
-        let shown = self.noise[0].hypot(self.misfit) / self.noise[0].max(1e-12);
-        if shown <= DISCREPANCY {
+        let [voxel, sample] = self.noise;
+        if !self.stands_out() {
+            let shown = sample.hypot(self.misfit) / sample.max(1e-12);
             return Some(format!(
-                "its misfit of {:.4} mm does not stand out of a field rough by {:.4} mm ({shown:.2} times, {DISCREPANCY} needed)",
-                self.misfit, self.noise[0]
+                "its misfit of {:.4} mm does not stand out of samples noisy by {sample:.4} mm ({shown:.2} times, {DISCREPANCY} needed)",
+                self.misfit
+            ));
+        }
+        let part = (self.misfit / voxel.max(1e-12)).powi(2);
+        if part <= TRACE {
+            return Some(format!(
+                "its misfit of {:.4} mm stands out of samples noisy by {sample:.4} mm, but is {part:.2} of the power of what a voxel is \
+                 rough by, {voxel:.4} mm ({TRACE} needed)",
+                self.misfit
             ));
         }
         (self.misfit <= self.geometry).then(|| {
@@ -98,6 +119,15 @@ impl Support {
                 self.misfit, self.geometry
             )
         })
+    }
+
+    fn stands_out(&self) -> bool {
+        self.noise[1].hypot(self.misfit) > DISCREPANCY * self.noise[1]
+    }
+
+    /// What the model that stands leaves over of the field, where that is more than noise.
+    pub fn left(&self) -> Option<LeftOver> {
+        self.stands_out().then_some(LeftOver { misfit_mm: self.misfit, surface_mm: self.geometry })
     }
 
     /// Whether a further region is worth a search.
@@ -110,13 +140,13 @@ impl Support {
         self.noise[1].hypot(0.5 * self.geometry)
     }
 
-    /// There is no estimate with so many regions.
+    /// There is no estimate with so many regions: neither a residual nor a criterion.
     pub fn none(&mut self, count: usize, why: &str) {
         self.evidence.push(Evidence {
             question: "regions",
             model: count.to_string(),
             parameters: 0,
-            residual_mm: self.rms,
+            residual_mm: f64::INFINITY,
             bic: f64::INFINITY,
             chosen: false,
             reason: why.into(),
@@ -141,7 +171,7 @@ impl Support {
             })
             .fold((f64::INFINITY, 0.0), |m, c| if c.0 < m.0 { c } else { m });
         let why = if gain <= MARGIN {
-            Some(format!("the criterion falls by {gain:.0} only, {MARGIN} are needed"))
+            Some(too_little(gain))
         } else if misfit > 0.8 * self.misfit {
             Some(format!("the misfit falls from {:.4} to {misfit:.4} mm only", self.misfit))
         } else if contrast.0 < (2.0 * contrast.1).max(0.22) {
@@ -175,5 +205,36 @@ impl Support {
     fn close_at(&mut self, count: usize) {
         let name = count.to_string();
         self.evidence.iter_mut().for_each(|e| e.chosen = e.model == name);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_criterion_that_rises_is_said_to_rise() {
+        assert_eq!(too_little(-901.2), "the criterion rises by 901, and should fall by 10");
+        assert_eq!(too_little(4.0), "the criterion falls by 4 only, 10 are needed");
+    }
+
+    /// What is said of one region with a misfit (mm) under noise of a voxel and of a sample of eight.
+    fn said(noise: f64, misfit: f64) -> (bool, Option<LeftOver>) {
+        let noise = [noise, noise / 8f64.sqrt()];
+        let (squares, effective, parameters, rms) = (1.0, 100.0, 6, misfit);
+        let s = Support { noise, geometry: 0.015, squares, misfit, effective, parameters, rms, evidence: Vec::new() };
+        (s.may_hold_more(), s.left())
+    }
+
+    #[test]
+    fn a_misfit_must_stand_out_of_a_sample_and_be_more_than_a_trace_of_a_voxels_noise() {
+        let left = |misfit_mm| Some(LeftOver { misfit_mm, surface_mm: 0.015 });
+        assert_eq!(said(0.0, 0.0), (false, None));
+        assert_eq!(said(0.1, 0.014), (false, None));
+        assert_eq!(said(0.1, 0.03), (false, left(0.03)));
+        assert_eq!(said(0.1, 0.033), (true, left(0.033)));
+        // The surface may be it.
+        assert_eq!(said(0.0, 0.014), (false, left(0.014)));
+        assert_eq!(said(0.0, 0.016), (true, left(0.016)));
     }
 }

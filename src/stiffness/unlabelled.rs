@@ -264,9 +264,9 @@ fn jacobian(
     Ok(sides.par_chunks(n).flat_map_iter(|y| picked.iter().flat_map(move |o| o.read(body, y))).collect())
 }
 
-/// The body's voxels in regions of like ln mu: k-means of the map at the voxels, then connected pieces. Label 1 is the largest
-/// region. None when fewer than `wanted` regions come out.
-pub fn regions(map: &Map, body: &Mask, wanted: usize) -> Option<Mask> {
+/// The body's voxels in `wanted` regions of like ln mu: k-means of the map at the voxels in so many `classes`, then the largest
+/// connected pieces. Label 1 is the largest region. None when fewer come out.
+pub fn regions(map: &Map, body: &Mask, classes: usize, wanted: usize) -> Option<Mask> {
     let grid = *body.grid();
     let inside: Vec<usize> = (0..grid.len()).filter(|&o| body.as_slice()[o] > 0).collect();
     let value = |&o: &usize| {
@@ -275,7 +275,7 @@ pub fn regions(map: &Map, body: &Mask, wanted: usize) -> Option<Mask> {
         map.lattice.at(&map.values, p.0)
     };
     let values: Vec<f64> = inside.par_iter().map(value).collect();
-    let centres = means(&values, wanted);
+    let centres = means(&values, classes);
     let class =
         |v: f64| (0..centres.len()).fold(0, |m, k| if (v - centres[k]).abs() < (v - centres[m]).abs() { k } else { m });
     let mut classes = vec![u8::MAX; grid.len()];

@@ -2,7 +2,7 @@
 
 use crate::error::{ParamError, UnknownName};
 use crate::types::names::choose;
-use crate::types::{QuadraticMesh, Volume};
+use crate::types::{Mask, QuadraticMesh, Volume};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
@@ -198,14 +198,30 @@ pub struct Evidence {
     pub model: String,
     /// Free parameters.
     pub parameters: usize,
-    /// Root mean square residual (mm, one component).
+    /// Root mean square residual (mm, one component); infinite where it was not tried.
     pub residual_mm: f64,
-    /// Bayesian information criterion, by the effective number of samples; lower is better.
+    /// Bayesian information criterion, by the effective number of samples; lower is better. Infinite where it was not tried.
     pub bic: f64,
     /// Whether it was chosen.
     pub chosen: bool,
     /// Why, in words.
     pub reason: String,
+}
+
+/// What one modulus leaves over of a field in which no second region was found.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LeftOver {
+    /// Root mean square misfit beyond the noise of a sample (mm, one component).
+    pub misfit_mm: f64,
+    /// What a surface known to half a voxel explains (mm).
+    pub surface_mm: f64,
+}
+
+impl LeftOver {
+    /// Whether a badly known surface may be all of it.
+    pub fn may_be_surface(&self) -> bool {
+        self.misfit_mm <= self.surface_mm
+    }
 }
 
 /// A patch of the surface that a plate or base holds.
@@ -282,6 +298,10 @@ pub struct StiffnessResult {
     pub samples: [f64; 2],
     /// Whether regions came from labels.
     pub labelled: bool,
+    /// Without labels, what a single region leaves over where that is more than noise.
+    pub left_over: Option<LeftOver>,
+    /// Without labels, the regions that were found (1 and on; 0 outside).
+    pub found: Option<Mask>,
 }
 
 /// A displacement that a plate or base prescribes at a node.
