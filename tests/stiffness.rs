@@ -808,15 +808,15 @@ fn under_too_much_noise_no_second_region_is_claimed() {
 #[test]
 fn an_inclusion_is_found_that_stands_out_of_the_noise_of_means_and_not_of_a_voxel() {
     // Its misfit of 0.04 mm was compared with the 0.1 mm of a voxel, where means over eight of them are measured.
-    let body = inclusion(5.0, 73, 64);
-    let found = without_labels(&body, &noisy(&body.phantom.truth, 0.1, 73), 6_000);
+    let body = inclusion(5.0, 73, 58);
+    let found = without_labels(&body, &noisy(&body.phantom.truth, 0.1, 73), 4_500);
     let [around, within] = &found.regions[..] else { panic!("{:?}", found.evidence) };
     let truth = body.modulus(2) / body.modulus(1);
     assert!((within.ratio / truth - 1.0).abs() < 0.15 && (within.ratio - truth).abs() < 2.0 * within.ratio_sd);
     assert!((around.youngs_modulus / body.modulus(1) - 1.0).abs() < 0.03, "{around:?}");
     assert!(found.left_over.is_none() && found.warnings.is_empty(), "{:?}", found.warnings);
     // Twice the noise hides it, and that is not called one modulus that explains the field.
-    let hidden = without_labels(&body, &noisy(&body.phantom.truth, 0.2, 73), 6_000);
+    let hidden = without_labels(&body, &noisy(&body.phantom.truth, 0.2, 73), 2_500);
     assert_eq!(hidden.regions.len(), 1);
     let said = palpate::report::stiffness::verdict(&hidden);
     assert!(said.contains("do not support a second region") && said.contains("beyond the noise"), "{said}");
@@ -825,11 +825,11 @@ fn an_inclusion_is_found_that_stands_out_of_the_noise_of_means_and_not_of_a_voxe
 
 #[test]
 fn noise_alone_makes_no_second_region_and_no_warning() {
-    let mut params = PhantomParams { seed: 74, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(64);
+    let mut params = PhantomParams { seed: 74, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(58);
     params.elastic.inclusions = 0;
     let body = Pressed::new(&params).unwrap();
     for noise in [0.05, 0.2] {
-        let result = without_labels(&body, &noisy(&body.phantom.truth, noise, 74), 4_000);
+        let result = without_labels(&body, &noisy(&body.phantom.truth, noise, 74), 2_500);
         assert_eq!(result.regions.len(), 1, "{noise}: {:?}", result.evidence);
         assert!(result.warnings.is_empty(), "{noise}: {:?}", result.warnings);
     }
@@ -848,7 +848,7 @@ fn two_alike() -> (DenseField, Mask) {
             false => 0,
         }
     });
-    let body = body(&map, 14_000);
+    let body = body(&map, 7_000);
     let moduli = body.region.iter().map(|r| Material::of_youngs_modulus([20.0, 100.0, 100.0][*r as usize], 0.49));
     let end = |z: f64| {
         let near = |n: &u32| (body.places[*n as usize][2] - z).abs() < 0.1;
@@ -867,14 +867,14 @@ fn two_alike() -> (DenseField, Mask) {
 fn two_like_inclusions_are_two_regions_beside_the_first() {
     // As many classes of moduli as regions found one of them, in two halves.
     let (field, known) = two_alike();
-    let params = StiffnessParams { nodes: 6_000, regions: 3, model: LawChoice::Linear, ..StiffnessParams::default() };
+    let params = StiffnessParams { nodes: 3_000, regions: 3, model: LawChoice::Linear, ..StiffnessParams::default() };
     let result = searched(&field, &known, &params);
     let [_, balls @ ..] = &result.regions[..] else { panic!("{:?}", result.regions) };
     assert_eq!(balls.len(), 2, "{:?}", result.evidence);
     // Regions are known less well without labels than with them: so much stays unknown of either.
     for ball in balls {
         assert!((ball.ratio - 5.0).abs() < 2.0 * ball.ratio_sd, "{ball:?}");
-        assert!((0.02 * 5f64.ln()..0.1).contains(&(ball.ratio_sd / ball.ratio)), "{ball:?}");
+        assert!((0.02 * 5f64.ln()..0.15).contains(&(ball.ratio_sd / ball.ratio)), "{ball:?}");
     }
     let found = result.found.unwrap();
     for label in [2, 3] {
