@@ -482,6 +482,21 @@ fn a_coil_profile_or_another_contrast_in_one_volume_is_not_taken_for_motion() {
     }
 }
 
+#[test]
+fn nodes_lie_as_asked_or_as_the_size_says() {
+    let of = |node_spacing| FieldParams { node_spacing, ..FieldParams::default() }.check();
+    assert!([0, 2, 5, 16].into_iter().all(|n| of(n).is_ok()));
+    for wrong in [1, 17] {
+        let said = of(wrong).unwrap_err().to_string();
+        assert!(said.contains("node_spacing") && said.contains("2 to 16"), "{said}");
+    }
+    // A small volume has nodes every four voxels.
+    let p = phantom(&block(40, MotionKind::Smooth, 2.0)).unwrap();
+    let (automatic, _) = measure_with(&p, &FieldParams::default());
+    let (asked, _) = measure_with(&p, &FieldParams { node_spacing: 4, ..FieldParams::default() });
+    assert_eq!(automatic.displacement, asked.displacement);
+}
+
 /// One half brighter, as from one element of a coil: a polynomial across the step was taken out, and a head at rest became a free motion of high trust.
 #[test]
 fn a_step_in_brightness_is_left_to_the_local_gain() {

@@ -165,7 +165,8 @@ fn canonical(
         let mut pair = light.level(&aligned, factor);
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
-        let lattice = level::lattice(&pair, if last { params.node_spacing } else { 3 });
+        let apart = if last { between_nodes(params.node_spacing, pair.inside) } else { COARSE };
+        let lattice = level::lattice(&pair, apart);
         let passes = if last { params.passes } else { params.coarse_passes };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
         let matching = || progress("matching", done(0.0));
@@ -226,7 +227,7 @@ fn canonical(
         if last {
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
-            let best = finer(&pair, field, (params.node_spacing, passes), params.seed, refine);
+            let best = finer(&pair, field, (apart, passes), params.seed, refine);
             (field, left, gain) = (best.field, best.left, best.gain);
             asked.extend(best.said);
         }
@@ -391,6 +392,20 @@ pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) ->
 
 /// Voxels of the mask that a preset without a fixed finest level works on at most.
 const WORKED_ON: usize = 600_000;
+
+/// Voxels between the nodes of the lattice on levels above the finest.
+const COARSE: usize = 3;
+
+/// Voxels between the nodes on the finest level: as asked, or by the `inside` voxels of tissue. Where there are many, motion is smooth over more
+/// of them: nine pairs of heads, legs and calves of 128 x 128 x 128 and 160 x 192 x 160 voxels had 6 to 8 % less error in the field and its
+/// gradients with 5 than with 4, none more; twenty of 96 x 96 x 96 had 2 and 4 % more.
+fn between_nodes(asked: usize, inside: usize) -> usize {
+    match asked {
+        0 if inside > WORKED_ON => 5,
+        0 => 4,
+        asked => asked,
+    }
+}
 
 /// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`] voxels of tissue are left.
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {

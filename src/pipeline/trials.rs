@@ -90,7 +90,7 @@ impl Variant {
             (p.interpolation, p.sub_voxel) = (Interpolation::Barycentric, false);
         }));
         for (nodes, name) in [(2, "nodes 2"), (8, "nodes 8")] {
-            out.push(stage(name, &format!("spline nodes every {nodes} voxels, not 4"), &|p| p.node_spacing = nodes));
+            out.push(stage(name, &format!("spline nodes every {nodes} voxels"), &|p| p.node_spacing = nodes));
         }
         for passes in [2, 24] {
             let settings = format!("{passes} residual passes on the finest level, not 6");

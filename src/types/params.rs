@@ -44,7 +44,7 @@ pub struct FieldParams {
     /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000 voxels of tissue.
     pub finest: usize,
     /// Voxels between the nodes of the spline lattice on the finest level (1), or fewer where the residual is more than noise and
-    /// a finer lattice explains it; 2 to 16.
+    /// a finer lattice explains it; 2 to 16, or 0 = 4, and 5 where more than 600,000 voxels of tissue are worked on.
     pub node_spacing: usize,
     /// Residual passes on the finest level; 1 to 40.
     pub passes: usize,
@@ -95,7 +95,7 @@ impl FieldParams {
             voxels_per_point: 125,
             search_mm: 0.0,
             finest: 1,
-            node_spacing: 4,
+            node_spacing: 0,
             passes: 6,
             coarse_passes: 10,
             interpolation: Interpolation::Spline,
@@ -129,11 +129,14 @@ impl FieldParams {
         let whole = [
             ("voxels_per_point", self.voxels_per_point, 8, 100_000, "8 to 100,000"),
             ("finest", self.finest, 0, 8, "0 (automatic), 1 (full resolution) to 8"),
-            ("node_spacing", self.node_spacing, 2, 16, "2 to 16 voxels"),
             ("passes", self.passes, 1, 100, "1 to 100"),
             ("coarse_passes", self.coarse_passes, 1, 100, "1 to 100"),
             ("candidates", self.candidates, 1, 20, "1 to 20"),
         ];
+        if self.node_spacing > 16 || self.node_spacing == 1 {
+            let value = self.node_spacing as f64;
+            return Err(ParamError { name: "node_spacing", value, range: "0 (automatic), or 2 to 16 voxels" });
+        }
         for (name, value, low, high, range) in whole {
             if !(low..=high).contains(&value) {
                 return Err(ParamError { name, value: value as f64, range });
