@@ -186,7 +186,7 @@ impl Brightness {
             let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
             let [tone_low, tone_high] = [-PAST, PAST].map(|t| scale[0] + t * scale[1] - of_tone(&terms[n..], t) / 2.0);
             let step = (tone_high - tone_low) / TABLE as f64;
-            let tone = (0..=TABLE).map(|i| seen(&terms[n..], scale, tone_low + i as f64 * step));
+            let tone = (0..=TABLE).map(|i| tone_from(&terms[n..], scale, tone_low + i as f64 * step));
             Some(Self {
                 zero,
                 shape,
@@ -235,7 +235,7 @@ impl Brightness {
             scaled(self.shape, from_level(p, factor))
         };
         let [low, high] = [self.range[0] - BEYOND, self.range[1] + BEYOND];
-        let Zero { at: [zero, seen], sign } = self.zero;
+        let Zero { at: [zero, darkest], sign } = self.zero;
         values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
             let (j, k) = (row % ny, row / ny);
             let first = at([0, j, k]);
@@ -246,7 +246,7 @@ impl Brightness {
             for (i, v) in values.iter_mut().enumerate() {
                 let x = at([i, j, k])[0];
                 let log = along.iter().rev().fold(0.0, |sum, c| sum * x + c).clamp(low, high);
-                let bright = sign * (f64::from(*v) - seen);
+                let bright = sign * (f64::from(*v) - darkest);
                 *v = (zero + sign * bright * (log + self.of_tone(bright, log)).exp()) as f32;
             }
         });
@@ -297,7 +297,7 @@ fn of_tone(terms: &[f64], t: f64) -> f64 {
 }
 
 /// Q for a logarithm of the deformed volume's brightness: at the middle between that and the initial one's that it leads to.
-fn seen(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
+fn tone_from(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
     (0..SETTLED).fold(0.0, |q, _| 0.5 * (q + of_tone(terms, toned(scale, log + q / 2.0))))
 }
 
@@ -374,7 +374,7 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
 }
 
 /// A block of voxels as both volumes show it under a field.
-struct Seen {
+struct BlockMeans {
     /// Place in the deformed volume (voxels of the level's initial lattice).
     at: [f64; 3],
     weight: f64,
@@ -383,7 +383,7 @@ struct Seen {
 }
 
 /// The blocks that lie in the mask by half at least.
-fn seen_blocks(pair: &Pair<'_>, (lattice, coefficients): (&Lattice, &[f32])) -> Vec<Seen> {
+fn seen_blocks(pair: &Pair<'_>, (lattice, coefficients): (&Lattice, &[f32])) -> Vec<BlockMeans> {
     let warped = pair.warp(lattice, coefficients, &pair.spans);
     let side = pair.in_voxels(BLOCK);
     let along = |a: usize| (0..pair.shape[a]).step_by(side[a]);
@@ -392,15 +392,15 @@ fn seen_blocks(pair: &Pair<'_>, (lattice, coefficients): (&Lattice, &[f32])) -> 
     let seen = |first| {
         let (p, weight, mean) = means(pair, &warped, first, side)?;
         let u = lattice.at(coefficients, p);
-        Some(Seen { at: std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]), weight, mean })
+        Some(BlockMeans { at: std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]), weight, mean })
     };
     starts.into_par_iter().filter_map(seen).collect()
 }
 
 /// Those that stand out of the noise, thinned out; none where too many are not positive.
-fn blocks(seen: &[Seen], (zero, least): (Zero, [f64; 2]), factor: [usize; 3]) -> Option<Vec<Block>> {
-    let bright = |s: &Seen| -> [f64; 2] { std::array::from_fn(|i| zero.sign * (s.mean[i] - zero.at[i])) };
-    let positive: Vec<(&Seen, [f64; 2])> =
+fn blocks(seen: &[BlockMeans], (zero, least): (Zero, [f64; 2]), factor: [usize; 3]) -> Option<Vec<Block>> {
+    let bright = |s: &BlockMeans| -> [f64; 2] { std::array::from_fn(|i| zero.sign * (s.mean[i] - zero.at[i])) };
+    let positive: Vec<(&BlockMeans, [f64; 2])> =
         seen.iter().map(|s| (s, bright(s))).filter(|(_, b)| b.iter().all(|v| *v > 0.0)).collect();
     if (seen.len() - positive.len()) as f64 > NOT_POSITIVE * seen.len() as f64 {
         return None;
@@ -410,7 +410,7 @@ fn blocks(seen: &[Seen], (zero, least): (Zero, [f64; 2]), factor: [usize; 3]) ->
     let share = BLOCKS as f64 / clear.len().max(1) as f64;
     let thinned = clear.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share);
     let block =
-        |(s, b): (&Seen, [f64; 2])| Block { at: from_level(s.at, factor), log: b.map(f64::ln), weight: s.weight };
+        |(s, b): (&BlockMeans, [f64; 2])| Block { at: from_level(s.at, factor), log: b.map(f64::ln), weight: s.weight };
     Some(thinned.map(|(_, s)| block(s)).collect())
 }
 
