@@ -142,6 +142,13 @@ struct Block {
     weight: f64,
 }
 
+impl Block {
+    /// By how much the initial volume is brighter (logarithm).
+    fn difference(&self) -> f64 {
+        self.log[0] - self.log[1]
+    }
+}
+
 impl Brightness {
     /// From a level of `factor` under a field on it; `shape` is the full initial volume's. P and Q are taken together where they leave less than
     /// `both` of what the better one leaves alone. None where there are too few blocks for it.
@@ -167,9 +174,9 @@ impl Brightness {
     fn of(blocks: &[Block], shape: [usize; 3], (zero, both): (Zero, f64)) -> Option<Self> {
         let room = blocks.len() / BLOCKS_A_TERM;
         let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
-        let mut ratios: Vec<f64> = blocks.iter().map(|b| b.log[0] - b.log[1]).collect();
-        let usual = percentile(&mut ratios, 50.0);
-        let before = robust_deviation(ratios.into_iter());
+        let mut differences: Vec<f64> = blocks.iter().map(Block::difference).collect();
+        let usual = percentile(&mut differences, 50.0);
+        let before = robust_deviation(differences.into_iter());
         let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1] + usual)).collect();
         let [low, high] = [2.0, 98.0].map(|q| percentile(&mut logs, q));
         let scale = [0.5 * (low + high), (0.5 * (high - low)).max(EQUAL)];
@@ -178,10 +185,10 @@ impl Brightness {
             let n = powers.len();
             let by_place = |b: &Block| powers.iter().map(|p| monomial(scaled(shape, b.at), *p)).collect();
             let (terms, left) = robust(blocks, by_place, usual, tone.then_some(scale))?;
-            let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
             if steepest(&terms[n..]) > STEEPEST * scale[1] {
                 return None;
             }
+            let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
             let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(*v), r[1].max(*v)]);
             let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
             let [tone_low, tone_high] = [-PAST, PAST].map(|t| scale[0] + t * scale[1] - of_tone(&terms[n..], t) / 2.0);
@@ -202,11 +209,8 @@ impl Brightness {
         let (place, tone, all) = (fitted(true, false)?, fitted(false, true), fitted(true, true));
         let alone = tone.filter(|tone| tone.deviation[1] < place.deviation[1]).unwrap_or(place);
         let best = all.filter(|all| all.deviation[1] <= both * alone.deviation[1]).unwrap_or(alone);
-        let ratios = |b: &Block| b.log[0] - b.log[1];
-        let [as_it_is, left] = [
-            between_neighbours(blocks, ratios),
-            between_neighbours(blocks, |b| ratios(b) - best.logarithm(scaled(shape, b.at), b.log[1])),
-        ];
+        let left = |b: &Block| b.difference() - best.logarithm(scaled(shape, b.at), b.log[1]);
+        let [as_it_is, left] = between_neighbours(blocks, [&Block::difference, &left]);
         Some(Self { uneven: left / as_it_is.max(EQUAL), ..best })
     }
 
@@ -292,8 +296,12 @@ fn toned(scale: [f64; 2], log: f64) -> f64 {
 fn of_tone(terms: &[f64], t: f64) -> f64 {
     let inside = t.clamp(-1.0, 1.0);
     let value = inside * terms.iter().rev().fold(0.0, |sum, c| sum * inside + c);
-    let slope = terms.iter().enumerate().rev().fold(0.0, |sum, (i, c)| sum * inside + (i + 1) as f64 * c);
-    value + slope * (t - inside)
+    value + slope(terms, inside) * (t - inside)
+}
+
+/// The slope of Q at a scaled brightness in the range of the tissue.
+fn slope(terms: &[f64], t: f64) -> f64 {
+    terms.iter().enumerate().rev().fold(0.0, |sum, (i, c)| sum * t + (i + 1) as f64 * c)
 }
 
 /// Q for a logarithm of the deformed volume's brightness: at the middle between that and the initial one's that it leads to.
@@ -303,23 +311,24 @@ fn tone_from(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
 
 /// The steepest that Q is, either way, in the range of the tissue.
 fn steepest(terms: &[f64]) -> f64 {
-    let slope = |t: f64| terms.iter().enumerate().rev().fold(0.0, |sum, (i, c)| sum * t + (i + 1) as f64 * c);
-    (-10..=10).map(|t| slope(f64::from(t) / 10.0).abs()).fold(0.0, f64::max)
+    (-10..=10).map(|t| slope(terms, f64::from(t) / 10.0).abs()).fold(0.0, f64::max)
 }
 
-/// By how much a value of blocks differs between neighbours (median), each the middle of the blocks about it.
-fn between_neighbours(blocks: &[Block], value: impl Fn(&Block) -> f64) -> f64 {
+/// By how much each of two values of blocks differs between neighbours (median), each the middle of the blocks about it.
+fn between_neighbours(blocks: &[Block], values: [&dyn Fn(&Block) -> f64; 2]) -> [f64; 2] {
     let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at).collect();
     let tree = Neighbours::new(&places);
     let near: Vec<Vec<usize>> = places.iter().map(|p| tree.within(*p, f64::INFINITY, AROUND)).collect();
-    let values: Vec<f64> = blocks.iter().map(value).collect();
-    let middle = |near: &Vec<usize>| percentile(&mut near.iter().map(|&i| values[i]).collect::<Vec<_>>(), 50.0);
-    let smooth: Vec<f64> = near.iter().map(middle).collect();
-    let steps = near.iter().zip(&smooth).flat_map(|(near, here)| {
-        let smooth = &smooth;
-        near.iter().skip(1).take(BESIDE).map(move |&i| (smooth[i] - here).abs())
-    });
-    percentile(&mut steps.collect::<Vec<_>>(), 50.0)
+    values.map(|value| {
+        let values: Vec<f64> = blocks.iter().map(value).collect();
+        let middle = |near: &Vec<usize>| percentile(&mut near.iter().map(|&i| values[i]).collect::<Vec<_>>(), 50.0);
+        let smooth: Vec<f64> = near.iter().map(middle).collect();
+        let beside = near.iter().zip(&smooth).flat_map(|(near, here)| {
+            let smooth = &smooth;
+            near.iter().skip(1).take(BESIDE).map(move |&i| (smooth[i] - here).abs())
+        });
+        percentile(&mut beside.collect::<Vec<_>>(), 50.0)
+    })
 }
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {
@@ -347,7 +356,7 @@ fn robust(
             row.extend(scale.into_iter().flat_map(powers));
         }
         let terms = fit(&rows, blocks, &weights)?;
-        let left = || rows.iter().zip(blocks).map(|(row, b)| b.log[0] - b.log[1] - dot(row, &terms));
+        let left = || rows.iter().zip(blocks).map(|(row, b)| b.difference() - dot(row, &terms));
         let deviation = robust_deviation(left());
         for ((w, off), b) in weights.iter_mut().zip(left()).zip(blocks) {
             *w = b.weight / (1.0 + (off / (HALF * deviation).max(EQUAL)).powi(2));
@@ -363,7 +372,7 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
     let (mut a, mut b) = (vec![0.0; n * n], vec![0.0; n]);
     for ((row, block), w) in rows.iter().zip(blocks).zip(weights) {
         for i in 0..n {
-            b[i] += w * row[i] * (block.log[0] - block.log[1]);
+            b[i] += w * row[i] * block.difference();
             (0..=i).for_each(|j| a[i * n + j] += w * row[i] * row[j]);
         }
     }

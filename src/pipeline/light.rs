@@ -90,22 +90,21 @@ impl Light {
         (leaves, both): (f64, f64),
     ) -> bool {
         let before = self.taken.take();
-        if before.is_some() {
+        let was_taken = before.is_some();
+        if was_taken {
             pair.put(aligned.deformed(factor));
         }
         let found = Brightness::measure(pair, (factor, aligned.shape()), (&field.lattice, &field.coefficients), both);
-        let matters = |b: &Brightness| {
-            b.deviation[0] > MATTERS && b.deviation[1] <= leaves * b.deviation[0] && b.uneven <= UNEVEN
-        };
+        let matters = |b: &Brightness| b.deviation[0] > MATTERS && explains(b, leaves) && b.uneven <= UNEVEN;
         match found {
             Some(found) if matters(&found) => self.taken = Some(found),
             Some(found) => self.left = Some(found),
-            None => self.taken = before.clone(),
+            None => self.taken = before,
         }
         if let Some(taken) = &self.taken {
             pair.even_out(taken, factor);
         }
-        before.is_some() || self.taken.is_some()
+        was_taken || self.taken.is_some()
     }
 
     /// What was done, in words.
@@ -113,7 +112,7 @@ impl Light {
         let found = self.taken.as_ref().or(self.left.as_ref())?;
         let [before, after] = found.deviation.map(|d| 100.0 * d.exp_m1());
         if self.taken.is_none() {
-            let step = if found.uneven > UNEVEN && after < LEAVES * before {
+            let step = if found.uneven > UNEVEN && explains(found, LEAVES) {
                 " (it is not smooth: a step, or other tissue)"
             } else {
                 ""
@@ -131,4 +130,9 @@ impl Light {
             how.join(" and ")
         ))
     }
+}
+
+/// Whether no more than a part is left of the difference.
+fn explains(found: &Brightness, leaves: f64) -> bool {
+    found.deviation[1] <= leaves * found.deviation[0]
 }
