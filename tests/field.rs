@@ -499,6 +499,32 @@ fn nodes_lie_as_asked_or_as_the_size_says() {
 
 /// One half brighter, as from one element of a coil: a polynomial across the step was taken out, and a head at rest became a free motion of high trust.
 #[test]
+fn passes_on_the_next_finer_level_find_what_averages_of_voxels_hide() {
+    let said =
+        |r: &FieldResult| r.summary.evidence.iter().any(|e| e.starts_with("finer passes: 3 more at 1 x 1 x 1 mm"));
+    let averages = |finer_passes| FieldParams { finest: 2, finer_passes, ..FieldParams::preset(Preset::Fast) };
+    for motion in [MotionKind::Smooth, MotionKind::Press, MotionKind::Slide] {
+        let p = phantom(&PhantomParams { noise: 0.03, ..block(72, motion, 5.0) }).unwrap();
+        let [coarse, fine] = [0, 3].map(|passes| measure_with(&p, &averages(passes)));
+        assert!(said(&fine.0) && !said(&coarse.0), "{:?}", fine.0.summary.evidence);
+        let ([before, after], counts) = ([&coarse.1, &fine.1], [&coarse.0, &fine.0].map(|r| r.summary.counts));
+        assert!(after.mean_mm < 0.8 * before.mean_mm, "{motion:?}: {before:?}, {after:?}");
+        assert!(after.grad_err_p95 < 0.95 * before.grad_err_p95, "{motion:?}: {before:?}, {after:?}");
+        assert_eq!(counts[0], counts[1], "the matches are those of the averages");
+    }
+    // A smaller model needs none, and full resolution has no finer level.
+    let turned = phantom(&block(72, MotionKind::Rotate, 5.0)).unwrap();
+    let (rigid, _) = measure_with(&turned, &averages(3));
+    assert!(!said(&rigid), "{:?}", rigid.summary.evidence);
+    let full = FieldParams { finest: 1, ..averages(3) };
+    let bent = phantom(&block(48, MotionKind::Smooth, 3.0)).unwrap();
+    assert!(!said(&measure_with(&bent, &full).0));
+    // A dry run names the level.
+    let levels = |passes| plan::field(&bent.initial, &bent.deformed, None, &averages(passes)).unwrap().levels;
+    assert_eq!(levels(3), [levels(0), vec![[48; 3]]].concat());
+}
+
+#[test]
 fn a_step_in_brightness_is_left_to_the_local_gain() {
     let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
     for (motion, amplitude) in [(MotionKind::None, 1.0), (MotionKind::Translate, 3.0), (MotionKind::Rotate, 5.0)] {

@@ -371,9 +371,10 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
     let n = rows.first()?.len();
     let (mut a, mut b) = (vec![0.0; n * n], vec![0.0; n]);
     for ((row, block), w) in rows.iter().zip(blocks).zip(weights) {
-        for i in 0..n {
-            b[i] += w * row[i] * block.difference();
-            (0..=i).for_each(|j| a[i * n + j] += w * row[i] * row[j]);
+        for (i, (a, b)) in a.chunks_exact_mut(n).zip(&mut b).enumerate() {
+            let weighed = w * row[i];
+            *b += weighed * block.difference();
+            a.iter_mut().zip(&row[..=i]).for_each(|(a, r)| *a += weighed * r);
         }
     }
     let ridge = 1e-6 * weights.iter().sum::<f64>();

@@ -18,6 +18,7 @@ use crate::pipeline::farther;
 use crate::pipeline::finer::{finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
+use crate::pipeline::polish;
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
 use crate::pipeline::whole::{self, Whole};
@@ -268,26 +269,39 @@ fn canonical(
     choice.evidence.extend(light.why());
     choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
-    let spacing = pair.spacing;
-    let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
     let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
     choice.evidence.extend(glides.as_ref().map(why_sliding));
-    let level_shape = pair.shape;
+    let places = glides.map_or(Vec::new(), |g| beside(&g, &grid, pair.shape, factor));
     let unlike = unlike(&pair, left);
     let unseen = level::unseen(&pair, &field);
-    let hidden = hidden(&pair, &field);
     let plain = without_texture(pair.plain());
+    clock.book("model");
+
+    // What the average of voxels hides.
+    let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
+    let (mut pair, mut field, mut factor) = (pair, field, factor);
+    let next = polish::next_finer(&grid, finest, params).filter(|&next| choice.motion.is_none() && next != factor);
+    if let Some(next) = next {
+        pair = light.level(&aligned, next);
+        clock.book("pyramid");
+        let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
+        field = polish::polish((&pair, next), (&field, factor), reach, params, tick);
+        factor = next;
+        choice.evidence.push(polish::why(&pair, params));
+        clock.book("residual");
+    }
+    let spacing = pair.spacing;
+    let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
+    let hidden = hidden(&pair, &field);
     drop(pair);
     drop(aligned);
     clock.book("model");
 
     // Mesh and dense field.
     progress("mesh", 0.92);
-    let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
     let (mesh, source) = triangulate(&sparse, flat)?;
     clock.book("mesh");
     let mut smooth = spline::dense(&grid, &lattice, &coefficients);
-    let places = glides.map_or(Vec::new(), |g| beside(&g, &grid, level_shape, factor));
     let changes = spline::follow(&mut smooth, &lattice, &coefficients, &places);
     let kept_matches: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();

@@ -34,6 +34,7 @@ pub mod stress;
 mod farther;
 mod finer;
 mod light;
+mod polish;
 mod search;
 mod start;
 mod whole;

@@ -5,6 +5,7 @@ use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
+use crate::pipeline::polish;
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
@@ -14,7 +15,7 @@ pub struct FieldPlan {
     pub search_mm: f64,
     /// Voxels of tissue.
     pub mask_voxels: usize,
-    /// Shape of the initial volume on each level, coarse to fine.
+    /// Shape of the initial volume on each level, coarse to fine, with the one of the finer passes where there are any.
     pub levels: Vec<[usize; 3]>,
     /// Feature points wanted on the finest level.
     pub points: usize,
@@ -46,7 +47,11 @@ pub fn field(
     Ok(FieldPlan {
         search_mm: search,
         mask_voxels,
-        levels: factors.iter().map(|f| std::array::from_fn(|a| shape[a].div_ceil(f[a]))).collect(),
+        levels: factors
+            .iter()
+            .chain(&polish::next_finer(&grid, finest, params))
+            .map(|f| std::array::from_fn(|a| shape[a].div_ceil(f[a])))
+            .collect(),
         points: if params.points > 0 { params.points } else { automatic },
         memory: memory(&grid, deformed.grid()),
     })

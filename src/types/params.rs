@@ -50,6 +50,9 @@ pub struct FieldParams {
     pub passes: usize,
     /// Residual passes on each coarser level; 1 to 60.
     pub coarse_passes: usize,
+    /// Residual passes on the level that is twice as fine as the finest one worked on, where that is not full resolution, for a field that
+    /// is free; 0 to 100.
+    pub finer_passes: usize,
     /// How the dense field is made.
     pub interpolation: Interpolation,
     /// Candidates kept from each source of matches on the coarsest level, at most 3 on the finest; 1 to 20.
@@ -71,7 +74,7 @@ impl Default for FieldParams {
 
 impl FieldParams {
     /// Names of all parameters, as files have them.
-    pub const KEYS: [&str; 13] = [
+    pub const KEYS: [&str; 14] = [
         "preset",
         "points",
         "voxels_per_point",
@@ -80,6 +83,7 @@ impl FieldParams {
         "node_spacing",
         "passes",
         "coarse_passes",
+        "finer_passes",
         "interpolation",
         "candidates",
         "consistency",
@@ -98,6 +102,7 @@ impl FieldParams {
             node_spacing: 0,
             passes: 6,
             coarse_passes: 10,
+            finer_passes: 0,
             interpolation: Interpolation::Spline,
             candidates: 8,
             consistency: true,
@@ -105,7 +110,9 @@ impl FieldParams {
             seed: 1,
         };
         match preset {
-            Preset::Fast => Self { finest: 0, passes: 5, coarse_passes: 8, voxels_per_point: 1000, ..balanced },
+            Preset::Fast => {
+                Self { finest: 0, passes: 5, coarse_passes: 8, finer_passes: 3, voxels_per_point: 1000, ..balanced }
+            }
             Preset::Balanced => balanced,
             Preset::Accurate => Self { passes: 12, coarse_passes: 16, voxels_per_point: 64, ..balanced },
         }
@@ -131,6 +138,7 @@ impl FieldParams {
             ("finest", self.finest, 0, 8, "0 (automatic), 1 (full resolution) to 8"),
             ("passes", self.passes, 1, 100, "1 to 100"),
             ("coarse_passes", self.coarse_passes, 1, 100, "1 to 100"),
+            ("finer_passes", self.finer_passes, 0, 100, "0 to 100"),
             ("candidates", self.candidates, 1, 20, "1 to 20"),
         ];
         if self.node_spacing > 16 || self.node_spacing == 1 {
