@@ -27,27 +27,28 @@ pub struct NormalEquations {
     pub sigma: f32,
 }
 
+/// Rows of a volume that are worth handing to another thread.
+const ROWS: usize = 64;
+
 /// Robust spread of `f - (a w + b)` over the mask (1.4826 MAD), from at most about 200,000 voxels.
 pub fn residual_sigma(pair: &Pair<'_>, warped: &[f32], gain: &GainField) -> f32 {
     let [nx, ny, nz] = pair.shape;
     let rows = ny * nz;
     let stride = row_step(pair.fixed.len() / 200_000, ny);
-    let (mut a, mut b) = (vec![0.0; nx], vec![0.0; nx]);
-    let mut r = Vec::new();
-    for row in (0..rows).step_by(stride) {
+    let in_row = |row: usize| -> Vec<f32> {
         let (j, k) = (row % ny, row / ny);
         if pair.spans.row(j, k).is_empty() {
-            continue;
+            return Vec::new();
         }
+        let (mut a, mut b) = (vec![0.0; nx], vec![0.0; nx]);
         gain.row(j, k, &mut a, &mut b);
-        let from = row * nx;
-        for i in 0..nx {
-            let v = pair.fixed_smooth[from + i] - (a[i] * warped[from + i] + b[i]);
-            if pair.mask[from + i] != 0 && v.is_finite() {
-                r.push(v.abs());
-            }
-        }
-    }
+        let here = row * nx..(row + 1) * nx;
+        let values = pair.fixed_smooth[here.clone()].iter().zip(&warped[here.clone()]).zip(a.iter().zip(&b));
+        let left = values.zip(&pair.mask[here]).filter(|(_, m)| **m != 0).map(|(((f, w), (a, b)), _)| f - (a * w + b));
+        left.filter(|v| v.is_finite()).map(f32::abs).collect()
+    };
+    let some: Vec<usize> = (0..rows).step_by(stride).collect();
+    let mut r: Vec<f32> = some.into_par_iter().with_min_len(ROWS).flat_map_iter(in_row).collect();
     if r.is_empty() { 0.0 } else { 1.4826 * median(&mut r) }
 }
 

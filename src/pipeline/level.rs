@@ -118,14 +118,14 @@ pub fn refine(
         }
         let lambda = field.lambda.map(|l| (l * cell) as f32);
         let base = field.coefficients.clone();
-        let (_, moved) = coupling::step(
-            &energy,
-            lambda,
-            &equations.blocks,
-            &equations.rhs,
-            &mut field.coefficients,
-            0.02,
-            ITERATIONS,
+        let (blocks, rhs, coefficients) = (&equations.blocks, &equations.rhs, &mut field.coefficients);
+        let settled = pass % 2 == 1 || pass + 1 == passes;
+        let limit = if pass < 2 { 20 } else { 10 };
+        // Neither needs the other, and the planes of a small lattice are not worth sharing out.
+        let ((_, moved), determined) = rayon::join(
+            || coupling::step(&energy, lambda, blocks, rhs, coefficients, 0.02, ITERATIONS),
+            // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
+            || settled.then(|| probe.determined(&energy, lambda, blocks, limit, false)),
         );
         for (((c, b), before), begun) in field.coefficients.iter_mut().zip(&base).zip(&before).zip(&begun) {
             *c = (*c + MOMENTUM * (b - before)).max(begun - reach).min(begun + reach);
@@ -133,10 +133,7 @@ pub fn refine(
         unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
         before = base;
         field.blocks = equations.blocks;
-        if pass % 2 == 1 || pass + 1 == passes {
-            let limit = if pass < 2 { 20 } else { 10 };
-            // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
-            let determined = probe.determined(&energy, lambda, &field.blocks, limit, false);
+        if let Some(determined) = determined {
             let target = coupling::supported(determined, energy.energy(&field.coefficients));
             for (lambda, target) in field.lambda.iter_mut().zip(target) {
                 *lambda = (target / cell).clamp(*lambda / 5.0, *lambda * 5.0).clamp(1e-6, 1e9);
