@@ -71,13 +71,24 @@ impl Smoothness {
     fn bands(&self) -> Bands {
         let h = self.step_mm;
         let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
+        let ([second, by, bz], [first, gy, gz]) = (self.second(), self.first());
+        let [nx, ny, nz] = self.nodes;
+        let twist = [pair(0, 1), pair(0, 2), pair(1, 2)];
+        // Rows two away from the border in y share their weights: they are treated as one long row.
+        let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
+        let starts = || (0..low).chain(high..ny).chain((low < high).then_some(low));
+        let of_plane = |k: usize| starts().map(|j| Weights::new([&by[j], &bz[k]], [&gy[j], &gz[k]], twist)).collect();
+        let inside = |r: usize| move |m: usize| f32::from((r..nx.saturating_sub(r)).contains(&(m % nx)));
         Bands {
             nodes: self.nodes,
-            second: self.second(),
-            first: self.first(),
-            twist: [pair(0, 1), pair(0, 2), pair(1, 2)],
+            runs: starts().map(|j| if (low..high).contains(&j) { (low, high) } else { (j, j + 1) }).collect(),
+            weights: (0..nz).map(of_plane).collect(),
+            inside: [1, 2].map(|r| (0..nx * ny).map(inside(r)).collect()),
+            second,
+            first,
         }
     }
+
     /// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
     fn second(&self) -> [Vec<[f32; 5]>; 3] {
         std::array::from_fn(|a| {
@@ -167,42 +178,57 @@ impl Smoothness {
 /// What [`Smoothness::apply`] needs, worked out once.
 struct Bands {
     nodes: [usize; 3],
-    second: [Vec<[f32; 5]>; 3],
-    first: [Vec<[f32; 3]>; 3],
-    /// Weights of the mixed differences: xy, xz, yz.
-    twist: [f32; 3],
+    /// Rows of a plane with the same weights: first, and one past the last.
+    runs: Vec<(usize, usize)>,
+    /// Those weights, of each plane.
+    weights: Vec<Vec<Weights>>,
+    /// Of the nodes of a plane, 1 where the first and where the second differences along x do not feel the border, else 0.
+    inside: [Vec<f32>; 2],
+    /// Second and first differences along x.
+    second: Vec<[f32; 5]>,
+    first: Vec<[f32; 3]>,
+}
+
+/// Weights of the rows of [`REACH`].
+struct Weights {
+    /// In the row itself.
+    own: [f32; 13],
+    /// In what the first differences along x are taken of.
+    twist: [f32; 5],
+}
+
+impl Weights {
+    /// From the rows of the second and of the first differences along y and z, and the weights of the mixed ones: xy, xz, yz.
+    fn new([vy, vz]: [&[f32; 5]; 2], [wy, wz]: [&[f32; 3]; 2], [xy, xz, yz]: [f32; 3]) -> Self {
+        let first = |g: &[f32; 3], d: usize| if (1..4).contains(&d) { g[d - 1] } else { 0.0 };
+        let own = REACH.map(|(dj, dk)| {
+            let bending = if dk == 2 { vy[dj] } else { 0.0 } + if dj == 2 { vz[dk] } else { 0.0 };
+            bending + yz * first(wy, dj) * first(wz, dk)
+        });
+        let twist = std::array::from_fn(|n| {
+            let (dj, dk) = REACH[n];
+            let y = if dk == 2 { xy * first(wy, dj) } else { 0.0 };
+            y + if dj == 2 { xz * first(wz, dk) } else { 0.0 }
+        });
+        Self { own, twist }
+    }
 }
 
 impl Bands {
     /// Plane `k` of `L x`; `cross` is room for a plane.
     #[inline(always)]
     fn plane(&self, x: &[f32], k: usize, out: &mut [f32], cross: &mut [f32]) {
-        let [nx, ny, _] = self.nodes;
-        let ([bx, by, bz], [gx, gy, gz], [xy, xz, yz]) = (&self.second, &self.first, self.twist);
-        let nz = self.nodes[2];
-        let first = |g: &[f32; 3], d: usize| if (1..4).contains(&d) { g[d - 1] } else { 0.0 };
-        // Rows two away from the border in y share their weights: they are treated as one long row.
-        let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
-        let borders = (0..low).chain(high..ny).map(|j| (j, j + 1));
-        for (j, end) in borders.chain((low < high).then_some((low, high))) {
-            let (vy, vz, wy, wz) = (&by[j], &bz[k], &gy[j], &gz[k]);
+        let [nx, ny, nz] = self.nodes;
+        for (&(j, end), weights) in self.runs.iter().zip(&self.weights[k]) {
             let length = nx * (end - j);
             // A row outside the lattice has weight zero; any other stands in for it.
             let near = |at: usize, d: usize, n: usize, height: usize| (at + d).saturating_sub(2).min(n - height);
             let rows = REACH.map(|(dj, dk)| &x[nx * (near(j, dj, ny, end - j) + ny * near(k, dk, nz, 1))..][..length]);
-            let weights = REACH.map(|(dj, dk)| {
-                let bending = if dk == 2 { vy[dj] } else { 0.0 } + if dj == 2 { vz[dk] } else { 0.0 };
-                bending + yz * first(wy, dj) * first(wz, dk)
-            });
-            let twist = REACH.map(|(dj, dk)| {
-                let y = if dk == 2 { xy * first(wy, dj) } else { 0.0 };
-                y + if dj == 2 { xz * first(wz, dk) } else { 0.0 }
-            });
             let (out, cross) = (&mut out[nx * j..][..length], &mut cross[nx * j..][..length]);
             // Spelled out, so that it is made of vector instructions.
             let [r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12] = rows;
-            let [w0, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12] = weights;
-            let [t0, t1, t2, t3, t4, ..] = twist;
+            let [w0, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12] = weights.own;
+            let [t0, t1, t2, t3, t4] = weights.twist;
             for i in 0..length {
                 let near = w0 * r0[i] + w1 * r1[i] + w2 * r2[i] + w3 * r3[i] + w4 * r4[i];
                 let far = w5 * r5[i] + w6 * r6[i] + w7 * r7[i] + w8 * r8[i];
@@ -211,10 +237,8 @@ impl Bands {
             }
         }
         let x = &x[k * nx * ny..(k + 1) * nx * ny];
-        for ((out, cross), x) in out.chunks_exact_mut(nx).zip(cross.chunks_exact(nx)).zip(x.chunks_exact(nx)) {
-            banded(bx, x, out);
-            banded(gx, cross, out);
-        }
+        banded(&self.second, &self.inside[1], x, out);
+        banded(&self.first, &self.inside[0], cross, out);
     }
 }
 
@@ -222,32 +246,35 @@ impl Bands {
 const REACH: [(usize, usize); 13] =
     [(2, 2), (1, 2), (3, 2), (2, 1), (2, 3), (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (3, 1), (1, 3), (3, 3)];
 
-/// `out += M row` for a banded matrix of `2 R + 1` diagonals whose inner rows are all alike.
+/// `out += M row` of each row of a plane for a banded matrix of `2 R + 1` diagonals whose inner rows are all alike; `inside` is 1 where they
+/// are, else 0: the plane is one long row to them.
 #[inline(always)]
-fn banded<const W: usize>(matrix: &[[f32; W]], row: &[f32], out: &mut [f32]) {
-    let (n, r) = (row.len(), W / 2);
-    let edge = |i: usize, out: &mut [f32]| {
-        for (d, w) in matrix[i].iter().enumerate() {
-            if *w != 0.0 {
-                out[i] += w * row[i + d - r];
+fn banded<const W: usize>(matrix: &[[f32; W]], inside: &[f32], plane: &[f32], out: &mut [f32]) {
+    let (n, r) = (matrix.len(), W / 2);
+    let edges = if n > 2 * r {
+        let m = matrix[r];
+        let inner = plane.len() - 2 * r;
+        let shifted: [&[f32]; W] = std::array::from_fn(|d| &plane[d..d + inner]);
+        for (i, (o, inside)) in out[r..].iter_mut().zip(&inside[r..r + inner]).enumerate() {
+            let mut s = 0.0;
+            for d in 0..W {
+                s += m[d] * shifted[d][i];
+            }
+            *o += inside * s;
+        }
+        [0..r, n - r..n]
+    } else {
+        [0..n, n..n]
+    };
+    // The first and last `r` places of a row feel the border.
+    for (out, row) in out.chunks_exact_mut(n).zip(plane.chunks_exact(n)) {
+        for i in edges.iter().cloned().flatten() {
+            for (d, w) in matrix[i].iter().enumerate() {
+                if *w != 0.0 {
+                    out[i] += w * row[i + d - r];
+                }
             }
         }
-    };
-    // The first and last `r` rows feel the border.
-    if n <= 2 * r {
-        (0..n).for_each(|i| edge(i, out));
-        return;
-    }
-    (0..r).chain(n - r..n).for_each(|i| edge(i, out));
-    let m = matrix[r];
-    let out = &mut out[r..n - r];
-    let shifted: [&[f32]; W] = std::array::from_fn(|d| &row[d..d + n - 2 * r]);
-    for (i, o) in out.iter_mut().enumerate() {
-        let mut s = 0.0;
-        for d in 0..W {
-            s += m[d] * shifted[d][i];
-        }
-        *o += s;
     }
 }
 
