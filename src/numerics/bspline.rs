@@ -30,21 +30,29 @@ pub struct Lattice {
     /// Nodes along each axis. Node `n` lies at voxel `(n - 1) * step` (at 0 for a side of one voxel).
     pub nodes: [usize; 3],
     phases: [Vec<[f32; 4]>; 3],
+    /// The first phases along x, by node.
+    across: [[f32; ACROSS]; 4],
 }
+
+/// Voxels along x that are worked out at once.
+const ACROSS: usize = 8;
 
 impl Lattice {
     /// A lattice of `step` voxels over `shape`.
     pub fn new(shape: [usize; 3], step: [usize; 3]) -> Self {
         let step: [usize; 3] = std::array::from_fn(|a| if shape[a] == 1 { 1 } else { step[a].max(1) });
         let nodes = std::array::from_fn(|a| if shape[a] == 1 { 1 } else { (shape[a] - 1) / step[a] + 4 });
-        let phases = std::array::from_fn(|a| {
+        let phases: [Vec<[f32; 4]>; 3] = std::array::from_fn(|a| {
             if shape[a] == 1 {
                 vec![[1.0, 0.0, 0.0, 0.0]]
             } else {
                 (0..step[a]).map(|i| weights(i as f32 / step[a] as f32)).collect()
             }
         });
-        Self { shape, step, nodes, phases }
+        let across = std::array::from_fn(|m| {
+            std::array::from_fn(|phase| phases[0].get(phase).map_or(0.0, |weights| weights[m]))
+        });
+        Self { shape, step, nodes, phases, across }
     }
 
     /// Number of nodes.
@@ -154,7 +162,17 @@ impl Lattice {
             out.fill(nodes[0]);
             return;
         }
-        for (cell, out) in out.chunks_mut(self.step[0]).enumerate() {
+        // Whole vectors: what one cell has too many the next writes over.
+        let (step, [w0, w1, w2, w3]) = (self.step[0], &self.across);
+        let whole = if step <= ACROSS && out.len() >= ACROSS { (out.len() - ACROSS) / step + 1 } else { 0 };
+        for cell in 0..whole {
+            let c = &nodes[cell..cell + 4];
+            let out = &mut out[cell * step..][..ACROSS];
+            for l in 0..ACROSS {
+                out[l] = w0[l] * c[0] + w1[l] * c[1] + w2[l] * c[2] + w3[l] * c[3];
+            }
+        }
+        for (cell, out) in out.chunks_mut(step).enumerate().skip(whole) {
             let c = &nodes[cell..cell + 4];
             for (o, w) in out.iter_mut().zip(&self.phases[0]) {
                 *o = w[0] * c[0] + w[1] * c[1] + w[2] * c[2] + w[3] * c[3];
