@@ -78,14 +78,12 @@ impl Smoothness {
         let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
         let starts = || (0..low).chain(high..ny).chain((low < high).then_some(low));
         let of_plane = |k: usize| starts().map(|j| Weights::new([&by[j], &bz[k]], [&gy[j], &gz[k]], twist)).collect();
-        let inside = |r: usize| move |m: usize| f32::from((r..nx.saturating_sub(r)).contains(&(m % nx)));
         Bands {
             nodes: self.nodes,
             runs: starts().map(|j| if (low..high).contains(&j) { (low, high) } else { (j, j + 1) }).collect(),
             weights: (0..nz).map(of_plane).collect(),
-            inside: [1, 2].map(|r| (0..nx * ny).map(inside(r)).collect()),
-            second,
-            first,
+            second: std::array::from_fn(|d| (0..nx * ny).map(|m| second[m % nx][d]).collect()),
+            first: std::array::from_fn(|d| (0..nx * ny).map(|m| first[m % nx][d]).collect()),
         }
     }
 
@@ -182,11 +180,9 @@ struct Bands {
     runs: Vec<(usize, usize)>,
     /// Those weights, of each plane.
     weights: Vec<Vec<Weights>>,
-    /// Of the nodes of a plane, 1 where the first and where the second differences along x do not feel the border, else 0.
-    inside: [Vec<f32>; 2],
-    /// Second and first differences along x.
-    second: Vec<[f32; 5]>,
-    first: Vec<[f32; 3]>,
+    /// Diagonals of the second and of the first differences along x, at each node of a plane; 0 past a row's ends.
+    second: [Vec<f32>; 5],
+    first: [Vec<f32>; 3],
 }
 
 /// Weights of the rows of [`REACH`].
@@ -237,8 +233,8 @@ impl Bands {
             }
         }
         let x = &x[k * nx * ny..(k + 1) * nx * ny];
-        banded(&self.second, &self.inside[1], x, out);
-        banded(&self.first, &self.inside[0], cross, out);
+        banded(&self.second, x, out);
+        banded(&self.first, cross, out);
     }
 }
 
@@ -246,34 +242,25 @@ impl Bands {
 const REACH: [(usize, usize); 13] =
     [(2, 2), (1, 2), (3, 2), (2, 1), (2, 3), (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (3, 1), (1, 3), (3, 3)];
 
-/// `out += M row` of each row of a plane for a banded matrix of `2 R + 1` diagonals whose inner rows are all alike; `inside` is 1 where they
-/// are, else 0: the plane is one long row to them.
+/// `out += M x` for a banded matrix, by its diagonals.
 #[inline(always)]
-fn banded<const W: usize>(matrix: &[[f32; W]], inside: &[f32], plane: &[f32], out: &mut [f32]) {
-    let (n, r) = (matrix.len(), W / 2);
-    let edges = if n > 2 * r {
-        let m = matrix[r];
-        let inner = plane.len() - 2 * r;
-        let shifted: [&[f32]; W] = std::array::from_fn(|d| &plane[d..d + inner]);
-        for (i, (o, inside)) in out[r..].iter_mut().zip(&inside[r..r + inner]).enumerate() {
-            let mut s = 0.0;
-            for d in 0..W {
-                s += m[d] * shifted[d][i];
-            }
-            *o += inside * s;
+fn banded<const W: usize>(diagonals: &[Vec<f32>; W], x: &[f32], out: &mut [f32]) {
+    let (n, r) = (x.len(), W / 2);
+    let (first, last) = (r.min(n), n.saturating_sub(r).max(r.min(n)));
+    let inner = last - first;
+    let shifted: [&[f32]; W] = std::array::from_fn(|d| x.get(d..d + inner).unwrap_or_default());
+    let weights: [&[f32]; W] = std::array::from_fn(|d| &diagonals[d][first..last]);
+    for (i, o) in out[first..last].iter_mut().enumerate() {
+        let mut s = 0.0;
+        for d in 0..W {
+            s += weights[d][i] * shifted[d][i];
         }
-        [0..r, n - r..n]
-    } else {
-        [0..n, n..n]
-    };
-    // The first and last `r` places of a row feel the border.
-    for (out, row) in out.chunks_exact_mut(n).zip(plane.chunks_exact(n)) {
-        for i in edges.iter().cloned().flatten() {
-            for (d, w) in matrix[i].iter().enumerate() {
-                if *w != 0.0 {
-                    out[i] += w * row[i + d - r];
-                }
-            }
+        *o += s;
+    }
+    // Where it would reach past an end.
+    for i in (0..first).chain(last..n) {
+        for (d, diagonal) in diagonals.iter().enumerate().filter(|(d, _)| (r..n + r).contains(&(i + d))) {
+            out[i] += diagonal[i] * x[i + d - r];
         }
     }
 }
