@@ -16,6 +16,17 @@ use rayon::prelude::*;
 /// Edge of a block (voxels).
 const BLOCK: usize = 8;
 
+/// Places of the voxels between the centres of two blocks, as parts of the way.
+const BETWEEN: [f32; BLOCK] = {
+    let mut out = [0.0; BLOCK];
+    let mut i = 0;
+    while i < BLOCK {
+        out[i] = (i as f32 + 0.5) / BLOCK as f32;
+        i += 1;
+    }
+    out
+};
+
 /// Times that what is left is put back.
 const AGAIN: usize = 3;
 
@@ -165,18 +176,19 @@ impl GainField {
             v
         };
         // Half a block before the first centre, whole blocks between centres, half a block after the last.
-        let half = BLOCK / 2;
-        let n = gain.len();
-        let (mut lo, mut from) = (at(0), 0);
-        for b in 0..=bx {
-            let hi = at(b.min(bx - 1));
-            let to = (half + b * BLOCK).min(n);
-            for i in from..to {
-                let t = if b == 0 { 0.0 } else { (i as f32 + 0.5 - (b as f32 - 0.5) * BLOCK as f32) / BLOCK as f32 };
-                gain[i] = lo[0] + t * (hi[0] - lo[0]);
-                offset[i] = lo[1] + t * (hi[1] - lo[1]);
+        let (first, rest) = gain.split_at_mut((BLOCK / 2).min(gain.len()));
+        let (first_offset, rest_offset) = offset.split_at_mut(first.len());
+        let mut lo = at(0);
+        first.fill(lo[0]);
+        first_offset.fill(lo[1]);
+        let between = rest.chunks_mut(BLOCK).zip(rest_offset.chunks_mut(BLOCK));
+        for (b, (gain, offset)) in between.enumerate() {
+            let hi = at((b + 1).min(bx - 1));
+            let step = [hi[0] - lo[0], hi[1] - lo[1]];
+            for ((g, o), t) in gain.iter_mut().zip(offset).zip(BETWEEN) {
+                (*g, *o) = (lo[0] + t * step[0], lo[1] + t * step[1]);
             }
-            (lo, from) = (hi, to);
+            lo = hi;
         }
     }
 }
