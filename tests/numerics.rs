@@ -13,13 +13,16 @@ use palpate::numerics::{filters, pyramid, small, statistics};
 use truth::{Dense, dense, entry, invert, normals, random_blocks, sampled, voxels, with_threads};
 
 /// Shapes and steps: step dividing the shape or not, larger than it, one slice, a line.
-const LATTICES: [([usize; 3], [usize; 3]); 6] = [
+const LATTICES: [([usize; 3], [usize; 3]); 9] = [
     ([13, 11, 9], [4, 5, 4]),
     ([12, 12, 12], [3, 4, 6]),
     ([7, 20, 5], [1, 2, 3]),
     ([17, 14, 1], [4, 3, 4]),
     ([21, 1, 1], [5, 1, 1]),
     ([5, 6, 4], [9, 16, 4]),
+    ([30, 9, 5], [8, 3, 2]),
+    ([43, 6, 1], [7, 4, 1]),
+    ([40, 5, 4], [10, 4, 3]),
 ];
 
 fn f64s(v: &[f32]) -> impl Iterator<Item = f64> {
@@ -282,8 +285,13 @@ fn energy_matrix(nodes: [usize; 3], h: [f64; 3]) -> Dense {
     (0..n).map(|i| (0..n).map(|j| 0.5 * (of(i, Some(j)) - single[i] - single[j])).collect()).collect()
 }
 
-const SMOOTHNESSES: [([usize; 3], [f64; 3]); 4] =
-    [([4, 5, 4], [1.0, 1.5, 2.0]), ([4, 4, 1], [2.0, 1.0, 1.0]), ([6, 1, 1], [0.5, 1.0, 1.0]), ([3, 2, 4], [1.0; 3])];
+const SMOOTHNESSES: [([usize; 3], [f64; 3]); 5] = [
+    ([4, 5, 4], [1.0, 1.5, 2.0]),
+    ([4, 4, 1], [2.0, 1.0, 1.0]),
+    ([6, 1, 1], [0.5, 1.0, 1.0]),
+    ([3, 2, 4], [1.0; 3]),
+    ([11, 6, 3], [1.0, 2.0, 1.5]),
+];
 
 #[test]
 fn the_smoothness_matrix_is_that_of_the_energy() {
