@@ -469,7 +469,7 @@ fn an_edge_that_moved_is_not_taken_for_gain() {
     let weighted = Pair { noise: 10.0, ..pair(shape, [1.0; 3], &tissue(36), &tissue(35)) };
     let mut alike = weighted.clone();
     assert!(weighted.mask.iter().all(|&m| m > 0) && weighted.mask.iter().any(|&m| m < 10));
-    alike.mask.fill(255);
+    alike.mask.to_mut().fill(255);
     // How far both volumes' own intensity is changed away from the edge, where nothing is to be changed.
     let changed = |pair: &Pair<'_>| {
         let (warped, mut sum) = (unmoved(pair), 0.0);
@@ -601,7 +601,7 @@ fn brightness_belongs_to_places_of_the_deformed_volume_on_every_level() {
             pair.even_out(&found, factor);
             let (lattice, c) = moved(&pair, 3.0);
             let warped = pair.warp(&lattice, &c, &pair.spans);
-            let seen = warped.iter().zip(&pair.fixed_smooth).filter(|(w, _)| w.is_finite());
+            let seen = warped.iter().zip(&pair.fixed_smooth[..]).filter(|(w, _)| w.is_finite());
             let mut off: Vec<f32> = seen.map(|(w, f)| (w / f).ln().abs()).collect();
             assert!(palpate::numerics::statistics::median(&mut off) < 0.01, "{factor:?}");
         }
@@ -758,7 +758,7 @@ fn the_blocks_are_positive_and_bound_the_curvature() {
     let shape = [24, 22, 20];
     let (fixed, moving) = texture(shape, 8.0, 9);
     let mut pair = pair(shape, [1.0; 3], &fixed, &moving);
-    for (m, p) in pair.mask.iter_mut().zip(voxels(shape)) {
+    for (m, p) in pair.mask.to_mut().iter_mut().zip(voxels(shape)) {
         *m = u8::from(p[2] < 12);
     }
     pair.spans = Spans::new(&pair.mask, shape);
@@ -900,7 +900,7 @@ fn rows_are_sampled_all_over_a_volume() {
     let inside: Vec<u8> = (0..448 * 4 * 448).map(|o| u8::from(o / 448 % 4 > 0)).collect();
     let (fixed, _) = texture(shape, 8.0, 6);
     let mut pair = pair(shape, [1.0; 3], &fixed, &fixed);
-    pair.mask = inside;
+    pair.mask = inside.into();
     pair.spans = Spans::new(&pair.mask, shape);
     let noisy: Vec<f32> = pair.fixed_smooth.iter().zip(normals(fixed.len(), 5)).map(|(f, n)| f + 3.0 * n).collect();
     let sigma = residual_sigma(&pair, &noisy, &GainField::measure(&pair, &noisy));

@@ -24,10 +24,10 @@ pub struct Pair<'a> {
     /// Initial intensities.
     pub fixed: Cow<'a, [f32]>,
     /// The same, smoothed by the cubic B-spline (see [`SmoothSampler`]).
-    pub fixed_smooth: Vec<f32>,
+    pub fixed_smooth: Cow<'a, [f32]>,
     /// Where matches are wanted (not 0), on the initial lattice; the value is the voxel's weight in the local gain
     /// ([`crate::matching::gain::weigh`]).
-    pub mask: Vec<u8>,
+    pub mask: Cow<'a, [u8]>,
     /// Voxels of the mask.
     pub inside: usize,
     /// The mask's extent in each row.
@@ -47,7 +47,25 @@ pub struct Pair<'a> {
 impl<'a> Pair<'a> {
     /// The same, with its own copy of the volumes.
     pub fn into_owned(self) -> Pair<'static> {
-        Pair { fixed: self.fixed.into_owned().into(), moving: self.moving.into_owned().into(), ..self }
+        Pair {
+            fixed: self.fixed.into_owned().into(),
+            fixed_smooth: self.fixed_smooth.into_owned().into(),
+            mask: self.mask.into_owned().into(),
+            moving: self.moving.into_owned().into(),
+            ..self
+        }
+    }
+
+    /// The same without copies of the volumes, where only `spans` are looked at.
+    pub fn within(&self, spans: Spans) -> Pair<'_> {
+        Pair {
+            fixed: Cow::Borrowed(&self.fixed),
+            fixed_smooth: Cow::Borrowed(&self.fixed_smooth),
+            mask: Cow::Borrowed(&self.mask),
+            moving: Cow::Borrowed(&self.moving),
+            spans,
+            ..*self
+        }
     }
 
     /// Puts `deformed` in the place of the deformed volume.
@@ -116,6 +134,13 @@ impl<'a> Pair<'a> {
     pub fn warp(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans) -> Vec<f32> {
         let mut out = self.unseen();
         self.warp_again(lattice, coefficients, spans, &mut out);
+        out
+    }
+
+    /// The deformed volume sampled within the pair's own spans. The rest is 0 and takes no memory; nothing may be read there.
+    pub fn warp_sparsely(&self, lattice: &Lattice, coefficients: &[f32]) -> Vec<f32> {
+        let mut out = vec![0.0; self.fixed.len()];
+        self.warp_again(lattice, coefficients, &self.spans, &mut out);
         out
     }
 

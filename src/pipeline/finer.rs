@@ -87,7 +87,8 @@ fn times(left: f32, noise: f32) -> f32 {
 
 /// Says so where what is `left` of the difference is more than noise, and not next to nothing in the tissue's contrast.
 pub(super) fn unlike(pair: &Pair<'_>, left: f32) -> Option<String> {
-    let tissue = pair.fixed_smooth.iter().zip(&pair.mask).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);
+    let tissue =
+        pair.fixed_smooth.iter().zip(&pair.mask[..]).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);
     let (times, part) = (times(left, pair.noise), left / deviation(tissue) as f32);
     (times > NOISY && part > UNLIKE).then(|| {
         format!(

@@ -157,12 +157,13 @@ pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
 /// that correlated noise leaves.
 pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
     let every = if pair.shape.iter().all(|&n| n >= 48) { 4 } else { 1 };
-    let active = pair.spans.slices(|k| k % every == every / 2);
-    let free = Baseline::new(pair, pair.warp(&field.lattice, &field.coefficients, &active));
+    // Of the slices between nothing is held.
+    let some = pair.within(pair.spans.slices(|k| k % every == every / 2));
+    let free = Baseline::new(&some, some.warp_sparsely(&field.lattice, &field.coefficients));
     move |motion| {
-        let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
-        let warped = pair.warp(&field.lattice, &map, &active);
-        residual::excess(pair, &warped, &free) * every as f64 * f64::from(independent(pair))
+        let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * some.spacing[a])));
+        let warped = some.warp_sparsely(&field.lattice, &map);
+        residual::excess(&some, &warped, &free) * every as f64 * f64::from(independent(&some))
     }
 }
 
@@ -301,7 +302,7 @@ pub fn matches(
     };
     let quick = !params.thorough && room >= BLOCKS;
     let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, quick, params.points);
-    let within = known.is_some().then_some(pair.mask.as_slice());
+    let within = known.is_some().then_some(&pair.mask[..]);
     let room = if params.thorough && known.is_some() { room / 5.0 } else { room };
     let deformed = corners(smooth_data, shape, spacing, within, noise, room, quick, 5 * params.points);
     let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
@@ -423,7 +424,7 @@ pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) 
         moving: pair.warp(&field.lattice, &field.coefficients, &around).into(),
         moving_shape: pair.shape,
         moving_origin: [0.0; 3],
-        ..pair.clone()
+        ..pair.within(pair.spans.clone())
     };
     let lattice = &field.lattice;
     let (_, more, report) = matches(&rest, None, params);

@@ -101,7 +101,7 @@ impl FieldParams {
             finest: 1,
             node_spacing: 0,
             passes: 6,
-            coarse_passes: 8,
+            coarse_passes: 10,
             finer_passes: 0,
             interpolation: Interpolation::Spline,
             candidates: 8,
@@ -110,7 +110,9 @@ impl FieldParams {
             seed: 1,
         };
         match preset {
-            Preset::Fast => Self { finest: 0, passes: 5, finer_passes: 3, voxels_per_point: 1000, ..balanced },
+            Preset::Fast => {
+                Self { finest: 0, passes: 5, coarse_passes: 8, finer_passes: 3, voxels_per_point: 1000, ..balanced }
+            }
             Preset::Balanced => balanced,
             Preset::Accurate => Self { passes: 12, coarse_passes: 16, voxels_per_point: 64, ..balanced },
         }
