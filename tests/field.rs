@@ -497,7 +497,6 @@ fn nodes_lie_as_asked_or_as_the_size_says() {
     assert_eq!(automatic.displacement, asked.displacement);
 }
 
-/// One half brighter, as from one element of a coil: a polynomial across the step was taken out, and a head at rest became a free motion of high trust.
 #[test]
 fn passes_on_the_next_finer_level_find_what_averages_of_voxels_hide() {
     let said =
@@ -524,6 +523,7 @@ fn passes_on_the_next_finer_level_find_what_averages_of_voxels_hide() {
     assert_eq!(levels(3), [levels(0), vec![[48; 3]]].concat());
 }
 
+/// One half brighter, as from one element of a coil: a polynomial across the step was taken out, and a head at rest became a free motion of high trust.
 #[test]
 fn a_step_in_brightness_is_left_to_the_local_gain() {
     let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };

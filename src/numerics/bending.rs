@@ -16,12 +16,13 @@ pub struct Smoothness {
     nodes: [usize; 3],
     /// Node distances (mm).
     step_mm: [f64; 3],
+    bands: Bands,
 }
 
 impl Smoothness {
     /// On `nodes` at distances `step_mm`.
     pub fn new(nodes: [usize; 3], step_mm: [f64; 3]) -> Self {
-        Self { nodes, step_mm }
+        Self { nodes, step_mm, bands: Bands::new(nodes, step_mm) }
     }
 
     /// Terms `(offset list, weight)`: the penalised differences, as node strides and signs.
@@ -57,72 +58,20 @@ impl Smoothness {
     /// `L` is a sum of products of the one-dimensional operators `B = D2^T D2` and `G = D1^T D1` (second and first
     /// differences), so a row of the result is a combination of 13 rows of `x` and one more filter along the row.
     pub fn apply(&self, x: &[f32], out: &mut [f32]) {
-        let bands = self.bands();
         let plane = self.nodes[0] * self.nodes[1];
         out.par_chunks_mut(plane).with_min_len(worthwhile(plane)).enumerate().for_each(|(k, out)| {
             let mut cross = vec![0.0f32; self.nodes[0] * self.nodes[1]];
             dispatch(
                 #[inline(always)]
-                || bands.plane(x, k, out, &mut cross),
+                || self.bands.plane(x, k, out, &mut cross),
             );
         });
-    }
-
-    fn bands(&self) -> Bands {
-        let h = self.step_mm;
-        let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
-        let ([second, by, bz], [first, gy, gz]) = (self.second(), self.first());
-        let [nx, ny, nz] = self.nodes;
-        let twist = [pair(0, 1), pair(0, 2), pair(1, 2)];
-        // Rows two away from the border in y share their weights: they are treated as one long row.
-        let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
-        let starts = || (0..low).chain(high..ny).chain((low < high).then_some(low));
-        let of_plane = |k: usize| starts().map(|j| Weights::new([&by[j], &bz[k]], [&gy[j], &gz[k]], twist)).collect();
-        Bands {
-            nodes: self.nodes,
-            runs: starts().map(|j| if (low..high).contains(&j) { (low, high) } else { (j, j + 1) }).collect(),
-            weights: (0..nz).map(of_plane).collect(),
-            second: std::array::from_fn(|d| (0..nx * ny).map(|m| second[m % nx][d]).collect()),
-            first: std::array::from_fn(|d| (0..nx * ny).map(|m| first[m % nx][d]).collect()),
-        }
-    }
-
-    /// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
-    fn second(&self) -> [Vec<[f32; 5]>; 3] {
-        std::array::from_fn(|a| {
-            let n = self.nodes[a];
-            let scale = (1.0 / self.step_mm[a].powi(4)) as f32;
-            let mut rows = vec![[0.0f32; 5]; n];
-            for s in 0..n.saturating_sub(2) {
-                for (p, v) in [1.0, -2.0, 1.0].into_iter().enumerate() {
-                    for (q, w) in [1.0, -2.0, 1.0].into_iter().enumerate() {
-                        rows[s + p][q + 2 - p] += scale * v * w;
-                    }
-                }
-            }
-            rows
-        })
-    }
-
-    /// Rows of `G = D1^T D1` along each axis: three diagonals.
-    fn first(&self) -> [Vec<[f32; 3]>; 3] {
-        std::array::from_fn(|a| {
-            let n = self.nodes[a];
-            let mut rows = vec![[0.0f32; 3]; n];
-            for s in 0..n.saturating_sub(1) {
-                rows[s][1] += 1.0;
-                rows[s + 1][1] += 1.0;
-                rows[s][2] -= 1.0;
-                rows[s + 1][0] -= 1.0;
-            }
-            rows
-        })
     }
 
     /// Diagonal of `L`.
     pub fn diagonal(&self) -> Vec<f32> {
         let [nx, ny, _] = self.nodes;
-        let (b, g, h) = (self.second(), self.first(), self.step_mm);
+        let (b, g, h) = (second(self.nodes, self.step_mm), first(self.nodes), self.step_mm);
         (0..self.nodes.iter().product())
             .map(|m| {
                 let at = [m % nx, m / nx % ny, m / (nx * ny)];
@@ -173,7 +122,8 @@ impl Smoothness {
     }
 }
 
-/// What [`Smoothness::apply`] needs, worked out once.
+/// What applying `L` needs, worked out once.
+#[derive(Debug, Clone)]
 struct Bands {
     nodes: [usize; 3],
     /// Rows of a plane with the same weights: first, and one past the last.
@@ -186,6 +136,7 @@ struct Bands {
 }
 
 /// Weights of the rows of [`REACH`].
+#[derive(Debug, Clone)]
 struct Weights {
     /// In the row itself.
     own: [f32; 13],
@@ -211,6 +162,25 @@ impl Weights {
 }
 
 impl Bands {
+    /// On `nodes` at distances `h` (mm).
+    fn new(nodes: [usize; 3], h: [f64; 3]) -> Self {
+        let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
+        let ([second, by, bz], [first, gy, gz]) = (second(nodes, h), first(nodes));
+        let [nx, ny, nz] = nodes;
+        let twist = [pair(0, 1), pair(0, 2), pair(1, 2)];
+        // Rows two away from the border in y share their weights: they are treated as one long row.
+        let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
+        let starts = || (0..low).chain(high..ny).chain((low < high).then_some(low));
+        let of_plane = |k: usize| starts().map(|j| Weights::new([&by[j], &bz[k]], [&gy[j], &gz[k]], twist)).collect();
+        Self {
+            nodes,
+            runs: starts().map(|j| if (low..high).contains(&j) { (low, high) } else { (j, j + 1) }).collect(),
+            weights: (0..nz).map(of_plane).collect(),
+            second: std::array::from_fn(|d| (0..nx * ny).map(|m| second[m % nx][d]).collect()),
+            first: std::array::from_fn(|d| (0..nx * ny).map(|m| first[m % nx][d]).collect()),
+        }
+    }
+
     /// Plane `k` of `L x`; `cross` is room for a plane.
     #[inline(always)]
     fn plane(&self, x: &[f32], k: usize, out: &mut [f32], cross: &mut [f32]) {
@@ -236,6 +206,38 @@ impl Bands {
         banded(&self.second, x, out);
         banded(&self.first, cross, out);
     }
+}
+
+/// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
+fn second(nodes: [usize; 3], h: [f64; 3]) -> [Vec<[f32; 5]>; 3] {
+    std::array::from_fn(|a| {
+        let n = nodes[a];
+        let scale = (1.0 / h[a].powi(4)) as f32;
+        let mut rows = vec![[0.0f32; 5]; n];
+        for s in 0..n.saturating_sub(2) {
+            for (p, v) in [1.0, -2.0, 1.0].into_iter().enumerate() {
+                for (q, w) in [1.0, -2.0, 1.0].into_iter().enumerate() {
+                    rows[s + p][q + 2 - p] += scale * v * w;
+                }
+            }
+        }
+        rows
+    })
+}
+
+/// Rows of `G = D1^T D1` along each axis: three diagonals.
+fn first(nodes: [usize; 3]) -> [Vec<[f32; 3]>; 3] {
+    std::array::from_fn(|a| {
+        let n = nodes[a];
+        let mut rows = vec![[0.0f32; 3]; n];
+        for s in 0..n.saturating_sub(1) {
+            rows[s][1] += 1.0;
+            rows[s + 1][1] += 1.0;
+            rows[s][2] -= 1.0;
+            rows[s + 1][0] -= 1.0;
+        }
+        rows
+    })
 }
 
 /// The rows that a row of `L x` is made of, as offsets in y and z plus 2; the first five alone enter the twists with x.
@@ -330,8 +332,8 @@ pub fn solver(
 }
 
 /// The matrix `D + lambda L` with its preconditioner, in slabs of node planes.
-struct System {
-    bands: Bands,
+struct System<'a> {
+    bands: &'a Bands,
     lambda: [f32; 3],
     /// Nodes of a plane.
     plane: usize,
@@ -343,8 +345,8 @@ struct System {
     coarse: Option<Box<Coarse>>,
 }
 
-impl System {
-    fn new(smoothness: &Smoothness, lambda: [f32; 3], blocks: &[[f32; 6]], multilevel: bool) -> Self {
+impl<'a> System<'a> {
+    fn new(smoothness: &'a Smoothness, lambda: [f32; 3], blocks: &[[f32; 6]], multilevel: bool) -> Self {
         let n = blocks.len();
         let diagonal = smoothness.diagonal();
         let inverses: Vec<[f32; 6]> = blocks
@@ -368,7 +370,7 @@ impl System {
         let blocks = planar(blocks);
         let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.map(f64::from), &blocks);
         Self {
-            bands: smoothness.bands(),
+            bands: &smoothness.bands,
             lambda,
             plane: smoothness.nodes[0] * smoothness.nodes[1],
             coarse: multilevel.then(below).flatten(),
