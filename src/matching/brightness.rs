@@ -16,7 +16,9 @@ use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::cholesky::Cholesky;
+use crate::numerics::exponential::{WHOLE, exp, ln};
 use crate::numerics::neighbours::Neighbours;
+use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::{noise_sigma, percentile, robust_deviation};
 use rayon::prelude::*;
 
@@ -217,7 +219,7 @@ impl Brightness {
     /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume.
     fn logarithm(&self, at: [f64; 3], tone: f64) -> f64 {
         let place: f64 = self.place.iter().map(|(p, t)| t * monomial(at, *p)).sum();
-        place + self.of_tone(tone.exp(), place)
+        place + self.of_tone(tone + place)
     }
 
     /// Whether it goes by the brightness itself: another contrast.
@@ -238,36 +240,93 @@ impl Brightness {
             let p = std::array::from_fn(|a| voxel[a] as f64 + origin[a]);
             scaled(self.shape, from_level(p, factor))
         };
-        let [low, high] = [self.range[0] - BEYOND, self.range[1] + BEYOND];
-        let Zero { at: [zero, darkest], sign } = self.zero;
-        values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
-            let (j, k) = (row % ny, row / ny);
-            let first = at([0, j, k]);
+        let step = if nx > 1 { (at([nx - 1, 0, 0])[0] - at([0; 3])[0]) / (nx - 1) as f64 } else { 0.0 };
+        let range = [self.range[0] - BEYOND, self.range[1] + BEYOND].map(|v| v as f32);
+        let tone = Tone::of(self);
+        let one = |log: &mut Vec<f32>, (row, values): (usize, &mut [f32])| {
+            let first = at([0, row % ny, row / ny]);
             let mut along = [0.0; DEGREE + 1];
             for ([x, y, z], t) in &self.place {
                 along[*x] += t * monomial(first, [0, *y, *z]);
             }
-            for (i, v) in values.iter_mut().enumerate() {
-                let x = at([i, j, k])[0];
-                let log = along.iter().rev().fold(0.0, |sum, c| sum * x + c).clamp(low, high);
-                let bright = sign * (f64::from(*v) - darkest);
-                *v = (zero + sign * bright * (log + self.of_tone(bright, log)).exp()) as f32;
-            }
-        });
+            let (along, x) = (along.map(|c| c as f32), [first[0], step].map(|x| x as f32));
+            let row = Row { along, x, range, zero: self.zero };
+            dispatch(
+                #[inline(always)]
+                || row.even_out(values, log, tone.as_ref()),
+            );
+        };
+        values.par_chunks_mut(nx).enumerate().for_each_init(|| vec![0.0; nx], one);
     }
 
-    /// Q of a brightness that P changes by `log`.
+    /// Q of a logarithm of brightness, P in it.
+    fn of_tone(&self, tone: f64) -> f64 {
+        Tone::of(self).map_or(0.0, |t| f64::from(t.at(tone as f32)))
+    }
+}
+
+/// Q as a table, with room for indices that are not checked.
+struct Tone {
+    table: [f32; 2 * TABLE],
+    /// The lowest logarithm, and steps of the table for 1.
+    low: f32,
+    steps: f32,
+}
+
+impl Tone {
+    /// None where place alone explains it.
+    fn of(found: &Brightness) -> Option<Self> {
+        let [low, high] = found.tones;
+        let last = *found.tone.last()?;
+        let table = std::array::from_fn(|i| *found.tone.get(i).unwrap_or(&last) as f32);
+        Some(Self { table, low: low as f32, steps: (TABLE as f64 / (high - low)) as f32 })
+    }
+
+    /// Linear between the steps, and even past them.
     #[inline(always)]
-    fn of_tone(&self, bright: f64, log: f64) -> f64 {
-        if self.tone.is_empty() {
-            return 0.0;
+    fn at(&self, tone: f32) -> f32 {
+        let at = ((tone - self.low) * self.steps).max(0.0).min(TABLE as f32);
+        let shifted = (at - 0.5) + WHOLE;
+        let i = (shifted.to_bits() & 0xffff) as usize;
+        let t = at - (shifted - WHOLE);
+        (1.0 - t) * self.table[i % (2 * TABLE)] + t * self.table[(i + 1) % (2 * TABLE)]
+    }
+}
+
+/// What is taken out along a row of voxels.
+struct Row {
+    /// P by powers of the place along the row.
+    along: [f32; DEGREE + 1],
+    /// That place (-1 to 1) at the first voxel, and from one to the next.
+    x: [f32; 2],
+    /// Lowest and highest P.
+    range: [f32; 2],
+    zero: Zero,
+}
+
+impl Row {
+    /// `log` is room for as many values as there are.
+    #[inline(always)]
+    fn even_out(&self, values: &mut [f32], log: &mut [f32], tone: Option<&Tone>) {
+        let Zero { at, sign } = self.zero;
+        let ([zero, darkest], sign) = (at.map(|v| v as f32), sign as f32);
+        for (i, (value, log)) in values.iter_mut().zip(&mut *log).enumerate() {
+            let x = self.x[0] + i as f32 * self.x[1];
+            let mut place = 0.0;
+            for c in self.along.iter().rev() {
+                place = place * x + c;
+            }
+            *log = place.max(self.range[0]).min(self.range[1]);
+            *value = sign * (*value - darkest);
         }
-        let [low, high] = self.tones;
-        let tone = bright.max(f64::MIN_POSITIVE).ln() + log;
-        let at = ((tone - low) / (high - low)).clamp(0.0, 1.0) * TABLE as f64;
-        let i = (at as usize).min(TABLE - 1);
-        let t = at - i as f64;
-        (1.0 - t) * self.tone[i] + t * self.tone[i + 1]
+        if let Some(tone) = tone {
+            for (value, log) in values.iter().zip(&mut *log) {
+                *log += tone.at(ln(*value) + *log);
+            }
+        }
+        for (value, log) in values.iter_mut().zip(log) {
+            *value = zero + sign * (*value * exp(*log));
+        }
     }
 }
 
@@ -370,13 +429,18 @@ fn robust(
 fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>> {
     let n = rows.first()?.len();
     let (mut a, mut b) = (vec![0.0; n * n], vec![0.0; n]);
-    for ((row, block), w) in rows.iter().zip(blocks).zip(weights) {
-        for (i, (a, b)) in a.chunks_exact_mut(n).zip(&mut b).enumerate() {
-            let weighed = w * row[i];
-            *b += weighed * block.difference();
-            a.iter_mut().zip(&row[..=i]).for_each(|(a, r)| *a += weighed * r);
-        }
-    }
+    dispatch(
+        #[inline(always)]
+        || {
+            for ((row, block), w) in rows.iter().zip(blocks).zip(weights) {
+                for (i, (a, b)) in a.chunks_exact_mut(n).zip(&mut b).enumerate() {
+                    let weighed = w * row[i];
+                    *b += weighed * block.difference();
+                    a.iter_mut().zip(&row[..=i]).for_each(|(a, r)| *a += weighed * r);
+                }
+            }
+        },
+    );
     let ridge = 1e-6 * weights.iter().sum::<f64>();
     (0..n).for_each(|i| a[i * n + i] += ridge);
     Cholesky::new(a, n)?.solve(&mut b);

@@ -42,5 +42,6 @@ pub mod sparse;
 
 pub mod cholesky;
 
+pub mod exponential;
 pub mod trig;
 pub mod unfold;

@@ -55,10 +55,14 @@ pub fn noise_sigma(data: &[f32], shape: [usize; 3], keep: impl Fn(usize) -> bool
     let stencil = second_differences(&thick, &stride);
     let reach = thick.iter().map(|&a| stride[a]).sum::<usize>();
     let every = (data.len() / 300_000).max(1) | 1;
-    let inner = |i: usize| thick.iter().all(|&a| (1..shape[a] - 1).contains(&(i / stride[a] % shape[a])));
-    let mut d: Vec<f32> = (0..data.len())
-        .step_by(every)
-        .filter(|&i| keep(i) && inner(i))
+    let inner = |a: usize| if shape[a] > 2 { 1..shape[a] - 1 } else { 0..shape[a] };
+    let rows = inner(2).flat_map(|k| inner(1).map(move |j| k * stride[2] + j * stride[1]));
+    let voxels = rows.flat_map(|row| {
+        let (first, end) = (row + inner(0).start, row + inner(0).end);
+        (first.next_multiple_of(every)..end).step_by(every)
+    });
+    let mut d: Vec<f32> = voxels
+        .filter(|&i| keep(i))
         .map(|i| {
             let from = &data[i - reach..=i + reach];
             stencil.iter().map(|&(at, weight)| weight * from[at]).sum::<f32>().abs()

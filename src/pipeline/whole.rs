@@ -33,6 +33,13 @@ const BENT: f64 = 1.6;
 /// Fewest matches that a search may start from; it competes with stillness.
 const FEWEST: usize = 8;
 
+/// Passes between the searches of the next level, of those of a coarse level: the next search needs a fair field, and what it ends with is brought
+/// to the residual as often as any. Over 20 pairs, seven of them legs that are searched so, 8 of 10 left 0.3 % more error and took 1 % less time in
+/// all; 6 of 10 left 0.7 % more (legs up to 5 %) and took 3 % less.
+fn between_searches(passes: usize) -> usize {
+    passes - passes / 5
+}
+
 /// How a whole volume is searched.
 #[derive(Clone, Copy)]
 pub(super) struct Whole<'a> {
@@ -114,7 +121,7 @@ impl Whole<'_> {
     ) -> Option<Begun> {
         let features = self.closer_points();
         let lattice = level::lattice(pair, self.nodes_for(pair, features));
-        let effort = (self.params.coarse_passes, features);
+        let effort = (between_searches(self.params.coarse_passes), features);
         let mut found = self.begin((pair, factor), &lattice, (&[], false), effort, seconds)?;
         found.field = level::carry(&found.field, own.lattice.clone(), |p| p);
         let reach = found.reach();
