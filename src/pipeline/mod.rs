@@ -31,6 +31,7 @@ pub mod pressed;
 
 pub mod stress;
 
+mod course;
 mod farther;
 mod finer;
 mod light;

@@ -223,7 +223,9 @@ fn labelled(
     let setup = fine.setup(choice.law, params.poisson, reference);
     let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
     let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
-    let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Vec::new() };
+    // Of regions that were found the shapes are open as a whole.
+    let mut interfaces = Interface::all(inputs.labels);
+    interfaces.retain(|i| inputs.labelled || i.is_wall());
     let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid(), (&interfaces, &inclusions))?;
     let corrected = |step: &[f64]| {
         let x = estimate.state.x.as_deref().unwrap_or_default();

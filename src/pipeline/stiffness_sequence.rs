@@ -2,16 +2,18 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::maps;
-use crate::stiffness::sequence::combine;
+use crate::stiffness::sequence::{Said, combine};
 use crate::types::stiffness::{
-    FrameStiffness, Gain, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams, StiffnessResult,
+    FrameStiffness, Gain, Law, LawChoice, SharedStiffness, StiffnessParams, StiffnessResult,
 };
 use crate::types::{Displacement, Mask};
 
 /// Collects frames, the one that moved most first, so that a sequence is never in memory as a whole.
 #[derive(Debug, Default)]
 pub struct Sequence {
-    first: Option<StiffnessResult>,
+    law: Option<Law>,
+    /// The frame that determines most regions, of those that do the first, and its number.
+    best: Option<(usize, StiffnessResult)>,
     frames: Vec<FrameStiffness>,
     failure: Option<StiffnessError>,
 }
@@ -19,7 +21,7 @@ pub struct Sequence {
 impl Sequence {
     /// Parameters for the next frame: those that move less are solved with the law of the first.
     pub fn params(&self, wanted: &StiffnessParams) -> StiffnessParams {
-        let model = self.first.as_ref().map_or(wanted.model, |r| LawChoice::from(r.law));
+        let model = self.law.map_or(wanted.model, LawChoice::from);
         StiffnessParams { model, ..wanted.clone() }
     }
 
@@ -29,7 +31,11 @@ impl Sequence {
             Ok(result) => {
                 let regions = Ok(result.regions.clone());
                 let residual = result.residual_mm;
-                self.first.get_or_insert(result);
+                self.law.get_or_insert(result.law);
+                let determined = |r: &StiffnessResult| r.regions.iter().filter(|r| r.identifiable).count();
+                if self.best.as_ref().is_none_or(|(_, best)| determined(&result) > determined(best)) {
+                    self.best = Some((frame, result));
+                }
                 (residual, regions)
             }
             Err(error) => {
@@ -46,10 +52,14 @@ impl Sequence {
     /// # Errors
     /// The first frame's error when no frame could be solved.
     pub fn finish(self, labels: &Mask) -> Result<SharedStiffness, StiffnessError> {
-        let Some(mut result) = self.first else { return Err(self.failure.unwrap_or(StiffnessError::NoEquilibrium)) };
-        let said: Vec<&Vec<RegionStiffness>> = self.frames.iter().filter_map(|f| f.regions.as_ref().ok()).collect();
+        let Some((shown, mut result)) = self.best else {
+            return Err(self.failure.unwrap_or(StiffnessError::NoEquilibrium));
+        };
+        result.warnings.iter_mut().for_each(|w| *w = format!("frame {shown}: {w}"));
         let count = result.regions.len();
-        let of = |r: usize| said.iter().filter_map(|f| f.get(r)).collect::<Vec<_>>();
+        let of = |r: usize| -> Vec<Said<'_>> {
+            self.frames.iter().filter_map(|f| Some((f.regions.as_ref().ok()?.get(r)?, f.motion_mm))).collect()
+        };
         let ratios: Vec<Vec<Gain>> = (0..count).map(|r| combine(&of(r), 1)).collect();
         let gains: Vec<Vec<Gain>> =
             if result.absolute { (0..count).map(|r| combine(&of(r), 0)).collect() } else { ratios.clone() };
@@ -77,8 +87,8 @@ impl Sequence {
                 };
                 let worst = self.frames.iter().filter_map(off).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |w| w.1);
                 result.warnings.push(format!(
-                    "{}: frames differ by {:.1} times what they claim, frame {worst} most (frames.csv); its standard deviation was raised by that: \
-                     check that frame, and that --forces stand in the frames' order and count from the reference",
+                    "{}: frames differ by {:.1} times what they claim, frame {worst} most (frames.csv), and those that count in the mean raise its \
+                     standard deviation: check that frame, and that --forces stand in the frames' order and count from the reference",
                     region.name, last.disagreement
                 ));
             }

@@ -2,11 +2,12 @@
 //!
 //! Every frame is measured against the reference itself, so that errors do not add up; the search starts from where the
 //! tissue was in the frame before and where steady motion would take it, beside the starts that a pair of volumes has.
-//! Only the reference, the frame at hand and what comes of it are held.
+//! Only the reference, the frame at hand with what comes of it, and the volume of the one before are held.
 
 use crate::error::FieldError;
 use crate::field::strain::{StrainField, StrainStatistics};
 use crate::numerics::sampling::{displacement, inside};
+use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
 use crate::types::*;
 use rayon::prelude::*;
@@ -84,10 +85,12 @@ pub fn run<'v, E: From<FieldError>>(
     let mut points = Points::new(frames);
     let mut tracked = Tracked::default();
     let mut refused = None;
+    let mut course = Course::new(reference, mask, origin);
     let order = (origin + 1..frames).chain((0..origin).rev());
     for (done, number) in order.enumerate() {
         if number + 1 == origin {
             tracker.restart();
+            tracked.book(course.end());
         }
         let volume = read(number)?;
         let started = Instant::now();
@@ -115,6 +118,8 @@ pub fn run<'v, E: From<FieldError>>(
                 }
                 tracked.frames.push(summary);
                 keep(Frame { number, volume: &volume, result: &result, strain: &strain })?;
+                let sigma = |at| result.uncertainty.at(at);
+                tracked.book(course.add(number, (&result.displacement, &sigma), volume));
             }
             Err(error) => {
                 tracked.frames.push(lost(number, &error));
@@ -122,6 +127,7 @@ pub fn run<'v, E: From<FieldError>>(
             }
         }
     }
+    tracked.book(course.end());
     if let Some(error) = refused.filter(|_| tracked.frames.iter().all(|f| f.lost.is_some())) {
         return Err(error.into());
     }
@@ -129,6 +135,17 @@ pub fn run<'v, E: From<FieldError>>(
     tracked.strain.sort_by_key(|s| (s.frame, s.label));
     tracked.trajectories = points.list;
     Ok(tracked)
+}
+
+impl Tracked {
+    /// Books what is out of line in a frame.
+    fn book(&mut self, told: Option<(usize, OutOfLine)>) {
+        let frame = told.and_then(|(number, said)| Some((self.frames.iter_mut().find(|f| f.frame == number)?, said)));
+        if let Some((frame, said)) = frame {
+            frame.out_of_line = said.share;
+            frame.warnings.push(said.why());
+        }
+    }
 }
 
 /// The offsets of each region's voxels: by label, or of the whole mask (of everything without one) as label 1.
@@ -178,6 +195,7 @@ fn summary(frame: usize, result: &FieldResult, seconds: f64) -> FrameSummary {
         residual_mm: s.levels.last().map_or(0.0, |l| l.residual_mm),
         uncertainty_median_mm: s.uncertainty_median_mm,
         folds: s.folds,
+        out_of_line: 0.0,
         seconds,
         warnings: s.warnings.clone(),
     }
@@ -195,6 +213,7 @@ fn lost(frame: usize, error: &FieldError) -> FrameSummary {
         residual_mm: 0.0,
         uncertainty_median_mm: 0.0,
         folds: 0,
+        out_of_line: 0.0,
         seconds: 0.0,
         warnings: Vec::new(),
     }

@@ -454,7 +454,8 @@ pub fn sequence_summary(shared: &SharedStiffness) -> Value {
 
 /// The lines that a shared map adds to the text.
 pub fn sequence_text(shared: &SharedStiffness) -> String {
-    let told = shared.frames.iter().filter(|f| f.regions.is_ok()).count();
+    let tells = |f: &&FrameStiffness| f.regions.as_ref().is_ok_and(|all| all.iter().any(|r| r.identifiable));
+    let told = shared.frames.iter().filter(tells).count();
     let mut out = format!("  frames       {told} of {} share these moduli", shared.frames.len());
     for (r, g) in shared.result.regions.iter().zip(&shared.gains) {
         if let [first, .., last] = g.as_slice()
@@ -462,6 +463,9 @@ pub fn sequence_text(shared: &SharedStiffness) -> String {
         {
             let parts = [100.0 * first.data_sd / first.value, 100.0 * last.data_sd / last.value];
             let _ = write!(out, "; {}: noise {:.2} % -> {:.2} %", r.name, parts[0], parts[1]);
+            if last.weighed < last.frames {
+                let _ = write!(out, " by {} that moved most", last.weighed);
+            }
         }
     }
     out.push('\n');

@@ -467,6 +467,7 @@ mod tests {
             residual_mm: 0.1,
             uncertainty_median_mm: 0.1,
             folds: 0,
+            out_of_line: 0.0,
             seconds: 1.0,
             warnings: Vec::new(),
         }

@@ -110,11 +110,13 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
 
 /// Judges a sequence by its worst frames, which the reasons name: `judged` has the number of each measured frame and what
 /// [`judge`] says of it. Trust in the sequence is low where more than
-/// half of the frames are lost or of low trust, high where each frame is of high trust, else moderate.
+/// half of the frames are lost or of low trust, high where each frame is of high trust, else moderate. A frame in which more than a quarter of the
+/// tissue is out of line with the frames beside it is of low trust.
 pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
     let of = |f: &FrameSummary| judged.iter().find(|j| j.0 == f.frame).map(|j| &j.1);
     let trust = |f: &FrameSummary| match (&f.lost, of(f).map_or(Trust::High, |v| v.trust)) {
         (Some(_), _) => Trust::Low,
+        (None, _) if f.out_of_line > UNSEEN => Trust::Low,
         (None, Trust::High) if !f.warnings.is_empty() => Trust::Moderate,
         (None, trust) => trust,
     };
@@ -261,6 +263,7 @@ mod tests {
             residual_mm: 0.0,
             uncertainty_median_mm,
             folds: 0,
+            out_of_line: 0.0,
             seconds: 0.0,
             warnings: Vec::new(),
         };

@@ -335,20 +335,22 @@ pub struct FrameStiffness {
 pub struct Gain {
     /// Frames that determine it.
     pub frames: usize,
+    /// Those that count in the mean; the others moved less, and know what all frames have in common worse.
+    pub weighed: usize,
     /// The modulus, or the ratio where no force is known.
     pub value: f64,
     /// Its standard deviation.
     pub sd: f64,
     /// The part of it that more frames lower.
     pub data_sd: f64,
-    /// Root of chi^2 per degree of freedom between the frames; 1 where they agree as well as they claim.
+    /// Root of chi^2 per degree of freedom between the frames, beside what they have in common; 1 where they agree as well as they claim.
     pub disagreement: f64,
 }
 
 /// The stiffness map that all frames of a sequence share.
 #[derive(Debug)]
 pub struct SharedStiffness {
-    /// The result of the frame that moved most, with the shared moduli.
+    /// The result of the frame that moved most of those that determine most regions, with the shared moduli.
     pub result: StiffnessResult,
     /// Every frame.
     pub frames: Vec<FrameStiffness>,

@@ -101,6 +101,8 @@ pub struct FrameSummary {
     pub uncertainty_median_mm: f64,
     /// Voxels of the mask that fold.
     pub folds: usize,
+    /// Part of the tissue (1) that lies elsewhere than the frames before and after have it, without its image bearing that out.
+    pub out_of_line: f64,
     /// Wall seconds of the measurement.
     pub seconds: f64,
     /// What the user should know.

@@ -1,0 +1,199 @@
+//! Whether what a frame of a sequence says is borne out: by the frames before and after it, or by its own image.
+//!
+//! A void, an artefact or a wrong match moves tissue where no frame beside it has it, and the pair alone cannot tell. A jerk does
+//! so too, but then the image agrees better with the frame's own field than with the middle of its neighbours'. Tissue where neither holds
+//! is told of.
+
+use crate::numerics::sampling::{Stencil, inside};
+use crate::types::space::length;
+use crate::types::{Displacement, Grid, Mask, Voxels};
+use rayon::prelude::*;
+
+/// Edge of a block, and between the voxels of it that are looked at (the finest axis' voxels).
+const BLOCK: usize = 8;
+const EVERY: usize = 2;
+
+/// Voxels of a block for it to count.
+const FEWEST: usize = 16;
+
+/// How far a block is from where its neighbours in time have it, to be out of line: in edges of a voxel, and in
+/// standard deviations of the difference.
+const APART: f64 = 0.5;
+const DEVIATIONS: f64 = 4.0;
+
+/// Of the misfit (1 - correlation^2) under the neighbours' field, what a frame's own leaves at most where its image bears it out.
+const BORNE_OUT: f64 = 0.8;
+
+/// Part of the tissue from which it is said, and part of what is out of line.
+const SHARE: f64 = 0.03;
+const OF_THOSE: f64 = 0.2;
+
+/// A frame at the voxels that are looked at.
+struct Seen {
+    number: usize,
+    /// Displacement (mm, RAS) and its standard deviation (mm).
+    moved: Vec<([f32; 3], f32)>,
+}
+
+/// What is not borne out in a frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct OutOfLine {
+    /// Part of the tissue (1).
+    pub share: f64,
+    /// Mean distance from where the frames beside it have it (mm).
+    pub apart_mm: f64,
+    /// The frames beside it.
+    pub beside: [Option<usize>; 2],
+}
+
+/// The frames in one direction from the reference, as they come.
+pub(super) struct Course<'a, 'v> {
+    reference: &'a Voxels<'a>,
+    /// Offsets of the voxels of each block.
+    blocks: Vec<Vec<usize>>,
+    origin: usize,
+    before: Seen,
+    last: Option<(Seen, Voxels<'v>)>,
+}
+
+impl<'a, 'v> Course<'a, 'v> {
+    /// `reference` is number `origin`; `mask` lies on its grid.
+    pub fn new(reference: &'a Voxels<'a>, mask: Option<&Mask>, origin: usize) -> Self {
+        let blocks = blocks(reference.grid(), mask);
+        let before = still(origin, &blocks);
+        Self { reference, blocks, origin, before, last: None }
+    }
+
+    /// Takes a frame, and says of the one before it what its number is and what is not borne out there.
+    pub fn add(
+        &mut self,
+        number: usize,
+        (field, uncertainty): (&Displacement<'_>, &dyn Fn(usize) -> f32),
+        volume: Voxels<'v>,
+    ) -> Option<(usize, OutOfLine)> {
+        let moved = self.blocks.iter().flatten().map(|&at| (field.at(at), uncertainty(at))).collect();
+        let next = Seen { number, moved };
+        let said = self.judge(Some(&next));
+        if let Some((last, _)) = self.last.replace((next, volume)) {
+            self.before = last;
+        }
+        said
+    }
+
+    /// The same of the last frame, by the one before it alone; and begins again beside the reference.
+    pub fn end(&mut self) -> Option<(usize, OutOfLine)> {
+        let said = self.judge(None);
+        self.before = still(self.origin, &self.blocks);
+        self.last = None;
+        said
+    }
+
+    fn judge(&self, next: Option<&Seen>) -> Option<(usize, OutOfLine)> {
+        let (own, volume) = self.last.as_ref()?;
+        let before = &self.before;
+        // Where steady motion from the one before to the next has it; lost frames are passed over.
+        let t =
+            next.map_or(0.0, |n| own.number.abs_diff(before.number) as f32 / n.number.abs_diff(before.number) as f32);
+        let after = next.unwrap_or(before);
+        let middle: Vec<([f32; 3], f32)> = before
+            .moved
+            .iter()
+            .zip(&after.moved)
+            .map(|((u, s), (v, r))| (std::array::from_fn(|a| u[a] + t * (v[a] - u[a])), s.max(*r)))
+            .collect();
+        let starts: Vec<usize> =
+            self.blocks.iter().scan(0, |at, b| Some(std::mem::replace(at, *at + b.len()))).collect();
+        let edge = self.reference.grid().spacing().iter().product::<f64>().cbrt();
+        let one = |(block, &from): (&Vec<usize>, &usize)| {
+            let part = from..from + block.len();
+            let (here, there) = (&own.moved[part.clone()], &middle[part]);
+            let mean = |of: &dyn Fn(usize) -> f64| (0..block.len()).map(of).sum::<f64>() / block.len() as f64;
+            let off: [f64; 3] = std::array::from_fn(|a| mean(&|i| f64::from(here[i].0[a] - there[i].0[a])));
+            let sigma = mean(&|i| f64::from(here[i].1.hypot(there[i].1)));
+            let apart = length(off);
+            if !(apart > APART * edge && apart > DEVIATIONS * sigma) {
+                return (block.len(), None);
+            }
+            let [own, beside] = [here, there].map(|moved| self.misfit(block, moved, volume));
+            (block.len(), own.zip(beside).map(|(own, beside)| (apart, own > BORNE_OUT * beside)))
+        };
+        let told: Vec<(usize, Option<(f64, bool)>)> = self.blocks.par_iter().zip(&starts).map(one).collect();
+        let count = |keep: &dyn Fn(&Option<(f64, bool)>) -> bool| -> f64 {
+            told.iter().filter(|t| keep(&t.1)).map(|t| t.0 as f64).sum()
+        };
+        let (all, out) = (count(&|_| true), count(&Option::is_some));
+        let alone = |t: &Option<(f64, bool)>| t.is_some_and(|t| t.1);
+        let unborne = count(&alone);
+        (unborne > SHARE * all && unborne > OF_THOSE * out).then(|| {
+            let sum: f64 = told.iter().filter(|t| alone(&t.1)).filter_map(|t| Some(t.0 as f64 * t.1?.0)).sum();
+            let beside = [Some(before.number), next.map(|n| n.number)];
+            (own.number, OutOfLine { share: unborne / all, apart_mm: sum / unborne, beside })
+        })
+    }
+
+    /// 1 - correlation^2 of a block of the reference and what a frame shows of it; none where that is not in view.
+    fn misfit(&self, block: &[usize], moved: &[([f32; 3], f32)], volume: &Voxels<'_>) -> Option<f64> {
+        let (grid, there) = (self.reference.grid(), volume.grid());
+        let pairs: Vec<[f64; 2]> = block
+            .iter()
+            .zip(moved)
+            .filter_map(|(&at, (u, _))| {
+                let [i, j, k] = grid.voxel(at);
+                let p = there.affine().to_voxel(grid.world(i, j, k).moved(u.map(f64::from)));
+                let seen = inside(there.shape(), p).then(|| Stencil::new(there.shape(), p).of(volume.as_slice()))?;
+                Some([f64::from(self.reference.as_slice()[at]), seen])
+            })
+            .filter(|p| p.iter().all(|v| v.is_finite()))
+            .collect();
+        (2 * pairs.len() >= block.len() && pairs.len() >= 2).then(|| 1.0 - correlation(&pairs).max(0.0).powi(2))
+    }
+}
+
+impl OutOfLine {
+    /// In words, for a frame's warnings.
+    pub fn why(&self) -> String {
+        let beside: Vec<String> = self.beside.iter().flatten().map(usize::to_string).collect();
+        format!(
+            "{:.0} % of the tissue lies {:.1} mm on the mean from where frame{} {} {} it, and the image does not bear that out there: a void, an \
+             artefact or blur; do not trust this frame there",
+            (100.0 * self.share).max(1.0),
+            self.apart_mm,
+            if beside.len() > 1 { "s" } else { "" },
+            beside.join(" and "),
+            if beside.len() > 1 { "have" } else { "has" },
+        )
+    }
+}
+
+fn still(number: usize, blocks: &[Vec<usize>]) -> Seen {
+    Seen { number, moved: vec![([0.0; 3], 0.0); blocks.iter().map(Vec::len).sum()] }
+}
+
+/// Of pairs of values (-1 to 1; 0 where either is constant).
+fn correlation(pairs: &[[f64; 2]]) -> f64 {
+    let mean: [f64; 2] = std::array::from_fn(|a| pairs.iter().map(|p| p[a]).sum::<f64>() / pairs.len() as f64);
+    let moment = |a: usize, b: usize| pairs.iter().map(|p| (p[a] - mean[a]) * (p[b] - mean[b])).sum::<f64>();
+    let size = (moment(0, 0) * moment(1, 1)).sqrt();
+    if size > 0.0 { moment(0, 1) / size } else { 0.0 }
+}
+
+/// Blocks of the mask (of everything without one): every second voxel of the finest axis, and about as far apart along the others.
+fn blocks(grid: &Grid, mask: Option<&Mask>) -> Vec<Vec<usize>> {
+    let (shape, spacing) = (grid.shape(), grid.spacing());
+    let finest = grid.least_spacing();
+    let voxels = |n: usize| spacing.map(|s| ((n as f64 * finest / s).round() as usize).max(1));
+    let (side, step) = (voxels(BLOCK), voxels(EVERY));
+    let count: [usize; 3] = std::array::from_fn(|a| shape[a].div_ceil(side[a]));
+    let mut all = vec![Vec::new(); count.iter().product()];
+    let along = |a: usize| (0..shape[a]).step_by(step[a]);
+    for (k, j) in along(2).flat_map(|k| along(1).map(move |j| (k, j))) {
+        for i in along(0) {
+            let at = grid.index(i, j, k);
+            if mask.is_none_or(|m| m.as_slice()[at] != 0) {
+                all[i / side[0] + count[0] * (j / side[1] + count[1] * (k / side[2]))].push(at);
+            }
+        }
+    }
+    all.retain(|block| block.len() >= FEWEST);
+    all
+}
