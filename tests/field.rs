@@ -579,6 +579,29 @@ fn lost_slices_are_left_out_and_said() {
     assert!(!result.summary.warnings.iter().any(|w| w.contains("as lost")), "{:?}", result.summary.warnings);
 }
 
+/// Every second slice with the voxel size of the whole: tissue was found squeezed to half, without a word.
+#[test]
+fn tissue_that_does_not_keep_its_volume_is_told_of() {
+    let p = phantom(&PhantomParams { noise: 0.02, ..block(48, MotionKind::Smooth, 1.0) }).unwrap();
+    let g = *p.initial.grid();
+    let [nx, ny, nz] = g.shape();
+    let shorter = 2 * nx / 3;
+    // Two of three slices, as if they lay side by side.
+    let cut = Grid::new([shorter, ny, nz], *g.affine()).unwrap();
+    let values = (0..cut.len()).map(|at| {
+        let [i, j, k] = cut.voxel(at);
+        p.deformed.as_slice()[g.index(i / 2 * 3 + i % 2, j, k)]
+    });
+    let squeezed = Volume::from_vec(cut, values.collect()).unwrap();
+    let params = FieldParams { search_mm: 20.0, ..FieldParams::default() };
+    let said =
+        |deformed: &Volume| run(&p.initial, deformed, Some(&p.mask), &params, &|_, _| {}).map(|r| r.summary.warnings);
+    let of_volume = |w: &String| w.contains("of its volume");
+    assert!(!said(&p.deformed).unwrap().iter().any(of_volume));
+    // Refused, or told of.
+    assert!(said(&squeezed).is_err() || said(&squeezed).unwrap().iter().any(of_volume), "{:?}", said(&squeezed));
+}
+
 #[test]
 fn the_number_of_threads_changes_nothing() {
     let cases = [block(40, MotionKind::Smooth, 2.0), PhantomParams::new(PhantomKind::Slice).sized(64)];

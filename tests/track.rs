@@ -169,6 +169,18 @@ fn a_lost_frame_does_not_stop_the_others() {
 }
 
 #[test]
+fn a_jerk_is_not_out_of_line() {
+    let s = sequence(SequenceKind::Pen, 24);
+    let (params, reference) = (FieldParams::default(), s.frame(0));
+    // There and back in one frame: its image bears it out.
+    for order in [[0, 4, 4, 20, 4, 4], [0, 12, 14, 16, 18, 20]] {
+        let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(order[t])) };
+        let found = run((6, 0), &reference, (Some(&s.mask), None), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+        assert!(found.frames.iter().all(|f| f.out_of_line == 0.0), "{order:?}: {:?}", found.frames);
+    }
+}
+
+#[test]
 fn a_label_out_of_a_frames_view_is_named() {
     let s = sequence(SequenceKind::Pinch, 3);
     let reference = s.frame(0);

@@ -1,11 +1,12 @@
 //! What cannot be measured is refused before any work.
 
 use crate::error::FieldError;
+use crate::field::jacobian::determinant_at;
 use crate::matching::levels::foreground;
 use crate::numerics::filters::mean_beside;
 use crate::numerics::statistics::quantile;
 use crate::pipeline::field::FEWEST;
-use crate::types::{Grid, Mask, Volume, Voxels};
+use crate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
@@ -238,6 +239,27 @@ fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
         slice(shape, axis, at).for_each(|o| new[o] = f32::NAN);
     }
     volume
+}
+
+/// Volume of the tissue over what it was, below or above whose inverse it is told of. Soft tissue keeps its volume; in part, parts of it may come
+/// and go with the blood.
+const KEPT: f64 = 0.75;
+
+/// Voxels that tell it.
+const SAMPLED: usize = 5000;
+
+/// What to say where the tissue as a whole does not keep its volume: most often a header is wrong. Nothing of one slice.
+pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
+    let inside: Vec<usize> = (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0).collect();
+    let some: Vec<usize> = inside.iter().copied().step_by((inside.len() / SAMPLED).max(1)).collect();
+    let volume = some.iter().map(|&o| f64::from(determinant_at(field, o))).sum::<f64>() / some.len().max(1) as f64;
+    let kept = field.grid().is_single_slice() || some.is_empty() || (KEPT..=1.0 / KEPT).contains(&volume);
+    (!kept).then(|| {
+        format!(
+            "the tissue as a whole comes out at {volume:.2} of its volume, which soft tissue keeps: check the voxel sizes in both headers \
+             (palpate info), and that both volumes show the same tissue"
+        )
+    })
 }
 
 /// What to say of lost slices.

@@ -197,3 +197,60 @@ fn blocks(grid: &Grid, mask: Option<&Mask>) -> Vec<Vec<usize>> {
     all.retain(|block| block.len() >= FEWEST);
     all
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::types::{Affine, DenseField, Volume, WorldPoint};
+
+    fn grid() -> Grid {
+        Grid::new([40, 36, 32], Affine::scaled([1.0, 1.0, 1.25], [3.0, -4.0, 5.0]).unwrap()).unwrap()
+    }
+
+    /// Waves of 5 to 9 mm.
+    fn texture(p: WorldPoint) -> f64 {
+        let [x, y, z] = p.0;
+        100.0 + 20.0 * ((1.1 * x + 0.3 * y).sin() + (0.9 * y - 0.4 * z).sin() + (0.8 * z + 0.5 * x).cos())
+    }
+
+    fn ball(p: WorldPoint) -> bool {
+        p.minus(grid().world(20, 18, 16)).iter().map(|d| d * d).sum::<f64>() < 100.0
+    }
+
+    /// What is told of frame 3 of frames 2 to 4, where all moved by 1 mm a frame along x, but in frame 3 a ball by 3 more along y; the image of
+    /// frame 3 shows the ball there, where it was without that, or not at all.
+    fn told(shows: Option<f64>) -> Option<(usize, OutOfLine)> {
+        let g = grid();
+        let reference = Volume::from_voxels(g, |_, p| texture(p) as f32);
+        let field = |x: f64, y: f64| DenseField::from_fn(g, |p| [x, if ball(p) { y } else { 0.0 }, 0.0]);
+        let seen = Volume::from_voxels(g, |at, p| {
+            let there = p.moved([-3.0, -shows.unwrap_or(0.0), 0.0]);
+            let still = p.moved([-3.0, 0.0, 0.0]);
+            match (ball(there) || ball(still), shows) {
+                (false, _) => texture(still) as f32,
+                (true, Some(_)) => texture(there) as f32,
+                (true, None) => ((at * 7919) % 50) as f32,
+            }
+        });
+        let mut course = Course::new(&reference, None, 0);
+        let sigma = |_: usize| 0.1;
+        assert_eq!(course.add(2, (&field(2.0, 0.0), &sigma), reference.view()), None);
+        let second = course.add(3, (&field(3.0, 3.0), &sigma), seen.view());
+        assert!(second.is_none_or(|s| s.0 == 2));
+        course.add(4, (&field(4.0, 0.0), &sigma), reference.view())
+    }
+
+    #[test]
+    fn what_the_image_does_not_bear_out_is_told() {
+        for shows in [None, Some(0.0)] {
+            let (frame, said) = told(shows).unwrap();
+            // The ball is 4.2 of 58 ml.
+            assert!(frame == 3 && (0.04..0.12).contains(&said.share), "{shows:?} {said:?}");
+            // Blocks at its rim have a part of it.
+            assert!((1.2..3.1).contains(&said.apart_mm), "{shows:?} {said:?}");
+            assert!(said.why().contains("frames 2 and 4"), "{}", said.why());
+        }
+        assert_eq!(told(Some(3.0)), None);
+    }
+}

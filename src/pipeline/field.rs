@@ -362,6 +362,7 @@ fn canonical(
         warnings: warnings(counts, folds, not_finite, length.1, if starts.is_empty() { search } else { f64::INFINITY })
             .into_iter()
             .chain(check::said_of(&lost))
+            .chain(check::squeezed(&displacement, &mask))
             .chain(vague(choice.model, uncertainty_mean_mm, length.0, &grid))
             .chain(doubted.map(in_doubt))
             .chain(unlike)

@@ -197,8 +197,15 @@ fn summary(frame: usize, result: &FieldResult, seconds: f64) -> FrameSummary {
         folds: s.folds,
         out_of_line: 0.0,
         seconds,
-        warnings: s.warnings.clone(),
+        warnings: s.warnings.iter().map(|w| of_a_frame(w)).collect(),
     }
+}
+
+/// A warning of a pair in the words of a sequence, which has the page in the place of the pair's volumes.
+fn of_a_frame(warning: &str) -> String {
+    ["warped.nii.gz", "uncertainty.nii.gz"]
+        .iter()
+        .fold(warning.to_string(), |text, file| text.replace(&format!("look at {file}"), "look at it in report.html"))
 }
 
 fn lost(frame: usize, error: &FieldError) -> FrameSummary {
