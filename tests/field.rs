@@ -579,14 +579,13 @@ fn lost_slices_are_left_out_and_said() {
     assert!(!result.summary.warnings.iter().any(|w| w.contains("as lost")), "{:?}", result.summary.warnings);
 }
 
-/// Every second slice with the voxel size of the whole: tissue was found squeezed to half, without a word.
+/// Two of three slices along x as if they lay side by side: tissue was found squeezed to two thirds, without a word.
 #[test]
 fn tissue_that_does_not_keep_its_volume_is_told_of() {
     let p = phantom(&PhantomParams { noise: 0.02, ..block(48, MotionKind::Smooth, 1.0) }).unwrap();
     let g = *p.initial.grid();
     let [nx, ny, nz] = g.shape();
     let shorter = 2 * nx / 3;
-    // Two of three slices, as if they lay side by side.
     let cut = Grid::new([shorter, ny, nz], *g.affine()).unwrap();
     let values = (0..cut.len()).map(|at| {
         let [i, j, k] = cut.voxel(at);

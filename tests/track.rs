@@ -168,6 +168,26 @@ fn a_lost_frame_does_not_stop_the_others() {
     assert!(run((6, 2), &reference, (None, None), &params, nothing, |_| Ok(()), &|_, _| {}).is_err());
 }
 
+/// Without a mask the mean strain was that of all voxels, air with them.
+#[test]
+fn without_a_mask_strain_is_that_of_tissue() {
+    let s = sequence(SequenceKind::Pinch, 3);
+    let (params, reference) = (FieldParams::default(), s.frame(0));
+    let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
+    let found = run((3, 0), &reference, (None, None), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+    // The mask that is made reaches a voxel into the air; all of the volume is three times the tissue.
+    let tissue = s.mask.as_slice().iter().filter(|m| **m != 0).count() as f64;
+    assert!(tissue < 0.4 * reference.grid().len() as f64);
+    for row in &found.strain {
+        let share = row.voxels as f64 / tissue;
+        assert!(
+            row.label == 1 && (0.8..1.6).contains(&share),
+            "{share} of the tissue, {:.2} of the volume",
+            tissue / reference.grid().len() as f64
+        );
+    }
+}
+
 #[test]
 fn a_jerk_is_not_out_of_line() {
     let s = sequence(SequenceKind::Pen, 24);

@@ -211,15 +211,16 @@ impl Brightness {
         let (place, tone, all) = (fitted(true, false)?, fitted(false, true), fitted(true, true));
         let alone = tone.filter(|tone| tone.deviation[1] < place.deviation[1]).unwrap_or(place);
         let best = all.filter(|all| all.deviation[1] <= both * alone.deviation[1]).unwrap_or(alone);
-        let left = |b: &Block| b.difference() - best.logarithm(scaled(shape, b.at), b.log[1]);
+        let tone = Tone::of(&best);
+        let left = |b: &Block| b.difference() - best.logarithm(tone.as_ref(), scaled(shape, b.at), b.log[1]);
         let [as_it_is, left] = between_neighbours(blocks, [&Block::difference, &left]);
         Some(Self { uneven: left / as_it_is.max(EQUAL), ..best })
     }
 
-    /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume.
-    fn logarithm(&self, at: [f64; 3], tone: f64) -> f64 {
+    /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume; `tone` is its [`Tone::of`].
+    fn logarithm(&self, tone: Option<&Tone>, at: [f64; 3], log: f64) -> f64 {
         let place: f64 = self.place.iter().map(|(p, t)| t * monomial(at, *p)).sum();
-        place + self.of_tone(tone + place)
+        place + tone.map_or(0.0, |t| f64::from(t.at((log + place) as f32)))
     }
 
     /// Whether it goes by the brightness itself: another contrast.
@@ -258,11 +259,6 @@ impl Brightness {
         };
         values.par_chunks_mut(nx).enumerate().for_each_init(|| vec![0.0; nx], one);
     }
-
-    /// Q of a logarithm of brightness, P in it.
-    fn of_tone(&self, tone: f64) -> f64 {
-        Tone::of(self).map_or(0.0, |t| f64::from(t.at(tone as f32)))
-    }
 }
 
 /// Q as a table, with room for indices that are not checked.
@@ -282,7 +278,7 @@ impl Tone {
         Some(Self { table, low: low as f32, steps: (TABLE as f64 / (high - low)) as f32 })
     }
 
-    /// Linear between the steps, and even past them.
+    /// Of a logarithm of brightness, P in it: linear between the steps, and even past them.
     #[inline(always)]
     fn at(&self, tone: f32) -> f32 {
         let at = ((tone - self.low) * self.steps).max(0.0).min(TABLE as f32);

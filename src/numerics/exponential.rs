@@ -31,8 +31,8 @@ pub fn exp(x: f32) -> f32 {
     series(r, terms) * power
 }
 
-/// ln x within 1.5e-7 of the larger of itself and 1, for positive x that single precision holds at full length; what is less counts as the least of
-/// these.
+/// ln x within 1.5e-7 of the larger of itself and 1, for positive x that single precision holds at full length; what is less, and NaN, counts as the
+/// least of these.
 ///
 /// With x = 2^n m, m from sqrt(1/2) to sqrt(2): n ln 2 + 2 artanh s, s = (m - 1) / (m + 1), its series to s^9 (7e-10).
 #[inline(always)]

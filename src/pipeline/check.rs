@@ -241,19 +241,22 @@ fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     volume
 }
 
-/// Volume of the tissue over what it was, below or above whose inverse it is told of. Soft tissue keeps its volume; in part, parts of it may come
-/// and go with the blood.
+/// Soft tissue keeps its volume: that it came out as this part of what it was or less, or as its inverse or more, is told.
 const KEPT: f64 = 0.75;
 
-/// Voxels that tell it.
+/// Voxels that are looked at for it.
 const SAMPLED: usize = 5000;
+const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// What to say where the tissue as a whole does not keep its volume: most often a header is wrong. Nothing of one slice.
 pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
-    let inside: Vec<usize> = (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0).collect();
-    let some: Vec<usize> = inside.iter().copied().step_by((inside.len() / SAMPLED).max(1)).collect();
-    let volume = some.iter().map(|&o| f64::from(determinant_at(field, o))).sum::<f64>() / some.len().max(1) as f64;
-    let kept = field.grid().is_single_slice() || some.is_empty() || (KEPT..=1.0 / KEPT).contains(&volume);
+    let inside = || (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0);
+    // Multiples of the golden ratio meet rows and slices alike.
+    let share = SAMPLED as f64 / inside().count().max(1) as f64;
+    let some = inside().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share);
+    let volumes: Vec<f64> = some.map(|(_, o)| f64::from(determinant_at(field, o))).filter(|v| v.is_finite()).collect();
+    let volume = volumes.iter().sum::<f64>() / volumes.len().max(1) as f64;
+    let kept = field.grid().is_single_slice() || volumes.is_empty() || (KEPT..=1.0 / KEPT).contains(&volume);
     (!kept).then(|| {
         format!(
             "the tissue as a whole comes out at {volume:.2} of its volume, which soft tissue keeps: check the voxel sizes in both headers \

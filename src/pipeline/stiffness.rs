@@ -224,8 +224,7 @@ fn labelled(
     let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
     let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
     // Of regions that were found the shapes are open as a whole.
-    let mut interfaces = Interface::all(inputs.labels);
-    interfaces.retain(|i| inputs.labelled || i.is_wall());
+    let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Interface::walls(inputs.labels) };
     let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid(), (&interfaces, &inclusions))?;
     let corrected = |step: &[f64]| {
         let x = estimate.state.x.as_deref().unwrap_or_default();

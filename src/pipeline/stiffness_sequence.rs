@@ -4,7 +4,7 @@ use crate::error::StiffnessError;
 use crate::stiffness::maps;
 use crate::stiffness::sequence::{Said, combine};
 use crate::types::stiffness::{
-    FrameStiffness, Gain, Law, LawChoice, SharedStiffness, StiffnessParams, StiffnessResult,
+    FrameStiffness, Gain, Law, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams, StiffnessResult,
 };
 use crate::types::{Displacement, Mask};
 
@@ -55,7 +55,6 @@ impl Sequence {
         let Some((shown, mut result)) = self.best else {
             return Err(self.failure.unwrap_or(StiffnessError::NoEquilibrium));
         };
-        result.warnings.iter_mut().for_each(|w| *w = format!("frame {shown}: {w}"));
         let count = result.regions.len();
         let of = |r: usize| -> Vec<Said<'_>> {
             self.frames.iter().filter_map(|f| Some((f.regions.as_ref().ok()?.get(r)?, f.motion_mm))).collect()
@@ -71,6 +70,13 @@ impl Sequence {
             let of_region = result.mesh.labels().iter().zip(&mut result.element_modulus);
             of_region.filter(|(l, _)| **l == region.label).for_each(|(_, e)| *e = gain.value);
         }
+        // What one frame does not determine another may.
+        let determined = |w: &String| {
+            let said = |r: &&RegionStiffness| r.identifiable && w.starts_with(&maps::not_determined(&r.name));
+            result.regions.iter().any(|r| said(&r))
+        };
+        let warnings = result.warnings.iter().filter(|w| !determined(w)).map(|w| format!("frame {shown}: {w}"));
+        result.warnings = warnings.collect();
         let names: Vec<u8> = result.regions.iter().map(|r| r.label).collect();
         result.map = maps::by_label(labels, &names, &|r| result.regions[r].youngs_modulus);
         result.map_sd = maps::by_label(labels, &names, &|r| result.regions[r].sd);
@@ -87,8 +93,7 @@ impl Sequence {
                 };
                 let worst = self.frames.iter().filter_map(off).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |w| w.1);
                 result.warnings.push(format!(
-                    "{}: frames differ by {:.1} times what they claim, frame {worst} most (frames.csv), and those that count in the mean raise its \
-                     standard deviation: check that frame, and that --forces stand in the frames' order and count from the reference",
+                    "{}: frames differ by {:.1} times what they claim, frame {worst} most (frames.csv): check that frame, and that --forces stand in the frames' order and count from the reference",
                     region.name, last.disagreement
                 ));
             }
@@ -97,12 +102,12 @@ impl Sequence {
     }
 }
 
-/// Mean length of the displacement in the body (mm); not finite where the field is not.
+/// Mean length of the displacement in the body (mm), where it is finite; NaN where it is nowhere.
 pub fn motion(field: &Displacement<'_>, labels: &Mask) -> f64 {
     let inside = labels.as_slice();
     let (mut sum, mut count) = (0.0, 0.0);
-    for o in (0..inside.len()).filter(|&o| inside[o] > 0) {
-        let u = field.at(o);
+    let seen = (0..inside.len()).filter(|&o| inside[o] > 0).map(|o| field.at(o));
+    for u in seen.filter(|u| u.iter().all(|v| v.is_finite())) {
         sum += u.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
         count += 1.0;
     }

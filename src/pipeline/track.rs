@@ -6,6 +6,7 @@
 
 use crate::error::FieldError;
 use crate::field::strain::{StrainField, StrainStatistics};
+use crate::matching::levels::foreground;
 use crate::numerics::sampling::{displacement, inside};
 use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
@@ -66,7 +67,8 @@ pub struct Frame<'a> {
 /// Measures `frames` volumes against number `origin` of them: forward from it to the last, then backward to the first.
 ///
 /// `read` gives a volume by its number, `keep` gets each result as soon as it is there. `labels` (on the reference's
-/// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them. A frame that cannot be
+/// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them, and what stands out of the background
+/// without either. A frame that cannot be
 /// measured is reported as lost, and the next one starts from the frames before it.
 ///
 /// # Errors
@@ -80,12 +82,15 @@ pub fn run<'v, E: From<FieldError>>(
     mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
     progress: Progress<'_>,
 ) -> Result<Tracked, E> {
-    let regions = regions(reference, mask, labels);
+    // Without a mask it is tissue that counts, not air.
+    let tissue = mask.is_none().then(|| foreground(reference));
+    let inside = mask.or(tissue.as_ref());
+    let regions = regions(reference, if labels.is_some() { mask } else { inside }, labels);
     let mut tracker = Tracker::new(reference, mask, params);
     let mut points = Points::new(frames);
     let mut tracked = Tracked::default();
     let mut refused = None;
-    let mut course = Course::new(reference, mask, origin);
+    let mut course = Course::new(reference, inside, origin);
     let order = (origin + 1..frames).chain((0..origin).rev());
     for (done, number) in order.enumerate() {
         if number + 1 == origin {
@@ -148,7 +153,7 @@ impl Tracked {
     }
 }
 
-/// The offsets of each region's voxels: by label, or of the whole mask (of everything without one) as label 1.
+/// The offsets of each region's voxels: by label, or of the whole mask as label 1.
 fn regions(reference: &Voxels<'_>, mask: Option<&Mask>, labels: Option<&Mask>) -> Vec<(u8, Vec<usize>)> {
     let inside = |at: usize| mask.is_none_or(|m| m.as_slice()[at] != 0);
     let all = (0..reference.grid().len()).filter(|&at| inside(at));

@@ -180,12 +180,19 @@ pub fn fit(
     let moving: Vec<_> = inclusions.iter().map(|i| (i.shapes(&setup.body.places), i.prior())).collect();
     parts.extend(moving.iter().flat_map(|(nodes, sigma)| (0..SHAPES).map(|k| Part::Inclusion(nodes, k, *sigma))));
     let without = parts.len();
-    parts.extend(interfaces.iter().map(Part::Interface));
-    // Labels that are wrong by more than a voxel do not take the faces with them.
-    match offsets(setup, estimate, grid, &parts)? {
-        None if parts.len() > without => offsets(setup, estimate, grid, &parts[..without]),
-        found => Ok(found),
+    let (walls, borders): (Vec<_>, Vec<_>) = interfaces.iter().partition(|i| i.is_wall());
+    parts.extend(borders.into_iter().map(Part::Interface));
+    let without_walls = parts.len();
+    parts.extend(walls.into_iter().map(Part::Interface));
+    // Labels that are wrong by more than a voxel do not take the faces with them, nor walls the labels.
+    let mut counts = vec![parts.len(), without_walls, without];
+    counts.dedup();
+    for count in counts {
+        if let Some(found) = offsets(setup, estimate, grid, &parts[..count])? {
+            return Ok(Some(found));
+        }
     }
+    Ok(None)
 }
 
 /// How much further outwards the edge of the punch lies (voxels), for all that the data say; none where there is no such edge.

@@ -99,6 +99,11 @@ impl Interface {
         kept.iter().map(one).collect()
     }
 
+    /// Those of the walls of holes alone.
+    pub fn walls(labels: &Mask) -> Vec<Self> {
+        Self::all(&Mask::from_voxels(*labels.grid(), |o, _| u8::from(labels.as_slice()[o] > 0)))
+    }
+
     /// Whether it is the wall of a hole.
     pub fn is_wall(&self) -> bool {
         self.labels[0] == 0

@@ -149,11 +149,11 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &
     out
 }
 
-/// The same that is said to be much: phantoms with the right assumptions, linear law and all, leave 0.003 to 0.015 (from images layers 0.02,
-/// fingertips 0.03 to 0.04); a body of which a part was cut off 0.08, a wall beside it that was not modelled 0.06, one label over a ball five times
-/// as stiff 0.027.
+/// The part of the plates' motion from which it is said to be much. Phantoms with the right assumptions, the linear law among them, leave 0.003 to
+/// 0.015, layers from images 0.02, fingertips from images 0.03 to 0.04 (these are warned of). A body of which a part was cut off leaves 0.08, one
+/// beside a wall that was not modelled 0.06, one label over a ball five times as stiff 0.027.
 const MUCH: f64 = 0.025;
-/// What stands out of the noise of a sample, over that: it takes 1.03 times the noise to a misfit of a quarter of it.
+/// The least misfit over the noise of a sample that stands out of it: together they are then 1.03 times that noise.
 const ROUGH: f64 = 0.25;
 
 /// Part of the surface that may lie on the volume's border without a word.
@@ -190,6 +190,11 @@ fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
 /// The borders of a volume.
 const SIDES: [[&str; 2]; 3] = [["first x", "last x"], ["first y", "last y"], ["first z", "last z"]];
 
+/// How it is said that a region's modulus is open.
+pub fn not_determined(name: &str) -> String {
+    format!("the data do not determine the modulus of {name}")
+}
+
 /// What to know before trusting the moduli. `area` is that of the loaded patch (mm^2).
 pub fn warnings(
     level: &Level,
@@ -215,7 +220,7 @@ pub fn warnings(
             Some("upper") => "its value is an upper bound",
             _ => "its value is a lower bound",
         };
-        out.push(format!("the data do not determine the modulus of {}: {value}", r.name));
+        out.push(format!("{}: {value}", not_determined(&r.name)));
     }
     for (r, change) in regions.iter().zip(mesh_change).filter(|(r, c)| r.identifiable && c.abs() > 0.15) {
         let percent = 100.0 * change.exp_m1();

@@ -21,11 +21,11 @@ pub type Said<'a> = (&'a RegionStiffness, f64);
 /// entry holds all frames; empty where none determines the region.
 pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
     let value = |r: &RegionStiffness| [r.youngs_modulus, r.ratio][which];
-    let one = |(r, motion): &Said<'_>| {
+    let one = |&(r, motion): &Said<'_>| {
         let (value, sd) = [(r.youngs_modulus, r.sd), (r.ratio, r.ratio_sd)][which];
         let data = r.data_sd[which].max(LEAST);
         let model = ((sd / value).powi(2) - data * data).max(0.0).sqrt();
-        Frame { log: value.ln(), data, model, weighed_as: model, motion: *motion }
+        Frame { log: value.ln(), data, model, weighed_as: model, motion }
     };
     let mut seen: Vec<Frame> = frames.iter().filter(|(r, _)| r.identifiable && value(r) > 0.0).map(one).collect();
     even_out(&mut seen);
@@ -35,16 +35,17 @@ pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
 /// Puts what the common parts are by the frames' motion in the place of what each frame claims: a power of it from -1 (errors of
 /// so many mm) to 0 (of so many per cent) by least squares of logarithms, and the same for frames that differ by [`ALIKE`].
 fn even_out(frames: &mut [Frame]) {
-    let known: Vec<[f64; 2]> =
-        frames.iter().filter(|f| f.model > 0.0 && f.motion > 0.0).map(|f| [f.motion.ln(), f.model.ln()]).collect();
-    if known.len() < frames.len() {
-        return;
-    }
+    let is_known = |v: f64| v.is_finite() && v > 0.0;
+    let known: Vec<[f64; 2]> = frames
+        .iter()
+        .filter(|f| is_known(f.model) && is_known(f.motion))
+        .map(|f| [f.motion.ln(), f.model.ln()])
+        .collect();
     let mean = |a: usize| known.iter().map(|k| k[a]).sum::<f64>() / known.len().max(1) as f64;
     let middle = [mean(0), mean(1)];
     let moment = |a: usize| known.iter().map(|k| (k[0] - middle[0]) * (k[a] - middle[a])).sum::<f64>();
     let power = (moment(1) / moment(0).max(f64::MIN_POSITIVE)).clamp(-1.0, 0.0);
-    for f in &mut *frames {
+    for f in frames.iter_mut().filter(|f| is_known(f.model) && is_known(f.motion)) {
         f.model = (middle[1] + power * (f.motion.ln() - middle[0])).exp();
     }
     let least = frames.iter().fold(f64::INFINITY, |m, f| m.min(f.model));
@@ -58,18 +59,19 @@ fn gain(frames: &[Frame]) -> Gain {
     let own = frames.iter().zip(&weights).map(|(f, w)| (w * f.data).powi(2)).sum::<f64>();
     // The mean of frames has a part of each one's noise, and what is common moves frames apart where it weighs more in one than in another.
     let off = |f: &Frame, w: f64| {
-        let expected = f.data.powi(2) * (1.0 - 2.0 * w) + own + (f.model - model).powi(2);
-        (f.log - log).powi(2) / expected.max(f64::MIN_POSITIVE)
+        let others = (own - (w * f.data).powi(2)).max(0.0);
+        let expected = (f.data * (1.0 - w)).powi(2) + others + (f.model - model).powi(2);
+        // A frame that is the mean tells nothing of how far it is from it.
+        (expected > 1e-6 * f.data * f.data).then(|| (f.log - log).powi(2) / expected)
     };
     let root = |least: f64| {
         let counted: Vec<f64> =
-            frames.iter().zip(&weights).filter(|(_, w)| **w >= least).map(|(f, w)| off(f, *w)).collect();
-        if counted.len() > 1 { (counted.iter().sum::<f64>() / counted.len() as f64).sqrt() } else { 1.0 }
+            frames.iter().zip(&weights).filter(|(_, w)| **w >= least).filter_map(|(f, w)| off(f, *w)).collect();
+        if counted.is_empty() { 1.0 } else { (counted.iter().sum::<f64>() / counted.len() as f64).sqrt() }
     };
     // Frames that do not count in the mean do not widen it.
     let (disagreement, among) = (root(0.0), root(f64::MIN_POSITIVE));
-    let (own, model) = (own.sqrt(), sum(&|f| f.weighed_as));
-    let (value, data) = (log.exp(), among.max(1.0) * own);
+    let (value, data) = (log.exp(), among.max(1.0) * own.sqrt());
     let weighed = weights.iter().filter(|w| **w > 0.0).count();
     Gain { frames: frames.len(), weighed, value, sd: value * data.hypot(model), data_sd: value * data, disagreement }
 }
