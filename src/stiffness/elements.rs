@@ -5,7 +5,7 @@
 //! shear modulus jumps.
 
 use crate::numerics::tetrahedron::{self, shapes, slopes};
-use crate::types::space::determinant;
+use crate::types::space::{cross, determinant, dot};
 
 const A: f64 = 0.585_410_196_624_968_5;
 const B: f64 = 0.138_196_601_125_010_5;
@@ -49,20 +49,53 @@ pub fn points(p: &[[f64; 3]; 10]) -> [Point; 4] {
     })
 }
 
-/// Barycentric coordinates of the place `x` (mm) in the element of nodes `p`, by Newton's method from the straight element;
+/// Coordinates in a tetrahedron of straight edges.
+#[derive(Debug, Clone, Copy)]
+pub struct Straight {
+    origin: [f64; 3],
+    /// Gradients of the second to fourth barycentric coordinate (1/mm).
+    gradient: [[f64; 3]; 3],
+}
+
+impl Straight {
+    /// That of the element's corners, the first four of its nodes `p` (mm).
+    pub fn of(p: &[[f64; 3]; 10]) -> Self {
+        let edges = [1, 2, 3].map(|b| std::array::from_fn(|a| p[b][a] - p[0][a]));
+        Self { origin: p[0], gradient: across(&edges) }
+    }
+
+    /// Barycentric coordinates of the place `x` (mm).
+    pub fn at(&self, x: [f64; 3]) -> [f64; 4] {
+        let d: [f64; 3] = std::array::from_fn(|a| x[a] - self.origin[a]);
+        let [b, c, e] = self.gradient.map(|g| dot(g, d));
+        [1.0 - b - c - e, b, c, e]
+    }
+}
+
+/// Rows of the inverse of the matrix of these columns; not finite where they lie in a plane.
+fn across(columns: &[[f64; 3]; 3]) -> [[f64; 3]; 3] {
+    let [a, b, c] = *columns;
+    let rows = [cross(b, c), cross(c, a), cross(a, b)];
+    let det = dot(a, rows[0]);
+    rows.map(|row| row.map(|v| v / det))
+}
+
+/// Barycentric coordinates of the place `x` (mm) in the element of nodes `p`, by Newton's method from those in the straight element;
 /// none when it does not converge.
-pub fn locate(p: &[[f64; 3]; 10], x: [f64; 3]) -> Option<[f64; 4]> {
-    let mut l = [0.25; 4];
+pub fn locate(p: &[[f64; 3]; 10], x: [f64; 3], straight: &Straight) -> Option<[f64; 4]> {
+    let mut l = straight.at(x);
     for _ in 0..12 {
         let n = shapes(l);
         let rest: [f64; 3] = std::array::from_fn(|a| x[a] - (0..10).map(|k| n[k] * p[k][a]).sum::<f64>());
         let j = tetrahedron::jacobian(p, &slopes(l));
-        let step = crate::numerics::dense::solve(&j, &rest)?;
+        let columns = std::array::from_fn(|b| std::array::from_fn(|a| j[a][b]));
+        let step = across(&columns).map(|row| dot(row, rest));
         for b in 0..3 {
             l[b + 1] += step[b];
         }
         l[0] = 1.0 - l[1] - l[2] - l[3];
-        if l.iter().any(|v| v.abs() > 4.0) {
+        // What is no number converges no more.
+        if !l.iter().all(|v| v.abs() <= 4.0) {
             return None;
         }
         if step.iter().all(|v| v.abs() < 1e-11) {

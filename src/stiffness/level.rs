@@ -4,7 +4,7 @@ use crate::error::StiffnessError;
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
-use crate::stiffness::elements::locate;
+use crate::stiffness::elements::{Straight, locate};
 use crate::stiffness::geometry::Edge;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::{Observation, find, from_field, from_matches, readings};
@@ -204,7 +204,8 @@ impl Level {
             let beside = |p: [f64; 3]| {
                 let &m = near.within(p, f64::INFINITY, 1).first()?;
                 let nodes = &from.body.cells[holder[m] as usize];
-                let l = locate(&nodes.map(|n| from.body.places[n as usize]), p)?;
+                let nodes = nodes.map(|n| from.body.places[n as usize]);
+                let l = locate(&nodes, p, &Straight::of(&nodes))?;
                 Some((holder[m], shapes(l))).filter(|_| l.iter().all(|v| *v > -1.0))
             };
             let mut x = vec![0.0; self.body.pattern.unknowns()];

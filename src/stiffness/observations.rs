@@ -2,13 +2,15 @@
 
 use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
-use crate::stiffness::elements::locate;
-use crate::types::space::{Matrix3, determinant};
+use crate::stiffness::elements::{Straight, locate};
 use crate::types::{Displacement, Mask, Match, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// Barycentric coordinates down to this count as inside an element.
 const SLACK: f64 = 1e-6;
+
+/// Least barycentric coordinate in the straight element of a place that may lie in the curved one.
+const BESIDE: f64 = -0.3;
 /// Samples of a dense field at most; blocks of voxels are averaged so that there are fewer.
 const SAMPLES: usize = 60_000;
 /// Every other corner of a cube.
@@ -115,8 +117,7 @@ pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
                 h[a] = h[a].max(p[a]);
             }
         }
-        let straight: Matrix3 = std::array::from_fn(|a| std::array::from_fn(|b| nodes[b + 1][a] - nodes[0][a]));
-        let det = determinant(&straight);
+        let straight = Straight::of(&nodes);
         let (c0, c1) = (cell(&l), cell(&h));
         let mut found = Vec::new();
         for z in c0[2]..=c1[2] {
@@ -125,11 +126,11 @@ pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
                     let k = key([x, y, z]);
                     for &i in &sorted[start[k] as usize..start[k + 1] as usize] {
                         let p = places[i as usize];
-                        if (0..3).any(|a| p[a] < l[a] - 0.1 || p[a] > h[a] + 0.1) || !near(&straight, det, nodes[0], p)
-                        {
+                        let is_beside = (0..3).any(|a| p[a] < l[a] - 0.1 || p[a] > h[a] + 0.1);
+                        if is_beside || straight.at(p).iter().any(|&v| v < BESIDE) {
                             continue;
                         }
-                        if let Some(b) = locate(&nodes, p).filter(|b| b.iter().all(|&v| v >= -SLACK)) {
+                        if let Some(b) = locate(&nodes, p, &straight).filter(|b| b.iter().all(|&v| v >= -SLACK)) {
                             found.push((i, shapes(b)));
                         }
                     }
@@ -146,22 +147,6 @@ pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
         }
     }
     out
-}
-
-/// Whether a place may lie in a curved element, by its coordinates in the straight one.
-fn near(j: &Matrix3, det: f64, origin: [f64; 3], p: [f64; 3]) -> bool {
-    let d: [f64; 3] = std::array::from_fn(|a| p[a] - origin[a]);
-    let mut sum = 0.0;
-    for b in 0..3 {
-        let mut m = *j;
-        (0..3).for_each(|a| m[a][b] = d[a]);
-        let l = determinant(&m) / det;
-        if l < -0.3 {
-            return false;
-        }
-        sum += l;
-    }
-    sum < 1.3
 }
 
 /// Those observations that lie in the body, ready to be read.
