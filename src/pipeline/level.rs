@@ -300,7 +300,7 @@ pub fn matches(
             smooth.as_slice()
         }
     };
-    let quick = room >= BLOCKS && (!params.thorough || pair.inside > MANY);
+    let quick = !params.thorough && room >= BLOCKS;
     let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, quick, params.points);
     let within = known.is_some().then_some(&pair.mask[..]);
     let room = if params.thorough && known.is_some() { room / 5.0 } else { room };
@@ -476,10 +476,6 @@ fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
 
 /// Voxels a point from which on corners are sought on blocks of two voxels.
 const BLOCKS: f64 = 100.0;
-
-/// Voxels of tissue from which on that is so for points that were asked for as well: two million blocks are more than enough of them, and the response
-/// of each voxel would take 4 bytes more of it.
-const MANY: usize = 20_000_000;
 
 /// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with less of it the window is
 /// narrower, which has more maxima. `quick` works the structure tensor out on blocks of two voxels, at an eighth of the cost.
