@@ -19,7 +19,7 @@ use crate::numerics::cholesky::Cholesky;
 use crate::numerics::exponential::{WHOLE, exp, ln};
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::simd::dispatch;
-use crate::numerics::statistics::{noise_sigma, percentile, robust_deviation};
+use crate::numerics::statistics::{noise_sigma, percentile, robust_deviation, stands_for_all};
 use rayon::prelude::*;
 
 /// Edge of a block (the finest axis' voxels).
@@ -41,10 +41,8 @@ const ABOVE_FLOOR: f64 = 3.0;
 /// Part of the blocks that may be 0 or negative, in volumes of brightness.
 const NOT_POSITIVE: f64 = 0.02;
 
-/// Blocks at most, about 25 times the terms; where there are more, those whose number times the golden ratio has the least fractions, which
-/// meets rows and slices alike.
+/// Blocks at most, about 25 times the terms.
 const BLOCKS: usize = 1000;
-const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that tell it. Where it is more than `OFFSET` of the
 /// percentile at the other end of both volumes, it may be that although no value is negative.
@@ -478,7 +476,7 @@ fn blocks(seen: &[BlockMeans], (zero, least): (Zero, [f64; 2]), factor: [usize; 
     let clear: Vec<_> =
         positive.into_iter().filter(|(_, b)| b.iter().zip(least).all(|(b, least)| *b > least)).collect();
     let share = BLOCKS as f64 / clear.len().max(1) as f64;
-    let thinned = clear.into_iter().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share);
+    let thinned = clear.into_iter().enumerate().filter(|(i, _)| stands_for_all(*i, share));
     let block =
         |(s, b): (&BlockMeans, [f64; 2])| Block { at: from_level(s.at, factor), log: b.map(f64::ln), weight: s.weight };
     Some(thinned.map(|(_, s)| block(s)).collect())

@@ -29,6 +29,12 @@ pub fn robust_deviation(values: impl Iterator<Item = f64>) -> f64 {
     1.4826 * f64::from(median(&mut off))
 }
 
+/// Whether number `i` is among the `share` (1) that stands for all: multiples of the golden ratio, which meet rows and slices alike.
+pub fn stands_for_all(i: usize, share: f64) -> bool {
+    const GOLDEN: f64 = 0.618_033_988_749_894_9;
+    (i as f64 * GOLDEN).fract() < share
+}
+
 /// The `q`-th percentile (0 to 100) with linear interpolation between order statistics, as numpy does by default.
 ///
 /// Reorders `values`; NaN sorts last. An empty slice gives NaN.

@@ -4,7 +4,7 @@ use crate::error::FieldError;
 use crate::field::jacobian::determinant_at;
 use crate::matching::levels::foreground;
 use crate::numerics::filters::mean_beside;
-use crate::numerics::statistics::quantile;
+use crate::numerics::statistics::{quantile, stands_for_all};
 use crate::pipeline::field::FEWEST;
 use crate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
@@ -246,14 +246,12 @@ const KEPT: f64 = 0.75;
 
 /// Voxels that are looked at for it.
 const SAMPLED: usize = 5000;
-const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// What to say where the tissue as a whole does not keep its volume: most often a header is wrong. Nothing of one slice.
 pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
     let inside = || (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0);
-    // Multiples of the golden ratio meet rows and slices alike.
     let share = SAMPLED as f64 / inside().count().max(1) as f64;
-    let some = inside().enumerate().filter(|(i, _)| (*i as f64 * GOLDEN).fract() < share);
+    let some = inside().enumerate().filter(|(i, _)| stands_for_all(*i, share));
     let volumes: Vec<f64> = some.map(|(_, o)| f64::from(determinant_at(field, o))).filter(|v| v.is_finite()).collect();
     let volume = volumes.iter().sum::<f64>() / volumes.len().max(1) as f64;
     let kept = field.grid().is_single_slice() || volumes.is_empty() || (KEPT..=1.0 / KEPT).contains(&volume);

@@ -7,7 +7,7 @@
 use crate::numerics::sampling::{Stencil, inside};
 use crate::numerics::statistics::noise_sigma;
 use crate::types::space::length;
-use crate::types::{Displacement, Grid, Mask, Voxels};
+use crate::types::{Displacement, Mask, Voxels};
 use rayon::prelude::*;
 
 /// How far apart the voxels that are looked at lie (the finest axis' voxels), and how many of them a block has along each axis, 64 in all; in one
@@ -45,8 +45,8 @@ pub(super) struct OutOfLine {
     pub share: f64,
     /// Mean distance from where the frames beside it have it (mm).
     pub apart_mm: f64,
-    /// The frames beside it.
-    pub beside: [Option<usize>; 2],
+    /// The frames beside it: the one before, and the one after unless it is the last.
+    pub beside: (usize, Option<usize>),
 }
 
 /// The frames in one direction from the reference, as they come.
@@ -61,11 +61,10 @@ pub(super) struct Course<'a, 'v> {
 
 impl<'a, 'v> Course<'a, 'v> {
     /// `reference` is number `origin`; `mask` lies on its grid.
-    pub fn new(reference: &'a Voxels<'a>, mask: Option<&Mask>, origin: usize) -> Self {
-        let mut blocks = blocks(reference.grid(), mask);
+    pub fn new(reference: &'a Voxels<'a>, mask: &Mask, origin: usize) -> Self {
+        let mut blocks = blocks(mask);
         let values = reference.as_slice();
-        let noise =
-            f64::from(noise_sigma(values, reference.grid().shape(), |o| mask.is_none_or(|m| m.as_slice()[o] != 0)));
+        let noise = f64::from(noise_sigma(values, reference.grid().shape(), |o| mask.as_slice()[o] != 0));
         // Where there is no texture any field looks alike.
         blocks.retain(|block| {
             let mean = block.iter().map(|&o| f64::from(values[o])).sum::<f64>() / block.len() as f64;
@@ -138,7 +137,7 @@ impl<'a, 'v> Course<'a, 'v> {
         let unborne = count(&alone);
         (unborne > SHARE * all && unborne > OF_THOSE * out).then(|| {
             let sum: f64 = told.iter().filter(|t| alone(&t.1)).filter_map(|t| Some(t.0 as f64 * t.1?.0)).sum();
-            let beside = [Some(before.number), next.map(|n| n.number)];
+            let beside = (before.number, next.map(|n| n.number));
             (own.number, OutOfLine { share: unborne / all, apart_mm: sum / unborne, beside })
         })
     }
@@ -164,15 +163,15 @@ impl<'a, 'v> Course<'a, 'v> {
 impl OutOfLine {
     /// In words, for a frame's warnings.
     pub fn why(&self) -> String {
-        let beside: Vec<String> = self.beside.iter().flatten().map(usize::to_string).collect();
+        let beside = match self.beside {
+            (before, Some(after)) => format!("frames {before} and {after} have"),
+            (before, None) => format!("frame {before} has"),
+        };
         format!(
-            "{:.0} % of the tissue lies {:.1} mm on the mean from where frame{} {} {} it, and the image does not bear that out there: a void, an \
+            "{:.0} % of the tissue lies {:.1} mm on the mean from where {beside} it, and the image does not bear that out there: a void, an \
              artefact or blur; do not trust this frame there",
             (100.0 * self.share).max(1.0),
             self.apart_mm,
-            if beside.len() > 1 { "s" } else { "" },
-            beside.join(" and "),
-            if beside.len() > 1 { "have" } else { "has" },
         )
     }
 }
@@ -189,8 +188,9 @@ fn correlation(pairs: &[[f64; 2]]) -> f64 {
     if size > 0.0 { moment(0, 1) / size } else { 0.0 }
 }
 
-/// Blocks of the mask (of everything without one).
-fn blocks(grid: &Grid, mask: Option<&Mask>) -> Vec<Vec<usize>> {
+/// Blocks of the mask.
+fn blocks(mask: &Mask) -> Vec<Vec<usize>> {
+    let grid = mask.grid();
     let (shape, spacing) = (grid.shape(), grid.spacing());
     let step = spacing.map(|s| ((EVERY as f64 * grid.least_spacing() / s).round() as usize).max(1));
     let along = if grid.is_single_slice() { 2 * ALONG } else { ALONG };
@@ -201,7 +201,7 @@ fn blocks(grid: &Grid, mask: Option<&Mask>) -> Vec<Vec<usize>> {
     for (k, j) in along(2).flat_map(|k| along(1).map(move |j| (k, j))) {
         for i in along(0) {
             let at = grid.index(i, j, k);
-            if mask.is_none_or(|m| m.as_slice()[at] != 0) {
+            if mask.as_slice()[at] != 0 {
                 all[i / side[0] + count[0] * (j / side[1] + count[1] * (k / side[2]))].push(at);
             }
         }
@@ -214,7 +214,7 @@ fn blocks(grid: &Grid, mask: Option<&Mask>) -> Vec<Vec<usize>> {
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{Affine, DenseField, Volume, WorldPoint};
+    use crate::types::{Affine, DenseField, Grid, Volume, WorldPoint};
 
     fn grid() -> Grid {
         Grid::new([40, 36, 32], Affine::scaled([1.0, 1.0, 1.25], [3.0, -4.0, 5.0]).unwrap()).unwrap()
@@ -245,7 +245,8 @@ mod tests {
                 (true, None) => ((at * 7919) % 50) as f32,
             }
         });
-        let mut course = Course::new(&reference, None, 0);
+        let all = Mask::filled(g, 1);
+        let mut course = Course::new(&reference, &all, 0);
         let sigma = |_: usize| 0.1;
         assert_eq!(course.add(2, (&field(2.0, 0.0), &sigma), reference.view()), None);
         let second = course.add(3, (&field(3.0, 3.0), &sigma), seen.view());
@@ -263,7 +264,8 @@ mod tests {
         let g = grid();
         let noisy = |seed: usize| Volume::from_voxels(g, move |at, _| ((at + seed) * 7919 % 101) as f32);
         let (reference, seen) = (noisy(0), noisy(5));
-        let mut course = Course::new(&reference, None, 0);
+        let all = Mask::filled(g, 1);
+        let mut course = Course::new(&reference, &all, 0);
         let field = DenseField::from_fn(g, |_| [3.0, 0.0, 0.0]);
         assert_eq!(course.add(1, (&field, &|_| 0.1), seen), None);
         assert_eq!(course.end(), None);

@@ -12,6 +12,7 @@ use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
 use crate::types::*;
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::time::Instant;
 
@@ -83,14 +84,13 @@ pub fn run<'v, E: From<FieldError>>(
     progress: Progress<'_>,
 ) -> Result<Tracked, E> {
     // Without a mask it is tissue that counts, not air.
-    let tissue = mask.is_none().then(|| foreground(reference));
-    let inside = mask.or(tissue.as_ref());
-    let regions = regions(reference, if labels.is_some() { mask } else { inside }, labels);
+    let tissue = mask.map_or_else(|| Cow::Owned(foreground(reference)), Cow::Borrowed);
+    let regions = regions(reference, if labels.is_some() { mask } else { Some(&*tissue) }, labels);
     let mut tracker = Tracker::new(reference, mask, params);
     let mut points = Points::new(frames);
     let mut tracked = Tracked::default();
     let mut refused = None;
-    let mut course = Course::new(reference, inside, origin);
+    let mut course = Course::new(reference, &tissue, origin);
     let order = (origin + 1..frames).chain((0..origin).rev());
     for (done, number) in order.enumerate() {
         if number + 1 == origin {
