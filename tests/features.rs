@@ -4,8 +4,8 @@
 #[path = "fixtures/truth.rs"]
 mod truth;
 
-use palpate::features::{Corner, HarrisParams, response, spread};
-use palpate::numerics::filters;
+use palpate::features::{Corner, HarrisParams, block_response, corners, response, spread};
+use palpate::numerics::{filters, pyramid};
 use truth::{normals, sampled, voxels, with_threads};
 
 const CUBE: [usize; 3] = [32, 32, 32];
@@ -215,6 +215,26 @@ fn found_places_are_maxima_and_a_plateau_counts_once() {
         flat[i] = 2.0;
     }
     assert_eq!(spread(&flat, shape, MM, None, 10, 0.0).len(), 1);
+}
+
+/// Corners are sought some slices at a time, so that the response of a large volume is never held.
+#[test]
+fn corners_by_slabs_are_those_of_the_whole_response() {
+    let spacing = [1.0, 1.1, 1.3];
+    for (deep, step) in [(1, [1; 3]), (3, [1; 3]), (23, [1; 3]), (24, [1; 3]), (25, [1; 3]), (49, [1; 3]), (97, [2; 3])]
+    {
+        let shape = [21, 18, deep];
+        let data = filters::bspline(&normals(shape.iter().product(), 5 + deep as u64), shape);
+        let blocks = pyramid::reduced_shape(shape, step);
+        let mask: Vec<u8> = voxels(blocks).map(|p| u8::from(p[0] > 4)).collect();
+        let r = block_response(&data, shape, spacing, 1.0, step);
+        let edges = std::array::from_fn(|a| spacing[a] * step[a] as f64);
+        for (mask, wanted) in [(None, 60), (Some(&mask[..]), 100_000)] {
+            let whole = spread(&r, blocks, edges, mask, wanted, 1e-3);
+            assert!(deep == 3 || whole.len() > if deep == 1 { 2 } else { 20 }, "{deep} slices: {}", whole.len());
+            assert_eq!(corners(&data, (shape, spacing), (1.0, step), mask, wanted, 1e-3), whole, "{deep} slices");
+        }
+    }
 }
 
 #[test]

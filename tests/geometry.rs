@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::numerics::sampling::displacement;
-use palpate::pipeline::field::{FieldResult, run};
+use palpate::pipeline::field::{FieldResult, run, run_lent};
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom};
 use palpate::types::{Affine, FieldParams, Grid, Mask, Volume, VoxelPoint};
 
@@ -75,7 +75,28 @@ fn the_48_orientations_of_either_volume_give_one_field() {
         let there = b.grid().affine().to_voxel(a.grid().world(i, j, k)).0.map(|x| x.round() as usize);
         let offset = b.grid().index(there[0], there[1], there[2]);
         assert!((a.as_slice()[at] - b.as_slice()[offset]).abs() < 1e-4);
-        assert!((found.uncertainty.at(offset) - b.as_slice()[offset]).abs() < 1e-5);
+        let unlike = |at: usize| (found.uncertainty.at(at) - b.as_slice()[at]).abs() > 1e-5;
+        assert!(!(0..b.grid().len()).step_by(31).any(unlike), "{here:?}");
+    }
+}
+
+/// The command line lends its volumes, so that those whose axes run otherwise are not held twice.
+#[test]
+fn lent_volumes_give_the_same_field_and_come_back() {
+    let params = PhantomParams { motion: MotionKind::Smooth, amplitude: 3.0, ..PhantomParams::new(PhantomKind::Block) };
+    let p = pair(&params.sized(28));
+    for (here, there) in
+        [(([0, 1, 2], 0), ([0, 1, 2], 0)), (([0, 1, 2], 3), ([0, 1, 2], 3)), (([2, 0, 1], 5), ([1, 0, 2], 2))]
+    {
+        let initial = stored(&p.initial, here.0, flips(here.1));
+        let deformed = stored(&p.deformed, there.0, flips(there.1));
+        let mask = stored(&p.mask, here.0, flips(here.1));
+        let wanted = measure(&initial, &deformed, &mask);
+        let (found, back) =
+            run_lent(initial.clone(), deformed.clone(), Some(&mask), &FieldParams::default(), &|_, _| {}).unwrap();
+        assert_eq!(back, [initial, deformed]);
+        assert_eq!(found.displacement, wanted.displacement);
+        assert_eq!(found.uncertainty.volume(), wanted.uncertainty.volume());
     }
 }
 

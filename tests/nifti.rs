@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::io::{
-    Series, count_non_finite, read_field, read_header, read_labels, read_mask, read_volume, write_field,
-    write_integers, write_labels, write_volume,
+    Series, count_non_finite, read_field, read_header, read_labels, read_mask, read_volume, write_by_rows, write_field,
+    write_integers, write_labels, write_steps, write_volume,
 };
 use palpate::types::{Affine, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
 use proptest::prelude::*;
@@ -565,6 +565,16 @@ fn volumes_labels_and_fields_come_back_on_the_same_grid() {
             for (a, b) in back.as_slice().iter().zip(volume.as_slice()) {
                 assert!((a - b).abs() <= b.abs() * 2f32.powi(-16), "{a} {b}");
             }
+        }
+        // The same bytes where rows are made while they are written: chunks end within rows.
+        let made = |first: usize, out: &mut [f32]| out.copy_from_slice(&volume.as_slice()[67 * first..][..out.len()]);
+        for (bits, name) in [(None, "v.nii"), (None, "v.nii.gz"), (Some(12), "s.nii.gz")] {
+            if let Some(bits) = bits {
+                write_steps(files.path(name), &volume, "a sine", bits).unwrap();
+            }
+            write_by_rows(files.path(&format!("rows_{name}")), &grid, "a sine", bits, &made).unwrap();
+            let [a, b] = [name.into(), format!("rows_{name}")].map(|n| std::fs::read(files.path(&n)).unwrap());
+            assert!(a == b, "{name}");
         }
         let raw = std::fs::read(files.path("v.nii")).unwrap();
         assert_eq!((raw[252], raw[254], raw[123]), (qform, 1, 2));

@@ -125,7 +125,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let read = started.elapsed().as_secs_f64();
 
     let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
-    let mut result = pipeline::field::run(&fixed, &moving, inside.as_ref(), &params, &|s, f| progress.set(s, f))
+    let set = |stage: &str, part| progress.set(stage, part);
+    let (mut result, [fixed, moving]) = pipeline::field::run_lent(fixed, moving, inside.as_ref(), &params, &set)
         .with_context(|| format!("{} to {}", names[0], names[1]))?;
     result.summary.seconds.insert(0, ("read".into(), read));
     result.summary.warnings.splice(0..0, warnings);

@@ -2,13 +2,15 @@
 
 use anyhow::Result;
 use clap::Args;
-use palpate::field::jacobian::{determinant_at, jacobian_determinant};
-use palpate::field::warp::warp_sampled;
+use palpate::error::IoError;
+use palpate::field::jacobian::{determinant_at, determinant_rows};
+use palpate::field::warp::{warp_rows, warped_at};
 use palpate::io::{self, OutputFolder};
 use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
 use palpate::report::{FieldReport, html, json};
-use palpate::types::{DenseField, FieldParams, Mask, Mesh, Metrics, Volume};
+use palpate::types::{DenseField, FieldParams, Grid, Mask, Mesh, Metrics, Volume};
+use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -72,92 +74,119 @@ pub struct Measured<'a> {
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
 }
 
+/// Voxels of a grid up to which what is made for a file is kept for the report. Of a larger one, files are made some rows at a time, and
+/// the report works out what it shows.
+const KEPT: usize = 2_000_000;
+
+/// A scalar over the result's grid: kept, or worked out where it is asked for.
+enum Layer<'a> {
+    Kept(Volume),
+    Made { grid: &'a Grid, rows: Box<dyn Fn(usize, &mut [f32]) + Sync + 'a>, at: Box<dyn Fn(usize) -> f32 + Sync + 'a> },
+}
+
+impl<'a> Layer<'a> {
+    /// Of the values of whole rows, from a row of the grid on, and of the value at a voxel offset.
+    fn new(
+        grid: &'a Grid,
+        rows: impl Fn(usize, &mut [f32]) + Sync + 'a,
+        at: impl Fn(usize) -> f32 + Sync + 'a,
+    ) -> Self {
+        if grid.len() > KEPT {
+            return Self::Made { grid, rows: Box::new(rows), at: Box::new(at) };
+        }
+        let mut volume = Volume::filled(*grid, 0.0);
+        volume.as_mut_slice().par_chunks_mut(grid.shape()[0]).enumerate().for_each(|(row, out)| rows(row, out));
+        Self::Kept(volume)
+    }
+
+    fn at(&self, offset: usize) -> f32 {
+        match self {
+            Self::Kept(volume) => volume.as_slice()[offset],
+            Self::Made { at, .. } => at(offset),
+        }
+    }
+
+    /// Writes it, rounded to multiples of 2^-`bits` where they are named.
+    fn write(&self, path: &Path, description: &str, bits: Option<i32>) -> Result<(), IoError> {
+        match (self, bits) {
+            (Self::Kept(volume), Some(bits)) => io::write_steps(path, volume, description, bits),
+            (Self::Kept(volume), None) => io::write_volume(path, volume, description),
+            (Self::Made { grid, rows, .. }, bits) => io::write_by_rows(path, grid, description, bits, rows),
+        }
+    }
+}
+
 /// Stages all files, adds the times of warping and writing to the summary, and gives the short summary for stdout back.
 pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &mut FieldResult) -> Result<String> {
     let Measured { command, names, initial, deformed, mask, params, truth } = measured;
-    // One volume at a time: each is made where it is written, so that few are held.
     let started = Instant::now();
-    let kept = write_volumes(folder, result)?;
+    let displacement = &result.displacement;
+    let grid = displacement.grid();
+    folder.write("displacement.nii.gz", |p| io::write_field(p, displacement))?;
+    let rows = |first: usize, out: &mut [f32]| determinant_rows(displacement, first, out);
+    let jacobian = Layer::new(grid, rows, |offset| determinant_at(displacement, offset));
+    folder.write("jacobian.nii.gz", |p| jacobian.write(p, "palpate: Jacobian determinant", Some(13)))?;
+    let vague = &result.uncertainty;
+    let uncertainty = Layer::new(grid, |first, out| vague.rows(first, out), |offset| vague.at(offset));
+    let bits = io::length_bits(grid);
+    folder.write("uncertainty.nii.gz", |p| uncertainty.write(p, "palpate: 1 sigma of u, mm", Some(bits)))?;
+    folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
+    folder.write("mesh.vtu", |p| match &result.mesh {
+        Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
+        Mesh::Triangles(mesh) => io::write_tri_mesh(p, mesh, &result.node_displacement, &[]),
+    })?;
     let mut writing = started.elapsed();
+
     let started = Instant::now();
     let deformed_grid = *deformed.grid();
     let sampler = Sampler::owning(deformed, 0.0);
-    let warped = warp_sampled(&sampler, &deformed_grid, &result.displacement);
-    result.summary.seconds.push(("warp".into(), started.elapsed().as_secs_f64()));
+    let rows = |first: usize, out: &mut [f32]| warp_rows(&sampler, &deformed_grid, displacement, first, out);
+    let warped = Layer::new(grid, rows, |offset| warped_at(&sampler, &deformed_grid, displacement, offset));
+    let mut summary = result.summary.clone();
+    summary.seconds.push(("warp".into(), started.elapsed().as_secs_f64()));
 
     let started = Instant::now();
-    let still: Box<dyn Fn(usize) -> f32 + Sync> = if deformed_grid == *initial.grid() {
-        let values = sampler.at_centres();
-        Box::new(move |offset| values[offset])
-    } else {
-        Box::new(move |offset| {
+    let centres = (grid.len() <= KEPT && deformed_grid == *initial.grid()).then(|| sampler.at_centres());
+    let still = |offset: usize| match &centres {
+        Some(values) => values[offset],
+        None => {
             let [i, j, k] = initial.grid().voxel(offset);
             sampler.at(deformed_grid.affine().to_voxel(initial.grid().world(i, j, k)))
-        })
-    };
-    let [swelling, vague]: [Box<dyn Fn(usize) -> f32 + Sync>; 2] = match &kept {
-        Some([jacobian, uncertainty]) => [jacobian, uncertainty].map(|v| -> Box<dyn Fn(usize) -> f32 + Sync> {
-            let values = v.as_slice();
-            Box::new(move |offset| values[offset])
-        }),
-        None => {
-            let (field, uncertainty) = (&result.displacement, &result.uncertainty);
-            [Box::new(|offset| determinant_at(field, offset)), Box::new(|offset| uncertainty.at(offset))]
         }
     };
+    let [jacobian, uncertainty, seen] =
+        [&jacobian, &uncertainty, &warped].map(|layer| |offset: usize| layer.at(offset));
     let mut report = FieldReport {
         command,
         names,
         initial,
-        deformed: &*still,
+        deformed: &still,
         deformed_grid: &deformed_grid,
-        warped: &warped,
+        warped: &seen,
         mask,
         params,
-        displacement: &result.displacement,
-        jacobian: &*swelling,
-        uncertainty: &*vague,
+        displacement,
+        jacobian: &jacobian,
+        uncertainty: &uncertainty,
         matches: &result.matches,
         mesh: &result.mesh,
         node_displacement: &result.node_displacement,
-        summary: &result.summary,
+        summary: &summary,
         truth,
     };
     let (written, page) = rayon::join(
-        || folder.write("warped.nii.gz", |p| io::write_volume(p, &warped, "palpate: deformed at x + u(x)")),
+        || folder.write("warped.nii.gz", |p| warped.write(p, "palpate: deformed at x + u(x)", None)),
         || html::page(&report),
     );
     written?;
     let page = page?;
     folder.write("report.html", |p| io::write_text(p, &page))?;
-    let mut summary = result.summary.clone();
     writing += started.elapsed();
+    let mut summary = summary.clone();
     summary.seconds.push(("write".into(), writing.as_secs_f64()));
     report.summary = &summary;
     folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
     let text = palpate::report::text::field_summary(&report);
     result.summary = summary;
     Ok(text)
-}
-
-/// Voxels of a grid up to which what was made for a file is kept for the report; beyond, the report works it out where it shows it.
-const KEPT: usize = 2_000_000;
-
-/// Writes what does not depend on the volumes; Jacobian and uncertainty are given back where they are small.
-fn write_volumes(folder: &mut OutputFolder, result: &FieldResult) -> Result<Option<[Volume; 2]>> {
-    folder.write("displacement.nii.gz", |p| io::write_field(p, &result.displacement))?;
-    let small = result.displacement.grid().len() <= KEPT;
-    let jacobian = jacobian_determinant(&result.displacement);
-    folder.write("jacobian.nii.gz", |p| io::write_steps(p, &jacobian, "palpate: Jacobian determinant", 13))?;
-    let jacobian = small.then_some(jacobian);
-    let uncertainty = result.uncertainty.volume();
-    let bits = io::length_bits(uncertainty.grid());
-    folder.write("uncertainty.nii.gz", |p| io::write_steps(p, &uncertainty, "palpate: 1 sigma of u, mm", bits))?;
-    let kept = jacobian.map(|jacobian| [jacobian, uncertainty]);
-    folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
-    folder.write("mesh.vtu", |p| match &result.mesh {
-        Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
-        Mesh::Triangles(mesh) => io::write_tri_mesh(p, mesh, &result.node_displacement, &[]),
-    })?;
-    Ok(kept)
 }

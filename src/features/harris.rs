@@ -20,8 +20,9 @@ impl Default for HarrisParams {
     }
 }
 
-/// Slices worked on at once: bounds the memory of the six products.
+/// Slices worked on at once, and values of one product where slices are large: bounds the memory of the six products.
 const SLAB: usize = 24;
+const VALUES: usize = 5 << 20;
 
 /// Foerstner's measure `det M / trace(adj M) = 1 / trace(M^-1)` at each voxel, (intensity/mm)^2.
 ///
@@ -47,6 +48,21 @@ pub fn block_response(
     integration_sigma: f64,
     step: [usize; 3],
 ) -> Vec<f32> {
+    let mut out = Vec::with_capacity(reduced_shape(shape, step).iter().product());
+    slabs(smooth, shape, spacing, integration_sigma, step, |_, slab| out.extend_from_slice(slab));
+    out
+}
+
+/// As [`block_response`], some slices at a time, from the first to the last: calls `each` with the first of them and their values,
+/// and holds no others.
+pub fn slabs(
+    smooth: &[f32],
+    shape: [usize; 3],
+    spacing: [f64; 3],
+    integration_sigma: f64,
+    step: [usize; 3],
+    mut each: impl FnMut(usize, &[f32]),
+) {
     let [nx, ny, nz] = shape;
     let blocks = reduced_shape(shape, step);
     let plane = blocks[0] * blocks[1];
@@ -60,9 +76,10 @@ pub fn block_response(
     let halo = kernels[2].len();
     let flat = shape.contains(&1);
     let per_mm: [f32; 3] = std::array::from_fn(|a| (1.0 / spacing[a]) as f32);
-    let mut out = vec![0.0f32; blocks.iter().product()];
-    for start in (0..blocks[2]).step_by(SLAB) {
-        let end = (start + SLAB).min(blocks[2]);
+    let slab = (VALUES / plane).clamp(1, SLAB);
+    let mut out = vec![0.0f32; plane * slab.min(blocks[2])];
+    for start in (0..blocks[2]).step_by(slab) {
+        let end = (start + slab).min(blocks[2]);
         let (lo, hi) = (start.saturating_sub(halo), (end + halo).min(blocks[2]));
         let mut products: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; plane * (hi - lo)]);
         let [xx, yy, zz, xy, xz, yz] = products.each_mut().map(|p| p.par_chunks_mut(plane));
@@ -108,7 +125,8 @@ pub fn block_response(
         let part = [blocks[0], blocks[1], hi - lo];
         let m = products.map(|p| separable(&p, part, [&kernels[0], &kernels[1], &kernels[2]]));
         let skip = (start - lo) * plane;
-        out[start * plane..end * plane].par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
+        let out = &mut out[..plane * (end - start)];
+        out.par_chunks_mut(plane).enumerate().for_each(|(k, out)| {
             let at = skip + k * plane;
             let [xx, yy, zz, xy, xz, yz] = std::array::from_fn(|q| &m[q][at..at + plane]);
             dispatch(
@@ -120,8 +138,8 @@ pub fn block_response(
                 },
             );
         });
+        each(start, out);
     }
-    out
 }
 
 /// `det / trace(adj)` of `[xx, yy, zz, xy, xz, yz]`; with a flat axis (all its entries are zero) the 2 x 2 form.

@@ -7,4 +7,4 @@ pub mod harris;
 pub mod suppression;
 
 pub use harris::{HarrisParams, block_response, response};
-pub use suppression::{Corner, spread};
+pub use suppression::{Corner, corners, spread};

@@ -109,27 +109,34 @@ impl ScalarSpline {
         sum
     }
 
+    /// The grid it is asked for on.
+    pub fn grid(&self) -> &Grid {
+        self.stored.as_ref().map_or(&self.grid, |(grid, _)| grid)
+    }
+
+    /// The values of whole rows of voxels, from row `first` of the grid on (`j + ny k`).
+    pub fn rows(&self, first: usize, out: &mut [f32]) {
+        let [nx, ny, _] = self.grid().shape();
+        let (axis, backwards) = self.stored.as_ref().map_or((0, false), |(_, orientation)| orientation.along_rows());
+        let mut nodes = Vec::new();
+        for (row, out) in (first..).zip(out.chunks_exact_mut(nx)) {
+            let start = [0, row % ny, row / ny];
+            let voxel = self
+                .stored
+                .as_ref()
+                .map_or(start, |(grid, orientation)| self.grid.voxel(orientation.offset(grid.shape(), start)));
+            self.lattice.line(&self.values, axis, voxel, &mut nodes, out);
+            if backwards {
+                out.reverse();
+            }
+        }
+    }
+
     /// The value at every voxel.
     pub fn volume(&self) -> Volume {
-        let Self { grid, lattice, values, stored } = self;
-        let [nx, ny, _] = grid.shape();
-        let three: Vec<f32> = [&values[..]; 3].concat();
-        let mut out = Volume::filled(*grid, 0.0);
-        out.as_mut_slice().par_chunks_mut(nx * ny).enumerate().for_each(|(k, plane)| {
-            let slice = lattice.slice(&three, k);
-            let mut nodes = vec![0.0; lattice.nodes[0]];
-            dispatch(
-                #[inline(always)]
-                || {
-                    for (j, row) in plane.chunks_exact_mut(nx).enumerate() {
-                        lattice.row(&slice, 0, j, &mut nodes, row);
-                    }
-                },
-            );
-        });
-        match stored {
-            Some((grid, orientation)) => orientation.stored(&out, grid),
-            None => out,
-        }
+        let mut out = Volume::filled(*self.grid(), 0.0);
+        let nx = self.grid().shape()[0];
+        out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| self.rows(row, out));
+        out
     }
 }

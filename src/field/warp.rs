@@ -28,13 +28,20 @@ pub fn warp_image(
 
 /// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be sampled.
 pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>) -> Volume {
+    let nx = field.grid().shape()[0];
+    let mut out = Volume::filled(*field.grid(), 0.0);
+    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| warp_rows(sampler, image, field, row, out));
+    out
+}
+
+/// [`warp_sampled`] at whole rows of voxels, from row `first` of the field's grid on (`j + ny k`).
+pub fn warp_rows(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, first: usize, out: &mut [f32]) {
     let grid = field.grid();
     let [nx, ny, _] = grid.shape();
     let components: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
     let inverse = image.affine().inverse_linear();
     let place = |i, j, k| image.affine().to_voxel(grid.world(i, j, k)).0;
-    let mut out = Volume::filled(*grid, 0.0);
-    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| {
+    for (row, out) in (first..).zip(out.chunks_exact_mut(nx)) {
         let (j, k) = (row % ny, row / ny);
         let (start, next) = (place(0, j, k), place(1, j, k));
         dispatch(
@@ -56,8 +63,14 @@ pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_
                 }
             },
         );
-    });
-    out
+    }
+}
+
+/// [`warp_sampled`] at one voxel offset (x fastest).
+pub fn warped_at(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, offset: usize) -> f32 {
+    let [i, j, k] = field.grid().voxel(offset);
+    let to = field.grid().world(i, j, k).moved(field.at(offset).map(f64::from));
+    sampler.at(image.affine().to_voxel(to))
 }
 
 /// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not there.

@@ -87,7 +87,7 @@ pub use live::abandon;
 pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
 pub use nifti::{
-    PackedField, Series, length_bits, stored, stored_length, stored_steps, write_exact, write_field,
+    PackedField, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact, write_field,
     write_field_series, write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
 };
 pub use output::OutputFolder;

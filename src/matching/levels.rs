@@ -87,7 +87,7 @@ impl<'a> Aligned<'a> {
     pub fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
-        let mut mask = pyramid::reduce_mask(mask, self.shape, factor);
+        let mut mask = pyramid::reduce_mask(mask, self.shape, factor).into_owned();
         let moving = self.deformed(factor);
         let spacing = std::array::from_fn(|a| self.spacing[a] * factor[a] as f64);
         let noise = noise_sigma(&fixed, shape, |i| mask[i] != 0);

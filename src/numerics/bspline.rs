@@ -158,6 +158,12 @@ impl Lattice {
                 *o += w[m] * v;
             }
         }
+        self.along(nodes, out);
+    }
+
+    /// The values at the voxels of a row along x between nodes that are combined along the other axes.
+    #[inline(always)]
+    fn along(&self, nodes: &[f32], out: &mut [f32]) {
         if self.nodes[0] == 1 {
             out.fill(nodes[0]);
             return;
@@ -178,6 +184,39 @@ impl Lattice {
                 *o = w[0] * c[0] + w[1] * c[1] + w[2] * c[2] + w[3] * c[3];
             }
         }
+    }
+
+    /// One component at all voxels of the grid along `axis` through one of them. `nodes` is working memory.
+    pub fn line(&self, component: &[f32], axis: usize, voxel: [usize; 3], nodes: &mut Vec<f32>, out: &mut [f32]) {
+        let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
+        let [b, c] = [[1, 2], [0, 2], [0, 1]][axis];
+        let ((first_b, w_b), (first_c, w_c)) = (self.stencil(b, voxel[b]), self.stencil(c, voxel[c]));
+        nodes.clear();
+        nodes.resize(self.nodes[axis], 0.0);
+        dispatch(
+            #[inline(always)]
+            || {
+                for (m, l) in (0..self.taps(c)).flat_map(|m| (0..self.taps(b)).map(move |l| (m, l))) {
+                    let from = (first_b + l) * stride[b] + (first_c + m) * stride[c];
+                    let (w, values) = (w_b[l] * w_c[m], component[from..].iter().step_by(stride[axis]));
+                    for (o, v) in nodes.iter_mut().zip(values) {
+                        *o += w * v;
+                    }
+                }
+                if axis == 0 {
+                    return self.along(nodes, out);
+                }
+                if self.nodes[axis] == 1 {
+                    return out.fill(nodes[0]);
+                }
+                for (cell, out) in out.chunks_mut(self.step[axis]).enumerate() {
+                    let c = &nodes[cell..cell + 4];
+                    for (o, w) in out.iter_mut().zip(&self.phases[axis]) {
+                        *o = w[0] * c[0] + w[1] * c[1] + w[2] * c[2] + w[3] * c[3];
+                    }
+                }
+            },
+        );
     }
 
     /// Evaluates the field at every voxel: three planar components.

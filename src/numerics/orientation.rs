@@ -1,5 +1,6 @@
 //! How a grid's axes lie in space, and the same voxels stored with axes that run right, forward and up.
 
+use crate::error::SpaceError;
 use crate::types::{Affine, DenseField, Grid, Volume, VoxelPoint, Voxels};
 use rayon::prelude::*;
 
@@ -73,6 +74,17 @@ impl Orientation {
         self.inverse().steps(self.axis.map(|s| stored[s]))
     }
 
+    /// The canonical axis along which the stored rows (x) run, and whether they run backwards.
+    pub fn along_rows(&self) -> (usize, bool) {
+        let Self { axis, backwards } = self.inverse();
+        (axis[0], backwards[0])
+    }
+
+    /// As [`Orientation::turned`], of a volume that is let go.
+    pub fn turn(&self, stored: Volume) -> Volume {
+        if self.is_canonical() { stored } else { self.turned(&stored).into_volume() }
+    }
+
     /// The same voxels on the canonical grid, where they lie if that is theirs already.
     pub fn turned<'a, T: Copy + Default + Send + Sync + 'static>(&self, stored: &'a Voxels<'_, T>) -> Voxels<'a, T> {
         if self.is_canonical() {
@@ -91,13 +103,18 @@ impl Orientation {
         out
     }
 
-    /// A field of the canonical grid, as it is stored on `grid`; its components are along the world's axes on both.
-    pub fn stored_field(&self, canonical: &DenseField, grid: &Grid) -> DenseField {
-        let mut out = DenseField::zeros(*grid);
-        for (c, part) in out.as_mut_slice().chunks_exact_mut(grid.len()).enumerate() {
-            gather(canonical.component(c), part, grid.shape(), self.back(grid.shape()));
+    /// A field of the canonical grid, as it is stored on `grid`; its components are along the world's axes on both. Each is turned where
+    /// it is, so that no second field is held.
+    ///
+    /// # Errors
+    /// [`SpaceError`] when the grids have different numbers of voxels.
+    pub fn stored_field(&self, canonical: DenseField, grid: &Grid) -> Result<DenseField, SpaceError> {
+        let mut values = canonical.into_vec();
+        for part in values.chunks_exact_mut(grid.len()) {
+            let before = part.to_vec();
+            gather(&before, part, grid.shape(), self.back(grid.shape()));
         }
-        out
+        DenseField::from_vec(*grid, values)
     }
 
     /// The canonical offset of a stored voxel.

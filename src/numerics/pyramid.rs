@@ -22,11 +22,11 @@ pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [f
 }
 
 /// Blocks of which at least half the voxels are set.
-pub fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Vec<u8> {
+pub fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [u8]> {
     if factor == [1, 1, 1] {
-        return mask.to_vec();
+        return Cow::Borrowed(mask);
     }
-    blocks(mask, shape, factor, |m| f32::from(u8::from(m != 0)), |share| u8::from(share >= 0.5))
+    Cow::Owned(blocks(mask, shape, factor, |m| f32::from(u8::from(m != 0)), |share| u8::from(share >= 0.5)))
 }
 
 /// The part of each block's voxels that are `marked`.

@@ -148,8 +148,8 @@ impl<'a> Sampler<'a> {
     }
 
     /// The value at every voxel centre (x fastest).
-    pub fn at_centres(self) -> Vec<f32> {
-        let mut values = self.values.into_owned();
+    pub fn at_centres(&self) -> Vec<f32> {
+        let mut values = self.values.to_vec();
         if self.interpolation == Interpolation::Cubic {
             along_axes(&mut values, self.shape, refilter);
         }

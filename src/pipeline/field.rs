@@ -115,16 +115,44 @@ pub fn run_from(
 ) -> Result<FieldResult, FieldError> {
     let [here, there] = [initial, deformed].map(|v| Orientation::of(v.grid()));
     let (first, second) = (here.turned(initial), there.turned(deformed));
-    if here.is_canonical() {
-        return canonical(&first, &second, mask, params, starts, progress);
-    }
     check::mask_grid(initial, mask)?;
-    let mask = mask.map(|m| here.turned(m).into_volume());
-    let found = canonical(&first, &second, mask.as_ref(), params, starts, progress)?;
+    let turned = mask.filter(|_| !here.is_canonical()).map(|m| here.turned(m).into_volume());
+    let found = canonical(&first, &second, turned.as_ref().or(mask), params, starts, progress)?;
     drop((first, second));
-    let grid = initial.grid();
+    stored(found, here, initial.grid())
+}
+
+/// As [`run`], of volumes that are lent and come back: where their axes run otherwise they are turned meanwhile, so that none is held twice.
+///
+/// # Errors
+/// As [`run`].
+pub fn run_lent(
+    initial: Volume,
+    deformed: Volume,
+    mask: Option<&Mask>,
+    params: &FieldParams,
+    progress: Progress<'_>,
+) -> Result<(FieldResult, [Volume; 2]), FieldError> {
+    let grids = [*initial.grid(), *deformed.grid()];
+    let turns = grids.map(|g| Orientation::of(&g));
+    check::mask_grid(&initial, mask)?;
+    let [initial, deformed] = [turns[0].turn(initial), turns[1].turn(deformed)];
+    let turned = mask.filter(|_| !turns[0].is_canonical()).map(|m| turns[0].turned(m).into_volume());
+    let found = canonical(&initial, &deformed, turned.as_ref().or(mask), params, &[], progress)?;
+    drop(turned);
+    let found = stored(found, turns[0], &grids[0])?;
+    let back =
+        |turn: Orientation, volume: Volume, grid| if turn.is_canonical() { volume } else { turn.stored(&volume, grid) };
+    Ok((found, [back(turns[0], initial, &grids[0]), back(turns[1], deformed, &grids[1])]))
+}
+
+/// A result on the grid that the initial volume is stored on.
+fn stored(found: FieldResult, here: Orientation, grid: &Grid) -> Result<FieldResult, FieldError> {
+    if here.is_canonical() {
+        return Ok(found);
+    }
     Ok(FieldResult {
-        displacement: here.stored_field(&found.displacement, grid),
+        displacement: here.stored_field(found.displacement, grid)?,
         uncertainty: found.uncertainty.stored_on(*grid, here),
         ..found
     })

@@ -5,7 +5,7 @@ use crate::consistency::energy::{EnergyParams, Graph, distance};
 use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{Measured, prune};
 use crate::consistency::relaxation::relax;
-use crate::features::{Corner, HarrisParams, block_response, spread};
+use crate::features::{self, Corner, HarrisParams};
 use crate::matching::candidates::{CandidateParams, Side, candidates};
 use crate::matching::correlation::Searchable;
 use crate::matching::gain::GainField;
@@ -110,6 +110,8 @@ pub fn refine(
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     let mut warped = pair.unseen();
     for pass in 0..passes {
+        // Those of the pass before serve nobody any more.
+        field.blocks = Vec::new();
         pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
@@ -496,11 +498,8 @@ fn corners(
     let least = 0.002 * (f64::from(noise) / finest).powi(2) as f32;
     let halved = |a: usize| quick && shape[a] >= 24 && spacing[a] < 1.5 * finest;
     let step: [usize; 3] = std::array::from_fn(|a| if halved(a) { 2 } else { 1 });
-    let r = block_response(smooth, shape, spacing, sigma, step);
-    let blocks = pyramid::reduced_shape(shape, step);
     let inside = mask.map(|m| pyramid::reduce_mask(m, shape, step));
-    let coarse = std::array::from_fn(|a| spacing[a] * step[a] as f64);
-    let mut found = spread(&r, blocks, coarse, inside.as_deref(), wanted, least);
+    let mut found = features::corners(smooth, (shape, spacing), (sigma, step), inside.as_deref(), wanted, least);
     for corner in &mut found {
         corner.voxel = from_level(corner.voxel, step);
         corner.centre = std::array::from_fn(|a| (corner.voxel[a].round().max(0.0) as usize).min(shape[a] - 1));

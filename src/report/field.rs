@@ -1,6 +1,6 @@
 //! What the report of `palpate field` is made from.
 
-use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Volume, Voxels};
+use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Voxels};
 
 /// A value for each voxel offset (x fastest): a volume, or what can be worked out where a picture asks for it.
 pub type Values<'a> = &'a (dyn Fn(usize) -> f32 + Sync);
@@ -19,7 +19,7 @@ pub struct FieldReport<'a> {
     /// The grid the deformed volume came on.
     pub deformed_grid: &'a Grid,
     /// The deformed volume at x + u(x).
-    pub warped: &'a Volume,
+    pub warped: Values<'a>,
     /// The mask.
     pub mask: Option<&'a Mask>,
     /// What was asked for.
@@ -46,12 +46,12 @@ pub struct FieldReport<'a> {
 pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{Affine, Counts, LevelReport, Match, MotionModel, TetMesh, WorldPoint};
+    use crate::types::{Affine, Counts, LevelReport, Match, MotionModel, TetMesh, Volume, WorldPoint};
 
     /// A made-up result with known numbers.
     pub(crate) struct Case {
         pub(crate) initial: Volume,
-        pub(crate) warped: Volume,
+        pub(crate) warped: Value,
         pub(crate) deformed: Value,
         pub(crate) uncertainty: Value,
         pub(crate) displacement: DenseField,
@@ -107,8 +107,9 @@ pub(crate) mod tests {
                 seconds: vec![("features".into(), 1.0), ("matching".into(), 2.0)],
                 warnings: vec!["two of <three> slices are empty".into()],
             };
+            let same = initial.clone();
             Self {
-                warped: initial.clone(),
+                warped: Box::new(move |o| same.as_slice()[o]),
                 deformed: Box::new(|o| (o % 97) as f32),
                 uncertainty: Box::new(|_| 0.2),
                 displacement,
@@ -128,7 +129,7 @@ pub(crate) mod tests {
                 initial: &self.initial,
                 deformed: &*self.deformed,
                 deformed_grid: self.initial.grid(),
-                warped: &self.warped,
+                warped: &*self.warped,
                 mask: None,
                 params: &self.params,
                 displacement: &self.displacement,

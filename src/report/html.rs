@@ -108,9 +108,9 @@ fn look(report: &FieldReport<'_>, views: &Views) -> String {
         let [low, high] = range.map(|r| r / f64::from(gain));
         Scale { low, high, unit: "", map: ColorMap::Gray }
     };
-    let (initial, warped) = (report.initial.as_slice(), report.warped.as_slice());
-    let (initial, warped): (Values<'_>, Values<'_>) = (&|o| initial[o], &|o| warped[o]);
-    let images = [("initial", initial, 1.0), ("deformed", report.deformed, before), ("warped", warped, after)]
+    let initial = report.initial.as_slice();
+    let initial: Values<'_> = &|o| initial[o];
+    let images = [("initial", initial, 1.0), ("deformed", report.deformed, before), ("warped", report.warped, after)]
         .map(|(name, values, gain)| Layer { name, values, scale: scale(gain) });
     let coloured =
         |name: &'static str, panel: &Panel, values| panel.scale.clone().map(|scale| Layer { name, values, scale });

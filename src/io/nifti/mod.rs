@@ -23,6 +23,6 @@ mod write;
 
 pub use series::Series;
 pub use write::{
-    PackedField, length_bits, stored, stored_length, stored_steps, write_exact, write_field, write_field_series,
-    write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
+    PackedField, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact, write_field,
+    write_field_series, write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
 };

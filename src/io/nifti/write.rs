@@ -8,8 +8,10 @@ use crate::io::gzip::{Chunk, Member, Run};
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::fs::File;
 use std::io::Write;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// NIfTI's code of a symmetric matrix a voxel.
@@ -54,6 +56,36 @@ pub fn write_steps(path: impl AsRef<Path>, volume: &Volume, description: &str, b
     let form = Form { description, ..Form::FLOATS };
     let step = stored_steps(bits);
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| step(v).to_le_bytes()).map(drop)
+}
+
+/// As [`write_volume`], or as [`write_steps`] where `bits` are named, of values that are worked out while they are written: `rows` gives
+/// those of whole rows from row `first` of the grid on (`j + ny k`). Of a large volume no more than some rows are ever held.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_by_rows(
+    path: impl AsRef<Path>,
+    grid: &Grid,
+    description: &str,
+    bits: Option<i32>,
+    rows: &(dyn Fn(usize, &mut [f32]) + Sync),
+) -> Result<(), IoError> {
+    let nx = grid.shape()[0];
+    let made = |_: usize, range: Range<usize>| {
+        let (first, end) = (range.start / nx, range.end.div_ceil(nx));
+        let mut values = vec![0.0f32; nx * (end - first)];
+        rows(first, &mut values);
+        values.truncate(range.end - nx * first);
+        values.drain(..range.start - nx * first);
+        Cow::Owned(values)
+    };
+    let form = Form { description, ..Form::FLOATS };
+    let step = bits.map(stored_steps);
+    let kept = |_: usize, v: f32| match step {
+        Some(step) => step(v).to_le_bytes(),
+        None => stored(v).to_le_bytes(),
+    };
+    write_made(path.as_ref(), grid, form, 1, made, kept).map(drop)
 }
 
 /// Writes a volume as int16, each value rounded to the nearest whole number: half the size of [`write_volume`].
@@ -232,19 +264,33 @@ fn write<T: Copy + Sync, const N: usize>(
     parts: &[&[T]],
     stored: impl Fn(usize, T) -> [u8; N] + Sync,
 ) -> Result<Vec<Run>, IoError> {
+    write_made(path, grid, form, parts.len(), |part, range| Cow::Borrowed(&parts[part][range]), stored)
+}
+
+/// As [`write`], of parts some of whose values are made at a time: `made` gives those of a range of a part.
+fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
+    path: &Path,
+    grid: &Grid,
+    form: Form<'_>,
+    parts: usize,
+    made: impl Fn(usize, Range<usize>) -> Cow<'a, [T]> + Sync,
+    stored: impl Fn(usize, T) -> [u8; N] + Sync,
+) -> Result<Vec<Run>, IoError> {
     let name = path.to_string_lossy().to_lowercase();
     let pack = name.ends_with(".nii.gz");
     if !pack && !name.ends_with(".nii") {
         return Err(Flaw::new("only NIfTI can be written", "end the name in .nii or .nii.gz").at(path));
     }
     let header = header(grid, &form).map_err(|flaw| flaw.at(path))?;
-    let chunks: Vec<(usize, &[T])> =
-        parts.iter().enumerate().flat_map(|(p, values)| values.chunks(CHUNK).map(move |c| (p, c))).collect();
-    let bytes = |&(part, values): &(usize, &[T])| -> Vec<u8> {
+    let all = grid.len();
+    let ranges = (0..all).step_by(CHUNK).map(|from| from..(from + CHUNK).min(all));
+    let chunks: Vec<(usize, Range<usize>)> = (0..parts).flat_map(|p| ranges.clone().map(move |r| (p, r))).collect();
+    let bytes = |(part, range): &(usize, Range<usize>)| -> Vec<u8> {
+        let (part, values) = (*part, made(*part, range.clone()));
         let mut bytes = vec![0; N * values.len()];
         dispatch(
             #[inline(always)]
-            || bytes.as_chunks_mut::<N>().0.iter_mut().zip(values).for_each(|(b, &v)| *b = stored(part, v)),
+            || bytes.as_chunks_mut::<N>().0.iter_mut().zip(&*values).for_each(|(b, &v)| *b = stored(part, v)),
         );
         bytes
     };
