@@ -73,6 +73,8 @@ fn in_slabs(pair: &Pair<'_>, lattice: &Lattice, coefficients: &[f32], slab: usiz
     if !fields.is_steep() {
         return None;
     }
+    // A warped volume and a slab of the field are never held at once.
+    fields.held = None;
     let gain = GainField::measure(pair, &pair.warp(lattice, coefficients, &pair.spans));
     let sparse = fields.look(&gain, &SURVEYED, 2, &pair.mask, SOME)?;
     let mut worth = vec![0u8; pair.fixed.len()];

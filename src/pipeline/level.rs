@@ -155,10 +155,14 @@ pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
     coupling::determined(&energy, field.coupled_at, &field.blocks, seed, 30).iter().sum::<f64>().max(12.0)
 }
 
-/// The excess misfit of a map against the free field, from every fourth slice of a thick volume, with the information
-/// that correlated noise leaves.
+/// The excess misfit of a map against the free field, from every fourth slice of a thick volume, every eighth of a very thick one, with
+/// the information that correlated noise leaves.
 pub fn excess<'a>(pair: &'a Pair<'a>, field: &'a SplineField) -> impl Fn(&AffineMotion) -> f64 + 'a {
-    let every = if pair.shape.iter().all(|&n| n >= 48) { 4 } else { 1 };
+    let every = match pair.shape.into_iter().min().unwrap_or(1) {
+        0..48 => 1,
+        48..256 => 4,
+        _ => 8,
+    };
     // Of the slices between nothing is held.
     let some = pair.within(pair.spans.slices(|k| k % every == every / 2));
     let free = Baseline::new(&some, some.warp_sparsely(&field.lattice, &field.coefficients));
