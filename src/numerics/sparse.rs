@@ -329,6 +329,23 @@ impl<'a> Factor<'a> {
         Ok(())
     }
 
+    /// As [`Factor::solve`] without refinement, for steps whose residual is worked out anew: to about five digits, or as far as the matrix
+    /// nearby goes.
+    ///
+    /// # Errors
+    /// [`Singular`] when the solution is not finite.
+    pub fn step(&self, x: &mut [f64]) -> Result<(), Singular> {
+        match &self.values {
+            Values::Single(values) => {
+                let mut step: Vec<f32> = x.iter().map(|&v| v as f32).collect();
+                self.pattern.substitute(values, &mut step)?;
+                x.iter_mut().zip(step).for_each(|(x, step)| *x = f64::from(step));
+            }
+            Values::Double(values) => self.pattern.substitute(values, x)?,
+        }
+        if x.iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Singular) }
+    }
+
     fn better(&self) -> Result<&Self, Singular> {
         let matrix = || Arc::clone(&self.matrix);
         let make = || if self.nearby { self.pattern.factor(matrix()) } else { self.pattern.exact_factor(matrix()) };

@@ -264,7 +264,7 @@ impl<'a> Problem<'a> {
         for _ in 0..STEPS {
             let mut step = self.residual(&x)?;
             step.iter_mut().for_each(|v| *v = -*v);
-            factor.solve(&mut step).ok()?;
+            factor.step(&mut step).ok()?;
             x.iter_mut().zip(&step).for_each(|(v, s)| *v += s);
             let size = self.size(&step);
             if size < precision {

@@ -4,7 +4,7 @@ use crate::error::StiffnessError;
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
-use crate::stiffness::elements::{Straight, locate};
+use crate::stiffness::elements::Mapping;
 use crate::stiffness::geometry::Edge;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::{Observation, find, from_field, from_matches, readings};
@@ -205,7 +205,7 @@ impl Level {
                 let &m = near.within(p, f64::INFINITY, 1).first()?;
                 let nodes = &from.body.cells[holder[m] as usize];
                 let nodes = nodes.map(|n| from.body.places[n as usize]);
-                let l = locate(&nodes, p, &Straight::of(&nodes))?;
+                let l = Mapping::of(&nodes).locate(p)?;
                 Some((holder[m], shapes(l))).filter(|_| l.iter().all(|v| *v > -1.0))
             };
             let mut x = vec![0.0; self.body.pattern.unknowns()];

@@ -2,7 +2,7 @@
 
 use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
-use crate::stiffness::elements::{Straight, locate};
+use crate::stiffness::elements::Mapping;
 use crate::types::{Displacement, Mask, Match, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
@@ -117,7 +117,7 @@ pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
                 h[a] = h[a].max(p[a]);
             }
         }
-        let straight = Straight::of(&nodes);
+        let mapping = Mapping::of(&nodes);
         let (c0, c1) = (cell(&l), cell(&h));
         let mut found = Vec::new();
         for z in c0[2]..=c1[2] {
@@ -127,10 +127,10 @@ pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
                     for &i in &sorted[start[k] as usize..start[k + 1] as usize] {
                         let p = places[i as usize];
                         let is_beside = (0..3).any(|a| p[a] < l[a] - 0.1 || p[a] > h[a] + 0.1);
-                        if is_beside || straight.at(p).iter().any(|&v| v < BESIDE) {
+                        if is_beside || mapping.straight(p).iter().any(|&v| v < BESIDE) {
                             continue;
                         }
-                        if let Some(b) = locate(&nodes, p, &straight).filter(|b| b.iter().all(|&v| v >= -SLACK)) {
+                        if let Some(b) = mapping.locate(p).filter(|b| b.iter().all(|&v| v >= -SLACK)) {
                             found.push((i, shapes(b)));
                         }
                     }
