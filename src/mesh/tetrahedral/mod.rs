@@ -23,6 +23,7 @@ pub mod smoothing;
 pub mod curving;
 
 use crate::error::MeshError;
+use crate::numerics::tetrahedron::EDGES;
 use crate::types::{Grid, Mask, QuadraticMesh, VoxelPoint, WorldPoint};
 use cutting::Cut;
 use levels::Levels;
@@ -152,7 +153,13 @@ impl Mesher {
     /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this fineness itself.
     pub fn nodes(&self, fineness: &Fineness, detail: Detail<'_>) -> Option<usize> {
         let lattice = self.lattice(fineness, detail, &self.halvings(fineness));
-        build(&lattice, &self.levels, detail.wall).ok().map(|made| made.places.len())
+        let cut = cut_up(&lattice, &self.levels, detail.wall).ok()?;
+        // One in the middle of each edge.
+        let mut edges: Vec<[u32; 2]> =
+            cut.cells.iter().flat_map(|c| EDGES.map(|[i, j]| [c[i].min(c[j]), c[i].max(c[j])])).collect();
+        edges.sort_unstable();
+        edges.dedup();
+        Some(cut.places.len() + edges.len())
     }
 
     fn cubes(&self, fineness: &Fineness) -> lattice::Octree {
@@ -210,7 +217,8 @@ struct Made {
     part: Vec<u8>,
 }
 
-fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) -> Result<Made, MeshError> {
+/// Tetrahedra along all surfaces, where they were cut.
+fn cut_up(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) -> Result<Cut, MeshError> {
     let mut cut = Cut::new(lattice.clone());
     let inside = cut.along(|p| levels.body(p), 1, |_, _| false);
     cut.retain(&inside);
@@ -230,7 +238,6 @@ fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) ->
         let edges = boundary_edges(&cut.cells);
         cut.along(wall, WALL, |a, b| cut_edge(&edges, a, b));
     }
-    smoothing::smooth(&mut cut);
     if cut.cells.len() < 4 {
         return Err(MeshError::TooFew { found: cut.places.len(), needed: 4 });
     }
@@ -239,6 +246,12 @@ fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) ->
     if !lost.is_empty() {
         return Err(MeshError::PartLost { labels: lost });
     }
+    Ok(cut)
+}
+
+fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) -> Result<Made, MeshError> {
+    let mut cut = cut_up(lattice, levels, wall)?;
+    smoothing::smooth(&mut cut);
     let (places, tetrahedra) = curving::quadratic(&cut, &cut.part, levels);
     Ok(Made { places, tetrahedra, part: cut.part })
 }
