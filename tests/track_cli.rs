@@ -105,6 +105,15 @@ fn volumes_and_a_series_give_the_same() {
     let mut head = [0; 70];
     std::io::Read::read_exact(&mut flate2::read::GzDecoder::new(&tensors[..]), &mut head).unwrap();
     assert_eq!((head[56..60].try_into().map(f32::from_le_bytes).unwrap(), head[68..70].to_vec()), (3.0, vec![237, 3]));
+    // What it wrote it knows again.
+    for (name, is) in [
+        ("displacement.nii.gz", "series of displacement fields"),
+        ("displacement_003.nii.gz", "displacement field"),
+        ("strain_003.nii.gz", "symmetric tensors"),
+    ] {
+        let (said, _) = run(&["info", results.join(name).to_str().unwrap()], 0);
+        assert!(said.contains(is) && !said.contains("does not read"), "{said}");
+    }
     // Each point stands once in the reference, where it was found, and its frame's own matches lie beside.
     let start: Vec<_> = points.iter().filter(|r| r[1] == "0").collect();
     let numbers: std::collections::HashSet<_> = points.iter().map(|r| &r[0]).collect();

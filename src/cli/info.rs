@@ -202,6 +202,18 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
             facts.values(&series.read(0)?);
             facts.does(&format!("palpate track {shown} -o TRACKED"));
         }
+        ImageKind::Fields => {
+            facts.is("series of displacement fields");
+            let frames = stored.axes.get(3).copied().unwrap_or(1);
+            facts.add("frames", frames.to_string(), frames.into());
+            facts.does(
+                "palpate stiffness --sequence TRACKED -o STIFFNESS    # with the folder that palpate track wrote",
+            );
+        }
+        ImageKind::Tensors => {
+            facts.is("symmetric tensors, such as strain");
+            facts.add("components", "xx xy yy xz yz zz, axes LPS".into(), 6.into());
+        }
         ImageKind::Other => {
             facts.is("image of another kind");
             let shape = times(stored.grid.shape());

@@ -71,6 +71,10 @@ pub enum ImageKind {
     Field,
     /// Volumes one after the other.
     Series,
+    /// Displacement fields one after the other, as `palpate track` writes them.
+    Fields,
+    /// Symmetric tensors, as `palpate track` writes strain.
+    Tensors,
     /// Something that palpate does not read.
     Other,
 }
@@ -89,6 +93,8 @@ pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoErro
                 [1, 3, ..] => ImageKind::Field,
                 [3] if intent == 2006 => ImageKind::Field,
                 [_] => ImageKind::Series,
+                [_, 3] if intent == 1007 => ImageKind::Fields,
+                [1, 6] if intent == 1005 => ImageKind::Tensors,
                 _ => ImageKind::Other,
             };
             Ok((stored, kind))

@@ -83,16 +83,25 @@ pub fn normal_equations(
         dispatch(
             #[inline(always)]
             || {
+                // One by one: mapped arrays are functions of their own here, and took as long as the sums.
+                let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = &mut *rows;
                 // The first two rows hold gain and offset until they are overwritten.
-                let [xx, yy, ..] = &mut *rows;
                 gain.row(j, k, xx, yy);
-                let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = rows.each_mut().map(|r| &mut r[span.clone()]);
+                let cut_out = span.start..span.end;
+                let (xx, yy, zz) = (&mut xx[cut_out.clone()], &mut yy[cut_out.clone()], &mut zz[cut_out.clone()]);
+                let (xy, xz, yz) = (&mut xy[cut_out.clone()], &mut xz[cut_out.clone()], &mut yz[cut_out.clone()]);
+                let (rx, ry, rz) = (&mut rx[cut_out.clone()], &mut ry[cut_out.clone()], &mut rz[cut_out]);
                 let f = &pair.fixed_smooth[here..][..n];
                 let w = &warped[here..][..n];
                 let mask = &pair.mask[here..][..n];
-                let [[fx0, fx1], [fy0, fy1], [fz0, fz1]] =
-                    sides.map(|(l, r)| [l, r].map(|s| &pair.fixed_smooth[s..][..n]));
-                let [[wx0, wx1], [wy0, wy1], [wz0, wz1]] = sides.map(|(l, r)| [l, r].map(|s| &warped[s..][..n]));
+                let [x, y, z] = sides;
+                let fixed = &pair.fixed_smooth[..];
+                let (fx0, fx1) = (&fixed[x.0..][..n], &fixed[x.1..][..n]);
+                let (fy0, fy1) = (&fixed[y.0..][..n], &fixed[y.1..][..n]);
+                let (fz0, fz1) = (&fixed[z.0..][..n], &fixed[z.1..][..n]);
+                let (wx0, wx1) = (&warped[x.0..][..n], &warped[x.1..][..n]);
+                let (wy0, wy1) = (&warped[y.0..][..n], &warped[y.1..][..n]);
+                let (wz0, wz1) = (&warped[z.0..][..n], &warped[z.1..][..n]);
                 for i in 0..n {
                     let (a, b) = (xx[i], yy[i]);
                     let r = f[i] - (a * w[i] + b);

@@ -198,9 +198,15 @@ impl Lattice {
             || {
                 for (m, l) in (0..self.taps(c)).flat_map(|m| (0..self.taps(b)).map(move |l| (m, l))) {
                     let from = (first_b + l) * stride[b] + (first_c + m) * stride[c];
-                    let (w, values) = (w_b[l] * w_c[m], component[from..].iter().step_by(stride[axis]));
-                    for (o, v) in nodes.iter_mut().zip(values) {
-                        *o += w * v;
+                    let (w, values) = (w_b[l] * w_c[m], &component[from..]);
+                    if axis == 0 {
+                        for (o, v) in nodes.iter_mut().zip(values) {
+                            *o += w * v;
+                        }
+                    } else {
+                        for (o, v) in nodes.iter_mut().zip(values.iter().step_by(stride[axis])) {
+                            *o += w * v;
+                        }
                     }
                 }
                 if axis == 0 {

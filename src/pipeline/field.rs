@@ -669,11 +669,11 @@ fn uncertainty(
     ScalarSpline::new(*grid, full, values)
 }
 
-/// Median and mean over the mask, from at most about 100,000 of its voxels.
+/// Median and mean over the mask, from at most about 25,000 of its voxels.
 fn average_inside(values: &ScalarSpline, mask: &Mask) -> (f64, f64) {
     let mask = mask.as_slice();
     let inside = || (0..mask.len()).filter(|&at| mask[at] != 0);
-    let step = (inside().count() / 100_000).max(1);
+    let step = (inside().count() / 25_000).max(1);
     let mut picked: Vec<f32> = inside().step_by(step).map(|at| values.at(at)).collect();
     let mean = picked.iter().map(|&v| f64::from(v)).sum::<f64>() / picked.len().max(1) as f64;
     (f64::from(median(&mut picked)), mean)
