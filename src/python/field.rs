@@ -72,7 +72,7 @@ pub fn field<'py>(
             initial: &fixed,
             deformed: &unseen,
             deformed_grid: &deformed_grid,
-            warped: &warped,
+            warped: &unseen,
             mask: mask.as_ref(),
             params: &params,
             displacement: &result.displacement,
