@@ -310,7 +310,7 @@ impl Lattice {
             slab
         };
         // A few cells at a time, from the last to the first: each node plane sums them in that order, however many these are.
-        let most = CELLS.max(4 * rayon::current_num_threads());
+        let most = CELLS.max(2 * rayon::current_num_threads());
         let mut out = vec![0.0f32; Q * total];
         let mut end = nz.div_ceil(self.step[2]);
         while end > 0 {

@@ -18,8 +18,9 @@ use std::path::{Path, PathBuf};
 const SYMMETRIC: i16 = 1005;
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
 const CHUNK: usize = 1 << 18;
-/// Chunks that are held packed at a time, for each thread.
-const BATCH: usize = 6;
+/// Chunks that are held packed at a time: of few threads six for each, of many two.
+const BATCH: [usize; 2] = [6, 2];
+const FEW: usize = 4;
 /// Bits of a float32's mantissa that a volume keeps (of 23).
 const MANTISSA_BITS: u32 = 15;
 /// Lengths are multiples of 2^-12 mm where no voxel edge is under a quarter of a millimetre.
@@ -314,7 +315,9 @@ fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
             })
         };
         let mut ready = Vec::new();
-        for batch in chunks.chunks(BATCH * rayon::current_num_threads()) {
+        let threads = rayon::current_num_threads();
+        let held = (BATCH[0] * threads.min(FEW)).max(BATCH[1] * threads);
+        for batch in chunks.chunks(held) {
             let (written, packed) = rayon::join(
                 || add(&ready),
                 || batch.par_iter().map(|chunk| (chunk.0, Chunk::new(&bytes(chunk)))).collect(),
