@@ -609,6 +609,20 @@ fn a_fingertip_touches_the_plate_where_it_would_go_through_it() {
     assert!(bone.youngs_modulus < body.modulus(bone.label));
 }
 
+/// A body pressed from above that is held where a mask says so.
+fn held_where(
+    held: impl Fn([f64; 3]) -> bool + Sync,
+    map: &Mask,
+    field: &DenseField,
+    params: &StiffnessParams,
+) -> StiffnessResult {
+    let mask = Mask::from_voxels(*map.grid(), |_, p| u8::from(held(p.0)));
+    let (held, load) = (Place::Mask(Box::new(mask), "held.nii.gz".into()), Place::Side(Side::parse("z+").unwrap()));
+    let names = |l: u8| format!("region {l}");
+    let inputs = Inputs { field, matches: None, labels: map, labelled: true, held: &held, load: &load, names: &names };
+    run(&inputs, params, &|_, _| {}).unwrap()
+}
+
 /// A mask of the held side that leaves out a quarter of it made moduli 20 % too high without a word.
 #[test]
 fn a_held_side_that_its_mask_covers_in_part_is_warned_of() {
@@ -618,22 +632,9 @@ fn a_held_side_that_its_mask_covers_in_part_is_warned_of() {
         let (h, bulge) = ((p.0[2] - 1.5) / 16.0, 0.2 * (1.0 - ((p.0[2] - 9.5) / 8.0).powi(2)));
         [bulge * (p.0[0] - 9.5) / 8.0, bulge * (p.0[1] - 9.5) / 8.0, -0.8 * h]
     });
-    let load = Place::Side(Side::parse("z+").unwrap());
-    let names = |l: u8| format!("region {l}");
     let params = StiffnessParams { nodes: 3000, ..Default::default() };
     for (part, warned) in [(18.0, false), (14.0, true)] {
-        let mask = Mask::from_voxels(grid([20, 20, 20], 1.0), |_, p| u8::from(p.0[2] < 3.0 && p.0[0] < part));
-        let held = Place::Mask(Box::new(mask), "held.nii.gz".into());
-        let inputs = Inputs {
-            field: &field,
-            matches: None,
-            labels: &map,
-            labelled: true,
-            held: &held,
-            load: &load,
-            names: &names,
-        };
-        let result = run(&inputs, &params, &|_, _| {}).unwrap();
+        let result = held_where(|p| p[2] < 3.0 && p[0] < part, &map, &field, &params);
         let said = result.warnings.iter().any(|w| w.contains("beside the held patch"));
         assert_eq!(said, warned, "{:?}", result.warnings);
     }
@@ -660,24 +661,10 @@ fn what_one_label_hides_is_warned_of_though_there_is_noise() {
 #[test]
 fn a_body_held_at_a_tenth_of_what_is_pressed_is_asked_about() {
     let map = labels([20, 20, 20], 1.0, |p| u8::from(p.iter().all(|v| (2.0..18.0).contains(v))));
-    let field = squeezed(0.05, 0.45);
-    let names = |l: u8| format!("region {l}");
-    let load = Place::Side(Side::parse("z+").unwrap());
     let params = StiffnessParams { nodes: 2000, ..Default::default() };
     for (side, warned) in [(16.0, false), (4.0, true)] {
         let held = |p: [f64; 3]| p[2] < 3.0 && (0..2).all(|a| (p[a] - 9.5).abs() < 0.5 * side);
-        let mask = Mask::from_voxels(*map.grid(), |_, p| u8::from(held(p.0)));
-        let held = Place::Mask(Box::new(mask), "held.nii.gz".into());
-        let inputs = Inputs {
-            field: &field,
-            matches: None,
-            labels: &map,
-            labelled: true,
-            held: &held,
-            load: &load,
-            names: &names,
-        };
-        let result = run(&inputs, &params, &|_, _| {}).unwrap();
+        let result = held_where(held, &map, &squeezed(0.05, 0.45), &params);
         assert_eq!(result.warnings.iter().any(|w| w.contains("the other way round")), warned, "{:?}", result.warnings);
     }
 }
