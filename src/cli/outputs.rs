@@ -10,7 +10,6 @@ use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
 use palpate::report::{FieldReport, html, json};
 use palpate::types::{DenseField, FieldParams, Grid, Mask, Mesh, Metrics, Volume};
-use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -94,9 +93,7 @@ impl<'a> Layer<'a> {
         if grid.len() > KEPT {
             return Self::Made { grid, rows: Box::new(rows), at: Box::new(at) };
         }
-        let mut volume = Volume::filled(*grid, 0.0);
-        volume.as_mut_slice().par_chunks_mut(grid.shape()[0]).enumerate().for_each(|(row, out)| rows(row, out));
-        Self::Kept(volume)
+        Self::Kept(Volume::by_rows(*grid, rows))
     }
 
     fn at(&self, offset: usize) -> f32 {

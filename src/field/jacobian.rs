@@ -10,10 +10,7 @@ use rayon::prelude::*;
 
 /// The Jacobian determinant of x + u(x) with respect to world mm (1): 1 = volume kept, at or below 0 = folded.
 pub fn jacobian_determinant(field: &DenseField) -> Volume {
-    let nx = field.grid().shape()[0];
-    let mut out = Volume::filled(*field.grid(), 1.0f32);
-    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| determinant_rows(field, row, out));
-    out
+    Volume::by_rows(*field.grid(), |first, out| determinant_rows(field, first, out))
 }
 
 /// [`jacobian_determinant`] of whole rows of voxels, from row `first` of the grid on (`j + ny k`).

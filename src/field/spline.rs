@@ -134,9 +134,6 @@ impl ScalarSpline {
 
     /// The value at every voxel.
     pub fn volume(&self) -> Volume {
-        let mut out = Volume::filled(*self.grid(), 0.0);
-        let nx = self.grid().shape()[0];
-        out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| self.rows(row, out));
-        out
+        Volume::by_rows(*self.grid(), |first, out| self.rows(first, out))
     }
 }

@@ -8,7 +8,6 @@ use crate::numerics::cubic::LANES;
 use crate::numerics::sampling::{Interpolation, Sampler, displacement, inside, nearest};
 use crate::numerics::simd::dispatch;
 use crate::types::{Displacement, Grid, Volume, Voxels, WorldPoint};
-use rayon::prelude::*;
 
 /// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background` outside the image.
 pub fn warp_image(
@@ -28,10 +27,7 @@ pub fn warp_image(
 
 /// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be sampled.
 pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>) -> Volume {
-    let nx = field.grid().shape()[0];
-    let mut out = Volume::filled(*field.grid(), 0.0);
-    out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, out)| warp_rows(sampler, image, field, row, out));
-    out
+    Volume::by_rows(*field.grid(), |first, out| warp_rows(sampler, image, field, first, out))
 }
 
 /// [`warp_sampled`] at whole rows of voxels, from row `first` of the field's grid on (`j + ny k`).

@@ -87,10 +87,10 @@ pub fn normal_equations(
                 let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = &mut *rows;
                 // The first two rows hold gain and offset until they are overwritten.
                 gain.row(j, k, xx, yy);
-                let cut_out = span.start..span.end;
-                let (xx, yy, zz) = (&mut xx[cut_out.clone()], &mut yy[cut_out.clone()], &mut zz[cut_out.clone()]);
-                let (xy, xz, yz) = (&mut xy[cut_out.clone()], &mut xz[cut_out.clone()], &mut yz[cut_out.clone()]);
-                let (rx, ry, rz) = (&mut rx[cut_out.clone()], &mut ry[cut_out.clone()], &mut rz[cut_out]);
+                let (from, to) = (span.start, span.end);
+                let (xx, yy, zz) = (&mut xx[from..to], &mut yy[from..to], &mut zz[from..to]);
+                let (xy, xz, yz) = (&mut xy[from..to], &mut xz[from..to], &mut yz[from..to]);
+                let (rx, ry, rz) = (&mut rx[from..to], &mut ry[from..to], &mut rz[from..to]);
                 let f = &pair.fixed_smooth[here..][..n];
                 let w = &warped[here..][..n];
                 let mask = &pair.mask[here..][..n];

@@ -116,7 +116,7 @@ pub fn run_from(
     let [here, there] = [initial, deformed].map(|v| Orientation::of(v.grid()));
     let (first, second) = (here.turned(initial), there.turned(deformed));
     check::mask_grid(initial, mask)?;
-    let turned = mask.filter(|_| !here.is_canonical()).map(|m| here.turned(m).into_volume());
+    let turned = turned_mask(mask, here);
     let found = canonical(&first, &second, turned.as_ref().or(mask), params, starts, progress)?;
     drop((first, second));
     stored(found, here, initial.grid())
@@ -137,13 +137,18 @@ pub fn run_lent(
     let turns = grids.map(|g| Orientation::of(&g));
     check::mask_grid(&initial, mask)?;
     let [initial, deformed] = [turns[0].turn(initial), turns[1].turn(deformed)];
-    let turned = mask.filter(|_| !turns[0].is_canonical()).map(|m| turns[0].turned(m).into_volume());
+    let turned = turned_mask(mask, turns[0]);
     let found = canonical(&initial, &deformed, turned.as_ref().or(mask), params, &[], progress)?;
     drop(turned);
     let found = stored(found, turns[0], &grids[0])?;
     let back =
         |turn: Orientation, volume: Volume, grid| if turn.is_canonical() { volume } else { turn.stored(&volume, grid) };
     Ok((found, [back(turns[0], initial, &grids[0]), back(turns[1], deformed, &grids[1])]))
+}
+
+/// The mask as the initial volume is turned; none where it is right as it lies.
+fn turned_mask(mask: Option<&Mask>, here: Orientation) -> Option<Mask> {
+    mask.filter(|_| !here.is_canonical()).map(|m| here.turned(m).into_volume())
 }
 
 /// A result on the grid that the initial volume is stored on.

@@ -48,13 +48,21 @@ impl<T: Clone> Volume<T> {
     where
         T: Send + Sync + Default,
     {
-        let mut out = Self::filled(grid, T::default());
         let [nx, ny, _] = grid.shape();
-        out.as_mut_slice().par_chunks_mut(nx).enumerate().for_each(|(row, line)| {
+        Self::by_rows(grid, |row, line| {
             for (i, v) in line.iter_mut().enumerate() {
                 *v = f(row * nx + i, grid.world(i, row % ny, row / ny));
             }
-        });
+        })
+    }
+
+    /// What `f` fills each row of voxels with, by its number (`j + ny k`), in parallel: `f` must not depend on the order of calls.
+    pub fn by_rows(grid: Grid, f: impl Fn(usize, &mut [T]) + Sync) -> Self
+    where
+        T: Send + Sync + Default,
+    {
+        let mut out = Self::filled(grid, T::default());
+        out.as_mut_slice().par_chunks_mut(grid.shape()[0]).enumerate().for_each(|(row, line)| f(row, line));
         out
     }
 
