@@ -5,6 +5,7 @@ use crate::field::jacobian::determinant_at;
 use crate::matching::levels::foreground;
 use crate::numerics::filters::mean_beside;
 use crate::numerics::statistics::{quantile, stands_for_all};
+use crate::pipeline::background::{Cut, hidden, is_empty};
 use crate::pipeline::field::FEWEST;
 use crate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
@@ -21,8 +22,8 @@ pub struct Checked<'a> {
     pub not_finite: [usize; 2],
     /// Slices of the two that are lost, as places along an axis (mm, RAS).
     pub lost: [Vec<LostSlice>; 2],
-    /// Of the two, the part of the voxels beside the background that is as bright as tissue, where the background was cut.
-    pub cut: [Option<f64>; 2],
+    /// Backgrounds of the two that a cut through tissue made.
+    pub cut: [Option<Cut>; 2],
 }
 
 /// A slice that holds one value throughout, with tissue going on at both its sides.
@@ -70,18 +71,21 @@ pub fn inputs<'a>(
     enough_slices(initial.grid())?;
     let not_finite = ranges.each_ref().map(|r| r.not_finite);
     let lost = [initial, deformed].map(lost_slices);
-    let cut = [initial, deformed].map(cut_background);
+    let cut = [initial, deformed].map(Cut::of);
+    // Where one was cut, the 0 beside tissue in the other is none to match with.
+    let empty = [initial, deformed].map(|v| cut.iter().any(Option::is_some) && is_empty(v));
     // In one slice there are 8 around a voxel, not 26.
     let least = |volume: &Voxels<'_>| if volume.grid().shape().contains(&1) { AROUND / 3 } else { AROUND };
     let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume, least(&volume)) } else { volume };
-    let mut first = fill(unseen_background(bridged(initial, &lost[0]), cut[0]), not_finite[0] > 0 || cut[0].is_some());
-    let bad = not_finite[1] > 0 || !lost[1].is_empty() || cut[1].is_some();
-    let second = fill(without(unseen_background(deformed.view(), cut[1]), &lost[1]), bad);
+    let hide = |volume: Voxels<'a>, empty: bool| if empty { drawn_on(hidden(volume)) } else { volume };
+    let mut first = fill(hide(bridged(initial, &lost[0]), empty[0]), not_finite[0] > 0 || empty[0]);
+    let bad = not_finite[1] > 0 || !lost[1].is_empty() || empty[1];
+    let second = fill(without(hide(deformed.view(), empty[1]), &lost[1]), bad);
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
-    if not_finite[0] > 0 || cut[0].is_some() {
+    if not_finite[0] > 0 || empty[0] {
         first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
         for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
-            if !v.is_finite() || cut[0].is_some() && *v == 0.0 {
+            if !v.is_finite() || empty[0] && *v == 0.0 {
                 *m = 0;
             }
         }
@@ -93,81 +97,6 @@ pub fn inputs<'a>(
     let (initial, spread) = in_range(first, &ranges[0], None);
     let (deformed, _) = in_range(second, &ranges[1], Some(spread));
     Ok(Checked { mask, initial, deformed, not_finite, lost, cut })
-}
-
-/// Part of a volume that a background of 0 takes at least.
-const BACKGROUND: f64 = 0.02;
-
-/// Part of the voxels beside a background of 0 that is as bright as tissue from which it was cut: where tissue ends in air it is 0 in
-/// phantoms without noise and 0.1 to 0.25 beside padding, where a mask cut through tissue 0.48 to 0.91.
-const CUT: f64 = 0.4;
-
-/// Part of the tissue's median intensity that is as bright as tissue.
-const BRIGHT: f32 = 0.5;
-
-/// The part of the voxels beside the background that is as bright as tissue, where the background is 0 by a cut through tissue (a mask, a
-/// skull taken off): its edge is none of the tissue, and moves with the mask.
-fn cut_background(volume: &Voxels<'_>) -> Option<f64> {
-    let values = volume.as_slice();
-    let empty = values.par_iter().filter(|v| **v == 0.0).count();
-    if (empty as f64) < BACKGROUND * values.len() as f64 {
-        return None;
-    }
-    let mut shown: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
-    shown.retain(|v| v.is_finite());
-    let [low, high] = [0.02, 0.98].map(|q| quantile(&mut shown, q));
-    shown.retain(|v| *v > low + 0.1 * (high - low));
-    if shown.is_empty() {
-        return None;
-    }
-    let bright = BRIGHT * quantile(&mut shown, 0.5);
-    let [nx, ny, nz] = volume.grid().shape();
-    let plane = |k: usize| -> [usize; 2] {
-        let mut sums = [0; 2];
-        let mut beside = |a: f32, b: f32| {
-            if (a == 0.0) != (b == 0.0) {
-                sums[0] += usize::from(a.max(b) > bright);
-                sums[1] += 1;
-            }
-        };
-        for j in 0..ny {
-            let from = nx * (j + ny * k);
-            for i in from..from + nx {
-                let along = [(i + 1 < from + nx, 1), (j + 1 < ny, nx), (k + 1 < nz, nx * ny)];
-                along.into_iter().filter(|a| a.0).for_each(|(_, step)| beside(values[i], values[i + step]));
-            }
-        }
-        sums
-    };
-    let [lit, all] = (0..nz).into_par_iter().map(plane).reduce(|| [0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
-    let part = lit as f64 / all.max(1) as f64;
-    (part > CUT).then_some(part)
-}
-
-/// The volume with a background that was cut as voxels that are not finite.
-fn unseen_background<'a>(mut volume: Voxels<'a>, cut: Option<f64>) -> Voxels<'a> {
-    if cut.is_some() {
-        volume.as_mut_slice().par_iter_mut().filter(|v| **v == 0.0).for_each(|v| *v = f32::NAN);
-        for _ in 0..DRAWN_ON {
-            volume = filled(&volume, 1);
-        }
-    }
-    volume
-}
-
-/// Voxels by which tissue is drawn on past a cut, so that patches beside it can be matched and no edge stands there. Of five legs and small
-/// blocks that were cut, 0, 1, 2 and 3 left 0.13, 0.08, 0.12 and 0.34 mm of a press, 0.59, 0.49, 0.45 and 0.61 of 6 mm; without any of them
-/// small bodies keep too few matches.
-const DRAWN_ON: usize = 2;
-
-/// What to say of a background that was cut.
-pub fn why_unseen(cut: [Option<f64>; 2]) -> Option<String> {
-    let of = |(part, volume): (Option<f64>, &str)| {
-        part.map(|p| format!("{:.0} % of what borders on it in the {volume} volume is as bright as tissue", 100.0 * p))
-    };
-    let parts: Vec<String> = cut.into_iter().zip(["initial", "deformed"]).filter_map(of).collect();
-    (!parts.is_empty())
-        .then(|| format!("background: 0 by a cut through tissue, taken as not seen ({})", parts.join("; ")))
 }
 
 /// So many slices in a row may be lost: more of one value lie between two bodies.
@@ -339,6 +268,19 @@ impl Range {
 
 /// Finite neighbours that a single voxel without a number needs to get one.
 const AROUND: usize = 13;
+
+/// Voxels by which tissue is drawn on past a cut, so that patches beside it can be matched and no edge stands there. Of five legs and small
+/// blocks that were cut, 0, 1, 2 and 3 left 0.13, 0.08, 0.12 and 0.34 mm of a press, 0.59, 0.49, 0.45 and 0.61 of 6 mm; without any of them
+/// small bodies keep too few matches.
+const DRAWN_ON: usize = 2;
+
+/// The volume with what shows drawn on a little into what does not.
+fn drawn_on(mut volume: Voxels<'_>) -> Voxels<'_> {
+    for _ in 0..DRAWN_ON {
+        volume = filled(&volume, 1);
+    }
+    volume
+}
 
 /// With the mean of the finite voxels around it in each that has no number and at least `least` of them.
 fn filled(volume: &Voxels<'_>, least: usize) -> Volume {

@@ -31,6 +31,7 @@ pub mod pressed;
 
 pub mod stress;
 
+mod background;
 mod course;
 mod farther;
 mod finer;

@@ -104,6 +104,7 @@ pub(crate) mod tests {
                 max_mm: 2.2,
                 uncertainty_median_mm: 0.2,
                 unseen: 0.0,
+                in_doubt: false,
                 seconds: vec![("features".into(), 1.0), ("matching".into(), 2.0)],
                 warnings: vec!["two of <three> slices are empty".into()],
             };

@@ -45,7 +45,7 @@ const UNSEEN: f64 = 0.25;
 
 /// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under 100 matches, folds in
 /// more than one voxel of a thousand, a median uncertainty above that edge, or one above the mean motion of a free field, and where
-/// more than a quarter of the tissue moves out of the deformed volume; high when nothing folds, the median uncertainty is under
+/// more than a quarter of the tissue moves out of the deformed volume or the field is in doubt; high when nothing folds, the median uncertainty is under
 /// half an edge, under a tenth of the voxels are uncertain by more than an edge, and nothing is warned of.
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     judge(report.initial.grid(), report.mask, report.uncertainty, report.summary)
@@ -81,6 +81,12 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
     }
     if s.unseen > UNSEEN {
         low.push(format!("{:.0} % of the tissue is not in the deformed volume", 100.0 * s.unseen));
+    }
+    if s.in_doubt {
+        low.push(
+            "features do not bear each other out, and the volumes stay different: another tissue, or another motion"
+                .into(),
+        );
     }
     let weak = format!(
         "{} % of the voxels are uncertain by more than a voxel ({} mm){side}",
@@ -236,6 +242,9 @@ mod tests {
         assert_eq!(vague.trust, Trust::Low);
         assert!(vague.reasons[0].contains("2.5 mm"));
         case.summary.uncertainty_median_mm = 0.2;
+        case.summary.in_doubt = true;
+        assert_eq!(verdict(&case.report()).trust, Trust::Low);
+        case.summary.in_doubt = false;
         case.summary.unseen = 0.4;
         let gone = verdict(&case.report());
         assert_eq!((gone.trust, gone.reasons[0].contains("40 %")), (Trust::Low, true));

@@ -88,6 +88,9 @@ pub struct FieldSummary {
     pub uncertainty_median_mm: f64,
     /// The part of the mask that lies outside the deformed volume after the motion, or where that is not finite (1).
     pub unseen: f64,
+    /// Whether fewer than half of the features agreed with their neighbours when the whole volume was searched, and the volumes stay different
+    /// by more than noise: another tissue, or another motion.
+    pub in_doubt: bool,
     /// Stage names and wall seconds, in order.
     pub seconds: Vec<(String, f64)>,
     /// What the user should know before trusting the result.
