@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Two people: how well the tissues of two brains lie on each other after each method, in one run.
 
-    people.py OUT_DIR FIXED:MASK MOVING[:MASK] [--palpate BIN] [--methods NAME ...] [--spacing MM] [--strip]
+    people.py OUT_DIR FIXED:MASK MOVING[:MASK] [--palpate BIN] [--methods NAME ...] [--spacing MM] [--strip] [--rigid]
 
-Volumes are NIfTI (T1). MOVING is first laid on FIXED by an affine map (mutual information, SimpleITK), on cubes of
+Volumes are NIfTI (T1). MOVING is first laid on FIXED by an affine map (--rigid: a rigid one; mutual information, SimpleITK), on cubes of
 --spacing mm; every method starts from that pair. Each volume is cut into three classes (fluid, gray, white) by k-means
 after N4, inside the mask; the moving one's classes are carried along each field, and Dice is taken in the fixed mask where the
 moving volume was seen. --strip takes away what is outside the masks before (a missing mask of MOVING is FIXED's along
@@ -22,10 +22,10 @@ from scipy import ndimage
 from run import field, run
 
 METHODS = [f"palpate {p}{m}" for p in ("fast", "balanced", "accurate") for m in ("", " mask")]
-METHODS += ["greedy half", "greedy full", "greedy long", "elastix", "ANTs SyNQuick", "plastimatch"]
+METHODS += ["greedy half", "greedy full", "greedy long", "elastix", "ANTs SyNQuick", "plastimatch", "ConvexAdam"]
 
 
-def affine(fixed, moving):
+def laid(fixed, moving, rigid):
     method = sitk.ImageRegistrationMethod()
     method.SetMetricAsMattesMutualInformation(50)
     method.SetMetricSamplingStrategy(method.RANDOM)
@@ -37,7 +37,8 @@ def affine(fixed, moving):
     method.SetSmoothingSigmasPerLevel([2, 1])
     method.SmoothingSigmasAreSpecifiedInPhysicalUnitsOn()
     moments = sitk.CenteredTransformInitializerFilter.MOMENTS
-    start = sitk.CenteredTransformInitializer(fixed, moving, sitk.AffineTransform(3), moments)
+    start = sitk.Euler3DTransform() if rigid else sitk.AffineTransform(3)
+    start = sitk.CenteredTransformInitializer(fixed, moving, start, moments)
     method.SetInitialTransform(start, inPlace=True)
     method.Execute(fixed, moving)
     return start
@@ -72,6 +73,7 @@ def main():
     parser.add_argument("--methods", nargs="*", default=METHODS)
     parser.add_argument("--spacing", type=float, default=1.5)
     parser.add_argument("--strip", action="store_true")
+    parser.add_argument("--rigid", action="store_true")
     options = parser.parse_args()
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
@@ -83,7 +85,7 @@ def main():
     grid.SetSpacing([options.spacing] * 3)
     grid.SetOrigin(images[0].GetOrigin())
     grid.SetDirection(images[0].GetDirection())
-    maps = [sitk.Transform(), affine(*images)]
+    maps = [sitk.Transform(), laid(*images, options.rigid)]
     paths = [out / "fixed.nii.gz", out / "moving.nii.gz"]
     for image, to, path in zip(images, maps, paths):
         sitk.WriteImage(sitk.Resample(image, grid, to, sitk.sitkBSpline, 0.0), str(path))

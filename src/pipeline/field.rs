@@ -194,7 +194,7 @@ fn canonical(
     let mut begun = None;
     let mut reach = f64::INFINITY;
     let mut light = Light::default();
-    let (mut left, mut gain, mut closer, mut asked) = (0.0, 1.0, false, Vec::new());
+    let (mut left, mut gain, mut closer, mut asked) = (0.0, 1.0, None, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let mut pair = light.level(&aligned, factor);
@@ -236,12 +236,13 @@ fn canonical(
                         (own, wider) => own.or(wider),
                     };
                 }
-                if params.search_mm == 0.0 && farther::is_open(&pair, search, found.as_ref()) {
+                let open = farther::is_open(&pair, search, found.as_ref()).filter(|_| params.search_mm == 0.0);
+                if let Some(open) = open {
                     let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
                     let coarser = all.len().saturating_sub(factors.len());
                     let here = (&all[..=coarser], &pair, &lattice);
                     let wide = farther::farther(&whole, (&aligned, &light), here, found.as_ref(), passes, &mut matched);
-                    asked.push(farther::why(search, found.as_ref(), wide.as_ref()));
+                    asked.push(farther::why(search, open, found.as_ref(), wide.as_ref()));
                     if wide.is_some() {
                         search *= farther::TWICE;
                         found = wide;
@@ -263,7 +264,8 @@ fn canonical(
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
             let best = finer(&pair, field, (apart, passes), params.seed, refine);
-            (field, left, gain, closer) = (best.field, best.left, best.gain, best.closer);
+            (field, left, gain, closer) =
+                (best.field, best.left, best.gain, (best.apart < apart).then_some(best.apart));
             asked.extend(best.said);
         }
         clock.skip("matching", matched);
@@ -304,8 +306,9 @@ fn canonical(
     choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
     let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
-    choice.evidence.extend(glides.as_ref().map(|g| why_sliding(g, closer)));
-    let places = glides.filter(|g| glides_by(g, closer)).map_or(Vec::new(), |g| beside(&g, &grid, pair.shape, factor));
+    choice.evidence.extend(glides.as_ref().map(|g| why_sliding(g, closer.is_some())));
+    let places =
+        glides.filter(|g| glides_by(g, closer.is_some())).map_or(Vec::new(), |g| beside(&g, &grid, pair.shape, factor));
     let unlike = unlike(&pair, left);
     let unseen = level::unseen(&pair, &field);
     let plain = without_texture(pair.plain());
@@ -319,9 +322,10 @@ fn canonical(
         pair = light.level(&aligned, next);
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-        field = polish::polish((&pair, next), (&field, factor), reach, params, tick);
+        let nodes = polish::nodes(closer);
+        field = polish::polish((&pair, next, nodes), (&field, factor), reach, params, tick);
         factor = next;
-        choice.evidence.push(polish::why(&pair, params));
+        choice.evidence.push(polish::why(&pair, nodes, params));
         clock.book("residual");
     }
     let spacing = pair.spacing;

@@ -11,32 +11,37 @@ use crate::types::{FieldParams, Grid};
 /// Voxels between nodes. Five pairs of 160 x 192 x 160 (3 passes): errors as with 5, gradients 4 % less, and less time.
 const NODES: usize = 6;
 
+/// Voxels between nodes, where the coarser level took a lattice of so many in place of its own: no wider than that.
+pub(super) fn nodes(closer: Option<usize>) -> usize {
+    closer.map_or(NODES, |apart| NODES.min(2 * apart))
+}
+
 /// The level below the one that `finest` asks for; none where that is full resolution, or no passes are wanted there.
 pub(super) fn next_finer(grid: &Grid, finest: usize, params: &FieldParams) -> Option<[usize; 3]> {
     let wanted = params.finer_passes > 0 && finest > 1;
     wanted.then(|| factors(grid.shape(), grid.spacing(), finest / 2, 0.0)[0])
 }
 
-/// A field of a level of factor `from` brought to the residual on `pair`, of `factor`. No node ends further than `reach` (voxels of the
+/// A field of a level of factor `from` brought to the residual on `pair`, of `factor`, with so many voxels between nodes. No node ends further than `reach` (voxels of the
 /// finest axis, along each axis) from where the coarser field had it.
 pub(super) fn polish(
-    (pair, factor): (&Pair<'_>, [usize; 3]),
+    (pair, factor, nodes): (&Pair<'_>, [usize; 3], usize),
     (field, from): (&SplineField, [usize; 3]),
     reach: f64,
     params: &FieldParams,
     tick: impl Fn(usize),
 ) -> SplineField {
-    let lattice = level::lattice(pair, NODES);
+    let lattice = level::lattice(pair, nodes);
     let mut finer = level::carry(field, lattice, |p| to_level(from_level(p, factor), from));
     level::refine(pair, &mut finer, (params.finer_passes, reach), params.seed, tick);
     finer
 }
 
 /// What was done, in words.
-pub(super) fn why(pair: &Pair<'_>, params: &FieldParams) -> String {
+pub(super) fn why(pair: &Pair<'_>, nodes: usize, params: &FieldParams) -> String {
     let edges = pair.spacing.map(|s| format!("{s:.3}").trim_end_matches('0').trim_end_matches('.').to_string());
     format!(
-        "finer passes: {} more at {} mm voxels, nodes every {NODES} of them; features, model and jumps are of the level before",
+        "finer passes: {} more at {} mm voxels, nodes every {nodes} of them; features, model and jumps are of the level before",
         params.finer_passes,
         edges.join(" x ")
     )
