@@ -457,13 +457,21 @@ fn a_background_that_was_cut_through_tissue_is_not_seen() {
         (evaluate::metrics(&result.displacement, &whole.truth, Some(&mask), &[]).unwrap().mean_mm, result.summary)
     };
     let (clean, plain) = measured(&whole.initial, &whole.deformed);
-    let told = |s: &palpate::types::FieldSummary| s.evidence.iter().any(|e| e.starts_with("background: 0 by a cut"));
+    let told = |s: &palpate::types::FieldSummary| {
+        s.evidence.iter().any(|e| e.starts_with("background: of one value by a cut"))
+    };
     assert!(!told(&plain), "{:?}", plain.evidence);
     for (initial, deformed) in
         [(whole.initial.clone(), cut(&whole.deformed, 27.0)), (cut(&whole.initial, 29.0), cut(&whole.deformed, 26.0))]
     {
-        let (off, summary) = measured(&initial, &deformed);
-        assert!(told(&summary) && off < 2.0 * clean + 0.05, "{off} for {clean}: {:?}", summary.evidence);
+        // As they are, and with a mean of 0 and a deviation of 1, as many programs leave them.
+        let moved = |v: &Volume| {
+            Volume::from_vec(*v.grid(), v.as_slice().iter().map(|v| (v - 300.0) / 80.0).collect()).unwrap()
+        };
+        for [initial, deformed] in [[moved(&initial), moved(&deformed)], [initial, deformed]] {
+            let (off, summary) = measured(&initial, &deformed);
+            assert!(told(&summary) && off < 2.0 * clean + 0.05, "{off} for {clean}: {:?}", summary.evidence);
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! A background of 0 that a cut through tissue made (a mask, a skull taken off, a volume resampled past its end): its edge is none of the
+//! A background of 0 (or of the least value, where 0 was moved) that a cut through tissue made (a mask, a skull taken off, a volume resampled past its end): its edge is none of the
 //! tissue and moves with the cut, so what lies behind it is not seen.
 
 use crate::numerics::statistics::quantile;
@@ -34,14 +34,11 @@ pub struct Cut {
 }
 
 impl Cut {
-    /// A volume's background, if it has one of 0 that was cut.
-    pub fn of(volume: &Voxels<'_>) -> Option<Self> {
+    /// What of a volume's background of one value, if it has one, tells of a cut.
+    pub fn of(volume: &Voxels<'_>, empty: f32) -> Option<Self> {
         let values = volume.as_slice();
-        if !is_empty(volume) {
-            return None;
-        }
         let blocks = Blocks::of(volume.grid());
-        let border = blocks.border(values, bright(values)?);
+        let border = blocks.border(values, empty, bright(values, empty)?);
         let of_all =
             |n: u32, all: &[[u32; 2]]| f64::from(n) / all.iter().map(|b| f64::from(b[1])).sum::<f64>().max(1.0);
         let lit = of_all(border.iter().map(|b| b[0]).sum(), &border);
@@ -51,15 +48,18 @@ impl Cut {
     }
 }
 
-/// Whether a volume has a background of 0.
-pub fn is_empty(volume: &Voxels<'_>) -> bool {
+/// The one value of a volume's background, if it has such: 0, or the volume's `least` value if more voxels hold that.
+pub fn empty(volume: &Voxels<'_>, least: f32) -> Option<f32> {
     let values = volume.as_slice();
-    values.par_iter().filter(|v| **v == 0.0).count() as f64 >= BACKGROUND * values.len() as f64
+    let count = |value: f32| values.par_iter().filter(|v| **v == value).count();
+    let [zeros, others] = [count(0.0), if least == 0.0 { 0 } else { count(least) }];
+    let (value, held) = if zeros >= others { (0.0, zeros) } else { (least, others) };
+    (held as f64 >= BACKGROUND * values.len() as f64).then_some(value)
 }
 
-/// The volume with its background of 0 as voxels that are not finite.
-pub fn hidden(mut volume: Voxels<'_>) -> Voxels<'_> {
-    volume.as_mut_slice().par_iter_mut().filter(|v| **v == 0.0).for_each(|v| *v = f32::NAN);
+/// The volume with its background as voxels that are not finite.
+pub fn hidden(mut volume: Voxels<'_>, empty: f32) -> Voxels<'_> {
+    volume.as_mut_slice().par_iter_mut().filter(|v| **v == empty).for_each(|v| *v = f32::NAN);
     volume
 }
 
@@ -76,16 +76,16 @@ pub fn why_unseen(cut: [Option<Cut>; 2]) -> Option<String> {
     };
     let parts: Vec<String> = cut.into_iter().zip(["initial", "deformed"]).filter_map(of).collect();
     (!parts.is_empty())
-        .then(|| format!("background: 0 by a cut through tissue, taken as not seen ({})", parts.join("; ")))
+        .then(|| format!("background: of one value by a cut through tissue, taken as not seen ({})", parts.join("; ")))
 }
 
 /// The intensity from which a voxel is as bright as tissue; none where nothing stands out.
-fn bright(values: &[f32]) -> Option<f32> {
+fn bright(values: &[f32], empty: f32) -> Option<f32> {
     let mut shown: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
     shown.retain(|v| v.is_finite());
     let [low, high] = [0.02, 0.98].map(|q| quantile(&mut shown, q));
     shown.retain(|v| *v > low + 0.1 * (high - low));
-    (!shown.is_empty()).then(|| BRIGHT * quantile(&mut shown, 0.5))
+    (!shown.is_empty()).then(|| empty + BRIGHT * (quantile(&mut shown, 0.5) - empty))
 }
 
 /// A volume in blocks.
@@ -105,8 +105,8 @@ impl Blocks {
         Self { shape, edge, count: std::array::from_fn(|a| shape[a].div_ceil(edge[a])) }
     }
 
-    /// Of each block the pairs of neighbours of which one is 0 and the other not: those with one as bright as tissue, and all.
-    fn border(&self, values: &[f32], bright: f32) -> Vec<[u32; 2]> {
+    /// Of each block the pairs of neighbours of which one is `empty` and the other not: those with one as bright as tissue, and all.
+    fn border(&self, values: &[f32], empty: f32, bright: f32) -> Vec<[u32; 2]> {
         let [nx, ny, nz] = self.shape;
         let layer = self.count[0] * self.count[1];
         let mut border = vec![[0; 2]; layer * self.count[2]];
@@ -118,7 +118,7 @@ impl Blocks {
                         let along = [(i + 1 < from + nx, 1), (j + 1 < ny, nx), (k + 1 < nz, nx * ny)];
                         for (_, step) in along.into_iter().filter(|a| a.0) {
                             let (a, b) = (values[i], values[i + step]);
-                            if (a == 0.0) != (b == 0.0) {
+                            if (a == empty) != (b == empty) {
                                 let here = &mut border[(i - from) / self.edge[0] + self.count[0] * (j / self.edge[1])];
                                 here[0] += u32::from(a.max(b) > bright);
                                 here[1] += 1;

@@ -5,7 +5,7 @@ use crate::field::jacobian::determinant_at;
 use crate::matching::levels::foreground;
 use crate::numerics::filters::mean_beside;
 use crate::numerics::statistics::{quantile, stands_for_all};
-use crate::pipeline::background::{Cut, hidden, is_empty};
+use crate::pipeline::background::{self, Cut, hidden};
 use crate::pipeline::field::FEWEST;
 use crate::types::{DenseField, Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
@@ -71,21 +71,28 @@ pub fn inputs<'a>(
     enough_slices(initial.grid())?;
     let not_finite = ranges.each_ref().map(|r| r.not_finite);
     let lost = [initial, deformed].map(lost_slices);
-    let cut = [initial, deformed].map(Cut::of);
-    // Where one was cut, the 0 beside tissue in the other is none to match with.
-    let empty = [initial, deformed].map(|v| cut.iter().any(Option::is_some) && is_empty(v));
+    let mut empty = [(initial, &ranges[0]), (deformed, &ranges[1])].map(|(v, range)| background::empty(v, range.low));
+    let cut = [(initial, empty[0]), (deformed, empty[1])].map(|(v, empty)| Cut::of(v, empty?));
+    // Where one was cut, what is empty beside tissue in the other is nothing to match with.
+    if cut == [None; 2] {
+        empty = [None; 2];
+    }
     // In one slice there are 8 around a voxel, not 26.
     let least = |volume: &Voxels<'_>| if volume.grid().shape().contains(&1) { AROUND / 3 } else { AROUND };
     let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume, least(&volume)) } else { volume };
-    let hide = |volume: Voxels<'a>, empty: bool| if empty { drawn_on(hidden(volume)) } else { volume };
-    let mut first = fill(hide(bridged(initial, &lost[0]), empty[0]), not_finite[0] > 0 || empty[0]);
-    let bad = not_finite[1] > 0 || !lost[1].is_empty() || empty[1];
+    let hide = |volume: Voxels<'a>, empty: Option<f32>| match empty {
+        Some(value) => drawn_on(hidden(volume, value)),
+        None => volume,
+    };
+    let mut first = fill(hide(bridged(initial, &lost[0]), empty[0]), not_finite[0] > 0 || empty[0].is_some());
+    let bad = not_finite[1] > 0 || !lost[1].is_empty() || empty[1].is_some();
     let second = fill(without(hide(deformed.view(), empty[1]), &lost[1]), bad);
     let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
-    if not_finite[0] > 0 || empty[0] {
-        first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = 0.0);
+    if not_finite[0] > 0 || empty[0].is_some() {
+        let nothing = empty[0].unwrap_or(0.0);
+        first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = nothing);
         for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
-            if !v.is_finite() || empty[0] && *v == 0.0 {
+            if !v.is_finite() || Some(*v) == empty[0] {
                 *m = 0;
             }
         }
