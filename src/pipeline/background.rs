@@ -1,14 +1,14 @@
-//! A background of 0 (or of the least value, where 0 was moved) that a cut through tissue made (a mask, a skull taken off, a volume resampled past its end): its edge is none of the
-//! tissue and moves with the cut, so what lies behind it is not seen.
+//! A background of one value that a cut through tissue made: a mask, a skull taken off, a volume resampled past its end. Its edge is none of
+//! the tissue and moves with the cut, so what lies behind it is not seen. The value is 0, or the least one where 0 was moved.
 
 use crate::numerics::statistics::quantile;
 use crate::types::{Grid, Voxels};
 use rayon::prelude::*;
 
-/// Part of a volume that a background of 0 takes at least.
+/// Part of a volume that a background of one value takes at least.
 const BACKGROUND: f64 = 0.02;
 
-/// Part of the voxels beside a background of 0 that is as bright as tissue from which all of it was cut: where tissue ends in air it is 0 in
+/// Part of the voxels beside such a background that is as bright as tissue from which all of it was cut: where tissue ends in air it is 0 in
 /// phantoms without noise and 0.1 to 0.25 beside padding, where a mask cut through tissue 0.48 to 0.91.
 const CUT: f64 = 0.4;
 
@@ -24,7 +24,7 @@ const BRIGHT: f32 = 0.5;
 /// Edge of the blocks by which a cut is looked for, in the finest voxels; three of them along each axis are one place.
 const BLOCK: f64 = 8.0;
 
-/// A background of 0 that was cut.
+/// A background of one value that was cut.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cut {
     /// The part of the voxels beside it that is as bright as tissue.
