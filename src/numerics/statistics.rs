@@ -14,6 +14,11 @@ pub fn median(values: &mut [f32]) -> f32 {
     quantile(values, 0.5)
 }
 
+/// The finite ones of at most about 100,000 of the values, evenly.
+pub fn sampled(values: &[f32]) -> Vec<f32> {
+    values.iter().step_by(values.len() / 100_000 + 1).copied().filter(|v| v.is_finite()).collect()
+}
+
 /// Standard deviation of all values, 0 for none.
 pub fn deviation(values: impl Iterator<Item = f32> + Clone) -> f64 {
     let count = values.clone().count().max(1) as f64;

@@ -1,7 +1,8 @@
 //! A background of one value that a cut through tissue made: a mask, a skull taken off, a volume resampled past its end. Its edge is none of
 //! the tissue and moves with the cut, so what lies behind it is not seen. The value is 0, or the least one where 0 was moved.
 
-use crate::numerics::statistics::quantile;
+use crate::numerics::pyramid;
+use crate::numerics::statistics::{quantile, sampled};
 use crate::types::{Grid, Voxels};
 use rayon::prelude::*;
 
@@ -39,11 +40,10 @@ impl Cut {
         let values = volume.as_slice();
         let blocks = Blocks::of(volume.grid());
         let border = blocks.border(values, empty, bright(values, empty)?);
-        let of_all =
-            |n: u32, all: &[[u32; 2]]| f64::from(n) / all.iter().map(|b| f64::from(b[1])).sum::<f64>().max(1.0);
-        let lit = of_all(border.iter().map(|b| b[0]).sum(), &border);
-        let here = (0..border.len()).filter(|&b| blocks.is_cut(&border, b)).map(|b| border[b][1]).sum();
-        let places = of_all(here, &border);
+        let sum = |which: &dyn Fn(usize) -> u32| (0..border.len()).map(|b| f64::from(which(b))).sum::<f64>();
+        let all = sum(&|b| border[b][1]).max(1.0);
+        let lit = sum(&|b| border[b][0]) / all;
+        let places = sum(&|b| if blocks.is_cut(&border, b) { border[b][1] } else { 0 }) / all;
         (lit > CUT || places > PLACES).then_some(Self { lit, places })
     }
 }
@@ -81,8 +81,7 @@ pub fn why_unseen(cut: [Option<Cut>; 2]) -> Option<String> {
 
 /// The intensity from which a voxel is as bright as tissue; none where nothing stands out.
 fn bright(values: &[f32], empty: f32) -> Option<f32> {
-    let mut shown: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
-    shown.retain(|v| v.is_finite());
+    let mut shown = sampled(values);
     let [low, high] = [0.02, 0.98].map(|q| quantile(&mut shown, q));
     shown.retain(|v| *v > low + 0.1 * (high - low));
     (!shown.is_empty()).then(|| empty + BRIGHT * (quantile(&mut shown, 0.5) - empty))
@@ -100,9 +99,9 @@ struct Blocks {
 impl Blocks {
     fn of(grid: &Grid) -> Self {
         let (shape, spacing) = (grid.shape(), grid.spacing());
-        let finest = (0..3).filter(|&a| shape[a] > 1).map(|a| spacing[a]).fold(f64::INFINITY, f64::min);
+        let finest = pyramid::finest(shape, spacing);
         let edge = spacing.map(|s| ((BLOCK * finest / s).round() as usize).max(2));
-        Self { shape, edge, count: std::array::from_fn(|a| shape[a].div_ceil(edge[a])) }
+        Self { shape, edge, count: pyramid::reduced_shape(shape, edge) }
     }
 
     /// Of each block the pairs of neighbours of which one is `empty` and the other not: those with one as bright as tissue, and all.

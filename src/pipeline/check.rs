@@ -4,7 +4,7 @@ use crate::error::FieldError;
 use crate::field::jacobian::determinant_at;
 use crate::matching::levels::foreground;
 use crate::numerics::filters::mean_beside;
-use crate::numerics::statistics::{quantile, stands_for_all};
+use crate::numerics::statistics::{quantile, sampled, stands_for_all};
 use crate::pipeline::background::{self, Cut, hidden};
 use crate::pipeline::field::FEWEST;
 use crate::types::{DenseField, Grid, Mask, Volume, Voxels};
@@ -41,7 +41,7 @@ pub struct LostSlice {
 ///
 /// A slice inside the body that holds one value throughout is lost: left out of the mask in the initial volume, not finite in the
 /// deformed one. A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
-/// initial volume and stay unseen in the deformed one, and so does a background that was set to 0 by a cut through tissue. Volumes whose
+/// initial volume and stay unseen in the deformed one, and so does the background of both where a cut through tissue made that of one. Volumes whose
 /// intensities are so large, so small or so far from 0 that single precision loses them are shifted and scaled by a power of two, and so is
 /// a deformed volume whose spread is another than the initial one's.
 ///
@@ -308,8 +308,7 @@ const FAR: f64 = 100.0;
 /// gains between the volumes are bounded, and noise is measured in the initial one alone.
 fn in_range<'a>(mut volume: Voxels<'a>, range: &Range, like: Option<f64>) -> (Voxels<'a>, f64) {
     let values = volume.as_slice();
-    let mut sample: Vec<f32> = values.iter().step_by(values.len() / 100_000 + 1).copied().collect();
-    sample.retain(|v| v.is_finite());
+    let mut sample = sampled(values);
     let [a, b] = [0.001, 0.999].map(|q| f64::from(quantile(&mut sample, q)));
     let [low, high] = [range.low, range.high].map(f64::from);
     let whole = high - low;

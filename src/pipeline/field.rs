@@ -236,8 +236,8 @@ fn canonical(
                         (own, wider) => own.or(wider),
                     };
                 }
-                let open = farther::is_open(&pair, search, found.as_ref()).filter(|_| params.search_mm == 0.0);
-                if let Some(open) = open {
+                let free = params.search_mm == 0.0;
+                if let Some(open) = free.then(|| farther::is_open(&pair, search, found.as_ref())).flatten() {
                     let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
                     let coarser = all.len().saturating_sub(factors.len());
                     let here = (&all[..=coarser], &pair, &lattice);
@@ -264,8 +264,7 @@ fn canonical(
             let refine =
                 |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
             let best = finer(&pair, field, (apart, passes), params.seed, refine);
-            (field, left, gain, closer) =
-                (best.field, best.left, best.gain, (best.apart < apart).then_some(best.apart));
+            (field, left, gain, closer) = (best.field, best.left, best.gain, best.closer);
             asked.extend(best.said);
         }
         clock.skip("matching", matched);
@@ -306,9 +305,14 @@ fn canonical(
     choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
     let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
-    choice.evidence.extend(glides.as_ref().map(|g| why_sliding(g, closer.is_some())));
-    let places =
-        glides.filter(|g| glides_by(g, closer.is_some())).map_or(Vec::new(), |g| beside(&g, &grid, pair.shape, factor));
+    let mut places = Vec::new();
+    if let Some(glides) = glides {
+        let believed = closer.is_none() || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
+        choice.evidence.push(why_sliding(&glides, believed));
+        if believed {
+            places = beside(&glides, &grid, pair.shape, factor);
+        }
+    }
     let unlike = unlike(&pair, left);
     let unseen = level::unseen(&pair, &field);
     let plain = without_texture(pair.plain());
@@ -529,15 +533,10 @@ fn full_lattice(grid: &Grid, field: &SplineField, factor: [usize; 3], choice: &C
 /// 0.09 did, who have no jump in common, and folded by it; of halves and cores that slid under a texture of their own 0.13 to 0.34.
 const GLIDING: f64 = 0.1;
 
-/// Whether a jump is believed, where a `closer` lattice was taken or not.
-fn glides_by(sliding: &Sliding, closer: bool) -> bool {
-    !closer || sliding.voxels.len() as f64 >= GLIDING * sliding.strained as f64
-}
-
-fn why_sliding(sliding: &Sliding, closer: bool) -> String {
+fn why_sliding(sliding: &Sliding, believed: bool) -> String {
     let Sliding { voxels, strained, left } = sliding;
     let followed = voxels.len();
-    match glides_by(sliding, closer) {
+    match believed {
         true => format!(
             "sliding: {followed} of {strained} strained voxels move with the tissue on one side of a jump, which leaves {left:.2} of their \
              squared residual"
@@ -798,7 +797,7 @@ const OUT_OF_VIEW: f64 = 0.05;
 fn out_of_view(share: f64) -> Option<String> {
     (share > OUT_OF_VIEW).then(|| {
         format!(
-            "{:.0} % of the tissue moves out of the deformed volume, or to where that is not finite: there the field is carried over from \
+            "{:.0} % of the tissue moves out of the deformed volume, or to where that shows nothing (not finite, or cut off): there the field is carried over from \
              what is in view, and may be off by more than its uncertainty says; leave such parts out with --mask",
             100.0 * share
         )

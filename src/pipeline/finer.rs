@@ -37,8 +37,8 @@ pub(super) struct Explained {
     pub left: f32,
     /// By what factor the gain varies across the tissue.
     pub gain: f32,
-    /// Voxels between its nodes.
-    pub apart: usize,
+    /// Voxels between its nodes, where a finer lattice was taken.
+    pub closer: Option<usize>,
     /// What was tried, in words.
     pub said: Vec<String>,
 }
@@ -53,7 +53,7 @@ pub(super) fn finer(
     refine: impl Fn(&mut SplineField, usize),
 ) -> Explained {
     let [left, gain] = level::misfit(pair, &field);
-    let mut best = Explained { field, left, gain, apart: spacing, said: Vec::new() };
+    let mut best = Explained { field, left, gain, closer: None, said: Vec::new() };
     for closer in (CLOSEST..spacing).rev() {
         let lattice = level::lattice(pair, closer);
         let noisy = times(best.left, pair.noise);
@@ -77,7 +77,7 @@ pub(super) fn finer(
         }
         refine(&mut next, passes.saturating_sub(TRIAL));
         [best.left, best.gain] = level::misfit(pair, &next);
-        (best.field, best.apart) = (next, closer);
+        (best.field, best.closer) = (next, Some(closer));
     }
     best
 }
