@@ -332,7 +332,7 @@ fn determined_degrees_of_freedom_are_the_trace() {
 }
 
 #[test]
-fn deviation_is_the_root_of_the_inverse() {
+fn deviation_and_degrees_of_freedom_are_those_of_the_inverse() {
     let (nodes, smoothness, l) = small();
     let mut blocks = random_blocks(80, 5);
     // A corner without data is less certain.
@@ -347,7 +347,24 @@ fn deviation_is_the_root_of_the_inverse() {
         let variance: Vec<f32> =
             (0..80).map(|i| ((0..3).map(|a| inverse[80 * a + i][80 * a + i]).sum::<f64>() / 3.0) as f32).collect();
         let exact = filters::gaussian(&variance, nodes, [1.0; 3]);
-        let found = coupling::deviation(&smoothness, lambda, &blocks, nodes, 200, 7);
+        let coupling::Posterior { deviation: found, determined } =
+            coupling::posterior(&smoothness, lambda, &blocks, nodes, 200, 7);
+        // The node's part of the trace of the inverse times the data.
+        let part = |i: usize| -> f64 {
+            let entry = |a: usize, b: usize| f64::from(blocks[i][[[0, 3, 4], [3, 1, 5], [4, 5, 2]][a][b]]);
+            (0..9).map(|k| inverse[80 * (k / 3) + i][80 * (k % 3) + i] * entry(k / 3, k % 3)).sum()
+        };
+        // One draw is as far off as chi-square with one degree of freedom at worst: 0.1 by chance in 200.
+        for (i, &found) in determined.iter().enumerate() {
+            let exact = part(i);
+            assert!(
+                (f64::from(found) / exact - 1.0).abs() < 0.45,
+                "lambda {lambda:?}, node {i}: {found} is not {exact}"
+            );
+        }
+        let [sum, all] = [determined.iter().map(|&v| f64::from(v)).sum::<f64>(), (0..80).map(part).sum()];
+        // A dozen of them in 200 draws: 0.03 by chance.
+        assert!((sum / all - 1.0).abs() < 0.1, "lambda {lambda:?}: {sum} is not {all}");
         for (i, (f, e)) in found.iter().zip(&exact).enumerate() {
             assert!((f / e.sqrt() - 1.0).abs() < 0.2, "lambda {lambda:?}, node {i}: {f} is not {}", e.sqrt());
         }
@@ -478,7 +495,7 @@ fn the_simplest_model_that_explains_is_chosen_and_exact() {
     ];
     for (model, motion) in cases {
         for bad in [0, 5] {
-            let choice = choose(&moved(&motion, bad, false), |m| excess(&motion, m), 100.0, 0.05);
+            let choice = choose(&moved(&motion, bad, false), |_, m| excess(&motion, m), 100.0, 0.05);
             assert_eq!(choice.model, model, "{:?}", choice.evidence);
             // Redescending weights leave an outlier of 80 sigma some thousandths of a match's pull.
             close(&choice.motion.unwrap(), &motion, if bad == 0 { 1e-6 } else { 0.01 });
@@ -489,7 +506,7 @@ fn the_simplest_model_that_explains_is_chosen_and_exact() {
 #[test]
 fn a_free_motion_stays_free_and_the_evidence_says_why() {
     let matches = moved(&general(), 0, false);
-    let choice = choose(&matches, |_| 4000.0, 200.0, 0.05);
+    let choice = choose(&matches, |_, _| 4000.0, 200.0, 0.05);
     assert_eq!((choice.model, choice.motion), (MotionModel::Free, None));
     assert_eq!(choice.evidence.len(), 4);
     for (line, name) in choice.evidence.iter().zip(["identity: ", "rigid: ", "affine: ", "free: "]) {
@@ -498,14 +515,17 @@ fn a_free_motion_stays_free_and_the_evidence_says_why() {
     assert!(choice.evidence[0].contains("excess misfit 20.00 per degree of freedom"), "{}", choice.evidence[0]);
     assert!(choice.evidence[3].contains("200 degrees of freedom"), "{}", choice.evidence[3]);
     // Just at the limit the simplest that the matches bear out stands.
-    let affine = choose(&matches, |_| 200.0, 200.0, 0.05);
+    let affine = choose(&matches, |_, _| 200.0, 200.0, 0.05);
     assert_ne!(affine.model, MotionModel::Identity);
     assert!(affine.evidence[0].contains("mm off"), "{}", affine.evidence[0]);
+    // Matches that are as far from the free field tell nothing.
+    let astray: Vec<Measured> = matches.iter().map(|m| Measured { field: [0.0; 3], ..*m }).collect();
+    assert_eq!(choose(&astray, |_, _| 200.0, 200.0, 0.05).model, MotionModel::Identity);
     let matches = moved(&AffineMotion::IDENTITY, 0, false);
-    let at = |ratio: f64| choose(&matches, |_| 200.0 * ratio, 200.0, 0.05).model;
+    let at = |ratio: f64| choose(&matches, |_, _| 200.0 * ratio, 200.0, 0.05).model;
     assert_eq!((at(CHANCE), at(CHANCE + 0.01)), (MotionModel::Identity, MotionModel::Free));
     // Few degrees of freedom count as a hundred.
-    let few = |excess: f64| choose(&matches, |_| excess, 9.0, 0.05).model;
+    let few = |excess: f64| choose(&matches, |_, _| excess, 9.0, 0.05).model;
     assert_eq!((few(100.0 * CHANCE), few(101.0 * CHANCE)), (MotionModel::Identity, MotionModel::Free));
 }
 
@@ -513,7 +533,7 @@ fn a_free_motion_stays_free_and_the_evidence_says_why() {
 fn models_of_one_slice_stay_in_its_plane() {
     let (s, c) = 0.1f64.sin_cos();
     let turn = AffineMotion { linear: [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], shift: [2.0, -3.0, 0.0] };
-    let choice = choose(&moved(&turn, 0, true), |m| excess(&turn, m), 100.0, 0.05);
+    let choice = choose(&moved(&turn, 0, true), |_, m| excess(&turn, m), 100.0, 0.05);
     assert_eq!(choice.model, MotionModel::Rigid);
     close(&choice.motion.unwrap(), &turn, 1e-6);
 }

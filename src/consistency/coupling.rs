@@ -208,21 +208,30 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
 /// Draws worked out side by side: each holds six vectors of the lattice.
 const SIDE_BY_SIDE: usize = 2;
 
-/// Standard deviation of the coupled field at each node along an axis (mm, root of the mean of the covariance's diagonal over the axes
-/// that there are data of).
+/// What the data leave open and what they determine, by node of a lattice.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Posterior {
+    /// Standard deviation of the coupled field along an axis (mm, root of the mean of the covariance's diagonal over the axes that
+    /// there are data of).
+    pub deviation: Vec<f32>,
+    /// Degrees of freedom that the data determine there, the node's part of `tr((A + lambda L)^-1 A)` (see [`determined`]).
+    pub determined: Vec<f32>,
+}
+
+/// Deviation and degrees of freedom of the coupled field at each node.
 ///
 /// The covariance is `(A + lambda L)^-1`; random vectors with just that covariance are drawn by solving for
-/// right-hand sides with covariance `A + lambda L` (perturb and optimise, Papandreou & Yuille 2010), and their squares
-/// averaged over `draws` and over neighbouring nodes. Each solution starts from the affine one: where nothing bends, `lambda L`
+/// right-hand sides with covariance `A + lambda L` (perturb and optimise, Papandreou & Yuille 2010), and their squares (those under `A`
+/// too) averaged over `draws`, those of the deviation over neighbouring nodes as well. Each solution starts from the affine one: where nothing bends, `lambda L`
 /// outweighs the data by so much that iterations would leave out all that an affine motion is uncertain by.
-pub fn deviation(
+pub fn posterior(
     smoothness: &Smoothness,
     lambda: [f32; 3],
     blocks: &[[f32; 6]],
     nodes: [usize; 3],
     draws: usize,
     seed: u64,
-) -> Vec<f32> {
+) -> Posterior {
     let n = blocks.len();
     let affine = Affine::new(nodes, blocks);
     let solve = solver(smoothness, lambda, blocks, true);
@@ -250,16 +259,19 @@ pub fn deviation(
     let seen: Vec<usize> = (0..3).filter(|&c| blocks.iter().any(|b| b[c] > 0.0)).collect();
     let share = 1.0 / (seen.len().max(1) * draws) as f32;
     let mut squares = vec![0.0f32; n];
+    let mut determined = vec![0.0f32; n];
     for first in (0..draws).step_by(SIDE_BY_SIDE) {
         let some: Vec<Vec<f32>> = (first..(first + SIDE_BY_SIDE).min(draws)).into_par_iter().map(draw).collect();
         for x in some {
-            for (i, s) in squares.iter_mut().enumerate() {
+            for (i, (s, d)) in squares.iter_mut().zip(&mut determined).enumerate() {
                 *s += share * seen.iter().map(|c| x[c * n + i] * x[c * n + i]).sum::<f32>();
+                let at = std::array::from_fn(|c| f64::from(x[c * n + i]));
+                *d += quadratic(&blocks[i].map(f64::from), at) as f32 / draws as f32;
             }
         }
     }
     let smooth = filters::gaussian(&squares, nodes, [1.0; 3]);
-    smooth.iter().map(|v| v.sqrt()).collect()
+    Posterior { deviation: smooth.iter().map(|v| v.sqrt()).collect(), determined }
 }
 
 /// The affine motions of a lattice, which no bending energy holds, under the data alone.

@@ -57,9 +57,17 @@ const FEWEST: f64 = 100.0;
 /// motion of four voxels on which 32 of 34 matches agreed.
 const CONTRADICTED: f64 = 50.0;
 
+/// ... and in units of how far they are from the free field: matches that agree with nothing speak against no model.
+const ASTRAY: f64 = 1.5;
+
 /// Chooses a model. `excess(m)` gives the excess misfit of a map against the free field, `determined` the field's
 /// degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm).
-pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, determined: f64, model_mm: f64) -> Choice {
+pub fn choose(
+    matches: &[Measured],
+    mut excess: impl FnMut(MotionModel, &AffineMotion) -> f64,
+    determined: f64,
+    model_mm: f64,
+) -> Choice {
     let information: Vec<Symmetric3> = matches
         .iter()
         .map(|m| {
@@ -76,13 +84,16 @@ pub fn choose(matches: &[Measured], excess: impl Fn(&AffineMotion) -> f64, deter
         [(MotionModel::Identity, AffineMotion::IDENTITY), (MotionModel::Rigid, rigid), (MotionModel::Affine, affine)];
     let mut evidence = Vec::new();
     let mut chosen = None;
+    let middle = |off: &dyn Fn(&Measured) -> f64| {
+        let mut off: Vec<f32> = matches.iter().map(|m| off(m) as f32).collect();
+        if off.is_empty() { 0.0 } else { f64::from(median(&mut off)) }
+    };
+    let astray = middle(&|m| distance(m.field, m.displacement));
     for (model, motion) in tried {
-        let ratio = excess(&motion) / determined.max(FEWEST);
-        let mut off: Vec<f32> =
-            matches.iter().map(|m| distance(motion.displacement(m.place), m.displacement) as f32).collect();
-        let off = if off.is_empty() { 0.0 } else { f64::from(median(&mut off)) };
+        let ratio = excess(model, &motion) / determined.max(FEWEST);
+        let off = middle(&|m| distance(motion.displacement(m.place), m.displacement));
         let name = format!("{model:?}").to_lowercase();
-        let contradicted = off > CONTRADICTED * model_mm;
+        let contradicted = off > CONTRADICTED * model_mm && off > ASTRAY * astray;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
         evidence
             .push(format!("{name}: excess misfit {ratio:.2} per degree of freedom (chance: at most {CHANCE}){but}"));
@@ -134,6 +145,12 @@ fn step<const N: usize>(
         h[r][r] += 1e-9 * h[r][r] + 1e-9;
     }
     cholesky_solve(h, b).unwrap_or([0.0; N])
+}
+
+/// The rigid motion nearest to what was measured, robustly and weighed by the inverse covariances.
+pub fn nearest_rigid(measured: &[Measured]) -> AffineMotion {
+    let information: Vec<Symmetric3> = measured.iter().map(|m| inverse(&m.covariance).unwrap_or([0.0; 6])).collect();
+    fit_rigid(measured, &information)
 }
 
 /// Robust information-weighted rigid fit: twelve Gauss-Newton steps on (rotation vector, shift).

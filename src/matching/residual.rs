@@ -149,40 +149,74 @@ impl Baseline {
 /// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see, with Cauchy's cost
 /// `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread under the better warp `b`.
 pub fn excess(pair: &Pair<'_>, a: &[f32], b: &Baseline) -> f64 {
-    let nx = pair.shape[0];
-    let own = GainField::measure(pair, a);
-    let cut = 1.0 / (CAUCHY * b.sigma);
-    let rows: Vec<f64> = (0..pair.shape[1] * pair.shape[2])
-        .into_par_iter()
-        .map(|row| {
-            let (j, k) = (row % pair.shape[1], row / pair.shape[1]);
-            if pair.spans.row(j, k).is_empty() {
-                return 0.0;
+    let [_, ny, nz] = pair.shape;
+    let compared = Compared::new(pair, a, b);
+    let in_row = |row: usize| {
+        let mut sum = 0.0;
+        compared.row(row % ny, row / ny, |_, excess| sum += excess);
+        sum
+    };
+    let rows: Vec<f64> = (0..ny * nz).into_par_iter().map(in_row).collect();
+    rows.iter().sum()
+}
+
+/// [`excess`] by place: of each voxel times each basis function of `windows`. The functions add up to one, so the places add up to
+/// the whole.
+pub fn excess_by_place(pair: &Pair<'_>, a: &[f32], b: &Baseline, windows: &Lattice) -> Vec<f32> {
+    let compared = Compared::new(pair, a, b);
+    windows.accumulate::<1>(|j, k, [row]| {
+        row.fill(0.0);
+        compared.row(j, k, |at, excess| row[at] += excess as f32);
+        pair.spans.row(j, k)
+    })
+}
+
+/// Voxels in a row whose costs share a logarithm.
+const TOGETHER: usize = 8;
+
+/// Two warps side by side.
+struct Compared<'a> {
+    pair: &'a Pair<'a>,
+    worse: (&'a [f32], GainField),
+    better: &'a Baseline,
+}
+
+impl<'a> Compared<'a> {
+    fn new(pair: &'a Pair<'a>, worse: &'a [f32], better: &'a Baseline) -> Self {
+        Self { pair, worse: (worse, GainField::measure(pair, worse)), better }
+    }
+
+    /// Calls `sum` with the excess of a few voxels of a row at a time, and one of them that lies in the pair's spans.
+    fn row(&self, j: usize, k: usize, mut sum: impl FnMut(usize, f64)) {
+        let Self { pair, worse, better } = self;
+        let (nx, span) = (pair.shape[0], pair.spans.row(j, k));
+        if span.is_empty() {
+            return;
+        }
+        let cut = 1.0 / (CAUCHY * better.sigma);
+        let from = nx * (j + pair.shape[1] * k);
+        let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);
+        let mut costs = [vec![0.0f32; nx], vec![0.0f32; nx]];
+        for ((warped, field), cost) in
+            [(worse.0, &worse.1), (&better.warped[..], &better.gain)].into_iter().zip(&mut costs)
+        {
+            field.row(j, k, &mut gain, &mut offset);
+            let (f, w) = (&pair.fixed_smooth[from..from + nx], &warped[from..from + nx]);
+            for i in 0..nx {
+                let t = cut * (f[i] - (gain[i] * w[i] + offset[i]));
+                cost[i] = 1.0 + t * t;
             }
-            let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);
-            let from = row * nx;
-            let mut costs = [vec![0.0f32; nx], vec![0.0f32; nx]];
-            for ((warped, field), cost) in [(a, &own), (&b.warped[..], &b.gain)].into_iter().zip(&mut costs) {
-                field.row(j, k, &mut gain, &mut offset);
-                let (f, w) = (&pair.fixed_smooth[from..from + nx], &warped[from..from + nx]);
-                for i in 0..nx {
-                    let t = cut * (f[i] - (gain[i] * w[i] + offset[i]));
-                    cost[i] = 1.0 + t * t;
-                }
+        }
+        // Logarithms of products of a few voxels, not of each: ln is dear.
+        for (at, (a, b)) in costs[0].chunks(TOGETHER).zip(costs[1].chunks(TOGETHER)).enumerate() {
+            let mask = &pair.mask[from + TOGETHER * at..];
+            let mut ratio = 1.0f64;
+            for ((a, b), m) in a.iter().zip(b).zip(mask) {
+                let r = f64::from(*a) / f64::from(*b);
+                ratio *= if *m != 0 && r.is_finite() { r } else { 1.0 };
             }
-            // Logarithms of products of a few voxels, not of each: ln is dear.
-            let mut sum = 0.0;
-            for (at, (a, b)) in costs[0].chunks(8).zip(costs[1].chunks(8)).enumerate() {
-                let mask = &pair.mask[from + 8 * at..];
-                let mut ratio = 1.0f64;
-                for ((a, b), m) in a.iter().zip(b).zip(mask) {
-                    let r = f64::from(*a) / f64::from(*b);
-                    ratio *= if *m != 0 && r.is_finite() { r } else { 1.0 };
-                }
-                sum += ratio.ln();
-            }
-            sum
-        })
-        .collect();
-    f64::from(CAUCHY * CAUCHY) * rows.iter().sum::<f64>()
+            let middle = TOGETHER * at + a.len() / 2;
+            sum(middle.clamp(span.start, span.end - 1), f64::from(CAUCHY * CAUCHY) * ratio.ln());
+        }
+    }
 }

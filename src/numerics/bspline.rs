@@ -72,6 +72,12 @@ impl Lattice {
         std::array::from_fn(|a| (index[a] as f64 - 1.0) * self.step[a] as f64)
     }
 
+    /// Where node `m` stands, or the nearest place of the grid to it (voxels).
+    pub fn within(&self, m: usize) -> [f64; 3] {
+        let at = self.place(m);
+        std::array::from_fn(|a| at[a].clamp(0.0, (self.shape[a] - 1) as f64))
+    }
+
     /// How many nodes act along axis `a`: 4, or 1 for a side of one voxel.
     #[inline(always)]
     fn taps(&self, a: usize) -> usize {

@@ -1,7 +1,6 @@
 //! Two volumes to a dense displacement field: the main chain, in order.
 
-use crate::consistency::coupling;
-use crate::consistency::models::{Choice, choose};
+use crate::consistency::models::{AffineMotion, Choice, choose};
 use crate::error::{FieldError, MeshError};
 use crate::field::spline::ScalarSpline;
 use crate::field::{interpolation, jacobian, spline};
@@ -20,6 +19,7 @@ use crate::pipeline::finer::{finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
+use crate::pipeline::rest::{Rest, Tried};
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
 use crate::pipeline::whole::{self, Whole};
@@ -298,7 +298,9 @@ fn canonical(
     // The smallest motion that explains the matches.
     progress("model", 0.9);
     let flat = grid.is_single_slice();
-    let mut choice = smallest(&matches, &pair, &field, params.seed);
+    let windows = level::windows(&pair);
+    let by_place = level::excess(&pair, &field, &windows);
+    let (mut choice, tried) = smallest(&matches, &pair, &field, &by_place, params.seed);
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
     choice.evidence.extend(background::why_unseen(cut));
     choice.evidence.extend(light.why());
@@ -317,10 +319,18 @@ fn canonical(
     let unseen = level::unseen(&pair, &field);
     let plain = without_texture(pair.plain());
     clock.book("model");
+    let mut posterior = level::posterior(&field, pair.spacing, params.seed);
+    clock.book("uncertainty");
+    let free = choice.motion.is_none();
+    let rest = free.then(|| Rest::find((&pair, &field), &windows, &tried, &by_place, &posterior)).flatten();
+    drop(by_place);
+    choice.evidence.extend(rest.as_ref().map(Rest::why));
+    let rest = rest.filter(Rest::is_taken);
+    clock.book("model");
 
     // What the average of voxels hides.
     let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
-    let (mut pair, mut field, mut factor) = (pair, field, factor);
+    let (mut pair, mut field, mut factor, searched) = (pair, field, factor, factor);
     let next = polish::next_finer(&grid, finest, params).filter(|&next| choice.motion.is_none() && next != factor);
     if let Some(next) = next {
         pair = light.level(&aligned, next);
@@ -331,10 +341,16 @@ fn canonical(
         factor = next;
         choice.evidence.push(polish::why(&pair, nodes, params));
         clock.book("residual");
+        posterior = level::posterior(&field, pair.spacing, params.seed);
+        clock.book("uncertainty");
+    }
+    if let Some(rest) = rest {
+        rest.bring(&mut field, |p| to_level(from_level(p, factor), searched));
     }
     let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
-    let hidden = hidden(&pair, &field);
+    let (coarse, posterior) = posterior;
+    let hidden = hidden(&pair, &field, &coarse);
     drop(pair);
     drop(aligned);
     clock.book("model");
@@ -375,7 +391,7 @@ fn canonical(
     clock.book("jacobian");
     progress("uncertainty", 0.95);
     let jumps = places.iter().map(|(v, _)| *v).zip(changes);
-    let uncertainty = uncertainty(&grid, &field, spacing, params.seed, &hidden, jumps);
+    let uncertainty = uncertainty(&grid, spacing, (coarse, posterior.deviation), &hidden, jumps);
     let (uncertainty_median_mm, uncertainty_mean_mm) = average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
@@ -507,11 +523,25 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     format!("points: {found} of {wanted} wanted, {source}{limit}")
 }
 
-/// Chooses the model from the kept matches and the free field.
-fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: u64) -> Choice {
+/// Chooses the model from the kept matches and the free field; with what was tried.
+fn smallest(
+    matches: &[LevelMatch],
+    pair: &Pair<'_>,
+    field: &SplineField,
+    by_place: impl Fn(&AffineMotion) -> Vec<f32>,
+    seed: u64,
+) -> (Choice, Vec<Tried>) {
     let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
     let finest = pyramid::finest(pair.shape, pair.spacing);
-    choose(&measured, level::excess(pair, field), level::determined(pair, field, seed), 0.02 * finest)
+    let mut tried = Vec::new();
+    let excess = |model, motion: &AffineMotion| {
+        let excess = by_place(motion);
+        let sum = excess.iter().map(|&v| f64::from(v)).sum();
+        tried.push(Tried { model, motion: *motion, excess });
+        sum
+    };
+    let choice = choose(&measured, excess, level::determined(pair, field, seed), 0.02 * finest);
+    (choice, tried)
 }
 
 /// The chosen motion on a lattice over the full-resolution grid.
@@ -631,44 +661,20 @@ const HIDDEN: f64 = 0.015;
 /// moved out of view the 95 % bands held 0.86 to 0.49 of the errors there without it.
 const EXTRAPOLATED: f32 = 3.0;
 
-/// A lattice twice as coarse as the field's own, on which its uncertainty is worked out.
-fn halved(field: &SplineField) -> Lattice {
-    Lattice::new(field.lattice.shape, field.lattice.step.map(|s| 2 * s))
+/// Of each node of a lattice over the initial volume, whether the deformed volume does not show what is there.
+fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
+    (0..lattice.len()).into_par_iter().map(|m| !level::sees(pair, field, lattice.within(m))).collect()
 }
 
-/// Of each node of that lattice, whether the deformed volume does not show what is there.
-fn hidden(pair: &Pair<'_>, field: &SplineField) -> Vec<bool> {
-    let coarse = halved(field);
-    let within = |m: usize| {
-        let at = coarse.place(m);
-        std::array::from_fn(|a| at[a].clamp(0.0, (coarse.shape[a] - 1) as f64))
-    };
-    (0..coarse.len()).into_par_iter().map(|m| !level::sees(pair, field, within(m))).collect()
-}
-
-/// Posterior standard deviation of the coupled field (mm), from a lattice twice as coarse as the field's own, times
-/// [`CALIBRATION`], with what no match shows ([`HIDDEN`]), what is not in view ([`hidden`]), and what is in doubt beside `jumps` (voxel, mm).
+/// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match shows ([`HIDDEN`]), what is not in view
+/// ([`hidden`]), and what is in doubt beside `jumps` (voxel, mm).
 fn uncertainty(
     grid: &Grid,
-    field: &SplineField,
     spacing: [f64; 3],
-    seed: u64,
+    (coarse, mut deviation): (Lattice, Vec<f32>),
     hidden: &[bool],
     jumps: impl Iterator<Item = ([usize; 3], f32)>,
 ) -> ScalarSpline {
-    let coarse = halved(field);
-    let mut blocks = vec![[0.0f32; 6]; coarse.len()];
-    for (m, block) in field.blocks.iter().enumerate() {
-        coarse.for_each_tap(field.lattice.place(m), |node, w| {
-            for q in 0..6 {
-                blocks[node][q] += w * block[q];
-            }
-        });
-    }
-    let energy = level::smoothness(&coarse, spacing);
-    let cell: f64 = (0..3).filter(|&a| coarse.shape[a] > 1).map(|a| coarse.step[a] as f64 * spacing[a]).product();
-    let mut deviation =
-        coupling::deviation(&energy, field.lambda.map(|l| (l * cell) as f32), &blocks, coarse.nodes, 6, seed);
     let thick = || (0..3).filter(|&a| coarse.shape[a] > 1);
     let least = HIDDEN * (thick().map(|a| spacing[a].powi(2)).sum::<f64>() / thick().count().max(1) as f64).sqrt();
     for (v, hidden) in deviation.iter_mut().zip(hidden) {

@@ -37,6 +37,7 @@ mod farther;
 mod finer;
 mod light;
 mod polish;
+mod rest;
 mod search;
 mod start;
 mod whole;
