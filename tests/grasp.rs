@@ -738,7 +738,7 @@ fn a_tabulated_tip_begins_in_equilibrium() {
 }
 
 #[test]
-fn joints_that_stay_behind_and_tips_pressed_past_their_profile_are_said() {
+fn joints_that_stay_behind_and_profiles_that_end_or_are_not_used_are_said() {
     let mut scene = short();
     assert_eq!(pipeline::grasp::notes(&scene, &run(&scene)), Vec::<String>::new());
     scene.finger.gains.ki = 0.0;
@@ -750,6 +750,10 @@ fn joints_that_stay_behind_and_tips_pressed_past_their_profile_are_said() {
     scene.fingertip.profile = vec![[0.0, E], [1e-3, E]];
     let notes = pipeline::grasp::notes(&scene, &run(&scene));
     assert!(notes.len() == 1 && notes[0].contains("ends at 1.00 mm"), "{notes:?}");
+    // A profile that the model does not use was ignored without a word.
+    scene.fingertip.model = FingertipModel::Parallel;
+    let notes = pipeline::grasp::notes(&scene, &run(&scene));
+    assert!(notes.len() == 1 && notes[0].contains("this one is parallel, of one modulus"), "{notes:?}");
 }
 
 #[test]

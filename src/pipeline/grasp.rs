@@ -73,6 +73,14 @@ pub fn notes(scene: &Scene, run: &GraspRun) -> Vec<String> {
         ));
     }
     let tip = &scene.fingertip;
+    if !tip.profile.is_empty() && tip.model != FingertipModel::Tabulated {
+        out.push(format!(
+            "fingertip.profile_depth and profile_modulus are of tabulated tips; this one is {}, of one modulus ({} Pa): give model = \"tabulated\" to \
+             have them used, or leave them out",
+            tip.model.name(),
+            tip.youngs_modulus
+        ));
+    }
     let deepest = run.samples.iter().flat_map(|s| s.normal).fold(0.0, f64::max);
     if let Some([end, _]) =
         tip.profile.last().filter(|p| tip.model == FingertipModel::Tabulated && deepest > PAST * p[0])

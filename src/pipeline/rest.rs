@@ -9,16 +9,19 @@ use crate::consistency::models::{AffineMotion, nearest_rigid};
 use crate::consistency::pruning::Measured;
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
+use crate::numerics::filters;
+use crate::numerics::sampling::nearest;
 use crate::pipeline::level::SplineField;
-use crate::types::MotionModel;
+use crate::types::{MotionModel, VoxelPoint};
 
 /// Excess misfit for each degree of freedom up to which tissue is at rest, and from which the free field stands. Over 31 pairs made from scans, most
 /// of them pressed, with 1 and 3 the mean error is 0.769 of what it was, its gradient's 0.549; with 1.5 and 4 0.754 and 0.500, with 2 and 5 0.751 and 0.471,
 /// but tissue that slides loses 16 % in place of 8; with 3 and 7 smooth motion under noise loses up to a sixth.
 const AT_REST: [f32; 2] = [1.5, 4.0];
 
-/// Degrees of freedom that a place has at least: with fewer, a chance difference would move it.
-const FEWEST: f32 = 0.1;
+/// What places about it add to the misfit and the degrees of freedom of a place, with a Gaussian of so many windows: where little is determined (no
+/// texture, nothing in view) they decide.
+const LENT: (f32, f64) = (0.02, 3.0);
 
 /// Part of the tissue that must be at rest for any to be held there. Of 37 pairs that moved smoothly or slid 34 had 0 to 0.11 (one 0.16, slides up to 0.24), of 23
 /// pressed ones all but one 0.32 to 0.87 (0.16 where the press went through the whole head).
@@ -72,9 +75,11 @@ impl Rest {
             }
             span
         });
+        let determined = with_lent(determined, windows.nodes);
         let all: f64 = tissue.iter().map(|&v| f64::from(v)).sum();
         let judged = |&Tried { model, motion, ref excess }: &Tried| {
-            let free: Vec<f32> = excess.iter().zip(&determined).map(|(q, d)| stands(q / d.max(FEWEST))).collect();
+            let excess = with_lent(excess.clone(), windows.nodes);
+            let free: Vec<f32> = excess.iter().zip(&determined).map(|(q, d)| stands(q / d.max(1e-9))).collect();
             let share: f64 = free.iter().zip(&tissue).map(|(f, t)| f64::from((1.0 - f) * t)).sum();
             Self { model, motion, windows: windows.clone(), free, share: share / all.max(1.0), spacing: pair.spacing }
         };
@@ -83,7 +88,7 @@ impl Rest {
         // What else moves draws the first fit of the whole to itself.
         let refit = |whole: Self| {
             (0..FITS).fold(whole, |last, _| {
-                let motion = nearest_rigid(&last.at_rest(field, (nodes, posterior)));
+                let motion = nearest_rigid(&last.at_rest((pair, field), (nodes, posterior)));
                 judged(&Tried { model: MotionModel::Rigid, motion, excess: excess(&motion) })
             })
         };
@@ -91,18 +96,24 @@ impl Rest {
         rigid.filter(more).map(refit).filter(more).or(still)
     }
 
-    /// What the field shows of the tissue at rest, at the nodes of the posterior.
-    fn at_rest(&self, field: &SplineField, (nodes, posterior): (&Lattice, &Posterior)) -> Vec<Measured> {
+    /// What the field shows of the tissue at rest, at the nodes of the posterior in it; a node tells as much as the data determine there.
+    fn at_rest(
+        &self,
+        (pair, field): (&Pair<'_>, &SplineField),
+        (nodes, posterior): (&Lattice, &Posterior),
+    ) -> Vec<Measured> {
         let shown = |m: usize| {
             let at = nodes.within(m);
-            let free = self.free_at(at);
-            let displacement = field.lattice.at(&field.coefficients, at);
-            let variance = f64::from(posterior.deviation[m]).powi(2);
-            (free < 0.5 && posterior.determined[m] > 0.0 && variance > 0.0).then(|| Measured {
-                place: std::array::from_fn(|a| at[a] * self.spacing[a]),
-                displacement,
-                covariance: [variance, variance, variance, 0.0, 0.0, 0.0],
-                field: displacement,
+            let variance = 3.0 * f64::from(posterior.deviation[m]).powi(2) / f64::from(posterior.determined[m]);
+            let here = nearest(pair.shape, VoxelPoint(at)).is_some_and(|at| pair.mask[at] != 0);
+            (here && self.free_at(at) < 0.5 && variance.is_finite() && variance > 0.0).then(|| {
+                let displacement = field.lattice.at(&field.coefficients, at);
+                Measured {
+                    place: std::array::from_fn(|a| at[a] * self.spacing[a]),
+                    displacement,
+                    covariance: [variance, variance, variance, 0.0, 0.0, 0.0],
+                    field: displacement,
+                }
             })
         };
         (0..nodes.len()).filter_map(shown).collect()
@@ -149,6 +160,14 @@ impl Rest {
             }
         }
     }
+}
+
+/// See [`LENT`].
+fn with_lent(mut values: Vec<f32>, nodes: [usize; 3]) -> Vec<f32> {
+    let (part, width) = LENT;
+    let about = filters::gaussian(&values, nodes, [width; 3]);
+    values.iter_mut().zip(about).for_each(|(v, about)| *v += part * about);
+    values
 }
 
 /// How much of the free field stands at an excess misfit for each degree of freedom, without a step.
