@@ -229,7 +229,7 @@ impl PhantomParams {
             let ok = (8..=4096).contains(&self.size[a]) || (self.size[a] == 1 && single == 1);
             if !ok {
                 let range = "8 to 4096 voxels a side (one side may be 1)";
-                let name = ["size along x", "size along y", "size along z"][a];
+                let name = ["size", "size along y", "size along z"][a];
                 return Err(ParamError { name, value: self.size[a] as f64, range });
             }
         }
