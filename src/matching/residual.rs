@@ -165,9 +165,10 @@ pub fn excess(pair: &Pair<'_>, a: &[f32], b: &Baseline) -> f64 {
 pub fn excess_by_place(pair: &Pair<'_>, a: &[f32], b: &Baseline, windows: &Lattice) -> Vec<f32> {
     let compared = Compared::new(pair, a, b);
     windows.accumulate::<1>(|j, k, [row]| {
-        row.fill(0.0);
+        let span = pair.spans.row(j, k);
+        row[span.clone()].fill(0.0);
         compared.row(j, k, |at, excess| row[at] += excess as f32);
-        pair.spans.row(j, k)
+        span
     })
 }
 

@@ -65,7 +65,7 @@ impl Rest {
     ) -> Option<Self> {
         let mut determined = vec![0.0f32; windows.len()];
         for (m, &part) in posterior.determined.iter().enumerate() {
-            windows.for_each_tap(nodes.within(m), |window, w| determined[window] += w * part);
+            windows.stencil_near(nodes.place(m)).scatter(part, &mut determined);
         }
         let tissue = windows.accumulate::<1>(|j, k, [row]| {
             let span = pair.spans.row(j, k);
@@ -119,11 +119,9 @@ impl Rest {
         (0..nodes.len()).filter_map(shown).collect()
     }
 
-    /// How much of the free field stands at a place of the windows' grid.
+    /// How much of the free field stands at a place of the windows' grid, or at the nearest to it.
     fn free_at(&self, at: [f64; 3]) -> f32 {
-        let mut sum = 0.0;
-        self.windows.for_each_tap(at, |node, w| sum += w * self.free[node]);
-        sum
+        self.windows.stencil_near(at).gather(&self.free)
     }
 
     /// Whether so much is at rest that it is held there.
@@ -153,8 +151,7 @@ impl Rest {
         let rest = field.lattice.fit(motion);
         let n = field.lattice.len();
         for m in 0..n {
-            let at = place(field.lattice.within(m));
-            let free = self.free_at(std::array::from_fn(|a| at[a].clamp(0.0, (self.windows.shape[a] - 1) as f64)));
+            let free = self.free_at(place(field.lattice.within(m)));
             for i in [m, n + m, 2 * n + m] {
                 field.coefficients[i] = rest[i] + free * (field.coefficients[i] - rest[i]);
             }
