@@ -344,13 +344,18 @@ fn canonical(
         posterior = level::posterior(&field, pair.spacing, params.seed);
         clock.book("uncertainty");
     }
-    if let Some(rest) = rest {
-        rest.bring(&mut field, |p| to_level(from_level(p, factor), searched));
+    let judged = |p| to_level(from_level(p, factor), searched);
+    if let Some(rest) = &rest {
+        rest.bring(&mut field, judged);
     }
     let spacing = pair.spacing;
     let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
-    let (coarse, posterior) = posterior;
+    let (coarse, mut posterior) = posterior;
     let hidden = hidden(&pair, &field, &coarse);
+    if let Some(rest) = rest {
+        let seen = posterior.deviation.iter_mut().enumerate().filter(|&(m, _)| !hidden[m]);
+        seen.for_each(|(m, v)| *v *= rest.narrowed(judged(coarse.within(m))));
+    }
     drop(pair);
     drop(aligned);
     clock.book("model");
