@@ -39,6 +39,7 @@ pub mod neighbours;
 pub mod dense;
 
 pub mod sparse;
+mod tail;
 
 pub mod cholesky;
 

@@ -9,7 +9,11 @@
 //! positive definite and for symmetric quasi-definite matrices, [K B^T; B -C] with K and C positive definite, under any
 //! order (Vanderbei, SIAM J. Optim. 5, 1995). Within a part of the dissection the nodes keep their order, so nodes of the
 //! second block belong at the end.
+//!
+//! Some nodes may be eliminated after all others: where a matrix changes at these alone, its factor is renewed there
+//! alone ([`Factor::renewed`]).
 
+use crate::numerics::tail::Tail;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::ldlt::factor::LdltRegularization;
 use faer::perm::PermRef;
@@ -51,6 +55,8 @@ pub struct Pattern {
     elements: Vec<u32>,
     nodes_per_element: usize,
     symbolic: SymbolicCholesky<u32>,
+    /// The columns of the nodes that come last, if any do.
+    tail: Option<Tail>,
     /// Numbers of factors that are no longer needed: fresh memory of this size takes a fifth of a factorisation's time.
     spare: Mutex<Vec<Vec<f32>>>,
 }
@@ -62,16 +68,34 @@ impl Pattern {
     /// [`Singular`] when the symbolic factorisation does not fit in memory.
     pub fn new(elements: Vec<u32>, per: usize, places: &[[f64; 3]], width: Vec<u8>) -> Result<Self, Singular> {
         let order = dissection(&elements, per, places, &width);
+        Self::ordered(elements, per, width, &order, &[])
+    }
+
+    /// The same with some nodes eliminated after all others, in an order of their own.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn eliminating_last(&self, nodes: &[u32]) -> Result<Self, Singular> {
+        let mut late = vec![false; self.first.len()];
+        nodes.iter().for_each(|&n| late[n as usize] = true);
+        let mut order: Vec<u32> = (0..late.len() as u32).collect();
+        order.sort_unstable_by_key(|&n| (late[n as usize], self.first[n as usize]));
+        let early = order.partition_point(|&n| !late[n as usize]);
+        Self::ordered(self.elements.clone(), self.nodes_per_element, self.width.clone(), &order, &order[early..])
+    }
+
+    /// The pattern with its nodes in an order, of which `last` are the last.
+    fn ordered(elements: Vec<u32>, per: usize, width: Vec<u8>, order: &[u32], last: &[u32]) -> Result<Self, Singular> {
         let mut first = vec![0; width.len()];
         let mut unknowns = 0;
-        for &node in &order {
+        for &node in order {
             first[node as usize] = unknowns;
             unknowns += u32::from(width[node as usize]);
         }
         let below = adjacency(&elements, per, &first);
         let mut column = vec![0; unknowns as usize + 1];
         let mut row = Vec::new();
-        for &node in &order {
+        for &node in order {
             let (start, w) = (first[node as usize], u32::from(width[node as usize]));
             for c in 0..w {
                 column[(start + c) as usize] = row.len();
@@ -112,8 +136,10 @@ impl Pattern {
         let params = CholeskySymbolicParams::default();
         // faer's own identity order reads the upper triangle whatever the side.
         let same: Vec<u32> = (0..unknowns).collect();
-        let order = SymmetricOrdering::Custom(PermRef::new_checked(&same, &same, n));
-        let symbolic = factorize_symbolic_cholesky(view, Side::Lower, order, params);
+        let unchanged = SymmetricOrdering::Custom(PermRef::new_checked(&same, &same, n));
+        let symbolic = factorize_symbolic_cholesky(view, Side::Lower, unchanged, params).map_err(|_| Singular)?;
+        let columns = last.iter().map(|&node| usize::from(width[node as usize])).sum();
+        let tail = Tail::of(&symbolic, columns);
         Ok(Self {
             first,
             width,
@@ -123,7 +149,8 @@ impl Pattern {
             blocks,
             elements,
             nodes_per_element: per,
-            symbolic: symbolic.map_err(|_| Singular)?,
+            symbolic,
+            tail,
             spare: Mutex::default(),
         })
     }
@@ -131,6 +158,11 @@ impl Pattern {
     /// Number of unknowns.
     pub fn unknowns(&self) -> usize {
         self.unknowns
+    }
+
+    /// Whether some nodes come last, so that a factor can be renewed there.
+    pub fn renews(&self) -> bool {
+        self.tail.is_some()
     }
 
     /// Numbers that a factor holds.
@@ -283,8 +315,9 @@ enum Values {
 pub struct Factor<'a> {
     pattern: &'a Pattern,
     matrix: Arc<Vec<f64>>,
+    /// The matrix that it is the factor of: that one, or one nearby.
+    of: Arc<Vec<f64>>,
     values: Values,
-    /// Whether it is of a matrix nearby.
     nearby: bool,
     /// The better factor, where one was needed.
     better: OnceLock<Result<Box<Factor<'a>>, Singular>>,
@@ -301,13 +334,38 @@ impl Drop for Factor<'_> {
 
 impl<'a> Factor<'a> {
     fn new(pattern: &'a Pattern, matrix: Arc<Vec<f64>>, values: Values) -> Self {
-        Self { pattern, matrix, values, nearby: false, better: OnceLock::new() }
+        Self { pattern, of: Arc::clone(&matrix), matrix, values, nearby: false, better: OnceLock::new() }
     }
 
     /// The same factor for a matrix near the one that it is of.
     pub fn near(mut self, matrix: Vec<f64>) -> Self {
         (self.matrix, self.nearby, self.better) = (Arc::new(matrix), true, OnceLock::new());
         self
+    }
+
+    /// A factor for another matrix with the same pattern. The columns of the nodes that come last are worked out anew alone where the matrix
+    /// changed there alone, or is `near` the one of the factor elsewhere; else all of them.
+    ///
+    /// # Errors
+    /// [`Singular`] when a pivot vanishes or is not finite.
+    pub fn renewed(mut self, matrix: Vec<f64>, near: bool) -> Result<Self, Singular> {
+        let pattern = self.pattern;
+        if let (Some(tail), Values::Single(values)) = (&pattern.tail, &mut self.values) {
+            let begin = pattern.column[tail.first()];
+            let same = matrix[..begin] == self.of[..begin];
+            let columns = tail.first()..pattern.unknowns;
+            let spans = columns.flat_map(|c| (pattern.column[c]..pattern.column[c + 1]).map(move |at| (at, c)));
+            let changes = spans.map(|(at, c)| (pattern.row[at] as usize, c, (matrix[at] - self.of[at]) as f32));
+            let changes = changes.filter(|change| change.2 != 0.0);
+            if (same || near) && tail.renew(&pattern.symbolic, values, changes).is_ok() {
+                Arc::make_mut(&mut self.of)[begin..].copy_from_slice(&matrix[begin..]);
+                (self.matrix, self.nearby, self.better) = (Arc::new(matrix), !same, OnceLock::new());
+                return Ok(self);
+            }
+        }
+        // Its memory is the next one's.
+        drop(self);
+        pattern.factorise(matrix)
     }
 
     /// Solves for several right-hand sides in place, one after the other in `x`. Relative error (2-norm over all unknowns of a
@@ -687,6 +745,74 @@ mod tests {
             let (worst, better) = error(&pattern, &pattern.factorise(values.clone()).unwrap(), &values);
             // Single precision alone would be off by 10^-7 times the spring.
             assert!(worst < 1e-6 && better == replaced, "{spring}: {worst} {better}");
+        }
+    }
+
+    /// Cubes of eight nodes with three unknowns each, `n` along an edge.
+    fn cubes(n: u32) -> (Vec<u32>, Vec<[f64; 3]>) {
+        let at = |i: u32, j: u32, k: u32| i + (n + 1) * (j + (n + 1) * k);
+        let corners = |c: u32| {
+            let (i, j, k) = (c % n, c / n % n, c / n / n);
+            (0..8u32).map(move |m| at(i + m % 2, j + m / 2 % 2, k + m / 4))
+        };
+        let places =
+            (0..(n + 1).pow(3)).map(|p| [p % (n + 1), p / (n + 1) % (n + 1), p / (n + 1).pow(2)].map(f64::from));
+        ((0..n.pow(3)).flat_map(corners).collect(), places.collect())
+    }
+
+    /// Symmetric, positive definite matrices of the cubes.
+    fn stiff(pattern: &Pattern, elements: usize) -> Vec<f64> {
+        let mut values = pattern.zeros();
+        let mut random = Random::new(8, 2);
+        for e in 0..elements {
+            let mut m = vec![0.0; 24 * 24];
+            for (i, j) in (0..24).flat_map(|i| (0..i).map(move |j| (i, j))) {
+                m[i * 24 + j] = random.uniform(-1.0, 1.0);
+                m[j * 24 + i] = m[i * 24 + j];
+            }
+            (0..24).for_each(|i| m[i * 25] = 14.0);
+            pattern.add(&mut values, e, &m, 24);
+        }
+        values
+    }
+
+    #[test]
+    fn a_factor_renewed_where_its_matrix_changed_is_that_of_the_new_matrix() {
+        let (elements, places) = cubes(9);
+        let last: Vec<u32> = (0..places.len() as u32).filter(|&n| places[n as usize][2] == 9.0).collect();
+        let count = elements.len() / 8;
+        let pattern = Pattern::new(elements, 8, &places, vec![3; places.len()]).unwrap();
+        let pattern = pattern.eliminating_last(&last).unwrap();
+        assert_eq!(last.iter().map(|&n| pattern.first(n)).min(), Some(pattern.unknowns() - 3 * last.len()));
+        let before = stiff(&pattern, count);
+        let pressed = |nodes: &[u32], spring: f64| {
+            let mut out = before.clone();
+            nodes.iter().for_each(|&n| pattern.add_at_node(&mut out, n, 2, 2, spring));
+            out
+        };
+        let single = |factor: &Factor<'_>| match &factor.values {
+            Values::Single(values) => values.clone(),
+            Values::Double(_) => panic!("double precision"),
+        };
+        let after = pressed(&last[20..70], 300.0);
+        // The tail alone, number by number.
+        let whole = single(&pattern.factorise(after.clone()).unwrap());
+        let mut renewed = single(&pattern.factorise(before.clone()).unwrap());
+        let tail = pattern.tail.as_ref().unwrap();
+        let at = |n: u32| (pattern.first(n) + 2, pattern.first(n) + 2, 300.0);
+        tail.renew(&pattern.symbolic, &mut renewed, last[20..70].iter().map(|&n| at(n))).unwrap();
+        let off =
+            |a: &[f32], b: &[f32]| a.iter().zip(b).fold(0.0f32, |m, (a, b)| m.max((a - b).abs() / (1.0 + b.abs())));
+        assert!(off(&renewed, &whole) < 1e-5, "{}", off(&renewed, &whole));
+        // Where it changed elsewhere as well all is worked out anew, and a spring that comes and goes leaves nothing behind.
+        for matrix in [after, pressed(&[5, last[40]], 300.0), pressed(&[], 0.0)] {
+            let factor = pattern.factorise(before.clone()).unwrap();
+            let factor =
+                factor.renewed(pressed(&last[..50], 40.0), false).unwrap().renewed(matrix.clone(), false).unwrap();
+            let (worst, better) = error(&pattern, &factor, &matrix);
+            assert!(worst < 1e-9 && !better, "{worst} {better}");
+            let whole = single(&pattern.factorise(matrix).unwrap());
+            assert!(off(&single(&factor), &whole) < 1e-4, "{}", off(&single(&factor), &whole));
         }
     }
 }

@@ -56,7 +56,7 @@ impl Search<'_> {
     /// Identified from the state of another mesh, of which it takes the contact.
     fn candidate(&self, labels: Mask, from: (&Level, &State)) -> Result<Candidate, StiffnessError> {
         let mut level = self.level(&labels)?;
-        level.contact_like(from.0);
+        level.contact_like(from.0)?;
         let estimate = identify(&level, self.law, self.poisson, from)?;
         Ok(Candidate { labels, level, estimate })
     }

@@ -196,7 +196,7 @@ fn labelled(
         coarse = level(&mesh, outline)?;
     }
     let mut fine = level(&fine_mesh, outline)?;
-    coarse.agree_on_shape(&mut fine);
+    coarse.agree_on_shape(&mut fine)?;
     let reference = fine.largest();
     clock.book("observe");
 
@@ -213,7 +213,7 @@ fn labelled(
     clock.book("coarse");
 
     progress("fine", 0.4);
-    fine.touch_like(&coarse);
+    fine.touch_like(&coarse)?;
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
     let estimate = settle(&mut fine, choice.law, params.poisson, reference, estimate, (FINE_MOVES, PRECISION))?;

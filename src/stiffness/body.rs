@@ -93,6 +93,16 @@ impl Body {
         Ok(Self { places, cells, pressures, region, labels, quadrature, pattern, surface, volumes })
     }
 
+    /// Has the displacements of some nodes eliminated last, which makes matrices that differ at these alone cheap to factorise in turn.
+    /// Unknowns are numbered anew.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn eliminate_last(&mut self, nodes: &[u32]) -> Result<(), StiffnessError> {
+        self.pattern = Arc::new(self.pattern.eliminating_last(nodes).map_err(|_| StiffnessError::Unsolvable)?);
+        Ok(())
+    }
+
     /// The same elements with their nodes elsewhere.
     pub fn with_places(&self, places: Vec<[f64; 3]>) -> Self {
         let quadrature = self.cells.par_iter().map(|c| points(&c.map(|n| places[n as usize]))).collect();

@@ -288,7 +288,9 @@ impl<'a> Problem<'a> {
     /// largest displacement) from the solution is factorised again at the end.
     fn newton(&self, mut x: Vec<f64>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         let mut factor = Some(self.factorise(&x)?);
-        let (mut factorisations, mut last, mut moved, mut fresh) = (1, f64::INFINITY, 0.0, true);
+        let (mut factorisations, mut last, mut fresh) = (1, f64::INFINITY, true);
+        // Since the tangent, and since its factor was made as a whole.
+        let (mut moved, mut far) = (0.0, 0.0);
         for steps in 1..=STEPS {
             let Some(tangent) = &factor else { break };
             let mut step = self.residual(&x).ok_or(StiffnessError::InsideOut)?;
@@ -308,7 +310,7 @@ impl<'a> Problem<'a> {
                     return Err(StiffnessError::InsideOut);
                 }
             };
-            moved += part * size;
+            (moved, far) = (moved + part * size, far + part * size);
             let done =
                 part == 1.0 && (size < precision || (size < 1e-3 && size * size / last.max(1e-300) < 0.1 * precision));
             if steps > 4 && size > 2.0 * last {
@@ -318,13 +320,19 @@ impl<'a> Problem<'a> {
             let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > CONTRACTS * last);
             let stale = moved > stale * self.size(&x);
             fresh = if done { stale } else { slow };
-            if done && stale && moved < NEAR * self.size(&x) {
+            if fresh {
+                // Another contact is another matrix, except where it alone is worked out anew.
+                let near = far < NEAR * self.size(&x) && (done || self.body.pattern.renews());
                 let matrix = self.tangent(&x).ok_or(StiffnessError::InsideOut)?;
-                factor = factor.map(|f| f.near(matrix));
-            } else if fresh {
-                drop(factor.take()); // its memory is the next one's
-                factor = Some(self.factorise(&x)?);
-                (factorisations, moved) = (factorisations + 1, 0.0);
+                let renew = |f: Factor<'a>| match near && !self.body.pattern.renews() {
+                    true => Ok(f.near(matrix)),
+                    false => f.renewed(matrix, near),
+                };
+                factor = factor.map(renew).transpose().map_err(|_| StiffnessError::Unsolvable)?;
+                moved = 0.0;
+                if !near {
+                    (factorisations, far) = (factorisations + 1, 0.0);
+                }
             }
             if let Some(factor) = factor.take_if(|_| done) {
                 return Ok(Solution { x, factor, factorisations });

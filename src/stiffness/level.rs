@@ -45,6 +45,8 @@ pub struct Level {
     pub hidden: Vec<u8>,
     /// Node places before the edge was moved (mm, RAS).
     unmoved: Vec<[f64; 3]>,
+    /// Whether the nodes about a contact are eliminated last.
+    ordered: bool,
 }
 
 impl Level {
@@ -82,6 +84,7 @@ impl Level {
             grid: *field.grid(),
             edge: None,
             hidden: Vec::new(),
+            ordered: false,
             body,
             observations,
             block,
@@ -116,22 +119,38 @@ impl Level {
     }
 
     /// Makes both meshes of a body agree on which patches are curved: the one with more nodes there knows better, as a
-    /// coarse mesh rounds the rim of a flat face.
-    pub fn agree_on_shape(&mut self, other: &mut Level) {
+    /// coarse mesh rounds the rim of a flat face. Unknowns are numbered anew where a plate presses a curved one.
+    ///
+    /// # Errors
+    /// As [`Body::new`].
+    pub fn agree_on_shape(&mut self, other: &mut Level) -> Result<(), StiffnessError> {
         for (a, b) in self.patches.iter_mut().zip(&mut other.patches) {
             if a.nodes.len() > b.nodes.len() { b.bend_like(a) } else { a.bend_like(b) }
         }
-        self.find_edge();
-        other.find_edge();
+        self.settle_shape()?;
+        other.settle_shape()
     }
 
     /// Takes over from another mesh of the body how the patches touch, and whether they are curved.
-    pub fn contact_like(&mut self, other: &Level) {
+    ///
+    /// # Errors
+    /// As [`Body::new`].
+    pub fn contact_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
         for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
             own.bend_like(theirs);
             own.contact = theirs.contact;
         }
+        self.settle_shape()
+    }
+
+    /// What follows from a loaded patch that is flat or curved: the edge of a punch, or the order of elimination.
+    fn settle_shape(&mut self) -> Result<(), StiffnessError> {
         self.find_edge();
+        if let Some(nodes) = self.patches[1].near_contact(&self.body).filter(|_| !self.ordered) {
+            self.body.eliminate_last(&nodes)?;
+            self.ordered = true;
+        }
+        Ok(())
     }
 
     /// The edge of the punch where it lies before it is moved; none where the loaded patch is curved.
@@ -141,12 +160,16 @@ impl Level {
 
     /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere, an edge of the punch that
     /// makes the patch as large.
-    pub fn touch_like(&mut self, other: &Level) {
-        self.contact_like(other);
+    ///
+    /// # Errors
+    /// As [`Body::new`].
+    pub fn touch_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
+        self.contact_like(other)?;
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
         if let Some((edge, _)) = self.edge {
             self.move_edge(edge.radius() / self.voxel * ((asked / own).sqrt() - 1.0));
         }
+        Ok(())
     }
 
     /// The mesh as the edge was moved.

@@ -10,7 +10,7 @@
 use crate::error::StiffnessError;
 use crate::numerics::dense::{solve, symmetric_eigen};
 use crate::numerics::statistics::percentile;
-use crate::stiffness::body::{Body, Facet};
+use crate::stiffness::body::{Body, Facet, sorted};
 use crate::stiffness::forward::Tie;
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::plate;
@@ -215,6 +215,14 @@ impl Patch {
     /// What it comes to lie on, where it is curved.
     fn landed(&self) -> Option<&Landing> {
         self.landing.as_ref().filter(|_| self.bends)
+    }
+
+    /// Nodes that may touch the plate, where it is curved: those that were seen to, and of the facets beside them (ascending).
+    pub fn near_contact(&self, body: &Body) -> Option<Vec<u32>> {
+        let Landing { facets, .. } = self.landed()?;
+        let touches = |n: &u32| self.nodes.binary_search(n).is_ok();
+        let beside = facets.iter().map(|&f| body.surface[f].nodes).filter(|nodes| nodes.iter().any(touches));
+        Some(sorted(self.nodes.iter().copied().chain(beside.flatten())))
     }
 
     /// Takes over from the same patch of another mesh whether it is curved: near the limit, facets that end elsewhere say
