@@ -365,7 +365,7 @@ fn meshes_of_a_body_agree_on_what_is_curved_as_the_finer_sees_it() {
         let (mut few, mut many) = (level(2500, coarse), level(10_000, fine));
         assert!(few.patches[1].curved() != many.patches[1].curved());
         assert!(few.patches[1].nodes.len() < many.patches[1].nodes.len());
-        few.agree_on_shape(&mut many);
+        few.agree_on_shape(&mut many).unwrap();
         for level in [&few, &many] {
             let expected = if fine == 1.0 { (true, 0) } else { (false, level.patches[1].nodes.len()) };
             assert_eq!(slides(level), expected);

@@ -12,6 +12,9 @@ use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::sparse::linalg::cholesky::{SymbolicCholesky, SymbolicCholeskyRaw};
 use faer::{Accum, Mat, Par};
 
+/// Work of a renewal over that of the whole factor from which it is not worth it.
+const WORTH: f64 = 0.5;
+
 /// The last columns of a factor.
 #[derive(Debug)]
 pub(super) struct Tail {
@@ -22,9 +25,21 @@ pub(super) struct Tail {
 }
 
 impl Tail {
-    /// The last `columns` columns; none where there are none, or the factor is not made of supernodes.
+    /// The last `columns` columns; none where there are none, or so many that the whole factor takes hardly more work, or the factor is not made
+    /// of supernodes.
     pub fn of(symbolic: &SymbolicCholesky<u32>, columns: usize) -> Option<Self> {
         let supernodes = supernodes(symbolic).filter(|_| columns > 0)?;
+        let whole: f64 = (0..supernodes.n_supernodes())
+            .map(|s| {
+                let [begin, end] = ends(supernodes, s);
+                let below = supernodes.supernode(s).pattern().len();
+                (begin..end).map(|column| ((end - column + below) as f64).powi(2)).sum::<f64>()
+            })
+            .sum();
+        // Put together and factorised again, a third of the cube each.
+        if 2.0 / 3.0 * (columns as f64).powi(3) > WORTH * whole {
+            return None;
+        }
         let first = symbolic.ncols() - columns;
         Some(Self { first, from: supernodes.supernode_end().partition_point(|&end| end as usize <= first) })
     }
@@ -70,7 +85,7 @@ impl Tail {
     /// Calls `with` for each number of the tail in a factor: where it is kept, and its row and column (from the first of the tail on).
     fn each(&self, supernodes: &SymbolicSupernodalCholesky<u32>, mut with: impl FnMut(usize, usize, usize)) {
         for s in self.from..supernodes.n_supernodes() {
-            let [begin, end] = [supernodes.supernode_begin(), supernodes.supernode_end()].map(|ends| ends[s] as usize);
+            let [begin, end] = ends(supernodes, s);
             // Column by column the square on the diagonal as a whole, then the rows below.
             let (below, start) = (supernodes.supernode(s).pattern(), supernodes.col_ptr_for_val()[s] as usize);
             for column in begin.max(self.first)..end {
@@ -81,6 +96,11 @@ impl Tail {
             }
         }
     }
+}
+
+/// The first column of a supernode, and that after its last.
+fn ends(supernodes: &SymbolicSupernodalCholesky<u32>, s: usize) -> [usize; 2] {
+    [supernodes.supernode_begin(), supernodes.supernode_end()].map(|ends| ends[s] as usize)
 }
 
 fn supernodes(symbolic: &SymbolicCholesky<u32>) -> Option<&SymbolicSupernodalCholesky<u32>> {

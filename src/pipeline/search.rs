@@ -123,6 +123,7 @@ pub(super) fn regions(
     let fineness = coarse_fineness(inputs.labels, params);
     let mut search = Search { inputs, fineness, law: Law::Linear, poisson: params.poisson };
     let mut one = search.level(inputs.labels)?;
+    one.settle_shape()?;
     let choice = choose(&mut one, params.model, params.poisson, 0)?;
     search.law = choice.law;
     let noise = maps::noise(inputs.field, inputs.labels);

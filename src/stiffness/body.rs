@@ -93,13 +93,16 @@ impl Body {
         Ok(Self { places, cells, pressures, region, labels, quadrature, pattern, surface, volumes })
     }
 
-    /// Has the displacements of some nodes eliminated last, which makes matrices that differ at these alone cheap to factorise in turn.
-    /// Unknowns are numbered anew.
+    /// Has the displacements of some nodes eliminated last, which makes matrices that differ at these alone cheap to factorise in turn; not where
+    /// there are too many for that. Unknowns are numbered anew.
     ///
     /// # Errors
     /// As [`Self::new`].
     pub fn eliminate_last(&mut self, nodes: &[u32]) -> Result<(), StiffnessError> {
-        self.pattern = Arc::new(self.pattern.eliminating_last(nodes).map_err(|_| StiffnessError::Unsolvable)?);
+        let pattern = self.pattern.eliminating_last(nodes).map_err(|_| StiffnessError::Unsolvable)?;
+        if pattern.renews() {
+            self.pattern = Arc::new(pattern);
+        }
         Ok(())
     }
 

@@ -292,10 +292,10 @@ impl<'a> Problem<'a> {
         // Since the tangent, and since its factor was made as a whole.
         let (mut moved, mut far) = (0.0, 0.0);
         for steps in 1..=STEPS {
-            let Some(tangent) = &factor else { break };
+            let Some(tangent) = &mut factor else { break };
             let mut step = self.residual(&x).ok_or(StiffnessError::InsideOut)?;
             step.iter_mut().for_each(|v| *v = -*v);
-            tangent.solve(&mut step).map_err(|_| StiffnessError::Unsolvable)?;
+            tangent.solve_or_replace(&mut step).map_err(|_| StiffnessError::Unsolvable)?;
             let size = self.size(&step);
             // What comes into touch and goes out of it by turns is met halfway.
             let swings = self.plate.is_some() && steps > 3 && size > (0.7 * last).max(precision);

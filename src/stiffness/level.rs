@@ -143,8 +143,11 @@ impl Level {
         self.settle_shape()
     }
 
-    /// What follows from a loaded patch that is flat or curved: the edge of a punch, or the order of elimination.
-    fn settle_shape(&mut self) -> Result<(), StiffnessError> {
+    /// What follows from a loaded patch that is flat or curved: the edge of a punch, or the order of elimination (unknowns are numbered anew).
+    ///
+    /// # Errors
+    /// As [`Body::new`].
+    pub fn settle_shape(&mut self) -> Result<(), StiffnessError> {
         self.find_edge();
         if let Some(nodes) = self.patches[1].near_contact(&self.body).filter(|_| !self.ordered) {
             self.body.eliminate_last(&nodes)?;
