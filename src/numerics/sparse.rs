@@ -351,7 +351,8 @@ impl<'a> Factor<'a> {
     }
 
     /// A factor for another matrix with the same pattern. The columns of the nodes that come last are worked out anew alone where the matrix
-    /// changed there alone, or is `near` the one of the factor elsewhere; else all of them.
+    /// changed there alone, or is `near` the one of the factor elsewhere; else all of them. Where none come last, a factor serves for a
+    /// matrix near its own as it is.
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes or is not finite.
@@ -359,6 +360,9 @@ impl<'a> Factor<'a> {
         let pattern = self.pattern;
         if let Some(Ok(better)) = self.better.take() {
             self = *better;
+        }
+        if near && pattern.tail.is_none() {
+            return Ok(self.near(matrix));
         }
         if let (Some(tail), Values::Single(values)) = (&pattern.tail, &mut self.values) {
             let begin = pattern.column[tail.first()];

@@ -324,11 +324,8 @@ impl<'a> Problem<'a> {
                 // Another contact is another matrix, except where it alone is worked out anew.
                 let near = far < NEAR * self.size(&x) && (done || self.body.pattern.renews());
                 let matrix = self.tangent(&x).ok_or(StiffnessError::InsideOut)?;
-                let renew = |f: Factor<'a>| match near && !self.body.pattern.renews() {
-                    true => Ok(f.near(matrix)),
-                    false => f.renewed(matrix, near),
-                };
-                factor = factor.map(renew).transpose().map_err(|_| StiffnessError::Unsolvable)?;
+                let renewed = factor.map(|f| f.renewed(matrix, near)).transpose();
+                factor = renewed.map_err(|_| StiffnessError::Unsolvable)?;
                 moved = 0.0;
                 if !near {
                     (factorisations, far) = (factorisations + 1, 0.0);

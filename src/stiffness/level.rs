@@ -45,7 +45,7 @@ pub struct Level {
     pub hidden: Vec<u8>,
     /// Node places before the edge was moved (mm, RAS).
     unmoved: Vec<[f64; 3]>,
-    /// Whether the nodes about a contact are eliminated last.
+    /// Whether the order of elimination was settled for its contact.
     ordered: bool,
 }
 
