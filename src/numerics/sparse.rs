@@ -318,7 +318,6 @@ pub struct Factor<'a> {
     /// The matrix that it is the factor of: that one, or one nearby.
     of: Arc<Vec<f64>>,
     values: Values,
-    nearby: bool,
     /// The better factor, where one was needed.
     better: OnceLock<Result<Box<Factor<'a>>, Singular>>,
 }
@@ -331,7 +330,7 @@ impl Drop for Factor<'_> {
 
 impl<'a> Factor<'a> {
     fn new(pattern: &'a Pattern, matrix: Arc<Vec<f64>>, values: Values) -> Self {
-        Self { pattern, of: Arc::clone(&matrix), matrix, values, nearby: false, better: OnceLock::new() }
+        Self { pattern, of: Arc::clone(&matrix), matrix, values, better: OnceLock::new() }
     }
 
     /// Leaves its memory to the next factor.
@@ -346,8 +345,13 @@ impl<'a> Factor<'a> {
 
     /// The same factor for a matrix near the one that it is of.
     pub fn near(mut self, matrix: Vec<f64>) -> Self {
-        (self.matrix, self.nearby, self.better) = (Arc::new(matrix), true, OnceLock::new());
+        (self.matrix, self.better) = (Arc::new(matrix), OnceLock::new());
         self
+    }
+
+    /// Whether it is of a matrix nearby.
+    fn is_nearby(&self) -> bool {
+        !Arc::ptr_eq(&self.of, &self.matrix)
     }
 
     /// A factor for another matrix with the same pattern. The columns of the nodes that come last are worked out anew alone where the matrix
@@ -372,9 +376,13 @@ impl<'a> Factor<'a> {
             let changes = spans.map(|(at, c)| (pattern.row[at] as usize, c, (matrix[at] - self.of[at]) as f32));
             let changes = changes.filter(|change| change.2 != 0.0);
             if (same || near) && tail.renew(&pattern.symbolic, values, changes).is_ok() {
-                Arc::make_mut(&mut self.of)[begin..].copy_from_slice(&matrix[begin..]);
-                (self.matrix, self.nearby, self.better) = (Arc::new(matrix), !same, OnceLock::new());
-                return Ok(self);
+                let mut out = self.near(matrix);
+                if same {
+                    out.of = Arc::clone(&out.matrix);
+                } else {
+                    Arc::make_mut(&mut out.of)[begin..].copy_from_slice(&out.matrix[begin..]);
+                }
+                return Ok(out);
             }
         }
         // Its memory is the next one's.
@@ -390,7 +398,7 @@ impl<'a> Factor<'a> {
     pub fn solve(&self, x: &mut [f64]) -> Result<(), Singular> {
         let solved = match &self.values {
             Values::Single(values) => self.refined(values, x),
-            Values::Double(_) if self.nearby => None,
+            Values::Double(_) if self.is_nearby() => None,
             Values::Double(values) => {
                 self.pattern.substitute(values, x)?;
                 return if x.iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Singular) };
@@ -406,7 +414,7 @@ impl<'a> Factor<'a> {
     /// # Errors
     /// As [`Factor::solve`].
     pub fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
-        if let (Values::Single(values), true) = (&self.values, self.nearby) {
+        if let (Values::Single(values), true) = (&self.values, self.is_nearby()) {
             if let Some(solved) = self.refined(values, x) {
                 x.copy_from_slice(&solved);
                 return Ok(());
@@ -439,12 +447,13 @@ impl<'a> Factor<'a> {
     /// # Errors
     /// [`Singular`] when a pivot vanishes or is not finite.
     pub fn whole(&self) -> Result<&Self, Singular> {
-        if self.nearby { self.better() } else { Ok(self) }
+        if self.is_nearby() { self.better() } else { Ok(self) }
     }
 
     fn better(&self) -> Result<&Self, Singular> {
         let matrix = || Arc::clone(&self.matrix);
-        let make = || if self.nearby { self.pattern.factor(matrix()) } else { self.pattern.exact_factor(matrix()) };
+        let make =
+            || if self.is_nearby() { self.pattern.factor(matrix()) } else { self.pattern.exact_factor(matrix()) };
         self.better.get_or_init(|| make().map(Box::new)).as_deref().map_err(|e| *e)
     }
 
@@ -858,11 +867,11 @@ mod tests {
             let mut matrix: Vec<f64> = before.iter().map(|v| scale * v).collect();
             last.iter().for_each(|&n| pattern.add_at_node(&mut matrix, n, 2, 2, 300.0));
             let mut factor = pattern.factorise(before.clone()).unwrap().renewed(matrix.clone(), true).unwrap();
-            assert!(factor.nearby);
+            assert!(factor.is_nearby());
             let mut x = pattern.multiply(&matrix, &truth);
             factor.solve_or_replace(&mut x).unwrap();
             let worst = x.iter().zip(&truth).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
-            assert!(worst < 1e-5 && factor.nearby != replaced, "{scale}: {worst}");
+            assert!(worst < 1e-5 && factor.is_nearby() != replaced, "{scale}: {worst}");
             let (worst, _) = error(&pattern, factor.whole().unwrap(), &matrix);
             assert!(worst < 1e-9, "{worst}");
         }
