@@ -9,7 +9,8 @@ use palpate::consistency::energy::{EnergyParams, Graph, distance, penalty};
 use palpate::consistency::models::{AffineMotion, CHANCE, choose};
 use palpate::consistency::pruning::{Measured, prune};
 use palpate::consistency::relaxation::relax;
-use palpate::numerics::bending::Smoothness;
+use palpate::numerics::bending::{Coupled, Smoothness};
+use palpate::numerics::blocks::Blocks;
 use palpate::numerics::bspline::Lattice;
 use palpate::numerics::filters;
 use palpate::numerics::random::Random;
@@ -270,18 +271,19 @@ fn a_step_reaches_the_minimum() {
     let (_, smoothness, l) = small();
     let (blocks, rhs, start) = (random_blocks(80, 1), normals(240, 2), normals(240, 3));
     let lambda = [5.0, 0.7, 20.0];
-    let mut c = start.clone();
-    let (report, moved) = coupling::step(&smoothness, lambda, &blocks, &rhs, &mut c, 1e-7, 500);
+    let planar = Blocks::from(&blocks[..]);
+    let matrix = Coupled::new(&smoothness, lambda, &planar, false);
+    let (report, step, moved) = coupling::step(&matrix, rhs.clone(), &start, 1e-7, 500);
     assert!(report.residual <= 1e-7, "{report:?}");
     let m = system(&l, lambda, &blocks);
     // The gradient `A d - b + lambda L (c + d)` vanishes.
     for r in 0..240 {
         let weight = f64::from(lambda[r / 80]);
         let smooth: f64 = (0..80).map(|j| weight * l[r % 80][j] * f64::from(start[r / 80 * 80 + j])).sum();
-        let d: f64 = (0..240).map(|k| m[r][k] * f64::from(c[k] - start[k])).sum();
+        let d: f64 = (0..240).map(|k| m[r][k] * f64::from(step[k])).sum();
         assert!((d + smooth - f64::from(rhs[r])).abs() < 1e-4, "{r}: {}", d + smooth - f64::from(rhs[r]));
     }
-    let exact = c.iter().zip(&start).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / 80.0;
+    let exact = step.iter().map(|d| f64::from(*d).powi(2)).sum::<f64>() / 80.0;
     assert!((f64::from(moved) - exact.sqrt()).abs() < 1e-4);
 }
 
@@ -297,12 +299,14 @@ fn determined_degrees_of_freedom_follow_a_weight_that_swings() {
         let strength = if i % 7 == 0 { 300.0 } else { 0.3 };
         block.iter_mut().for_each(|v| *v *= strength);
     }
+    let blocks = Blocks::from(&blocks[..]);
     let mut probe = coupling::Probe::new(18_000, 3);
     for (pass, lambda) in [1e3, 5e3, 1e3, 2e2, 1e3, 5e3, 2.5e4, 5e3].into_iter().enumerate() {
         let lambda = [lambda, 0.3 * lambda, lambda];
         let limit = if pass == 0 { 20 } else { 10 };
-        let quick = probe.determined(&smoothness, lambda, &blocks, limit, false);
-        let sure = coupling::determined(&smoothness, lambda, &blocks, 3, 2000);
+        let matrix = Coupled::new(&smoothness, lambda, &blocks, false);
+        let quick = probe.determined(&matrix, limit);
+        let sure = coupling::determined(&matrix, 3, 2000);
         let [quick, sure] = [quick, sure].map(|v| v.iter().sum::<f64>());
         assert!(quick > 0.9 * sure && quick < 1.02 * sure, "{lambda:?}: {quick:.0} of {sure:.0}");
     }
@@ -314,9 +318,9 @@ fn determined_degrees_of_freedom_are_the_trace() {
     let blocks = random_blocks(80, 4);
     for lambda in [[0.1f32; 3], [10.0, 1.0, 100.0], [1000.0; 3]] {
         let inverse = invert(&system(&l, lambda, &blocks));
-        let seeds = 1500;
-        let all: Vec<[f64; 3]> =
-            (0..seeds).map(|s| coupling::determined(&smoothness, lambda, &blocks, s, 200)).collect();
+        let (seeds, planar) = (1500, Blocks::from(&blocks[..]));
+        let matrix = Coupled::new(&smoothness, lambda, &planar, false);
+        let all: Vec<[f64; 3]> = (0..seeds).map(|s| coupling::determined(&matrix, s, 200)).collect();
         for a in 0..3 {
             let trace: f64 = (0..80)
                 .flat_map(|i| (0..80).map(move |j| (i, j)))

@@ -775,12 +775,12 @@ fn the_blocks_are_positive_and_bound_the_curvature() {
         for v in
             [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.6, -0.8, 0.0], [0.5, 0.5, -0.7], [-0.3, 0.9, 0.4]]
         {
-            let q: f64 = (0..9).map(|e| v[e / 3] * v[e % 3] * entry(m, e / 3, e % 3)).sum();
+            let q: f64 = (0..9).map(|e| v[e / 3] * v[e % 3] * entry(&m, e / 3, e % 3)).sum();
             assert!(q >= -1e-5 * trace, "node {node}: {q} of {trace}");
         }
         // Nodes that only reach beyond the mask know nothing.
         if node / (lattice.nodes[0] * lattice.nodes[1]) >= 7 {
-            assert_eq!((*m, found.rhs[node]), ([0.0; 6], 0.0));
+            assert_eq!((m, found.rhs[node]), ([0.0; 6], 0.0));
         }
     }
     let again = with_threads(1, run);

@@ -4,7 +4,8 @@
 #[path = "fixtures/truth.rs"]
 mod truth;
 
-use palpate::numerics::bending::{Data, Smoothness, solve};
+use palpate::numerics::bending::{Coupled, Smoothness};
+use palpate::numerics::blocks::Blocks;
 use palpate::numerics::bspline::{Lattice, SmoothSampler, weights};
 use palpate::numerics::dense::symmetric_eigen;
 use palpate::numerics::neighbours::Neighbours;
@@ -377,10 +378,12 @@ fn solving_gives_the_dense_solution() {
     let inverse = invert(&system(&energy_matrix(nodes, h), lambda, &blocks));
     let exact: Vec<f64> = inverse.iter().map(|row| row.iter().zip(f64s(&b)).map(|(a, b)| a * b).sum()).collect();
     let top = exact.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    let planar = Blocks::from(&blocks[..]);
     let run = || {
         let mut x = vec![0.0f32; 3 * n];
         let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
-        let report = solve(&smoothness, lambda, &blocks, Data::Operator(&data), true, &b, &mut x, 1e-7, 500);
+        let matrix = Coupled::new(&smoothness, lambda, &planar, true);
+        let report = matrix.solve_with(data, b.clone(), &mut x, 1e-7, 500);
         (x, report)
     };
     let (x, report) = run();
@@ -391,7 +394,7 @@ fn solving_gives_the_dense_solution() {
     assert_eq!(with_threads(1, run), with_threads(3, run));
 
     let mut x = vec![0.0f32; 3 * n];
-    let report = solve(&smoothness, lambda, &blocks, Data::Blocks, false, &b, &mut x, 1e-7, 2000);
+    let report = Coupled::new(&smoothness, lambda, &planar, false).solve(b.clone(), &mut x, 1e-7, 2000);
     assert!(report.residual <= 1e-7, "{report:?}");
     for (i, (x, e)) in f64s(&x).zip(&exact).enumerate() {
         assert!((x - e).abs() < 1e-5 * top, "blocks alone, {i}: {x} is not {e}");
@@ -410,12 +413,14 @@ fn coarser_lattices_carry_sparse_data_in_few_iterations() {
         (0..3).for_each(|c| b[c * n + i] = 9.0 * v);
     }
     let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
+    let planar = Blocks::from(&blocks[..]);
     let solved = |limit: usize, multilevel: bool| {
         let mut x = vec![0.0f32; 3 * n];
+        let matrix = Coupled::new(&smoothness, [1000.0; 3], &planar, multilevel);
         if multilevel {
-            solve(&smoothness, [1000.0; 3], &blocks, Data::Operator(&data), true, &b, &mut x, 1e-9, limit);
+            matrix.solve_with(data, b.clone(), &mut x, 1e-9, limit);
         } else {
-            solve(&smoothness, [1000.0; 3], &blocks, Data::Blocks, false, &b, &mut x, 1e-9, limit);
+            matrix.solve(b.clone(), &mut x, 1e-9, limit);
         }
         x
     };
@@ -454,7 +459,8 @@ fn a_solve_that_starts_at_the_solution_stays() {
     let blocks = random_blocks(16, 2);
     let mut x = vec![0.0f32; 48];
     let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
-    let report = solve(&smoothness, [1.0; 3], &blocks, Data::Operator(&data), true, &[0.0; 48], &mut x, 1e-6, 50);
+    let planar = Blocks::from(&blocks[..]);
+    let report = Coupled::new(&smoothness, [1.0; 3], &planar, true).solve_with(data, vec![0.0; 48], &mut x, 1e-6, 50);
     assert_eq!((report.iterations, report.residual), (0, 0.0));
     assert!(x.iter().all(|v| *v == 0.0));
 }

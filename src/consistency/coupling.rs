@@ -1,41 +1,36 @@
 //! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
 //! energy of a spline lattice holds the places together.
 
-use crate::numerics::bending::{Data, Smoothness, SolveReport, solve, solver};
+use crate::numerics::bending::{Coupled, Smoothness, SolveReport};
+use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
 use crate::numerics::small::{Symmetric3, cholesky_solve, multiply, quadratic};
 use rayon::prelude::*;
 
-/// One Gauss-Newton step: adds to `coefficients` the `d` that minimises
-/// `1/2 d.A d - b.d + lambda/2 (c + d).L (c + d)`.
+/// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises `1/2 d.A d - b.d + lambda/2 (c + d).L (c + d)`, and its root
+/// mean square length. `rhs` is `b`.
 pub fn step(
-    smoothness: &Smoothness,
-    lambda: [f32; 3],
-    blocks: &[[f32; 6]],
-    rhs: &[f32],
-    coefficients: &mut [f32],
+    matrix: &Coupled<'_>,
+    mut rhs: Vec<f32>,
+    coefficients: &[f32],
     tolerance: f64,
     limit: usize,
-) -> (SolveReport, f32) {
-    let n = blocks.len();
-    let mut b = rhs.to_vec();
+) -> (SolveReport, Vec<f32>, f32) {
+    let n = coefficients.len() / 3;
     let mut lc = vec![0.0f32; n];
-    for ((c, b), lambda) in coefficients.chunks_exact(n).zip(b.chunks_exact_mut(n)).zip(lambda) {
-        smoothness.apply(c, &mut lc);
+    for ((c, b), lambda) in coefficients.chunks_exact(n).zip(rhs.chunks_exact_mut(n)).zip(matrix.lambda()) {
+        matrix.smoothness().apply(c, &mut lc);
         for (b, l) in b.iter_mut().zip(&lc) {
             *b -= lambda * l;
         }
     }
+    drop(lc);
     let mut d = vec![0.0f32; 3 * n];
-    let report = solve(smoothness, lambda, blocks, Data::Blocks, false, &b, &mut d, tolerance, limit);
-    let mut moved = 0.0f64;
-    for (c, d) in coefficients.iter_mut().zip(&d) {
-        *c += d;
-        moved += f64::from(d * d);
-    }
-    (report, (moved / n as f64).sqrt() as f32)
+    let report = matrix.solve(rhs, &mut d, tolerance, limit);
+    let moved = d.iter().map(|d| f64::from(d * d)).sum::<f64>();
+    (report, d, (moved / n as f64).sqrt() as f32)
 }
 
 /// How much the axes share their weights: an axis along which nothing moves is held at most about four times as stiffly as all
@@ -56,15 +51,15 @@ pub fn supported(determined: [f64; 3], energy: [f64; 3]) -> [f64; 3] {
 ///
 /// The trace is estimated with one random sign vector `z` (Hutchinson 1990): `z.C^T (A + lambda L)^-1 C z` with `C C^T = A`, which is
 /// good to about one part in the root of half of what it finds.
-pub fn determined(smoothness: &Smoothness, lambda: [f32; 3], blocks: &[[f32; 6]], seed: u64, limit: usize) -> [f64; 3] {
-    Probe::new(blocks.len(), seed).determined(smoothness, lambda, blocks, limit, false)
+pub fn determined(matrix: &Coupled<'_>, seed: u64, limit: usize) -> [f64; 3] {
+    Probe::new(matrix.blocks().len(), seed).determined(matrix, limit)
 }
 
 /// The random sign vector of [`determined`] and its last solution, from which the next one starts: while a field settles, a
 /// few iterations a time suffice.
 #[derive(Debug, Clone)]
 pub struct Probe {
-    signs: Vec<f32>,
+    signs: Vec<i8>,
     solution: Vec<f32>,
 }
 
@@ -72,34 +67,29 @@ impl Probe {
     /// For `nodes` nodes.
     pub fn new(nodes: usize, seed: u64) -> Self {
         let mut random = Random::new(seed, 77);
-        let signs = (0..3 * nodes).map(|_| if random.bits() >> 63 == 0 { 1.0 } else { -1.0 }).collect();
+        let signs = (0..3 * nodes).map(|_| if random.bits() >> 63 == 0 { 1 } else { -1 }).collect();
         Self { signs, solution: vec![0.0; 3 * nodes] }
     }
 
-    /// See [`determined`]; at most `limit` more iterations, `multilevel` where the blocks are sparse.
+    /// See [`determined`]; at most `limit` more iterations.
     ///
     /// With `b = C z` and `M = A + lambda L` it is the greatest `(b.x)^2 / x.M x`: what the iterations are short of shows only squared,
     /// and the sum over the axes is neither negative nor more than there is.
-    pub fn determined(
-        &mut self,
-        smoothness: &Smoothness,
-        lambda: [f32; 3],
-        blocks: &[[f32; 6]],
-        limit: usize,
-        multilevel: bool,
-    ) -> [f64; 3] {
+    pub fn determined(&mut self, matrix: &Coupled<'_>, limit: usize) -> [f64; 3] {
+        let (blocks, lambda) = (matrix.blocks(), matrix.lambda());
         let n = blocks.len();
-        let at = |v: &[f32], i: usize| -> [f64; 3] { std::array::from_fn(|c| f64::from(v[c * n + i])) };
         let mut b = vec![0.0f32; 3 * n];
         for (i, block) in blocks.iter().enumerate() {
-            for (c, v) in cholesky_times(block, at(&self.signs, i)).into_iter().enumerate() {
+            let signs = std::array::from_fn(|c| f64::from(self.signs[c * n + i]));
+            for (c, v) in cholesky_times(&block, signs).into_iter().enumerate() {
                 b[c * n + i] = v as f32;
             }
         }
         let x = &mut self.solution;
-        solve(smoothness, lambda, blocks, Data::Blocks, multilevel, &b, x, 1e-2, limit);
-        let bent = smoothness.energy(x);
+        matrix.solve(b.clone(), x, 1e-2, limit);
+        let bent = matrix.smoothness().energy(x);
         let (mut bx, mut xmx) = ([0.0; 3], std::array::from_fn::<f64, 3, _>(|c| f64::from(lambda[c]) * bent[c]));
+        let at = |v: &[f32], i: usize| -> [f64; 3] { std::array::from_fn(|c| f64::from(v[c * n + i])) };
         for (i, block) in blocks.iter().enumerate() {
             let (b, x) = (at(&b, i), at(x, i));
             let ax = multiply(&block.map(f64::from), x);
@@ -194,8 +184,10 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         };
         // Early rounds only sort the evidence; the last two settle the field.
         let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-2, 60) };
-        solve(smoothness, [lambda; 3], &blocks, Data::Operator(&operator), true, &rhs, &mut c, tolerance, limit);
-        let gamma = probe.determined(smoothness, [lambda; 3], &blocks, if round < 2 { 30 } else { 15 }, true);
+        let blocks = Blocks::from(&blocks[..]);
+        let matrix = Coupled::new(smoothness, [lambda; 3], &blocks, true);
+        matrix.solve_with(operator, rhs, &mut c, tolerance, limit);
+        let gamma = probe.determined(&matrix, if round < 2 { 30 } else { 15 });
         let [gamma, energy] = [gamma, smoothness.energy(&c)].map(|v| v.iter().sum::<f64>());
         // Half way on the logarithm: whole steps swing to and fro.
         let target = (lambda * (0.5 * gamma.max(1.0) / energy.max(1e-9)) as f32).sqrt();
@@ -234,7 +226,8 @@ pub fn posterior(
 ) -> Posterior {
     let n = blocks.len();
     let affine = Affine::new(nodes, blocks);
-    let solve = solver(smoothness, lambda, blocks, true);
+    let planar = Blocks::from(blocks);
+    let matrix = Coupled::new(smoothness, lambda, &planar, true);
     let draw = |draw: usize| {
         let mut random = Random::new(seed, 1000 + draw as u64);
         let mut b = vec![0.0f32; 3 * n];
@@ -252,7 +245,7 @@ pub fn posterior(
         }
         // Of the rest an affine motion feels nothing.
         let mut x = affine.solve(&pulls);
-        solve(&b, &mut x, 1e-2, 200);
+        matrix.solve(b, &mut x, 1e-2, 200);
         x
     };
     // Across a slice there is neither motion nor data.

@@ -8,6 +8,7 @@
 
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, row_step};
+use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
@@ -19,8 +20,8 @@ pub(super) const CAUCHY: f32 = 2.385;
 /// Normal equations of one pass.
 #[derive(Debug, Clone)]
 pub struct NormalEquations {
-    /// Information of each node (1/mm^2): xx, yy, zz, xy, xz, yz.
-    pub blocks: Vec<[f32; 6]>,
+    /// Information of each node (1/mm^2).
+    pub blocks: Blocks,
     /// Right-hand side (1/mm), planar.
     pub rhs: Vec<f32>,
     /// Robust standard deviation of the residual (intensity).
@@ -66,7 +67,7 @@ pub fn normal_equations(
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
     // Differences over two voxels, over one at the border; none along a side of one voxel.
     let ends = |at: usize, n: usize| (at.saturating_sub(1), (at + 1).min(n - 1));
-    let sums = lattice.accumulate::<9>(|j, k, rows| {
+    let mut sums = lattice.accumulate::<9>(|j, k, rows| {
         let mut span = pair.spans.row(j, k);
         if nx > 1 {
             span = span.start.max(1)..span.end.min(nx - 1);
@@ -121,9 +122,9 @@ pub fn normal_equations(
         );
         span
     });
-    let n = lattice.len();
-    let blocks = (0..n).map(|i| std::array::from_fn(|q| sums[q * n + i])).collect();
-    NormalEquations { blocks, rhs: sums[6 * n..9 * n].to_vec(), sigma }
+    let rhs = sums.split_off(6 * lattice.len());
+    sums.shrink_to_fit();
+    NormalEquations { blocks: Blocks::from_planar(sums), rhs, sigma }
 }
 
 /// A warp that others are judged against.

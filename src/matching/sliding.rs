@@ -44,8 +44,8 @@ const MOST: f32 = 0.5;
 /// and under 0.02 elsewhere.
 const SOME: f32 = 0.3;
 
-/// Voxels of a slab, about: with what is needed around it 0.1 to 0.5 GB.
-const SLAB: usize = 8_000_000;
+/// Voxels of a slab, about: with what is needed around it 0.1 to 0.3 GB.
+const SLAB: usize = 5_000_000;
 
 /// Voxels that move with one side of a surface along which tissue glides.
 #[derive(Debug, Clone, PartialEq)]

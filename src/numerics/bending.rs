@@ -3,6 +3,7 @@
 //! Energy (per component): `sum over nodes of |second differences|^2 / mm^4` over all six second derivatives (a P-spline
 //! penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999). An affine field costs nothing.
 
+use crate::numerics::blocks::Blocks;
 use crate::numerics::multilevel::Coarse;
 use crate::numerics::random::Random;
 use crate::numerics::simd::dispatch;
@@ -283,106 +284,93 @@ pub struct SolveReport {
     pub residual: f64,
 }
 
-/// A positive semidefinite data operator `D`.
-pub enum Data<'a> {
-    /// The 3 x 3 blocks on its diagonal are all of it.
-    Blocks,
-    /// Writes `D x` into the second (planar, three components).
-    Operator(&'a dyn Fn(&[f32], &mut [f32])),
-}
-
-/// Conjugate gradients for `(D + lambda L) x = b` (Hestenes & Stiefel 1952).
+/// The matrix `D + lambda L` with its preconditioner.
 ///
-/// `blocks` holds (an upper bound of) the 3 x 3 diagonal blocks of `D`; `x` holds the start and receives the result.
-/// Preconditioned by the blocks alone, smooth errors go slowly, which early stopping makes use of; with `multilevel`
-/// coarser lattices take them. Stops at `tolerance` (relative residual) or after `limit` iterations.
-pub fn solve(
-    smoothness: &Smoothness,
-    lambda: [f32; 3],
-    blocks: &[[f32; 6]],
-    data: Data<'_>,
-    multilevel: bool,
-    b: &[f32],
-    x: &mut [f32],
-    tolerance: f64,
-    limit: usize,
-) -> SolveReport {
-    let system = System::new(smoothness, lambda, blocks, multilevel);
-    match data {
-        Data::Blocks => system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None)),
-        Data::Operator(data) => {
-            let mut values = vec![0.0f32; b.len()];
-            system.iterate(b, x, tolerance, limit, |p, ap| {
-                data(p, &mut values);
-                system.apply(p, ap, Some(&values))
-            })
-        }
-    }
-}
-
-/// As [`solve`] with the blocks as data, for many right-hand sides `b`: takes `b`, `x`, the tolerance and the limit.
-pub fn solver(
-    smoothness: &Smoothness,
-    lambda: [f32; 3],
-    blocks: &[[f32; 6]],
-    multilevel: bool,
-) -> impl Fn(&[f32], &mut [f32], f64, usize) -> SolveReport + Sync {
-    let system = System::new(smoothness, lambda, blocks, multilevel);
-    move |b, x, tolerance, limit| system.iterate(b, x, tolerance, limit, |p, ap| system.apply(p, ap, None))
-}
-
-/// The matrix `D + lambda L` with its preconditioner, in slabs of node planes.
-struct System<'a> {
-    bands: &'a Bands,
+/// `blocks` holds (an upper bound of) the 3 x 3 diagonal blocks of `D`. Preconditioned by them alone, smooth errors go slowly, which
+/// early stopping makes use of; with `multilevel` coarser lattices take them.
+pub struct Coupled<'a> {
+    smoothness: &'a Smoothness,
     lambda: [f32; 3],
     /// Nodes of a plane.
     plane: usize,
-    /// Diagonal blocks of `D`, planar: xx, yy, zz, xy, xz, yz.
-    blocks: Vec<f32>,
-    /// Inverse 3 x 3 diagonal blocks of the whole matrix, planar.
-    inverse: Vec<f32>,
+    /// Diagonal blocks of `D`.
+    blocks: &'a Blocks,
+    /// Inverse 3 x 3 diagonal blocks of the whole matrix.
+    inverse: Blocks,
     /// What is smooth is left to coarser lattices, where that is wanted.
     coarse: Option<Box<Coarse>>,
 }
 
-impl<'a> System<'a> {
-    fn new(smoothness: &'a Smoothness, lambda: [f32; 3], blocks: &[[f32; 6]], multilevel: bool) -> Self {
-        let n = blocks.len();
-        let diagonal = smoothness.diagonal();
-        let inverses: Vec<[f32; 6]> = blocks
-            .par_iter()
-            .zip(&diagonal)
-            .map(|(a, &l)| {
-                let mut m = a.map(f64::from);
+impl<'a> Coupled<'a> {
+    /// Of weights `lambda`, one an axis.
+    pub fn new(smoothness: &'a Smoothness, lambda: [f32; 3], blocks: &'a Blocks, multilevel: bool) -> Self {
+        let plane = smoothness.nodes[0] * smoothness.nodes[1];
+        let (n, diagonal) = (blocks.len(), smoothness.diagonal());
+        let mut inverses = vec![0.0; 6 * n];
+        planes::<6>(&mut inverses, plane).for_each(|(k, mut out)| {
+            for i in 0..out[0].len() {
+                let at = k * plane + i;
+                let mut m = blocks.at(at).map(f64::from);
                 for (v, lambda) in m.iter_mut().zip(lambda) {
-                    *v += f64::from(lambda * l) + 1e-12;
+                    *v += f64::from(lambda * diagonal[at]) + 1e-12;
                 }
-                inverse(&m).unwrap_or([1.0 / m[0], 1.0 / m[1], 1.0 / m[2], 0.0, 0.0, 0.0]).map(|v| v as f32)
-            })
-            .collect();
-        let planar = |rows: &[[f32; 6]]| -> Vec<f32> {
-            let mut out = vec![0.0; 6 * n];
-            for (q, out) in out.chunks_exact_mut(n).enumerate() {
-                out.iter_mut().zip(rows).for_each(|(o, r)| *o = r[q]);
+                let inverse = inverse(&m).unwrap_or([1.0 / m[0], 1.0 / m[1], 1.0 / m[2], 0.0, 0.0, 0.0]);
+                out.iter_mut().zip(inverse).for_each(|(out, v)| out[i] = v as f32);
             }
-            out
-        };
-        let blocks = planar(blocks);
-        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.map(f64::from), &blocks);
+        });
+        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.map(f64::from), blocks.planar());
         Self {
-            bands: &smoothness.bands,
+            smoothness,
             lambda,
-            plane: smoothness.nodes[0] * smoothness.nodes[1],
-            coarse: multilevel.then(below).flatten(),
+            plane,
             blocks,
-            inverse: planar(&inverses),
+            coarse: multilevel.then(below).flatten(),
+            inverse: Blocks::from_planar(inverses),
         }
+    }
+
+    /// The bending energy.
+    pub fn smoothness(&self) -> &Smoothness {
+        self.smoothness
+    }
+
+    /// Its weight along each axis.
+    pub fn lambda(&self) -> [f32; 3] {
+        self.lambda
+    }
+
+    /// The diagonal blocks of `D`.
+    pub fn blocks(&self) -> &Blocks {
+        self.blocks
+    }
+
+    /// Conjugate gradients for `(D + lambda L) x = b` (Hestenes & Stiefel 1952), `b` and `x` planar, the blocks being all of `D`.
+    ///
+    /// `x` holds the start and receives the result. Stops at `tolerance` (relative residual) or after `limit` iterations.
+    pub fn solve(&self, b: Vec<f32>, x: &mut [f32], tolerance: f64, limit: usize) -> SolveReport {
+        self.iterate(b, x, tolerance, limit, |p, ap| self.apply(p, ap, None))
+    }
+
+    /// The same where the blocks bound `D`, and `data` writes `D x` into its second (planar, three components).
+    pub fn solve_with(
+        &self,
+        data: impl Fn(&[f32], &mut [f32]),
+        b: Vec<f32>,
+        x: &mut [f32],
+        tolerance: f64,
+        limit: usize,
+    ) -> SolveReport {
+        let mut values = vec![0.0f32; b.len()];
+        self.iterate(b, x, tolerance, limit, |p, ap| {
+            data(p, &mut values);
+            self.apply(p, ap, Some(&values))
+        })
     }
 
     /// `out = (D + lambda L) x`, with `D x` given or from the blocks; returns `x . out`. Sums go plane by plane, so that
     /// they are the same whatever the number of threads.
     fn apply(&self, x: &[f32], out: &mut [f32], data: Option<&[f32]>) -> f64 {
-        let n = x.len() / 3;
+        let (n, bands) = (x.len() / 3, &self.smoothness.bands);
         let [x0, x1, x2] = thirds(x);
         let parts = planes(out, self.plane).map(|(k, [o0, o1, o2])| {
             let at = k * self.plane..(k + 1) * self.plane;
@@ -390,9 +378,9 @@ impl<'a> System<'a> {
             dispatch(
                 #[inline(always)]
                 || {
-                    self.bands.plane(x0, k, o0, &mut cross);
-                    self.bands.plane(x1, k, o1, &mut cross);
-                    self.bands.plane(x2, k, o2, &mut cross);
+                    bands.plane(x0, k, o0, &mut cross);
+                    bands.plane(x1, k, o1, &mut cross);
+                    bands.plane(x2, k, o2, &mut cross);
                     let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
                     let [l0, l1, l2] = self.lambda;
                     match data {
@@ -405,7 +393,7 @@ impl<'a> System<'a> {
                             }
                         }
                         None => {
-                            let [xx, yy, zz, xy, xz, yz] = sixths(&self.blocks, n, &at);
+                            let [xx, yy, zz, xy, xz, yz] = sixths(self.blocks.planar(), n, &at);
                             for i in 0..x.len() {
                                 o0[i] = l0 * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
                                 o1[i] = l1 * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
@@ -427,7 +415,7 @@ impl<'a> System<'a> {
         let parts = planes(z, self.plane).map(|(k, z)| {
             let at = k * self.plane..(k + 1) * self.plane;
             let [r0, r1, r2] = thirds(r).map(|r| &r[at.clone()]);
-            let [xx, yy, zz, xy, xz, yz] = sixths(&self.inverse, n, &at);
+            let [xx, yy, zz, xy, xz, yz] = sixths(self.inverse.planar(), n, &at);
             let mut room = Vec::new();
             dispatch(
                 #[inline(always)]
@@ -452,32 +440,31 @@ impl<'a> System<'a> {
 
     fn iterate(
         &self,
-        b: &[f32],
+        mut r: Vec<f32>,
         x: &mut [f32],
         tolerance: f64,
         limit: usize,
         mut operator: impl FnMut(&[f32], &mut [f32]) -> f64,
     ) -> SolveReport {
-        let mut ap = vec![0.0f32; x.len()];
-        let mut r = b.to_vec();
+        // What the matrix makes of a direction, and by turns what the preconditioner makes of the residual.
+        let mut made = vec![0.0f32; x.len()];
         if x.iter().any(|&v| v != 0.0) {
-            operator(x, &mut ap);
-            r.iter_mut().zip(&ap).for_each(|(r, a)| *r -= a);
+            operator(x, &mut made);
+            r.iter_mut().zip(&made).for_each(|(r, a)| *r -= a);
         }
-        let mut z = vec![0.0f32; x.len()];
-        let mut rz = self.precondition(&r, &mut z);
-        let mut p = z.clone();
+        let mut rz = self.precondition(&r, &mut made);
+        let mut p = made.clone();
         let first = rz;
         let mut iterations = 0;
         while iterations < limit && rz > tolerance * tolerance * first && rz > 0.0 {
-            let curvature = operator(&p, &mut ap);
+            let curvature = operator(&p, &mut made);
             if !(curvature > 0.0 && curvature.is_finite()) {
                 break;
             }
             let alpha = (rz / curvature) as f32;
-            planes(x, self.plane).zip(planes(&mut r, self.plane)).for_each(|((k, x), (_, r))| {
+            planes::<3>(x, self.plane).zip(planes::<3>(&mut r, self.plane)).for_each(|((k, x), (_, r))| {
                 let at = k * self.plane..(k + 1) * self.plane;
-                let (p, a) = (thirds(&p).map(|p| &p[at.clone()]), thirds(&ap).map(|a| &a[at.clone()]));
+                let (p, a) = (thirds(&p).map(|p| &p[at.clone()]), thirds(&made).map(|a| &a[at.clone()]));
                 dispatch(
                     #[inline(always)]
                     || {
@@ -490,13 +477,13 @@ impl<'a> System<'a> {
                     },
                 );
             });
-            let next = self.precondition(&r, &mut z);
+            let next = self.precondition(&r, &mut made);
             let beta = (next / rz) as f32;
             rz = next;
             dispatch(
                 #[inline(always)]
                 || {
-                    for (p, z) in p.iter_mut().zip(&z) {
+                    for (p, z) in p.iter_mut().zip(&made) {
                         *p = z + beta * *p;
                     }
                 },
@@ -519,13 +506,17 @@ fn sixths<'a>(v: &'a [f32], n: usize, at: &Range<usize>) -> [&'a [f32]; 6] {
     std::array::from_fn(|q| &v[q * n + at.start..q * n + at.end])
 }
 
-/// The node planes of a planar vector with their index, to be filled in parallel.
-fn planes(v: &mut [f32], plane: usize) -> impl IndexedParallelIterator<Item = (usize, [&mut [f32]; 3])> {
-    let n = v.len() / 3;
-    let (x, rest) = v.split_at_mut(n);
-    let (y, z) = rest.split_at_mut(n);
-    let chunks = (x.par_chunks_mut(plane), y.par_chunks_mut(plane), z.par_chunks_mut(plane));
-    chunks.into_par_iter().with_min_len(worthwhile(plane)).enumerate().map(|(k, (x, y, z))| (k, [x, y, z]))
+/// The node planes of `N` planar quantities with their index, to be filled in parallel.
+fn planes<const N: usize>(
+    v: &mut [f32],
+    plane: usize,
+) -> impl IndexedParallelIterator<Item = (usize, [&mut [f32]; N])> {
+    let n = v.len() / N;
+    let mut parts = v.chunks_exact_mut(n.max(1));
+    let mut quantities: [_; N] = std::array::from_fn(|_| parts.next().unwrap_or_default().chunks_mut(plane));
+    let plane_of = |_| std::array::from_fn(|q| quantities[q].next().unwrap_or_default());
+    let planes: Vec<[&mut [f32]; N]> = (0..n / plane).map(plane_of).collect();
+    planes.into_par_iter().with_min_len(worthwhile(plane)).enumerate()
 }
 
 /// Planes of `plane` nodes that are worth handing to another thread.

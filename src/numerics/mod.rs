@@ -24,6 +24,8 @@ mod multilevel;
 
 pub mod banded;
 
+pub mod blocks;
+
 pub mod bending;
 
 pub mod statistics;

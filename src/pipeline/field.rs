@@ -8,6 +8,7 @@ use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level
 use crate::matching::pair::Pair;
 use crate::matching::sliding::{Sliding, sliding};
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
+use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
@@ -439,7 +440,7 @@ fn canonical(
     let voxel = pyramid::finest(grid.shape(), grid.spacing());
     let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
     // What the data say at each node is as large again twice over, and no search starts from it.
-    let spline = Start { field: SplineField { blocks: Vec::new(), ..field }, factor, searched };
+    let spline = Start { field: SplineField { blocks: Blocks::default(), ..field }, factor, searched };
     Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
 }
 

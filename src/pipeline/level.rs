@@ -13,7 +13,8 @@ use crate::matching::levels::from_level;
 use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::Pair;
 use crate::matching::residual::{self, Baseline, normal_equations};
-use crate::numerics::bending::Smoothness;
+use crate::numerics::bending::{Coupled, Smoothness};
+use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::sampling::nearest;
 use crate::numerics::simd::dispatch;
@@ -34,7 +35,7 @@ pub struct SplineField {
     /// Weight of the bending energy along each axis, per mm^3 of lattice cell.
     pub lambda: [f64; 3],
     /// Information of the last pass (1/mm^2), one block a node.
-    pub blocks: Vec<[f32; 6]>,
+    pub blocks: Blocks,
     /// Weight of the bending energy along each axis in the last pass, per lattice cell.
     pub coupled_at: [f32; 3],
 }
@@ -43,7 +44,7 @@ impl SplineField {
     /// No motion, with a bending energy to start from.
     pub fn still(lattice: Lattice) -> Self {
         let coefficients = vec![0.0; 3 * lattice.len()];
-        Self { lattice, coefficients, lambda: [30.0; 3], blocks: Vec::new(), coupled_at: [0.0; 3] }
+        Self { lattice, coefficients, lambda: [30.0; 3], blocks: Blocks::default(), coupled_at: [0.0; 3] }
     }
 }
 
@@ -86,6 +87,9 @@ const SETTLED: f64 = 0.004;
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 15;
 
+/// Nodes of a lattice from which one system is solved after the other in place of beside it.
+const LARGE: usize = 500_000;
+
 /// What tissue is left of its volume at least; below it, the field is smoothed.
 const LEAST_VOLUME: f32 = 0.1;
 
@@ -111,29 +115,32 @@ pub fn refine(
     let mut warped = pair.unseen();
     for pass in 0..passes {
         // Those of the pass before serve nobody any more.
-        field.blocks = Vec::new();
+        field.blocks = Blocks::default();
         pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
-        for v in equations.blocks.iter_mut().flatten().chain(&mut equations.rhs) {
+        for v in equations.blocks.planar_mut().iter_mut().chain(&mut equations.rhs) {
             *v *= weight;
         }
         let lambda = field.lambda.map(|l| (l * cell) as f32);
-        let base = field.coefficients.clone();
-        let (blocks, rhs, coefficients) = (&equations.blocks, &equations.rhs, &mut field.coefficients);
         let settled = pass % 2 == 1 || pass + 1 == passes;
         let limit = if pass < 2 { 20 } else { 10 };
-        // Neither needs the other, and the planes of a small lattice are not worth sharing out.
-        let ((_, moved), determined) = rayon::join(
-            || coupling::step(&energy, lambda, blocks, rhs, coefficients, 0.02, ITERATIONS),
-            // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
-            || settled.then(|| probe.determined(&energy, lambda, blocks, limit, false)),
-        );
-        for (((c, b), before), begun) in field.coefficients.iter_mut().zip(&base).zip(&before).zip(&begun) {
-            *c = (*c + MOMENTUM * (b - before)).max(begun - reach).min(begun + reach);
+        let matrix = Coupled::new(&energy, lambda, &equations.blocks, false);
+        let (rhs, coefficients) = (equations.rhs, &field.coefficients);
+        let step = || coupling::step(&matrix, rhs, coefficients, 0.02, ITERATIONS);
+        // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
+        let mut determine = || settled.then(|| probe.determined(&matrix, limit));
+        // Neither needs the other, and the planes of a small lattice are not worth sharing out; those of a large one are, and only one
+        // of the two then needs its vectors.
+        let ((_, step, length), determined) = match field.lattice.len() {
+            0..LARGE => rayon::join(step, determine),
+            _ => (step(), determine()),
+        };
+        for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(&begun) {
+            let last = std::mem::replace(before, *c);
+            *c = (*c + d + MOMENTUM * (*c - last)).max(begun - reach).min(begun + reach);
         }
         unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
-        before = base;
         field.blocks = equations.blocks;
         if let Some(determined) = determined {
             let target = coupling::supported(determined, energy.energy(&field.coefficients));
@@ -143,7 +150,7 @@ pub fn refine(
         }
         field.coupled_at = lambda;
         tick(pass);
-        if f64::from(moved) < SETTLED * finest && pass >= 3 {
+        if f64::from(length) < SETTLED * finest && pass >= 3 {
             break;
         }
     }
@@ -152,7 +159,8 @@ pub fn refine(
 /// Degrees of freedom that the data of the last pass determine.
 pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
     let energy = smoothness(&field.lattice, pair.spacing);
-    coupling::determined(&energy, field.coupled_at, &field.blocks, seed, 30).iter().sum::<f64>().max(12.0)
+    let matrix = Coupled::new(&energy, field.coupled_at, &field.blocks, false);
+    coupling::determined(&matrix, seed, 30).iter().sum::<f64>().max(12.0)
 }
 
 /// Voxels of the finest axis between the places about which a map is held against the free field, and a field against stillness. Errors of 24
@@ -264,7 +272,7 @@ pub fn misfit(pair: &Pair<'_>, field: &SplineField) -> [f32; 2] {
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
 pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> SplineField {
     let coefficients = lattice.fit(|p| coarse.lattice.at(&coarse.coefficients, from_here(p)));
-    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Vec::new(), coupled_at: [0.0; 3] }
+    SplineField { lattice, coefficients, lambda: coarse.lambda, blocks: Blocks::default(), coupled_at: [0.0; 3] }
 }
 
 /// What the feature stages need to know.
@@ -582,7 +590,7 @@ fn fit(
     let energy = smoothness(&lattice, pair.spacing);
     let (coefficients, lambda) = coupling::fit(&lattice, &energy, &evidence, ROUNDS);
     let lambda = [STIFF * f64::from(lambda) / cell_volume(&lattice, pair.spacing); 3];
-    SplineField { lattice, coefficients, lambda, blocks: Vec::new(), coupled_at: [0.0; 3] }
+    SplineField { lattice, coefficients, lambda, blocks: Blocks::default(), coupled_at: [0.0; 3] }
 }
 
 /// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it leaves the volume.
