@@ -276,7 +276,7 @@ fn canonical(
                 if params.points > 0 { params.points } else { (pair.inside / params.voxels_per_point).max(200) };
             let finest = pyramid::finest(pair.shape, pair.spacing);
             let thorough = params.points > 0;
-            let near = MatchParams::new(params, points, thorough, finest, 3, 0.05);
+            let near = MatchParams::new(params, points, thorough, finest, SparseField::PATCH, 0.05);
             let (matches, _, report) = level::matches(&pair, Some(&field), near);
             if !first || reports.is_empty() {
                 reports.push(report);

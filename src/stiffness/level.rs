@@ -73,7 +73,7 @@ impl Level {
         let motion = SurfaceMotion::new(&body, field, labels);
         let patches = patches::find(&body, &motion, held, load, outline, voxel)?;
         let (observations, block) = match matches {
-            Some(m) => (from_matches(&body, m), 0),
+            Some(m) => (from_matches(&body, field, m), 0),
             None => from_field(&body, field, labels),
         };
         if observations.len() < NEEDED {

@@ -1,5 +1,6 @@
 //! What was measured inside the body: places with a displacement, and how a solution is read there.
 
+use crate::numerics::sampling::displacement;
 use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
 use crate::stiffness::elements::Mapping;
@@ -19,13 +20,13 @@ const SIDES: [[f64; 3]; 4] = [[-1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 
 /// An element and the weights of its nodes.
 pub type Reading = (u32, [f64; 10]);
 
-/// A measured displacement: at a place, or the mean over a block of voxels about it.
+/// A measured displacement: at a place, or the mean over a block of voxels or a match's patch about it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// Where (mm, RAS); the middle of the block.
+    /// Where (mm, RAS); the middle of the block or patch.
     pub place: [f64; 3],
-    /// Four places whose mean is that over the block, to second order; none for a single place.
-    pub around: Option<[[f64; 3]; 4]>,
+    /// Places whose mean is that over the block or patch, to second order; none for a single place.
+    pub around: Vec<[f64; 3]>,
     /// The elements that hold the places, and the shape functions there.
     pub readings: Vec<Reading>,
     /// Measured displacement (mm, RAS).
@@ -42,7 +43,7 @@ impl Observation {
     }
 
     fn places(&self) -> &[[f64; 3]] {
-        self.around.as_ref().map_or(std::slice::from_ref(&self.place), |around| around)
+        if self.around.is_empty() { std::slice::from_ref(&self.place) } else { &self.around }
     }
 }
 
@@ -190,11 +191,12 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
                 let world = |[x, y, z]: [f64; 3]| {
                     grid.affine().to_world(VoxelPoint([i as f64 + x, j as f64 + y, k as f64 + z])).0
                 };
+                let corners = || SIDES.map(|side| world(side.map(|s| middle + s * spread(block))));
                 let mean = sum.map(|s| s / (block * block * block) as f64);
                 if mean.iter().all(|v| v.is_finite()) {
                     out.push(Observation {
                         place: world([middle; 3]),
-                        around: (block > 1).then(|| SIDES.map(|side| world(side.map(|s| middle + s * spread(block))))),
+                        around: if block > 1 { corners().to_vec() } else { Vec::new() },
                         readings: Vec::new(),
                         displacement: mean,
                         sigma: 1.0,
@@ -209,16 +211,57 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
     (located(body, raw), block)
 }
 
-/// The kept matches that lie in the body.
-pub fn from_matches(body: &Body, matches: &SparseField) -> Vec<Observation> {
-    let one = |m: &Match| Observation {
-        place: m.initial.0,
-        around: None,
-        readings: Vec::new(),
-        displacement: m.displacement,
-        sigma: m.sigma().max(1e-4),
+/// Places of a patch along each axis.
+const ACROSS: usize = 3;
+
+/// The kept matches that lie in the body, as means over their patches.
+///
+/// A match is sought in the deformed volume warped by the field, so it is the field at its place and the mean over its patch of what
+/// the field is short of. With the field's mean over the patch in place of the field at its place it is the mean of the displacement,
+/// which a model's mean is held against. Of a patch that reaches past the body only what lies in it counts.
+pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField) -> Vec<Observation> {
+    let grid = field.grid();
+    let finest = grid.least_spacing();
+    // Equally far apart, with the second moments of a patch's voxels.
+    let apart = grid.spacing().map(|s| {
+        let radius = ((SparseField::PATCH as f64 * finest / s).round() as usize).max(1);
+        1.5f64.sqrt() * spread(2 * radius + 1)
+    });
+    const PLACES: usize = ACROSS * ACROSS * ACROSS;
+    let patch = |m: &Match| -> [[f64; 3]; PLACES] {
+        let middle = grid.affine().to_voxel(m.initial).0;
+        std::array::from_fn(|n| {
+            let at = [n % ACROSS, n / ACROSS % ACROSS, n / (ACROSS * ACROSS)];
+            let voxel = std::array::from_fn(|a| middle[a] + (at[a] as f64 - 1.0) * apart[a]);
+            grid.affine().to_world(VoxelPoint(voxel)).0
+        })
     };
-    located(body, matches.kept().map(one).collect())
+    let kept: Vec<&Match> = matches.kept().collect();
+    let places: Vec<[f64; 3]> = kept.iter().flat_map(|m| patch(m)).collect();
+    let found = find(body, &places);
+    let one = |((m, places), found): ((&&Match, &[[f64; 3]]), &[Option<Reading>])| {
+        // The one in the middle is the match's own.
+        found[PLACES / 2]?;
+        let here = displacement(field, m.initial);
+        let (mut around, mut rest) = (Vec::new(), [0.0; 3]);
+        for (place, _) in places.iter().zip(found).filter(|(_, found)| found.is_some()) {
+            let there = displacement(field, WorldPoint(*place));
+            if there.iter().all(|v| v.is_finite()) {
+                around.push(*place);
+                (0..3).for_each(|a| rest[a] += there[a] - here[a]);
+            }
+        }
+        let count = around.len().max(1) as f64;
+        Some(Observation {
+            place: m.initial.0,
+            around,
+            readings: Vec::new(),
+            displacement: std::array::from_fn(|a| m.displacement[a] + rest[a] / count),
+            sigma: m.sigma().max(1e-4),
+        })
+    };
+    let patches = kept.iter().zip(places.chunks_exact(PLACES)).zip(found.chunks_exact(PLACES));
+    located(body, patches.filter_map(one).collect())
 }
 
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to the voxels of the mask

@@ -52,6 +52,10 @@ pub struct SparseField {
 }
 
 impl SparseField {
+    /// Voxels of the finest axis between the middle one of a match's patch and its outermost ones: a match tells the mean over 7 x 7 x 7
+    /// (over fewer along the normal of thick slices, at least 3).
+    pub const PATCH: usize = 3;
+
     /// The matches that consistency kept.
     pub fn kept(&self) -> impl Iterator<Item = &Match> {
         self.matches.iter().filter(|m| m.kept)
