@@ -69,6 +69,11 @@ fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     [one(held), one(load)]
 }
 
+/// Lets both patches touch so.
+fn touch(level: &mut Level, contact: [Contact; 2]) {
+    (level.patches[0].contact, level.patches[1].contact) = (contact[0], contact[1]);
+}
+
 /// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the contact chosen.
 ///
 /// # Errors
@@ -81,8 +86,7 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
     let mut failure = None;
     for &a in &names[0] {
         for &b in &names[1] {
-            level.patches[0].contact = a;
-            level.patches[1].contact = b;
+            touch(level, [a, b]);
             let setup = level.setup(first, poisson, reference);
             let mut start = setup.start();
             if let Some((_, last)) = tried.last() {
@@ -124,8 +128,12 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
             },
         });
     }
+    let plain =
+        (0..tried.len()).filter(|&i| !guided(&tried[i])).min_by(|&i, &k| score(&tried[i]).total_cmp(&score(&tried[k])));
+    // Of a guided patch, what the evidence has of it and of the best one that is not.
+    let rival = plain.filter(|_| guided(&tried[best])).map(|plain| ([best, plain], tried[plain].clone()));
     let (contact, mut estimate) = tried.swap_remove(best);
-    (level.patches[0].contact, level.patches[1].contact) = (contact[0], contact[1]);
+    touch(level, contact);
     let mut law = first;
     if wanted != LawChoice::Linear && first == Law::Linear {
         let strain = summary::strain(&level.setup(law, poisson, reference), &estimate.state);
@@ -162,6 +170,28 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         if better {
             law = Law::NeoHookean;
             estimate = large;
+            if let Some((of, (without, rival))) = rival {
+                let edge = level.edge.map_or(0.0, |e| e.1);
+                touch(level, without);
+                let rival = level.setup(law, poisson, reference).run(rival.state, ITERATIONS, COARSE)?;
+                let rival = settle(level, law, poisson, reference, rival, (LAW_MOVES, COARSE))?;
+                let samples = estimate.effective.min(rival.effective);
+                let guides = 12 * contact.iter().filter(|c| **c == Contact::Guided).count();
+                let gain = bic(rival.squares, samples, rival.parameters)
+                    - bic(estimate.squares, samples, estimate.parameters + guides);
+                if gain < DECISIVE * samples {
+                    estimate = rival;
+                    for (at, chosen, reason) in [
+                        (of[0], false, "explains the field best under small strain alone"),
+                        (of[1], true, "explains the field nearly as well under the law that is taken"),
+                    ] {
+                        (evidence[at].chosen, evidence[at].reason) = (chosen, reason.into());
+                    }
+                } else {
+                    touch(level, contact);
+                    level.move_edge(edge);
+                }
+            }
         } else {
             level.move_edge(edge);
         }
