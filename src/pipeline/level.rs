@@ -87,7 +87,8 @@ const SETTLED: f64 = 0.004;
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 15;
 
-/// Nodes of a lattice from which one system is solved after the other in place of beside it.
+/// Nodes of a lattice from which memory goes before time: one system is solved after the other in place of beside it, and the warped
+/// volume is not kept meanwhile.
 const LARGE: usize = 500_000;
 
 /// What tissue is left of its volume at least; below it, the field is smoothed.
@@ -112,10 +113,14 @@ pub fn refine(
     let reach = (reach * finest) as f32;
     let mut before = begun.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
-    let mut warped = pair.unseen();
+    let large = field.lattice.len() >= LARGE;
+    let mut warped = Vec::new();
     for pass in 0..passes {
         // Those of the pass before serve nobody any more.
         field.blocks = Blocks::default();
+        if warped.is_empty() {
+            warped = pair.unseen();
+        }
         pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
@@ -123,6 +128,9 @@ pub fn refine(
             *v *= weight;
         }
         let lambda = field.lambda.map(|l| (l * cell) as f32);
+        if large {
+            warped = Vec::new();
+        }
         let settled = pass % 2 == 1 || pass + 1 == passes;
         let limit = if pass < 2 { 20 } else { 10 };
         let matrix = Coupled::new(&energy, lambda, &equations.blocks, false);
@@ -132,10 +140,7 @@ pub fn refine(
         let mut determine = || settled.then(|| probe.determined(&matrix, limit));
         // Neither needs the other, and the planes of a small lattice are not worth sharing out; those of a large one are, and only one
         // of the two then needs its vectors.
-        let ((_, step, length), determined) = match field.lattice.len() {
-            0..LARGE => rayon::join(step, determine),
-            _ => (step(), determine()),
-        };
+        let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
         for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(&begun) {
             let last = std::mem::replace(before, *c);
             *c = (*c + d + MOMENTUM * (*c - last)).max(begun - reach).min(begun + reach);
