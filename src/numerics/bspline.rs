@@ -9,8 +9,9 @@ use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Cells of a lattice along z whose sums are held at a time, at least: those of 128 cells of a lattice of 131 x 152 nodes a plane were 0.4 GB.
-const CELLS: usize = 32;
+/// Sums of cells of a lattice along z that are held at a time: so many values, where that is no fewer cells than keep the threads busy. Those of
+/// 128 cells of a lattice of 131 x 152 nodes a plane were 0.4 GB.
+const HELD: usize = 1 << 22;
 
 /// The four cubic B-spline weights at fraction `t` (0 to 1) between the second and the third node.
 #[inline(always)]
@@ -316,7 +317,7 @@ impl Lattice {
             slab
         };
         // A few cells at a time, from the last to the first: each node plane sums them in that order, however many these are.
-        let most = CELLS.max(2 * rayon::current_num_threads());
+        let most = (HELD / (taps_z * Q * plane)).max(2 * rayon::current_num_threads());
         let mut out = vec![0.0f32; Q * total];
         let mut end = nz.div_ceil(self.step[2]);
         while end > 0 {
