@@ -760,6 +760,10 @@ fn a_match_is_read_as_the_mean_over_its_patch() {
     assert!(middle > 3e-3, "{middle}");
     // Of the patch beside the face a third lies outside.
     assert_eq!((observations[6].place, observations[6].around.len()), (places[6], 18));
+    // A field without numbers leaves the match as it is.
+    let none = DenseField::from_fn(*map.grid(), |_| [f64::NAN; 3]);
+    let alone = from_matches(&body, &none, &SparseField { matches: vec![one(&places[0])] });
+    assert_eq!((alone[0].displacement, alone[0].around.len()), (found(places[0]), 0));
 }
 
 /// A block with one inclusion, `size` voxels along x.

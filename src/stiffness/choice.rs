@@ -2,7 +2,7 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::geometry::edge_step;
-use crate::stiffness::identify::Estimate;
+use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::{Patch, travel};
 use crate::stiffness::summary;
@@ -74,6 +74,25 @@ fn touch(level: &mut Level, contact: [Contact; 2]) {
     (level.patches[0].contact, level.patches[1].contact) = (contact[0], contact[1]);
 }
 
+/// Numbers that guided patches are given: twelve each.
+fn given(contact: [Contact; 2]) -> usize {
+    12 * contact.iter().filter(|c| **c == Contact::Guided).count()
+}
+
+/// The estimate under large strain from another one.
+///
+/// # Errors
+/// As [`crate::stiffness::identify::Setup::run`].
+fn large_strain_from(
+    level: &mut Level,
+    start: State,
+    poisson: f64,
+    reference: usize,
+) -> Result<Estimate, StiffnessError> {
+    let large = level.setup(Law::NeoHookean, poisson, reference).run(start, ITERATIONS, COARSE)?;
+    settle(level, Law::NeoHookean, poisson, reference, large, (LAW_MOVES, COARSE))
+}
+
 /// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the contact chosen.
 ///
 /// # Errors
@@ -99,9 +118,7 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         }
     }
     let samples = tried.iter().map(|t| t.1.effective).fold(f64::INFINITY, f64::min);
-    // A guided patch is given twelve numbers of its own.
-    let count =
-        |t: &([Contact; 2], Estimate)| t.1.parameters + 12 * t.0.iter().filter(|c| **c == Contact::Guided).count();
+    let count = |t: &([Contact; 2], Estimate)| t.1.parameters + given(t.0);
     let score = |t: &([Contact; 2], Estimate)| bic(t.1.squares, samples, count(t));
     let guided = |t: &([Contact; 2], Estimate)| t.0.contains(&Contact::Guided);
     let rank = |t| score(t) + if guided(t) { DECISIVE * samples } else { 0.0 };
@@ -141,10 +158,8 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
         if !large_strain {
             estimate = settle(level, law, poisson, reference, estimate, (LAW_MOVES, COARSE))?;
         }
-        let start = estimate.state.clone();
         let edge = level.edge.map_or(0.0, |e| e.1);
-        let large = level.setup(Law::NeoHookean, poisson, reference).run(start, ITERATIONS, COARSE)?;
-        let large = settle(level, Law::NeoHookean, poisson, reference, large, (LAW_MOVES, COARSE))?;
+        let large = large_strain_from(level, estimate.state.clone(), poisson, reference)?;
         let samples = estimate.effective.min(large.effective);
         let scores = [&estimate, &large].map(|e| bic(e.squares, samples, e.parameters));
         let better = large_strain || scores[1] + MARGIN < scores[0];
@@ -173,13 +188,14 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
             if let Some((of, (without, rival))) = rival {
                 let edge = level.edge.map_or(0.0, |e| e.1);
                 touch(level, without);
-                let rival = level.setup(law, poisson, reference).run(rival.state, ITERATIONS, COARSE)?;
-                let rival = settle(level, law, poisson, reference, rival, (LAW_MOVES, COARSE))?;
-                let samples = estimate.effective.min(rival.effective);
-                let guides = 12 * contact.iter().filter(|c| **c == Contact::Guided).count();
-                let gain = bic(rival.squares, samples, rival.parameters)
-                    - bic(estimate.squares, samples, estimate.parameters + guides);
-                if gain < DECISIVE * samples {
+                // One that cannot be solved is none.
+                let rival = large_strain_from(level, rival.state, poisson, reference).ok().filter(|rival| {
+                    let samples = estimate.effective.min(rival.effective);
+                    let gain = bic(rival.squares, samples, rival.parameters)
+                        - bic(estimate.squares, samples, estimate.parameters + given(contact));
+                    gain < DECISIVE * samples
+                });
+                if let Some(rival) = rival {
                     estimate = rival;
                     for (at, chosen, reason) in [
                         (of[0], false, "explains the field best under small strain alone"),

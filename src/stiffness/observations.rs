@@ -14,6 +14,9 @@ const SLACK: f64 = 1e-6;
 const BESIDE: f64 = -0.3;
 /// Samples of a dense field at most; blocks of voxels are averaged so that there are fewer.
 const SAMPLES: usize = 60_000;
+/// Places of a match's patch along each axis, and in all.
+const ACROSS: usize = 3;
+const PLACES: usize = ACROSS * ACROSS * ACROSS;
 /// Every other corner of a cube.
 const SIDES: [[f64; 3]; 4] = [[-1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]];
 
@@ -67,20 +70,24 @@ pub fn readings(body: &Body, observations: &[Observation]) -> Vec<Option<Vec<Rea
     let places: Vec<[f64; 3]> = observations.iter().flat_map(Observation::places).copied().collect();
     let mut rest = find(body, &places).into_iter();
     let one = |o: &Observation| {
-        let count = o.places().len();
-        let found: Vec<Option<Reading>> = rest.by_ref().take(count).collect();
-        let mut out = Vec::<Reading>::new();
-        for f in found {
-            let (element, weights) = f?;
-            let weights = weights.map(|w| w / count as f64);
-            match out.iter_mut().find(|r| r.0 == element) {
-                Some((_, sum)) => sum.iter_mut().zip(weights).for_each(|(s, w)| *s += w),
-                None => out.push((element, weights)),
-            }
-        }
-        Some(out)
+        // All of them are taken, whether or not one is outside.
+        let found: Vec<Option<Reading>> = rest.by_ref().take(o.places().len()).collect();
+        found.into_iter().collect::<Option<Vec<Reading>>>().map(|found| mean(&found))
     };
     observations.iter().map(one).collect()
+}
+
+/// The mean over some readings, one an element.
+fn mean(found: &[Reading]) -> Vec<Reading> {
+    let mut out = Vec::<Reading>::new();
+    for (element, weights) in found {
+        let weights = weights.map(|w| w / found.len() as f64);
+        match out.iter_mut().find(|r| r.0 == *element) {
+            Some((_, sum)) => sum.iter_mut().zip(weights).for_each(|(s, w)| *s += w),
+            None => out.push((*element, weights)),
+        }
+    }
+    out
 }
 
 /// The element that holds each place (mm, RAS) and the shape functions there; none outside the body.
@@ -211,9 +218,6 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
     (located(body, raw), block)
 }
 
-/// Places of a patch along each axis.
-const ACROSS: usize = 3;
-
 /// The kept matches that lie in the body, as means over their patches.
 ///
 /// A match is sought in the deformed volume warped by the field, so it is the field at its place and the mean over its patch of what
@@ -227,7 +231,6 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
         let radius = ((SparseField::PATCH as f64 * finest / s).round() as usize).max(1);
         1.5f64.sqrt() * spread(2 * radius + 1)
     });
-    const PLACES: usize = ACROSS * ACROSS * ACROSS;
     let patch = |m: &Match| -> [[f64; 3]; PLACES] {
         let middle = grid.affine().to_voxel(m.initial).0;
         std::array::from_fn(|n| {
@@ -241,27 +244,33 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
     let found = find(body, &places);
     let one = |((m, places), found): ((&&Match, &[[f64; 3]]), &[Option<Reading>])| {
         // The one in the middle is the match's own.
-        found[PLACES / 2]?;
+        let own = found[PLACES / 2]?;
         let here = displacement(field, m.initial);
-        let (mut around, mut rest) = (Vec::new(), [0.0; 3]);
-        for (place, _) in places.iter().zip(found).filter(|(_, found)| found.is_some()) {
+        let (mut around, mut readings, mut rest) = (Vec::new(), Vec::new(), [0.0; 3]);
+        for (place, reading) in places.iter().zip(found).filter_map(|(p, f)| f.map(|f| (p, f))) {
             let there = displacement(field, WorldPoint(*place));
-            if there.iter().all(|v| v.is_finite()) {
+            let more: [f64; 3] = std::array::from_fn(|a| there[a] - here[a]);
+            if more.iter().all(|v| v.is_finite()) {
                 around.push(*place);
-                (0..3).for_each(|a| rest[a] += there[a] - here[a]);
+                readings.push(reading);
+                (0..3).for_each(|a| rest[a] += more[a]);
             }
         }
-        let count = around.len().max(1) as f64;
+        // Where the field has no number the match stands for its place alone.
+        if around.is_empty() {
+            readings.push(own);
+        }
+        let count = readings.len() as f64;
         Some(Observation {
             place: m.initial.0,
             around,
-            readings: Vec::new(),
+            readings: mean(&readings),
             displacement: std::array::from_fn(|a| m.displacement[a] + rest[a] / count),
             sigma: m.sigma().max(1e-4),
         })
     };
     let patches = kept.iter().zip(places.chunks_exact(PLACES)).zip(found.chunks_exact(PLACES));
-    located(body, patches.filter_map(one).collect())
+    patches.filter_map(one).collect()
 }
 
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to the voxels of the mask
