@@ -81,10 +81,7 @@ impl Whole<'_> {
         let share = if self.flat { SHARE / 4 } else { SHARE };
         let points = pair.inside.div_ceil(share).min(most).max(40);
         let wide = MatchParams::new(self.params, points, false, self.range, 2, 0.3);
-        let refine = |mut start, reach| {
-            level::refine(pair, &mut start, (passes, reach), self.params.seed, self.tick);
-            start
-        };
+        let refine = |starts, reach| level::refine_best(pair, starts, (passes, reach), self.params.seed, self.tick);
         let mut reach_mm = self.range;
         let nearest = (LEAST_REACH * pyramid::finest(pair.shape, pair.spacing)).min(self.range);
         let seek = |about: Option<&SplineField>| {

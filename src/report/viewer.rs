@@ -294,7 +294,11 @@ impl Viewer<'_> {
         let sizes: Vec<[f64; 2]> = planes.iter().map(|p| canonical.size_mm(*p)).collect();
         let tallest = sizes.iter().map(|s| s[1]).fold(1e-9, f64::max);
         let most = (HEIGHT_PX * sizes.iter().map(|s| s[0]).sum::<f64>() / tallest).max(300.0);
-        let text = data.to_string().replace("</", "<\\/");
+        let mut text = data.to_string();
+        // Only names could have one; the rest of these megabytes is base64.
+        if text.as_bytes().contains(&b'<') {
+            text = text.replace("</", "<\\/");
+        }
         format!(
             "<div class=\"viewer\">{}<div class=\"planes\" style=\"max-width:{most:.0}px\">{views}</div><p><output></output></p>{}<p class=\"state\">The \
              viewer needs JavaScript.</p><script type=\"application/json\">{text}</script></div><script>{}</script>",
