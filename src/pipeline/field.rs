@@ -212,8 +212,12 @@ fn canonical(
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
-                let loose = begun.as_ref().filter(|b: &&Begun| l == 1 && b.is_loose());
-                let coarsest = loose.map(|_| (light.level(&aligned, *from), *from));
+                let loose = l == 1 && begun.as_ref().is_some_and(Begun::is_loose);
+                let borne_out = loose && whole.is_borne_out(&pair, &field, &mut matched);
+                if borne_out {
+                    level::refine(&pair, &mut field, (whole::SETTLING, reach), params.seed, |_| ());
+                }
+                let coarsest = (loose && !borne_out).then(|| (light.level(&aligned, *from), *from));
                 let next = coarsest.and_then(|(coarse, from)| {
                     whole.closer((&pair, factor), &field, (&coarse, from), passes, &mut matched)
                 });
