@@ -1,4 +1,4 @@
-//! One level of the pyramid: matches by features, and the passes that bring the spline field to the residual.
+//! One level of the pyramid: matches by features, the spline field, and how the volumes agree under it.
 
 use crate::consistency::coupling::{self, Evidence, Posterior};
 use crate::consistency::energy::{EnergyParams, Graph, distance};
@@ -12,7 +12,7 @@ use crate::matching::gain::GainField;
 use crate::matching::levels::from_level;
 use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::Pair;
-use crate::matching::residual::{self, Baseline, normal_equations};
+use crate::matching::residual::{self, Baseline};
 use crate::numerics::bending::{Coupled, Smoothness};
 use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
@@ -20,7 +20,6 @@ use crate::numerics::sampling::nearest;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
-use crate::numerics::unfold::unfold;
 use crate::numerics::{filters, pyramid};
 use crate::types::{Counts, FieldParams, LevelReport, VoxelPoint};
 use rayon::prelude::*;
@@ -59,7 +58,7 @@ pub fn is_better(pair: &Pair<'_>, a: &SplineField, b: &SplineField) -> bool {
 }
 
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
-fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
+pub fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
     (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] as f64 * spacing[a]).product()
 }
 
@@ -74,149 +73,8 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
 }
 
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
-fn independent(pair: &Pair<'_>) -> f32 {
+pub fn independent(pair: &Pair<'_>) -> f32 {
     (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
-}
-
-/// How much of the last step is carried into the next: the block diagonal is an upper bound, so plain steps are short.
-const MOMENTUM: f32 = 0.5;
-
-/// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
-const SETTLED: f64 = 0.004;
-
-/// Conjugate gradient iterations a pass: each pass needs only a fair step.
-const ITERATIONS: usize = 15;
-
-/// Nodes of a lattice from which memory goes before time: one system is solved after the other in place of beside it, and the warped
-/// volume is not kept meanwhile.
-const LARGE: usize = 500_000;
-
-/// What tissue is left of its volume at least; below it, the field is smoothed.
-const LEAST_VOLUME: f32 = 0.1;
-
-/// As many passes as `passes` says from a field on ([`Passes`]); no node ends further than `reach` (voxels of the finest axis, along each
-/// axis) from where it began. Calls `tick` after each pass.
-pub fn refine(
-    pair: &Pair<'_>,
-    field: &mut SplineField,
-    (passes, reach): (usize, f64),
-    seed: u64,
-    tick: impl Fn(usize),
-) {
-    Passes::new(pair, field, (passes, reach), seed).run(pair, field, passes, tick);
-}
-
-/// Passes after which one of several starts goes on alone. Of 206 contests between what a search found and stillness two ended with fields that
-/// differed by more than noise, and after four passes it was clear which; all others ended in one place from either.
-const TRIAL: usize = 4;
-
-/// Of several starts the one that agrees best after a few passes, brought to the residual as by [`refine`].
-pub fn refine_best(
-    pair: &Pair<'_>,
-    starts: impl IntoIterator<Item = SplineField>,
-    (passes, reach): (usize, f64),
-    seed: u64,
-    tick: impl Fn(usize),
-) -> Option<SplineField> {
-    let begin = |field| (Passes::new(pair, &field, (passes, reach), seed), field);
-    let mut all: Vec<(Passes, SplineField)> = starts.into_iter().map(begin).collect();
-    if all.len() > 1 {
-        all.iter_mut().for_each(|(own, field)| own.run(pair, field, TRIAL, &tick));
-    }
-    let (mut own, mut field) = all.into_iter().reduce(|a, b| if is_better(pair, &b.1, &a.1) { b } else { a })?;
-    own.run(pair, &mut field, passes, tick);
-    Some(field)
-}
-
-/// Passes that bring a field to the residual: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence
-/// (MacKay 1992): `lambda = determined / (2 energy)` along each axis. They may be halted, and go on as if they had not been.
-pub struct Passes {
-    /// Coefficients at the start, and before the last pass.
-    begun: Vec<f32>,
-    before: Vec<f32>,
-    /// How far from the start a node may end (mm along each axis).
-    reach: f32,
-    probe: coupling::Probe,
-    /// Passes made, and all there may be.
-    made: usize,
-    all: usize,
-    settled: bool,
-}
-
-impl Passes {
-    /// From `field` on, `all` at most.
-    pub fn new(pair: &Pair<'_>, field: &SplineField, (all, reach): (usize, f64), seed: u64) -> Self {
-        let begun = field.coefficients.clone();
-        Self {
-            before: begun.clone(),
-            begun,
-            reach: (reach * pyramid::finest(pair.shape, pair.spacing)) as f32,
-            probe: coupling::Probe::new(field.lattice.len(), seed),
-            made: 0,
-            all,
-            settled: false,
-        }
-    }
-
-    /// Goes on until so many passes are made, or the field is settled.
-    pub fn run(&mut self, pair: &Pair<'_>, field: &mut SplineField, until: usize, tick: impl Fn(usize)) {
-        let energy = smoothness(&field.lattice, pair.spacing);
-        let cell = cell_volume(&field.lattice, pair.spacing);
-        let active = pair.spans.grown(1);
-        let weight = independent(pair);
-        let finest = pyramid::finest(pair.shape, pair.spacing);
-        let reach = self.reach;
-        let large = field.lattice.len() >= LARGE;
-        let mut warped = Vec::new();
-        while self.made < until.min(self.all) && !self.settled {
-            let pass = self.made;
-            // Those of the pass before serve nobody any more.
-            field.blocks = Blocks::default();
-            if warped.is_empty() {
-                warped = pair.unseen();
-            }
-            pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
-            let gain = GainField::sharpened(pair, &warped);
-            let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
-            for v in equations.blocks.planar_mut().iter_mut().chain(&mut equations.rhs) {
-                *v *= weight;
-            }
-            let lambda = field.lambda.map(|l| (l * cell) as f32);
-            if large {
-                warped = Vec::new();
-            }
-            let weighed = pass % 2 == 1 || pass + 1 == self.all;
-            let limit = if pass < 2 { 20 } else { 10 };
-            let matrix = Coupled::new(&energy, lambda, &equations.blocks, false);
-            let (rhs, coefficients) = (equations.rhs, &field.coefficients);
-            let step = || coupling::step(&matrix, rhs, coefficients, 0.02, ITERATIONS);
-            // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
-            let probe = &mut self.probe;
-            let mut determine = || weighed.then(|| probe.determined(&matrix, limit));
-            // Neither needs the other, and the planes of a small lattice are not worth sharing out; those of a large one are, and only one
-            // of the two then needs its vectors.
-            let ((_, step, length), determined) =
-                if large { (step(), determine()) } else { rayon::join(step, determine) };
-            for (((c, d), before), begun) in
-                field.coefficients.iter_mut().zip(step).zip(&mut self.before).zip(&self.begun)
-            {
-                let last = std::mem::replace(before, *c);
-                *c = (*c + d + MOMENTUM * (*c - last)).max(begun - reach).min(begun + reach);
-            }
-            unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
-            field.blocks = equations.blocks;
-            if let Some(determined) = determined {
-                let target = coupling::supported(determined, energy.energy(&field.coefficients));
-                for (lambda, target) in field.lambda.iter_mut().zip(target) {
-                    *lambda = (target / cell).clamp(*lambda / 5.0, *lambda * 5.0).clamp(1e-6, 1e9);
-                }
-            }
-            field.coupled_at = lambda;
-            tick(pass);
-            self.made += 1;
-            self.settled = f64::from(length) < SETTLED * finest && self.made > 3;
-        }
-    }
 }
 
 /// Degrees of freedom that the data of the last pass determine.
