@@ -22,7 +22,7 @@ from scipy import ndimage
 from run import field, run
 
 METHODS = [f"palpate {p}{m}" for p in ("fast", "balanced", "accurate") for m in ("", " mask")]
-METHODS += ["greedy half", "greedy full", "greedy long", "elastix", "ANTs SyNQuick", "plastimatch", "ConvexAdam"]
+METHODS += ["greedy half", "greedy full", "greedy long", "elastix", "ANTs SyNQuick", "plastimatch", "deeds", "ConvexAdam"]
 
 
 def laid(fixed, moving, rigid):
