@@ -5,7 +5,6 @@ use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::level;
 use crate::pipeline::light::Light;
-use crate::pipeline::passes;
 use crate::pipeline::start::Begun;
 use crate::pipeline::whole::{POINTS, Whole};
 
@@ -63,7 +62,7 @@ pub(super) fn farther(
                 let from = factors[l - 1];
                 found.field = level::carry(&found.field, lattice.clone(), |p| to_level(from_level(p, factor), from));
                 let reach = found.reach();
-                passes::refine(pair, &mut found.field, (passes, reach), whole.params.seed, whole.tick);
+                level::refine(pair, &mut found.field, (passes, reach), whole.params.seed, whole.tick);
                 found
             }
         });

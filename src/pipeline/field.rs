@@ -19,7 +19,6 @@ use crate::pipeline::farther;
 use crate::pipeline::finer::{finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
-use crate::pipeline::passes;
 use crate::pipeline::polish;
 use crate::pipeline::rest::{Rest, Tried};
 use crate::pipeline::start::Begun;
@@ -212,11 +211,11 @@ fn canonical(
         let mut field = match &state {
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
-                passes::refine(&pair, &mut field, (passes, reach), params.seed, tick);
+                level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
                 let loose = l == 1 && begun.as_ref().is_some_and(Begun::is_loose);
                 let borne_out = loose && whole.is_borne_out(&pair, &field, &mut matched);
                 if borne_out {
-                    passes::refine(&pair, &mut field, (whole::SETTLING, reach), params.seed, |_| ());
+                    level::refine(&pair, &mut field, (whole::SETTLING, reach), params.seed, |_| ());
                 }
                 let coarsest = (loose && !borne_out).then(|| (light.level(&aligned, *from), *from));
                 let next = coarsest.and_then(|(coarse, from)| {
@@ -264,11 +263,11 @@ fn canonical(
         let open = first || !last || light.is_unknown();
         let more = open && light.look(&mut pair, (&aligned, factor), &field);
         if more && last {
-            passes::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
+            level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
         }
         if last {
             let refine =
-                |field: &mut SplineField, passes| passes::refine(&pair, field, (passes, reach), params.seed, |_| ());
+                |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
             let best = finer(&pair, field, (apart, passes), params.seed, refine);
             (field, left, gain, closer) = (best.field, best.left, best.gain, best.closer);
             asked.extend(best.said);

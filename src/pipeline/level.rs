@@ -1,4 +1,4 @@
-//! One level of the pyramid: matches by features, the spline field, and how the volumes agree under it.
+//! One level of the pyramid: matches by features, and the passes that bring the spline field to the residual.
 
 use crate::consistency::coupling::{self, Evidence, Posterior};
 use crate::consistency::energy::{EnergyParams, Graph, distance};
@@ -12,7 +12,7 @@ use crate::matching::gain::GainField;
 use crate::matching::levels::from_level;
 use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::Pair;
-use crate::matching::residual::{self, Baseline};
+use crate::matching::residual::{self, Baseline, normal_equations};
 use crate::numerics::bending::{Coupled, Smoothness};
 use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
@@ -20,6 +20,7 @@ use crate::numerics::sampling::nearest;
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
+use crate::numerics::unfold::unfold;
 use crate::numerics::{filters, pyramid};
 use crate::types::{Counts, FieldParams, LevelReport, VoxelPoint};
 use rayon::prelude::*;
@@ -58,7 +59,7 @@ pub fn is_better(pair: &Pair<'_>, a: &SplineField, b: &SplineField) -> bool {
 }
 
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
-pub fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
+fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
     (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] as f64 * spacing[a]).product()
 }
 
@@ -73,8 +74,91 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
 }
 
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
-pub fn independent(pair: &Pair<'_>) -> f32 {
+fn independent(pair: &Pair<'_>) -> f32 {
     (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
+}
+
+/// How much of the last step is carried into the next: the block diagonal is an upper bound, so plain steps are short.
+const MOMENTUM: f32 = 0.5;
+
+/// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
+const SETTLED: f64 = 0.004;
+
+/// Conjugate gradient iterations a pass: each pass needs only a fair step.
+const ITERATIONS: usize = 15;
+
+/// Nodes of a lattice from which memory goes before time: one system is solved after the other in place of beside it, and the warped
+/// volume is not kept meanwhile.
+const LARGE: usize = 500_000;
+
+/// What tissue is left of its volume at least; below it, the field is smoothed.
+const LEAST_VOLUME: f32 = 0.1;
+
+/// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence (MacKay 1992):
+/// `lambda = determined / (2 energy)` along each axis. No node ends further than `reach` (voxels of the finest axis, along each
+/// axis) from where it began. Calls `tick` after each pass.
+pub fn refine(
+    pair: &Pair<'_>,
+    field: &mut SplineField,
+    (passes, reach): (usize, f64),
+    seed: u64,
+    tick: impl Fn(usize),
+) {
+    let energy = smoothness(&field.lattice, pair.spacing);
+    let cell = cell_volume(&field.lattice, pair.spacing);
+    let active = pair.spans.grown(1);
+    let weight = independent(pair);
+    let finest = pyramid::finest(pair.shape, pair.spacing);
+    let begun = field.coefficients.clone();
+    let reach = (reach * finest) as f32;
+    let mut before = begun.clone();
+    let mut probe = coupling::Probe::new(field.lattice.len(), seed);
+    let large = field.lattice.len() >= LARGE;
+    let mut warped = Vec::new();
+    for pass in 0..passes {
+        // Those of the pass before serve nobody any more.
+        field.blocks = Blocks::default();
+        if warped.is_empty() {
+            warped = pair.unseen();
+        }
+        pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
+        let gain = GainField::sharpened(pair, &warped);
+        let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
+        for v in equations.blocks.planar_mut().iter_mut().chain(&mut equations.rhs) {
+            *v *= weight;
+        }
+        let lambda = field.lambda.map(|l| (l * cell) as f32);
+        if large {
+            warped = Vec::new();
+        }
+        let settled = pass % 2 == 1 || pass + 1 == passes;
+        let limit = if pass < 2 { 20 } else { 10 };
+        let matrix = Coupled::new(&energy, lambda, &equations.blocks, false);
+        let (rhs, coefficients) = (equations.rhs, &field.coefficients);
+        let step = || coupling::step(&matrix, rhs, coefficients, 0.02, ITERATIONS);
+        // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
+        let mut determine = || settled.then(|| probe.determined(&matrix, limit));
+        // Neither needs the other, and the planes of a small lattice are not worth sharing out; those of a large one are, and only one
+        // of the two then needs its vectors.
+        let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
+        for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(&begun) {
+            let last = std::mem::replace(before, *c);
+            *c = (*c + d + MOMENTUM * (*c - last)).max(begun - reach).min(begun + reach);
+        }
+        unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
+        field.blocks = equations.blocks;
+        if let Some(determined) = determined {
+            let target = coupling::supported(determined, energy.energy(&field.coefficients));
+            for (lambda, target) in field.lambda.iter_mut().zip(target) {
+                *lambda = (target / cell).clamp(*lambda / 5.0, *lambda * 5.0).clamp(1e-6, 1e9);
+            }
+        }
+        field.coupled_at = lambda;
+        tick(pass);
+        if f64::from(length) < SETTLED * finest && pass >= 3 {
+            break;
+        }
+    }
 }
 
 /// Degrees of freedom that the data of the last pass determine.

@@ -36,7 +36,6 @@ mod course;
 mod farther;
 mod finer;
 mod light;
-mod passes;
 mod polish;
 mod rest;
 mod search;

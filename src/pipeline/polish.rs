@@ -6,7 +6,6 @@
 use crate::matching::levels::{factors, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::pipeline::level::{self, SplineField};
-use crate::pipeline::passes;
 use crate::types::{FieldParams, Grid};
 
 /// Voxels between nodes. Five pairs of 160 x 192 x 160 (3 passes): errors as with 5, gradients 4 % less, and less time.
@@ -34,7 +33,7 @@ pub(super) fn polish(
 ) -> SplineField {
     let lattice = level::lattice(pair, nodes);
     let mut finer = level::carry(field, lattice, |p| to_level(from_level(p, factor), from));
-    passes::refine(pair, &mut finer, (params.finer_passes, reach), params.seed, tick);
+    level::refine(pair, &mut finer, (params.finer_passes, reach), params.seed, tick);
     finer
 }
 

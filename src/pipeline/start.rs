@@ -192,7 +192,7 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 
 /// The coarsest level of a search that may start from `known` fields.
 ///
-/// `refine` brings the best of some starts to the residual within a reach (voxels of the finest axis); `search` matches the whole volume,
+/// `refine` brings a start to the residual within a reach (voxels of the finest axis); `search` matches the whole volume,
 /// from nothing or about a field.
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
@@ -208,19 +208,19 @@ pub(super) fn begin(
     lattice: &Lattice,
     factor: [usize; 3],
     (known, rest): (&[Start], bool),
-    refine: impl Fn(Vec<SplineField>, f64) -> Option<SplineField>,
+    refine: impl Fn(SplineField, f64) -> SplineField,
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
-    let refined = |field| refine(vec![field], f64::INFINITY);
-    let follow = || known.iter().map(|s| s.on(lattice, factor)).reduce(better).and_then(refined);
+    let refined = |field| refine(field, f64::INFINITY);
+    let follow = || known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
     let course = (known.len() > 1).then(follow).flatten();
     let recent = known.first().and_then(|s| s.searched.as_ref()).filter(|s| s.frames < FOLLOWED && s.certain);
     if let Some((field, searched)) = course.as_ref().zip(recent) {
         let now = agreement(pair, field, Some(searched.agreement.sigma()));
         let searched = Searched { frames: searched.frames + 1, ..searched.clone() };
         if now.worsened(&searched.agreement) <= GROWN {
-            return course.and_then(refined).map(|field| Begun { field, report: None, searched });
+            return course.map(|field| Begun { field: refined(field), report: None, searched });
         }
     }
     let (found, mut report) = search(None);
@@ -229,11 +229,14 @@ pub(super) fn begin(
     let least = FAR * pyramid::finest(pair.shape, pair.spacing);
     let clear = |found: &SplineField| level::lengths(pair, found)[0] > least && level::is_better(pair, found, &still);
     let still_too = rest && !(sure && found.as_ref().is_some_and(clear));
-    let starts = [found, still_too.then_some(still)].into_iter().flatten().collect();
-    let own = refine(starts, reach(&report, FROM_SEARCH));
+    let own = [found, still_too.then_some(still)]
+        .into_iter()
+        .flatten()
+        .map(|start| refine(start, reach(&report, FROM_SEARCH)))
+        .reduce(better);
     let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
     let wins = |known: &SplineField| own.as_ref().is_none_or(|own| level::is_better(pair, known, own));
-    let mut field = followed.filter(wins).and_then(refined).or(own)?;
+    let mut field = followed.filter(wins).map(refined).or(own)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED {
             break;
@@ -241,7 +244,7 @@ pub(super) fn begin(
         let (next, seen) = search(Some(&field));
         let Some(next) = next.filter(|_| seen.counts.kept > report.counts.kept) else { break };
         let won = seen.counts.kept - report.counts.kept;
-        (field, report) = (refine(vec![next], reach(&seen, FROM_SEARCH))?, seen);
+        (field, report) = (refine(next, reach(&seen, FROM_SEARCH)), seen);
         if (won as f64) < GREW * report.counts.features_initial as f64 {
             break;
         }

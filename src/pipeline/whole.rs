@@ -5,7 +5,6 @@ use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::pyramid;
 use crate::pipeline::level::{self, MatchParams, SplineField};
-use crate::pipeline::passes;
 use crate::pipeline::start::{Begun, Searched, Start, begin};
 use crate::types::{FieldParams, SparseField};
 use std::time::Instant;
@@ -90,7 +89,10 @@ impl Whole<'_> {
         let share = if self.flat { SHARE / 4 } else { SHARE };
         let points = pair.inside.div_ceil(share).min(most).max(40);
         let wide = MatchParams::new(self.params, points, false, self.range, 2, 0.3);
-        let refine = |starts, reach| passes::refine_best(pair, starts, (passes, reach), self.params.seed, self.tick);
+        let refine = |mut start, reach| {
+            level::refine(pair, &mut start, (passes, reach), self.params.seed, self.tick);
+            start
+        };
         let mut reach_mm = self.range;
         let nearest = (LEAST_REACH * pyramid::finest(pair.shape, pair.spacing)).min(self.range);
         let seek = |about: Option<&SplineField>| {
@@ -143,7 +145,7 @@ impl Whole<'_> {
         let mut found = self.begin((pair, factor), &lattice, (&[], false), effort, seconds)?;
         found.field = level::carry(&found.field, own.lattice.clone(), |p| p);
         let reach = found.reach();
-        passes::refine(pair, &mut found.field, (passes, reach), self.params.seed, self.tick);
+        level::refine(pair, &mut found.field, (passes, reach), self.params.seed, self.tick);
         let bending = [own, &found.field].map(|f| level::bending(pair, f));
         if bending[1] > BENT * bending[0] || !level::is_better(pair, &found.field, own) {
             return None;
