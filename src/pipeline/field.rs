@@ -278,9 +278,7 @@ fn canonical(
             progress("matching", done(0.9));
             let points =
                 if params.points > 0 { params.points } else { (pair.inside / params.voxels_per_point).max(200) };
-            let finest = pyramid::finest(pair.shape, pair.spacing);
-            let thorough = params.points > 0;
-            let near = MatchParams::new(params, points, thorough, finest, SparseField::PATCH, 0.05);
+            let near = MatchParams::near(params, &pair, points, params.points > 0);
             let (matches, _, report) = level::matches(&pair, Some(&field), near);
             if !first || reports.is_empty() {
                 reports.push(report);

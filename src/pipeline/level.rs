@@ -22,7 +22,7 @@ use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
 use crate::numerics::unfold::unfold;
 use crate::numerics::{filters, pyramid};
-use crate::types::{Counts, FieldParams, LevelReport, VoxelPoint};
+use crate::types::{Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
 use rayon::prelude::*;
 
 /// A spline field on one level, with the state of its coupling.
@@ -306,6 +306,11 @@ impl MatchParams {
     pub fn new(params: &FieldParams, points: usize, thorough: bool, reach_mm: f64, patch: usize, strain: f64) -> Self {
         let FieldParams { candidates, consistency, sub_voxel, .. } = *params;
         Self { points, thorough, reach_mm, patch, strain, candidates, consistency, sub_voxel }
+    }
+
+    /// About a field that has most features within a voxel of the finest axis already.
+    pub fn near(params: &FieldParams, pair: &Pair<'_>, points: usize, thorough: bool) -> Self {
+        Self::new(params, points, thorough, pyramid::finest(pair.shape, pair.spacing), SparseField::PATCH, 0.05)
     }
 }
 

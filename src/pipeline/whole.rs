@@ -6,7 +6,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::pyramid;
 use crate::pipeline::level::{self, MatchParams, SplineField};
 use crate::pipeline::start::{Begun, Searched, Start, begin};
-use crate::types::{FieldParams, SparseField};
+use crate::types::FieldParams;
 use std::time::Instant;
 
 /// Voxels of a level's mask for each feature, where a whole volume is searched; a quarter of it in one slice.
@@ -33,7 +33,7 @@ const BENT: f64 = 1.6;
 /// Share of the features of the next level that lie where the field from the coarsest one has them, from which that level is not searched. Of 106
 /// pairs of which few features agreed on the coarsest level the search left 0.97 of the error in the 22 with as many (two passes more left 0.98
 /// of it, at a tenth of the time) and 0.96 in the others, down to 0.68.
-const BORNE_OUT: f64 = 0.9;
+const IN_PLACE: f64 = 0.9;
 
 /// Passes more in place of that search.
 pub(super) const SETTLING: usize = 2;
@@ -120,11 +120,10 @@ impl Whole<'_> {
     pub fn is_borne_out(&self, pair: &Pair<'_>, field: &SplineField, seconds: &mut f64) -> bool {
         let started = Instant::now();
         let points = (pair.inside / self.params.voxels_per_point).max(CLOSER_LEAST);
-        let finest = pyramid::finest(pair.shape, pair.spacing);
-        let near = MatchParams::new(self.params, points, false, finest, SparseField::PATCH, 0.05);
+        let near = MatchParams::near(self.params, pair, points, false);
         let (_, _, report) = level::matches(pair, Some(field), near);
         *seconds += started.elapsed().as_secs_f64();
-        report.counts.kept_share() >= BORNE_OUT
+        report.counts.kept_share() >= IN_PLACE
     }
 
     /// The better of a field that came down from the coarsest level and of what a search of the next level itself finds: smaller
