@@ -1,11 +1,12 @@
-//! A sequence measured three ways: followed, each frame on its own, and frame to frame in a chain.
+//! A sequence measured four ways: all frames together, each as it is followed, each on its own, and frame to frame in a chain.
 //!
 //!     cargo run --release --example sequence -- [pinch|pen|contraction] [FRAMES] [VOXELS ALONG X] [SEED]
 
+use palpate::error::FieldError;
 use palpate::evaluate::metrics;
 use palpate::field::composition::compose;
 use palpate::pipeline::field::run;
-use palpate::pipeline::track::Tracker;
+use palpate::pipeline::track::{self, Frame};
 use palpate::synth::{Sequence, SequenceKind, SequenceParams};
 use palpate::types::{DenseField, FieldParams};
 
@@ -23,20 +24,42 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     let field = FieldParams::default();
     let reference = sequence.frame(0);
-    let mut tracker = Tracker::new(&reference, mask, &field);
+    let measured = |together: bool| {
+        let mut fields = Vec::new();
+        let keep = |frame: Frame<'_>| -> Result<(), FieldError> {
+            fields.push(frame.result.displacement.clone());
+            Ok(())
+        };
+        let read = |t: usize| Ok(sequence.frame(t));
+        let order = (sequence.frames(), 0);
+        let found = track::run(order, &reference, (mask, None), (&field, together), read, keep, &|_, _| {})?;
+        Ok::<_, FieldError>((fields, found.together))
+    };
+    let ((followed, _), (all, together)) = (measured(false)?, measured(true)?);
     let mut previous = reference.clone();
     let mut chain = DenseField::zeros(*reference.grid());
-    println!("frame  motion  followed  alone  chained (mm)");
+    let mut sums = [0.0; 5];
+    println!("frame  motion  together  followed  alone  chained (mm)");
     for t in 1..sequence.frames() {
         let (frame, truth) = (sequence.frame(t), sequence.truth(t));
-        let followed = tracker.next(&frame, &|_, _| {})?;
         let alone = run(&reference, &frame, mask, &field, &|_, _| {})?;
         let step = run(&previous, &frame, None, &field, &|_, _| {})?;
         chain = compose(&chain, &step.displacement);
         let error = |u: &DenseField| metrics(u, &truth, mask, &[]);
-        let (f, a, c) = (error(&followed.displacement)?, error(&alone.displacement)?, error(&chain)?);
-        println!("{t:5}  {:6.3}  {:8.3}  {:5.3}  {:7.3}", f.identity_mm, f.mean_mm, a.mean_mm, c.mean_mm);
+        let own = error(&followed[t - 1])?;
+        let errors = [own.identity_mm, error(&all[t - 1])?.mean_mm, own.mean_mm];
+        let [motion, together, followed] = errors;
+        let (alone, chained) = (error(&alone.displacement)?.mean_mm, error(&chain)?.mean_mm);
+        println!("{t:5}  {motion:6.3}  {together:8.4}  {followed:8.4}  {alone:6.4}  {chained:7.4}");
+        for (sum, e) in sums.iter_mut().zip([motion, together, followed, alone, chained]) {
+            *sum += e / (sequence.frames() - 1) as f64;
+        }
         previous = frame;
+    }
+    let [motion, all, followed, alone, chained] = sums;
+    println!(" mean  {motion:6.3}  {all:8.4}  {followed:8.4}  {alone:6.4}  {chained:7.4}");
+    if let Some(together) = together {
+        println!("together: {}", together.why);
     }
     Ok(())
 }

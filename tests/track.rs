@@ -154,7 +154,8 @@ fn a_lost_frame_does_not_stop_the_others() {
         seen.push(f.number);
         Ok(())
     };
-    let found = run((6, 2), &reference, (Some(&s.mask), Some(&s.labels)), &params, read, keep, &|_, _| {}).unwrap();
+    let found =
+        run((6, 2), &reference, (Some(&s.mask), Some(&s.labels)), (&params, true), read, keep, &|_, _| {}).unwrap();
     assert_eq!(seen, [3, 5, 1, 0]);
     assert_eq!(found.frames.iter().map(|f| f.frame).collect::<Vec<_>>(), [0, 1, 3, 4, 5]);
     assert!(found.frames[3].lost.as_ref().unwrap().contains("constant"), "{:?}", found.frames[3].lost);
@@ -165,7 +166,7 @@ fn a_lost_frame_does_not_stop_the_others() {
     }
 
     let nothing = |_: usize| -> Result<Volume, FieldError> { Ok(Volume::filled(*reference.grid(), 0.0)) };
-    assert!(run((6, 2), &reference, (None, None), &params, nothing, |_| Ok(()), &|_, _| {}).is_err());
+    assert!(run((6, 2), &reference, (None, None), (&params, true), nothing, |_| Ok(()), &|_, _| {}).is_err());
 }
 
 /// Without a mask the mean strain was that of all voxels, air with them.
@@ -174,7 +175,7 @@ fn without_a_mask_strain_is_that_of_tissue() {
     let s = sequence(SequenceKind::Pinch, 3);
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
-    let found = run((3, 0), &reference, (None, None), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+    let found = run((3, 0), &reference, (None, None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
     // The mask that is made reaches a voxel into the air; all of the volume is three times the tissue.
     let tissue = s.mask.as_slice().iter().filter(|m| **m != 0).count() as f64;
     assert!(tissue < 0.4 * reference.grid().len() as f64);
@@ -195,7 +196,8 @@ fn a_jerk_is_not_out_of_line() {
     // There and back in one frame: its image bears it out.
     for order in [[0, 4, 4, 20, 4, 4], [0, 12, 14, 16, 18, 20]] {
         let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(order[t])) };
-        let found = run((6, 0), &reference, (Some(&s.mask), None), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+        let found =
+            run((6, 0), &reference, (Some(&s.mask), None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
         assert!(found.frames.iter().all(|f| f.out_of_line == 0.0), "{order:?}: {:?}", found.frames);
     }
 }
@@ -215,7 +217,7 @@ fn a_label_out_of_a_frames_view_is_named() {
     };
     let params = FieldParams::default();
     let tracked =
-        run((3, 0), &reference, (Some(&s.mask), Some(&labels)), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+        run((3, 0), &reference, (Some(&s.mask), Some(&labels)), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
     let said = |t: usize| tracked.frames.iter().find(|f| f.frame == t).unwrap().warnings.join(" ");
     assert!(said(2).contains("label 7 (100 %)") && !said(2).contains("label 1"), "{}", said(2));
     assert!(!said(1).contains("label"), "{}", said(1));
@@ -226,7 +228,7 @@ fn trajectories_follow_the_true_motion() {
     let s = sequence(SequenceKind::Pen, 5);
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
-    let found = run((5, 0), &reference, (Some(&s.mask), None), &params, read, |_| Ok(()), &|_, _| {}).unwrap();
+    let found = run((5, 0), &reference, (Some(&s.mask), None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
     assert!(found.trajectories.len() > 50, "{}", found.trajectories.len());
     for t in 1..5 {
         let places: Vec<_> = found.trajectories.iter().filter_map(|p| Some((p.initial, p.places[t]?))).collect();
@@ -313,5 +315,46 @@ fn a_sequence_is_exact_and_the_same_twice() {
         };
         let (still, warped) = (off(&s.frame(3)), off(&back));
         assert!(warped < 0.25 * still, "{name}: {warped:.1} against {still:.1} without the motion");
+    }
+}
+
+/// Frames of 12 that are lost or lie before the reference do not keep what all say together from being nearer to the truth than each alone.
+#[test]
+fn frames_together_are_nearer_to_the_truth_than_alone() {
+    for (kind, origin, blank, modes) in [(SequenceKind::Pinch, 0, None, 2), (SequenceKind::Pen, 5, Some(8), 4)] {
+        let s = sequence(kind, 12);
+        let (params, reference) = (FieldParams::default(), s.frame(origin));
+        let read = |t: usize| -> Result<Volume, FieldError> {
+            Ok(if Some(t) == blank { Volume::filled(*reference.grid(), 50.0) } else { s.frame(t) })
+        };
+        let measured = |together: bool| {
+            let mut fields: Vec<Option<DenseField>> = vec![None; 12];
+            let keep = |f: palpate::pipeline::track::Frame<'_>| -> Result<(), FieldError> {
+                fields[f.number] = Some(f.result.displacement.clone());
+                Ok(())
+            };
+            let found =
+                run((12, origin), &reference, (Some(&s.mask), None), (&params, together), read, keep, &|_, _| {});
+            (found.unwrap(), fields)
+        };
+        let ((alone, own), (found, all)) = (measured(false), measured(true));
+        assert_eq!(alone.together, None);
+        let together = found.together.unwrap();
+        assert_eq!(together.modes, Some(modes), "{kind:?}: {}", together.why);
+        if origin > 0 {
+            // The truth is known from the first frame alone.
+            assert!(own[8].is_none() && all[8].is_none());
+            let moves = |f: &Option<DenseField>| f.as_ref().is_some_and(|f| f.as_slice().iter().any(|v| *v != 0.0));
+            assert!(own.iter().filter(|f| moves(f)).count() >= 9);
+            assert!(own.iter().zip(&all).all(|(a, b)| !moves(a) || a != b));
+            continue;
+        }
+        let errors = |fields: &[Option<DenseField>]| -> Vec<f64> {
+            (1..12).map(|t| error(fields[t].as_ref().unwrap(), &s.truth(t), &s.mask)).collect()
+        };
+        let (own, all) = (errors(&own), errors(&all));
+        let mean = |e: &[f64]| e.iter().sum::<f64>() / e.len() as f64;
+        assert!(mean(&all) < 0.9 * mean(&own), "{kind:?}: {:.4} mm, alone {:.4}", mean(&all), mean(&own));
+        assert!(all.iter().zip(&own).all(|(a, o)| *a < 1.1 * o), "{kind:?}: {all:?}, alone {own:?}");
     }
 }

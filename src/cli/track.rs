@@ -46,6 +46,9 @@ pub struct Options {
     /// Regions whose strain is written to strain.csv: a label map on the reference's grid
     #[arg(long, value_name = "L")]
     labels: Option<PathBuf>,
+    /// Leave each frame's field as its own volume has it, without what all frames say together
+    #[arg(long)]
+    frame_by_frame: bool,
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     dry_run: bool,
@@ -140,7 +143,7 @@ impl<'a> Source<'a> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { volumes, target, reference: origin, mask, labels, dry_run, tuning } = options;
+    let Options { volumes, target, reference: origin, mask, labels, frame_by_frame, dry_run, tuning } = options;
     let (params, origin) = (tuning.params()?, *origin);
     let mut source = Source::open(volumes)?;
     let frames = source.frames();
@@ -188,9 +191,13 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
     let range = gray_range(&reference);
     let shown = inside.as_ref().or(regions.as_ref());
+    let mut seen = vec![false; frames];
     let read = |frame: usize| -> Result<Volume> {
         let started = Instant::now();
-        let volume = source.read_frame(frame, &mut warnings);
+        // What the first reading had to say is not said again.
+        let mut again = Vec::new();
+        let said = if std::mem::replace(&mut seen[frame], true) { &mut again } else { &mut warnings };
+        let volume = source.read_frame(frame, said);
         reading += started.elapsed();
         volume
     };
@@ -233,11 +240,16 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         writing += started.elapsed();
         Ok(())
     };
-    let tracked =
-        track::run((frames, origin), &reference, (inside.as_ref(), regions.as_ref()), &params, read, keep, &|s, f| {
-            progress.set(s, f)
-        })
-        .map_err(|error| if error.is::<FieldError>() { none_against(error, &source.name(origin)) } else { error })?;
+    let tracked = track::run(
+        (frames, origin),
+        &reference,
+        (inside.as_ref(), regions.as_ref()),
+        (&params, !frame_by_frame),
+        read,
+        keep,
+        &|s, f| progress.set(s, f),
+    )
+    .map_err(|error| if error.is::<FieldError>() { none_against(error, &source.name(origin)) } else { error })?;
 
     progress.set("write", 1.0);
     let started = Instant::now();

@@ -1,5 +1,6 @@
 //! A spline lattice as a dense field.
 
+use crate::error::SpaceError;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::simd::dispatch;
@@ -77,6 +78,51 @@ pub fn follow(
     found.into_iter().map(|(_, change)| change).collect()
 }
 
+/// A displacement field as its B-spline coefficients, and the voxels beside a jump that move as another place does: all that a dense one is worked
+/// out from, and much smaller.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FieldSpline {
+    grid: Grid,
+    /// Nodes over the grid.
+    pub(crate) lattice: Lattice,
+    /// Displacement (mm along the grid's axes), planar.
+    pub(crate) coefficients: Vec<f32>,
+    places: Vec<([usize; 3], [f64; 3])>,
+    /// The grid it is asked for on, where that one's axes run otherwise.
+    stored: Option<(Grid, Orientation)>,
+}
+
+impl FieldSpline {
+    /// From coefficients (mm along `grid`'s axes, planar) on the nodes of a lattice that lies over its shape; `places` are those of [`follow`].
+    pub fn new(grid: Grid, (lattice, coefficients): (Lattice, Vec<f32>), places: Vec<([usize; 3], [f64; 3])>) -> Self {
+        Self { grid, lattice, coefficients, places, stored: None }
+    }
+
+    /// The same, to be asked for on the grid `stored` of the same voxels.
+    pub fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
+        Self { stored: Some((stored, orientation)), ..self }
+    }
+
+    /// The displacement at every voxel (mm, RAS).
+    ///
+    /// # Errors
+    /// [`SpaceError`] where the grid it is asked for on is not one of the same voxels.
+    pub fn dense(&self) -> Result<DenseField, SpaceError> {
+        let (field, _) = self.with_changes();
+        match &self.stored {
+            Some((grid, orientation)) => orientation.stored_field(field, grid),
+            None => Ok(field),
+        }
+    }
+
+    /// The displacement on its own grid, and by how much each voxel beside a jump is moved from the smooth field (mm) with its index.
+    pub(crate) fn with_changes(&self) -> (DenseField, Vec<([usize; 3], f32)>) {
+        let mut field = dense(&self.grid, &self.lattice, &self.coefficients);
+        let changes = follow(&mut field, &self.lattice, &self.coefficients, &self.places);
+        (field, self.places.iter().map(|(v, _)| *v).zip(changes).collect())
+    }
+}
+
 /// A smooth scalar over a grid, kept as its B-spline coefficients: small, and worked out where it is asked for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScalarSpline {
@@ -104,8 +150,13 @@ impl ScalarSpline {
             Some((grid, orientation)) => orientation.offset(grid.shape(), grid.voxel(offset)),
             None => offset,
         };
+        self.at_place(self.grid.voxel(offset).map(|i| i as f64))
+    }
+
+    /// The value at a place of the canonical grid (voxels).
+    pub(crate) fn at_place(&self, place: [f64; 3]) -> f32 {
         let mut sum = 0.0;
-        self.lattice.for_each_tap(self.grid.voxel(offset).map(|i| i as f64), |node, w| sum += w * self.values[node]);
+        self.lattice.for_each_tap(place, |node, w| sum += w * self.values[node]);
         sum
     }
 

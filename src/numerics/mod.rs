@@ -18,6 +18,8 @@ pub mod pyramid;
 
 pub mod small;
 
+pub mod eigen;
+
 pub mod bspline;
 pub mod cubic;
 mod multilevel;

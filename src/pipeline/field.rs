@@ -2,7 +2,7 @@
 
 use crate::consistency::models::{AffineMotion, Choice, choose};
 use crate::error::{FieldError, MeshError};
-use crate::field::spline::ScalarSpline;
+use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::field::{interpolation, jacobian, spline};
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
@@ -42,6 +42,8 @@ pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 pub struct FieldResult {
     /// Displacement, initial to deformed (mm, RAS).
     pub displacement: DenseField,
+    /// What it is worked out from.
+    pub coefficients: FieldSpline,
     /// The field as the search left it, a start for a volume taken soon after.
     pub spline: Start,
     /// One standard deviation of the displacement (mm).
@@ -54,6 +56,25 @@ pub struct FieldResult {
     pub node_displacement: Vec<[f64; 3]>,
     /// The rest.
     pub summary: FieldSummary,
+}
+
+impl FieldResult {
+    /// The displacement once more, from what it is worked out from.
+    pub(super) fn dense(&self, interpolation: Interpolation) -> Result<DenseField, FieldError> {
+        let smooth = self.coefficients.dense()?;
+        match interpolation {
+            Interpolation::Spline => Ok(smooth),
+            Interpolation::Barycentric => barycentric(&self.mesh, &self.node_displacement, smooth),
+        }
+    }
+
+    /// Puts another displacement in the place of its own, and what the summary says of it over the mask.
+    pub(super) fn replace(&mut self, displacement: DenseField, mask: &Mask) -> Result<(), FieldError> {
+        (self.summary.mean_mm, self.summary.max_mm, _) = lengths(&displacement, mask);
+        self.summary.folds = jacobian::count_folds(&displacement, Some(mask))?;
+        self.displacement = displacement;
+        Ok(())
+    }
 }
 
 /// Fewest matches that a result may rest on.
@@ -160,6 +181,7 @@ fn stored(found: FieldResult, here: Orientation, grid: &Grid) -> Result<FieldRes
     }
     Ok(FieldResult {
         displacement: here.stored_field(found.displacement, grid)?,
+        coefficients: found.coefficients.stored_on(*grid, here),
         uncertainty: found.uncertainty.stored_on(*grid, here),
         ..found
     })
@@ -352,7 +374,7 @@ fn canonical(
         rest.bring(&mut field, judged);
     }
     let spacing = pair.spacing;
-    let (lattice, coefficients) = full_lattice(&grid, &field, factor, &choice);
+    let coefficients = FieldSpline::new(grid, full_lattice(&grid, &field, factor, &choice), places);
     let (coarse, mut posterior) = posterior;
     let hidden = hidden(&pair, &field, &coarse);
     if let Some(rest) = rest {
@@ -367,8 +389,7 @@ fn canonical(
     progress("mesh", 0.92);
     let (mesh, source) = triangulate(&sparse, flat)?;
     clock.book("mesh");
-    let mut smooth = spline::dense(&grid, &lattice, &coefficients);
-    let changes = spline::follow(&mut smooth, &lattice, &coefficients, &places);
+    let (smooth, jumps) = coefficients.with_changes();
     let kept_matches: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
     let displacement = match params.interpolation {
@@ -398,7 +419,6 @@ fn canonical(
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
     progress("uncertainty", 0.95);
-    let jumps = places.iter().map(|(v, _)| *v).zip(changes);
     let uncertainty = uncertainty(&grid, spacing, (coarse, posterior.deviation), &hidden, jumps);
     let (uncertainty_median_mm, uncertainty_mean_mm) = average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
@@ -443,7 +463,16 @@ fn canonical(
     let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
     // What the data say at each node is as large again twice over, and no search starts from it.
     let spline = Start { field: SplineField { blocks: Blocks::default(), ..field }, factor, searched };
-    Ok(FieldResult { displacement, spline, uncertainty, matches: sparse, mesh, node_displacement, summary })
+    Ok(FieldResult {
+        displacement,
+        coefficients,
+        spline,
+        uncertainty,
+        matches: sparse,
+        mesh,
+        node_displacement,
+        summary,
+    })
 }
 
 /// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and [`FEWEST`] must be left.
@@ -681,7 +710,7 @@ fn uncertainty(
     spacing: [f64; 3],
     (coarse, mut deviation): (Lattice, Vec<f32>),
     hidden: &[bool],
-    jumps: impl Iterator<Item = ([usize; 3], f32)>,
+    jumps: Vec<([usize; 3], f32)>,
 ) -> ScalarSpline {
     let thick = || (0..3).filter(|&a| coarse.shape[a] > 1);
     let least = HIDDEN * (thick().map(|a| spacing[a].powi(2)).sum::<f64>() / thick().count().max(1) as f64).sqrt();

@@ -36,6 +36,7 @@ mod course;
 mod farther;
 mod finer;
 mod light;
+mod modes;
 mod polish;
 mod rest;
 mod search;

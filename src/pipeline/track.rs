@@ -1,15 +1,19 @@
 //! A sequence of volumes: the displacement from one of them to each other, frame by frame.
 //!
 //! Every frame is measured against the reference itself, so that errors do not add up; the search starts from where the
-//! tissue was in the frame before and where steady motion would take it, beside the starts that a pair of volumes has.
-//! Only the reference, the frame at hand with what comes of it, and the volume of the one before are held.
+//! tissue was in the frame before and where steady motion would take it, beside the starts that a pair of volumes has. Then what all frames
+//! say together takes from each what is its own noise and the reference's ([`Modes`]).
+//! Of volumes only the reference, the frame at hand and the one before are held, and of fields one; the others as their coefficients.
 
 use crate::error::FieldError;
 use crate::field::strain::{StrainField, StrainStatistics};
 use crate::matching::levels::foreground;
+use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{displacement, inside};
 use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
+use crate::pipeline::modes::{self, Modes};
+use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -67,7 +71,8 @@ pub struct Frame<'a> {
 
 /// Measures `frames` volumes against number `origin` of them: forward from it to the last, then backward to the first.
 ///
-/// `read` gives a volume by its number, `keep` gets each result as soon as it is there. `labels` (on the reference's
+/// `read` gives a volume by its number, twice each; `keep` gets each result once all are measured. Where `together` holds, each field is what all frames
+/// say of it. `labels` (on the reference's
 /// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them, and what stands out of the background
 /// without either. A frame that cannot be
 /// measured is reported as lost, and the next one starts from the frames before it.
@@ -78,7 +83,7 @@ pub fn run<'v, E: From<FieldError>>(
     (frames, origin): (usize, usize),
     reference: &Voxels<'_>,
     (mask, labels): (Option<&Mask>, Option<&Mask>),
-    params: &FieldParams,
+    (params, together): (&FieldParams, bool),
     mut read: impl FnMut(usize) -> Result<Voxels<'v>, E>,
     mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
     progress: Progress<'_>,
@@ -87,44 +92,27 @@ pub fn run<'v, E: From<FieldError>>(
     let tissue = mask.map_or_else(|| Cow::Owned(foreground(reference)), Cow::Borrowed);
     let regions = regions(reference, if labels.is_some() { mask } else { Some(&*tissue) }, labels);
     let mut tracker = Tracker::new(reference, mask, params);
-    let mut points = Points::new(frames);
     let mut tracked = Tracked::default();
     let mut refused = None;
     let mut course = Course::new(reference, &tissue, origin);
+    let mut said: Vec<(usize, OutOfLine)> = Vec::new();
+    let mut held: Vec<Held> = Vec::new();
     let order = (origin + 1..frames).chain((0..origin).rev());
     for (done, number) in order.enumerate() {
         if number + 1 == origin {
             tracker.restart();
-            tracked.book(course.end());
+            said.extend(course.end());
         }
         let volume = read(number)?;
         let started = Instant::now();
         let part = |stage: &str, f: f64| progress(stage, (done as f64 + f) / (frames - 1) as f64);
         match tracker.next(&volume, &part) {
-            Ok(result) => {
-                let strain = StrainField::of(&result.displacement);
-                points.add(number, &result, volume.grid());
-                for (label, offsets) in &regions {
-                    let s = StrainStatistics::over(&strain, offsets);
-                    let StrainStatistics { voxels, mean, peak, shear, volume_change } = s;
-                    tracked.strain.push(StrainRow {
-                        frame: number,
-                        label: *label,
-                        voxels,
-                        mean,
-                        peak,
-                        shear,
-                        volume_change,
-                    });
-                }
-                let mut summary = summary(number, &result, started.elapsed().as_secs_f64());
-                if labels.is_some() {
-                    summary.warnings.extend(out_of_view(&regions, &result.displacement, volume.grid()));
-                }
-                tracked.frames.push(summary);
-                keep(Frame { number, volume: &volume, result: &result, strain: &strain })?;
+            Ok(mut result) => {
                 let sigma = |at| result.uncertainty.at(at);
-                tracked.book(course.add(number, (&result.displacement, &sigma), volume));
+                said.extend(course.add(number, (&result.displacement, &sigma), volume));
+                // The field takes far more room than what it is worked out from.
+                result.displacement = DenseField::zeros(one_voxel(reference.grid())?);
+                held.push(Held { number, result, seconds: started.elapsed().as_secs_f64() });
             }
             Err(error) => {
                 tracked.frames.push(lost(number, &error));
@@ -132,7 +120,35 @@ pub fn run<'v, E: From<FieldError>>(
             }
         }
     }
-    tracked.book(course.end());
+    said.extend(course.end());
+    drop((course, tracker));
+
+    progress("together", 1.0);
+    if together && params.interpolation == Interpolation::Spline && frames > 2 {
+        tracked.together = Some(take_together(&mut held, origin, &tissue));
+    }
+    let mut points = Points::new(frames);
+    for Held { number, mut result, seconds } in held {
+        let volume = read(number)?;
+        result.replace(result.dense(params.interpolation)?, &tissue)?;
+        let strain = StrainField::of(&result.displacement);
+        points.add(number, &result, volume.grid());
+        for (label, offsets) in &regions {
+            let StrainStatistics { voxels, mean, peak, shear, volume_change } =
+                StrainStatistics::over(&strain, offsets);
+            tracked.strain.push(StrainRow { frame: number, label: *label, voxels, mean, peak, shear, volume_change });
+        }
+        let mut summary = summary(number, &result, seconds);
+        if labels.is_some() {
+            summary.warnings.extend(out_of_view(&regions, &result.displacement, volume.grid()));
+        }
+        if let Some((_, out)) = said.iter().find(|s| s.0 == number) {
+            summary.out_of_line = out.share;
+            summary.warnings.push(out.why());
+        }
+        tracked.frames.push(summary);
+        keep(Frame { number, volume: &volume, result: &result, strain: &strain })?;
+    }
     if let Some(error) = refused.filter(|_| tracked.frames.iter().all(|f| f.lost.is_some())) {
         return Err(error.into());
     }
@@ -142,14 +158,35 @@ pub fn run<'v, E: From<FieldError>>(
     Ok(tracked)
 }
 
-impl Tracked {
-    /// Books what is out of line in a frame.
-    fn book(&mut self, told: Option<(usize, OutOfLine)>) {
-        let frame = told.and_then(|(number, said)| Some((self.frames.iter_mut().find(|f| f.frame == number)?, said)));
-        if let Some((frame, said)) = frame {
-            frame.out_of_line = said.share;
-            frame.warnings.push(said.why());
+/// A frame that was measured, without its dense field.
+struct Held {
+    number: usize,
+    result: FieldResult,
+    seconds: f64,
+}
+
+/// A grid to stand where there is no field.
+fn one_voxel(grid: &Grid) -> Result<Grid, FieldError> {
+    Ok(Grid::new([1; 3], *grid.affine())?)
+}
+
+/// Takes from each frame what is noise by all of them, and says how.
+fn take_together(held: &mut [Held], origin: usize, tissue: &Mask) -> Together {
+    let frames: Vec<modes::Frame<'_>> = held
+        .iter()
+        .map(|h| modes::Frame { number: h.number, field: &h.result.coefficients, uncertainty: &h.result.uncertainty })
+        .collect();
+    let here = Orientation::of(tissue.grid());
+    let turned = here.turned(tissue);
+    let canonical = here.canonical(tissue.grid());
+    let found = Modes::find(&frames, origin, |[i, j, k]| turned.as_slice()[canonical.index(i, j, k)] != 0);
+    drop(frames);
+    match found {
+        Ok(modes) => {
+            held.iter_mut().enumerate().for_each(|(at, h)| modes.apply(at, &mut h.result.coefficients));
+            Together { modes: Some(modes.count), why: modes.why }
         }
+        Err(why) => Together { modes: None, why },
     }
 }
 

@@ -14,7 +14,7 @@ use std::time::Instant;
 
 /// The displacement from one volume of a sequence to each other, with strain and trajectories.
 #[pyfunction]
-#[pyo3(signature = (volumes, reference, mask, labels, params, names, regions, step_s=None, progress=None, threads=None))]
+#[pyo3(signature = (volumes, reference, mask, labels, params, names, regions, together=true, step_s=None, progress=None, threads=None))]
 pub fn track<'py>(
     py: Python<'py>,
     volumes: Vec<Image<'py>>,
@@ -24,6 +24,7 @@ pub fn track<'py>(
     params: &str,
     names: Vec<String>,
     regions: [String; 2],
+    together: bool,
     step_s: Option<f64>,
     progress: Callback,
     threads: Option<i64>,
@@ -51,7 +52,15 @@ pub fn track<'py>(
             fields[frame.number] = Some(kept_field(frame.result.displacement.clone()));
             Ok(())
         };
-        run((frames, reference), &all[reference], (mask.as_ref(), labels.as_ref()), &params, read, keep, tell)
+        run(
+            (frames, reference),
+            &all[reference],
+            (mask.as_ref(), labels.as_ref()),
+            (&params, together),
+            read,
+            keep,
+            tell,
+        )
     })?;
     let tracked = tracked.map_err(told)?;
     let out = PyDict::new(py);

@@ -223,6 +223,7 @@ pub fn summary(report: &TrackReport<'_>) -> Value {
         "grid": grid(report.grid),
         "frames": t.frames,
         "points": t.trajectories.len(),
+        "together": t.together,
         "trust": trust.name(),
         "trust_reasons": reasons,
         "seconds": seconds(report.seconds),
@@ -248,6 +249,9 @@ pub fn text(report: &TrackReport<'_>) -> String {
                 f.uncertainty_median_mm
             ),
         };
+    }
+    if let Some(together) = &t.together {
+        let _ = writeln!(out, "  together     {}", together.why);
     }
     let (trust, reasons) = judge_frames(&t.frames, report.judged);
     let _ = writeln!(out, "  trust        {}: {}", trust.name(), reasons.join("; "));
@@ -320,7 +324,8 @@ pub fn page(report: &TrackReport<'_>) -> String {
     let _ = write!(
         body,
         "<section><h2>Over time</h2><p class=\"lead\">E1 and E3 are the largest and the smallest principal strain (Green-Lagrange), peaks their \
-         98th and 2nd percentile; volume is its relative change.</p><div class=\"grid\">{}</div></section>",
+         98th and 2nd percentile; volume is its relative change.{}</p><div class=\"grid\">{}</div></section>",
+        t.together.as_ref().map_or_else(String::new, |all| format!(" All frames together: {}.", escape(&all.why))),
         curves(report)
     );
     let rows: Vec<Vec<String>> = t
@@ -486,7 +491,7 @@ mod tests {
         };
         let strain = [1, 3, 4].into_iter().flat_map(|f| (1..=labels).map(move |l| row(f, l))).collect();
         let frames = (1..5).map(|f| frame(f, (f == 2).then_some("it is blank"))).collect();
-        Tracked { frames, trajectories: Vec::new(), strain }
+        Tracked { frames, trajectories: Vec::new(), strain, together: None }
     }
 
     fn told<T>(tracked: &Tracked, tell: impl Fn(&TrackReport<'_>) -> T) -> T {

@@ -48,6 +48,6 @@ pub use result::{Counts, FieldSummary, LevelReport, Mesh, MotionModel};
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
-pub use track::{FrameSummary, Place, PointState, StrainRow, Tracked, Trajectory};
+pub use track::{FrameSummary, Place, PointState, StrainRow, Together, Tracked, Trajectory};
 pub use trial::{Part, Standing, StressCurve, StressRun, Trial};
 pub use volume::{Mask, Volume, Voxels};

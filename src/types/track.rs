@@ -109,6 +109,15 @@ pub struct FrameSummary {
     pub warnings: Vec<String>,
 }
 
+/// What the frames of a sequence say together.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Together {
+    /// Courses over time that the motion of all frames is made of; none where each frame's field is its own.
+    pub modes: Option<usize>,
+    /// Why, in words.
+    pub why: String,
+}
+
 /// Everything but the fields.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Tracked {
@@ -118,4 +127,6 @@ pub struct Tracked {
     pub trajectories: Vec<Trajectory>,
     /// By frame, then by label.
     pub strain: Vec<StrainRow>,
+    /// What all frames say together; none where it was not asked.
+    pub together: Option<Together>,
 }

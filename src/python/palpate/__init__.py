@@ -357,6 +357,7 @@ def track(
     search: Optional[float] = None,
     seed: Optional[int] = None,
     params: Mapping[str, Any] = {},
+    together: bool = True,
     progress: Progress = None,
     threads: Optional[int] = None,
 ) -> Track:
@@ -364,7 +365,7 @@ def track(
     taken, in mm (RAS).
 
     ``volumes`` is a list, or one image, path or ``(array, affine)`` with the frames on its fourth axis; of these only a path gives
-    the time between frames. ``mask`` and ``labels`` lie on the reference's grid. Raises `PalpateError` with the message of the
+    the time between frames. Where ``together`` is true, each field is what all frames say of it. ``mask`` and ``labels`` lie on the reference's grid. Raises `PalpateError` with the message of the
     command line.
     """
     frames, names, step = _frames(volumes)
@@ -380,6 +381,7 @@ def track(
         asked,
         names,
         regions,
+        together,
         step,
         progress,
         threads,

@@ -68,6 +68,7 @@ def track(
     params: str,
     names: Sequence[str],
     regions: Sequence[str],
+    together: bool = True,
     step_s: Optional[float] = None,
     progress: _Progress = None,
     threads: Optional[int] = None,
