@@ -67,9 +67,14 @@ fn own_pair_measures_the_press() {
 fn sequence_follows_a_pinch() {
     let (out, _) = example("sequence", &["pinch", "3", "32"]);
     let rows: Vec<Vec<f64>> =
-        out.lines().skip(1).map(|l| l.split_whitespace().map(|v| v.parse().unwrap()).collect()).collect();
-    assert_eq!(rows.len(), 2, "{out}");
-    assert!(rows.iter().all(|r| r[2] < 0.5 * r[1]), "{out}");
+        out.lines().skip(1).take(2).map(|l| l.split_whitespace().map(|v| v.parse().unwrap()).collect()).collect();
+    assert_eq!(rows.iter().map(|r| r[0]).collect::<Vec<_>>(), [1.0, 2.0], "{out}");
+    // All frames together, followed, and alone.
+    assert!(rows.iter().all(|r| r.len() == 6 && r[2..5].iter().all(|e| *e < 0.5 * r[1])), "{out}");
+    assert!(
+        out.lines().any(|l| l.trim_start().starts_with("mean ")) && out.contains("\ntogether: each frame by itself"),
+        "{out}"
+    );
 }
 
 #[test]

@@ -458,7 +458,7 @@ fn over_time(report: &TrackReport<'_>, still: f64, values: impl Iterator<Item = 
 mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{Affine, Counts};
+    use crate::types::{Affine, Counts, Together};
 
     fn frame(frame: usize, lost: Option<&str>) -> FrameSummary {
         FrameSummary {
@@ -558,5 +558,16 @@ mod tests {
                 .contains("<b>Trust is moderate</b> median uncertainty at most 0.1 mm in any frame; frame 2 is lost.")
         );
         assert!(told(&tracked, text).contains("  trust        moderate: median"));
+    }
+
+    #[test]
+    fn what_all_frames_say_together_is_told() {
+        let why = "2 courses < 4".to_string();
+        let tracked = Tracked { together: Some(Together { modes: Some(2), why }), ..sequence(1) };
+        assert!(told(&tracked, text).contains("\n  together     2 courses < 4\n"));
+        assert!(told(&tracked, page).contains(" All frames together: 2 courses &lt; 4.</p>"));
+        assert_eq!(told(&tracked, summary)["together"]["modes"], 2);
+        assert!(!told(&sequence(1), text).contains("together"));
+        assert!(told(&sequence(1), summary)["together"].is_null());
     }
 }
