@@ -358,3 +358,26 @@ fn frames_together_are_nearer_to_the_truth_than_alone() {
         assert!(all.iter().zip(&own).all(|(a, o)| *a < 1.1 * o), "{kind:?}: {all:?}, alone {own:?}");
     }
 }
+
+/// What is said of a frame that keeps its own field was worked out anew, over voxels without a number as well.
+#[test]
+fn a_frame_that_keeps_its_own_field_is_summed_up_as_a_pair() {
+    let s = sequence(SequenceKind::Pinch, 3);
+    let mut reference = s.frame(0);
+    let [nx, ny, nz] = reference.grid().shape();
+    let grid = *reference.grid();
+    for k in 0..nz {
+        (0..nx).for_each(|i| reference.as_mut_slice()[grid.index(i, ny / 2, k)] = f32::NAN);
+    }
+    let params = FieldParams::default();
+    let alone = pair(&reference, &s.frame(1), Some(&s.mask), &params, &|_, _| {}).unwrap();
+    let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
+    let keep = |f: palpate::pipeline::track::Frame<'_>| -> Result<(), FieldError> {
+        assert!(f.number != 1 || f.result.displacement == alone.displacement);
+        Ok(())
+    };
+    let found = run((3, 0), &reference, (Some(&s.mask), None), (&params, true), read, keep, &|_, _| {}).unwrap();
+    let (first, own) = (&found.frames[0], &alone.summary);
+    assert_eq!((first.mean_mm, first.max_mm, first.folds), (own.mean_mm, own.max_mm, own.folds));
+    assert_eq!(found.together.unwrap().modes, None);
+}

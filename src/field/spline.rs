@@ -103,6 +103,11 @@ impl FieldSpline {
         Self { stored: Some((stored, orientation)), ..self }
     }
 
+    /// The lattice, and the coefficients on it.
+    pub(crate) fn parts(&self) -> (&Lattice, &[f32]) {
+        (&self.lattice, &self.coefficients)
+    }
+
     /// The displacement at every voxel (mm, RAS).
     ///
     /// # Errors

@@ -61,11 +61,7 @@ pub struct FieldResult {
 impl FieldResult {
     /// The displacement once more, from what it is worked out from.
     pub(super) fn dense(&self, interpolation: Interpolation) -> Result<DenseField, FieldError> {
-        let smooth = self.coefficients.dense()?;
-        match interpolation {
-            Interpolation::Spline => Ok(smooth),
-            Interpolation::Barycentric => barycentric(&self.mesh, &self.node_displacement, smooth),
-        }
+        interpolated(interpolation, self.coefficients.dense()?, (&self.mesh, &self.node_displacement))
     }
 
     /// Puts another displacement in the place of its own, and what the summary says of it over the mask.
@@ -392,10 +388,7 @@ fn canonical(
     let (smooth, jumps) = coefficients.with_changes();
     let kept_matches: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
-    let displacement = match params.interpolation {
-        Interpolation::Spline => smooth,
-        Interpolation::Barycentric => barycentric(&mesh, &node_displacement, smooth)?,
-    };
+    let displacement = interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
     let doubted = begun.as_ref().and_then(Begun::doubted);
@@ -663,6 +656,18 @@ fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), Fie
     }
     let d = delaunay2(&places)?;
     Ok((Mesh::Triangles(d.mesh), d.source))
+}
+
+/// The field as asked for: `smooth`, or from the mesh inside it.
+fn interpolated(
+    interpolation: Interpolation,
+    smooth: DenseField,
+    (mesh, nodes): (&Mesh, &[[f64; 3]]),
+) -> Result<DenseField, FieldError> {
+    match interpolation {
+        Interpolation::Spline => Ok(smooth),
+        Interpolation::Barycentric => barycentric(mesh, nodes, smooth),
+    }
 }
 
 /// Piecewise linear inside the mesh, `outside` elsewhere.

@@ -57,12 +57,10 @@ pub(super) struct Modes {
     corrections: Vec<Vec<f32>>,
 }
 
-/// Why there are none, in words.
-pub(super) type Refused = String;
-
 impl Modes {
-    /// Of `frames`, measured against frame `origin`; `counts` says of a voxel of the fields' own grid whether it is tissue.
-    pub fn find(frames: &[Frame<'_>], origin: usize, counts: impl Fn([usize; 3]) -> bool) -> Result<Self, Refused> {
+    /// Of `frames`, measured against frame `origin`; `counts` says of a voxel of the fields' own grid whether it is tissue. Else why there are
+    /// none, in words.
+    pub fn find(frames: &[Frame<'_>], origin: usize, counts: impl Fn([usize; 3]) -> bool) -> Result<Self, String> {
         if frames.len() < FEWEST {
             return Err(format!(
                 "each frame by itself: {FEWEST} beside the reference are needed to tell courses from noise"
@@ -74,7 +72,7 @@ impl Modes {
         order.sort_by_key(|&f| frames[f].number);
         let before = order.iter().filter(|&&f| frames[f].number < origin).count();
         let still = Cow::Owned(vec![0.0; 3 * lattice.len()]);
-        let mut rows: Vec<Cow<'_, [f32]>> = order.iter().map(|&f| on(lattice, frames[f].field)).collect();
+        let mut rows: Vec<Cow<'_, [f32]>> = order.iter().map(|&f| carried(frames[f].field.parts(), lattice)).collect();
         rows.insert(before, still);
         let nodes: Vec<usize> =
             (0..lattice.len()).filter(|&m| counts(lattice.within(m).map(|v| v.round() as usize))).collect();
@@ -102,27 +100,18 @@ impl Modes {
 
     /// The field of frame `at` of those that were given, by all of them.
     pub fn apply(&self, at: usize, field: &mut FieldSpline) {
-        let taken = &self.corrections[at];
-        if field.lattice == self.lattice {
-            field.coefficients.iter_mut().zip(taken).for_each(|(c, t)| *c -= t);
-        } else {
-            let taken = field.lattice.fit(|p| self.lattice.at(taken, within(p, &self.lattice)));
-            field.coefficients.iter_mut().zip(taken).for_each(|(c, t)| *c -= t);
-        }
+        let taken = carried((&self.lattice, &self.corrections[at]), &field.lattice);
+        field.coefficients.iter_mut().zip(taken.iter()).for_each(|(c, t)| *c -= t);
     }
 }
 
-fn within(p: [f64; 3], lattice: &Lattice) -> [f64; 3] {
-    std::array::from_fn(|a| p[a].clamp(0.0, (lattice.shape[a] - 1) as f64))
-}
-
-/// The coefficients of a field on a lattice.
-fn on<'a>(lattice: &Lattice, field: &'a FieldSpline) -> Cow<'a, [f32]> {
-    if field.lattice == *lattice {
-        Cow::Borrowed(&field.coefficients)
-    } else {
-        Cow::Owned(lattice.fit(|p| field.lattice.at(&field.coefficients, within(p, &field.lattice))))
+/// Coefficients on another lattice over the same grid.
+fn carried<'a>((from, coefficients): (&Lattice, &'a [f32]), to: &Lattice) -> Cow<'a, [f32]> {
+    if from == to {
+        return Cow::Borrowed(coefficients);
     }
+    let inside = |p: [f64; 3]| std::array::from_fn(|a| p[a].clamp(0.0, (from.shape[a] - 1) as f64));
+    Cow::Owned(to.fit(|p| from.at(coefficients, inside(p))))
 }
 
 /// Coefficients of the tissue's nodes, less their mean over the frames, in units of their noise.

@@ -130,7 +130,12 @@ pub fn run<'v, E: From<FieldError>>(
     let mut points = Points::new(frames);
     for Held { number, mut result, seconds } in held {
         let volume = read(number)?;
-        result.replace(result.dense(params.interpolation)?, &tissue)?;
+        let displacement = result.dense(params.interpolation)?;
+        if tracked.together.as_ref().is_some_and(|t| t.modes.is_some()) {
+            result.replace(displacement, &tissue)?;
+        } else {
+            result.displacement = displacement;
+        }
         let strain = StrainField::of(&result.displacement);
         points.add(number, &result, volume.grid());
         for (label, offsets) in &regions {
@@ -176,10 +181,8 @@ fn take_together(held: &mut [Held], origin: usize, tissue: &Mask) -> Together {
         .iter()
         .map(|h| modes::Frame { number: h.number, field: &h.result.coefficients, uncertainty: &h.result.uncertainty })
         .collect();
-    let here = Orientation::of(tissue.grid());
-    let turned = here.turned(tissue);
-    let canonical = here.canonical(tissue.grid());
-    let found = Modes::find(&frames, origin, |[i, j, k]| turned.as_slice()[canonical.index(i, j, k)] != 0);
+    let turned = Orientation::of(tissue.grid()).turned(tissue);
+    let found = Modes::find(&frames, origin, |[i, j, k]| turned.as_slice()[turned.grid().index(i, j, k)] != 0);
     drop(frames);
     match found {
         Ok(modes) => {
