@@ -2,7 +2,7 @@
 //!
 //! Every frame is measured against the reference itself, so that errors do not add up; the search starts from where the
 //! tissue was in the frame before and where steady motion would take it, beside the starts that a pair of volumes has. Then what all frames
-//! say together takes from each what is its own noise and the reference's ([`Modes`]).
+//! say together takes from each what is its own noise and the reference's (`pipeline::modes`).
 //! Of volumes only the reference, the frame at hand and the one before are held, and of fields one; the others as their coefficients.
 
 use crate::error::FieldError;
