@@ -499,7 +499,7 @@ fn the_simplest_model_that_explains_is_chosen_and_exact() {
     ];
     for (model, motion) in cases {
         for bad in [0, 5] {
-            let choice = choose(&moved(&motion, bad, false), |_, m| excess(&motion, m), 100.0, 0.05);
+            let choice = choose(&moved(&motion, bad, false), |_, m| whole(excess(&motion, m)), 100.0, 0.05);
             assert_eq!(choice.model, model, "{:?}", choice.evidence);
             // Redescending weights leave an outlier of 80 sigma some thousandths of a match's pull.
             close(&choice.motion.unwrap(), &motion, if bad == 0 { 1e-6 } else { 0.01 });
@@ -510,7 +510,7 @@ fn the_simplest_model_that_explains_is_chosen_and_exact() {
 #[test]
 fn a_free_motion_stays_free_and_the_evidence_says_why() {
     let matches = moved(&general(), 0, false);
-    let choice = choose(&matches, |_, _| 4000.0, 200.0, 0.05);
+    let choice = choose(&matches, |_, _| whole(4000.0), 200.0, 0.05);
     assert_eq!((choice.model, choice.motion), (MotionModel::Free, None));
     assert_eq!(choice.evidence.len(), 4);
     for (line, name) in choice.evidence.iter().zip(["identity: ", "rigid: ", "affine: ", "free: "]) {
@@ -519,17 +519,17 @@ fn a_free_motion_stays_free_and_the_evidence_says_why() {
     assert!(choice.evidence[0].contains("excess misfit 20.00 per degree of freedom"), "{}", choice.evidence[0]);
     assert!(choice.evidence[3].contains("200 degrees of freedom"), "{}", choice.evidence[3]);
     // Just at the limit the simplest that the matches bear out stands.
-    let affine = choose(&matches, |_, _| 200.0, 200.0, 0.05);
+    let affine = choose(&matches, |_, _| whole(200.0), 200.0, 0.05);
     assert_ne!(affine.model, MotionModel::Identity);
     assert!(affine.evidence[0].contains("mm off"), "{}", affine.evidence[0]);
     // Matches that are as far from the free field tell nothing.
     let astray: Vec<Measured> = matches.iter().map(|m| Measured { field: [0.0; 3], ..*m }).collect();
-    assert_eq!(choose(&astray, |_, _| 200.0, 200.0, 0.05).model, MotionModel::Identity);
+    assert_eq!(choose(&astray, |_, _| whole(200.0), 200.0, 0.05).model, MotionModel::Identity);
     let matches = moved(&AffineMotion::IDENTITY, 0, false);
-    let at = |ratio: f64| choose(&matches, |_, _| 200.0 * ratio, 200.0, 0.05).model;
+    let at = |ratio: f64| choose(&matches, |_, _| whole(200.0 * ratio), 200.0, 0.05).model;
     assert_eq!((at(CHANCE), at(CHANCE + 0.01)), (MotionModel::Identity, MotionModel::Free));
     // Few degrees of freedom count as a hundred.
-    let few = |excess: f64| choose(&matches, |_, _| excess, 9.0, 0.05).model;
+    let few = |excess: f64| choose(&matches, |_, _| whole(excess), 9.0, 0.05).model;
     assert_eq!((few(100.0 * CHANCE), few(101.0 * CHANCE)), (MotionModel::Identity, MotionModel::Free));
 }
 
@@ -537,7 +537,7 @@ fn a_free_motion_stays_free_and_the_evidence_says_why() {
 fn models_of_one_slice_stay_in_its_plane() {
     let (s, c) = 0.1f64.sin_cos();
     let turn = AffineMotion { linear: [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], shift: [2.0, -3.0, 0.0] };
-    let choice = choose(&moved(&turn, 0, true), |_, m| excess(&turn, m), 100.0, 0.05);
+    let choice = choose(&moved(&turn, 0, true), |_, m| whole(excess(&turn, m)), 100.0, 0.05);
     assert_eq!(choice.model, MotionModel::Rigid);
     close(&choice.motion.unwrap(), &turn, 1e-6);
 }

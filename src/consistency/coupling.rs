@@ -1,6 +1,7 @@
 //! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
 //! energy of a spline lattice holds the places together.
 
+use crate::numerics::ablation;
 use crate::numerics::bending::{Coupled, Smoothness, SolveReport};
 use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::{Lattice, Stencil};
@@ -9,8 +10,8 @@ use crate::numerics::random::Random;
 use crate::numerics::small::{Symmetric3, cholesky_solve, multiply, quadratic};
 use rayon::prelude::*;
 
-/// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises `1/2 d.A d - b.d + lambda/2 (c + d).L (c + d)`, and its root
-/// mean square length. `rhs` is `b`.
+/// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises `1/2 d.A d - b.d + 1/2 (c + d).L (c + d)` with `A` and `L` the
+/// two parts of `matrix` (data and smoothness), and its root mean square length. `rhs` is `b`.
 pub fn step(
     matrix: &Coupled<'_>,
     mut rhs: Vec<f32>,
@@ -20,11 +21,11 @@ pub fn step(
 ) -> (SolveReport, Vec<f32>, f32) {
     let n = coefficients.len() / 3;
     let mut lc = vec![0.0f32; n];
-    for ((c, b), lambda) in coefficients.chunks_exact(n).zip(rhs.chunks_exact_mut(n)).zip(matrix.lambda()) {
-        matrix.smoothness().apply(c, &mut lc);
-        for (b, l) in b.iter_mut().zip(&lc) {
-            *b -= lambda * l;
-        }
+    for ((c, b), weight) in
+        coefficients.chunks_exact(n).zip(rhs.chunks_exact_mut(n)).zip(matrix.weights().chunks_exact(n))
+    {
+        matrix.smoothness().apply(weight, c, &mut lc);
+        b.iter_mut().zip(&lc).for_each(|(b, l)| *b -= l);
     }
     drop(lc);
     let mut d = vec![0.0f32; 3 * n];
@@ -33,26 +34,45 @@ pub fn step(
     (report, d, (moved / n as f64).sqrt() as f32)
 }
 
-/// How much the axes share their weights: an axis along which nothing moves is held at most about four times as stiffly as all
-/// of them together would be, so that motion along it that only a finer level shows can still come up.
-const SHARED: f64 = 0.3;
+/// How far the smoothness of a place and axis is drawn to that of the whole: weight of the mean over the lattice beside the
+/// window's own (dimensionless). Calibrated: docs/lab/2026-11-local-smoothness.md.
+const SHARED: f32 = 0.02;
 
-/// The weights of the bending energy that the data support, one an axis (MacKay 1992): `determined / (2 energy)`.
+/// Width of the window over which smoothness is estimated (nodes, one standard deviation of a Gaussian).
+const WINDOW: f64 = 1.5;
+
+/// The weights of the bending energy that the data support at each node and axis (planar, three components).
 ///
-/// Tissue that is pressed or contracts moves far more along one axis than across, and one weight for all would hold back the
-/// one and let the others follow noise.
-pub fn supported(determined: [f64; 3], energy: [f64; 3]) -> [f64; 3] {
-    let determined = determined.map(|v| v.max(0.3));
-    let [shared, bent] = [determined, energy].map(|v| SHARED * v.iter().sum::<f64>() / 3.0);
-    std::array::from_fn(|c| 0.5 * (determined[c] + shared) / (energy[c] + bent).max(1e-12))
+/// The evidence procedure (MacKay 1992), `determined / (2 energy)`, in a Gaussian window about each node under a gamma prior
+/// that draws each place and axis to the mean of all. `determined` and `energy` are planar and by node, `seen` the nodes
+/// that any data inform.
+pub fn supported(determined: &[f32], energy: &[f32], nodes: [usize; 3], seen: usize) -> Vec<f32> {
+    let n = determined.len() / 3;
+    let shared = if ablation::is_on("local-smoothness") { SHARED } else { f32::MAX.sqrt() };
+    let mean = |v: &[f32]| shared * v.iter().map(|v| f64::from(*v)).sum::<f64>() as f32 / (3 * seen.max(1)) as f32;
+    let (all, bent) = (mean(determined).max(1e-6), mean(energy));
+    let about = |v: &[f32]| filters::gaussian(v, nodes, nodes.map(|n| if n > 1 { WINDOW } else { 0.0 }));
+    let axes = determined.chunks_exact(n).zip(energy.chunks_exact(n));
+    axes.flat_map(|(determined, energy)| {
+        let pairs = about(determined).into_iter().zip(about(energy)).collect::<Vec<_>>();
+        pairs.into_iter().map(|(d, e)| 0.5 * (d.max(0.0) + all) / (e + bent).max(1e-12)).collect::<Vec<_>>()
+    })
+    .collect()
 }
 
-/// How many degrees of freedom the data determine along each axis: `tr((A + lambda L)^-1 A)` of its component (MacKay 1992).
+/// How many degrees of freedom the data determine along each axis: `tr((A + L)^-1 A)` of its component (MacKay 1992).
 ///
-/// The trace is estimated with one random sign vector `z` (Hutchinson 1990): `z.C^T (A + lambda L)^-1 C z` with `C C^T = A`, which is
+/// The trace is estimated with one random sign vector `z` (Hutchinson 1990): `z.C^T (A + L)^-1 C z` with `C C^T = A`, which is
 /// good to about one part in the root of half of what it finds.
 pub fn determined(matrix: &Coupled<'_>, seed: u64, limit: usize) -> [f64; 3] {
-    Probe::new(matrix.blocks().len(), seed).determined(matrix, limit)
+    let by_node = Probe::new(matrix.blocks().len(), seed).determined(matrix, limit);
+    total(&by_node)
+}
+
+/// The sum of each component of a planar vector.
+pub fn total(planar: &[f32]) -> [f64; 3] {
+    let n = (planar.len() / 3).max(1);
+    std::array::from_fn(|c| planar[c * n..(c + 1) * n].iter().map(|v| f64::from(*v)).sum())
 }
 
 /// The random sign vector of [`determined`] and its last solution, from which the next one starts: while a field settles, a
@@ -71,35 +91,40 @@ impl Probe {
         Self { signs, solution: vec![0.0; 3 * nodes] }
     }
 
-    /// See [`determined`]; at most `limit` more iterations.
+    /// What each node and axis contributes to [`determined`] (planar); at most `limit` more iterations.
     ///
-    /// With `b = C z` and `M = A + lambda L` it is the greatest `(b.x)^2 / x.M x`: what the iterations are short of shows only squared,
-    /// and the sum over the axes is neither negative nor more than there is.
-    pub fn determined(&mut self, matrix: &Coupled<'_>, limit: usize) -> [f64; 3] {
-        let (blocks, lambda) = (matrix.blocks(), matrix.lambda());
+    /// With `b = C z` and `M = A + L` the sum is the greatest `(b.x)^2 / x.M x`: what the iterations are short of shows only
+    /// squared, and it is neither negative nor more than there is.
+    pub fn determined(&mut self, matrix: &Coupled<'_>, limit: usize) -> Vec<f32> {
+        let blocks = matrix.blocks();
         let n = blocks.len();
-        let mut b = vec![0.0f32; 3 * n];
+        let mut pulls = vec![0.0f32; 3 * n];
         for (i, block) in blocks.iter().enumerate() {
             let signs = std::array::from_fn(|c| f64::from(self.signs[c * n + i]));
             for (c, v) in cholesky_times(&block, signs).into_iter().enumerate() {
-                b[c * n + i] = v as f32;
+                pulls[c * n + i] = v as f32;
             }
         }
         let x = &mut self.solution;
-        matrix.solve(b.clone(), x, 1e-2, limit);
-        let bent = matrix.smoothness().energy(x);
-        let (mut bx, mut xmx) = ([0.0; 3], std::array::from_fn::<f64, 3, _>(|c| f64::from(lambda[c]) * bent[c]));
+        matrix.solve(pulls.clone(), x, 1e-2, limit);
         let at = |v: &[f32], i: usize| -> [f64; 3] { std::array::from_fn(|c| f64::from(v[c * n + i])) };
+        let (mut bx, mut xmx) = (vec![0.0f32; 3 * n], vec![0.0f32; 3 * n]);
+        for c in 0..3 {
+            let density = matrix.smoothness().density(&x[c * n..(c + 1) * n]);
+            let weighted = density.iter().zip(&matrix.weights()[c * n..]).map(|(e, w)| e * w);
+            xmx[c * n..].iter_mut().zip(weighted).for_each(|(v, e)| *v = e);
+        }
         for (i, block) in blocks.iter().enumerate() {
-            let (b, x) = (at(&b, i), at(x, i));
+            let (b, x) = (at(&pulls, i), at(x, i));
             let ax = multiply(&block.map(f64::from), x);
             for c in 0..3 {
-                bx[c] += b[c] * x[c];
-                xmx[c] += ax[c] * x[c];
+                bx[c * n + i] = (b[c] * x[c]) as f32;
+                xmx[c * n + i] += (ax[c] * x[c]) as f32;
             }
         }
-        let length = bx.iter().sum::<f64>() / xmx.iter().sum::<f64>().max(f64::MIN_POSITIVE);
-        std::array::from_fn(|c| length * (2.0 * bx[c] - length * xmx[c]))
+        let sum = |v: &[f32]| total(v).iter().sum::<f64>();
+        let length = (sum(&bx) / sum(&xmx).max(f64::MIN_POSITIVE)) as f32;
+        bx.iter().zip(&xmx).map(|(b, m)| length * (2.0 * b - length * m)).collect()
     }
 }
 
@@ -121,7 +146,8 @@ const ROUNDING: f64 = 0.1;
 /// not outweigh the evidence.
 fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
     let pull = evidence.iter().map(|e| e.information[..3].iter().sum::<f64>() / 3.0).sum::<f64>();
-    let rounded = smoothness.diagonal().iter().map(|&v| f64::from(v)).sum::<f64>() * f64::from(f32::EPSILON);
+    let rounded = smoothness.diagonal(&vec![1.0; smoothness.len()]).iter().map(|&v| f64::from(v)).sum::<f64>()
+        * f64::from(f32::EPSILON);
     ((ROUNDING * pull / rounded.max(f64::MIN_POSITIVE)) as f32).clamp(1.0, 1e9)
 }
 
@@ -185,9 +211,10 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
         // Early rounds only sort the evidence; the last two settle the field.
         let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-2, 60) };
         let blocks = Blocks::from(&blocks[..]);
-        let matrix = Coupled::new(smoothness, [lambda; 3], &blocks, true);
+        let weights = vec![lambda; 3 * n];
+        let matrix = Coupled::new(smoothness, &weights, &blocks, true);
         matrix.solve_with(operator, rhs, &mut c, tolerance, limit);
-        let gamma = probe.determined(&matrix, if round < 2 { 30 } else { 15 });
+        let gamma = total(&probe.determined(&matrix, if round < 2 { 30 } else { 15 }));
         let [gamma, energy] = [gamma, smoothness.energy(&c)].map(|v| v.iter().sum::<f64>());
         // Half way on the logarithm: whole steps swing to and fro.
         let target = (lambda * (0.5 * gamma.max(1.0) / energy.max(1e-9)) as f32).sqrt();
@@ -206,7 +233,7 @@ pub struct Posterior {
     /// Standard deviation of the coupled field along an axis (mm, root of the mean of the covariance's diagonal over the axes that
     /// there are data of).
     pub deviation: Vec<f32>,
-    /// Degrees of freedom that the data determine there, the node's part of `tr((A + lambda L)^-1 A)` (see [`determined`]).
+    /// Degrees of freedom that the data determine there, the node's part of `tr((A + L)^-1 A)` (see [`determined`]).
     pub determined: Vec<f32>,
 }
 
@@ -218,7 +245,7 @@ pub struct Posterior {
 /// outweighs the data by so much that iterations would leave out all that an affine motion is uncertain by.
 pub fn posterior(
     smoothness: &Smoothness,
-    lambda: [f32; 3],
+    weights: &[f32],
     blocks: &[[f32; 6]],
     nodes: [usize; 3],
     draws: usize,
@@ -227,16 +254,10 @@ pub fn posterior(
     let n = blocks.len();
     let affine = Affine::new(nodes, blocks);
     let planar = Blocks::from(blocks);
-    let matrix = Coupled::new(smoothness, lambda, &planar, true);
+    let matrix = Coupled::new(smoothness, weights, &planar, true);
     let draw = |draw: usize| {
         let mut random = Random::new(seed, 1000 + draw as u64);
-        let mut b = vec![0.0f32; 3 * n];
-        for (component, lambda) in b.chunks_exact_mut(n).zip(lambda) {
-            let l = smoothness.sample(&mut random);
-            for (b, l) in component.iter_mut().zip(l) {
-                *b = lambda.sqrt() * l;
-            }
-        }
+        let mut b: Vec<f32> = weights.chunks_exact(n).flat_map(|w| smoothness.sample(w, &mut random)).collect();
         let mut pulls = vec![[0.0f32; 3]; n];
         for (i, (a, pull)) in blocks.iter().zip(&mut pulls).enumerate() {
             let (e, f) = (random.normals(), random.normals());

@@ -9,6 +9,7 @@
 
 use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
+use crate::numerics::ablation;
 use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
 use crate::numerics::statistics::median;
 use crate::types::MotionModel;
@@ -60,11 +61,24 @@ const CONTRADICTED: f64 = 50.0;
 /// ... and in units of how far they are from the free field: matches that agree with nothing speak against no model.
 const ASTRAY: f64 = 1.5;
 
+/// Excess misfit per degree of freedom about any one place beyond which a simpler model does not stand: tissue that moves is
+/// not outvoted by more tissue that does not. Chance reaches 1.5 about a place; what moves by a tenth of a voxel, 4 and more.
+pub const PLACE: f64 = 4.0;
+
+/// How much worse the volumes agree under a map than under the free field, in units of noise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Excess {
+    /// Of the whole.
+    pub total: f64,
+    /// Per degree of freedom about the place that speaks most against the map.
+    pub worst: f64,
+}
+
 /// Chooses a model. `excess(m)` gives the excess misfit of a map against the free field, `determined` the field's
 /// degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm).
 pub fn choose(
     matches: &[Measured],
-    mut excess: impl FnMut(MotionModel, &AffineMotion) -> f64,
+    mut excess: impl FnMut(MotionModel, &AffineMotion) -> Excess,
     determined: f64,
     model_mm: f64,
 ) -> Choice {
@@ -90,14 +104,16 @@ pub fn choose(
     };
     let astray = middle(&|m| distance(m.field, m.displacement));
     for (model, motion) in tried {
-        let ratio = excess(model, &motion) / determined.max(FEWEST);
+        let Excess { total, worst } = excess(model, &motion);
+        let ratio = total / determined.max(FEWEST);
         let off = middle(&|m| distance(motion.displacement(m.place), m.displacement));
         let name = format!("{model:?}").to_lowercase();
         let contradicted = off > CONTRADICTED * model_mm && off > ASTRAY * astray;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
-        evidence
-            .push(format!("{name}: excess misfit {ratio:.2} per degree of freedom (chance: at most {CHANCE}){but}"));
-        if chosen.is_none() && ratio <= CHANCE && !contradicted {
+        evidence.push(format!(
+            "{name}: excess misfit {ratio:.2} per degree of freedom (chance: at most {CHANCE}), {worst:.1} at the worst place (at most {PLACE}){but}"
+        ));
+        if chosen.is_none() && ablation::is_on("model") && ratio <= CHANCE && worst <= PLACE && !contradicted {
             chosen = Some((model, motion));
         }
     }

@@ -5,7 +5,7 @@ use crate::matching::gain::weigh;
 use crate::matching::pair::{Pair, Spans, about_mean};
 use crate::numerics::sampling::Sampler;
 use crate::numerics::statistics::{noise_sigma, quantile};
-use crate::numerics::{filters, pyramid};
+use crate::numerics::{ablation, filters, pyramid};
 use crate::types::{Affine, Grid, Mask, Volume, VoxelPoint, Voxels};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -160,8 +160,47 @@ pub fn foreground(volume: &Voxels<'_>) -> Mask {
     if inside.iter().filter(|&&m| m != 0).count() * 50 < inside.len() {
         inside.fill(1);
     }
+    if ablation::is_on("enclosed") {
+        inside = filled(inside, shape);
+    }
     let mut out = Mask::filled(*volume.grid(), 0);
     out.as_mut_slice().copy_from_slice(&crate::matching::pair::dilate(&inside, shape, 1));
+    out
+}
+
+/// The mask with what it encloses in a slice across any axis: dark tissue inside a bright ring is tissue.
+fn filled(mask: Vec<u8>, shape: [usize; 3]) -> Vec<u8> {
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    let enclosed = |axis: usize| -> Vec<usize> {
+        let [a, b] = [usize::from(axis == 0), 2 - usize::from(axis == 2)];
+        let [na, nb] = [shape[a], shape[b]];
+        let of_slice = |at: usize| {
+            let voxel = |i: usize| at * stride[axis] + i % na * stride[a] + i / na * stride[b];
+            let mut open: Vec<bool> = (0..na * nb).map(|i| mask[voxel(i)] != 0).collect();
+            let rim = |i: usize| i % na == 0 || i % na + 1 == na || i / na == 0 || i / na + 1 == nb;
+            let mut next: Vec<usize> = (0..na * nb).filter(|&i| rim(i) && !open[i]).collect();
+            next.iter().for_each(|&i| open[i] = true);
+            while let Some(i) = next.pop() {
+                let (x, y) = (i % na, i / na);
+                let beside = [
+                    (x > 0, i.wrapping_sub(1)),
+                    (x + 1 < na, i + 1),
+                    (y > 0, i.wrapping_sub(na)),
+                    (y + 1 < nb, i + na),
+                ];
+                for (_, other) in beside.into_iter().filter(|b| b.0) {
+                    if !std::mem::replace(&mut open[other], true) {
+                        next.push(other);
+                    }
+                }
+            }
+            (0..na * nb).filter(|&i| !open[i]).map(voxel).collect::<Vec<_>>()
+        };
+        (0..shape[axis]).into_par_iter().flat_map_iter(of_slice).collect()
+    };
+    let holes: Vec<usize> = (0..3).flat_map(enclosed).collect();
+    let mut out = mask;
+    holes.into_iter().for_each(|at| out[at] = 1);
     out
 }
 

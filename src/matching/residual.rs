@@ -4,7 +4,8 @@
 //! Gauss-Newton step of Benhimane & Malis 2004), every node of the lattice gets the information
 //! `A = sum_x B(x) rho(x) g g^T / sigma^2` and the right-hand side `sum_x B(x) rho(x) g r / sigma^2`. The sum of the
 //! basis functions is one, so the block diagonal `A` bounds the true Gauss-Newton matrix from above (each step cannot
-//! overshoot) and no pair of nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`.
+//! overshoot) and no pair of nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`, to which what
+//! interpolation leaves unsure adds in proportion to `g`: contrast beyond that tells no more.
 
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, row_step};
@@ -12,10 +13,15 @@ use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
+use crate::numerics::{ablation, pyramid};
 use rayon::prelude::*;
 
 /// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
 pub(super) const CAUCHY: f32 = 2.385;
+
+/// Place that interpolation leaves unsure at any voxel, however steep (finest voxels): bright edges say no more than this. Measured
+/// on affine motions without noise, which come out .005 to .03 of a voxel off.
+const UNSURE: f64 = 0.02;
 
 /// Normal equations of one pass.
 #[derive(Debug, Clone)]
@@ -63,7 +69,10 @@ pub fn normal_equations(
 ) -> NormalEquations {
     let [nx, ny, nz] = pair.shape;
     let sigma = residual_sigma(pair, warped, gain).max(floor).max(f32::MIN_POSITIVE);
-    let (inverse, cut) = (1.0 / sigma, 1.0 / (CAUCHY * sigma));
+    let (variance, cut) = (sigma * sigma, 1.0 / (CAUCHY * CAUCHY));
+    let unsure =
+        if ablation::is_on("gradient-floor") { UNSURE * pyramid::finest(pair.shape, pair.spacing) } else { 0.0 };
+    let floor = unsure.powi(2) as f32;
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
     // Differences over two voxels, over one at the border; none along a side of one voxel.
     let ends = |at: usize, n: usize| (at.saturating_sub(1), (at + 1).min(n - 1));
@@ -111,8 +120,7 @@ pub fn normal_equations(
                     let gz = scale[2] * (fz1[i] - fz0[i] + a * (wz1[i] - wz0[i]));
                     let good = mask[i] != 0 && (r + gx + gy + gz).is_finite();
                     let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
-                    let t = r * cut;
-                    let weight = inverse * inverse / (1.0 + t * t);
+                    let weight = 1.0 / (variance + floor * (gx * gx + gy * gy + gz * gz) + cut * r * r);
                     let (hx, hy, hz) = (weight * gx, weight * gy, weight * gz);
                     (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
                     (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);

@@ -11,268 +11,320 @@ use crate::numerics::small::inverse;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Second difference operators on a lattice of nodes.
+/// Second differences on a lattice of nodes, and what an energy of them weighs by place.
 #[derive(Debug, Clone)]
 pub struct Smoothness {
     nodes: [usize; 3],
     /// Node distances (mm).
     step_mm: [f64; 3],
-    bands: Bands,
+    /// Weights of the squared differences along x, y, z and of the mixed ones xy, xz, yz (1/mm^4); 0 along a flat axis.
+    scale: [f32; 6],
 }
 
 impl Smoothness {
     /// On `nodes` at distances `step_mm`.
     pub fn new(nodes: [usize; 3], step_mm: [f64; 3]) -> Self {
-        Self { nodes, step_mm, bands: Bands::new(nodes, step_mm) }
+        let long = |a: usize| nodes[a] >= 3;
+        let pure = |a: usize| if long(a) { step_mm[a].powi(-4) } else { 0.0 };
+        let mixed = |a: usize, b: usize| {
+            if long(a) && long(b) { 2.0 / (step_mm[a] * step_mm[b]).powi(2) } else { 0.0 }
+        };
+        let scale = [pure(0), pure(1), pure(2), mixed(0, 1), mixed(0, 2), mixed(1, 2)];
+        Self { nodes, step_mm, scale: scale.map(|v| v as f32) }
     }
 
-    /// Terms `(offset list, weight)`: the penalised differences, as node strides and signs.
-    fn terms(&self) -> Vec<Term> {
-        let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
-        let h = self.step_mm;
-        let mut out = Vec::new();
-        for a in 0..3 {
-            if self.nodes[a] >= 3 {
-                let mut reach = [0; 3];
-                reach[a] = 2;
-                out.push(Term {
-                    reach,
-                    taps: vec![(0, 1.0), (stride[a], -2.0), (2 * stride[a], 1.0)],
-                    weight: (1.0 / h[a].powi(4)) as f32,
-                });
-            }
-            for b in 0..a {
-                if self.nodes[a] >= 2 && self.nodes[b] >= 2 {
-                    let mut reach = [0; 3];
-                    (reach[a], reach[b]) = (1, 1);
-                    let (s, t) = (stride[a], stride[b]);
-                    let weight = (2.0 / (h[a] * h[b]).powi(2)) as f32;
-                    out.push(Term { reach, taps: vec![(0, 1.0), (s, -1.0), (t, -1.0), (s + t, 1.0)], weight });
-                }
-            }
-        }
-        out
+    /// Number of nodes.
+    pub fn len(&self) -> usize {
+        self.nodes.iter().product()
     }
 
-    /// `out = L x` for one planar component; `x . L x` is the energy.
-    ///
-    /// `L` is a sum of products of the one-dimensional operators `B = D2^T D2` and `G = D1^T D1` (second and first
-    /// differences), so a row of the result is a combination of 13 rows of `x` and one more filter along the row.
-    pub fn apply(&self, x: &[f32], out: &mut [f32]) {
+    /// Never true.
+    pub fn is_empty(&self) -> bool {
+        false
+    }
+
+    /// `out = D^T W D x` for one planar component, with `weight` (one a node) on the squared differences about each node.
+    pub fn apply(&self, weight: &[f32], x: &[f32], out: &mut [f32]) {
         let plane = self.nodes[0] * self.nodes[1];
+        let slab = worthwhile(plane);
+        out.par_chunks_mut(slab * plane).enumerate().for_each(|(s, out)| {
+            let mut differences = Differences::new(self, weight, x, s * slab);
+            for out in out.chunks_exact_mut(plane) {
+                dispatch(
+                    #[inline(always)]
+                    || differences.transposed(out),
+                );
+            }
+        });
+    }
+
+    /// The energy about each node of one planar component, under a weight of 1.
+    pub fn density(&self, x: &[f32]) -> Vec<f32> {
+        let [nx, ny, nz] = self.nodes;
+        let plane = nx * ny;
+        let mut out = vec![0.0f32; x.len()];
         out.par_chunks_mut(plane).with_min_len(worthwhile(plane)).enumerate().for_each(|(k, out)| {
-            let mut cross = vec![0.0f32; self.nodes[0] * self.nodes[1]];
             dispatch(
                 #[inline(always)]
-                || self.bands.plane(x, k, out, &mut cross),
-            );
-        });
-    }
-
-    /// Diagonal of `L`.
-    pub fn diagonal(&self) -> Vec<f32> {
-        let [nx, ny, _] = self.nodes;
-        let (b, g, h) = (second(self.nodes, self.step_mm), first(self.nodes), self.step_mm);
-        (0..self.nodes.iter().product())
-            .map(|m| {
-                let at = [m % nx, m / nx % ny, m / (nx * ny)];
-                let bending: f32 = (0..3).map(|a| b[a][at[a]][2]).sum();
-                let twist = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32 * g[a][at[a]][1] * g[c][at[c]][1];
-                bending + twist(0, 1) + twist(0, 2) + twist(1, 2)
-            })
-            .collect()
-    }
-
-    /// A random vector with covariance `L` (one planar component): the transpose of the differences applied to
-    /// independent standard normal numbers.
-    pub fn sample(&self, random: &mut Random) -> Vec<f32> {
-        let [nx, ny, nz] = self.nodes;
-        let mut out = vec![0.0f32; nx * ny * nz];
-        for t in self.terms() {
-            let scale = t.weight.sqrt();
-            let mut spare = None;
-            for k in 0..nz - t.reach[2] {
-                for j in 0..ny - t.reach[1] {
-                    for i in 0..nx - t.reach[0] {
-                        let anchor = i + nx * (j + ny * k);
-                        let e = match spare.take() {
-                            Some(e) => e,
-                            None => {
-                                let [a, b] = random.normals();
-                                spare = Some(b);
-                                a
-                            }
-                        };
-                        for &(o, s) in &t.taps {
-                            out[anchor + o] += scale * s * e as f32;
+                || {
+                    for j in 0..ny {
+                        let row = |dj: usize, dk: usize| &x[nx * (j + dj + ny * (k + dk))..][..nx];
+                        let here = row(0, 0);
+                        let out = &mut out[nx * j..][..nx];
+                        let mut add = |scale: f32, i: usize, d: f32| out[i] += scale * d * d;
+                        let [xx, yy, zz, xy, xz, yz] = self.scale;
+                        for i in 1..nx.saturating_sub(1) {
+                            add(xx, i, here[i - 1] - 2.0 * here[i] + here[i + 1]);
+                        }
+                        if j > 0 && j + 1 < ny {
+                            let (low, high) = (&x[nx * (j - 1 + ny * k)..][..nx], row(1, 0));
+                            (0..nx).for_each(|i| add(yy, i, low[i] - 2.0 * here[i] + high[i]));
+                        }
+                        if k > 0 && k + 1 < nz {
+                            let (low, high) = (&x[nx * (j + ny * (k - 1))..][..nx], row(0, 1));
+                            (0..nx).for_each(|i| add(zz, i, low[i] - 2.0 * here[i] + high[i]));
+                        }
+                        if j + 1 < ny {
+                            let next = row(1, 0);
+                            (0..nx - 1).for_each(|i| add(xy, i, next[i + 1] - next[i] - here[i + 1] + here[i]));
+                        }
+                        if k + 1 < nz {
+                            let above = row(0, 1);
+                            (0..nx - 1).for_each(|i| add(xz, i, above[i + 1] - above[i] - here[i + 1] + here[i]));
+                        }
+                        if j + 1 < ny && k + 1 < nz {
+                            let (next, above, far) = (row(1, 0), row(0, 1), row(1, 1));
+                            (0..nx).for_each(|i| add(yz, i, far[i] - next[i] - above[i] + here[i]));
                         }
                     }
-                }
-            }
-        }
+                },
+            );
+        });
         out
     }
 
-    /// The energy of each component of a planar vector field.
-    pub fn energy(&self, x: &[f32]) -> [f64; 3] {
-        let mut lx = vec![0.0; x.len() / 3];
-        thirds(x).map(|x| {
-            self.apply(x, &mut lx);
-            x.iter().zip(&lx).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
-        })
-    }
-}
-
-/// What applying `L` needs, worked out once.
-#[derive(Debug, Clone)]
-struct Bands {
-    nodes: [usize; 3],
-    /// Rows of a plane with the same weights: first, and one past the last.
-    runs: Vec<(usize, usize)>,
-    /// Those weights, of each plane.
-    weights: Vec<Vec<Weights>>,
-    /// Diagonals of the second and of the first differences along x, at each node of a plane; 0 past a row's ends.
-    second: [Vec<f32>; 5],
-    first: [Vec<f32>; 3],
-}
-
-/// Weights of the rows of [`REACH`].
-#[derive(Debug, Clone)]
-struct Weights {
-    /// In the row itself.
-    own: [f32; 13],
-    /// In what the first differences along x are taken of.
-    twist: [f32; 5],
-}
-
-impl Weights {
-    /// From the rows of the second and of the first differences along y and z, and the weights of the mixed ones: xy, xz, yz.
-    fn new([vy, vz]: [&[f32; 5]; 2], [wy, wz]: [&[f32; 3]; 2], [xy, xz, yz]: [f32; 3]) -> Self {
-        let first = |g: &[f32; 3], d: usize| if (1..4).contains(&d) { g[d - 1] } else { 0.0 };
-        let own = REACH.map(|(dj, dk)| {
-            let bending = if dk == 2 { vy[dj] } else { 0.0 } + if dj == 2 { vz[dk] } else { 0.0 };
-            bending + yz * first(wy, dj) * first(wz, dk)
-        });
-        let twist = std::array::from_fn(|n| {
-            let (dj, dk) = REACH[n];
-            let y = if dk == 2 { xy * first(wy, dj) } else { 0.0 };
-            y + if dj == 2 { xz * first(wz, dk) } else { 0.0 }
-        });
-        Self { own, twist }
-    }
-}
-
-impl Bands {
-    /// On `nodes` at distances `h` (mm).
-    fn new(nodes: [usize; 3], h: [f64; 3]) -> Self {
-        let pair = |a: usize, c: usize| (2.0 / (h[a] * h[c]).powi(2)) as f32;
-        let ([second, by, bz], [first, gy, gz]) = (second(nodes, h), first(nodes));
-        let [nx, ny, nz] = nodes;
-        let twist = [pair(0, 1), pair(0, 2), pair(1, 2)];
-        // Rows two away from the border in y share their weights: they are treated as one long row.
-        let (low, high) = if ny >= 5 { (2, ny - 2) } else { (ny, ny) };
-        let starts = || (0..low).chain(high..ny).chain((low < high).then_some(low));
-        let of_plane = |k: usize| starts().map(|j| Weights::new([&by[j], &bz[k]], [&gy[j], &gz[k]], twist)).collect();
-        Self {
-            nodes,
-            runs: starts().map(|j| if (low..high).contains(&j) { (low, high) } else { (j, j + 1) }).collect(),
-            weights: (0..nz).map(of_plane).collect(),
-            second: std::array::from_fn(|d| (0..nx * ny).map(|m| second[m % nx][d]).collect()),
-            first: std::array::from_fn(|d| (0..nx * ny).map(|m| first[m % nx][d]).collect()),
-        }
-    }
-
-    /// Plane `k` of `L x`; `cross` is room for a plane.
-    #[inline(always)]
-    fn plane(&self, x: &[f32], k: usize, out: &mut [f32], cross: &mut [f32]) {
+    /// Each tap of each squared difference: the node that weighs it, its taps, and its scale.
+    fn for_each_difference(&self, mut each: impl FnMut(usize, &[(usize, f32)], f32)) {
         let [nx, ny, nz] = self.nodes;
-        for (&(j, end), weights) in self.runs.iter().zip(&self.weights[k]) {
-            let length = nx * (end - j);
-            // A row outside the lattice has weight zero; any other stands in for it.
-            let near = |at: usize, d: usize, n: usize, height: usize| (at + d).saturating_sub(2).min(n - height);
-            let rows = REACH.map(|(dj, dk)| &x[nx * (near(j, dj, ny, end - j) + ny * near(k, dk, nz, 1))..][..length]);
-            let (out, cross) = (&mut out[nx * j..][..length], &mut cross[nx * j..][..length]);
-            // Spelled out, so that it is made of vector instructions.
-            let [r0, r1, r2, r3, r4, r5, r6, r7, r8, r9, r10, r11, r12] = rows;
-            let [w0, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12] = weights.own;
-            let [t0, t1, t2, t3, t4] = weights.twist;
-            for i in 0..length {
-                let near = w0 * r0[i] + w1 * r1[i] + w2 * r2[i] + w3 * r3[i] + w4 * r4[i];
-                let far = w5 * r5[i] + w6 * r6[i] + w7 * r7[i] + w8 * r8[i];
-                out[i] = near + far + (w9 * r9[i] + w10 * r10[i] + w11 * r11[i] + w12 * r12[i]);
-                cross[i] = t0 * r0[i] + t1 * r1[i] + t2 * r2[i] + t3 * r3[i] + t4 * r4[i];
+        let stride = [1, nx, nx * ny];
+        for (k, j, i) in (0..nz).flat_map(|k| (0..ny).flat_map(move |j| (0..nx).map(move |i| (k, j, i)))) {
+            let at = [i, j, k];
+            let m = i + nx * (j + ny * k);
+            for a in 0..3 {
+                let s = stride[a];
+                if self.scale[a] > 0.0 && at[a] > 0 && at[a] + 1 < self.nodes[a] {
+                    each(m, &[(m - s, 1.0), (m, -2.0), (m + s, 1.0)], self.scale[a]);
+                }
             }
-        }
-        let x = &x[k * nx * ny..(k + 1) * nx * ny];
-        banded(&self.second, x, out);
-        banded(&self.first, cross, out);
-    }
-}
-
-/// Rows of `B = D2^T D2 / h^4` along each axis: five diagonals.
-fn second(nodes: [usize; 3], h: [f64; 3]) -> [Vec<[f32; 5]>; 3] {
-    std::array::from_fn(|a| {
-        let n = nodes[a];
-        let scale = (1.0 / h[a].powi(4)) as f32;
-        let mut rows = vec![[0.0f32; 5]; n];
-        for s in 0..n.saturating_sub(2) {
-            for (p, v) in [1.0, -2.0, 1.0].into_iter().enumerate() {
-                for (q, w) in [1.0, -2.0, 1.0].into_iter().enumerate() {
-                    rows[s + p][q + 2 - p] += scale * v * w;
+            for (q, (a, b)) in [(0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
+                let (s, t) = (stride[a], stride[b]);
+                if self.scale[3 + q] > 0.0 && at[a] + 1 < self.nodes[a] && at[b] + 1 < self.nodes[b] {
+                    each(m, &[(m, 1.0), (m + s, -1.0), (m + t, -1.0), (m + s + t, 1.0)], self.scale[3 + q]);
                 }
             }
         }
-        rows
-    })
-}
-
-/// Rows of `G = D1^T D1` along each axis: three diagonals.
-fn first(nodes: [usize; 3]) -> [Vec<[f32; 3]>; 3] {
-    std::array::from_fn(|a| {
-        let n = nodes[a];
-        let mut rows = vec![[0.0f32; 3]; n];
-        for s in 0..n.saturating_sub(1) {
-            rows[s][1] += 1.0;
-            rows[s + 1][1] += 1.0;
-            rows[s][2] -= 1.0;
-            rows[s + 1][0] -= 1.0;
-        }
-        rows
-    })
-}
-
-/// The rows that a row of `L x` is made of, as offsets in y and z plus 2; the first five alone enter the twists with x.
-const REACH: [(usize, usize); 13] =
-    [(2, 2), (1, 2), (3, 2), (2, 1), (2, 3), (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (3, 1), (1, 3), (3, 3)];
-
-/// `out += M x` for a banded matrix, by its diagonals.
-#[inline(always)]
-fn banded<const W: usize>(diagonals: &[Vec<f32>; W], x: &[f32], out: &mut [f32]) {
-    let (n, r) = (x.len(), W / 2);
-    let (first, last) = (r.min(n), n.saturating_sub(r).max(r.min(n)));
-    let inner = last - first;
-    let shifted: [&[f32]; W] = std::array::from_fn(|d| x.get(d..d + inner).unwrap_or_default());
-    let weights: [&[f32]; W] = std::array::from_fn(|d| &diagonals[d][first..last]);
-    for (i, o) in out[first..last].iter_mut().enumerate() {
-        let mut s = 0.0;
-        for d in 0..W {
-            s += weights[d][i] * shifted[d][i];
-        }
-        *o += s;
     }
-    // Where it would reach past an end.
-    for i in (0..first).chain(last..n) {
-        for (d, diagonal) in diagonals.iter().enumerate().filter(|(d, _)| (r..n + r).contains(&(i + d))) {
-            out[i] += diagonal[i] * x[i + d - r];
-        }
+
+    /// Diagonal of `D^T W D` for one component.
+    pub fn diagonal(&self, weight: &[f32]) -> Vec<f32> {
+        let mut out = vec![0.0f32; weight.len()];
+        self.for_each_difference(|m, taps, scale| {
+            taps.iter().for_each(|&(at, s)| out[at] += weight[m] * scale * s * s);
+        });
+        out
+    }
+
+    /// A random vector with covariance `D^T W D` (one planar component): the transpose of the weighted differences applied
+    /// to independent standard normal numbers.
+    pub fn sample(&self, weight: &[f32], random: &mut Random) -> Vec<f32> {
+        let mut out = vec![0.0f32; weight.len()];
+        let mut spare = None;
+        self.for_each_difference(|m, taps, scale| {
+            let e = spare.take().unwrap_or_else(|| {
+                let [a, b] = random.normals();
+                spare = Some(b);
+                a
+            });
+            let e = (weight[m] * scale).sqrt() * e as f32;
+            taps.iter().for_each(|&(at, s)| out[at] += s * e);
+        });
+        out
+    }
+
+    /// The energy of each component of a planar vector field, under a weight of 1.
+    pub fn energy(&self, x: &[f32]) -> [f64; 3] {
+        thirds(x).map(|x| self.density(x).iter().map(|v| f64::from(*v)).sum())
     }
 }
 
-/// One penalised difference.
-struct Term {
-    reach: [usize; 3],
-    taps: Vec<(usize, f32)>,
-    weight: f32,
+/// Weighted differences of one component, plane by plane upwards.
+struct Differences<'a> {
+    of: &'a Smoothness,
+    weight: &'a [f32],
+    x: &'a [f32],
+    /// The plane whose transpose is next.
+    k: usize,
+    /// Second differences along z about the plane below, the plane itself and the one above.
+    along: [Vec<f32>; 3],
+    /// Mixed differences xz and yz that start on the plane below and on the plane itself.
+    tilted: [[Vec<f32>; 2]; 2],
+    /// Differences within the plane: xx, yy, xy.
+    flat: [Vec<f32>; 3],
+}
+
+impl<'a> Differences<'a> {
+    fn new(of: &'a Smoothness, weight: &'a [f32], x: &'a [f32], k: usize) -> Self {
+        let room = || vec![0.0f32; of.nodes[0] * of.nodes[1]];
+        let mut out = Self {
+            of,
+            weight,
+            x,
+            k,
+            along: std::array::from_fn(|_| room()),
+            tilted: std::array::from_fn(|_| std::array::from_fn(|_| room())),
+            flat: std::array::from_fn(|_| room()),
+        };
+        if k > 0 {
+            out.fill_along(k - 1, 1);
+            out.fill_tilted(k - 1);
+        }
+        out.fill_along(k, 2);
+        out
+    }
+
+    /// Second differences along z about plane `k`, where there are any.
+    #[inline(always)]
+    fn fill_along(&mut self, k: usize, slot: usize) {
+        let plane = self.along[0].len();
+        let out = &mut self.along[slot];
+        if k == 0 || k + 1 >= self.of.nodes[2] {
+            return out.fill(0.0);
+        }
+        let at = |k: usize| &self.x[k * plane..][..plane];
+        let (low, here, high) = (at(k - 1), at(k), at(k + 1));
+        let weight = &self.weight[k * plane..][..plane];
+        let scale = self.of.scale[2];
+        for i in 0..plane {
+            out[i] = scale * weight[i] * (low[i] - 2.0 * here[i] + high[i]);
+        }
+    }
+
+    /// Mixed differences with z that start on plane `k`, where there are any.
+    #[inline(always)]
+    fn fill_tilted(&mut self, k: usize) {
+        let [nx, ny, nz] = self.of.nodes;
+        let plane = nx * ny;
+        let [xz, yz] = &mut self.tilted[1];
+        if k + 1 >= nz {
+            xz.fill(0.0);
+            return yz.fill(0.0);
+        }
+        let (here, above) = (&self.x[k * plane..][..plane], &self.x[(k + 1) * plane..][..plane]);
+        let weight = &self.weight[k * plane..][..plane];
+        let [.., a, b] = self.of.scale;
+        for j in 0..ny {
+            let at = nx * j..nx * (j + 1);
+            let (h, u, w) = (&here[at.clone()], &above[at.clone()], &weight[at.clone()]);
+            let xz = &mut xz[at.clone()];
+            for i in 0..nx - 1 {
+                xz[i] = a * w[i] * (u[i + 1] - u[i] - h[i + 1] + h[i]);
+            }
+            xz[nx - 1] = 0.0;
+            let yz = &mut yz[at];
+            if j + 1 < ny {
+                let next = nx * (j + 1)..nx * (j + 2);
+                let (h1, u1) = (&here[next.clone()], &above[next]);
+                for i in 0..nx {
+                    yz[i] = b * w[i] * (u1[i] - u[i] - h1[i] + h[i]);
+                }
+            } else {
+                yz.fill(0.0);
+            }
+        }
+    }
+
+    /// Differences within plane `k`.
+    #[inline(always)]
+    fn fill_flat(&mut self, k: usize) {
+        let [nx, ny, _] = self.of.nodes;
+        let plane = nx * ny;
+        let x = &self.x[k * plane..][..plane];
+        let weight = &self.weight[k * plane..][..plane];
+        let [xx, yy, xy] = &mut self.flat;
+        let [a, b, _, c, ..] = self.of.scale;
+        for j in 0..ny {
+            let row = |j: usize| &x[nx * j..][..nx];
+            let (h, w) = (row(j), &weight[nx * j..][..nx]);
+            let xx = &mut xx[nx * j..][..nx];
+            for i in 1..nx.saturating_sub(1) {
+                xx[i] = a * w[i] * (h[i - 1] - 2.0 * h[i] + h[i + 1]);
+            }
+            let yy = &mut yy[nx * j..][..nx];
+            if j > 0 && j + 1 < ny {
+                let (low, high) = (row(j - 1), row(j + 1));
+                for i in 0..nx {
+                    yy[i] = b * w[i] * (low[i] - 2.0 * h[i] + high[i]);
+                }
+            }
+            let xy = &mut xy[nx * j..][..nx];
+            if j + 1 < ny {
+                let next = row(j + 1);
+                for i in 0..nx - 1 {
+                    xy[i] = c * w[i] * (next[i + 1] - next[i] - h[i + 1] + h[i]);
+                }
+            }
+        }
+    }
+
+    /// The next plane of `D^T W D x`.
+    #[inline(always)]
+    fn transposed(&mut self, out: &mut [f32]) {
+        let [nx, ny, _] = self.of.nodes;
+        let k = self.k;
+        self.along.rotate_left(1);
+        self.fill_along(k + 1, 2);
+        self.tilted.rotate_left(1);
+        self.fill_tilted(k);
+        self.fill_flat(k);
+        self.k += 1;
+        let [low, here, high] = &self.along;
+        for i in 0..out.len() {
+            out[i] = low[i] - 2.0 * here[i] + high[i];
+        }
+        let [[xz0, yz0], [xz1, yz1]] = &self.tilted;
+        let [xx, yy, xy] = &self.flat;
+        for j in 0..ny {
+            let at = nx * j..nx * (j + 1);
+            let out = &mut out[at.clone()];
+            let [x2, y2, xy2] = [xx, yy, xy].map(|v| &v[at.clone()]);
+            let [a0, a1, b0, b1] = [xz0, xz1, yz0, yz1].map(|v| &v[at.clone()]);
+            for i in 0..nx {
+                out[i] += xy2[i] + a1[i] - a0[i] + b1[i] - b0[i] - 2.0 * (x2[i] + y2[i]);
+            }
+            for i in 1..nx {
+                out[i] += a0[i - 1] - a1[i - 1] + x2[i - 1] - xy2[i - 1];
+            }
+            for i in 0..nx - 1 {
+                out[i] += x2[i + 1];
+            }
+            if j > 0 {
+                let before = nx * (j - 1)..nx * j;
+                let [y2, xy2, b0, b1] = [yy, xy, yz0, yz1].map(|v| &v[before.clone()]);
+                for i in 0..nx {
+                    out[i] += y2[i] - xy2[i] + b0[i] - b1[i];
+                }
+                for i in 1..nx {
+                    out[i] += xy2[i - 1];
+                }
+            }
+            if j + 1 < ny {
+                let y2 = &yy[nx * (j + 1)..][..nx];
+                for i in 0..nx {
+                    out[i] += y2[i];
+                }
+            }
+        }
+    }
 }
 
 /// How a solve went.
@@ -284,44 +336,44 @@ pub struct SolveReport {
     pub residual: f64,
 }
 
-/// The matrix `D + lambda L` with its preconditioner.
+/// The matrix `A + D^T W D` with its preconditioner: information `A` of the data at the nodes and the weighted bending energy.
 ///
-/// `blocks` holds (an upper bound of) the 3 x 3 diagonal blocks of `D`. Preconditioned by them alone, smooth errors go slowly, which
-/// early stopping makes use of; with `multilevel` coarser lattices take them.
+/// Preconditioned by its 3 x 3 blocks alone, smooth errors go slowly; with `multilevel` coarser lattices take them.
 pub struct Coupled<'a> {
     smoothness: &'a Smoothness,
-    lambda: [f32; 3],
+    /// Weight of the bending energy at each node, planar by component.
+    weights: &'a [f32],
     /// Nodes of a plane.
     plane: usize,
-    /// Diagonal blocks of `D`.
+    /// Information at the nodes.
     blocks: &'a Blocks,
     /// Inverse 3 x 3 diagonal blocks of the whole matrix.
     inverse: Blocks,
-    /// What is smooth is left to coarser lattices, where that is wanted.
     coarse: Option<Box<Coarse>>,
 }
 
 impl<'a> Coupled<'a> {
-    /// Of weights `lambda`, one an axis.
-    pub fn new(smoothness: &'a Smoothness, lambda: [f32; 3], blocks: &'a Blocks, multilevel: bool) -> Self {
+    /// With `weights` of the bending energy, three planar components of one a node.
+    pub fn new(smoothness: &'a Smoothness, weights: &'a [f32], blocks: &'a Blocks, multilevel: bool) -> Self {
         let plane = smoothness.nodes[0] * smoothness.nodes[1];
-        let (n, diagonal) = (blocks.len(), smoothness.diagonal());
+        let n = blocks.len();
+        let diagonal = thirds(weights).map(|w| smoothness.diagonal(w));
         let mut inverses = vec![0.0; 6 * n];
         planes::<6>(&mut inverses, plane).for_each(|(k, mut out)| {
             for i in 0..out[0].len() {
                 let at = k * plane + i;
                 let mut m = blocks.at(at).map(f64::from);
-                for (v, lambda) in m.iter_mut().zip(lambda) {
-                    *v += f64::from(lambda * diagonal[at]) + 1e-12;
+                for (v, diagonal) in m.iter_mut().zip(&diagonal) {
+                    *v += f64::from(diagonal[at]) + 1e-12;
                 }
                 let inverse = inverse(&m).unwrap_or([1.0 / m[0], 1.0 / m[1], 1.0 / m[2], 0.0, 0.0, 0.0]);
                 out.iter_mut().zip(inverse).for_each(|(out, v)| out[i] = v as f32);
             }
         });
-        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, lambda.map(f64::from), blocks.planar());
+        let below = || Coarse::new(smoothness.nodes, smoothness.step_mm, weights, blocks.planar());
         Self {
             smoothness,
-            lambda,
+            weights,
             plane,
             blocks,
             coarse: multilevel.then(below).flatten(),
@@ -334,24 +386,24 @@ impl<'a> Coupled<'a> {
         self.smoothness
     }
 
-    /// Its weight along each axis.
-    pub fn lambda(&self) -> [f32; 3] {
-        self.lambda
+    /// Its weight at each node, planar by component.
+    pub fn weights(&self) -> &[f32] {
+        self.weights
     }
 
-    /// The diagonal blocks of `D`.
+    /// The information at the nodes.
     pub fn blocks(&self) -> &Blocks {
         self.blocks
     }
 
-    /// Conjugate gradients for `(D + lambda L) x = b` (Hestenes & Stiefel 1952), `b` and `x` planar, the blocks being all of `D`.
+    /// Conjugate gradients (Hestenes & Stiefel 1952) for right-hand side `b`, `b` and `x` planar.
     ///
     /// `x` holds the start and receives the result. Stops at `tolerance` (relative residual) or after `limit` iterations.
     pub fn solve(&self, b: Vec<f32>, x: &mut [f32], tolerance: f64, limit: usize) -> SolveReport {
         self.iterate(b, x, tolerance, limit, |p, ap| self.apply(p, ap, None))
     }
 
-    /// The same where the blocks bound `D`, and `data` writes `D x` into its second (planar, three components).
+    /// The same where `data` writes what the data make of its first argument into its second (planar, three components).
     pub fn solve_with(
         &self,
         data: impl Fn(&[f32], &mut [f32]),
@@ -367,37 +419,33 @@ impl<'a> Coupled<'a> {
         })
     }
 
-    /// `out = (D + lambda L) x`, with `D x` given or from the blocks; returns `x . out`. Sums go plane by plane, so that
-    /// they are the same whatever the number of threads.
+    /// `out = A x + D^T W D x`, with `A x` given or from the blocks; returns `x . out`. Sums go plane by plane, so that they are the
+    /// same whatever the number of threads.
     fn apply(&self, x: &[f32], out: &mut [f32], data: Option<&[f32]>) -> f64 {
-        let (n, bands) = (x.len() / 3, &self.smoothness.bands);
+        let n = x.len() / 3;
+        for ((x, out), weight) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(self.weights.chunks_exact(n)) {
+            self.smoothness.apply(weight, x, out);
+        }
         let [x0, x1, x2] = thirds(x);
         let parts = planes(out, self.plane).map(|(k, [o0, o1, o2])| {
             let at = k * self.plane..(k + 1) * self.plane;
-            let mut cross = vec![0.0f32; self.plane];
+            let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
             dispatch(
                 #[inline(always)]
                 || {
-                    bands.plane(x0, k, o0, &mut cross);
-                    bands.plane(x1, k, o1, &mut cross);
-                    bands.plane(x2, k, o2, &mut cross);
-                    let (x, y, z) = (&x0[at.clone()], &x1[at.clone()], &x2[at.clone()]);
-                    let [l0, l1, l2] = self.lambda;
                     match data {
                         Some(d) => {
                             let [d0, d1, d2] = thirds(d).map(|d| &d[at.clone()]);
                             for i in 0..x.len() {
-                                o0[i] = l0 * o0[i] + d0[i];
-                                o1[i] = l1 * o1[i] + d1[i];
-                                o2[i] = l2 * o2[i] + d2[i];
+                                (o0[i], o1[i], o2[i]) = (o0[i] + d0[i], o1[i] + d1[i], o2[i] + d2[i]);
                             }
                         }
                         None => {
                             let [xx, yy, zz, xy, xz, yz] = sixths(self.blocks.planar(), n, &at);
                             for i in 0..x.len() {
-                                o0[i] = l0 * o0[i] + (xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i]);
-                                o1[i] = l1 * o1[i] + (xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i]);
-                                o2[i] = l2 * o2[i] + (xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i]);
+                                o0[i] += xx[i] * x[i] + xy[i] * y[i] + xz[i] * z[i];
+                                o1[i] += xy[i] * x[i] + yy[i] * y[i] + yz[i] * z[i];
+                                o2[i] += xz[i] * x[i] + yz[i] * y[i] + zz[i] * z[i];
                             }
                         }
                     }

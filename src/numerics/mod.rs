@@ -24,6 +24,8 @@ pub mod bspline;
 pub mod cubic;
 mod multilevel;
 
+pub mod ablation;
+
 pub mod banded;
 
 pub mod blocks;

@@ -26,18 +26,18 @@ pub(super) struct Coarse {
 }
 
 impl Coarse {
-    /// For `D + lambda L` on `fine` nodes `step_mm` apart, with `blocks` the planar diagonal blocks of `D`; none where the
-    /// lattice is too small.
-    pub(super) fn new(fine: [usize; 3], step_mm: [f64; 3], lambda: [f64; 3], blocks: &[f32]) -> Option<Box<Self>> {
+    /// For `A + D^T W D` on `fine` nodes `step_mm` apart, with `blocks` the planar blocks of `A` and `weights` (planar, three
+    /// components) the diagonal of `W`; none where the lattice is too small.
+    pub(super) fn new(fine: [usize; 3], step_mm: [f64; 3], weights: &[f32], blocks: &[f32]) -> Option<Box<Self>> {
         let shape = fine.map(|n| if n > 1 { vec![1.0] } else { Vec::new() });
-        Self::below(fine, step_mm, lambda, blocks, &shape)
+        Self::below(fine, step_mm, weights, blocks, &shape)
     }
 
     /// `shape` is the lattice's basis function along each axis in coefficients of the finest lattice; empty for one node.
     fn below(
         fine: [usize; 3],
         step_mm: [f64; 3],
-        lambda: [f64; 3],
+        weights: &[f32],
         blocks: &[f32],
         shape: &[Vec<f64>; 3],
     ) -> Option<Box<Self>> {
@@ -47,22 +47,21 @@ impl Coarse {
         }
         let shape: [Vec<f64>; 3] =
             std::array::from_fn(|a| if nodes[a] < fine[a] { subdivided(&shape[a]) } else { shape[a].clone() });
-        let squares = TWO_SCALE.map(|w| w * w);
         let (m, n) = (fine.iter().product::<usize>(), nodes.iter().product::<usize>());
         let mut coarse = vec![0.0f32; 6 * n];
         for (from, to) in blocks.chunks_exact(m).zip(coarse.chunks_exact_mut(n)) {
-            restrict(from, fine, nodes, &squares, to);
+            restrict(from, fine, nodes, &TWO_SCALE, to);
         }
         let energy = energy(&shape, step_mm);
-        let bending = lambda.map(|l| (l * energy).max(1e-12));
+        let weights = nearest(weights, fine, nodes);
         let mut inverses = vec![0.0f32; 6 * n];
         for i in 0..n {
             let mut b: [f64; 6] = std::array::from_fn(|q| f64::from(coarse[q * n + i]));
-            b.iter_mut().zip(bending).for_each(|(v, l)| *v += l);
+            (0..3).for_each(|c| b[c] += (f64::from(weights[c * n + i]) * energy).max(1e-12));
             let inverse = inverse(&b).unwrap_or([1.0 / b[0], 1.0 / b[1], 1.0 / b[2], 0.0, 0.0, 0.0]);
             (0..6).for_each(|q| inverses[q * n + i] = inverse[q] as f32);
         }
-        let next = Self::below(nodes, step_mm, lambda, &coarse, &shape);
+        let next = Self::below(nodes, step_mm, &weights, &coarse, &shape);
         Some(Box::new(Self { fine, nodes, inverse: inverses, next }))
     }
 
@@ -124,6 +123,23 @@ impl Coarse {
             }
         }
     }
+}
+
+/// A planar vector of three components at the fine node nearest to each coarse one.
+fn nearest(values: &[f32], fine: [usize; 3], nodes: [usize; 3]) -> Vec<f32> {
+    let along = |m: usize, a: usize| match nodes[a] == fine[a] {
+        true => m,
+        false => (2 * m).saturating_sub(1).min(fine[a] - 1),
+    };
+    let ([nx, ny, nz], [mx, my, mz]) = (fine, nodes);
+    let mut out = Vec::with_capacity(3 * mx * my * mz);
+    for values in values.chunks_exact(nx * ny * nz) {
+        for (k, j) in (0..mz).flat_map(|k| (0..my).map(move |j| (k, j))) {
+            let row = &values[nx * (along(j, 1) + ny * along(k, 2))..][..nx];
+            out.extend((0..mx).map(|i| row[along(i, 0)]));
+        }
+    }
+    out
 }
 
 /// The coarse nodes that make up fine node `at` along an axis, with their weights (some may be zero).
@@ -227,7 +243,7 @@ mod tests {
     fn restriction_is_the_transpose_of_prolongation() {
         for fine in [[9, 12, 7], [13, 8, 1], [10, 5, 11]] {
             let n: usize = fine.iter().product();
-            let Some(c) = Coarse::new(fine, [1.0; 3], [1.0; 3], &vec![0.0; 6 * n]) else { panic!("{fine:?}") };
+            let Some(c) = Coarse::new(fine, [1.0; 3], &vec![1.0; 3 * n], &vec![0.0; 6 * n]) else { panic!("{fine:?}") };
             let m: usize = c.nodes.iter().product();
             let number = |i: usize| ((i * 7919 + 13) % 101) as f32 / 50.0 - 1.0;
             let (x, y): (Vec<f32>, Vec<f32>) = ((0..n).map(number).collect(), (0..m).map(|i| number(3 * i)).collect());

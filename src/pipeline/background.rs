@@ -1,8 +1,8 @@
 //! A background of one value that a cut through tissue made: a mask, a skull taken off, a volume resampled past its end. Its edge is none of
 //! the tissue and moves with the cut, so what lies behind it is not seen. The value is 0, or the least one where 0 was moved.
 
-use crate::numerics::pyramid;
 use crate::numerics::statistics::{quantile, sampled};
+use crate::numerics::{ablation, pyramid};
 use crate::types::{Grid, Voxels};
 use rayon::prelude::*;
 
@@ -44,17 +44,24 @@ impl Cut {
         let all = sum(&|b| border[b][1]).max(1.0);
         let lit = sum(&|b| border[b][0]) / all;
         let places = sum(&|b| if blocks.is_cut(&border, b) { border[b][1] } else { 0 }) / all;
-        (lit > CUT || places > PLACES).then_some(Self { lit, places })
+        ((lit > CUT || places > PLACES) && ablation::is_on("cut")).then_some(Self { lit, places })
     }
 }
 
 /// The one value of a volume's background, if it has such: 0, or the volume's `least` value if more voxels hold that.
 pub fn empty(volume: &Voxels<'_>, least: f32) -> Option<f32> {
-    let values = volume.as_slice();
-    let count = |value: f32| values.par_iter().filter(|v| **v == value).count();
-    let [zeros, others] = [count(0.0), if least == 0.0 { 0 } else { count(least) }];
-    let (value, held) = if zeros >= others { (0.0, zeros) } else { (least, others) };
-    (held as f64 >= BACKGROUND * values.len() as f64).then_some(value)
+    let [zeros, others] = [held(volume, 0.0), if least == 0.0 { 0 } else { held(volume, least) }];
+    let value = if zeros >= others { 0.0 } else { least };
+    filled_with(volume, value).then_some(value)
+}
+
+/// Whether so many voxels hold a value that they are a background.
+pub fn filled_with(volume: &Voxels<'_>, value: f32) -> bool {
+    held(volume, value) as f64 >= BACKGROUND * volume.as_slice().len() as f64
+}
+
+fn held(volume: &Voxels<'_>, value: f32) -> usize {
+    volume.as_slice().par_iter().filter(|v| **v == value).count()
 }
 
 /// The volume with its background as voxels that are not finite.

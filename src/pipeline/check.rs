@@ -37,7 +37,7 @@ pub struct LostSlice {
     pub place: f64,
 }
 
-/// Checks the two volumes and the mask, and makes them fit to work on.
+/// Checks the two volumes (as [`tamed`] gives them) and the mask, and makes them fit to work on.
 ///
 /// A slice inside the body that holds one value throughout is lost: left out of the mask in the initial volume, not finite in the
 /// deformed one. A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
@@ -101,8 +101,8 @@ pub fn inputs<'a>(
         let mask = mask.as_mut_slice();
         slice(first.grid().shape(), axis, at).for_each(|o| mask[o] = 0);
     }
-    let (initial, spread) = in_range(first, &ranges[0], None);
-    let (deformed, _) = in_range(second, &ranges[1], Some(spread));
+    let (initial, spread) = in_range(first, None);
+    let (deformed, _) = in_range(second, Some(spread));
     Ok(Checked { mask, initial, deformed, not_finite, lost, cut })
 }
 
@@ -304,26 +304,81 @@ const SPREADS: std::ops::Range<f64> = 1e-3..1e7;
 /// Distance from 0, in spreads, up to which they are.
 const FAR: f64 = 100.0;
 
+/// Quantiles between which a volume's intensities are taken to lie.
+const ROBUST: [f64; 2] = [0.001, 0.999];
+
+/// The range of the intensities without far outliers (hot voxels, spikes) and without `padding`.
+fn robust_range(volume: &Voxels<'_>, padding: Option<f32>) -> [f32; 2] {
+    let mut sample = sampled(volume.as_slice());
+    sample.retain(|v| Some(*v) != padding);
+    let [low, high] = ROBUST.map(|q| quantile(&mut sample, q));
+    if high > low {
+        return [low, high];
+    }
+    let Range { low, high, .. } = Range::of(volume);
+    [low, high]
+}
+
+/// How far past its robust range a volume's intensities may lie, in widths of it.
+const PAST: f32 = 3.0;
+
+/// The most extreme neighbours that do not count when a voxel is held against them: hot voxels come in short runs.
+const RUN: usize = 3;
+
+/// The volume with padding that lies far from its intensities as the darkest of these, lone far outliers as the median of their
+/// neighbours, and others drawn in to the end of the range.
+pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
+    let Range { low: least, high: most, .. } = Range::of(volume);
+    let padding = [least, most].map(|v| background::filled_with(volume, v).then_some(v));
+    let [low, high] = robust_range(volume, padding[0].or(padding[1]));
+    let width = high - low;
+    if width.is_nan() || width <= 0.0 {
+        return volume.view();
+    }
+    let (least, most) = (low - PAST * width, high + PAST * width);
+    let far = |v: f32| v.is_finite() && !(least..=most).contains(&v);
+    let (values, shape) = (volume.as_slice(), volume.grid().shape());
+    let other = |at: usize| {
+        if padding.contains(&Some(values[at])) {
+            return low;
+        }
+        let mut beside = neighbours(values, shape, at);
+        beside.sort_by(f32::total_cmp);
+        let lone = beside.len() > 2 * RUN && !far(beside[RUN]) && !far(beside[beside.len() - 1 - RUN]);
+        if lone { beside[beside.len() / 2] } else { values[at].clamp(least, most) }
+    };
+    let outliers: Vec<(usize, f32)> =
+        (0..values.len()).into_par_iter().filter(|&at| far(values[at])).map(|at| (at, other(at))).collect();
+    let mut out = volume.view();
+    if !outliers.is_empty() {
+        let values = out.as_mut_slice();
+        outliers.into_iter().for_each(|(at, v)| values[at] = v);
+    }
+    out
+}
+
+/// The finite values next to a voxel, at most 26.
+fn neighbours(values: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Vec<f32> {
+    let near = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
+    let (i, j, k) = (at % nx, at / nx % ny, at / (nx * ny));
+    let rows = near(k, nz).flat_map(|k| near(j, ny).map(move |j| nx * (j + ny * k)));
+    let all = rows.flat_map(|row| near(i, nx).map(move |i| row + i));
+    all.filter(|&other| other != at && values[other].is_finite()).map(|other| values[other]).collect()
+}
+
 /// With intensities that can be squared and summed in single precision, and with their spread, which comes near to `like`:
 /// gains between the volumes are bounded, and noise is measured in the initial one alone.
-fn in_range<'a>(mut volume: Voxels<'a>, range: &Range, like: Option<f64>) -> (Voxels<'a>, f64) {
-    let values = volume.as_slice();
-    let mut sample = sampled(values);
-    let [a, b] = [0.001, 0.999].map(|q| f64::from(quantile(&mut sample, q)));
-    let [low, high] = [range.low, range.high].map(f64::from);
-    let whole = high - low;
-    let spread = if b > a { b - a } else { whole };
+fn in_range<'a>(mut volume: Voxels<'a>, like: Option<f64>) -> (Voxels<'a>, f64) {
+    let [low, high] = robust_range(&volume, None).map(f64::from);
+    let spread = high - low;
     let furthest = low.abs().max(high.abs());
     let alike = like.is_none_or(|l| (l / spread).log2().abs() < 0.5);
     if SPREADS.contains(&spread) && furthest <= FAR * spread && alike {
         return (volume, spread);
     }
-    // Far outliers are drawn in, so that their squares stay finite.
-    let aim = like.unwrap_or(1000.0);
-    let scale = (aim / spread).log2().round().exp2();
-    let limit = 2.0 * aim * FAR;
+    let scale = (like.unwrap_or(1000.0) / spread).log2().round().exp2();
     for v in volume.as_mut_slice().iter_mut().filter(|v| v.is_finite()) {
-        *v = ((f64::from(*v) - a) * scale).clamp(-limit, limit) as f32;
+        *v = ((f64::from(*v) - low) * scale) as f32;
     }
     (volume, spread * scale)
 }

@@ -2,6 +2,7 @@
 
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
+use crate::numerics::ablation;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::level;
 use crate::pipeline::light::Light;
@@ -25,7 +26,7 @@ const FEW: f64 = 0.65;
 
 /// Why what was found (or nothing was) leaves the question open what lies past the range.
 pub(super) fn is_open(pair: &Pair<'_>, range: f64, found: Option<&Begun>) -> Option<&'static str> {
-    let Some(found) = found else { return Some("in vain") };
+    let Some(found) = found.filter(|_| ablation::is_on("farther")) else { return found.is_none().then_some("in vain") };
     found.report.as_ref()?;
     if level::lengths(pair, &found.field)[1] > NEAR * range {
         return Some("which the motion reaches");

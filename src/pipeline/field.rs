@@ -1,6 +1,6 @@
 //! Two volumes to a dense displacement field: the main chain, in order.
 
-use crate::consistency::models::{AffineMotion, Choice, choose};
+use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
 use crate::error::{FieldError, MeshError};
 use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::field::{interpolation, jacobian, spline};
@@ -8,6 +8,7 @@ use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level
 use crate::matching::pair::Pair;
 use crate::matching::sliding::{Sliding, sliding};
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
+use crate::numerics::ablation;
 use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
@@ -16,11 +17,11 @@ use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::background;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::farther;
-use crate::pipeline::finer::{finer, uneven, unlike};
+use crate::pipeline::finer::{self, finer, uneven, unlike};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
-use crate::pipeline::rest::{Rest, Tried};
+use crate::pipeline::rest::{Places, Rest, Tried};
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
 use crate::pipeline::whole::{self, Whole};
@@ -197,8 +198,12 @@ fn canonical(
     progress("pyramid", 0.0);
     let mut clock = Clock(Vec::new(), Instant::now());
     let given = mask.is_some();
+    let [initial, deformed] = match ablation::is_on("robust-range") {
+        true => [initial, deformed].map(check::tamed),
+        false => [initial, deformed].map(Voxels::view),
+    };
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
-        check::inputs(initial, deformed, mask)?;
+        check::inputs(&initial, &deformed, mask)?;
     let grid = *initial.grid();
     let mut search = search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, farther::TWICE * search)?;
@@ -213,13 +218,26 @@ fn canonical(
     let mut begun = None;
     let mut reach = f64::INFINITY;
     let mut light = Light::default();
-    let (mut left, mut gain, mut closer, mut asked) = (0.0, 1.0, None, Vec::new());
+    let (mut left, mut gain, mut apart_mm, mut asked) = (0.0, 1.0, None::<f64>, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let mut pair = light.level(&aligned, factor);
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
-        let apart = if last { between_nodes(params.node_spacing, pair.inside) } else { COARSE };
+        let voxel = pyramid::finest(pair.shape, pair.spacing);
+        let fixed = if ablation::is_on("node-spacing") {
+            params.node_spacing
+        } else if last {
+            4
+        } else {
+            3
+        };
+        let apart = match apart_mm {
+            _ if fixed > 0 && last => fixed,
+            Some(mm) => ((mm / voxel).round() as usize).clamp(2, WIDEST),
+            None if last => WIDEST,
+            None => COARSEST,
+        };
         let lattice = level::lattice(&pair, apart);
         let passes = if last { params.passes } else { params.coarse_passes };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
@@ -283,12 +301,18 @@ fn canonical(
         if more && last {
             level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
         }
-        if last {
+        apart_mm = Some(apart as f64 * voxel);
+        if fixed == 0 {
             let refine =
-                |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
-            let best = finer(&pair, field, (apart, passes), params.seed, refine);
-            (field, left, gain, closer) = (best.field, best.left, best.gain, best.closer);
-            asked.extend(best.said);
+                |field: &mut SplineField| level::refine(&pair, field, (finer::TRIAL, reach), params.seed, |_| ());
+            let best = finer(&pair, field, apart, params.seed, refine);
+            (field, apart_mm) = (best.field, Some(best.spacing as f64 * voxel));
+            if last {
+                asked.extend(best.said);
+            }
+        }
+        if last {
+            [left, gain] = level::misfit(&pair, &field);
         }
         clock.skip("matching", matched);
         clock.book("residual");
@@ -321,16 +345,20 @@ fn canonical(
     let flat = grid.is_single_slice();
     let windows = level::windows(&pair);
     let by_place = level::excess(&pair, &field, &windows);
-    let (mut choice, tried) = smallest(&matches, &pair, &field, &by_place, params.seed);
+    let mut posterior = level::posterior(&field, pair.spacing, params.seed);
+    let places_of = Places::new(&pair, &windows, &posterior);
+    let (mut choice, tried) = smallest(&matches, &pair, &field, &by_place, &places_of, params.seed);
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
     choice.evidence.extend(background::why_unseen(cut));
     choice.evidence.extend(light.why());
     choice.evidence.extend(asked);
     choice.evidence.push(why_so_many(params, points, found));
-    let glides = choice.motion.is_none().then(|| sliding(&pair, &field.lattice, &field.coefficients)).flatten();
+    let glides = (choice.motion.is_none() && ablation::is_on("sliding"))
+        .then(|| sliding(&pair, &field.lattice, &field.coefficients))
+        .flatten();
     let mut places = Vec::new();
     if let Some(glides) = glides {
-        let believed = closer.is_none() || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
+        let believed = unlike(&pair, left).is_none() || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
         choice.evidence.push(why_sliding(&glides, believed));
         if believed {
             places = beside(&glides, &grid, pair.shape, factor);
@@ -339,11 +367,8 @@ fn canonical(
     let unlike = unlike(&pair, left);
     let unseen = level::unseen(&pair, &field);
     let plain = without_texture(pair.plain());
-    clock.book("model");
-    let mut posterior = level::posterior(&field, pair.spacing, params.seed);
-    clock.book("uncertainty");
-    let free = choice.motion.is_none();
-    let rest = free.then(|| Rest::find((&pair, &field), &windows, &tried, &by_place, &posterior)).flatten();
+    let free = choice.motion.is_none() && ablation::is_on("rest");
+    let rest = free.then(|| Rest::find((&pair, &field), &windows, &places_of, &tried, &by_place, &posterior)).flatten();
     drop(by_place);
     choice.evidence.extend(rest.as_ref().map(Rest::why));
     let rest = rest.filter(Rest::is_taken);
@@ -357,7 +382,8 @@ fn canonical(
         pair = light.level(&aligned, next);
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-        let nodes = polish::nodes(closer);
+        let voxel = pyramid::finest(pair.shape, pair.spacing);
+        let nodes = apart_mm.map_or(WIDEST, |mm| ((mm / voxel).round() as usize).clamp(2, WIDEST));
         field = polish::polish((&pair, next, nodes), (&field, factor), reach, params, tick);
         factor = next;
         choice.evidence.push(polish::why(&pair, nodes, params));
@@ -497,19 +523,9 @@ pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) ->
 /// Voxels of the mask that a preset without a fixed finest level works on at most.
 const WORKED_ON: usize = 600_000;
 
-/// Voxels between the nodes of the lattice on levels above the finest.
-const COARSE: usize = 3;
-
-/// Voxels between the nodes on the finest level: as asked, or by the `inside` voxels of tissue. Where there are many, motion is smooth over more
-/// of them: eight pairs of heads, legs and calves of 128 x 128 x 128 and 160 x 192 x 160 voxels had 1 to 11 % less error in the field (6 on the mean) and 7 in its
-/// gradients with 5 than with 4, none more; twenty of 96 x 96 x 96 had 2 and 4 % more.
-fn between_nodes(asked: usize, inside: usize) -> usize {
-    match asked {
-        0 if inside > WORKED_ON => 5,
-        0 => 4,
-        asked => asked,
-    }
-}
+/// Voxels between nodes at first: on the coarsest of several levels, and at most on any.
+const COARSEST: usize = 5;
+const WIDEST: usize = finer::SPACINGS[0];
 
 /// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`] voxels of tissue are left.
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
@@ -559,6 +575,7 @@ fn smallest(
     pair: &Pair<'_>,
     field: &SplineField,
     by_place: impl Fn(&AffineMotion) -> Vec<f32>,
+    places: &Places,
     seed: u64,
 ) -> (Choice, Vec<Tried>) {
     let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
@@ -566,9 +583,9 @@ fn smallest(
     let mut tried = Vec::new();
     let excess = |model, motion: &AffineMotion| {
         let excess = by_place(motion);
-        let sum = excess.iter().map(|&v| f64::from(v)).sum();
+        let found = Excess { total: excess.iter().map(|&v| f64::from(v)).sum(), worst: places.worst(&excess) };
         tried.push(Tried { model, motion: *motion, excess });
-        sum
+        found
     };
     let choice = choose(&measured, excess, level::determined(pair, field, seed), 0.02 * finest);
     (choice, tried)

@@ -1,4 +1,4 @@
-//! A finer lattice where the volumes still differ by more than noise, and the finer field explains why.
+//! As many nodes as the volumes ask for: from a wide lattice to closer ones while each explains more than chance.
 
 use crate::matching::pair::Pair;
 use crate::numerics::statistics::deviation;
@@ -9,9 +9,16 @@ use crate::pipeline::level::{self, SplineField};
 /// 1.4 to 12.
 const NOISY: f32 = 1.1;
 
-/// Misfit that a finer lattice must explain for each degree of freedom more that the data determine: several times what it takes
-/// from noise and the last errors of interpolation (0.2 to 0.75 over pairs of the same tissue; two people, 0.9 to 1.6 with six passes before).
+/// Misfit per degree of freedom that a closer lattice must explain. Past the spacing that a scene asks for lattices explained .3 to .75 of noise
+/// and interpolation (docs/lab/2026-11-local-signal.md).
 const WORTH: f64 = 0.8;
+
+/// Misfit per degree of freedom from which the next closer lattice is tried: a step gains about half of the one before, so where less was
+/// gained the next would not be worth it.
+const NEXT: f64 = 2.0 * WORTH;
+
+/// Passes on each closer lattice.
+pub(super) const TRIAL: usize = 4;
 
 /// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is no matter.
 const UNLIKE: f32 = 0.05;
@@ -21,63 +28,53 @@ const UNLIKE: f32 = 0.05;
 /// the second and the 98th percentile one of those, in thick slices, had 1.55.
 const UNEVEN: f32 = 1.25;
 
-/// Passes after which a finer lattice is judged.
-const TRIAL: usize = 6;
-
-/// Voxels between nodes at least.
-const CLOSEST: usize = 2;
+/// Voxels between nodes, from the lattice that every field starts with to the closest.
+pub(super) const SPACINGS: [usize; 7] = [10, 8, 6, 5, 4, 3, 2];
 
 /// Nodes at most, to bound memory.
 const NODES: usize = 4_000_000;
 
-/// A field with what it leaves.
-pub(super) struct Explained {
+/// A field on the lattice that was chosen.
+pub(super) struct Refined {
     pub field: SplineField,
-    /// Robust standard deviation of what is left of the difference (intensity).
-    pub left: f32,
-    /// By what factor the gain varies across the tissue.
-    pub gain: f32,
-    /// Voxels between its nodes, where a finer lattice was taken.
-    pub closer: Option<usize>,
+    /// Voxels between its nodes.
+    pub spacing: usize,
     /// What was tried, in words.
     pub said: Vec<String>,
 }
 
-/// Brings the field to lattices of one voxel less between nodes, from `spacing`, for as long as the residual is more than noise
-/// and each explains it. `refine` brings a field to the residual.
+/// Brings the field to ever closer nodes, from `spacing`, for as long as each lattice explains more than chance for each degree of
+/// freedom that it adds. `refine` brings a field to the residual.
 pub(super) fn finer(
     pair: &Pair<'_>,
     field: SplineField,
-    (spacing, passes): (usize, usize),
+    spacing: usize,
     seed: u64,
-    refine: impl Fn(&mut SplineField, usize),
-) -> Explained {
-    let [left, gain] = level::misfit(pair, &field);
-    let mut best = Explained { field, left, gain, closer: None, said: Vec::new() };
-    for closer in (CLOSEST..spacing).rev() {
+    refine: impl Fn(&mut SplineField),
+) -> Refined {
+    let mut best = Refined { field, spacing, said: Vec::new() };
+    for closer in SPACINGS.into_iter().filter(|&s| s < spacing) {
         let lattice = level::lattice(pair, closer);
-        let noisy = times(best.left, pair.noise);
-        if noisy < NOISY || lattice.len() > NODES || lattice == best.field.lattice {
+        if lattice.len() > NODES || lattice == best.field.lattice {
             break;
         }
         let mut next = level::carry(&best.field, lattice, |p| p);
-        refine(&mut next, TRIAL);
+        refine(&mut next);
         let gain = level::gained(pair, &best.field, &next);
         let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
         let worth = gain / (many - few).max(1.0);
         let taken = gain > 0.0 && worth > WORTH;
         best.said.push(format!(
-            "nodes every {closer} voxels: {}; the residual is {noisy:.1} times the noise, and {:.0} degrees of freedom more explain {worth:.2} of it each \
-             (the same tissue: up to 0.75)",
+            "nodes every {closer} voxels: {}; {:.0} degrees of freedom more explain {worth:.2} of the misfit each (chance: up to {WORTH})",
             if taken { "taken" } else { "not taken" },
             many - few
         ));
-        if !taken {
+        if taken {
+            (best.field, best.spacing) = (next, closer);
+        }
+        if worth < NEXT {
             break;
         }
-        refine(&mut next, passes.saturating_sub(TRIAL));
-        [best.left, best.gain] = level::misfit(pair, &next);
-        (best.field, best.closer) = (next, Some(closer));
     }
     best
 }

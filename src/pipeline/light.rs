@@ -3,6 +3,7 @@
 use crate::matching::brightness::Brightness;
 use crate::matching::levels::Aligned;
 use crate::matching::pair::Pair;
+use crate::numerics::ablation;
 use crate::pipeline::level::SplineField;
 
 /// What may be left of the difference, as a part of it, for the rest to be taken out. Of 82 pairs of all kinds those without a bias kept 0.75
@@ -95,7 +96,9 @@ impl Light {
             pair.put(aligned.deformed(factor));
         }
         let found = Brightness::measure(pair, (factor, aligned.shape()), (&field.lattice, &field.coefficients), both);
-        let matters = |b: &Brightness| b.deviation[0] > MATTERS && explains(b, leaves) && b.uneven <= UNEVEN;
+        let matters = |b: &Brightness| {
+            ablation::is_on("brightness") && b.deviation[0] > MATTERS && explains(b, leaves) && b.uneven <= UNEVEN
+        };
         match found {
             Some(found) if matters(&found) => self.taken = Some(found),
             Some(found) => self.left = Some(found),

@@ -34,10 +34,11 @@ pub fn field(
     params: &FieldParams,
 ) -> Result<FieldPlan, FieldError> {
     params.check()?;
-    let Checked { mask, initial: clean, .. } = check::inputs(initial, deformed, mask)?;
+    let [initial, deformed] = [check::tamed(initial), check::tamed(deformed)];
+    let Checked { mask, initial: clean, .. } = check::inputs(&initial, &deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
-    Aligned::new(&clean, deformed, &mask, search)?;
+    Aligned::new(&clean, &deformed, &mask, search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
     let mask_voxels = inside(&mask);

@@ -49,6 +49,53 @@ pub(super) struct Tried {
     pub excess: Vec<f32>,
 }
 
+/// Degrees of freedom that a place counts for at least when it speaks against a model: with fewer, chance decides.
+const FEWEST: f32 = 5.0;
+
+/// What each of the windows holds.
+pub(super) struct Places {
+    nodes: [usize; 3],
+    /// Voxels of tissue.
+    tissue: Vec<f32>,
+    /// Degrees of freedom that the data determine, those of the neighbourhood lent in.
+    determined: Vec<f32>,
+}
+
+impl Places {
+    /// From the posterior of a field.
+    pub fn new(pair: &Pair<'_>, windows: &Lattice, (nodes, posterior): &(Lattice, Posterior)) -> Self {
+        let mut determined = vec![0.0f32; windows.len()];
+        for (m, &part) in posterior.determined.iter().enumerate() {
+            windows.stencil_near(nodes.place(m)).scatter(part, &mut determined);
+        }
+        let tissue = windows.accumulate::<1>(|j, k, [row]| {
+            let span = pair.spans.row(j, k);
+            let from = pair.shape[0] * (j + pair.shape[1] * k);
+            for i in span.clone() {
+                row[i] = f32::from(pair.mask[from + i] != 0);
+            }
+            span
+        });
+        Self { nodes: windows.nodes, tissue, determined: with_lent(determined, windows.nodes) }
+    }
+
+    /// Excess misfit for each degree of freedom about each of the windows.
+    pub fn ratio(&self, excess: &[f32]) -> Vec<f32> {
+        let excess = with_lent(excess.to_vec(), self.nodes);
+        excess.iter().zip(&self.determined).map(|(q, d)| q / d.max(1e-9)).collect()
+    }
+
+    /// The greatest of them, where there is as much tissue as in the windows on average.
+    pub fn worst(&self, excess: &[f32]) -> f64 {
+        let filled = self.tissue.iter().filter(|&&t| t > 0.0).count().max(1);
+        let least = self.tissue.iter().sum::<f32>() / filled as f32;
+        let excess = with_lent(excess.to_vec(), self.nodes);
+        let ratios = excess.iter().zip(&self.determined).map(|(q, d)| q / d.max(FEWEST));
+        let held = ratios.zip(&self.tissue).filter(|(_, t)| **t >= least);
+        held.map(|(r, _)| f64::from(r)).fold(0.0, f64::max)
+    }
+}
+
 /// Tissue that moves as a whole does.
 pub(super) struct Rest {
     model: MotionModel,
@@ -69,29 +116,17 @@ impl Rest {
     pub fn find(
         (pair, field): (&Pair<'_>, &SplineField),
         windows: &Lattice,
+        places: &Places,
         tried: &[Tried],
         excess: impl Fn(&AffineMotion) -> Vec<f32>,
         (nodes, posterior): &(Lattice, Posterior),
     ) -> Option<Self> {
-        let mut determined = vec![0.0f32; windows.len()];
-        for (m, &part) in posterior.determined.iter().enumerate() {
-            windows.stencil_near(nodes.place(m)).scatter(part, &mut determined);
-        }
-        let tissue = windows.accumulate::<1>(|j, k, [row]| {
-            let span = pair.spans.row(j, k);
-            let from = pair.shape[0] * (j + pair.shape[1] * k);
-            for i in span.clone() {
-                row[i] = f32::from(pair.mask[from + i] != 0);
-            }
-            span
-        });
-        let determined = with_lent(determined, windows.nodes);
+        let tissue = &places.tissue;
         let all: f64 = tissue.iter().map(|&v| f64::from(v)).sum();
         let judged = |&Tried { model, motion, ref excess }: &Tried| {
-            let excess = with_lent(excess.clone(), windows.nodes);
-            let ratio: Vec<f32> = excess.iter().zip(&determined).map(|(q, d)| q / d.max(1e-9)).collect();
+            let ratio = places.ratio(excess);
             let free: Vec<f32> = ratio.iter().map(|&r| stands(r)).collect();
-            let share: f64 = free.iter().zip(&tissue).map(|(f, t)| f64::from((1.0 - f) * t)).sum();
+            let share: f64 = free.iter().zip(tissue).map(|(f, t)| f64::from((1.0 - f) * t)).sum();
             Self {
                 model,
                 motion,

@@ -4,7 +4,7 @@ use crate::matching::agreement::Agreement;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
-use crate::numerics::pyramid;
+use crate::numerics::{ablation, pyramid};
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Counts, LevelReport};
 
@@ -108,7 +108,7 @@ fn is_in_doubt(report: &LevelReport) -> bool {
 
 /// `held` where the field is to be held near what the matches say, else as far as the passes take it.
 fn reach(report: &LevelReport, held: f64) -> f64 {
-    if is_loose(report) { held } else { f64::INFINITY }
+    if is_loose(report) && ablation::is_on("reach") { held } else { f64::INFINITY }
 }
 
 /// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more
@@ -228,7 +228,7 @@ pub(super) fn begin(
     let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
     let least = FAR * pyramid::finest(pair.shape, pair.spacing);
     let clear = |found: &SplineField| level::lengths(pair, found)[0] > least && level::is_better(pair, found, &still);
-    let still_too = rest && !(sure && found.as_ref().is_some_and(clear));
+    let still_too = rest && ablation::is_on("second-start") && !(sure && found.as_ref().is_some_and(clear));
     let own = [found, still_too.then_some(still)]
         .into_iter()
         .flatten()
@@ -238,7 +238,7 @@ pub(super) fn begin(
     let wins = |known: &SplineField| own.as_ref().is_none_or(|own| level::is_better(pair, known, own));
     let mut field = followed.filter(wins).map(refined).or(own)?;
     for _ in 0..AGAIN {
-        if report.counts.kept_share() >= AGREED {
+        if report.counts.kept_share() >= AGREED || !ablation::is_on("search-again") {
             break;
         }
         let (next, seen) = search(Some(&field));

@@ -3,7 +3,7 @@
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
-use crate::numerics::pyramid;
+use crate::numerics::{ablation, pyramid};
 use crate::pipeline::level::{self, MatchParams, SplineField};
 use crate::pipeline::start::{Begun, Searched, Start, begin};
 use crate::types::FieldParams;
@@ -138,6 +138,9 @@ impl Whole<'_> {
         passes: usize,
         seconds: &mut f64,
     ) -> Option<Begun> {
+        if !ablation::is_on("next-level") {
+            return None;
+        }
         let features = self.closer_points();
         let lattice = level::lattice(pair, self.nodes_for(pair, features));
         let effort = (between_searches(self.params.coarse_passes), features);

@@ -43,8 +43,7 @@ pub struct FieldParams {
     pub search_mm: f64,
     /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000 voxels of tissue.
     pub finest: usize,
-    /// Voxels between the nodes of the spline lattice on the finest level (1), or fewer where the residual is more than noise and
-    /// a finer lattice explains it; 2 to 16, or 0 = 4, and 5 where more than 600,000 voxels of tissue are worked on.
+    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 16, or 0 = 10 to 2, by evidence.
     pub node_spacing: usize,
     /// Residual passes on the finest level; 1 to 40.
     pub passes: usize,
@@ -101,7 +100,7 @@ impl FieldParams {
             finest: 1,
             node_spacing: 0,
             passes: 6,
-            coarse_passes: 10,
+            coarse_passes: 8,
             finer_passes: 0,
             interpolation: Interpolation::Spline,
             candidates: 8,
