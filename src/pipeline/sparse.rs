@@ -53,6 +53,10 @@ const REACH: [f64; 2] = [2.0, 1.0];
 /// finest leave 13 % more and 2 % less error.
 const ROUNDS: [usize; 2] = [2, 3];
 
+/// What neighbouring matches may be off together (voxels), when a simpler motion is asked for: a block at rest whose brightness
+/// differs by 15 % across the volume passed for an affine motion without it.
+const SHARED: f64 = 0.1;
+
 /// Voxels of tissue for each point on coarser levels. The same five pairs: 12 and 48 leave the same error.
 const COARSE_ROOM: usize = 24;
 
@@ -324,7 +328,7 @@ fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: 
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let off = |m: &Measured, u: [f64; 3]| {
         let mut c = m.covariance;
-        c[..3].iter_mut().for_each(|v| *v += (FLOOR * finest).powi(2));
+        c[..3].iter_mut().for_each(|v| *v += (SHARED * finest).powi(2));
         inverse(&c).map_or(0.0, |i| quadratic(&i, std::array::from_fn(|a| m.displacement[a] - u[a])))
     };
     let excess = |_, motion: &AffineMotion| {
