@@ -8,7 +8,7 @@ use super::outputs::{FIELD_FILES, Measured, Target, write_field};
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::error::UnknownName;
-use palpate::types::params::Preset;
+use palpate::types::params::{Method, Preset};
 use palpate::types::{FieldParams, FieldSummary, names};
 use palpate::{io, pipeline};
 use std::path::{Path, PathBuf};
@@ -38,6 +38,9 @@ pub struct Tuning {
     /// Time against error: fast, balanced or accurate [default: balanced]
     #[arg(long, value_parser = preset, conflicts_with = "config")]
     preset: Option<Preset>,
+    /// What makes the field: full (all voxels) or sparse (matches alone, as in the source) [default: full]
+    #[arg(long, value_parser = method)]
+    method: Option<Method>,
     /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
     #[arg(long, value_name = "N")]
     points: Option<usize>,
@@ -58,6 +61,7 @@ impl Tuning {
         let mut out = Vec::new();
         out.extend(self.config.iter().flat_map(|c| ["--config".into(), c.display().to_string()]));
         out.extend(self.preset.iter().flat_map(|p| ["--preset".into(), preset_name(*p)]));
+        out.extend(self.method.iter().flat_map(|m| ["--method".into(), method_name(*m)]));
         out.extend(self.seed.iter().flat_map(|s| ["--seed".into(), s.to_string()]));
         out.extend(self.points.iter().flat_map(|p| ["--points".into(), p.to_string()]));
         out.extend(self.search.iter().flat_map(|s| ["--search".into(), s.to_string()]));
@@ -75,6 +79,7 @@ impl Tuning {
             Some(file) => io::read_config(file)?,
             None => FieldParams::preset(self.preset.unwrap_or_default()),
         };
+        params.method = self.method.unwrap_or(params.method);
         params.seed = self.seed.unwrap_or(params.seed);
         params.points = self.points.unwrap_or(params.points);
         params.search_mm = self.search.unwrap_or(params.search_mm);
@@ -92,6 +97,16 @@ fn preset_name(preset: Preset) -> String {
 
 fn preset(name: &str) -> Result<Preset, UnknownName> {
     names::choose("preset", name, &PRESETS)
+}
+
+const METHODS: [(&str, Method); 2] = [("full", Method::Full), ("sparse", Method::Sparse)];
+
+fn method_name(method: Method) -> String {
+    METHODS.iter().find(|m| m.1 == method).map_or_else(String::new, |m| m.0.into())
+}
+
+fn method(name: &str) -> Result<Method, UnknownName> {
+    names::choose("method", name, &METHODS)
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {

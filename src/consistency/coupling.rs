@@ -160,12 +160,25 @@ fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
 /// axis alone a few dozen matches tell too little. Where nothing bends, the evidence asks for ever more of it, up to what single
 /// precision bears.
 pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], rounds: usize) -> (Vec<f32>, f32) {
+    fit_from(lattice, smoothness, evidence, None, rounds)
+}
+
+/// As [`fit`], from coefficients (mm, planar) and a weight (per lattice cell) that are nearly right: a few rounds of few iterations
+/// then suffice, the scale of `rho` starts low enough to end at 3 standard deviations, and `lambda` is set once.
+pub fn fit_from(
+    lattice: &Lattice,
+    smoothness: &Smoothness,
+    evidence: &[Evidence],
+    start: Option<(&[f32], f32)>,
+    rounds: usize,
+) -> (Vec<f32>, f32) {
     let n = lattice.len();
-    let mut c = vec![0.0f32; 3 * n];
     let most = borne(smoothness, evidence);
     // A first guess of lambda: second derivatives of 0.01 / mm.
-    let mut lambda = most.min(1e4);
-    let mut scale = 400.0;
+    let (mut c, mut lambda, mut scale) = match start {
+        Some((c, lambda)) => (c.to_vec(), lambda.clamp(1e-2, most), 9.0 * f64::from(1u32 << rounds.clamp(1, 8)) / 2.0),
+        None => (vec![0.0f32; 3 * n], most.min(1e4), 400.0),
+    };
     let stencils: Vec<Stencil> = evidence.iter().map(|e| lattice.stencil_near(e.at)).collect();
     let mut probe = Probe::new(n, 0);
     for round in 0..rounds {
@@ -176,7 +189,7 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
             .map(|e| {
                 let u = lattice.at(&c, e.at);
                 let q = quadratic(&e.information, std::array::from_fn(|a| u[a] - e.displacement[a]));
-                if round == 0 { 1.0 } else { (scale / (scale + q)).powi(2) }
+                if round == 0 && start.is_none() { 1.0 } else { (scale / (scale + q)).powi(2) }
             })
             .collect();
         for (e, w) in evidence.iter().zip(&weights) {
@@ -209,17 +222,22 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
             });
         };
         // Early rounds only sort the evidence; the last two settle the field.
-        let (tolerance, limit) = if round + 2 < rounds { (3e-2, 15) } else { (1e-2, 60) };
+        let early = start.is_some() || round + 2 < rounds;
+        let (tolerance, limit) = if early { (3e-2, 15) } else { (1e-2, 60) };
         let blocks = Blocks::from(&blocks[..]);
         let weights = vec![lambda; 3 * n];
         let matrix = Coupled::new(smoothness, &weights, &blocks, true);
         matrix.solve_with(operator, rhs, &mut c, tolerance, limit);
+        scale = (scale * 0.5f64).max(9.0);
+        // A weight that is nearly right is set once.
+        if start.is_some() && round + 1 < rounds {
+            continue;
+        }
         let gamma = total(&probe.determined(&matrix, if round < 2 { 30 } else { 15 }));
         let [gamma, energy] = [gamma, smoothness.energy(&c)].map(|v| v.iter().sum::<f64>());
         // Half way on the logarithm: whole steps swing to and fro.
         let target = (lambda * (0.5 * gamma.max(1.0) / energy.max(1e-9)) as f32).sqrt();
         lambda = target.clamp(lambda / 10.0, lambda * 10.0).clamp(1e-2, most);
-        scale = (scale * 0.5f64).max(9.0);
     }
     (c, lambda)
 }

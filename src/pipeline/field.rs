@@ -22,10 +22,11 @@ use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
 use crate::pipeline::rest::{Places, Rest, Tried};
+use crate::pipeline::sparse;
 use crate::pipeline::start::Begun;
 pub use crate::pipeline::start::Start;
 use crate::pipeline::whole::{self, Whole};
-use crate::types::params::Interpolation;
+use crate::types::params::{Interpolation, Method};
 use crate::types::*;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -78,11 +79,16 @@ impl FieldResult {
 pub(super) const FEWEST: usize = 20;
 
 /// Stage names and their wall seconds.
-struct Clock(Vec<(String, f64)>, Instant);
+pub(super) struct Clock(pub(super) Vec<(String, f64)>, Instant);
 
 impl Clock {
+    /// Nothing booked yet.
+    pub(super) fn start() -> Self {
+        Self(Vec::new(), Instant::now())
+    }
+
     /// Books the time since the last call to `stage`.
-    fn book(&mut self, stage: &str) {
+    pub(super) fn book(&mut self, stage: &str) {
         let seconds = self.1.elapsed().as_secs_f64();
         self.1 = Instant::now();
         self.add(stage, seconds);
@@ -195,8 +201,11 @@ fn canonical(
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
     params.check()?;
+    if params.method == Method::Sparse {
+        return sparse::measure(initial, deformed, mask, params, progress);
+    }
     progress("pyramid", 0.0);
-    let mut clock = Clock(Vec::new(), Instant::now());
+    let mut clock = Clock::start();
     let given = mask.is_some();
     let [initial, deformed] = match ablation::is_on("robust-range") {
         true => [initial, deformed].map(check::tamed),
@@ -554,7 +563,7 @@ fn in_doubt(counts: Counts) -> String {
     )
 }
 
-fn too_few(found: usize, search: f64) -> FieldError {
+pub(super) fn too_few(found: usize, search: f64) -> FieldError {
     let hint = format!("widen --search (now {search:.0} mm), check the mask, or check that both show the same tissue");
     FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
 }
@@ -592,7 +601,12 @@ fn smallest(
 }
 
 /// The chosen motion on a lattice over the full-resolution grid.
-fn full_lattice(grid: &Grid, field: &SplineField, factor: [usize; 3], choice: &Choice) -> (Lattice, Vec<f32>) {
+pub(super) fn full_lattice(
+    grid: &Grid,
+    field: &SplineField,
+    factor: [usize; 3],
+    choice: &Choice,
+) -> (Lattice, Vec<f32>) {
     let step = std::array::from_fn(|a| field.lattice.step[a] * factor[a]);
     let lattice = Lattice::new(grid.shape(), step);
     let spacing = grid.spacing();
@@ -645,7 +659,7 @@ fn beside(sliding: &Sliding, grid: &Grid, level: [usize; 3], factor: [usize; 3])
 }
 
 /// A level's match in world mm (RAS).
-fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
+pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
     let axes = spline::axes(grid);
     let [xx, yy, zz, xy, xz, yz] = m.measured.covariance;
     let c = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
@@ -662,7 +676,7 @@ fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
 }
 
 /// The Delaunay mesh of the kept matches, and the kept match of each node.
-fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
+pub(super) fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
     let places: Vec<WorldPoint> = sparse.kept().map(|m| m.initial).collect();
     if !flat {
         match delaunay3(&places) {
@@ -676,7 +690,7 @@ fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), Fie
 }
 
 /// The field as asked for: `smooth`, or from the mesh inside it.
-fn interpolated(
+pub(super) fn interpolated(
     interpolation: Interpolation,
     smooth: DenseField,
     (mesh, nodes): (&Mesh, &[[f64; 3]]),
@@ -721,13 +735,13 @@ const HIDDEN: f64 = 0.015;
 const EXTRAPOLATED: f32 = 3.0;
 
 /// Of each node of a lattice over the initial volume, whether the deformed volume does not show what is there.
-fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
+pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
     (0..lattice.len()).into_par_iter().map(|m| !level::sees(pair, field, lattice.within(m))).collect()
 }
 
 /// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match shows ([`HIDDEN`]), what is not in view
 /// ([`hidden`]), and what is in doubt beside `jumps` (voxel, mm).
-fn uncertainty(
+pub(super) fn uncertainty(
     grid: &Grid,
     spacing: [f64; 3],
     (coarse, mut deviation): (Lattice, Vec<f32>),
@@ -768,7 +782,7 @@ fn some_of(mask: &Mask) -> impl Iterator<Item = usize> {
 }
 
 /// Median and mean over the mask, from at most about 25,000 of its voxels.
-fn average_inside(values: &ScalarSpline, mask: &Mask) -> (f64, f64) {
+pub(super) fn average_inside(values: &ScalarSpline, mask: &Mask) -> (f64, f64) {
     let mut picked: Vec<f32> = some_of(mask).map(|at| values.at(at)).collect();
     let mean = picked.iter().map(|&v| f64::from(v)).sum::<f64>() / picked.len().max(1) as f64;
     (f64::from(median(&mut picked)), mean)
@@ -785,7 +799,7 @@ fn most_move(field: &DenseField, mask: &Mask) -> f64 {
 }
 
 /// Mean and largest length over the mask (mm), and its voxels.
-fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
+pub(super) fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
     let nx = field.grid().shape()[0];
     let [x, y, z] = [0, 1, 2].map(|c| field.component(c));
     let rows: Vec<(f64, f32, usize)> = mask
@@ -818,7 +832,7 @@ const NEARLY: f64 = 0.95;
 /// Says so where the field is expected to be off by about half of the motion or a voxel, or more: beyond that it is of
 /// little use (docs/failures.md shows how often this is right). A free field's own length holds its errors, as squares; under a
 /// smaller model that much bending would not have shown, and where nothing is seen to move a voxel alone counts.
-fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
+pub(super) fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
     let edge = pyramid::finest(grid.shape(), grid.spacing());
     let expected = LENGTH * sigma;
     let motion = match model {
@@ -845,7 +859,7 @@ fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<Str
 const PLAIN: f64 = 0.1;
 
 /// Says so where much of the tissue shows nothing that could be seen to move.
-fn without_texture(share: f64) -> Option<String> {
+pub(super) fn without_texture(share: f64) -> Option<String> {
     (share > PLAIN).then(|| {
         format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: there the field is carried in from around, smooth, \
@@ -859,7 +873,7 @@ fn without_texture(share: f64) -> Option<String> {
 const OUT_OF_VIEW: f64 = 0.05;
 
 /// Says so where much of the tissue is not in the deformed volume.
-fn out_of_view(share: f64) -> Option<String> {
+pub(super) fn out_of_view(share: f64) -> Option<String> {
     (share > OUT_OF_VIEW).then(|| {
         format!(
             "{:.0} % of the tissue moves out of the deformed volume, or to where that shows nothing (not finite, or cut off): there the field is carried over from \
@@ -870,7 +884,7 @@ fn out_of_view(share: f64) -> Option<String> {
 }
 
 /// What a user should know.
-fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max_mm: f64, search: f64) -> Vec<String> {
+pub(super) fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max_mm: f64, search: f64) -> Vec<String> {
     let mut out = Vec::new();
     for (count, volume) in not_finite.into_iter().zip(["initial", "deformed"]) {
         if count > 0 {

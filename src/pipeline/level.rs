@@ -60,7 +60,7 @@ pub fn is_better(pair: &Pair<'_>, a: &SplineField, b: &SplineField) -> bool {
 }
 
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
-fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
+pub(super) fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
     (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] as f64 * spacing[a]).product()
 }
 
@@ -412,13 +412,7 @@ pub fn matches(
     };
 
     // Sub-voxel position and covariance of each choice.
-    let template = Template {
-        data: &pair.fixed_smooth,
-        shape: pair.shape,
-        spacing,
-        radius,
-        noise: f64::from(noise) * f64::from(independent(pair)).sqrt(),
-    };
+    let template = template(pair, radius);
     let refined: Vec<Option<(usize, [f64; 3], Refined)>> = (0..initial.len())
         .into_par_iter()
         .map(|i| {
@@ -492,6 +486,40 @@ pub fn matches(
     (matches, fitted, report)
 }
 
+/// Least-squares matching alone, about a field that has each place within two voxels: what is left there is measured in the deformed
+/// volume warped by it. One match a place (voxels) that has one, none rejected yet.
+pub(super) fn follow(
+    pair: &Pair<'_>,
+    known: &SplineField,
+    places: impl IntoParallelIterator<Item = [f64; 3], Iter: IndexedParallelIterator>,
+    patch: usize,
+) -> Vec<LevelMatch> {
+    let radius = pair.in_voxels(patch);
+    let warped = pair.warp(&known.lattice, &known.coefficients, &pair.spans.grown(radius[0] + 3));
+    let template = template(pair, radius);
+    let measure = |voxel: [f64; 3]| {
+        let centre = std::array::from_fn(|a| (voxel[a].round().max(0.0) as usize).min(pair.shape[a] - 1));
+        let place = |o: [f32; 3]| std::array::from_fn(|a| centre[a] as f32 + o[a]);
+        let patch = |shift, out: &mut [f32]| trilinear_patch(&warped, pair.shape, place(shift), radius, out);
+        let found = lsm::refine(&template, centre, patch, 3, 2.0)?;
+        let field = known.lattice.at(&known.coefficients, voxel);
+        let measured = Measured {
+            place: std::array::from_fn(|a| voxel[a] * pair.spacing[a]),
+            displacement: std::array::from_fn(|a| field[a] + found.shift[a]),
+            covariance: found.covariance,
+            field,
+        };
+        Some(LevelMatch { voxel, measured, ncc: found.ncc, kept: true })
+    };
+    places.into_par_iter().map(measure).collect::<Vec<_>>().into_iter().flatten().collect()
+}
+
+/// The initial volume's side of the least-squares matching on a level.
+fn template<'a>(pair: &'a Pair<'_>, radius: [usize; 3]) -> Template<'a> {
+    let noise = f64::from(pair.noise) * f64::from(independent(pair)).sqrt();
+    Template { data: &pair.fixed_smooth, shape: pair.shape, spacing: pair.spacing, radius, noise }
+}
+
 /// The field that matches suggest once the deformed volume is warped by `field`: where that one is right their patches are
 /// no longer sheared, and where it is wrong what is missing has neighbours that are in place.
 pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) -> (Option<SplineField>, LevelReport) {
@@ -517,12 +545,12 @@ pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) 
 }
 
 /// 99.9 % point of chi-square with 3 degrees of freedom.
-const GATE: f64 = 16.27;
+pub(super) const GATE: f64 = 16.27;
 
 /// Scales all covariances so that the kept matches scatter about the coupled field as they say: by the median squared
 /// Mahalanobis distance over chi-square's median, 2.366. Noise alone does not tell what interpolation, strain inside
 /// a patch and contrast changes add.
-fn calibrate(measured: &mut [Measured], kept: &[bool]) {
+pub(super) fn calibrate(measured: &mut [Measured], kept: &[bool]) {
     let mut q: Vec<f32> = measured
         .iter()
         .zip(kept)
@@ -585,9 +613,12 @@ fn corners(
 /// Rounds of the robust fit: its scale has then fallen to 3 standard deviations.
 const ROUNDS: usize = 7;
 
+/// The same from a field that is nearly right.
+const AGAIN: usize = 3;
+
 /// How much stiffer the residual passes start than the matches alone suggest; the evidence takes over after two passes.
 /// A loose start follows false residuals where texture is weak: measured on a thigh, errors a fifth larger.
-const STIFF: f64 = 30.0;
+pub(super) const STIFF: f32 = 30.0;
 
 /// Voxels between the nodes that matches alone are coupled on: about as far apart as they lie. Over 37 pairs 3, 4, 5 and 6 left the
 /// same error to 0.1 %, and 6 takes an eighth of the nodes of 3.
@@ -600,28 +631,49 @@ fn fit(
     refined: &[(usize, [f64; 3], Refined)],
     radius: &[usize; 3],
 ) -> SplineField {
+    let measured =
+        refined.iter().map(|(i, start, r)| (starts[*i], std::array::from_fn(|a| start[a] + r.shift[a]), r.covariance));
+    let mut field = couple(pair, measured, (radius, 0.3), None).0;
+    field.smoothness.iter_mut().for_each(|s| *s *= STIFF);
+    field
+}
+
+/// Couples displacements measured on a level (place in voxels, displacement in mm, covariance in mm^2) into a spline field, from one
+/// that is nearly right and on its lattice where there is one; with the evidence used. Each may be off by `floor` voxels beyond its
+/// covariance, and was found with a patch of `radius` voxels.
+pub(super) fn couple(
+    pair: &Pair<'_>,
+    measured: impl ExactSizeIterator<Item = ([f64; 3], [f64; 3], Symmetric3)>,
+    (radius, floor): (&[usize; 3], f64),
+    known: Option<&SplineField>,
+) -> (SplineField, Vec<Evidence>) {
     // Patches overlap: each match counts for the share of voxels that is its own.
     let inside = pair.inside.max(1) as f64;
     let patch: f64 = (0..3).filter(|&a| pair.shape[a] > 1).map(|a| (2 * radius[a] + 1) as f64).product();
-    let share = (inside / (refined.len().max(1) as f64 * patch)).min(1.0);
+    let share = (inside / (measured.len().max(1) as f64 * patch)).min(1.0);
     let finest = pyramid::finest(pair.shape, pair.spacing);
-    let evidence: Vec<Evidence> = refined
-        .iter()
-        .filter_map(|(i, start, r)| {
-            let mut c = r.covariance;
+    let evidence: Vec<Evidence> = measured
+        .map(|(at, displacement, mut c)| {
             for v in &mut c[..3] {
-                *v += (0.3 * finest).powi(2);
+                *v += (floor * finest).powi(2);
             }
-            let information = inverse(&c)?.map(|v| v * share);
-            let displacement = std::array::from_fn(|a| start[a] + r.shift[a]);
-            Some(Evidence { at: starts[*i], displacement, information })
+            // What has no inverse says nothing.
+            let information = inverse(&c).unwrap_or([0.0; 6]).map(|v| v * share);
+            Evidence { at, displacement, information }
         })
         .collect();
-    let lattice = lattice(pair, APART);
+    let lattice = known.map_or_else(|| lattice(pair, APART), |k| k.lattice.clone());
     let energy = smoothness(&lattice, pair.spacing);
-    let (coefficients, lambda) = coupling::fit(&lattice, &energy, &evidence, ROUNDS);
-    let smoothness = vec![(STIFF * f64::from(lambda) / cell_volume(&lattice, pair.spacing)) as f32; 3 * lattice.len()];
-    SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }
+    let cell = cell_volume(&lattice, pair.spacing) as f32;
+    let (coefficients, weight) = match known {
+        Some(known) => {
+            let start = (&known.coefficients[..], known.smoothness[0] * cell);
+            coupling::fit_from(&lattice, &energy, &evidence, Some(start), AGAIN)
+        }
+        None => coupling::fit(&lattice, &energy, &evidence, ROUNDS),
+    };
+    let smoothness = vec![weight / cell; 3 * lattice.len()];
+    (SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }, evidence)
 }
 
 /// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it leaves the volume.

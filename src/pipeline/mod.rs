@@ -40,5 +40,6 @@ mod modes;
 mod polish;
 mod rest;
 mod search;
+mod sparse;
 mod start;
 mod whole;

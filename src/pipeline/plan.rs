@@ -5,7 +5,8 @@ use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
-use crate::pipeline::polish;
+use crate::pipeline::{polish, sparse};
+use crate::types::params::Method;
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
 /// What [`crate::pipeline::field::run`] would choose for itself.
@@ -39,18 +40,25 @@ pub fn field(
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     Aligned::new(&clean, &deformed, &mask, search)?;
-    let finest = finest_level(&grid, &mask, params.finest);
+    let matches_alone = params.method == Method::Sparse;
+    let finest = match params.method {
+        Method::Full => finest_level(&grid, &mask, params.finest),
+        Method::Sparse => sparse::finest_level(&grid, &mask, params),
+    };
     let factors = worked_on(&grid, &mask, finest, search);
     let mask_voxels = inside(&mask);
     let last: usize = factors.last().map_or(1, |f| f.iter().product());
-    let automatic = (mask_voxels / last / params.voxels_per_point).max(200);
+    let automatic = match params.method {
+        Method::Full => (mask_voxels / last / params.voxels_per_point).max(200),
+        Method::Sparse => sparse::points(params, mask_voxels / last),
+    };
     let shape = grid.shape();
     Ok(FieldPlan {
         search_mm: search,
         mask_voxels,
         levels: factors
             .iter()
-            .chain(&polish::next_finer(&grid, finest, params))
+            .chain(&polish::next_finer(&grid, finest, params).filter(|_| !matches_alone))
             .map(|f| std::array::from_fn(|a| shape[a].div_ceil(f[a])))
             .collect(),
         points: if params.points > 0 { params.points } else { automatic },

@@ -23,7 +23,7 @@ const CLOSER_POINTS: usize = 75_000;
 const CLOSER_LEAST: usize = 190;
 
 /// Least reach of a search about a field that a search has found (the finest axis' voxels).
-const LEAST_REACH: f64 = 6.0;
+pub(super) const LEAST_REACH: f64 = 6.0;
 
 /// Bending energy up to which a better agreement on the next level is believed, in that of the field from the coarsest one. Of 19 pairs
 /// the 13 better fields had 0.46 to 1.45 of it; a slide that came out worse 1.8, heads turned by 36 degrees, which small patches do not
@@ -39,7 +39,14 @@ const IN_PLACE: f64 = 0.9;
 pub(super) const SETTLING: usize = 2;
 
 /// Fewest matches that a search may start from; it competes with stillness.
-const FEWEST: usize = 8;
+pub(super) const FEWEST: usize = 8;
+
+/// How the matches of a whole level are sought within `range` (mm), with at most `most` features; `flat` of one slice.
+pub(super) fn wide(params: &FieldParams, pair: &Pair<'_>, (range, flat): (f64, bool), most: usize) -> MatchParams {
+    let share = if flat { SHARE / 4 } else { SHARE };
+    let points = pair.inside.div_ceil(share).min(most).max(40);
+    MatchParams::new(params, points, false, range, 2, 0.3)
+}
 
 /// Passes between the searches of the next level, of those of a coarse level: the next search needs a fair field, and what it ends with is brought
 /// to the residual as often as any. Over 20 pairs, four of them legs that are searched so, 8 of 10 left 0.2 % more error (geometric mean) and took 1 % less
@@ -86,9 +93,7 @@ impl Whole<'_> {
         (passes, most): (usize, usize),
         seconds: &mut f64,
     ) -> Option<Begun> {
-        let share = if self.flat { SHARE / 4 } else { SHARE };
-        let points = pair.inside.div_ceil(share).min(most).max(40);
-        let wide = MatchParams::new(self.params, points, false, self.range, 2, 0.3);
+        let wide = wide(self.params, pair, (self.range, self.flat), most);
         let refine = |mut start, reach| {
             level::refine(pair, &mut start, (passes, reach), self.params.seed, self.tick);
             start

@@ -16,6 +16,18 @@ pub enum Preset {
     Accurate,
 }
 
+/// Which stages make the field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// Matches find the motion, the residual of all voxels makes the field.
+    #[default]
+    Full,
+    /// Matches alone: many-to-many candidates, energy-based consistency, least-squares matching and the field through
+    /// them, coarse to fine (Zhang, Hirai, Endo & Morikawa 2007).
+    Sparse,
+}
+
 /// How the dense field is made from the measured places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -32,6 +44,8 @@ pub enum Interpolation {
 pub struct FieldParams {
     /// Preset that the other values came from.
     pub preset: Preset,
+    /// Which stages make the field.
+    pub method: Method,
     /// Feature points wanted in the initial volume at full resolution (the deformed one gets up to five times as
     /// many, as in the source); 0 = one for each `voxels_per_point` voxels of the mask.
     pub points: usize,
@@ -73,8 +87,9 @@ impl Default for FieldParams {
 
 impl FieldParams {
     /// Names of all parameters, as files have them.
-    pub const KEYS: [&str; 14] = [
+    pub const KEYS: [&str; 15] = [
         "preset",
+        "method",
         "points",
         "voxels_per_point",
         "search_mm",
@@ -94,6 +109,7 @@ impl FieldParams {
     pub fn preset(preset: Preset) -> Self {
         let balanced = Self {
             preset,
+            method: Method::Full,
             points: 0,
             voxels_per_point: 125,
             search_mm: 0.0,

@@ -1,0 +1,338 @@
+//! The source's own chain, coarse to fine (Zhang, Hirai, Endo & Morikawa 2007): corners, many-to-many candidates, energy-based
+//! consistency, least-squares matching, the smooth field through the matches and their Delaunay mesh.
+//!
+//! Each level seeks matches about the field of the one before. It then alternates: the deformed volume is warped by the field, each
+//! match is measured again by least squares, and the field is fitted to all of them through its bending energy. The residual of all
+//! voxels is never used. Where the motion varies within a patch or between matches, that detail is lost: the full method is better there.
+
+use crate::consistency::coupling::{Evidence, Posterior};
+use crate::consistency::energy::distance;
+use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
+use crate::consistency::pruning::{Measured, prune};
+use crate::error::FieldError;
+use crate::field::jacobian;
+use crate::field::spline::FieldSpline;
+use crate::matching::levels::{Aligned, from_level, to_level};
+use crate::matching::pair::Pair;
+use crate::numerics::blocks::Blocks;
+use crate::numerics::bspline::Lattice;
+use crate::numerics::pyramid;
+use crate::numerics::small::{inverse, quadratic};
+use crate::numerics::statistics::median;
+use crate::numerics::unfold::unfold;
+use crate::pipeline::check::{self, Checked};
+use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
+use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::{background, whole};
+use crate::types::*;
+use rayon::prelude::*;
+
+/// Searches of the coarsest level about the warped volume, at most.
+const AGAIN: usize = 2;
+
+/// Share of the features that agree with their neighbours from which the coarsest level is not searched again.
+const AGREED: f64 = 0.75;
+
+/// Patch radius (voxels of the finest axis). Five pairs (heads and calves, 3 to 16 mm): 3 leaves 7 % more error, at more time.
+const PATCH: usize = 2;
+
+/// Voxels of the finest axis between lattice nodes. The same five pairs: 4 and 6 leave 2 % less and 10 % more error.
+const APART: usize = 5;
+
+/// What a match may be off beyond its covariance (voxels). The same five pairs: 0.05 leaves 2 % more error, 0.3 a third more.
+const FLOOR: f64 = 0.02;
+
+/// Strain that neighbours may show against the field of the level before (1).
+const STRAIN: f64 = 0.1;
+
+/// Reach of the search about the field of the level before (voxels of the finest axis), on coarser levels and on the finest. The
+/// same five pairs: 2 on the finest leaves 1 % less error.
+const REACH: [f64; 2] = [2.0, 1.0];
+
+/// Rounds of warping, least-squares matching and fitting, on coarser levels and on the finest. The same five pairs: 1 and 5 on the
+/// finest leave 13 % more and 2 % less error.
+const ROUNDS: [usize; 2] = [2, 3];
+
+/// What neighbouring matches may be off together (voxels), when a simpler motion is asked for: a block at rest whose brightness
+/// differs by 15 % across the volume passed for an affine motion without it.
+const SHARED: f64 = 0.1;
+
+/// Voxels of tissue for each point on coarser levels. The same five pairs: 12 and 48 leave the same error.
+const COARSE_ROOM: usize = 24;
+
+/// Points on the finest level, for each one of the full method, which needs them only to begin. The same five pairs: half as many
+/// leave 40 % more error, twice as many the same.
+const MORE: f64 = 2.5;
+
+/// Voxels of tissue that each point asked for needs at least: with less the next finer level is worked on.
+const ROOM: usize = 24;
+
+/// Least volume that tissue keeps (1); below it the field is smoothed.
+const LEAST_VOLUME: f32 = 0.1;
+
+/// The finest level worked on: the coarsest with room for the points asked for, or the one with at most 600,000 voxels of tissue.
+pub(super) fn finest_level(grid: &Grid, mask: &Mask, params: &FieldParams) -> usize {
+    let automatic = field::finest_level(grid, mask, 0).max(params.finest);
+    let tissue = field::inside(mask);
+    let room = |f: usize| {
+        let factor = field::worked_on(grid, mask, f, 0.0);
+        tissue / factor.last().map_or(1, |f| f.iter().product::<usize>()) >= ROOM * params.points
+    };
+    [8, 4, 2, 1]
+        .into_iter()
+        .filter(|&f| f <= automatic && f >= params.finest)
+        .find(|&f| room(f))
+        .unwrap_or(params.finest.max(1))
+}
+
+/// Points wanted on a finest level with so many voxels of tissue.
+pub(super) fn points(params: &FieldParams, inside: usize) -> usize {
+    match params.points {
+        0 => ((MORE * inside as f64 / params.voxels_per_point as f64) as usize).max(200),
+        asked => asked,
+    }
+}
+
+/// What one level found.
+struct Found {
+    /// Fitted to the matches, with the information that the kept ones give at each node.
+    field: SplineField,
+    matches: Vec<LevelMatch>,
+    report: LevelReport,
+}
+
+/// Measures the displacement of two volumes whose axes run right, anterior and superior, by matches alone.
+///
+/// # Errors
+/// As [`field::run`].
+pub(super) fn measure(
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
+    mask: Option<&Mask>,
+    params: &FieldParams,
+    progress: Progress<'_>,
+) -> Result<FieldResult, FieldError> {
+    progress("pyramid", 0.0);
+    let mut clock = Clock::start();
+    let [initial, deformed] = [initial, deformed].map(check::tamed);
+    let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
+        check::inputs(&initial, &deformed, mask)?;
+    let grid = *initial.grid();
+    let flat = grid.is_single_slice();
+    let search = field::search_mm(&grid, params.search_mm);
+    let aligned = Aligned::new(&clean, &seen, &mask, search)?;
+    let factors = field::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
+
+    // Coarse to fine.
+    let mut reports = Vec::new();
+    let mut state: Option<(Found, Pair<'_>, [usize; 3])> = None;
+    for (l, &factor) in factors.iter().enumerate() {
+        let pair = aligned.level(factor);
+        clock.book("pyramid");
+        progress("matching", 0.9 * l as f64 / factors.len() as f64);
+        let lattice = level::lattice(&pair, APART);
+        let begun = match &state {
+            None => coarsest(&pair, lattice, params, (search, flat)),
+            Some((found, _, from)) => level::carry(&found.field, lattice, |p| to_level(from_level(p, factor), *from)),
+        };
+        let found = on_level(&pair, begun, l + 1 == factors.len(), params);
+        reports.push(found.report.clone());
+        state = Some((found, pair, factor));
+        clock.book("matching");
+    }
+    let Some((Found { mut field, matches, .. }, pair, factor)) = state else { return Err(field::too_few(0, search)) };
+    let kept = matches.iter().filter(|m| m.kept).count();
+    if kept < FEWEST {
+        return Err(field::too_few(kept, search));
+    }
+
+    // The smallest motion that explains the matches, and what they leave open.
+    progress("model", 0.9);
+    let mut choice = smallest(&matches, &pair, &field, params.seed);
+    choice.evidence.insert(0, MADE_BY.into());
+    choice.evidence.extend(background::why_unseen(cut));
+    let corners = reports.last().map_or(0, |r| r.counts.features_initial);
+    choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
+    let unseen = level::unseen(&pair, &field);
+    clock.book("model");
+    let (coarse, Posterior { deviation, .. }) = level::posterior(&field, pair.spacing, params.seed);
+    let hidden = field::hidden(&pair, &field, &coarse);
+    clock.book("uncertainty");
+
+    progress("mesh", 0.92);
+    let sparse = SparseField { matches: matches.iter().map(|m| field::world_match(&grid, m, factor)).collect() };
+    let (mesh, source) = field::triangulate(&sparse, flat)?;
+    let at_nodes: Vec<&Match> = sparse.kept().collect();
+    let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
+    clock.book("mesh");
+    let coefficients = FieldSpline::new(grid, field::full_lattice(&grid, &field, factor, &choice), Vec::new());
+    let displacement = field::interpolated(params.interpolation, coefficients.dense()?, (&mesh, &node_displacement))?;
+    clock.book("interpolation");
+    let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
+    let folds = jacobian::count_folds(&displacement, Some(&mask))?;
+    clock.book("jacobian");
+    let uncertainty = field::uncertainty(&grid, pair.spacing, (coarse, deviation), &hidden, Vec::new());
+    let (uncertainty_median_mm, uncertainty_mean_mm) = field::average_inside(&uncertainty, &mask);
+    clock.book("uncertainty");
+
+    let mut counts = reports.last().map(|r| r.counts).unwrap_or_default();
+    (counts.nodes, counts.tetrahedra) = match &mesh {
+        Mesh::Tetrahedra(m) => (m.nodes().len(), m.tetrahedra().len()),
+        Mesh::Triangles(m) => (m.nodes().len(), m.triangles().len()),
+    };
+    if let Some(report) = reports.last_mut() {
+        report.counts = counts;
+    }
+    let summary = FieldSummary {
+        counts,
+        model: choice.model,
+        evidence: choice.evidence,
+        levels: reports,
+        folds,
+        mask_voxels,
+        mean_mm,
+        max_mm,
+        uncertainty_median_mm,
+        unseen,
+        in_doubt: false,
+        seconds: clock.0,
+        warnings: field::warnings(counts, folds, not_finite, max_mm, search)
+            .into_iter()
+            .chain(check::said_of(&lost))
+            .chain(check::squeezed(&displacement, &mask))
+            .chain(field::vague(choice.model, uncertainty_mean_mm, mean_mm, &grid))
+            .chain(field::without_texture(pair.plain()))
+            .chain(field::out_of_view(unseen))
+            .collect(),
+    };
+    progress("done", 1.0);
+    // A search that starts from the field needs no information at its nodes.
+    field.blocks = Blocks::default();
+    Ok(FieldResult {
+        displacement,
+        coefficients,
+        spline: Start { field, factor, searched: None },
+        uncertainty,
+        matches: sparse,
+        mesh,
+        node_displacement,
+        summary,
+    })
+}
+
+/// What the summary says first.
+const MADE_BY: &str =
+    "field: fitted to the matches of features alone (--method sparse); the other voxels were not used";
+
+/// Where the number of points comes from.
+fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
+    let source = match params.points {
+        0 => format!("{MORE} for {} voxels of tissue", params.voxels_per_point),
+        _ => "as asked".into(),
+    };
+    let limit = if found < wanted { "; no more corners stand out of the noise" } else { "" };
+    format!("points: {found} of {wanted} wanted, {source}{limit}")
+}
+
+/// The motion by a search of the whole coarsest level, on `lattice`; searched again about the warped volume where few features agree.
+fn coarsest(pair: &Pair<'_>, lattice: Lattice, params: &FieldParams, (range, flat): (f64, bool)) -> SplineField {
+    let wide = whole::wide(params, pair, (range, flat), whole::POINTS);
+    let (_, fitted, mut report) = level::matches(pair, None, wide);
+    let enough = |report: &LevelReport| report.counts.kept >= whole::FEWEST;
+    let Some(mut field) = fitted.filter(|_| enough(&report)) else { return SplineField::still(lattice) };
+    let nearest = (whole::LEAST_REACH * pyramid::finest(pair.shape, pair.spacing)).min(range);
+    let mut reach_mm = range;
+    for _ in 0..AGAIN {
+        if report.counts.kept_share() >= AGREED {
+            break;
+        }
+        reach_mm = (reach_mm / 2.0).max(nearest);
+        let (next, seen) = level::matches_again(pair, &field, MatchParams { reach_mm, ..wide });
+        let Some(next) = next.filter(|_| enough(&seen) && seen.counts.kept > report.counts.kept) else { break };
+        (field, report) = (next, seen);
+    }
+    let mut field = level::carry(&field, lattice, |p| p);
+    field.smoothness.iter_mut().for_each(|s| *s /= level::STIFF);
+    field
+}
+
+/// What a level finds about the field it begins with.
+fn on_level(pair: &Pair<'_>, begun: SplineField, last: bool, params: &FieldParams) -> Found {
+    let which = usize::from(last);
+    let wanted = if last { points(params, pair.inside) } else { (pair.inside / COARSE_ROOM).max(200) };
+    let near = MatchParams {
+        reach_mm: REACH[which] * pyramid::finest(pair.shape, pair.spacing),
+        strain: STRAIN,
+        patch: PATCH,
+        ..MatchParams::near(params, pair, wanted, last && params.points > 0)
+    };
+    let (matches, _, report) = level::matches(pair, Some(&begun), near);
+    let places: Vec<[f64; 3]> = matches.iter().map(|m| m.voxel).collect();
+    let mut found = coupled(pair, &begun, (matches, report), params);
+    // Comparisons without sub-voxel matching have no use for it.
+    let rounds = if params.sub_voxel { ROUNDS[which] } else { 0 };
+    for _ in 0..rounds {
+        let matches = level::follow(pair, &found.field, places.par_iter().copied(), PATCH);
+        found = coupled(pair, &found.field, (matches, found.report), params);
+    }
+    found
+}
+
+/// The smooth field through matches, from one that is nearly right, and which of them agree with it and with their neighbours.
+fn coupled(
+    pair: &Pair<'_>,
+    known: &SplineField,
+    (mut matches, mut report): (Vec<LevelMatch>, LevelReport),
+    params: &FieldParams,
+) -> Found {
+    let radius = pair.in_voxels(PATCH);
+    let measured = matches.iter().map(|m| (m.voxel, m.measured.displacement, m.measured.covariance));
+    let (mut field, evidence) = level::couple(pair, measured, (&radius, FLOOR), Some(known));
+    unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
+    let at = |m: &LevelMatch| field.lattice.at(&field.coefficients, m.voxel);
+    let mut measured: Vec<Measured> = matches.iter().map(|m| Measured { field: at(m), ..m.measured }).collect();
+    let kept = match params.consistency {
+        true => prune(&measured, 0.2 * pyramid::finest(pair.shape, pair.spacing), level::GATE),
+        false => vec![true; measured.len()],
+    };
+    level::calibrate(&mut measured, &kept);
+    for ((m, measured), kept) in matches.iter_mut().zip(measured).zip(kept) {
+        (m.measured, m.kept) = (measured, kept);
+    }
+    let kept = || matches.iter().filter(|m| m.kept);
+    let mut apart: Vec<f32> = kept().map(|m| distance(m.measured.displacement, m.measured.field) as f32).collect();
+    report.counts.kept = apart.len();
+    report.residual_mm = if apart.is_empty() { 0.0 } else { f64::from(median(&mut apart)) };
+    let kept = evidence.iter().zip(&matches).filter(|(_, m)| m.kept).map(|(e, _)| e);
+    informed(&mut field, kept);
+    Found { field, matches, report }
+}
+
+/// Sets the information that the evidence gives at each node (1/mm^2), of which the posterior is made.
+fn informed<'a>(field: &mut SplineField, evidence: impl Iterator<Item = &'a Evidence>) {
+    let mut blocks = vec![[0.0f32; 6]; field.lattice.len()];
+    for e in evidence {
+        field.lattice.for_each_tap(e.at, |node, weight| {
+            for (b, i) in blocks[node].iter_mut().zip(e.information) {
+                *b += weight * i as f32;
+            }
+        });
+    }
+    field.blocks = Blocks::from(&blocks[..]);
+}
+
+/// What the matches alone say against a map: squared distances from it in standard deviations, less those from the field.
+fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: u64) -> Choice {
+    let measured: Vec<Measured> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
+    let finest = pyramid::finest(pair.shape, pair.spacing);
+    let off = |m: &Measured, u: [f64; 3]| {
+        let mut c = m.covariance;
+        c[..3].iter_mut().for_each(|v| *v += (SHARED * finest).powi(2));
+        inverse(&c).map_or(0.0, |i| quadratic(&i, std::array::from_fn(|a| m.displacement[a] - u[a])))
+    };
+    let excess = |_, motion: &AffineMotion| {
+        let total = measured.iter().map(|m| off(m, motion.displacement(m.place)) - off(m, m.field)).sum();
+        Excess { total, worst: 0.0 }
+    };
+    choose(&measured, excess, level::determined(pair, field, seed), 0.02 * finest)
+}
