@@ -303,10 +303,10 @@ fn the_smoothness_matrix_is_that_of_the_energy() {
         let top = exact.iter().flatten().fold(0.0f64, |m, v| m.max(v.abs()));
         let fast = dense(n, |x| {
             let mut out = vec![f32::NAN; n];
-            smoothness.apply(x, &mut out);
+            smoothness.apply(&vec![1.0; n], x, &mut out);
             out
         });
-        let diagonal = smoothness.diagonal();
+        let diagonal = smoothness.diagonal(&vec![1.0; n]);
         for r in 0..n {
             for c in 0..n {
                 assert!((fast[r][c] - exact[r][c]).abs() < 1e-6 * top, "{nodes:?} ({r}, {c})");
@@ -324,6 +324,43 @@ fn the_smoothness_matrix_is_that_of_the_energy() {
             }
         }
     }
+}
+
+/// Weights that differ from node to node stand on the differences about each node: the matrix is that of the weighted density.
+#[test]
+fn weights_by_place_make_the_matrix_of_the_weighted_density() {
+    for (nodes, h) in SMOOTHNESSES {
+        let smoothness = Smoothness::new(nodes, h);
+        let n: usize = nodes.iter().product();
+        let weight: Vec<f32> = normals(n, 31).iter().map(|v| 0.1 + v * v).collect();
+        let diagonal = smoothness.diagonal(&weight);
+        for seed in 0..5 {
+            let (x, y) = (normals(n, seed), normals(n, 50 + seed));
+            let (mut wx, mut wy) = (vec![f32::NAN; n], vec![f32::NAN; n]);
+            smoothness.apply(&weight, &x, &mut wx);
+            smoothness.apply(&weight, &y, &mut wy);
+            let dot = |a: &[f32], b: &[f32]| f64s(a).zip(f64s(b)).map(|(a, b)| a * b).sum::<f64>();
+            let density: f64 = f64s(&smoothness.density(&x)).zip(f64s(&weight)).map(|(e, w)| e * w).sum();
+            let size = density.max(1e-3);
+            assert!((dot(&x, &wx) - density).abs() < 1e-4 * size, "{nodes:?}: {} is not {density}", dot(&x, &wx));
+            assert!((dot(&y, &wx) - dot(&x, &wy)).abs() < 1e-3 * size, "{nodes:?}: not symmetric");
+        }
+        for i in 0..n {
+            let (unit, mut out): (Vec<f32>, _) = ((0..n).map(|j| f32::from(u8::from(i == j))).collect(), vec![0.0; n]);
+            smoothness.apply(&weight, &unit, &mut out);
+            assert!(
+                (out[i] - diagonal[i]).abs() <= 1e-5 * diagonal[i].abs(),
+                "{nodes:?}: {} is not {}",
+                diagonal[i],
+                out[i]
+            );
+        }
+    }
+}
+
+/// One weight a component, at every node.
+fn even(lambda: [f32; 3], n: usize) -> Vec<f32> {
+    lambda.iter().flat_map(|l| vec![*l; n]).collect()
 }
 
 #[test]
@@ -379,10 +416,11 @@ fn solving_gives_the_dense_solution() {
     let exact: Vec<f64> = inverse.iter().map(|row| row.iter().zip(f64s(&b)).map(|(a, b)| a * b).sum()).collect();
     let top = exact.iter().fold(0.0f64, |m, v| m.max(v.abs()));
     let planar = Blocks::from(&blocks[..]);
+    let weights = even(lambda, n);
     let run = || {
         let mut x = vec![0.0f32; 3 * n];
         let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
-        let matrix = Coupled::new(&smoothness, lambda, &planar, true);
+        let matrix = Coupled::new(&smoothness, &weights, &planar, true);
         let report = matrix.solve_with(data, b.clone(), &mut x, 1e-7, 500);
         (x, report)
     };
@@ -394,7 +432,7 @@ fn solving_gives_the_dense_solution() {
     assert_eq!(with_threads(1, run), with_threads(3, run));
 
     let mut x = vec![0.0f32; 3 * n];
-    let report = Coupled::new(&smoothness, lambda, &planar, false).solve(b.clone(), &mut x, 1e-7, 2000);
+    let report = Coupled::new(&smoothness, &weights, &planar, false).solve(b.clone(), &mut x, 1e-7, 2000);
     assert!(report.residual <= 1e-7, "{report:?}");
     for (i, (x, e)) in f64s(&x).zip(&exact).enumerate() {
         assert!((x - e).abs() < 1e-5 * top, "blocks alone, {i}: {x} is not {e}");
@@ -414,9 +452,10 @@ fn coarser_lattices_carry_sparse_data_in_few_iterations() {
     }
     let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
     let planar = Blocks::from(&blocks[..]);
+    let weights = even([1000.0; 3], n);
     let solved = |limit: usize, multilevel: bool| {
         let mut x = vec![0.0f32; 3 * n];
-        let matrix = Coupled::new(&smoothness, [1000.0; 3], &planar, multilevel);
+        let matrix = Coupled::new(&smoothness, &weights, &planar, multilevel);
         if multilevel {
             matrix.solve_with(data, b.clone(), &mut x, 1e-9, limit);
         } else {
@@ -460,7 +499,7 @@ fn a_solve_that_starts_at_the_solution_stays() {
     let mut x = vec![0.0f32; 48];
     let data = |x: &[f32], out: &mut [f32]| apply_blocks(&blocks, x, out);
     let planar = Blocks::from(&blocks[..]);
-    let report = Coupled::new(&smoothness, [1.0; 3], &planar, true).solve_with(data, vec![0.0; 48], &mut x, 1e-6, 50);
+    let report = Coupled::new(&smoothness, &[1.0; 48], &planar, true).solve_with(data, vec![0.0; 48], &mut x, 1e-6, 50);
     assert_eq!((report.iterations, report.residual), (0, 0.0));
     assert!(x.iter().all(|v| *v == 0.0));
 }
@@ -474,7 +513,7 @@ fn samples_scatter_with_the_matrix_of_the_energy() {
     let mut random = Random::new(11, 0);
     let mut sums = vec![vec![0.0; n]; n];
     for _ in 0..draws {
-        let v = smoothness.sample(&mut random);
+        let v = smoothness.sample(&[1.0; 18], &mut random);
         for i in 0..n {
             for j in 0..n {
                 sums[i][j] += f64::from(v[i] * v[j]) / f64::from(draws);

@@ -177,7 +177,7 @@ fn filled(mask: Vec<u8>, shape: [usize; 3]) -> Vec<u8> {
         let of_slice = |at: usize| {
             let voxel = |i: usize| at * stride[axis] + i % na * stride[a] + i / na * stride[b];
             let mut open: Vec<bool> = (0..na * nb).map(|i| mask[voxel(i)] != 0).collect();
-            let rim = |i: usize| i % na == 0 || i % na + 1 == na || i / na == 0 || i / na + 1 == nb;
+            let rim = |i: usize| i.is_multiple_of(na) || (i + 1).is_multiple_of(na) || i / na == 0 || i / na + 1 == nb;
             let mut next: Vec<usize> = (0..na * nb).filter(|&i| rim(i) && !open[i]).collect();
             next.iter().for_each(|&i| open[i] = true);
             while let Some(i) = next.pop() {

@@ -24,10 +24,9 @@ pub struct Smoothness {
 impl Smoothness {
     /// On `nodes` at distances `step_mm`.
     pub fn new(nodes: [usize; 3], step_mm: [f64; 3]) -> Self {
-        let long = |a: usize| nodes[a] >= 3;
-        let pure = |a: usize| if long(a) { step_mm[a].powi(-4) } else { 0.0 };
+        let pure = |a: usize| if nodes[a] >= 3 { step_mm[a].powi(-4) } else { 0.0 };
         let mixed = |a: usize, b: usize| {
-            if long(a) && long(b) { 2.0 / (step_mm[a] * step_mm[b]).powi(2) } else { 0.0 }
+            if nodes[a].min(nodes[b]) >= 2 { 2.0 / (step_mm[a] * step_mm[b]).powi(2) } else { 0.0 }
         };
         let scale = [pure(0), pure(1), pure(2), mixed(0, 1), mixed(0, 2), mixed(1, 2)];
         Self { nodes, step_mm, scale: scale.map(|v| v as f32) }
