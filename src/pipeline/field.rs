@@ -234,15 +234,16 @@ fn canonical(
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
         let voxel = pyramid::finest(pair.shape, pair.spacing);
-        let fixed = if ablation::is_on("node-spacing") {
-            params.node_spacing
-        } else if last {
-            4
-        } else {
-            3
-        };
+        let by_evidence = ablation::is_on("node-spacing") && !(last && params.node_spacing > 0);
         let apart = match apart_mm {
-            _ if fixed > 0 && last => fixed,
+            _ if !by_evidence && params.node_spacing > 0 => params.node_spacing,
+            _ if !by_evidence => {
+                if last {
+                    4
+                } else {
+                    3
+                }
+            }
             Some(mm) => ((mm / voxel).round() as usize).clamp(2, WIDEST),
             None if last => WIDEST,
             None => COARSEST,
@@ -253,10 +254,17 @@ fn canonical(
         let matching = || progress("matching", done(0.0));
         let whole = Whole { params, range: search, flat: grid.is_single_slice(), matching: &matching, tick: &tick };
         let mut matched = 0.0;
+        let (mut spacing, mut tried) = (apart, Vec::new());
+        let closer = |pair: &Pair<'_>, field: SplineField, reach: f64| {
+            let refine =
+                |field: &mut SplineField| level::refine(pair, field, (finer::TRIAL, reach), params.seed, |_| ());
+            if by_evidence { finer(pair, field, apart, params.seed, refine) } else { (field, apart, Vec::new()) }
+        };
         let mut field = match &state {
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
+                (field, spacing, tried) = closer(&pair, field, reach);
                 let loose = l == 1 && begun.as_ref().is_some_and(Begun::is_loose);
                 let borne_out = loose && whole.is_borne_out(&pair, &field, &mut matched);
                 if borne_out {
@@ -304,23 +312,18 @@ fn canonical(
                 begun.insert(found).field.clone()
             }
         };
+        if first {
+            (field, spacing, tried) = closer(&pair, field, reach);
+        }
         // What a coarser level saw of the brightness serves the finest one.
         let open = first || !last || light.is_unknown();
         let more = open && light.look(&mut pair, (&aligned, factor), &field);
         if more && last {
             level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
         }
-        apart_mm = Some(apart as f64 * voxel);
-        if fixed == 0 {
-            let refine =
-                |field: &mut SplineField| level::refine(&pair, field, (finer::TRIAL, reach), params.seed, |_| ());
-            let best = finer(&pair, field, apart, params.seed, refine);
-            (field, apart_mm) = (best.field, Some(best.spacing as f64 * voxel));
-            if last {
-                asked.extend(best.said);
-            }
-        }
+        apart_mm = Some(spacing as f64 * voxel);
         if last {
+            asked.extend(tried);
             [left, gain] = level::misfit(&pair, &field);
         }
         clock.skip("matching", matched);

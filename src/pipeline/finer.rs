@@ -34,49 +34,40 @@ pub(super) const SPACINGS: [usize; 7] = [10, 8, 6, 5, 4, 3, 2];
 /// Nodes at most, to bound memory.
 const NODES: usize = 4_000_000;
 
-/// A field on the lattice that was chosen.
-pub(super) struct Refined {
-    pub field: SplineField,
-    /// Voxels between its nodes.
-    pub spacing: usize,
-    /// What was tried, in words.
-    pub said: Vec<String>,
-}
-
 /// Brings the field to ever closer nodes, from `spacing`, for as long as each lattice explains more than chance for each degree of
-/// freedom that it adds. `refine` brings a field to the residual.
+/// freedom that it adds: that field, the voxels between its nodes, and what was tried, in words. `refine` brings a field to the residual.
 pub(super) fn finer(
     pair: &Pair<'_>,
     field: SplineField,
     spacing: usize,
     seed: u64,
     refine: impl Fn(&mut SplineField),
-) -> Refined {
-    let mut best = Refined { field, spacing, said: Vec::new() };
+) -> (SplineField, usize, Vec<String>) {
+    let (mut best, mut chosen, mut said) = (field, spacing, Vec::new());
     for closer in SPACINGS.into_iter().filter(|&s| s < spacing) {
         let lattice = level::lattice(pair, closer);
-        if lattice.len() > NODES || lattice == best.field.lattice {
+        if lattice.len() > NODES || lattice == best.lattice {
             break;
         }
-        let mut next = level::carry(&best.field, lattice, |p| p);
+        let mut next = level::carry(&best, lattice, |p| p);
         refine(&mut next);
-        let gain = level::gained(pair, &best.field, &next);
-        let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
+        let gain = level::gained(pair, &best, &next);
+        let [few, many] = [&best, &next].map(|f| level::determined(pair, f, seed));
         let worth = gain / (many - few).max(1.0);
         let taken = gain > 0.0 && worth > WORTH;
-        best.said.push(format!(
+        said.push(format!(
             "nodes every {closer} voxels: {}; {:.0} degrees of freedom more explain {worth:.2} of the misfit each (chance: up to {WORTH})",
             if taken { "taken" } else { "not taken" },
             many - few
         ));
         if taken {
-            (best.field, best.spacing) = (next, closer);
+            (best, chosen) = (next, closer);
         }
         if worth < NEXT {
             break;
         }
     }
-    best
+    (best, chosen, said)
 }
 
 /// A residual in standard deviations of the noise.

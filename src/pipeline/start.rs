@@ -1,10 +1,10 @@
-//! Where the search begins: with what the matches say, with stillness, or with a field known from the frame before.
+//! Where the search begins: with what the matches say, or with a field known from the frame before.
 
 use crate::matching::agreement::Agreement;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
-use crate::numerics::{ablation, pyramid};
+use crate::numerics::ablation;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Counts, LevelReport};
 
@@ -121,13 +121,6 @@ const ENOUGH: usize = 20;
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
-/// Where so many of the features agree on a motion of [`FAR`] or more under which the volumes agree better than at rest, stillness is
-/// not brought to the residual beside it: over 37 pairs it never won there.
-const SURE: f64 = 0.9;
-
-/// Mean motion (voxels of the finest axis) of which that is so: smaller ones the residual finds from rest as well, or better.
-const FAR: f64 = 0.5;
-
 /// Part of the features by which those that agree must have grown in a search for another to follow: in four legs, after
 /// fewer were won the next won nothing.
 const GREW: f64 = 0.05;
@@ -196,9 +189,8 @@ fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreem
 /// from nothing or about a field.
 ///
 /// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
-/// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field,
-/// stillness (with `rest`, where the matches leave room for it) and the known fields compete, and the one that ends at the better
-/// agreement goes on; None when there is none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
+/// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field (with `rest`
+/// stillness, where there is none) and the known fields compete, and the one that ends at the better agreement goes on; None when there is none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
 /// A known field that goes on is refined twice: it begins with the noise of another frame, which takes long to forget. Of several
 /// the one that agrees best as it is goes on, so that this costs no more than to refine each once.
 /// Where few matches agreed, they are sought again about it for as long as clearly more of them agree each time: the agreement of
@@ -224,16 +216,8 @@ pub(super) fn begin(
         }
     }
     let (found, mut report) = search(None);
-    let still = SplineField::still(lattice.clone());
-    let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
-    let least = FAR * pyramid::finest(pair.shape, pair.spacing);
-    let clear = |found: &SplineField| level::lengths(pair, found)[0] > least && level::is_better(pair, found, &still);
-    let still_too = rest && ablation::is_on("second-start") && !(sure && found.as_ref().is_some_and(clear));
-    let own = [found, still_too.then_some(still)]
-        .into_iter()
-        .flatten()
-        .map(|start| refine(start, reach(&report, FROM_SEARCH)))
-        .reduce(better);
+    let still = rest.then(|| SplineField::still(lattice.clone()));
+    let own = found.or(still).map(|start| refine(start, reach(&report, FROM_SEARCH)));
     let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
     let wins = |known: &SplineField| own.as_ref().is_none_or(|own| level::is_better(pair, known, own));
     let mut field = followed.filter(wins).map(refined).or(own)?;
