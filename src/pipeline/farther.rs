@@ -68,7 +68,7 @@ pub(super) fn farther(
             }
         });
     }
-    let found = found?.seen(pair);
+    let found = found?;
     let believed =
         |own: &Begun| found.share() >= BORNE * own.share() && level::is_better(pair, &found.field, &own.field);
     own.is_none_or(believed).then_some(found)

@@ -270,10 +270,8 @@ fn canonical(
                 if borne_out {
                     level::refine(&pair, &mut field, (whole::SETTLING, reach), params.seed, |_| ());
                 }
-                let coarsest = (loose && !borne_out).then(|| (light.level(&aligned, *from), *from));
-                let next = coarsest.and_then(|(coarse, from)| {
-                    whole.closer((&pair, factor), &field, (&coarse, from), passes, &mut matched)
-                });
+                let search = || whole.closer((&pair, factor), &field, passes, &mut matched);
+                let next = (loose && !borne_out).then(search).flatten();
                 if let Some(found) = next {
                     field = found.field.clone();
                     reports.extend(found.report.clone());
@@ -395,7 +393,7 @@ fn canonical(
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
         let voxel = pyramid::finest(pair.shape, pair.spacing);
-        let nodes = apart_mm.map_or(WIDEST, |mm| ((mm / voxel).round() as usize).clamp(2, WIDEST));
+        let nodes = apart_mm.map_or(polish::WIDEST, |mm| ((mm / voxel).round() as usize).clamp(2, polish::WIDEST));
         field = polish::polish((&pair, next, nodes), (&field, factor), reach, params, tick);
         factor = next;
         choice.evidence.push(polish::why(&pair, nodes, params));
@@ -490,10 +488,12 @@ fn canonical(
             .collect(),
     };
     progress("done", 1.0);
-    let voxel = pyramid::finest(grid.shape(), grid.spacing());
-    let searched = begun.map(|b| b.searched.judged(uncertainty_median_mm, length.0, voxel));
     // What the data say at each node is as large again twice over, and no search starts from it.
-    let spline = Start { field: SplineField { blocks: Blocks::default(), ..field }, factor, searched };
+    let spline = Start {
+        field: SplineField { blocks: Blocks::default(), ..field },
+        factor,
+        followed: begun.map(|b| b.followed),
+    };
     Ok(FieldResult {
         displacement,
         coefficients,

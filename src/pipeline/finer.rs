@@ -4,7 +4,7 @@ use crate::matching::pair::Pair;
 use crate::numerics::statistics::deviation;
 use crate::pipeline::level::{self, SplineField};
 
-/// Residual (in standard deviations of the noise) beyond which a finer lattice is tried. The spline filter leaves noise alone at
+/// Residual (in standard deviations of the noise) beyond which a closer lattice is tried in any case. The spline filter leaves noise alone at
 /// about 0.5. Same tissue at 3 % noise: 0.5 to 0.75 where the motion was found, 0.95 at most where not; brains of two people,
 /// 1.4 to 12.
 const NOISY: f32 = 1.1;
@@ -63,7 +63,8 @@ pub(super) fn finer(
         if taken {
             (best, chosen) = (next, closer);
         }
-        if worth < NEXT {
+        // What is left beyond noise may be finer than any lattice so far.
+        if worth < NEXT && times(level::misfit(pair, &best)[0], pair.noise) < NOISY {
             break;
         }
     }

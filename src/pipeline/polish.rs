@@ -8,6 +8,9 @@ use crate::matching::pair::Pair;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{FieldParams, Grid};
 
+/// Voxels between nodes at most. Five pairs of 160 x 192 x 160 (3 passes): errors as with 5, gradients 4 % less, and less time.
+pub(super) const WIDEST: usize = 6;
+
 /// The level below the one that `finest` asks for; none where that is full resolution, or no passes are wanted there.
 pub(super) fn next_finer(grid: &Grid, finest: usize, params: &FieldParams) -> Option<[usize; 3]> {
     let wanted = params.finer_passes > 0 && finest > 1;

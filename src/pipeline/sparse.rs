@@ -211,7 +211,7 @@ pub(super) fn measure(
     Ok(FieldResult {
         displacement,
         coefficients,
-        spline: Start { field, factor, searched: None },
+        spline: Start { field, factor, followed: None },
         uncertainty,
         matches: sparse,
         mesh,

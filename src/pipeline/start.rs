@@ -1,10 +1,9 @@
-//! Where the search begins: with what the matches say, or with a field known from the frame before.
+//! Where the search begins: with what the matches say, with stillness, or with a field known from the frame before.
 
-use crate::matching::agreement::Agreement;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
-use crate::numerics::ablation;
+use crate::numerics::{ablation, pyramid};
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Counts, LevelReport};
 
@@ -14,27 +13,29 @@ pub struct Start {
     pub(super) field: SplineField,
     /// Voxels that a voxel of its level stands for.
     pub(super) factor: [usize; 3],
-    /// Of the search that it comes from.
-    pub(super) searched: Option<Searched>,
+    /// Frames since the whole volume was searched; none where it never was.
+    pub(super) followed: Option<usize>,
 }
 
 impl Start {
     /// Whether the whole volume was searched for this field, rather than known fields followed.
     pub fn searched_all(&self) -> bool {
-        self.searched.as_ref().is_some_and(|s| s.frames == 0)
+        self.followed == Some(0)
     }
 
-    /// As far again as from `before` to here: where steady motion would be next. None when the two do not lie on one
-    /// lattice.
-    pub fn extrapolated(&self, before: &Self) -> Option<Self> {
-        if self.factor != before.factor || self.field.lattice != before.field.lattice {
-            return None;
-        }
+    /// Voxels between the nodes of its lattice, along the axis with most.
+    pub fn nodes_apart(&self) -> usize {
+        self.field.lattice.step.into_iter().max().unwrap_or(1)
+    }
+
+    /// As far again as from `before` to here: where steady motion would be next.
+    pub fn extrapolated(&self, before: &Self) -> Self {
         let mut next = self.clone();
-        for (n, b) in next.field.coefficients.iter_mut().zip(&before.field.coefficients) {
+        let before = before.on(&self.field.lattice, self.factor);
+        for (n, b) in next.field.coefficients.iter_mut().zip(&before.coefficients) {
             *n += *n - b;
         }
-        Some(next)
+        next
     }
 
     /// The field on a level's lattice.
@@ -43,42 +44,8 @@ impl Start {
     }
 }
 
-/// What is remembered of the last search of a whole volume.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Searched {
-    /// How well the volumes agreed at the coarsest level.
-    agreement: Agreement,
-    /// Fields that started from it without a search.
-    frames: usize,
-    /// Whether the last frame's field is certain enough for the agreement to tell one motion from another.
-    certain: bool,
-}
-
-impl Searched {
-    /// What a field found by a search of all leaves of the difference on the coarsest level.
-    pub fn of(pair: &Pair<'_>, field: &SplineField) -> Self {
-        Self { agreement: agreement(pair, field, None), frames: 0, certain: false }
-    }
-
-    /// With the last frame's median uncertainty, its mean motion and its finest voxel edge (mm).
-    pub fn judged(self, uncertainty: f64, motion: f64, voxel: f64) -> Self {
-        Self { certain: uncertainty < (VAGUE * voxel).min(UNSURE * motion), ..self }
-    }
-}
-
-/// Growth of the worst block's misfit (in variances of the residual) up to which a known field is taken to have found the
-/// way. Over 24 frames of three phantoms at 3 % noise it stayed under 1 where the motion was found.
-const GROWN: f32 = 1.5;
-
-/// All is searched again after so many frames, whatever the agreement.
+/// All is searched again after so many frames, whatever confirms the field.
 const FOLLOWED: usize = 5;
-
-/// Median uncertainty (voxels) beyond which the agreement does not tell one motion from another. Where texture leaves
-/// the motion open (a leg in thick slices: 0.14 to 0.23) fields that are wrong by millimetres agree as well as the right
-/// one; in finger pads it is 0.10 to 0.14.
-const VAGUE: f64 = 0.15;
-/// The same, as a part of the mean motion: at 0.5 of it frames were followed 1.4 times worse than measured alone.
-const UNSURE: f64 = 0.32;
 
 /// Where fewer of the features than this agree with each other, matches are sought again on the warped volume. Heads, pads
 /// and small motions keep nine tenths, legs in thick slices that moved by 16 mm four.
@@ -121,6 +88,13 @@ const ENOUGH: usize = 20;
 /// Searches on the warped volume at most.
 const AGAIN: usize = 3;
 
+/// Where so many of the features agree on a motion of [`FAR`] or more under which the volumes agree better than at rest, stillness is
+/// not brought to the residual beside it: over 37 pairs it never won there.
+const SURE: f64 = 0.9;
+
+/// Mean motion (voxels of the finest axis) of which that is so: smaller ones the residual finds from rest as well, or better.
+const FAR: f64 = 0.5;
+
 /// Part of the features by which those that agree must have grown in a search for another to follow: in four legs, after
 /// fewer were won the next won nothing.
 const GREW: f64 = 0.05;
@@ -130,8 +104,8 @@ pub(super) struct Begun {
     pub field: SplineField,
     /// Of the matches, where they were sought.
     pub report: Option<LevelReport>,
-    /// For the next frame.
-    pub searched: Searched,
+    /// Frames since the whole volume was searched.
+    pub followed: usize,
 }
 
 impl Begun {
@@ -148,11 +122,6 @@ impl Begun {
     /// The part of the features that agreed (0 to 1); nothing where none was sought.
     pub fn share(&self) -> f64 {
         self.report.as_ref().map_or(0.0, |r| r.counts.kept_share())
-    }
-
-    /// The same, remembered for the next frame by how the volumes agree on the level of `pair`.
-    pub fn seen(self, pair: &Pair<'_>) -> Self {
-        Self { searched: Searched::of(pair, &self.field), ..self }
     }
 
     /// The features and those that agreed, where these are too few to go by.
@@ -179,20 +148,14 @@ impl Begun {
     }
 }
 
-fn agreement(pair: &Pair<'_>, field: &SplineField, sigma: Option<f32>) -> Agreement {
-    Agreement::measure(pair, &pair.warp(&field.lattice, &field.coefficients, &pair.spans), sigma)
-}
-
 /// The coarsest level of a search that may start from `known` fields.
 ///
 /// `refine` brings a start to the residual within a reach (voxels of the finest axis); `search` matches the whole volume,
 /// from nothing or about a field.
 ///
-/// The known fields are enough where texture determines the motion, all was searched a few frames ago, and they leave no
-/// block of the volume worse explained than it was then. Two are needed: the motion's course. Else the matches' field (with `rest`
-/// stillness, where there is none) and the known fields compete, and the one that ends at the better agreement goes on; None when there is none. One known field alone competes only where the matches are in doubt: the error it brings is as large as what has moved since.
-/// A known field that goes on is refined twice: it begins with the noise of another frame, which takes long to forget. Of several
-/// the one that agrees best as it is goes on, so that this costs no more than to refine each once.
+/// A known field that `is_confirmed` by the features is enough, but all is searched again every few frames. Else the matches' field,
+/// stillness (with `rest`, where the matches leave room for it) and, where the matches are in doubt, the known fields compete, and the one
+/// that ends at the better agreement goes on; None when there is none. A known field that goes on is refined twice: it begins with the noise of another frame.
 /// Where few matches agreed, they are sought again about it for as long as clearly more of them agree each time: the agreement of
 /// the volumes does not tell a wrong island there from the truth, neighbours do.
 pub(super) fn begin(
@@ -201,26 +164,32 @@ pub(super) fn begin(
     factor: [usize; 3],
     (known, rest): (&[Start], bool),
     refine: impl Fn(SplineField, f64) -> SplineField,
+    is_confirmed: impl FnOnce(&SplineField) -> bool,
     mut search: impl FnMut(Option<&SplineField>) -> (Option<SplineField>, LevelReport),
 ) -> Option<Begun> {
     let better = |a, b| level::better(pair, a, b);
     let refined = |field| refine(field, f64::INFINITY);
-    let follow = || known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
-    let course = (known.len() > 1).then(follow).flatten();
-    let recent = known.first().and_then(|s| s.searched.as_ref()).filter(|s| s.frames < FOLLOWED && s.certain);
-    if let Some((field, searched)) = course.as_ref().zip(recent) {
-        let now = agreement(pair, field, Some(searched.agreement.sigma()));
-        let searched = Searched { frames: searched.frames + 1, ..searched.clone() };
-        if now.worsened(&searched.agreement) <= GROWN {
-            return course.map(|field| Begun { field: refined(field), report: None, searched });
-        }
+    let course = known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
+    let followed = known.first().and_then(|s| s.followed).filter(|&f| f < FOLLOWED);
+    if let Some((field, followed)) = course.as_ref().zip(followed)
+        && is_confirmed(field)
+    {
+        return course.map(|field| Begun { field: refined(field), report: None, followed: followed + 1 });
     }
     let (found, mut report) = search(None);
-    let still = rest.then(|| SplineField::still(lattice.clone()));
-    let own = found.or(still).map(|start| refine(start, reach(&report, FROM_SEARCH)));
-    let followed = course.or_else(|| is_in_doubt(&report).then(follow).flatten());
+    let still = SplineField::still(lattice.clone());
+    let sure = report.counts.kept >= ENOUGH && report.counts.kept_share() >= SURE;
+    let least = FAR * pyramid::finest(pair.shape, pair.spacing);
+    let clear = |found: &SplineField| level::lengths(pair, found)[0] > least && level::is_better(pair, found, &still);
+    let still_too = rest && ablation::is_on("second-start") && !(sure && found.as_ref().is_some_and(clear));
+    let own = [found, still_too.then_some(still)]
+        .into_iter()
+        .flatten()
+        .map(|start| refine(start, reach(&report, FROM_SEARCH)))
+        .reduce(better);
+    let known = course.filter(|_| is_in_doubt(&report));
     let wins = |known: &SplineField| own.as_ref().is_none_or(|own| level::is_better(pair, known, own));
-    let mut field = followed.filter(wins).map(refined).or(own)?;
+    let mut field = known.filter(wins).map(refined).or(own)?;
     for _ in 0..AGAIN {
         if report.counts.kept_share() >= AGREED || !ablation::is_on("search-again") {
             break;
@@ -233,6 +202,5 @@ pub(super) fn begin(
             break;
         }
     }
-    let searched = Searched::of(pair, &field);
-    Some(Begun { field, report: Some(report), searched })
+    Some(Begun { field, report: Some(report), followed: 0 })
 }

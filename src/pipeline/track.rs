@@ -47,7 +47,7 @@ impl<'a> Tracker<'a> {
     /// As [`crate::pipeline::field::run`]; the tracker then goes on from the frames before.
     pub fn next(&mut self, frame: &Voxels<'_>, progress: Progress<'_>) -> Result<FieldResult, FieldError> {
         let [last, before] = &self.past;
-        let steady = last.as_ref().zip(before.as_ref()).and_then(|(l, b)| l.extrapolated(b));
+        let steady = last.as_ref().zip(before.as_ref()).map(|(l, b)| l.extrapolated(b));
         let starts: Vec<Start> = last.iter().cloned().chain(steady).collect();
         let result = run_from(self.reference, frame, self.mask, self.params, &starts, progress)?;
         self.past.swap(0, 1);

@@ -1,11 +1,10 @@
 //! The search of a whole volume, on the coarsest level and, where few features agree there, on the next.
 
-use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::{ablation, pyramid};
 use crate::pipeline::level::{self, MatchParams, SplineField};
-use crate::pipeline::start::{Begun, Searched, Start, begin};
+use crate::pipeline::start::{Begun, Start, begin};
 use crate::types::FieldParams;
 use std::time::Instant;
 
@@ -117,7 +116,11 @@ impl Whole<'_> {
             *seconds += started.elapsed().as_secs_f64();
             (fitted.filter(|_| report.counts.kept >= FEWEST), report)
         };
-        begin(pair, lattice, factor, (known, rest), refine, seek)
+        let mut confirming = 0.0;
+        let confirmed = |field: &SplineField| self.is_borne_out(pair, field, &mut confirming);
+        let found = begin(pair, lattice, factor, (known, rest), refine, confirmed, seek);
+        *seconds += confirming;
+        found
     }
 
     /// Whether nearly all features of a level are found where the field has them: then few that agreed before are no reason to search it.
@@ -134,12 +137,11 @@ impl Whole<'_> {
     /// The better of a field that came down from the coarsest level and of what a search of the next level itself finds: smaller
     /// patches are distorted less, and fine texture tells a wrong island from the truth, which the coarse volumes do not. What agrees
     /// better by much more bending is not taken.
-    /// None where it is the first. `coarse` is the coarsest level, where a winner is remembered for the next frame.
+    /// None where it is the first.
     pub fn closer(
         &self,
         (pair, factor): (&Pair<'_>, [usize; 3]),
         own: &SplineField,
-        (coarse, coarsest): (&Pair<'_>, [usize; 3]),
         passes: usize,
         seconds: &mut f64,
     ) -> Option<Begun> {
@@ -157,8 +159,6 @@ impl Whole<'_> {
         if bending[1] > BENT * bending[0] || !level::is_better(pair, &found.field, own) {
             return None;
         }
-        let lattice = level::lattice(coarse, 3);
-        let seen = level::carry(&found.field, lattice, |p| to_level(from_level(p, coarsest), factor));
-        Some(Begun { searched: Searched::of(coarse, &seen), ..found })
+        Some(found)
     }
 }
