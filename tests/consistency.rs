@@ -516,7 +516,7 @@ fn whole(total: f64) -> Excess {
 fn one_place_that_moves_contradicts_stillness() {
     let matches = moved(&AffineMotion::IDENTITY, 0, false);
     let at = |worst: f64| choose(&matches, |_, _| Excess { total: 20.0, worst }, 200.0, 0.05).model;
-    assert_eq!((at(PLACE - 0.1), at(PLACE + 0.1)), (MotionModel::Identity, MotionModel::Free));
+    assert_eq!((at(PLACE - 0.1), at(PLACE + 0.1)), (MotionModel::Identity, MotionModel::Rigid));
 }
 
 fn close(a: &AffineMotion, b: &AffineMotion, tolerance: f64) {

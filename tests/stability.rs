@@ -48,7 +48,7 @@ const STORED: [(Trouble, f64, [[f64; 2]; 2]); 7] = [
     (Trouble::Rotation, 15.0, [[0.037, 0.044], [0.848, 0.481]]),
     (Trouble::Bias, 40.0, [[0.560, 0.090], [2.243, 0.433]]),
     (Trouble::NoTexture, 30.0, [[0.584, 0.075], [2.093, 0.107]]),
-    (Trouble::MissingTissue, 15.0, [[0.806, 0.247], [2.818, 0.105]]),
+    (Trouble::MissingTissue, 15.0, [[0.806, 0.247], [3.040, 0.885]]),
 ];
 
 #[test]

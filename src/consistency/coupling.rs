@@ -35,7 +35,7 @@ pub fn step(
 }
 
 /// How far the smoothness of a place and axis is drawn to that of the whole: weight of the mean over the lattice beside the
-/// window's own (dimensionless). Calibrated: docs/lab/2026-11-local-smoothness.md.
+/// window's own (dimensionless). Calibrated: docs/lab/2026-11-local-signal.md.
 const SHARED: f32 = 0.02;
 
 /// Width of the window over which smoothness is estimated (nodes, one standard deviation of a Gaussian).
@@ -257,8 +257,8 @@ pub struct Posterior {
 
 /// Deviation and degrees of freedom of the coupled field at each node.
 ///
-/// The covariance is `(A + lambda L)^-1`; random vectors with just that covariance are drawn by solving for
-/// right-hand sides with covariance `A + lambda L` (perturb and optimise, Papandreou & Yuille 2010), and their squares (those under `A`
+/// The covariance is `(A + L)^-1` with `L` the weighted energy; random vectors with just that covariance are drawn by solving for
+/// right-hand sides with covariance `A + L` (perturb and optimise, Papandreou & Yuille 2010), and their squares (those under `A`
 /// too) averaged over `draws`, those of the deviation over neighbouring nodes as well. Each solution starts from the affine one: where nothing bends, `lambda L`
 /// outweighs the data by so much that iterations would leave out all that an affine motion is uncertain by.
 pub fn posterior(

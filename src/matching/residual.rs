@@ -72,7 +72,7 @@ pub fn normal_equations(
     let (variance, cut) = (sigma * sigma, 1.0 / (CAUCHY * CAUCHY));
     let unsure =
         if ablation::is_on("gradient-floor") { UNSURE * pyramid::finest(pair.shape, pair.spacing) } else { 0.0 };
-    let floor = unsure.powi(2) as f32;
+    let least = unsure.powi(2) as f32;
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
     // Differences over two voxels, over one at the border; none along a side of one voxel.
     let ends = |at: usize, n: usize| (at.saturating_sub(1), (at + 1).min(n - 1));
@@ -120,7 +120,7 @@ pub fn normal_equations(
                     let gz = scale[2] * (fz1[i] - fz0[i] + a * (wz1[i] - wz0[i]));
                     let good = mask[i] != 0 && (r + gx + gy + gz).is_finite();
                     let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
-                    let weight = 1.0 / (variance + floor * (gx * gx + gy * gy + gz * gz) + cut * r * r);
+                    let weight = 1.0 / (variance + least * (gx * gx + gy * gy + gz * gz) + cut * r * r);
                     let (hx, hy, hz) = (weight * gx, weight * gy, weight * gz);
                     (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
                     (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);

@@ -266,7 +266,7 @@ fn canonical(
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
                 (field, spacing, tried) = closer(&pair, field, reach);
                 let loose = l == 1 && begun.as_ref().is_some_and(Begun::is_loose);
-                let borne_out = loose && whole.is_borne_out(&pair, &field, &mut matched);
+                let borne_out = loose && whole.is_borne_out(&pair, &field, whole::IN_PLACE, &mut matched);
                 if borne_out {
                     level::refine(&pair, &mut field, (whole::SETTLING, reach), params.seed, |_| ());
                 }
@@ -368,7 +368,8 @@ fn canonical(
         .flatten();
     let mut places = Vec::new();
     if let Some(glides) = glides {
-        let believed = unlike(&pair, left).is_none() || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
+        let wide = apart_mm.is_none_or(|mm| mm > SLIDING_NODES * pyramid::finest(pair.shape, pair.spacing));
+        let believed = wide || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
         choice.evidence.push(why_sliding(&glides, believed));
         if believed {
             places = beside(&glides, &grid, pair.shape, factor);
@@ -626,6 +627,9 @@ pub(super) fn full_lattice(
 /// Part of the strained voxels that must follow a side where the volumes differ by more than motion, as a closer lattice says: of two people 0.007 to
 /// 0.09 did, who have no jump in common, and folded by it; of halves and cores that slid under a texture of their own 0.13 to 0.34.
 const GLIDING: f64 = 0.1;
+
+/// Voxels between nodes up to which that is asked: so close a lattice was taken since the volumes differ by more than smooth motion.
+const SLIDING_NODES: f64 = 3.5;
 
 fn why_sliding(sliding: &Sliding, believed: bool) -> String {
     let Sliding { voxels, strained, left } = sliding;

@@ -17,7 +17,10 @@ const WORTH: f64 = 0.8;
 /// gained the next would not be worth it.
 const NEXT: f64 = 2.0 * WORTH;
 
-/// Passes on each closer lattice.
+/// Degrees of freedom that a closer lattice counts for at least: with fewer, what a few passes more explain would decide.
+const FEWEST: f64 = 40.0;
+
+/// Passes on each closer lattice, and again where it is taken and leaves more than noise.
 pub(super) const TRIAL: usize = 4;
 
 /// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is no matter.
@@ -28,7 +31,7 @@ const UNLIKE: f32 = 0.05;
 /// the second and the 98th percentile one of those, in thick slices, had 1.55.
 const UNEVEN: f32 = 1.25;
 
-/// Voxels between nodes, from the lattice that every field starts with to the closest.
+/// Voxels between nodes, from the widest lattice to the closest.
 pub(super) const SPACINGS: [usize; 7] = [10, 8, 6, 5, 4, 3, 2];
 
 /// Nodes at most, to bound memory.
@@ -53,7 +56,7 @@ pub(super) fn finer(
         refine(&mut next);
         let gain = level::gained(pair, &best, &next);
         let [few, many] = [&best, &next].map(|f| level::determined(pair, f, seed));
-        let worth = gain / (many - few).max(1.0);
+        let worth = gain / (many - few).max(FEWEST);
         let taken = gain > 0.0 && worth > WORTH;
         said.push(format!(
             "nodes every {closer} voxels: {}; {:.0} degrees of freedom more explain {worth:.2} of the misfit each (chance: up to {WORTH})",
@@ -62,13 +65,21 @@ pub(super) fn finer(
         ));
         if taken {
             (best, chosen) = (next, closer);
+            if is_noisy(pair, &best) {
+                refine(&mut best);
+            }
         }
         // What is left beyond noise may be finer than any lattice so far.
-        if worth < NEXT && times(level::misfit(pair, &best)[0], pair.noise) < NOISY {
+        if worth < NEXT && !is_noisy(pair, &best) {
             break;
         }
     }
     (best, chosen, said)
+}
+
+/// Whether a field leaves more than noise of the difference.
+fn is_noisy(pair: &Pair<'_>, field: &SplineField) -> bool {
+    times(level::misfit(pair, field)[0], pair.noise) > NOISY
 }
 
 /// A residual in standard deviations of the noise.

@@ -87,7 +87,7 @@ const MOMENTUM: f32 = 0.5;
 const SETTLED: f64 = 0.004;
 
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
-const ITERATIONS: usize = 8;
+const ITERATIONS: usize = 10;
 
 /// Nodes of a lattice from which memory goes before time: one system is solved after the other in place of beside it, and the warped
 /// volume is not kept meanwhile.

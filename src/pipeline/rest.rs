@@ -1,6 +1,6 @@
 //! The smallest model, place by place: where nothing says that tissue moves otherwise than as the whole does, the field is that motion.
 //!
-//! One weight of the bending energy serves a whole volume. Beside a local press it lets all that stays at rest follow the noise. About every
+//! Smoothness that varies by place still leaves what stays at rest free to follow the noise. About every
 //! place the excess misfit of stillness, or of one rigid motion, against the free field is held against the degrees of freedom that the data
 //! determine there, as [`crate::consistency::models`] does for the whole.
 

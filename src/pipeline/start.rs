@@ -23,11 +23,6 @@ impl Start {
         self.followed == Some(0)
     }
 
-    /// Voxels between the nodes of its lattice, along the axis with most.
-    pub fn nodes_apart(&self) -> usize {
-        self.field.lattice.step.into_iter().max().unwrap_or(1)
-    }
-
     /// As far again as from `before` to here: where steady motion would be next.
     pub fn extrapolated(&self, before: &Self) -> Self {
         let mut next = self.clone();
@@ -49,7 +44,7 @@ const FOLLOWED: usize = 5;
 
 /// Where fewer of the features than this agree with each other, matches are sought again on the warped volume. Heads, pads
 /// and small motions keep nine tenths, legs in thick slices that moved by 16 mm four.
-const AGREED: f64 = 0.75;
+pub(super) const AGREED: f64 = 0.75;
 
 /// Where fewer of the features than this agree with each other, the field is held near what they say: the passes would take it
 /// on by centimetres where nothing holds it. Slides and legs that move far keep 0.4 to 0.81; pads under a press, whose edges the

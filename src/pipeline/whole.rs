@@ -4,7 +4,7 @@ use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::{ablation, pyramid};
 use crate::pipeline::level::{self, MatchParams, SplineField};
-use crate::pipeline::start::{Begun, Start, begin};
+use crate::pipeline::start::{AGREED, Begun, Start, begin};
 use crate::types::FieldParams;
 use std::time::Instant;
 
@@ -32,7 +32,7 @@ const BENT: f64 = 1.6;
 /// Share of the features of the next level that lie where the field from the coarsest one has them, from which that level is not searched. Of 106
 /// pairs of which few features agreed on the coarsest level the search left 0.97 of the error in the 22 with as many (two passes more left 0.98
 /// of it, at a tenth of the time) and 0.96 in the others, down to 0.68.
-const IN_PLACE: f64 = 0.9;
+pub(super) const IN_PLACE: f64 = 0.9;
 
 /// Passes more in place of that search.
 pub(super) const SETTLING: usize = 2;
@@ -117,21 +117,21 @@ impl Whole<'_> {
             (fitted.filter(|_| report.counts.kept >= FEWEST), report)
         };
         let mut confirming = 0.0;
-        let confirmed = |field: &SplineField| self.is_borne_out(pair, field, &mut confirming);
+        let confirmed = |field: &SplineField| self.is_borne_out(pair, field, AGREED, &mut confirming);
         let found = begin(pair, lattice, factor, (known, rest), refine, confirmed, seek);
         *seconds += confirming;
         found
     }
 
-    /// Whether nearly all features of a level are found where the field has them: then few that agreed before are no reason to search it.
+    /// Whether so many of the features of a level (a share of at least `least`) are found where the field has them: then it is not searched.
     /// Adds the seconds that takes to `seconds`.
-    pub fn is_borne_out(&self, pair: &Pair<'_>, field: &SplineField, seconds: &mut f64) -> bool {
+    pub fn is_borne_out(&self, pair: &Pair<'_>, field: &SplineField, least: f64, seconds: &mut f64) -> bool {
         let started = Instant::now();
         let points = (pair.inside / self.params.voxels_per_point).max(CLOSER_LEAST);
         let near = MatchParams::near(self.params, pair, points, false);
         let (_, _, report) = level::matches(pair, Some(field), near);
         *seconds += started.elapsed().as_secs_f64();
-        report.counts.kept_share() >= IN_PLACE
+        report.counts.kept_share() >= least
     }
 
     /// The better of a field that came down from the coarsest level and of what a search of the next level itself finds: smaller

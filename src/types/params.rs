@@ -129,7 +129,7 @@ impl FieldParams {
                 Self { finest: 0, passes: 5, coarse_passes: 8, finer_passes: 3, voxels_per_point: 1000, ..balanced }
             }
             Preset::Balanced => balanced,
-            Preset::Accurate => Self { passes: 12, coarse_passes: 16, voxels_per_point: 64, ..balanced },
+            Preset::Accurate => Self { passes: 16, ..balanced },
         }
     }
 
