@@ -62,7 +62,7 @@ const CONTRADICTED: f64 = 50.0;
 const ASTRAY: f64 = 1.5;
 
 /// Excess misfit per degree of freedom about any one place beyond which nothing is called still: tissue that moves is not outvoted by
-/// more tissue that does not. At rest, under noise, a bias or another contrast, it reached 5; muscle that moved inside a still ring had 15 and more.
+/// more tissue that does not. At rest, under noise, a bias or another contrast, it reached 5; muscle that moved inside a still ring had 11 and more.
 pub const PLACE: f64 = 8.0;
 
 /// How much worse the volumes agree under a map than under the free field, in units of noise.
