@@ -156,7 +156,8 @@ impl Smoothness {
     }
 }
 
-/// Weighted differences of one component, plane by plane upwards.
+/// Weighted differences of one component, plane by plane upwards. Each is zero where it has no taps, so rows follow one another
+/// without a seam.
 struct Differences<'a> {
     of: &'a Smoothness,
     weight: &'a [f32],
@@ -169,11 +170,18 @@ struct Differences<'a> {
     tilted: [[Vec<f32>; 2]; 2],
     /// Differences within the plane: xx, yy, xy.
     flat: [Vec<f32>; 3],
+    /// 1 but on the last column; 1 but on the first and the last one.
+    inner: [Vec<f32>; 2],
 }
 
 impl<'a> Differences<'a> {
     fn new(of: &'a Smoothness, weight: &'a [f32], x: &'a [f32], k: usize) -> Self {
-        let room = || vec![0.0f32; of.nodes[0] * of.nodes[1]];
+        let [nx, ny, _] = of.nodes;
+        let room = || vec![0.0f32; nx * ny];
+        let column = |first: usize| {
+            let one = move |i: usize| if i >= first && i + 1 < nx { 1.0 } else { 0.0 };
+            (0..ny).flat_map(|_| (0..nx).map(one)).collect()
+        };
         let mut out = Self {
             of,
             weight,
@@ -182,6 +190,7 @@ impl<'a> Differences<'a> {
             along: std::array::from_fn(|_| room()),
             tilted: std::array::from_fn(|_| std::array::from_fn(|_| room())),
             flat: std::array::from_fn(|_| room()),
+            inner: [0, 1].map(column),
         };
         if k > 0 {
             out.fill_along(k - 1, 1);
@@ -200,8 +209,7 @@ impl<'a> Differences<'a> {
             return out.fill(0.0);
         }
         let at = |k: usize| &self.x[k * plane..][..plane];
-        let (low, here, high) = (at(k - 1), at(k), at(k + 1));
-        let weight = &self.weight[k * plane..][..plane];
+        let (low, here, high, weight) = (at(k - 1), at(k), at(k + 1), &self.weight[k * plane..][..plane]);
         let scale = self.of.scale[2];
         for i in 0..plane {
             out[i] = scale * weight[i] * (low[i] - 2.0 * here[i] + high[i]);
@@ -221,24 +229,17 @@ impl<'a> Differences<'a> {
         let (here, above) = (&self.x[k * plane..][..plane], &self.x[(k + 1) * plane..][..plane]);
         let weight = &self.weight[k * plane..][..plane];
         let [.., a, b] = self.of.scale;
-        for j in 0..ny {
-            let at = nx * j..nx * (j + 1);
-            let (h, u, w) = (&here[at.clone()], &above[at.clone()], &weight[at.clone()]);
-            let xz = &mut xz[at.clone()];
-            for i in 0..nx - 1 {
-                xz[i] = a * w[i] * (u[i + 1] - u[i] - h[i + 1] + h[i]);
-            }
-            xz[nx - 1] = 0.0;
-            let yz = &mut yz[at];
-            if j + 1 < ny {
-                let next = nx * (j + 1)..nx * (j + 2);
-                let (h1, u1) = (&here[next.clone()], &above[next]);
-                for i in 0..nx {
-                    yz[i] = b * w[i] * (u1[i] - u[i] - h1[i] + h[i]);
-                }
-            } else {
-                yz.fill(0.0);
-            }
+        let n = plane - 1;
+        let (h, u, h1, u1) = (&here[..n], &above[..n], &here[1..], &above[1..]);
+        let (xz, w, inner) = (&mut xz[..n], &weight[..n], &self.inner[0][..n]);
+        for i in 0..n {
+            xz[i] = a * inner[i] * w[i] * (u1[i] - u[i] - h1[i] + h[i]);
+        }
+        let n = plane - nx;
+        let (h, u, h1, u1) = (&here[..n], &above[..n], &here[nx..], &above[nx..]);
+        let (yz, w) = (&mut yz[..n], &weight[..n]);
+        for i in 0..n {
+            yz[i] = b * w[i] * (u1[i] - u[i] - h1[i] + h[i]);
         }
     }
 
@@ -251,26 +252,28 @@ impl<'a> Differences<'a> {
         let weight = &self.weight[k * plane..][..plane];
         let [xx, yy, xy] = &mut self.flat;
         let [a, b, _, c, ..] = self.of.scale;
-        for j in 0..ny {
-            let row = |j: usize| &x[nx * j..][..nx];
-            let (h, w) = (row(j), &weight[nx * j..][..nx]);
-            let xx = &mut xx[nx * j..][..nx];
-            for i in 1..nx.saturating_sub(1) {
-                xx[i] = a * w[i] * (h[i - 1] - 2.0 * h[i] + h[i + 1]);
+        if plane > 2 {
+            let n = plane - 2;
+            let (low, here, high) = (&x[..n], &x[1..][..n], &x[2..]);
+            let (xx, w, inner) = (&mut xx[1..][..n], &weight[1..][..n], &self.inner[1][1..][..n]);
+            for i in 0..n {
+                xx[i] = a * inner[i] * w[i] * (low[i] - 2.0 * here[i] + high[i]);
             }
-            let yy = &mut yy[nx * j..][..nx];
-            if j > 0 && j + 1 < ny {
-                let (low, high) = (row(j - 1), row(j + 1));
-                for i in 0..nx {
-                    yy[i] = b * w[i] * (low[i] - 2.0 * h[i] + high[i]);
-                }
+        }
+        if ny > 2 {
+            let n = plane - 2 * nx;
+            let (low, here, high) = (&x[..n], &x[nx..][..n], &x[2 * nx..]);
+            let (yy, w) = (&mut yy[nx..][..n], &weight[nx..][..n]);
+            for i in 0..n {
+                yy[i] = b * w[i] * (low[i] - 2.0 * here[i] + high[i]);
             }
-            let xy = &mut xy[nx * j..][..nx];
-            if j + 1 < ny {
-                let next = row(j + 1);
-                for i in 0..nx - 1 {
-                    xy[i] = c * w[i] * (next[i + 1] - next[i] - h[i + 1] + h[i]);
-                }
+        }
+        if ny > 1 && nx > 1 {
+            let n = plane - nx - 1;
+            let (here, right, next, far) = (&x[..n], &x[1..][..n], &x[nx..][..n], &x[nx + 1..]);
+            let (xy, w, inner) = (&mut xy[..n], &weight[..n], &self.inner[0][..n]);
+            for i in 0..n {
+                xy[i] = c * inner[i] * w[i] * (far[i] - next[i] - right[i] + here[i]);
             }
         }
     }
@@ -278,7 +281,7 @@ impl<'a> Differences<'a> {
     /// The next plane of `D^T W D x`.
     #[inline(always)]
     fn transposed(&mut self, out: &mut [f32]) {
-        let [nx, ny, _] = self.of.nodes;
+        let nx = self.of.nodes[0];
         let k = self.k;
         self.along.rotate_left(1);
         self.fill_along(k + 1, 2);
@@ -287,40 +290,39 @@ impl<'a> Differences<'a> {
         self.fill_flat(k);
         self.k += 1;
         let [low, here, high] = &self.along;
-        for i in 0..out.len() {
-            out[i] = low[i] - 2.0 * here[i] + high[i];
-        }
         let [[xz0, yz0], [xz1, yz1]] = &self.tilted;
         let [xx, yy, xy] = &self.flat;
-        for j in 0..ny {
-            let at = nx * j..nx * (j + 1);
-            let out = &mut out[at.clone()];
-            let [x2, y2, xy2] = [xx, yy, xy].map(|v| &v[at.clone()]);
-            let [a0, a1, b0, b1] = [xz0, xz1, yz0, yz1].map(|v| &v[at.clone()]);
-            for i in 0..nx {
-                out[i] += xy2[i] + a1[i] - a0[i] + b1[i] - b0[i] - 2.0 * (x2[i] + y2[i]);
-            }
-            for i in 1..nx {
-                out[i] += a0[i - 1] - a1[i - 1] + x2[i - 1] - xy2[i - 1];
-            }
-            for i in 0..nx - 1 {
-                out[i] += x2[i + 1];
-            }
-            if j > 0 {
-                let before = nx * (j - 1)..nx * j;
-                let [y2, xy2, b0, b1] = [yy, xy, yz0, yz1].map(|v| &v[before.clone()]);
-                for i in 0..nx {
-                    out[i] += y2[i] - xy2[i] + b0[i] - b1[i];
-                }
-                for i in 1..nx {
-                    out[i] += xy2[i - 1];
-                }
-            }
-            if j + 1 < ny {
-                let y2 = &yy[nx * (j + 1)..][..nx];
-                for i in 0..nx {
-                    out[i] += y2[i];
-                }
+        let plane = out.len();
+        let [low, here, high, xz0, xz1] = [low, here, high, xz0, xz1].map(|v| &v[..plane]);
+        let [yz0, yz1, xx, yy, xy] = [yz0, yz1, xx, yy, xy].map(|v| &v[..plane]);
+        for i in 0..plane {
+            out[i] = low[i] - 2.0 * (here[i] + xx[i] + yy[i]) + high[i] + xy[i] + xz1[i] - xz0[i] + yz1[i] - yz0[i];
+        }
+        // From a column to the right, a row on, and both.
+        let n = plane - 1;
+        let (right, xx, xy1) = (&mut out[1..], &xx[..n], &xy[..n]);
+        let (xz0, xz1) = (&xz0[..n], &xz1[..n]);
+        for i in 0..n {
+            right[i] += xx[i] - xy1[i] + xz0[i] - xz1[i];
+        }
+        let (left, xx) = (&mut out[..n], &self.flat[0][1..]);
+        for i in 0..n {
+            left[i] += xx[i];
+        }
+        let n = plane - nx;
+        let (next, yy0, xy1, yz0, yz1) = (&mut out[nx..], &yy[..n], &xy[..n], &yz0[..n], &yz1[..n]);
+        for i in 0..n {
+            next[i] += yy0[i] - xy1[i] + yz0[i] - yz1[i];
+        }
+        let (before, yy) = (&mut out[..n], &yy[nx..]);
+        for i in 0..n {
+            before[i] += yy[i];
+        }
+        if plane > nx + 1 {
+            let n = plane - nx - 1;
+            let (far, xy) = (&mut out[nx + 1..], &xy[..n]);
+            for i in 0..n {
+                far[i] += xy[i];
             }
         }
     }

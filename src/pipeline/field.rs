@@ -227,44 +227,23 @@ fn canonical(
     let mut begun = None;
     let mut reach = f64::INFINITY;
     let mut light = Light::default();
-    let (mut left, mut gain, mut apart_mm, mut asked) = (0.0, 1.0, None::<f64>, Vec::new());
+    let (mut left, mut gain, mut nodes_apart, mut asked) = (0.0, 1.0, 0, Vec::new());
     for (l, &factor) in factors.iter().enumerate() {
         let (first, last) = (l == 0, l + 1 == factors.len());
         let mut pair = light.level(&aligned, factor);
         clock.book("pyramid");
         let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
-        let voxel = pyramid::finest(pair.shape, pair.spacing);
-        let by_evidence = ablation::is_on("node-spacing") && !(last && params.node_spacing > 0);
-        let apart = match apart_mm {
-            _ if !by_evidence && params.node_spacing > 0 => params.node_spacing,
-            _ if !by_evidence => {
-                if last {
-                    4
-                } else {
-                    3
-                }
-            }
-            Some(mm) => ((mm / voxel).round() as usize).clamp(2, WIDEST),
-            None if last => WIDEST,
-            None => COARSEST,
-        };
+        let apart = if last { finer::apart(params.node_spacing, pair.inside) } else { COARSE };
         let lattice = level::lattice(&pair, apart);
         let passes = if last { params.passes } else { params.coarse_passes };
         let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
         let matching = || progress("matching", done(0.0));
         let whole = Whole { params, range: search, flat: grid.is_single_slice(), matching: &matching, tick: &tick };
         let mut matched = 0.0;
-        let (mut spacing, mut tried) = (apart, Vec::new());
-        let closer = |pair: &Pair<'_>, field: SplineField, reach: f64| {
-            let refine =
-                |field: &mut SplineField| level::refine(pair, field, (finer::TRIAL, reach), params.seed, |_| ());
-            if by_evidence { finer(pair, field, apart, params.seed, refine) } else { (field, apart, Vec::new()) }
-        };
         let mut field = match &state {
             Some((coarse, from)) => {
                 let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
                 level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
-                (field, spacing, tried) = closer(&pair, field, reach);
                 let loose = l == 1 && begun.as_ref().is_some_and(Begun::is_loose);
                 let borne_out = loose && whole.is_borne_out(&pair, &field, whole::IN_PLACE, &mut matched);
                 if borne_out {
@@ -310,19 +289,18 @@ fn canonical(
                 begun.insert(found).field.clone()
             }
         };
-        if first {
-            (field, spacing, tried) = closer(&pair, field, reach);
-        }
         // What a coarser level saw of the brightness serves the finest one.
         let open = first || !last || light.is_unknown();
         let more = open && light.look(&mut pair, (&aligned, factor), &field);
         if more && last {
             level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
         }
-        apart_mm = Some(spacing as f64 * voxel);
         if last {
-            asked.extend(tried);
-            [left, gain] = level::misfit(&pair, &field);
+            let refine =
+                |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
+            let found = finer(&pair, field, apart, params.seed, refine);
+            (field, nodes_apart, left, gain) = (found.field, found.apart, found.left, found.gain);
+            asked.extend(found.said);
         }
         clock.skip("matching", matched);
         clock.book("residual");
@@ -368,7 +346,7 @@ fn canonical(
         .flatten();
     let mut places = Vec::new();
     if let Some(glides) = glides {
-        let wide = apart_mm.is_none_or(|mm| mm > SLIDING_NODES * pyramid::finest(pair.shape, pair.spacing));
+        let wide = nodes_apart > SLIDING_NODES;
         let believed = wide || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
         choice.evidence.push(why_sliding(&glides, believed));
         if believed {
@@ -393,8 +371,7 @@ fn canonical(
         pair = light.level(&aligned, next);
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-        let voxel = pyramid::finest(pair.shape, pair.spacing);
-        let nodes = apart_mm.map_or(polish::WIDEST, |mm| ((mm / voxel).round() as usize).clamp(2, polish::WIDEST));
+        let nodes = polish::WIDEST.min(2 * nodes_apart);
         field = polish::polish((&pair, next, nodes), (&field, factor), reach, params, tick);
         factor = next;
         choice.evidence.push(polish::why(&pair, nodes, params));
@@ -536,9 +513,8 @@ pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) ->
 /// Voxels of the mask that a preset without a fixed finest level works on at most.
 const WORKED_ON: usize = 600_000;
 
-/// Voxels between nodes at first: on the coarsest of several levels, and at most on any.
-const COARSEST: usize = 5;
-const WIDEST: usize = finer::SPACINGS[0];
+/// Voxels between the nodes of the lattice on levels above the finest.
+const COARSE: usize = 3;
 
 /// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`] voxels of tissue are left.
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
@@ -629,7 +605,7 @@ pub(super) fn full_lattice(
 const GLIDING: f64 = 0.1;
 
 /// Voxels between nodes up to which that is asked: so close a lattice was taken since the volumes differ by more than smooth motion.
-const SLIDING_NODES: f64 = 3.5;
+const SLIDING_NODES: usize = 3;
 
 fn why_sliding(sliding: &Sliding, believed: bool) -> String {
     let Sliding { voxels, strained, left } = sliding;

@@ -1,10 +1,10 @@
-//! As many nodes as the volumes ask for: from a wide lattice to closer ones while each explains more than chance.
+//! A closer lattice where the volumes still differ by more than noise, and the closer field explains why.
 
 use crate::matching::pair::Pair;
 use crate::numerics::statistics::deviation;
 use crate::pipeline::level::{self, SplineField};
 
-/// Residual (in standard deviations of the noise) beyond which a closer lattice is tried in any case. The spline filter leaves noise alone at
+/// Residual (in standard deviations of the noise) beyond which a closer lattice is tried. The spline filter leaves noise alone at
 /// about 0.5. Same tissue at 3 % noise: 0.5 to 0.75 where the motion was found, 0.95 at most where not; brains of two people,
 /// 1.4 to 12.
 const NOISY: f32 = 1.1;
@@ -13,15 +13,15 @@ const NOISY: f32 = 1.1;
 /// and interpolation (docs/lab/2026-11-local-signal.md).
 const WORTH: f64 = 0.8;
 
-/// Misfit per degree of freedom from which the next closer lattice is tried: a step gains about half of the one before, so where less was
-/// gained the next would not be worth it.
-const NEXT: f64 = 2.0 * WORTH;
+/// Passes on each closer lattice, and again where it is taken.
+const TRIAL: usize = 4;
 
-/// Degrees of freedom that a closer lattice counts for at least: with fewer, what a few passes more explain would decide.
-const FEWEST: f64 = 40.0;
+/// Nodes in the tissue from which on they lie further apart than [`APART`]: smoothness sets the scale of motion on any lattice, and
+/// bodies move on a scale of their own size. Calibrated: docs/lab/2026-11-local-signal.md.
+const ENOUGH: f64 = 6000.0;
 
-/// Passes on each closer lattice, and again where it is taken and leaves more than noise.
-pub(super) const TRIAL: usize = 4;
+/// Voxels between nodes, at least, to begin with.
+const APART: usize = 4;
 
 /// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is no matter.
 const UNLIKE: f32 = 0.05;
@@ -31,55 +31,65 @@ const UNLIKE: f32 = 0.05;
 /// the second and the 98th percentile one of those, in thick slices, had 1.55.
 const UNEVEN: f32 = 1.25;
 
-/// Voxels between nodes, from the widest lattice to the closest.
-pub(super) const SPACINGS: [usize; 7] = [10, 8, 6, 5, 4, 3, 2];
-
 /// Nodes at most, to bound memory.
 const NODES: usize = 4_000_000;
 
-/// Brings the field to ever closer nodes, from `spacing`, for as long as each lattice explains more than chance for each degree of
-/// freedom that it adds: that field, the voxels between its nodes, and what was tried, in words. `refine` brings a field to the residual.
+/// Voxels between the nodes of the finest level to begin with: as asked, or by the `inside` voxels of tissue.
+pub(super) fn apart(asked: usize, inside: usize) -> usize {
+    let wide = (inside as f64 / ENOUGH).cbrt().round() as usize;
+    if asked > 0 { asked } else { wide.max(APART) }
+}
+
+/// A field with what it leaves.
+pub(super) struct Explained {
+    pub field: SplineField,
+    /// Voxels between its nodes.
+    pub apart: usize,
+    /// Robust standard deviation of what is left of the difference (intensity).
+    pub left: f32,
+    /// By what factor the gain varies across the tissue.
+    pub gain: f32,
+    /// What was tried, in words.
+    pub said: Vec<String>,
+}
+
+/// Brings the field to lattices of one voxel less between nodes, from `apart`, for as long as the residual is more than noise and
+/// each explains it. `refine` brings a field to the residual in so many passes.
 pub(super) fn finer(
     pair: &Pair<'_>,
     field: SplineField,
-    spacing: usize,
+    apart: usize,
     seed: u64,
-    refine: impl Fn(&mut SplineField),
-) -> (SplineField, usize, Vec<String>) {
-    let (mut best, mut chosen, mut said) = (field, spacing, Vec::new());
-    for closer in SPACINGS.into_iter().filter(|&s| s < spacing) {
+    refine: impl Fn(&mut SplineField, usize),
+) -> Explained {
+    let [left, gain] = level::misfit(pair, &field);
+    let mut best = Explained { field, apart, left, gain, said: Vec::new() };
+    for closer in (2..apart).rev() {
         let lattice = level::lattice(pair, closer);
-        if lattice.len() > NODES || lattice == best.lattice {
+        let noisy = times(best.left, pair.noise);
+        if noisy < NOISY || lattice.len() > NODES || lattice == best.field.lattice {
             break;
         }
-        let mut next = level::carry(&best, lattice, |p| p);
-        refine(&mut next);
-        let gain = level::gained(pair, &best, &next);
-        let [few, many] = [&best, &next].map(|f| level::determined(pair, f, seed));
-        let worth = gain / (many - few).max(FEWEST);
+        let mut next = level::carry(&best.field, lattice, |p| p);
+        refine(&mut next, TRIAL);
+        let gain = level::gained(pair, &best.field, &next);
+        let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
+        let worth = gain / (many - few).max(1.0);
         let taken = gain > 0.0 && worth > WORTH;
-        said.push(format!(
-            "nodes every {closer} voxels: {}; {:.0} degrees of freedom more explain {worth:.2} of the misfit each (chance: up to {WORTH})",
+        best.said.push(format!(
+            "nodes every {closer} voxels: {}; the residual is {noisy:.1} times the noise, and {:.0} degrees of freedom more explain \
+             {worth:.2} of the misfit each (chance: up to {WORTH})",
             if taken { "taken" } else { "not taken" },
             many - few
         ));
-        if taken {
-            (best, chosen) = (next, closer);
-            if is_noisy(pair, &best) {
-                refine(&mut best);
-            }
-        }
-        // What is left beyond noise may be finer than any lattice so far.
-        if worth < NEXT && !is_noisy(pair, &best) {
+        if !taken {
             break;
         }
+        refine(&mut next, TRIAL);
+        [best.left, best.gain] = level::misfit(pair, &next);
+        (best.field, best.apart) = (next, closer);
     }
-    (best, chosen, said)
-}
-
-/// Whether a field leaves more than noise of the difference.
-fn is_noisy(pair: &Pair<'_>, field: &SplineField) -> bool {
-    times(level::misfit(pair, field)[0], pair.noise) > NOISY
+    best
 }
 
 /// A residual in standard deviations of the noise.
