@@ -259,17 +259,20 @@ struct Range {
 impl Range {
     fn of(volume: &Voxels<'_>) -> Self {
         let none = || Self { low: f32::INFINITY, high: f32::NEG_INFINITY, not_finite: 0 };
-        let with = |r: Self, &v: &f32| match v.is_finite() {
-            true => Self { low: r.low.min(v), high: r.high.max(v), ..r },
-            false => Self { not_finite: r.not_finite + 1, ..r },
+        let of_part = |part: &[f32]| {
+            let or = |v: &f32, other: f32| if v.is_finite() { *v } else { other };
+            Self {
+                low: part.iter().fold(f32::INFINITY, |low, v| low.min(or(v, f32::INFINITY))),
+                high: part.iter().fold(f32::NEG_INFINITY, |high, v| high.max(or(v, f32::NEG_INFINITY))),
+                not_finite: part.iter().filter(|v| !v.is_finite()).count(),
+            }
         };
         let both = |a: Self, b: Self| Self {
             low: a.low.min(b.low),
             high: a.high.max(b.high),
             not_finite: a.not_finite + b.not_finite,
         };
-        let parts = volume.as_slice().par_chunks(1 << 16);
-        parts.map(|part| part.iter().fold(none(), with)).reduce(none, both)
+        volume.as_slice().par_chunks(1 << 14).map(of_part).reduce(none, both)
     }
 }
 
@@ -307,16 +310,10 @@ const FAR: f64 = 100.0;
 /// Quantiles between which a volume's intensities are taken to lie.
 const ROBUST: [f64; 2] = [0.001, 0.999];
 
-/// The range of the intensities without far outliers (hot voxels, spikes) and without `padding`.
-fn robust_range(volume: &Voxels<'_>, padding: Option<f32>) -> [f32; 2] {
-    let mut sample = sampled(volume.as_slice());
-    sample.retain(|v| Some(*v) != padding);
-    let [low, high] = ROBUST.map(|q| quantile(&mut sample, q));
-    if high > low {
-        return [low, high];
-    }
-    let Range { low, high, .. } = Range::of(volume);
-    [low, high]
+/// The range of some intensities without far outliers (hot voxels, spikes); none where they are all alike.
+fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
+    let [low, high] = ROBUST.map(|q| quantile(sample, q));
+    (high > low).then_some([low, high])
 }
 
 /// How far past its robust range a volume's intensities may lie, in widths of it.
@@ -328,14 +325,16 @@ const RUN: usize = 3;
 /// The volume with padding that lies far from its intensities as the darkest of these, lone far outliers as the median of their
 /// neighbours, and others drawn in to the end of the range.
 pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
-    let Range { low: least, high: most, .. } = Range::of(volume);
-    let padding = [least, most].map(|v| background::filled_with(volume, v).then_some(v));
-    let [low, high] = robust_range(volume, padding[0].or(padding[1]));
+    let reached = Range::of(volume);
+    let mut sample = sampled(volume.as_slice());
+    let padding = [reached.low, reached.high].map(|v| background::filled_with(&sample, v).then_some(v));
+    sample.retain(|v| !padding.contains(&Some(*v)));
+    let Some([low, high]) = robust_range(&mut sample) else { return volume.view() };
     let width = high - low;
-    if width.is_nan() || width <= 0.0 {
+    let (least, most) = (low - PAST * width, high + PAST * width);
+    if least <= reached.low && reached.high <= most {
         return volume.view();
     }
-    let (least, most) = (low - PAST * width, high + PAST * width);
     let far = |v: f32| v.is_finite() && !(least..=most).contains(&v);
     let (values, shape) = (volume.as_slice(), volume.grid().shape());
     let other = |at: usize| {
@@ -369,7 +368,11 @@ fn neighbours(values: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Vec<f32> {
 /// With intensities that can be squared and summed in single precision, and with their spread, which comes near to `like`:
 /// gains between the volumes are bounded, and noise is measured in the initial one alone.
 fn in_range<'a>(mut volume: Voxels<'a>, like: Option<f64>) -> (Voxels<'a>, f64) {
-    let [low, high] = robust_range(&volume, None).map(f64::from);
+    let reached = || {
+        let Range { low, high, .. } = Range::of(&volume);
+        [low, high]
+    };
+    let [low, high] = robust_range(&mut sampled(volume.as_slice())).unwrap_or_else(reached).map(f64::from);
     let spread = high - low;
     let furthest = low.abs().max(high.abs());
     let alike = like.is_none_or(|l| (l / spread).log2().abs() < 0.5);

@@ -84,7 +84,7 @@ fn independent(pair: &Pair<'_>) -> f32 {
 const MOMENTUM: f32 = 0.5;
 
 /// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
-const SETTLED: f64 = 0.004;
+const SETTLED: f64 = 0.008;
 
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 10;
