@@ -26,8 +26,8 @@ HERE = Path(__file__).resolve().parent
 FIELDS = ["case", "variant", "mean_mm", "p95_mm", "still_mm", "gradient", "folds", "inside", "motion_mm", "cpu_s", "memory_mb", "model", "trust"]
 # What PALPATE_WITHOUT knows in a build with the feature `ablation`.
 MECHANISMS = (
-    "local-smoothness node-spacing gradient-floor robust-range enclosed cut brightness consistency second-start "
-    "search-again next-level farther reach unfold sliding rest model"
+    "local-smoothness gradient-floor robust-range enclosed cut brightness consistency turned next-level unfold "
+    "sliding rest model"
 ).split()
 
 

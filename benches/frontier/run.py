@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-OURS = ["palpate fast", "palpate balanced", "palpate accurate"]
+OURS = ["palpate fast", "palpate balanced"]
 PEERS = ["greedy half", "greedy full", "elastix", "plastimatch", "demons"]
 FIELDS = ["case", "method", "mean_mm", "median_mm", "p95_mm", "still_mm", "grad_err", "folds", "identity_mm", "cpu_s", "wall_s", "memory_mb"]
 

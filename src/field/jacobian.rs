@@ -34,6 +34,14 @@ pub fn determinant_at(field: &DenseField, offset: usize) -> f32 {
 /// # Errors
 /// [`FieldError::GridMismatch`] when the mask has another shape.
 pub fn count_folds(field: &DenseField, mask: Option<&Mask>) -> Result<usize, FieldError> {
+    Ok(folds(field, mask)?.len())
+}
+
+/// The offsets (x fastest) of the voxels whose determinant is at or below zero, within `mask` (everywhere when `None`), in order.
+///
+/// # Errors
+/// [`FieldError::GridMismatch`] when the mask has another shape.
+pub fn folds(field: &DenseField, mask: Option<&Mask>) -> Result<Vec<usize>, FieldError> {
     let derivative = Derivative::new(field);
     let [nx, ny, nz] = derivative.shape;
     if let Some(mask) = mask.filter(|m| m.grid().shape() != derivative.shape) {
@@ -45,19 +53,21 @@ pub fn count_folds(field: &DenseField, mask: Option<&Mask>) -> Result<usize, Fie
         });
     }
     let mask = mask.map(Mask::as_slice);
-    let slice = |k: usize| -> usize {
+    let slice = |k: usize| -> Vec<usize> {
         let mut row = vec![1.0; nx];
-        let mut folds = |j: usize| {
-            let inside = mask.map(|m| &m[nx * (j + ny * k)..][..nx]);
+        let mut found = Vec::new();
+        for j in 0..ny {
+            let from = nx * (j + ny * k);
+            let inside = mask.map(|m| &m[from..][..nx]);
             if inside.is_some_and(|m| m.iter().all(|&m| m == 0)) {
-                return 0;
+                continue;
             }
             derivative.determinants([0, j, k], &mut row);
-            (0..nx).filter(|&i| row[i] <= 0.0 && inside.is_none_or(|m| m[i] != 0)).count()
-        };
-        (0..ny).map(&mut folds).sum()
+            found.extend((0..nx).filter(|&i| row[i] <= 0.0 && inside.is_none_or(|m| m[i] != 0)).map(|i| from + i));
+        }
+        found
     };
-    Ok((0..nz).into_par_iter().map(slice).sum())
+    Ok((0..nz).into_par_iter().flat_map_iter(slice).collect())
 }
 
 /// What the determinants are worked out from.

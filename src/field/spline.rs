@@ -1,10 +1,12 @@
 //! A spline lattice as a dense field.
 
-use crate::error::SpaceError;
+use crate::error::{FieldError, SpaceError};
+use crate::field::jacobian;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::simd::dispatch;
-use crate::types::{DenseField, Grid, Volume};
+use crate::numerics::unfold;
+use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
 
 /// Evaluates `coefficients` (mm along `grid`'s axes, planar) at every voxel and turns them into world mm (RAS).
@@ -78,6 +80,9 @@ pub fn follow(
     found.into_iter().map(|(_, change)| change).collect()
 }
 
+/// Times that what still folds between the knots of a lattice is smoothed.
+const UNFOLDED: usize = 20;
+
 /// A displacement field as its B-spline coefficients, and the voxels beside a jump that move as another place does: all that a dense one is worked
 /// out from, and much smaller.
 #[derive(Debug, Clone, PartialEq)]
@@ -118,6 +123,22 @@ impl FieldSpline {
             Some((grid, orientation)) => orientation.stored_field(field, grid),
             None => Ok(field),
         }
+    }
+
+    /// Smooths the coefficients about voxels of `mask` that fold, until none does but for jumps, [`UNFOLDED`] times at most.
+    ///
+    /// # Errors
+    /// [`FieldError::GridMismatch`] when the mask has another shape.
+    pub(crate) fn unfold(&mut self, mask: &Mask) -> Result<(), FieldError> {
+        for _ in 0..UNFOLDED {
+            let folds = jacobian::folds(&dense(&self.grid, &self.lattice, &self.coefficients), Some(mask))?;
+            if folds.is_empty() {
+                break;
+            }
+            let voxels = folds.into_iter().map(|at| self.grid.voxel(at));
+            unfold::smooth_about(&self.lattice, &mut self.coefficients, voxels);
+        }
+        Ok(())
     }
 
     /// The displacement on its own grid, and by how much each voxel beside a jump is moved from the smooth field (mm) with its index.

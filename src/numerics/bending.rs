@@ -212,7 +212,7 @@ impl<'a> Differences<'a> {
         let (low, here, high, weight) = (at(k - 1), at(k), at(k + 1), &self.weight[k * plane..][..plane]);
         let scale = self.of.scale[2];
         for i in 0..plane {
-            out[i] = scale * weight[i] * (low[i] - 2.0 * here[i] + high[i]);
+            out[i] = scale * weight[i] * ((low[i] - here[i]) + (high[i] - here[i]));
         }
     }
 
@@ -233,13 +233,13 @@ impl<'a> Differences<'a> {
         let (h, u, h1, u1) = (&here[..n], &above[..n], &here[1..], &above[1..]);
         let (xz, w, inner) = (&mut xz[..n], &weight[..n], &self.inner[0][..n]);
         for i in 0..n {
-            xz[i] = a * inner[i] * w[i] * (u1[i] - u[i] - h1[i] + h[i]);
+            xz[i] = a * inner[i] * w[i] * ((u1[i] - u[i]) - (h1[i] - h[i]));
         }
         let n = plane - nx;
         let (h, u, h1, u1) = (&here[..n], &above[..n], &here[nx..], &above[nx..]);
         let (yz, w) = (&mut yz[..n], &weight[..n]);
         for i in 0..n {
-            yz[i] = b * w[i] * (u1[i] - u[i] - h1[i] + h[i]);
+            yz[i] = b * w[i] * ((u1[i] - u[i]) - (h1[i] - h[i]));
         }
     }
 
@@ -257,7 +257,7 @@ impl<'a> Differences<'a> {
             let (low, here, high) = (&x[..n], &x[1..][..n], &x[2..]);
             let (xx, w, inner) = (&mut xx[1..][..n], &weight[1..][..n], &self.inner[1][1..][..n]);
             for i in 0..n {
-                xx[i] = a * inner[i] * w[i] * (low[i] - 2.0 * here[i] + high[i]);
+                xx[i] = a * inner[i] * w[i] * ((low[i] - here[i]) + (high[i] - here[i]));
             }
         }
         if ny > 2 {
@@ -265,7 +265,7 @@ impl<'a> Differences<'a> {
             let (low, here, high) = (&x[..n], &x[nx..][..n], &x[2 * nx..]);
             let (yy, w) = (&mut yy[nx..][..n], &weight[nx..][..n]);
             for i in 0..n {
-                yy[i] = b * w[i] * (low[i] - 2.0 * here[i] + high[i]);
+                yy[i] = b * w[i] * ((low[i] - here[i]) + (high[i] - here[i]));
             }
         }
         if ny > 1 && nx > 1 {
@@ -273,7 +273,7 @@ impl<'a> Differences<'a> {
             let (here, right, next, far) = (&x[..n], &x[1..][..n], &x[nx..][..n], &x[nx + 1..]);
             let (xy, w, inner) = (&mut xy[..n], &weight[..n], &self.inner[0][..n]);
             for i in 0..n {
-                xy[i] = c * inner[i] * w[i] * (far[i] - next[i] - right[i] + here[i]);
+                xy[i] = c * inner[i] * w[i] * ((far[i] - next[i]) - (right[i] - here[i]));
             }
         }
     }

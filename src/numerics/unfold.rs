@@ -170,6 +170,17 @@ impl<'a> Knots<'a> {
         inner(nz).into_par_iter().flat_map_iter(in_plane).collect()
     }
 
+    /// Smooths the coefficients (planar) of some nodes.
+    fn smooth(&self, coefficients: &mut [f32], nodes: &[usize]) {
+        for values in coefficients.chunks_exact_mut(self.lattice.len()) {
+            let smooth: Vec<f32> =
+                nodes.par_iter().with_min_len(256).map(|&node| self.smoothed(values, node)).collect();
+            for (&node, v) in nodes.iter().zip(smooth) {
+                values[node] = v;
+            }
+        }
+    }
+
     fn smoothed(&self, values: &[f32], node: usize) -> f32 {
         let at = self.place(node);
         let mut sum = 0.0;
@@ -184,24 +195,31 @@ impl<'a> Knots<'a> {
     }
 }
 
+/// Smooths the coefficients (planar) of the nodes about `voxels` of the lattice's grid.
+pub fn smooth_about(lattice: &Lattice, coefficients: &mut [f32], voxels: impl Iterator<Item = [usize; 3]>) {
+    let knots = Knots::new(lattice, [1.0; 3]);
+    let n = lattice.nodes;
+    let node = |v: [usize; 3]| {
+        let p: [usize; 3] = std::array::from_fn(|a| if n[a] == 1 { 0 } else { v[a] / lattice.step[a] + 1 });
+        p[0] + n[0] * (p[1] + n[1] * p[2])
+    };
+    let mut nodes: Vec<usize> = voxels.map(node).collect();
+    nodes.sort_unstable();
+    nodes.dedup();
+    knots.smooth(coefficients, &knots.around(&nodes, 1));
+}
+
 /// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of what it was, until there is
 /// none, twenty rounds at most. `spacing` is that of the lattice's voxels (mm).
 pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
     let knots = Knots::new(lattice, spacing);
-    let total = lattice.len();
     let mut folded = knots.folded(coefficients, knots.suspects(coefficients, least).into_par_iter(), least);
     for _ in 0..ROUNDS {
         if folded.is_empty() {
             break;
         }
         let touched = knots.around(&folded, 1);
-        for values in coefficients.chunks_exact_mut(total) {
-            let smooth: Vec<f32> =
-                touched.par_iter().with_min_len(256).map(|&node| knots.smoothed(values, node)).collect();
-            for (&node, v) in touched.iter().zip(smooth) {
-                values[node] = v;
-            }
-        }
+        knots.smooth(coefficients, &touched);
         folded = knots.folded(coefficients, knots.around(&touched, 1).into_par_iter(), least);
     }
 }

@@ -16,16 +16,14 @@ use crate::numerics::pyramid;
 use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::background;
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::farther;
-use crate::pipeline::finer::{self, finer, uneven, unlike};
+use crate::pipeline::finer::{self, Explained, finer, uneven, unlike};
+pub use crate::pipeline::hypotheses::Start;
+use crate::pipeline::hypotheses::{Begun, NEAR, Search};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
 use crate::pipeline::rest::{Places, Rest, Tried};
 use crate::pipeline::sparse;
-use crate::pipeline::start::Begun;
-pub use crate::pipeline::start::Start;
-use crate::pipeline::whole::{self, Whole};
 use crate::types::params::{Interpolation, Method};
 use crate::types::*;
 use rayon::prelude::*;
@@ -214,115 +212,17 @@ fn canonical(
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
         check::inputs(&initial, &deformed, mask)?;
     let grid = *initial.grid();
-    let mut search = search_mm(&grid, params.search_mm);
-    let aligned = Aligned::new(&clean, &seen, &mask, farther::TWICE * search)?;
+    let search = search_mm(&grid, params.search_mm);
+    let aligned = Aligned::new(&clean, &seen, &mask, TWICE * search)?;
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
     clock.book("pyramid");
-
-    // Coarse to fine.
-    let mut reports = Vec::new();
-    let mut state: Option<(SplineField, [usize; 3])> = None;
-    let mut fine = None;
-    let mut begun = None;
-    let mut reach = f64::INFINITY;
-    let mut light = Light::default();
-    let (mut left, mut gain, mut nodes_apart, mut asked) = (0.0, 1.0, 0, Vec::new());
-    for (l, &factor) in factors.iter().enumerate() {
-        let (first, last) = (l == 0, l + 1 == factors.len());
-        let mut pair = light.level(&aligned, factor);
-        clock.book("pyramid");
-        let done = |part: f64| (l as f64 + part) / (factors.len() as f64 + 1.0);
-        let apart = if last { finer::apart(params.node_spacing, pair.inside) } else { COARSE };
-        let lattice = level::lattice(&pair, apart);
-        let passes = if last { params.passes } else { params.coarse_passes };
-        let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
-        let matching = || progress("matching", done(0.0));
-        let whole = Whole { params, range: search, flat: grid.is_single_slice(), matching: &matching, tick: &tick };
-        let mut matched = 0.0;
-        let mut field = match &state {
-            Some((coarse, from)) => {
-                let mut field = level::carry(coarse, lattice, |p| to_level(from_level(p, factor), *from));
-                level::refine(&pair, &mut field, (passes, reach), params.seed, tick);
-                let loose = l == 1 && begun.as_ref().is_some_and(Begun::is_loose);
-                let borne_out = loose && whole.is_borne_out(&pair, &field, whole::IN_PLACE, &mut matched);
-                if borne_out {
-                    level::refine(&pair, &mut field, (whole::SETTLING, reach), params.seed, |_| ());
-                }
-                let search = || whole.closer((&pair, factor), &field, passes, &mut matched);
-                let next = (loose && !borne_out).then(search).flatten();
-                if let Some(found) = next {
-                    field = found.field.clone();
-                    reports.extend(found.report.clone());
-                    reach = found.reach();
-                    begun = Some(found);
-                }
-                field
-            }
-            None => {
-                light.look_at_rest(&mut pair, (&aligned, factor), &SplineField::still(lattice.clone()));
-                let effort = (passes, whole::POINTS);
-                let mut found = whole.begin((&pair, factor), &lattice, (starts, true), effort, &mut matched);
-                if given && found.as_ref().is_none_or(Begun::is_unsure) {
-                    let tissue = light.level_within(&aligned, &around(&mask, &clean), factor);
-                    let wider = whole.begin((&tissue, factor), &lattice, (&[], true), effort, &mut matched);
-                    found = match (found, wider) {
-                        (Some(own), Some(wider)) => Some(Begun::surer(&pair, own, wider)),
-                        (own, wider) => own.or(wider),
-                    };
-                }
-                let free = params.search_mm == 0.0;
-                if let Some(open) = free.then(|| farther::is_open(&pair, search, found.as_ref())).flatten() {
-                    let all = worked_on(&grid, &mask, finest, farther::TWICE * search);
-                    let coarser = all.len().saturating_sub(factors.len());
-                    let here = (&all[..=coarser], &pair, &lattice);
-                    let wide = farther::farther(&whole, (&aligned, &light), here, found.as_ref(), passes, &mut matched);
-                    asked.push(farther::why(search, open, found.as_ref(), wide.as_ref()));
-                    if wide.is_some() {
-                        search *= farther::TWICE;
-                        found = wide;
-                    }
-                }
-                let found = found.ok_or_else(|| too_few(0, search))?;
-                reports.extend(found.report.clone());
-                reach = found.reach();
-                begun.insert(found).field.clone()
-            }
-        };
-        // What a coarser level saw of the brightness serves the finest one.
-        let open = first || !last || light.is_unknown();
-        let more = open && light.look(&mut pair, (&aligned, factor), &field);
-        if more && last {
-            level::refine(&pair, &mut field, (passes, reach), params.seed, |_| ());
-        }
-        if last {
-            let refine =
-                |field: &mut SplineField, passes| level::refine(&pair, field, (passes, reach), params.seed, |_| ());
-            let found = finer(&pair, field, apart, params.seed, refine);
-            (field, nodes_apart, left, gain) = (found.field, found.apart, found.left, found.gain);
-            asked.extend(found.said);
-        }
-        clock.skip("matching", matched);
-        clock.book("residual");
-        if last {
-            progress("matching", done(0.9));
-            let points =
-                if params.points > 0 { params.points } else { (pair.inside / params.voxels_per_point).max(200) };
-            let near = MatchParams::near(params, &pair, points, params.points > 0);
-            let (matches, _, report) = level::matches(&pair, Some(&field), near);
-            if !first || reports.is_empty() {
-                reports.push(report);
-            } else {
-                reports = vec![report];
-            }
-            clock.book("matching");
-            fine = Some((matches, pair, points));
-        }
-        state = Some((field, factor));
-    }
-    let (Some((field, factor)), Some((matches, pair, points))) = (state, fine) else {
-        return Err(too_few(0, search));
-    };
+    // Without a mask all tissue is searched from the start.
+    let tissue = || given.then(|| around(&mask, &clean));
+    let chain =
+        CoarseToFine { aligned: &aligned, factors: &factors, flat: grid.is_single_slice(), params, starts, progress };
+    let Found { field, factor, pair, matches, points, mut reports, begun, light, search, left, gain, apart, asked } =
+        chain.run(search, tissue, &mut clock)?;
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
         return Err(too_few(kept, search));
@@ -346,7 +246,7 @@ fn canonical(
         .flatten();
     let mut places = Vec::new();
     if let Some(glides) = glides {
-        let wide = nodes_apart > SLIDING_NODES;
+        let wide = apart > SLIDING_NODES;
         let believed = wide || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
         choice.evidence.push(why_sliding(&glides, believed));
         if believed {
@@ -357,7 +257,7 @@ fn canonical(
     let unseen = level::unseen(&pair, &field);
     let plain = without_texture(pair.plain());
     let free = choice.motion.is_none() && ablation::is_on("rest");
-    let rest = free.then(|| Rest::find((&pair, &field), &windows, &places_of, &tried, &by_place, &posterior)).flatten();
+    let rest = free.then(|| Rest::find((&pair, &field), &windows, &places_of, &tried, &by_place)).flatten();
     drop(by_place);
     choice.evidence.extend(rest.as_ref().map(Rest::why));
     let rest = rest.filter(Rest::is_taken);
@@ -371,8 +271,8 @@ fn canonical(
         pair = light.level(&aligned, next);
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-        let nodes = polish::WIDEST.min(2 * nodes_apart);
-        field = polish::polish((&pair, next, nodes), (&field, factor), reach, params, tick);
+        let nodes = polish::WIDEST.min(2 * apart);
+        field = polish::polish((&pair, next, nodes), (&field, factor), params, tick);
         factor = next;
         choice.evidence.push(polish::why(&pair, nodes, params));
         clock.book("residual");
@@ -384,7 +284,8 @@ fn canonical(
         rest.bring(&mut field, judged);
     }
     let spacing = pair.spacing;
-    let coefficients = FieldSpline::new(grid, full_lattice(&grid, &field, factor, &choice), places);
+    let mut coefficients = FieldSpline::new(grid, full_lattice(&grid, &field, factor, &choice), places);
+    coefficients.unfold(&mask)?;
     let (coarse, mut posterior) = posterior;
     let hidden = hidden(&pair, &field, &coarse);
     if let Some(rest) = rest {
@@ -405,7 +306,7 @@ fn canonical(
     let displacement = interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
-    let doubted = begun.as_ref().and_then(Begun::doubted);
+    let doubted = begun.doubted();
     // Features that do not bear each other out, few matches or volumes that do not agree in the end, and a motion past all that was
     // looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| most_move(&displacement, &mask) > search) {
@@ -430,15 +331,7 @@ fn canonical(
     let (uncertainty_median_mm, uncertainty_mean_mm) = average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
-    let last = reports.last_mut();
-    let mut counts = last.as_ref().map(|r| r.counts).unwrap_or_default();
-    (counts.nodes, counts.tetrahedra) = match &mesh {
-        Mesh::Tetrahedra(m) => (m.nodes().len(), m.tetrahedra().len()),
-        Mesh::Triangles(m) => (m.nodes().len(), m.triangles().len()),
-    };
-    if let Some(r) = last {
-        r.counts = counts;
-    }
+    let counts = with_mesh(&mut reports, &mesh);
     let summary = FieldSummary {
         counts,
         model: choice.model,
@@ -467,11 +360,8 @@ fn canonical(
     };
     progress("done", 1.0);
     // What the data say at each node is as large again twice over, and no search starts from it.
-    let spline = Start {
-        field: SplineField { blocks: Blocks::default(), ..field },
-        factor,
-        followed: begun.map(|b| b.followed),
-    };
+    let spline =
+        Start { field: SplineField { blocks: Blocks::default(), ..field }, factor, followed: Some(begun.followed) };
     Ok(FieldResult {
         displacement,
         coefficients,
@@ -482,6 +372,178 @@ fn canonical(
         node_displacement,
         summary,
     })
+}
+
+/// The levels of the pyramid, from the coarsest one, and how they are worked on.
+struct CoarseToFine<'a, 'p> {
+    aligned: &'a Aligned<'a>,
+    /// Voxels that a voxel of each level stands for.
+    factors: &'p [[usize; 3]],
+    /// Whether the volumes are one slice.
+    flat: bool,
+    params: &'p FieldParams,
+    starts: &'p [Start],
+    progress: Progress<'p>,
+}
+
+/// What the levels found.
+struct Found<'a> {
+    /// On the finest level, with that level's factor and pair.
+    field: SplineField,
+    factor: [usize; 3],
+    pair: Pair<'a>,
+    /// Of that level, about the field, with the number wanted.
+    matches: Vec<LevelMatch>,
+    points: usize,
+    reports: Vec<LevelReport>,
+    /// Where the passes began.
+    begun: Begun,
+    light: Light,
+    /// The range (mm) that was searched.
+    search: f64,
+    /// What is left of the difference (intensity), and how the gain varies.
+    left: f32,
+    gain: f32,
+    /// Voxels between nodes.
+    apart: usize,
+    /// Questions that were asked on the way, with their answers.
+    asked: Vec<String>,
+}
+
+impl<'a> CoarseToFine<'a, '_> {
+    /// From the coarsest level to the finest: where the passes begin, the passes, and the matches about their field. `tissue` gives
+    /// the mask with all tissue around it, where that is another.
+    fn run(
+        &self,
+        range: f64,
+        tissue: impl Fn() -> Option<Vec<u8>>,
+        clock: &mut Clock,
+    ) -> Result<Found<'a>, FieldError> {
+        let Self { aligned, params, progress, .. } = *self;
+        let (mut reports, mut asked, mut light, mut range) = (Vec::new(), Vec::new(), Light::default(), range);
+        let mut state: Option<(SplineField, [usize; 3], Begun)> = None;
+        for (l, &factor) in self.factors.iter().enumerate() {
+            let (first, last) = (l == 0, l + 1 == self.factors.len());
+            let mut pair = light.level(aligned, factor);
+            clock.book("pyramid");
+            let done = |part: f64| (l as f64 + part) / (self.factors.len() as f64 + 1.0);
+            let apart = if last { finer::apart(params.node_spacing, pair.inside) } else { COARSE };
+            let lattice = level::lattice(&pair, apart);
+            let passes = if last { params.passes } else { params.coarse_passes };
+            let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
+            let matching = || progress("matching", done(0.0));
+            let search = Search { params, range, flat: self.flat, matching: &matching, tick: &tick };
+            let mut matched = 0.0;
+            let (mut field, begun) = match state.take() {
+                Some((coarse, from, mut begun)) => {
+                    let mut field = level::carry(&coarse, lattice, |p| to_level(from_level(p, factor), from));
+                    level::refine(&pair, &mut field, passes, params.seed, tick);
+                    let loose = l == 1 && begun.is_loose();
+                    if let Some(found) = loose.then(|| search.closer(&pair, &field, passes, &mut matched)).flatten() {
+                        field = found.field.clone();
+                        reports.extend(found.report.clone());
+                        begun = found;
+                    }
+                    (field, begun)
+                }
+                None => {
+                    light.look_at_rest(&mut pair, (aligned, factor), &SplineField::still(lattice.clone()));
+                    let level = (&pair, factor, &lattice);
+                    let around = || tissue().map(|mask| light.level_within(aligned, &mask, factor));
+                    let begun = self.begin(&search, level, around, passes, (&mut range, &mut asked), &mut matched);
+                    reports.extend(begun.report.clone());
+                    (begun.field.clone(), begun)
+                }
+            };
+            // What a coarser level saw of the brightness serves the finest one.
+            let open = first || !last || light.is_unknown();
+            let more = open && light.look(&mut pair, (aligned, factor), &field);
+            if more && last {
+                level::refine(&pair, &mut field, passes, params.seed, |_| ());
+            }
+            if !last {
+                clock.skip("matching", matched);
+                clock.book("residual");
+                state = Some((field, factor, begun));
+                continue;
+            }
+            let refine = |field: &mut SplineField, passes| level::refine(&pair, field, passes, params.seed, |_| ());
+            let Explained { field, apart, left, gain, said } = finer(&pair, field, apart, params.seed, refine);
+            asked.extend(said);
+            clock.skip("matching", matched);
+            clock.book("residual");
+            progress("matching", done(0.9));
+            let automatic = (pair.inside / params.voxels_per_point).max(200);
+            let points = if params.points > 0 { params.points } else { automatic };
+            let near = MatchParams::near(params, &pair, points, params.points > 0);
+            let (matches, _, report) = level::matches(&pair, Some(&field), near);
+            if first {
+                reports.clear();
+            }
+            reports.push(report);
+            clock.book("matching");
+            let search = range;
+            return Ok(Found {
+                field,
+                factor,
+                pair,
+                matches,
+                points,
+                reports,
+                begun,
+                light,
+                search,
+                left,
+                gain,
+                apart,
+                asked,
+            });
+        }
+        Err(too_few(0, range))
+    }
+
+    /// Where the passes of the coarsest level begin: inside the mask, with all tissue `around` it where few features agree there, and
+    /// twice as far where the motion reaches the range or few agree.
+    fn begin(
+        &self,
+        search: &Search<'_>,
+        (pair, factor, lattice): (&Pair<'_>, [usize; 3], &Lattice),
+        around: impl Fn() -> Option<Pair<'a>>,
+        passes: usize,
+        (range, asked): (&mut f64, &mut Vec<String>),
+        matched: &mut f64,
+    ) -> Begun {
+        let mut found = search.begin((pair, factor), lattice, self.starts, passes, matched);
+        if let Some(tissue) = found.is_unsure().then(around).flatten() {
+            let wider = search.begin((&tissue, factor), lattice, &[], passes, matched);
+            found = Begun::surer(pair, found, wider);
+        }
+        if self.params.search_mm == 0.0 && found.leaves_open(pair, search.range) {
+            let far = Search { range: TWICE * search.range, ..*search };
+            let wide = far.begin((pair, factor), lattice, &[], passes, matched);
+            let taken = wide.outdoes(pair, &found);
+            asked.push(why_farther(search.range, &found, &wide, taken));
+            if taken {
+                (*range, found) = (far.range, wide);
+            }
+        }
+        found
+    }
+}
+
+/// How far is searched where few features agree or the motion reaches the range, in ranges.
+const TWICE: f64 = 2.0;
+
+/// What a search twice as far gave, in words.
+fn why_farther(range: f64, own: &Begun, wide: &Begun, taken: bool) -> String {
+    let open = if own.agrees_on_few() { "where few agree" } else { "which the motion reaches" };
+    format!(
+        "search range: {range:.1} mm was looked over, {open} ({:.0} % of the features agree); over {:.1} mm: {:.0} % of the features agree, {}",
+        100.0 * own.share(),
+        TWICE * range,
+        100.0 * wide.share(),
+        if taken { "taken" } else { "not taken" }
+    )
 }
 
 /// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and [`FEWEST`] must be left.
@@ -670,6 +732,17 @@ pub(super) fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec
     }
     let d = delaunay2(&places)?;
     Ok((Mesh::Triangles(d.mesh), d.source))
+}
+
+/// Adds the mesh to the counts of the last level: these.
+pub(super) fn with_mesh(reports: &mut [LevelReport], mesh: &Mesh) -> Counts {
+    let mut nothing = Counts::default();
+    let counts = reports.last_mut().map_or(&mut nothing, |r| &mut r.counts);
+    (counts.nodes, counts.tetrahedra) = match mesh {
+        Mesh::Tetrahedra(m) => (m.nodes().len(), m.tetrahedra().len()),
+        Mesh::Triangles(m) => (m.nodes().len(), m.triangles().len()),
+    };
+    *counts
 }
 
 /// The field as asked for: `smooth`, or from the mesh inside it.
@@ -877,7 +950,7 @@ pub(super) fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max
     if folds > 0 {
         out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));
     }
-    if max_mm > farther::NEAR * search {
+    if max_mm > NEAR * search {
         let at = if max_mm > search { "past" } else { "near" };
         out.push(format!(
             "the motion reaches {max_mm:.1} mm, {at} the search range of {search:.1} mm; try a wider --search"

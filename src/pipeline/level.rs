@@ -38,14 +38,25 @@ pub struct SplineField {
     pub blocks: Blocks,
 }
 
-/// Weight of the bending energy to start from, per mm^3 of lattice cell.
+/// Weight of the bending energy to start from at most, per mm^3 of lattice cell. A stiffer start holds a few moving parts to still
+/// ones around them for all passes.
 const STIFFNESS: f32 = 30.0;
+
+/// How much stiffer passes start than matches alone suggest, up to [`STIFFNESS`]; the evidence takes over after two of them. A looser
+/// start follows false residuals where texture is weak: measured on a thigh, errors a fifth larger.
+const STIFFER: f32 = 30.0;
 
 impl SplineField {
     /// No motion, with a bending energy to start from.
     pub fn still(lattice: Lattice) -> Self {
         let n = 3 * lattice.len();
         Self { lattice, coefficients: vec![0.0; n], smoothness: vec![STIFFNESS; n], blocks: Blocks::default() }
+    }
+
+    /// Of matches alone, with a bending energy to start passes from.
+    pub fn to_refine(mut self) -> Self {
+        self.smoothness.iter_mut().for_each(|s| *s = (STIFFER * *s).min(STIFFNESS));
+        self
     }
 }
 
@@ -86,6 +97,10 @@ const MOMENTUM: f32 = 0.5;
 /// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
 const SETTLED: f64 = 0.008;
 
+/// How far passes take a node along an axis (voxels of the finest one): the residual of smooth tissue does not point the way further, and
+/// where texture is weak nothing else would hold it.
+const REACH: f64 = 2.0;
+
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 10;
 
@@ -97,22 +112,15 @@ const LARGE: usize = 500_000;
 const LEAST_VOLUME: f32 = 0.1;
 
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence by place and axis
-/// ([`coupling::supported`]). No node ends further than `reach` (voxels of the finest axis, along each
-/// axis) from where it began. Calls `tick` after each pass.
-pub fn refine(
-    pair: &Pair<'_>,
-    field: &mut SplineField,
-    (passes, reach): (usize, f64),
-    seed: u64,
-    tick: impl Fn(usize),
-) {
+/// ([`coupling::supported`]). No node ends further than two voxels of the finest axis from where it began, along each axis. Calls `tick` after each pass.
+pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
     let energy = smoothness(&field.lattice, pair.spacing);
     let cell = cell_volume(&field.lattice, pair.spacing);
     let active = pair.spans.grown(1);
     let weight = independent(pair);
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let begun = field.coefficients.clone();
-    let reach = (reach * finest) as f32;
+    let reach = (REACH * finest) as f32;
     let mut before = begun.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     let large = field.lattice.len() >= LARGE;
@@ -145,7 +153,7 @@ pub fn refine(
         let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
         for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(&begun) {
             let last = std::mem::replace(before, *c);
-            *c = (*c + d + MOMENTUM * (*c - last)).max(begun - reach).min(begun + reach);
+            *c = (*c + d + MOMENTUM * (*c - last)).clamp(begun - reach, begun + reach);
         }
         if ablation::is_on("unfold") {
             unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
@@ -269,12 +277,6 @@ pub fn unseen(pair: &Pair<'_>, field: &SplineField) -> f64 {
     let planes: Vec<usize> = (0..nz).step_by(3).collect();
     let [out, all] = planes.into_par_iter().map(in_plane).reduce(|| [0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
     out as f64 / all.max(1) as f64
-}
-
-/// Bending energy of a field (mm^2 per mm, all axes).
-pub fn bending(pair: &Pair<'_>, field: &SplineField) -> f64 {
-    let energy = smoothness(&field.lattice, pair.spacing).energy(&field.coefficients);
-    energy.iter().sum::<f64>() * cell_volume(&field.lattice, pair.spacing)
 }
 
 /// How the two volumes differ under a field: the robust standard deviation of what is left (intensity), and by what factor the
@@ -522,7 +524,11 @@ fn template<'a>(pair: &'a Pair<'_>, radius: [usize; 3]) -> Template<'a> {
 
 /// The field that matches suggest once the deformed volume is warped by `field`: where that one is right their patches are
 /// no longer sheared, and where it is wrong what is missing has neighbours that are in place.
-pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) -> (Option<SplineField>, LevelReport) {
+pub fn matches_again(
+    pair: &Pair<'_>,
+    field: &SplineField,
+    params: MatchParams,
+) -> (Vec<LevelMatch>, Option<SplineField>, LevelReport) {
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let around = pair.spans.grown((params.reach_mm / finest).ceil() as usize + params.patch);
     let rest = Pair {
@@ -532,7 +538,7 @@ pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) 
         ..pair.within(pair.spans.clone())
     };
     let lattice = &field.lattice;
-    let (_, more, report) = matches(&rest, None, params);
+    let (mut found, more, report) = matches(&rest, None, params);
     let joined = more.map(|more| {
         let coefficients = lattice.fit(|p| {
             let step = more.lattice.at(&more.coefficients, p);
@@ -541,7 +547,13 @@ pub fn matches_again(pair: &Pair<'_>, field: &SplineField, params: MatchParams) 
         });
         SplineField { coefficients, ..field.clone() }
     });
-    (joined, report)
+    // A match leads to a place of the warped volume; the field takes it on from there.
+    for m in &mut found {
+        let step = m.measured.displacement;
+        let known = lattice.at(&field.coefficients, std::array::from_fn(|a| m.voxel[a] + step[a] / pair.spacing[a]));
+        m.measured.displacement = std::array::from_fn(|a| step[a] + known[a]);
+    }
+    (found, joined, report)
 }
 
 /// 99.9 % point of chi-square with 3 degrees of freedom.
@@ -616,10 +628,6 @@ const ROUNDS: usize = 7;
 /// The same from a field that is nearly right.
 const AGAIN: usize = 3;
 
-/// How much stiffer the residual passes start than the matches alone suggest; the evidence takes over after two passes.
-/// A loose start follows false residuals where texture is weak: measured on a thigh, errors a fifth larger.
-pub(super) const STIFF: f32 = 30.0;
-
 /// Voxels between the nodes that matches alone are coupled on: about as far apart as they lie. Over 37 pairs 3, 4, 5 and 6 left the
 /// same error to 0.1 %, and 6 takes an eighth of the nodes of 3.
 const APART: usize = 6;
@@ -633,9 +641,7 @@ fn fit(
 ) -> SplineField {
     let measured =
         refined.iter().map(|(i, start, r)| (starts[*i], std::array::from_fn(|a| start[a] + r.shift[a]), r.covariance));
-    let mut field = couple(pair, measured, (radius, 0.3), None).0;
-    field.smoothness.iter_mut().for_each(|s| *s *= STIFF);
-    field
+    couple(pair, measured, (radius, 0.3), None).0
 }
 
 /// Couples displacements measured on a level (place in voxels, displacement in mm, covariance in mm^2) into a spline field, from one

@@ -33,13 +33,11 @@ pub mod stress;
 
 mod background;
 mod course;
-mod farther;
 mod finer;
+mod hypotheses;
 mod light;
 mod modes;
 mod polish;
 mod rest;
 mod search;
 mod sparse;
-mod start;
-mod whole;

@@ -17,18 +17,16 @@ pub(super) fn next_finer(grid: &Grid, finest: usize, params: &FieldParams) -> Op
     wanted.then(|| factors(grid.shape(), grid.spacing(), finest / 2, 0.0)[0])
 }
 
-/// A field of a level of factor `from` brought to the residual on `pair`, of `factor`, with so many voxels between nodes. No node ends further than `reach` (voxels of the
-/// finest axis, along each axis) from where the coarser field had it.
+/// A field of a level of factor `from` brought to the residual on `pair`, of `factor`, with so many voxels between nodes.
 pub(super) fn polish(
     (pair, factor, nodes): (&Pair<'_>, [usize; 3], usize),
     (field, from): (&SplineField, [usize; 3]),
-    reach: f64,
     params: &FieldParams,
     tick: impl Fn(usize),
 ) -> SplineField {
     let lattice = level::lattice(pair, nodes);
     let mut finer = level::carry(field, lattice, |p| to_level(from_level(p, factor), from));
-    level::refine(pair, &mut finer, (params.finer_passes, reach), params.seed, tick);
+    level::refine(pair, &mut finer, params.finer_passes, params.seed, tick);
     finer
 }
 

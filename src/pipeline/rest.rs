@@ -11,6 +11,7 @@ use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::filters;
 use crate::numerics::sampling::nearest;
+use crate::numerics::small::inverse;
 use crate::pipeline::level::SplineField;
 use crate::types::{MotionModel, VoxelPoint};
 
@@ -119,7 +120,6 @@ impl Rest {
         places: &Places,
         tried: &[Tried],
         excess: impl Fn(&AffineMotion) -> Vec<f32>,
-        (nodes, posterior): &(Lattice, Posterior),
     ) -> Option<Self> {
         let tissue = &places.tissue;
         let all: f64 = tissue.iter().map(|&v| f64::from(v)).sum();
@@ -142,7 +142,7 @@ impl Rest {
         // What else moves draws the first fit of the whole to itself.
         let refit = |whole: Self| {
             (0..FITS).fold(whole, |last, _| {
-                let motion = nearest_rigid(&last.at_rest((pair, field), (nodes, posterior)));
+                let motion = nearest_rigid(&last.at_rest(pair, field));
                 judged(&Tried { model: MotionModel::Rigid, motion, excess: excess(&motion) })
             })
         };
@@ -150,27 +150,18 @@ impl Rest {
         rigid.filter(more).map(refit).filter(more).or(still)
     }
 
-    /// What the field shows of the tissue at rest, at the nodes of the posterior in it; a node tells as much as the data determine there.
-    fn at_rest(
-        &self,
-        (pair, field): (&Pair<'_>, &SplineField),
-        (nodes, posterior): (&Lattice, &Posterior),
-    ) -> Vec<Measured> {
-        let shown = |m: usize| {
+    /// What the field shows of the tissue at rest, at its nodes, with the information that the data give there.
+    fn at_rest(&self, pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
+        let nodes = &field.lattice;
+        let shown = |(m, block): (usize, [f32; 6])| {
             let at = nodes.within(m);
-            let variance = 3.0 * f64::from(posterior.deviation[m]).powi(2) / f64::from(posterior.determined[m]);
             let here = nearest(pair.shape, VoxelPoint(at)).is_some_and(|at| pair.mask[at] != 0);
-            (here && self.free_at(at) < 0.5 && variance.is_finite() && variance > 0.0).then(|| {
-                let displacement = field.lattice.at(&field.coefficients, at);
-                Measured {
-                    place: std::array::from_fn(|a| at[a] * self.spacing[a]),
-                    displacement,
-                    covariance: [variance, variance, variance, 0.0, 0.0, 0.0],
-                    field: displacement,
-                }
-            })
+            let covariance = if here && self.free_at(at) < 0.5 { inverse(&block.map(f64::from)) } else { None }?;
+            let displacement = nodes.at(&field.coefficients, at);
+            let place = std::array::from_fn(|a| at[a] * self.spacing[a]);
+            Some(Measured { place, displacement, covariance, field: displacement })
         };
-        (0..nodes.len()).filter_map(shown).collect()
+        field.blocks.iter().enumerate().filter_map(shown).collect()
     }
 
     /// How much of the free field stands at a place of the windows' grid, or at the nearest to it.

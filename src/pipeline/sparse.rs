@@ -15,23 +15,17 @@ use crate::field::spline::FieldSpline;
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::blocks::Blocks;
-use crate::numerics::bspline::Lattice;
 use crate::numerics::pyramid;
 use crate::numerics::small::{inverse, quadratic};
 use crate::numerics::statistics::median;
 use crate::numerics::unfold::unfold;
+use crate::pipeline::background;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
+use crate::pipeline::hypotheses::Search;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
-use crate::pipeline::{background, whole};
 use crate::types::*;
 use rayon::prelude::*;
-
-/// Searches of the coarsest level about the warped volume, at most.
-const AGAIN: usize = 2;
-
-/// Share of the features that agree with their neighbours from which the coarsest level is not searched again.
-const AGREED: f64 = 0.75;
 
 /// Patch radius (voxels of the finest axis). Five pairs (heads and calves, 3 to 16 mm): 3 leaves 7 % more error, at more time.
 const PATCH: usize = 2;
@@ -132,7 +126,7 @@ pub(super) fn measure(
         progress("matching", 0.9 * l as f64 / factors.len() as f64);
         let lattice = level::lattice(&pair, APART);
         let begun = match &state {
-            None => coarsest(&pair, lattice, params, (search, flat)),
+            None => Search { params, range: search, flat, matching: &|| (), tick: &|_| () }.by_matches(&pair, &lattice),
             Some((found, _, from)) => level::carry(&found.field, lattice, |p| to_level(from_level(p, factor), *from)),
         };
         let found = on_level(&pair, begun, l + 1 == factors.len(), params);
@@ -165,7 +159,8 @@ pub(super) fn measure(
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
-    let coefficients = FieldSpline::new(grid, field::full_lattice(&grid, &field, factor, &choice), Vec::new());
+    let mut coefficients = FieldSpline::new(grid, field::full_lattice(&grid, &field, factor, &choice), Vec::new());
+    coefficients.unfold(&mask)?;
     let displacement = field::interpolated(params.interpolation, coefficients.dense()?, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
@@ -175,14 +170,7 @@ pub(super) fn measure(
     let (uncertainty_median_mm, uncertainty_mean_mm) = field::average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
-    let mut counts = reports.last().map(|r| r.counts).unwrap_or_default();
-    (counts.nodes, counts.tetrahedra) = match &mesh {
-        Mesh::Tetrahedra(m) => (m.nodes().len(), m.tetrahedra().len()),
-        Mesh::Triangles(m) => (m.nodes().len(), m.triangles().len()),
-    };
-    if let Some(report) = reports.last_mut() {
-        report.counts = counts;
-    }
+    let counts = field::with_mesh(&mut reports, &mesh);
     let summary = FieldSummary {
         counts,
         model: choice.model,
@@ -232,28 +220,6 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     };
     let limit = if found < wanted { "; no more corners stand out of the noise" } else { "" };
     format!("points: {found} of {wanted} wanted, {source}{limit}")
-}
-
-/// The motion by a search of the whole coarsest level, on `lattice`; searched again about the warped volume where few features agree.
-fn coarsest(pair: &Pair<'_>, lattice: Lattice, params: &FieldParams, (range, flat): (f64, bool)) -> SplineField {
-    let wide = whole::wide(params, pair, (range, flat), whole::POINTS);
-    let (_, fitted, mut report) = level::matches(pair, None, wide);
-    let enough = |report: &LevelReport| report.counts.kept >= whole::FEWEST;
-    let Some(mut field) = fitted.filter(|_| enough(&report)) else { return SplineField::still(lattice) };
-    let nearest = (whole::LEAST_REACH * pyramid::finest(pair.shape, pair.spacing)).min(range);
-    let mut reach_mm = range;
-    for _ in 0..AGAIN {
-        if report.counts.kept_share() >= AGREED {
-            break;
-        }
-        reach_mm = (reach_mm / 2.0).max(nearest);
-        let (next, seen) = level::matches_again(pair, &field, MatchParams { reach_mm, ..wide });
-        let Some(next) = next.filter(|_| enough(&seen) && seen.counts.kept > report.counts.kept) else { break };
-        (field, report) = (next, seen);
-    }
-    let mut field = level::carry(&field, lattice, |p| p);
-    field.smoothness.iter_mut().for_each(|s| *s /= level::STIFF);
-    field
 }
 
 /// What a level finds about the field it begins with.
