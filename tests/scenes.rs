@@ -30,6 +30,7 @@ impl Texture {
 }
 
 /// A pair with its truth: muscle that slips along a limb's axis by 3 mm at most, inside a ring of fat that does not move.
+#[derive(Clone)]
 struct Limb {
     initial: Volume,
     deformed: Volume,
@@ -123,12 +124,7 @@ fn padding_of_any_value_is_background() {
             let values = volume.as_slice().iter().enumerate().map(|(at, &v)| value(at, v));
             Volume::from_vec(grid, values.collect()).unwrap()
         };
-        let pair = Limb {
-            initial: padded(&clean.initial),
-            deformed: padded(&clean.deformed),
-            truth: clean.truth.clone(),
-            mask: clean.mask.clone(),
-        };
+        let pair = Limb { initial: padded(&clean.initial), deformed: padded(&clean.deformed), ..clean.clone() };
         let (_, error) = measured(&pair, false);
         assert!(error < 1.3 * least, "{value}: {error} for {least}");
     }
@@ -154,8 +150,7 @@ fn hot_voxels_cost_no_accuracy() {
             let pair = Limb {
                 initial: hot(&clean.initial, 1),
                 deformed: if both { hot(&clean.deformed, 2) } else { clean.deformed.clone() },
-                truth: clean.truth.clone(),
-                mask: clean.mask.clone(),
+                ..clean.clone()
             };
             let (_, error) = measured(&pair, false);
             assert!(error < 1.1 * least, "{count} at {times}, {run_of} in a row: {error} for {least}");

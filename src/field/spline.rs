@@ -125,25 +125,32 @@ impl FieldSpline {
         }
     }
 
-    /// Smooths the coefficients about voxels of `mask` that fold, until none does but for jumps, [`UNFOLDED`] times at most.
+    /// Smooths the coefficients about voxels of `mask` that fold, until none does but for jumps, [`UNFOLDED`] times at most; the
+    /// displacement on its own grid and by how much jumps change it, as [`Self::with_changes`].
     ///
     /// # Errors
     /// [`FieldError::GridMismatch`] when the mask has another shape.
-    pub(crate) fn unfold(&mut self, mask: &Mask) -> Result<(), FieldError> {
+    pub(crate) fn unfold(&mut self, mask: &Mask) -> Result<(DenseField, Vec<([usize; 3], f32)>), FieldError> {
+        let mut field = dense(&self.grid, &self.lattice, &self.coefficients);
         for _ in 0..UNFOLDED {
-            let folds = jacobian::folds(&dense(&self.grid, &self.lattice, &self.coefficients), Some(mask))?;
+            let folds = jacobian::folds(&field, Some(mask))?;
             if folds.is_empty() {
                 break;
             }
             let voxels = folds.into_iter().map(|at| self.grid.voxel(at));
             unfold::smooth_about(&self.lattice, &mut self.coefficients, voxels);
+            field = dense(&self.grid, &self.lattice, &self.coefficients);
         }
-        Ok(())
+        Ok(self.changed(field))
     }
 
     /// The displacement on its own grid, and by how much each voxel beside a jump is moved from the smooth field (mm) with its index.
     pub(crate) fn with_changes(&self) -> (DenseField, Vec<([usize; 3], f32)>) {
-        let mut field = dense(&self.grid, &self.lattice, &self.coefficients);
+        self.changed(dense(&self.grid, &self.lattice, &self.coefficients))
+    }
+
+    /// The same from the smooth field.
+    fn changed(&self, mut field: DenseField) -> (DenseField, Vec<([usize; 3], f32)>) {
         let changes = follow(&mut field, &self.lattice, &self.coefficients, &self.places);
         (field, self.places.iter().map(|(v, _)| *v).zip(changes).collect())
     }

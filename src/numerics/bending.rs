@@ -19,6 +19,8 @@ pub struct Smoothness {
     step_mm: [f64; 3],
     /// Weights of the squared differences along x, y, z and of the mixed ones xy, xz, yz (1/mm^4); 0 along a flat axis.
     scale: [f32; 6],
+    /// Of a plane's nodes, 1 but on the last column; 1 but on the first and the last one.
+    inner: [Vec<f32>; 2],
 }
 
 impl Smoothness {
@@ -29,7 +31,11 @@ impl Smoothness {
             if nodes[a].min(nodes[b]) >= 2 { 2.0 / (step_mm[a] * step_mm[b]).powi(2) } else { 0.0 }
         };
         let scale = [pure(0), pure(1), pure(2), mixed(0, 1), mixed(0, 2), mixed(1, 2)];
-        Self { nodes, step_mm, scale: scale.map(|v| v as f32) }
+        let column = |first: usize| {
+            let one = move |i: usize| if i >= first && i + 1 < nodes[0] { 1.0 } else { 0.0 };
+            (0..nodes[1]).flat_map(|_| (0..nodes[0]).map(one)).collect()
+        };
+        Self { nodes, step_mm, scale: scale.map(|v| v as f32), inner: [0, 1].map(column) }
     }
 
     /// Number of nodes.
@@ -170,18 +176,12 @@ struct Differences<'a> {
     tilted: [[Vec<f32>; 2]; 2],
     /// Differences within the plane: xx, yy, xy.
     flat: [Vec<f32>; 3],
-    /// 1 but on the last column; 1 but on the first and the last one.
-    inner: [Vec<f32>; 2],
 }
 
 impl<'a> Differences<'a> {
     fn new(of: &'a Smoothness, weight: &'a [f32], x: &'a [f32], k: usize) -> Self {
         let [nx, ny, _] = of.nodes;
         let room = || vec![0.0f32; nx * ny];
-        let column = |first: usize| {
-            let one = move |i: usize| if i >= first && i + 1 < nx { 1.0 } else { 0.0 };
-            (0..ny).flat_map(|_| (0..nx).map(one)).collect()
-        };
         let mut out = Self {
             of,
             weight,
@@ -190,7 +190,6 @@ impl<'a> Differences<'a> {
             along: std::array::from_fn(|_| room()),
             tilted: std::array::from_fn(|_| std::array::from_fn(|_| room())),
             flat: std::array::from_fn(|_| room()),
-            inner: [0, 1].map(column),
         };
         if k > 0 {
             out.fill_along(k - 1, 1);
@@ -231,7 +230,7 @@ impl<'a> Differences<'a> {
         let [.., a, b] = self.of.scale;
         let n = plane - 1;
         let (h, u, h1, u1) = (&here[..n], &above[..n], &here[1..], &above[1..]);
-        let (xz, w, inner) = (&mut xz[..n], &weight[..n], &self.inner[0][..n]);
+        let (xz, w, inner) = (&mut xz[..n], &weight[..n], &self.of.inner[0][..n]);
         for i in 0..n {
             xz[i] = a * inner[i] * w[i] * ((u1[i] - u[i]) - (h1[i] - h[i]));
         }
@@ -255,7 +254,7 @@ impl<'a> Differences<'a> {
         if plane > 2 {
             let n = plane - 2;
             let (low, here, high) = (&x[..n], &x[1..][..n], &x[2..]);
-            let (xx, w, inner) = (&mut xx[1..][..n], &weight[1..][..n], &self.inner[1][1..][..n]);
+            let (xx, w, inner) = (&mut xx[1..][..n], &weight[1..][..n], &self.of.inner[1][1..][..n]);
             for i in 0..n {
                 xx[i] = a * inner[i] * w[i] * ((low[i] - here[i]) + (high[i] - here[i]));
             }
@@ -271,7 +270,7 @@ impl<'a> Differences<'a> {
         if ny > 1 && nx > 1 {
             let n = plane - nx - 1;
             let (here, right, next, far) = (&x[..n], &x[1..][..n], &x[nx..][..n], &x[nx + 1..]);
-            let (xy, w, inner) = (&mut xy[..n], &weight[..n], &self.inner[0][..n]);
+            let (xy, w, inner) = (&mut xy[..n], &weight[..n], &self.of.inner[0][..n]);
             for i in 0..n {
                 xy[i] = c * inner[i] * w[i] * ((far[i] - next[i]) - (right[i] - here[i]));
             }

@@ -285,7 +285,6 @@ fn canonical(
     }
     let spacing = pair.spacing;
     let mut coefficients = FieldSpline::new(grid, full_lattice(&grid, &field, factor, &choice), places);
-    coefficients.unfold(&mask)?;
     let (coarse, mut posterior) = posterior;
     let hidden = hidden(&pair, &field, &coarse);
     if let Some(rest) = rest {
@@ -300,7 +299,7 @@ fn canonical(
     progress("mesh", 0.92);
     let (mesh, source) = triangulate(&sparse, flat)?;
     clock.book("mesh");
-    let (smooth, jumps) = coefficients.with_changes();
+    let (smooth, jumps) = coefficients.unfold(&mask)?;
     let kept_matches: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
     let displacement = interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;

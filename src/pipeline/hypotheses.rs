@@ -61,13 +61,13 @@ const CLOSER_LEAST: usize = 190;
 const CLOSER: f64 = 0.25;
 
 /// Fewest matches that a search may start from.
-pub(super) const FEWEST: usize = 8;
+const FEWEST: usize = 8;
 
-/// Where fewer of the features than this agree with each other, more is sought: about a rigid motion, outside the mask, on the next level.
-/// Heads, pads and small motions keep nine tenths, legs in thick slices that moved by 16 mm four.
+/// Where fewer of the features than this agree with each other, more is sought: about a rigid motion and outside the mask.
+/// Heads, pads and small motions keep nine tenths, legs in thick slices that moved by 16 mm four tenths.
 const AGREED: f64 = 0.75;
 
-/// The same for the next level. Slides and legs that move far keep 0.4 to 0.81.
+/// The same for a search of the next level. Slides and legs that move far keep 0.4 to 0.81.
 const LOOSE: f64 = 0.85;
 
 /// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more

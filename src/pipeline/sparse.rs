@@ -160,8 +160,8 @@ pub(super) fn measure(
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
     let mut coefficients = FieldSpline::new(grid, field::full_lattice(&grid, &field, factor, &choice), Vec::new());
-    coefficients.unfold(&mask)?;
-    let displacement = field::interpolated(params.interpolation, coefficients.dense()?, (&mesh, &node_displacement))?;
+    let (smooth, _) = coefficients.unfold(&mask)?;
+    let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
