@@ -80,11 +80,11 @@ fn small_motions_and_slides_are_never_worse_than_nothing() {
 #[test]
 fn a_jump_where_tissue_slides_is_kept_and_no_smooth_field_is_broken() {
     // Smeared, the first was 0.34 mm off and the second 0.26.
-    let sliding = |r: &FieldResult| r.summary.evidence.iter().any(|e| e.starts_with("sliding"));
-    for (amplitude, noise, bar) in [(6.0, 0.01, 0.28), (4.0, 0.03, 0.22)] {
+    let sliding = |r: &FieldResult| r.summary.bodies.len() == 2;
+    for (amplitude, noise, bar) in [(6.0, 0.01, 0.1), (4.0, 0.03, 0.1)] {
         let params = PhantomParams { seed: 8, noise, ..block(64, MotionKind::Slide, amplitude) };
         let (result, m) = measure(&params);
-        assert!(sliding(&result) && m.mean_mm < bar, "{m:?}");
+        assert!(sliding(&result) && m.mean_mm < bar && result.summary.folds == 0, "{m:?}");
     }
     let (result, _) = measure(&PhantomParams { seed: 3, noise: 0.03, ..block(64, MotionKind::Smooth, 6.0) });
     assert!(!sliding(&result), "{:?}", result.summary.evidence);
@@ -204,8 +204,7 @@ fn no_jumps_are_made_between_two_people() {
         |seed| PhantomParams { seed, motion: MotionKind::None, ..PhantomParams::new(PhantomKind::Head).sized(64) };
     let [one, other] = [1, 2].map(|seed| phantom(&head(seed)).unwrap().initial);
     let found = run(&one, &other, None, &FieldParams::default(), &|_, _| {}).unwrap();
-    let jumps = |e: &String| e.starts_with("sliding:") && !e.contains("not taken");
-    assert!(!found.summary.evidence.iter().any(jumps), "{:?}", found.summary.evidence);
+    assert_eq!(found.summary.bodies.len(), 1, "{:?}", found.summary.evidence);
     assert!(found.summary.folds < 10, "{}", found.summary.folds);
 }
 

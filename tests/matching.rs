@@ -531,8 +531,14 @@ fn moved(pair: &Pair<'_>, mm: f32) -> (Lattice, Vec<f32>) {
 }
 
 fn brightness(pair: &Pair<'_>) -> Option<Brightness> {
-    let (lattice, c) = moved(pair, 0.0);
-    Brightness::measure(pair, ([1; 3], pair.shape), (&lattice, &c), 0.95)
+    under(pair, ([1; 3], pair.shape), 0.0)
+}
+
+/// Under a motion along x (mm).
+fn under(pair: &Pair<'_>, level: ([usize; 3], [usize; 3]), mm: f32) -> Option<Brightness> {
+    let (lattice, c) = moved(pair, mm);
+    let warped = pair.warp(&lattice, &c, &pair.spans);
+    Brightness::measure(pair, level, &warped, |p| lattice.at(&c, p), 0.95)
 }
 
 /// How far the deformed volume is from the initial one when it is evened out: the median of the logarithms' distances.
@@ -594,8 +600,7 @@ fn brightness_belongs_to_places_of_the_deformed_volume_on_every_level() {
     let both = Aligned::new(&fixed, &moving, &mask, 10.0).unwrap();
     for factor in [[1; 3], [2; 3]] {
         let pair = both.level(factor);
-        let (lattice, c) = moved(&pair, 3.0);
-        let found = Brightness::measure(&pair, (factor, shape), (&lattice, &c), 0.95).unwrap();
+        let found = under(&pair, (factor, shape), 3.0).unwrap();
         for factor in [[1; 3], [2; 3]] {
             let mut pair = both.level(factor);
             pair.even_out(&found, factor);

@@ -2,15 +2,16 @@
 
 use super::console::Console;
 use super::dry_run;
-use super::inputs::{check_distinct, name, read_mask, read_volume, same_file, warn_all};
+use super::inputs::{check_distinct, name, read_labels, read_mask, read_volume, same_file, warn_all};
 use super::limits::field_fits;
 use super::outputs::{FIELD_FILES, Measured, Target, write_field};
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
-use palpate::types::params::{Method, Preset};
-use palpate::types::{FieldParams, FieldSummary, names};
+use palpate::types::params::{BodySource, Method, Preset};
+use palpate::types::{FieldParams, FieldSummary, Mask, names};
 use palpate::{io, pipeline};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -25,6 +26,15 @@ pub struct Options {
     /// Where to measure: a mask on the initial volume's grid, 0 outside
     #[arg(long, value_name = "M")]
     mask: Option<PathBuf>,
+    /// Bodies that slide along each other: labels on the initial volume's grid, 0 outside [default: found from the volumes]
+    #[arg(long, value_name = "LABELS")]
+    bodies: Option<PathBuf>,
+    /// A body of --bodies that moves rigidly (a bone), by its label; may be given several times
+    #[arg(long, value_name = "LABEL", requires = "bodies")]
+    rigid: Vec<u8>,
+    /// One body: nothing slides
+    #[arg(long, conflicts_with = "bodies")]
+    bonded: bool,
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     dry_run: bool,
@@ -110,9 +120,12 @@ fn method(name: &str) -> Result<Method, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, dry_run, tuning } = options;
-    let params = tuning.params()?;
-    let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).map(PathBuf::as_path).collect();
+    let Options { initial, deformed, target, mask, bodies, rigid, bonded, dry_run, tuning } = options;
+    let mut params = tuning.params()?;
+    if *bonded {
+        params.bodies = BodySource::Bonded;
+    }
+    let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).chain(bodies).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FIELD_FILES))?;
 
     field_fits(initial, deformed)?;
@@ -128,7 +141,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (fixed, moving) = rayon::join(|| read_volume(initial, &mut first), || read_volume(deformed, &mut second));
     let (fixed, moving) = (fixed?, moving?);
     warnings.extend(first.into_iter().chain(second));
-    let inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
+    let mut inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
+    if let Some(path) = bodies {
+        let labels = read_labels(path, fixed.grid(), initial)?;
+        inside = Some(bodies_of(path, labels, inside.as_ref(), rigid)?);
+        (params.bodies, params.rigid) = (BodySource::Given, rigid.clone());
+    }
     if *dry_run {
         drop(progress);
         let plan = pipeline::plan::field(&fixed, &moving, inside.as_ref(), &params)?;
@@ -162,6 +180,30 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{summary}{}", target.look()))
+}
+
+/// Bodies at most: each takes passes of its own.
+const BODIES: usize = 32;
+
+/// The labels of `path` inside the mask. Each of `rigid` must be among them.
+fn bodies_of(path: &Path, mut labels: Mask, mask: Option<&Mask>, rigid: &[u8]) -> Result<Mask> {
+    if let Some(mask) = mask {
+        let outside = labels.as_mut_slice().iter_mut().zip(mask.as_slice()).filter(|(_, m)| **m == 0);
+        outside.for_each(|(l, _)| *l = 0);
+    }
+    let found: BTreeSet<u8> = labels.as_slice().iter().copied().filter(|l| *l != 0).collect();
+    let names = || found.iter().map(u8::to_string).collect::<Vec<_>>().join(", ");
+    match (found.len(), rigid.iter().find(|r| !found.contains(r))) {
+        (0, _) => bail!("{}: no body lies in the mask; give labels that are 1 or more in the tissue", path.display()),
+        (n, _) if n > BODIES => {
+            bail!(
+                "{}: {n} bodies; give at most {BODIES} labels, one a part that slides along the others",
+                path.display()
+            )
+        }
+        (_, Some(label)) => bail!("{}: --rigid {label} is no body of it; there are {}", path.display(), names()),
+        _ => Ok(labels),
+    }
 }
 
 /// Levels, reasons and stages, for -v.

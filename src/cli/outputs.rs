@@ -14,11 +14,12 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Names of what [`write_field`] writes.
-pub const FIELD_FILES: [&str; 8] = [
+pub const FIELD_FILES: [&str; 9] = [
     "displacement.nii.gz",
     "warped.nii.gz",
     "jacobian.nii.gz",
     "uncertainty.nii.gz",
+    "bodies.nii.gz",
     "matches.csv",
     "mesh.vtu",
     "summary.json",
@@ -127,6 +128,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     let uncertainty = Layer::new(grid, |first, out| vague.rows(first, out), |offset| vague.at(offset));
     let bits = io::length_bits(grid);
     folder.write("uncertainty.nii.gz", |p| uncertainty.write(p, "palpate: 1 sigma of u, mm", Some(bits)))?;
+    folder.write("bodies.nii.gz", |p| io::write_labels(p, &result.bodies, "palpate: bodies, from 1"))?;
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
     folder.write("mesh.vtu", |p| match &result.mesh {
         Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
@@ -153,6 +155,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     };
     let [jacobian, uncertainty, seen] =
         [&jacobian, &uncertainty, &warped].map(|layer| |offset: usize| layer.at(offset));
+    let bodies = result.bodies.as_slice();
     let mut report = FieldReport {
         command,
         names,
@@ -165,6 +168,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         displacement,
         jacobian: &jacobian,
         uncertainty: &uncertainty,
+        bodies: &|offset| f32::from(bodies[offset]),
         matches: &result.matches,
         mesh: &result.mesh,
         node_displacement: &result.node_displacement,

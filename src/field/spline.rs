@@ -9,10 +9,13 @@ use crate::numerics::unfold;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
 
-/// Evaluates `coefficients` (mm along `grid`'s axes, planar) at every voxel and turns them into world mm (RAS).
+/// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at its nodes.
+pub type Spline = (Lattice, Vec<f32>);
+
+/// Evaluates the spline of each voxel's body at every voxel and turns it into world mm (RAS); `labels` may be empty where there is one.
 ///
-/// The lattice must lie over `grid`'s shape.
-pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField {
+/// The lattices must lie over `grid`'s shape.
+fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
     let [nx, ny, _] = grid.shape();
     let axes = axes(grid).map(|row| row.map(|v| v as f32));
     let mut out = DenseField::zeros(*grid);
@@ -22,24 +25,31 @@ pub fn dense(grid: &Grid, lattice: &Lattice, coefficients: &[f32]) -> DenseField
     let plane = nx * ny;
     let planes = (x.par_chunks_mut(plane), y.par_chunks_mut(plane), z.par_chunks_mut(plane));
     planes.into_par_iter().enumerate().for_each(|(k, (x, y, z))| {
-        let slice = lattice.slice(coefficients, k);
-        let mut nodes = vec![0.0; lattice.nodes[0]];
-        let mut d: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
-        dispatch(
-            #[inline(always)]
-            || {
-                for j in 0..ny {
-                    for (c, d) in d.iter_mut().enumerate() {
-                        lattice.row(&slice, c, j, &mut nodes, d);
+        let own = labels.get(k * plane..(k + 1) * plane);
+        for (b, (lattice, coefficients)) in bodies.iter().enumerate() {
+            let is_own = |at: usize| own.is_none_or(|labels| usize::from(labels[at]) == b);
+            if !(0..plane).any(is_own) {
+                continue;
+            }
+            let slice = lattice.slice(coefficients, k);
+            let mut nodes = vec![0.0; lattice.nodes[0]];
+            let mut d: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; nx]);
+            dispatch(
+                #[inline(always)]
+                || {
+                    for j in 0..ny {
+                        for (c, d) in d.iter_mut().enumerate() {
+                            lattice.row(&slice, c, j, &mut nodes, d);
+                        }
+                        for i in (0..nx).filter(|i| is_own(j * nx + i)) {
+                            let v = [d[0][i], d[1][i], d[2][i]];
+                            let world = |r: usize| axes[r][0] * v[0] + axes[r][1] * v[1] + axes[r][2] * v[2];
+                            (x[j * nx + i], y[j * nx + i], z[j * nx + i]) = (world(0), world(1), world(2));
+                        }
                     }
-                    for i in 0..nx {
-                        let v = [d[0][i], d[1][i], d[2][i]];
-                        let world = |r: usize| axes[r][0] * v[0] + axes[r][1] * v[1] + axes[r][2] * v[2];
-                        (x[j * nx + i], y[j * nx + i], z[j * nx + i]) = (world(0), world(1), world(2));
-                    }
-                }
-            },
-        );
+                },
+            );
+        }
     });
     out
 }
@@ -50,57 +60,27 @@ pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
     std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
 }
 
-/// Gives voxels of a field that was made by [`dense`] the displacement of another place, `(voxel, place)` in voxels; returns
-/// by how much each changed (mm).
-pub fn follow(
-    field: &mut DenseField,
-    lattice: &Lattice,
-    coefficients: &[f32],
-    places: &[([usize; 3], [f64; 3])],
-) -> Vec<f32> {
-    let grid = *field.grid();
-    let (shape, axes, n) = (grid.shape(), axes(&grid), grid.len());
-    let values = field.as_mut_slice();
-    let own = &values;
-    let found: Vec<([f32; 3], f32)> = places
-        .par_iter()
-        .map(|([i, j, k], p)| {
-            let d = lattice.at(coefficients, std::array::from_fn(|a| p[a].clamp(0.0, (shape[a] - 1) as f64)));
-            let world: [f32; 3] = std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * d[a]).sum::<f64>() as f32);
-            let at = grid.index(*i, *j, *k);
-            let change = (0..3).map(|c| (world[c] - own[c * n + at]).powi(2)).sum::<f32>().sqrt();
-            (world, change)
-        })
-        .collect();
-    for (([i, j, k], _), (d, _)) in places.iter().zip(&found) {
-        for (c, d) in d.iter().enumerate() {
-            values[c * n + grid.index(*i, *j, *k)] = *d;
-        }
-    }
-    found.into_iter().map(|(_, change)| change).collect()
-}
-
 /// Times that what still folds between the knots of a lattice is smoothed.
 const UNFOLDED: usize = 20;
 
-/// A displacement field as its B-spline coefficients, and the voxels beside a jump that move as another place does: all that a dense one is worked
-/// out from, and much smaller.
+/// A displacement field as its B-spline coefficients, one lattice a body that slides along others: all that a dense one is worked out
+/// from, and much smaller.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldSpline {
     grid: Grid,
-    /// Nodes over the grid.
-    pub(crate) lattice: Lattice,
-    /// Displacement (mm along the grid's axes), planar.
-    pub(crate) coefficients: Vec<f32>,
-    places: Vec<([usize; 3], [f64; 3])>,
+    bodies: Vec<Spline>,
+    /// The body of each voxel; empty where there is one.
+    labels: Vec<u8>,
+    /// Voxels at borders between bodies that were smoothed so that nothing folds: offset, displacement (mm, RAS).
+    seams: Vec<(usize, [f32; 3])>,
     /// The grid it is asked for on, where that one's axes run otherwise.
     stored: Option<(Grid, Orientation)>,
 }
 
 impl FieldSpline {
-    /// From coefficients (mm along `grid`'s axes, planar) on the nodes of a lattice that lies over its shape; `places` are those of [`follow`].
-    pub fn new(grid: Grid, (lattice, coefficients): (Lattice, Vec<f32>), places: Vec<([usize; 3], [f64; 3])>) -> Self {
-        Self { grid, lattice, coefficients, places, stored: None }
+    /// From the spline of each body over `grid` and the body of each voxel; no labels where there is one.
+    pub fn new(grid: Grid, bodies: Vec<Spline>, labels: Vec<u8>) -> Self {
+        Self { grid, bodies, labels, seams: Vec::new(), stored: None }
     }
 
     /// The same, to be asked for on the grid `stored` of the same voxels.
@@ -108,9 +88,15 @@ impl FieldSpline {
         Self { stored: Some((stored, orientation)), ..self }
     }
 
-    /// The lattice, and the coefficients on it.
-    pub(crate) fn parts(&self) -> (&Lattice, &[f32]) {
-        (&self.lattice, &self.coefficients)
+    /// The spline of all voxels, where there is one body.
+    pub(crate) fn only(&self) -> Option<&Spline> {
+        self.bodies.first().filter(|_| self.bodies.len() == 1)
+    }
+
+    /// The same, to be changed.
+    pub(crate) fn only_mut(&mut self) -> Option<&mut Spline> {
+        let one = self.bodies.len() == 1;
+        self.bodies.first_mut().filter(|_| one)
     }
 
     /// The displacement at every voxel (mm, RAS).
@@ -118,41 +104,62 @@ impl FieldSpline {
     /// # Errors
     /// [`SpaceError`] where the grid it is asked for on is not one of the same voxels.
     pub fn dense(&self) -> Result<DenseField, SpaceError> {
-        let (field, _) = self.with_changes();
+        let mut field = evaluated(&self.grid, &self.bodies, &self.labels);
+        let n = self.grid.len();
+        for (at, moved) in &self.seams {
+            moved.iter().enumerate().for_each(|(c, v)| field.as_mut_slice()[c * n + at] = *v);
+        }
         match &self.stored {
             Some((grid, orientation)) => orientation.stored_field(field, grid),
             None => Ok(field),
         }
     }
 
-    /// Smooths the coefficients about voxels of `mask` that fold, until none does but for jumps, [`UNFOLDED`] times at most; the
-    /// displacement on its own grid and by how much jumps change it, as [`Self::with_changes`].
+    /// Undoes what folds in `mask`: by smoother coefficients of a single body, by the displacement itself where there are several. The displacement
+    /// on its own grid.
     ///
     /// # Errors
     /// [`FieldError::GridMismatch`] when the mask has another shape.
-    pub(crate) fn unfold(&mut self, mask: &Mask) -> Result<(DenseField, Vec<([usize; 3], f32)>), FieldError> {
-        let mut field = dense(&self.grid, &self.lattice, &self.coefficients);
+    pub(crate) fn unfold(&mut self, mask: &Mask) -> Result<DenseField, FieldError> {
+        let mut field = evaluated(&self.grid, &self.bodies, &self.labels);
+        if !self.labels.is_empty() {
+            let n = self.grid.len();
+            let changed = jacobian::unfold(&mut field);
+            let values = field.as_slice();
+            self.seams = changed.into_iter().map(|at| (at, [0, 1, 2].map(|c| values[c * n + at]))).collect();
+            return Ok(field);
+        }
         for _ in 0..UNFOLDED {
             let folds = jacobian::folds(&field, Some(mask))?;
             if folds.is_empty() {
                 break;
             }
-            let voxels = folds.into_iter().map(|at| self.grid.voxel(at));
-            unfold::smooth_about(&self.lattice, &mut self.coefficients, voxels);
-            field = dense(&self.grid, &self.lattice, &self.coefficients);
+            let voxels: Vec<[usize; 3]> = folds.into_iter().map(|at| self.grid.voxel(at)).collect();
+            for (lattice, coefficients) in &mut self.bodies {
+                unfold::smooth_about(lattice, coefficients, voxels.iter().copied());
+            }
+            field = evaluated(&self.grid, &self.bodies, &self.labels);
         }
-        Ok(self.changed(field))
+        Ok(field)
     }
 
-    /// The displacement on its own grid, and by how much each voxel beside a jump is moved from the smooth field (mm) with its index.
-    pub(crate) fn with_changes(&self) -> (DenseField, Vec<([usize; 3], f32)>) {
-        self.changed(dense(&self.grid, &self.lattice, &self.coefficients))
-    }
-
-    /// The same from the smooth field.
-    fn changed(&self, mut field: DenseField) -> (DenseField, Vec<([usize; 3], f32)>) {
-        let changes = follow(&mut field, &self.lattice, &self.coefficients, &self.places);
-        (field, self.places.iter().map(|(v, _)| *v).zip(changes).collect())
+    /// Voxels of `mask` beside another body, and how far that one moves from where the voxel's own does (mm).
+    pub(crate) fn jumps(&self, mask: &Mask) -> Vec<([usize; 3], f32)> {
+        let (shape, inside) = (self.grid.shape(), mask.as_slice());
+        let stride = [1, shape[0], shape[0] * shape[1]];
+        let at_border = |at: usize| {
+            let v = self.grid.voxel(at);
+            let own = usize::from(self.labels[at]);
+            let other = (0..3).find_map(|a| {
+                let below = (v[a] > 0).then(|| at - stride[a]);
+                let above = (v[a] + 1 < shape[a]).then(|| at + stride[a]);
+                below.into_iter().chain(above).find(|&o| inside[o] != 0 && usize::from(self.labels[o]) != own)
+            })?;
+            let at = |b: usize| self.bodies[b].0.at(&self.bodies[b].1, v.map(|v| v as f64));
+            let (own, other) = (at(own), at(self.labels[other].into()));
+            Some((v, (0..3).map(|a| (own[a] - other[a]).powi(2)).sum::<f64>().sqrt() as f32))
+        };
+        (0..self.labels.len()).into_par_iter().filter(|&at| inside[at] != 0).filter_map(at_border).collect()
     }
 }
 

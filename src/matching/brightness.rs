@@ -14,7 +14,6 @@
 
 use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
-use crate::numerics::bspline::Lattice;
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::exponential::{WHOLE, exp, ln};
 use crate::numerics::neighbours::Neighbours;
@@ -150,15 +149,17 @@ impl Block {
 }
 
 impl Brightness {
-    /// From a level of `factor` under a field on it; `shape` is the full initial volume's. P and Q are taken together where they leave less than
+    /// From a level of `factor`, the deformed volume `warped` by a field and its displacement (mm) at a place (voxels); `shape` is the full
+    /// initial volume's. P and Q are taken together where they leave less than
     /// `both` of what the better one leaves alone. None where there are too few blocks for it.
     pub fn measure(
         pair: &Pair<'_>,
         (factor, shape): ([usize; 3], [usize; 3]),
-        field: (&Lattice, &[f32]),
+        warped: &[f32],
+        displacement: impl Fn([f64; 3]) -> [f64; 3] + Sync,
         both: f64,
     ) -> Option<Self> {
-        let seen = seen_blocks(pair, field);
+        let seen = seen_blocks(pair, warped, displacement);
         let noise = noise_sigma(&pair.moving, pair.moving_shape, |_| true);
         let above = (factor.iter().product::<usize>() as f64).sqrt() * ABOVE_FLOOR;
         let least = [f64::from(pair.noise) * ABOVE_NOISE, f64::from(noise) * above.max(ABOVE_NOISE)];
@@ -451,15 +452,14 @@ struct BlockMeans {
 }
 
 /// The blocks that lie in the mask by half at least.
-fn seen_blocks(pair: &Pair<'_>, (lattice, coefficients): (&Lattice, &[f32])) -> Vec<BlockMeans> {
-    let warped = pair.warp(lattice, coefficients, &pair.spans);
+fn seen_blocks(pair: &Pair<'_>, warped: &[f32], displacement: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<BlockMeans> {
     let side = pair.in_voxels(BLOCK);
     let along = |a: usize| (0..pair.shape[a]).step_by(side[a]);
     let starts: Vec<[usize; 3]> =
         along(2).flat_map(|k| along(1).flat_map(move |j| along(0).map(move |i| [i, j, k]))).collect();
     let seen = |first| {
-        let (p, weight, mean) = means(pair, &warped, first, side)?;
-        let u = lattice.at(coefficients, p);
+        let (p, weight, mean) = means(pair, warped, first, side)?;
+        let u = displacement(p);
         Some(BlockMeans { at: std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]), weight, mean })
     };
     starts.into_par_iter().filter_map(seen).collect()

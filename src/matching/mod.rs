@@ -2,8 +2,7 @@
 //!
 //! [`correlation`] searches by normalised cross-correlation, [`candidates`] joins searches and feature pairs into
 //! many-to-many candidates, [`lsm`] brings a candidate to sub-voxel precision with a covariance, and [`residual`] turns
-//! the whole remaining difference of the two volumes into normal equations for a spline field; [`sliding`] says where a jump
-//! explains it better.
+//! the whole remaining difference of the two volumes into normal equations for a spline field.
 //!
 //! Positions are voxels of one common lattice (the initial volume's axes on the level at hand); displacements are
 //! millimetres along those axes unless a name says voxels. Fails quietly where there is no texture: the information
@@ -24,5 +23,3 @@ pub mod brightness;
 pub mod gain;
 
 pub mod residual;
-
-pub mod sliding;

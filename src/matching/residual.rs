@@ -17,7 +17,7 @@ use crate::numerics::{ablation, pyramid};
 use rayon::prelude::*;
 
 /// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
-pub(super) const CAUCHY: f32 = 2.385;
+pub const CAUCHY: f32 = 2.385;
 
 /// Place that interpolation leaves unsure at any voxel, however steep (finest voxels): bright edges say no more than this. Measured
 /// on affine motions without noise, which come out .005 to .03 of a voxel off.

@@ -1,12 +1,13 @@
 //! Two volumes to a dense displacement field: the main chain, in order.
 
-use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
+use crate::consistency::coupling::Posterior;
+use crate::consistency::models::{AffineMotion, Choice, Excess, choose, nearest_rigid};
+use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, MeshError};
 use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::field::{interpolation, jacobian, spline};
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
-use crate::matching::sliding::{Sliding, sliding};
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::ablation;
 use crate::numerics::blocks::Blocks;
@@ -15,6 +16,7 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::pyramid;
 use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::background;
+use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::finer::{self, Explained, finer, uneven, unlike};
 pub use crate::pipeline::hypotheses::Start;
@@ -22,12 +24,11 @@ use crate::pipeline::hypotheses::{Begun, NEAR, Search};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
-use crate::pipeline::rest::{Places, Rest, Tried};
+use crate::pipeline::rest::{self, Places, Rest, Tried};
 use crate::pipeline::sparse;
-use crate::types::params::{Interpolation, Method};
+use crate::types::params::{BodySource, Interpolation, Method};
 use crate::types::*;
 use rayon::prelude::*;
-use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
@@ -48,6 +49,8 @@ pub struct FieldResult {
     pub spline: Start,
     /// One standard deviation of the displacement (mm).
     pub uncertainty: ScalarSpline,
+    /// The body of each voxel of the mask, from 1; 0 outside it.
+    pub bodies: Mask,
     /// All matches with covariance.
     pub matches: SparseField,
     /// The mesh through the kept matches (initial positions).
@@ -184,6 +187,7 @@ fn stored(found: FieldResult, here: Orientation, grid: &Grid) -> Result<FieldRes
         displacement: here.stored_field(found.displacement, grid)?,
         coefficients: found.coefficients.stored_on(*grid, here),
         uncertainty: found.uncertainty.stored_on(*grid, here),
+        bodies: here.stored(&found.bodies, grid),
         ..found
     })
 }
@@ -219,87 +223,117 @@ fn canonical(
     clock.book("pyramid");
     // Without a mask all tissue is searched from the start.
     let tissue = || given.then(|| around(&mask, &clean));
-    let chain =
-        CoarseToFine { aligned: &aligned, factors: &factors, flat: grid.is_single_slice(), params, starts, progress };
-    let Found { field, factor, pair, matches, points, mut reports, begun, light, search, left, gain, apart, asked } =
-        chain.run(search, tissue, &mut clock)?;
+    let given = (params.bodies == BodySource::Given).then(|| Given::new(mask.as_slice(), grid.shape()));
+    let chain = CoarseToFine {
+        given: given.as_ref(),
+        aligned: &aligned,
+        factors: &factors,
+        flat: grid.is_single_slice(),
+        params,
+        starts,
+        progress,
+    };
+    let Found {
+        mut bodies,
+        mut factor,
+        mut pair,
+        matches,
+        points,
+        mut reports,
+        begun,
+        light,
+        search,
+        left,
+        gain,
+        apart,
+        asked,
+    } = chain.run(search, tissue, &mut clock)?;
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
         return Err(too_few(kept, search));
     }
 
-    // The smallest motion that explains the matches.
+    // The smallest motion that explains the matches, body by body.
     progress("model", 0.9);
     let flat = grid.is_single_slice();
-    let windows = level::windows(&pair);
-    let by_place = level::excess(&pair, &field, &windows);
-    let mut posterior = level::posterior(&field, pair.spacing, params.seed);
-    let places_of = Places::new(&pair, &windows, &posterior);
-    let (mut choice, tried) = smallest(&matches, &pair, &field, &by_place, &places_of, params.seed);
+    let is_rigid = |b: usize| given.as_ref().is_some_and(|g| params.rigid.contains(&g.names[b]));
+    let concluded: Vec<Concluded> =
+        (0..bodies.count()).map(|b| Concluded::of(&bodies, b, &pair, &matches, (is_rigid(b), params.seed))).collect();
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
-    choice.evidence.extend(background::why_unseen(cut));
-    choice.evidence.extend(light.why());
-    choice.evidence.extend(asked);
-    choice.evidence.push(why_so_many(params, points, found));
-    let glides = (choice.motion.is_none() && ablation::is_on("sliding"))
-        .then(|| sliding(&pair, &field.lattice, &field.coefficients))
-        .flatten();
-    let mut places = Vec::new();
-    if let Some(glides) = glides {
-        let wide = apart > SLIDING_NODES;
-        let believed = wide || glides.voxels.len() as f64 >= GLIDING * glides.strained as f64;
-        choice.evidence.push(why_sliding(&glides, believed));
-        if believed {
-            places = beside(&glides, &grid, pair.shape, factor);
-        }
-    }
+    let (model, mut evidence) = Concluded::together(&concluded, &bodies, &pair);
+    evidence.extend(background::why_unseen(cut));
+    evidence.extend(light.why());
+    evidence.extend(asked);
+    evidence.push(why_so_many(params, points, found));
     let unlike = unlike(&pair, left);
-    let unseen = level::unseen(&pair, &field);
+    let unseen = level::unseen(&pair, |p| bodies.at(p));
     let plain = without_texture(pair.plain());
-    let free = choice.motion.is_none() && ablation::is_on("rest");
-    let rest = free.then(|| Rest::find((&pair, &field), &windows, &places_of, &tried, &by_place)).flatten();
-    drop(by_place);
-    choice.evidence.extend(rest.as_ref().map(Rest::why));
-    let rest = rest.filter(Rest::is_taken);
+    evidence.extend(concluded.iter().filter_map(|c| c.rest.as_ref()).map(Rest::why));
     clock.book("model");
 
     // What the average of voxels hides.
     let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
-    let (mut pair, mut field, mut factor, searched) = (pair, field, factor, factor);
-    let next = polish::next_finer(&grid, finest, params).filter(|&next| choice.motion.is_none() && next != factor);
+    let searched = factor;
+    let any_free = concluded.iter().any(|c| c.choice.motion.is_none());
+    let next = polish::next_finer(&grid, finest, params).filter(|&next| any_free && next != factor);
     if let Some(next) = next {
         pair = light.level(&aligned, next);
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
         let nodes = polish::WIDEST.min(2 * apart);
-        field = polish::polish((&pair, next, nodes), (&field, factor), params, tick);
+        bodies = polish::polish((&pair, next, nodes), (&bodies, factor), params, tick);
+        if let Some(given) = &given {
+            bodies.relabel(given.on(pair.shape, next));
+        }
         factor = next;
-        choice.evidence.push(polish::why(&pair, nodes, params));
+        evidence.push(polish::why(&pair, nodes, params));
         clock.book("residual");
-        posterior = level::posterior(&field, pair.spacing, params.seed);
-        clock.book("uncertainty");
     }
     let judged = |p| to_level(from_level(p, factor), searched);
-    if let Some(rest) = &rest {
-        rest.bring(&mut field, judged);
+    let models: Vec<MotionModel> = concluded.iter().map(|c| c.choice.model).collect();
+    let mut splines = Vec::new();
+    let mut stated = Vec::new();
+    for (b, Concluded { choice, rest, posterior }) in concluded.into_iter().enumerate() {
+        let field = &mut bodies.fields[b];
+        let (coarse, mut posterior) =
+            if next.is_some() { level::posterior(field, pair.spacing, params.seed) } else { posterior };
+        let rest = rest.filter(Rest::is_taken);
+        if let Some(rest) = &rest {
+            rest.bring(field, judged);
+        }
+        splines.push(full_lattice(&grid, field, factor, &choice));
+        let hidden = hidden(&pair, field, &coarse);
+        if let Some(rest) = rest {
+            let seen = posterior.deviation.iter_mut().enumerate().filter(|&(m, _)| !hidden[m]);
+            seen.for_each(|(m, v)| *v *= rest.narrowed(judged(coarse.within(m))));
+        }
+        stated.push(Stated { coarse, deviation: posterior.deviation, hidden });
     }
+    let stated = Stated::by_place(stated, &bodies);
+    let labels = match &given {
+        Some(given) => given.on(grid.shape(), [1; 3]),
+        None => bodies.labels_on(grid.shape(), |p| to_level(p, factor)),
+    };
+    let name = |b: usize| given.as_ref().map_or(b as u8 + 1, |g| g.names[b]);
+    let labelled = labelled(&mask, &labels, name);
+    let reported = |(b, model): (usize, MotionModel)| {
+        let label = name(b);
+        let voxels = labelled.as_slice().iter().filter(|l| **l == label).count();
+        BodyReport { label, voxels, model, slides_mm: bodies.jump(&pair, b) }
+    };
+    let body_reports: Vec<BodyReport> = models.into_iter().enumerate().map(reported).collect();
+    let mut coefficients = FieldSpline::new(grid, splines, labels);
     let spacing = pair.spacing;
-    let mut coefficients = FieldSpline::new(grid, full_lattice(&grid, &field, factor, &choice), places);
-    let (coarse, mut posterior) = posterior;
-    let hidden = hidden(&pair, &field, &coarse);
-    if let Some(rest) = rest {
-        let seen = posterior.deviation.iter_mut().enumerate().filter(|&(m, _)| !hidden[m]);
-        seen.for_each(|(m, v)| *v *= rest.narrowed(judged(coarse.within(m))));
-    }
     drop(pair);
     drop(aligned);
-    clock.book("model");
+    clock.book("uncertainty");
 
     // Mesh and dense field.
     progress("mesh", 0.92);
     let (mesh, source) = triangulate(&sparse, flat)?;
     clock.book("mesh");
-    let (smooth, jumps) = coefficients.unfold(&mask)?;
+    let smooth = coefficients.unfold(&mask)?;
+    let jumps = coefficients.jumps(&mask);
     let kept_matches: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
     let displacement = interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
@@ -326,15 +360,16 @@ fn canonical(
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
     progress("uncertainty", 0.95);
-    let uncertainty = uncertainty(&grid, spacing, (coarse, posterior.deviation), &hidden, jumps);
+    let uncertainty = uncertainty(&grid, spacing, stated, jumps);
     let (uncertainty_median_mm, uncertainty_mean_mm) = average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
     let counts = with_mesh(&mut reports, &mesh);
     let summary = FieldSummary {
         counts,
-        model: choice.model,
-        evidence: choice.evidence,
+        model,
+        evidence,
+        bodies: body_reports,
         levels: reports,
         folds,
         mask_voxels: length.2,
@@ -349,7 +384,7 @@ fn canonical(
             .into_iter()
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
-            .chain(vague(choice.model, uncertainty_mean_mm, length.0, &grid))
+            .chain(vague(model, uncertainty_mean_mm, length.0, &grid))
             .chain(doubted.map(in_doubt))
             .chain(unlike)
             .chain(uneven(gain))
@@ -359,13 +394,14 @@ fn canonical(
     };
     progress("done", 1.0);
     // What the data say at each node is as large again twice over, and no search starts from it.
-    let spline =
-        Start { field: SplineField { blocks: Blocks::default(), ..field }, factor, followed: Some(begun.followed) };
+    bodies.fields.iter_mut().for_each(|f| f.blocks = Blocks::default());
+    let spline = Start { motion: bodies, factor, followed: Some(begun.followed) };
     Ok(FieldResult {
         displacement,
         coefficients,
         spline,
         uncertainty,
+        bodies: labelled,
         matches: sparse,
         mesh,
         node_displacement,
@@ -380,6 +416,8 @@ struct CoarseToFine<'a, 'p> {
     factors: &'p [[usize; 3]],
     /// Whether the volumes are one slice.
     flat: bool,
+    /// The bodies that are given.
+    given: Option<&'p Given>,
     params: &'p FieldParams,
     starts: &'p [Start],
     progress: Progress<'p>,
@@ -388,10 +426,10 @@ struct CoarseToFine<'a, 'p> {
 /// What the levels found.
 struct Found<'a> {
     /// On the finest level, with that level's factor and pair.
-    field: SplineField,
+    bodies: Bodies,
     factor: [usize; 3],
     pair: Pair<'a>,
-    /// Of that level, about the field, with the number wanted.
+    /// Of that level, about the bodies' fields, with the number wanted.
     matches: Vec<LevelMatch>,
     points: usize,
     reports: Vec<LevelReport>,
@@ -420,7 +458,7 @@ impl<'a> CoarseToFine<'a, '_> {
     ) -> Result<Found<'a>, FieldError> {
         let Self { aligned, params, progress, .. } = *self;
         let (mut reports, mut asked, mut light, mut range) = (Vec::new(), Vec::new(), Light::default(), range);
-        let mut state: Option<(SplineField, [usize; 3], Begun)> = None;
+        let mut state: Option<(Bodies, [usize; 3], Begun)> = None;
         for (l, &factor) in self.factors.iter().enumerate() {
             let (first, last) = (l == 0, l + 1 == self.factors.len());
             let mut pair = light.level(aligned, factor);
@@ -433,57 +471,84 @@ impl<'a> CoarseToFine<'a, '_> {
             let matching = || progress("matching", done(0.0));
             let search = Search { params, range, flat: self.flat, matching: &matching, tick: &tick };
             let mut matched = 0.0;
-            let (mut field, begun) = match state.take() {
+            let (mut bodies, begun, sought) = match state.take() {
+                Some((coarse, from, begun)) if self.given.is_some() => {
+                    (coarse.carried(&lattice, |p| to_level(from_level(p, factor), from)), begun, false)
+                }
                 Some((coarse, from, mut begun)) => {
-                    let mut field = level::carry(&coarse, lattice, |p| to_level(from_level(p, factor), from));
-                    level::refine(&pair, &mut field, passes, params.seed, tick);
+                    let mut bodies = coarse.carried(&lattice, |p| to_level(from_level(p, factor), from));
+                    bodies.refine(&pair, passes, params.seed, tick);
                     let loose = l == 1 && begun.is_loose();
-                    if let Some(found) = loose.then(|| search.closer(&pair, &field, passes, &mut matched)).flatten() {
-                        field = found.field.clone();
+                    let found = loose.then(|| search.closer(&pair, &bodies, passes, &mut matched)).flatten();
+                    let sought = found.is_some() && !last;
+                    if let Some(found) = found {
+                        bodies = found.motion.clone();
                         reports.extend(found.report.clone());
                         begun = found;
                     }
-                    (field, begun)
+                    (bodies, begun, sought)
                 }
                 None => {
-                    light.look_at_rest(&mut pair, (aligned, factor), &SplineField::still(lattice.clone()));
+                    light.look_at_rest(&mut pair, (aligned, factor), &SplineField::still(lattice.clone()).into());
                     let level = (&pair, factor, &lattice);
                     let around = || tissue().map(|mask| light.level_within(aligned, &mask, factor));
                     let begun = self.begin(&search, level, around, passes, (&mut range, &mut asked), &mut matched);
                     reports.extend(begun.report.clone());
-                    (begun.field.clone(), begun)
+                    (begun.motion.clone(), begun, true)
                 }
             };
+            if let Some(given) = self.given {
+                let labels = given.on(pair.shape, factor);
+                if first {
+                    bodies =
+                        self.each(&search, (&pair, factor, &lattice), (labels, &begun.motion), passes, &mut matched);
+                } else {
+                    bodies.relabel(labels);
+                    bodies.refine(&pair, passes, params.seed, tick);
+                }
+            } else if sought && params.bodies == BodySource::Found {
+                let edge =
+                    pair.spacing.into_iter().zip(factor).map(|(s, f)| s / f as f64).fold(f64::INFINITY, f64::min);
+                asked.extend(bodies.divide(&pair, &begun.matches, (passes, edge), params.seed));
+            }
             // What a coarser level saw of the brightness serves the finest one.
             let open = first || !last || light.is_unknown();
-            let more = open && light.look(&mut pair, (aligned, factor), &field);
+            let more = open && light.look(&mut pair, (aligned, factor), &bodies);
             if more && last {
-                level::refine(&pair, &mut field, passes, params.seed, |_| ());
+                bodies.refine(&pair, passes, params.seed, |_| ());
             }
             if !last {
                 clock.skip("matching", matched);
                 clock.book("residual");
-                state = Some((field, factor, begun));
+                state = Some((bodies, factor, begun));
                 continue;
             }
-            let refine = |field: &mut SplineField, passes| level::refine(&pair, field, passes, params.seed, |_| ());
-            let Explained { field, apart, left, gain, said } = finer(&pair, field, apart, params.seed, refine);
-            asked.extend(said);
+            let mut closest = apart;
+            for b in 0..bodies.count() {
+                let part = bodies.part(&pair, b);
+                let refine = |field: &mut SplineField, passes| level::refine(&part, field, passes, params.seed, |_| ());
+                let Explained { field, apart, said } =
+                    finer(&part, bodies.fields[b].clone(), apart, params.seed, refine);
+                closest = closest.min(apart);
+                asked.extend(said);
+                bodies.fields[b] = field;
+            }
+            let [left, gain] = level::misfit(&pair, &bodies.warp(&pair, &pair.spans));
             clock.skip("matching", matched);
             clock.book("residual");
             progress("matching", done(0.9));
             let automatic = (pair.inside / params.voxels_per_point).max(200);
             let points = if params.points > 0 { params.points } else { automatic };
             let near = MatchParams::near(params, &pair, points, params.points > 0);
-            let (matches, _, report) = level::matches(&pair, Some(&field), near);
+            let (matches, report) = bodies.matches(&pair, near);
             if first {
                 reports.clear();
             }
             reports.push(report);
             clock.book("matching");
-            let search = range;
+            let (search, apart) = (range, closest);
             return Ok(Found {
-                field,
+                bodies,
                 factor,
                 pair,
                 matches,
@@ -499,6 +564,31 @@ impl<'a> CoarseToFine<'a, '_> {
             });
         }
         Err(too_few(0, range))
+    }
+
+    /// Each given body's motion on the coarsest level: by a search of its own or that of the whole, whichever agrees better in it.
+    fn each(
+        &self,
+        search: &Search<'_>,
+        (pair, factor, lattice): (&Pair<'_>, [usize; 3], &Lattice),
+        (labels, whole): (Vec<u8>, &Bodies),
+        passes: usize,
+        matched: &mut f64,
+    ) -> Bodies {
+        let count = self.given.map_or(1, |g| g.names.len());
+        let field = |bodies: Bodies| bodies.fields.into_iter().next();
+        let start = field(whole.clone()).unwrap_or_else(|| SplineField::still(lattice.clone()));
+        let mut bodies = Bodies::given(labels, vec![start.clone(); count]);
+        for b in 0..count {
+            let part = bodies.part(pair, b);
+            let own = search.begin((&part, factor), lattice, &[], passes, matched).motion;
+            let mut whole = Bodies::from(start.clone());
+            whole.refine(&part, passes, self.params.seed, |_| ());
+            if let Some(better) = field(Bodies::better(&part, whole, own)) {
+                bodies.fields[b] = better;
+            }
+        }
+        bodies
     }
 
     /// Where the passes of the coarsest level begin: inside the mask, with all tissue `around` it where few features agree there, and
@@ -619,16 +709,102 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     format!("points: {found} of {wanted} wanted, {source}{limit}")
 }
 
+/// The mask with the `name` of each voxel's body; `labels` (bodies from 0) may be empty where there is one.
+pub(super) fn labelled(mask: &Mask, labels: &[u8], name: impl Fn(usize) -> u8) -> Mask {
+    let mut out = mask.clone();
+    for (at, voxel) in out.as_mut_slice().iter_mut().enumerate().filter(|(_, v)| **v != 0) {
+        *voxel = name(labels.get(at).copied().unwrap_or(0).into());
+    }
+    out
+}
+
+/// What is concluded of one body.
+struct Concluded {
+    choice: Choice,
+    rest: Option<Rest>,
+    /// On a lattice twice as coarse as the field's own.
+    posterior: (Lattice, Posterior),
+}
+
+impl Concluded {
+    /// The smallest motion that explains a body's matches, where it stays at rest, and what its data leave open.
+    /// `rigid` says that it moves rigidly, whatever the evidence.
+    fn of(bodies: &Bodies, body: usize, pair: &Pair<'_>, matches: &[LevelMatch], (rigid, seed): (bool, u64)) -> Self {
+        let (pair, field) = (bodies.part(pair, body), &bodies.fields[body]);
+        let own = matches.iter().filter(|m| m.kept && bodies.label_near(m.voxel) == body);
+        let measured: Vec<Measured> = own.map(|m| m.measured).collect();
+        let windows = level::windows(&pair);
+        let by_place = level::excess(&pair, field, &windows);
+        let posterior = level::posterior(field, pair.spacing, seed);
+        let places_of = Places::new(&pair, &windows, &posterior);
+        let (mut choice, tried) = smallest(&measured, &pair, field, &by_place, &places_of, seed);
+        if rigid {
+            let motion = nearest_rigid(&rest::shown(&pair, field, |_| true));
+            choice.evidence.push("rigid: as asked".into());
+            choice = Choice { model: MotionModel::Rigid, motion: Some(motion), ..choice };
+        }
+        let free = choice.motion.is_none() && ablation::is_on("rest");
+        let rest = free.then(|| Rest::find((&pair, field), &windows, &places_of, &tried, &by_place)).flatten();
+        drop(by_place);
+        Self { choice, rest, posterior }
+    }
+
+    /// The model of the whole, and the evidence for each body's.
+    fn together(concluded: &[Self], bodies: &Bodies, pair: &Pair<'_>) -> (MotionModel, Vec<String>) {
+        if let [Self { choice, .. }] = concluded {
+            return (choice.model, choice.evidence.clone());
+        }
+        let of = |(b, Self { choice, .. }): (usize, &Self)| {
+            let share = 100.0 * bodies.part(pair, b).inside as f64 / pair.inside.max(1) as f64;
+            let model = format!("{:?}", choice.model).to_lowercase();
+            let head = format!("body {}: {model}, {share:.0} % of the tissue", b + 1);
+            let why = choice.evidence.iter().map(|e| format!("body {}: {e}", b + 1));
+            [head].into_iter().chain(why).collect::<Vec<_>>()
+        };
+        (MotionModel::Free, concluded.iter().enumerate().flat_map(of).collect())
+    }
+}
+
+/// Standard deviations at the nodes of a lattice (mm), and which of these the deformed volume does not show.
+pub(super) struct Stated {
+    pub coarse: Lattice,
+    pub deviation: Vec<f32>,
+    pub hidden: Vec<bool>,
+}
+
+impl Stated {
+    /// On the closest lattice of all bodies, each node's from the body there.
+    fn by_place(mut all: Vec<Self>, bodies: &Bodies) -> Self {
+        let closest = (0..all.len()).max_by_key(|&b| all[b].coarse.len()).unwrap_or(0);
+        let lattice = all[closest].coarse.clone();
+        let at = |m: usize| {
+            let place = lattice.within(m);
+            let Self { coarse, deviation, hidden } = &all[bodies.label_near(place)];
+            if *coarse == lattice {
+                return (deviation[m], hidden[m]);
+            }
+            let stencil = coarse.stencil_near(place);
+            let mut nearest = (0.0, 0);
+            coarse.for_each_tap(place, |node, w| nearest = if w > nearest.0 { (w, node) } else { nearest });
+            (stencil.gather(deviation), hidden[nearest.1])
+        };
+        if all.len() == 1 {
+            return all.remove(0);
+        }
+        let (deviation, hidden) = (0..lattice.len()).map(at).unzip();
+        Self { deviation, hidden, coarse: lattice }
+    }
+}
+
 /// Chooses the model from the kept matches and the free field; with what was tried.
 fn smallest(
-    matches: &[LevelMatch],
+    measured: &[Measured],
     pair: &Pair<'_>,
     field: &SplineField,
     by_place: impl Fn(&AffineMotion) -> Vec<f32>,
     places: &Places,
     seed: u64,
 ) -> (Choice, Vec<Tried>) {
-    let measured: Vec<_> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let mut tried = Vec::new();
     let excess = |model, motion: &AffineMotion| {
@@ -637,7 +813,7 @@ fn smallest(
         tried.push(Tried { model, motion: *motion, excess });
         found
     };
-    let choice = choose(&measured, excess, level::determined(pair, field, seed), 0.02 * finest);
+    let choice = choose(measured, excess, level::determined(pair, field, seed), 0.02 * finest);
     (choice, tried)
 }
 
@@ -659,47 +835,6 @@ pub(super) fn full_lattice(
         None => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
     };
     (lattice, coefficients)
-}
-
-/// Part of the strained voxels that must follow a side where the volumes differ by more than motion, as a closer lattice says: of two people 0.007 to
-/// 0.09 did, who have no jump in common, and folded by it; of halves and cores that slid under a texture of their own 0.13 to 0.34.
-const GLIDING: f64 = 0.1;
-
-/// Voxels between nodes up to which that is asked: so close a lattice was taken since the volumes differ by more than smooth motion.
-const SLIDING_NODES: usize = 3;
-
-fn why_sliding(sliding: &Sliding, believed: bool) -> String {
-    let Sliding { voxels, strained, left } = sliding;
-    let followed = voxels.len();
-    match believed {
-        true => format!(
-            "sliding: {followed} of {strained} strained voxels move with the tissue on one side of a jump, which leaves {left:.2} of their \
-             squared residual"
-        ),
-        false => format!(
-            "sliding: not taken; {followed} of {strained} strained voxels would follow one side of a jump, and the volumes differ by more than \
-             motion (at least {:.0} % must then)",
-            100.0 * GLIDING
-        ),
-    }
-}
-
-/// The full-resolution voxels beside a jump, and the places with which they move (voxels).
-fn beside(sliding: &Sliding, grid: &Grid, level: [usize; 3], factor: [usize; 3]) -> Vec<([usize; 3], [f64; 3])> {
-    let shape = grid.shape();
-    let block = |&(at, offset): &(u32, [f32; 3])| {
-        let at = at as usize;
-        let v = [at % level[0], at / level[0] % level[1], at / (level[0] * level[1])];
-        let [x, y, z]: [Range<usize>; 3] =
-            std::array::from_fn(|a| v[a] * factor[a]..((v[a] + 1) * factor[a]).min(shape[a]));
-        let row = move |k| {
-            let x = x.clone();
-            y.clone().flat_map(move |j| x.clone().map(move |i| [i, j, k]))
-        };
-        z.flat_map(row)
-            .map(move |v| (v, std::array::from_fn(|a| v[a] as f64 + f64::from(offset[a]) * factor[a] as f64)))
-    };
-    sliding.voxels.iter().flat_map(block).collect()
 }
 
 /// A level's match in world mm (RAS).
@@ -791,7 +926,11 @@ const EXTRAPOLATED: f32 = 3.0;
 
 /// Of each node of a lattice over the initial volume, whether the deformed volume does not show what is there.
 pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
-    (0..lattice.len()).into_par_iter().map(|m| !level::sees(pair, field, lattice.within(m))).collect()
+    let sees = |m: usize| {
+        let p = lattice.within(m);
+        level::sees(pair, p, field.lattice.at(&field.coefficients, p))
+    };
+    (0..lattice.len()).into_par_iter().map(|m| !sees(m)).collect()
 }
 
 /// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match shows ([`HIDDEN`]), what is not in view
@@ -799,14 +938,13 @@ pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) ->
 pub(super) fn uncertainty(
     grid: &Grid,
     spacing: [f64; 3],
-    (coarse, mut deviation): (Lattice, Vec<f32>),
-    hidden: &[bool],
+    Stated { coarse, mut deviation, hidden }: Stated,
     jumps: Vec<([usize; 3], f32)>,
 ) -> ScalarSpline {
     let thick = || (0..3).filter(|&a| coarse.shape[a] > 1);
     let least = HIDDEN * (thick().map(|a| spacing[a].powi(2)).sum::<f64>() / thick().count().max(1) as f64).sqrt();
     for (v, hidden) in deviation.iter_mut().zip(hidden) {
-        let part = if *hidden { EXTRAPOLATED } else { 1.0 };
+        let part = if hidden { EXTRAPOLATED } else { 1.0 };
         *v = part * (*v * CALIBRATION).hypot(least as f32);
     }
     let factor: [usize; 3] = std::array::from_fn(|a| (spacing[a] / grid.spacing()[a]).round() as usize);

@@ -45,10 +45,6 @@ pub(super) struct Explained {
     pub field: SplineField,
     /// Voxels between its nodes.
     pub apart: usize,
-    /// Robust standard deviation of what is left of the difference (intensity).
-    pub left: f32,
-    /// By what factor the gain varies across the tissue.
-    pub gain: f32,
     /// What was tried, in words.
     pub said: Vec<String>,
 }
@@ -62,17 +58,18 @@ pub(super) fn finer(
     seed: u64,
     refine: impl Fn(&mut SplineField, usize),
 ) -> Explained {
-    let [left, gain] = level::misfit(pair, &field);
-    let mut best = Explained { field, apart, left, gain, said: Vec::new() };
+    let warped = |field: &SplineField| pair.warp(&field.lattice, &field.coefficients, &pair.spans);
+    let left = |field: &SplineField| level::misfit(pair, &warped(field))[0];
+    let mut noisy = times(left(&field), pair.noise);
+    let mut best = Explained { field, apart, said: Vec::new() };
     for closer in (2..apart).rev() {
         let lattice = level::lattice(pair, closer);
-        let noisy = times(best.left, pair.noise);
         if noisy < NOISY || lattice.len() > NODES || lattice == best.field.lattice {
             break;
         }
         let mut next = level::carry(&best.field, lattice, |p| p);
         refine(&mut next, TRIAL);
-        let gain = level::gained(pair, &best.field, &next);
+        let gain = level::gained(pair, &warped(&best.field), warped(&next));
         let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
         let worth = gain / (many - few).max(1.0);
         let taken = gain > 0.0 && worth > WORTH;
@@ -86,7 +83,7 @@ pub(super) fn finer(
             break;
         }
         refine(&mut next, TRIAL);
-        [best.left, best.gain] = level::misfit(pair, &next);
+        noisy = times(left(&next), pair.noise);
         (best.field, best.apart) = (next, closer);
     }
     best

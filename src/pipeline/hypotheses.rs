@@ -5,14 +5,15 @@ use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::ablation;
 use crate::numerics::bspline::Lattice;
+use crate::pipeline::bodies::Bodies;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::types::{Counts, FieldParams, LevelReport};
 use std::time::Instant;
 
-/// A field where another search may start.
+/// A motion where another search may start.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Start {
-    pub(super) field: SplineField,
+    pub(super) motion: Bodies,
     /// Voxels that a voxel of its level stands for.
     pub(super) factor: [usize; 3],
     /// Frames since the whole volume was searched; none where it never was.
@@ -20,7 +21,7 @@ pub struct Start {
 }
 
 impl Start {
-    /// Whether the whole volume was searched for this field, rather than known fields followed.
+    /// Whether the whole volume was searched for this motion, rather than known ones followed.
     pub fn searched_all(&self) -> bool {
         self.followed == Some(0)
     }
@@ -28,16 +29,18 @@ impl Start {
     /// As far again as from `before` to here: where steady motion would be next.
     pub fn extrapolated(&self, before: &Self) -> Self {
         let mut next = self.clone();
-        let before = before.on(&self.field.lattice, self.factor);
-        for (n, b) in next.field.coefficients.iter_mut().zip(&before.coefficients) {
-            *n += *n - b;
+        for field in &mut next.motion.fields {
+            let before = before.on(&field.lattice, self.factor);
+            // Where the frame before had other bodies, this one's own places tell how it moved.
+            let moved = field.lattice.fit(|p| before.at(p));
+            field.coefficients.iter_mut().zip(&moved).for_each(|(n, b)| *n += *n - b);
         }
         next
     }
 
-    /// The field on a level's lattice.
-    fn on(&self, lattice: &Lattice, factor: [usize; 3]) -> SplineField {
-        level::carry(&self.field, lattice.clone(), |p| to_level(from_level(p, factor), self.factor))
+    /// The motion on a level's lattice.
+    fn on(&self, lattice: &Lattice, factor: [usize; 3]) -> Bodies {
+        self.motion.carried(lattice, |p| to_level(from_level(p, factor), self.factor))
     }
 }
 
@@ -95,9 +98,10 @@ const KEPT: f64 = 0.9;
 
 /// What the coarsest level found.
 pub(super) struct Begun {
-    pub field: SplineField,
+    pub motion: Bodies,
     /// Of the matches, where they were sought.
     pub report: Option<LevelReport>,
+    pub matches: Vec<LevelMatch>,
     /// Frames since the whole volume was searched.
     pub followed: usize,
 }
@@ -134,12 +138,12 @@ impl Begun {
 
     /// Whether a search within `range` (mm) leaves open what lies past it.
     pub fn leaves_open(&self, pair: &Pair<'_>, range: f64) -> bool {
-        self.agrees_on_few() || self.report.is_some() && level::lengths(pair, &self.field)[1] > NEAR * range
+        self.agrees_on_few() || self.report.is_some() && level::lengths(pair, |p| self.motion.at(p))[1] > NEAR * range
     }
 
     /// Whether a search twice as far found what the nearer one, `own`, did not: the volumes agree better, and hardly fewer features.
     pub fn outdoes(&self, pair: &Pair<'_>, own: &Self) -> bool {
-        self.share() >= HARDLY_FEWER * own.share() && level::is_better(pair, &self.field, &own.field)
+        self.share() >= HARDLY_FEWER * own.share() && self.motion.agree_better(pair, &own.motion)
     }
 
     /// Of an unsure search and a wider one the one in which more of the features agreed: the agreement of the volumes does not
@@ -149,7 +153,7 @@ impl Begun {
         let wider_is_surer = match (few.kept < ENOUGH, many.kept < ENOUGH) {
             (false, false) => many.kept_share() > few.kept_share(),
             (true, false) if many.kept_share() >= AGREED => true,
-            _ => level::is_better(pair, &wider.field, &own.field),
+            _ => wider.motion.agree_better(pair, &own.motion),
         };
         if wider_is_surer { wider } else { own }
     }
@@ -177,9 +181,9 @@ impl Search<'_> {
         MatchParams::new(self.params, points, false, reach_mm, 2, 0.3)
     }
 
-    fn refined(&self, pair: &Pair<'_>, mut field: SplineField, passes: usize) -> SplineField {
-        level::refine(pair, &mut field, passes, self.params.seed, self.tick);
-        field
+    fn refined(&self, pair: &Pair<'_>, mut motion: Bodies, passes: usize) -> Bodies {
+        motion.refine(pair, passes, self.params.seed, self.tick);
+        motion
     }
 
     /// What the coarsest level finds, from nothing or from `known` fields. Adds the seconds that matching takes to `seconds`.
@@ -195,32 +199,38 @@ impl Search<'_> {
         passes: usize,
         seconds: &mut f64,
     ) -> Begun {
-        let refined = |field| self.refined(pair, field, passes);
-        let better = |a, b| level::better(pair, a, b);
+        let refined = |motion| self.refined(pair, motion, passes);
+        let better = |a, b| Bodies::better(pair, a, b);
         let course = known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
         let followed = known.first().and_then(|s| s.followed).filter(|&f| f < FOLLOWED);
-        if let Some((field, followed)) = course.as_ref().zip(followed)
-            && timed(seconds, || self.is_confirmed(pair, field))
+        if let Some((motion, followed)) = course.as_ref().zip(followed)
+            && timed(seconds, || self.is_confirmed(pair, motion))
         {
-            return Begun { field: refined(field.clone()), report: None, followed: followed + 1 };
+            return Begun {
+                motion: refined(motion.clone()),
+                report: None,
+                matches: Vec::new(),
+                followed: followed + 1,
+            };
         }
         (self.matching)();
-        let (found, report) = timed(seconds, || self.matched(pair, lattice));
+        let (found, report, matches) = timed(seconds, || self.matched(pair, lattice));
         let counts = report.counts;
-        let own = refined(found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine));
+        let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
+        let own = refined(own.into());
         let in_doubt = counts.kept_share() < LOOSE || counts.kept < ENOUGH;
-        let wins = |known: &SplineField| in_doubt && level::is_better(pair, known, &own);
-        let field = course.filter(wins).map_or(own, refined);
-        Begun { field, report: Some(report), followed: 0 }
+        let wins = |known: &Bodies| in_doubt && known.agree_better(pair, &own);
+        let motion = course.filter(wins).map_or(own, refined);
+        Begun { motion, report: Some(report), matches, followed: 0 }
     }
 
     /// The field of the matches of a whole volume; none where these are too few. Where few features agree they are sought again about
     /// the rigid motion that most agree on, for as long as no fewer agree there: patches that turned by much are hardly alike.
-    fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport) {
+    fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
         let wide = self.wide(pair, self.range, POINTS);
         let agreed = |matches: &[LevelMatch]| matches.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
         let (matches, field, report) = level::matches(pair, None, wide);
-        let (mut kept, mut best) = (agreed(&matches), (field, report));
+        let (mut kept, mut best) = (agreed(&matches), (field, report, matches));
         for _ in 0..TURNS {
             let before = best.1.counts;
             if before.kept_share() >= AGREED || kept.len() < FEWEST || !ablation::is_on("turned") {
@@ -231,15 +241,16 @@ impl Search<'_> {
             let about = SplineField { coefficients: lattice.fit(moved), ..SplineField::still(lattice.clone()) };
             let (matches, field, report) = level::matches_again(pair, &about, wide);
             kept = agreed(&matches);
-            if report.counts.kept > before.kept {
-                best = (field, report);
-            } else if (report.counts.kept as f64) < KEPT * before.kept as f64 {
+            let now = report.counts.kept;
+            if now > before.kept {
+                best = (field, report, matches);
+            } else if (now as f64) < KEPT * before.kept as f64 {
                 break;
             }
         }
-        let (field, report) = best;
+        let (field, report, matches) = best;
         let enough = report.counts.kept >= FEWEST;
-        (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report)
+        (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
     }
 
     /// The field of the matches of a whole volume on `lattice`; stillness where they are too few.
@@ -248,24 +259,22 @@ impl Search<'_> {
     }
 
     /// Whether the features of a level are found where the field has them.
-    fn is_confirmed(&self, pair: &Pair<'_>, field: &SplineField) -> bool {
+    fn is_confirmed(&self, pair: &Pair<'_>, motion: &Bodies) -> bool {
         let points = (pair.inside / self.params.voxels_per_point).max(CLOSER_LEAST);
         let near = MatchParams::near(self.params, pair, points, false);
-        level::matches(pair, Some(field), near).2.counts.kept_share() >= AGREED
+        motion.matches(pair, near).1.counts.kept_share() >= AGREED
     }
 
     /// What a search of the next level about its field finds, if the volumes agree better there: smaller patches are distorted less,
     /// and fine texture tells a wrong island from the truth.
-    pub fn closer(&self, pair: &Pair<'_>, own: &SplineField, passes: usize, seconds: &mut f64) -> Option<Begun> {
-        if !ablation::is_on("next-level") {
-            return None;
-        }
+    pub fn closer(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
+        let only = own.only().filter(|_| ablation::is_on("next-level"))?;
         let most = (CLOSER_POINTS / self.params.voxels_per_point.max(1)).clamp(CLOSER_LEAST, POINTS);
         let wide = self.wide(pair, CLOSER * self.range, most);
         (self.matching)();
-        let (_, found, report) = timed(seconds, || level::matches_again(pair, own, wide));
-        let field = self.refined(pair, found.filter(|_| report.counts.kept >= FEWEST)?, passes);
-        level::is_better(pair, &field, own).then_some(Begun { field, report: Some(report), followed: 0 })
+        let (matches, found, report) = timed(seconds, || level::matches_again(pair, only, wide));
+        let motion = self.refined(pair, found.filter(|_| report.counts.kept >= FEWEST)?.into(), passes);
+        motion.agree_better(pair, own).then_some(Begun { motion, report: Some(report), matches, followed: 0 })
     }
 }
 

@@ -60,16 +60,6 @@ impl SplineField {
     }
 }
 
-/// The field under which the two volumes agree better.
-pub fn better(pair: &Pair<'_>, a: SplineField, b: SplineField) -> SplineField {
-    if is_better(pair, &b, &a) { b } else { a }
-}
-
-/// Whether the two volumes agree better under `a` than under `b`.
-pub fn is_better(pair: &Pair<'_>, a: &SplineField, b: &SplineField) -> bool {
-    gained(pair, b, a) > 0.0
-}
-
 /// Volume of a lattice cell (mm^3), flat axes counting 1.
 pub(super) fn cell_volume(lattice: &Lattice, spacing: [f64; 3]) -> f64 {
     (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] as f64 * spacing[a]).product()
@@ -86,7 +76,7 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
 }
 
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
-fn independent(pair: &Pair<'_>) -> f32 {
+pub(super) fn independent(pair: &Pair<'_>) -> f32 {
     (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
 }
 
@@ -114,14 +104,26 @@ const LEAST_VOLUME: f32 = 0.1;
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence by place and axis
 /// ([`coupling::supported`]). No node ends further than two voxels of the finest axis from where it began, along each axis. Calls `tick` after each pass.
 pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
+    let begun = field.coefficients.clone();
+    refine_from(pair, field, &begun, passes, seed, tick);
+}
+
+/// As [`refine`], where earlier passes began at the coefficients `begun`.
+pub(super) fn refine_from(
+    pair: &Pair<'_>,
+    field: &mut SplineField,
+    begun: &[f32],
+    passes: usize,
+    seed: u64,
+    tick: impl Fn(usize),
+) {
     let energy = smoothness(&field.lattice, pair.spacing);
     let cell = cell_volume(&field.lattice, pair.spacing);
     let active = pair.spans.grown(1);
     let weight = independent(pair);
     let finest = pyramid::finest(pair.shape, pair.spacing);
-    let begun = field.coefficients.clone();
     let reach = (REACH * finest) as f32;
-    let mut before = begun.clone();
+    let mut before = field.coefficients.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     let large = field.lattice.len() >= LARGE;
     let mut warped = Vec::new();
@@ -151,7 +153,7 @@ pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64
         // Neither needs the other, and the planes of a small lattice are not worth sharing out; those of a large one are, and only one
         // of the two then needs its vectors.
         let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
-        for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(&begun) {
+        for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(begun) {
             let last = std::mem::replace(before, *c);
             *c = (*c + d + MOMENTUM * (*c - last)).clamp(begun - reach, begun + reach);
         }
@@ -237,54 +239,54 @@ pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> (Lattice,
     (coarse, posterior)
 }
 
-/// By how much the misfit shrinks from one field to another, with the information that correlated noise leaves.
-pub fn gained(pair: &Pair<'_>, from: &SplineField, to: &SplineField) -> f64 {
-    let warp = |f: &SplineField| pair.warp(&f.lattice, &f.coefficients, &pair.spans);
-    residual::excess(pair, &warp(from), &Baseline::new(pair, warp(to))) * f64::from(independent(pair))
+/// By how much the misfit shrinks from one warp to another, with the information that correlated noise leaves.
+pub fn gained(pair: &Pair<'_>, from: &[f32], to: Vec<f32>) -> f64 {
+    residual::excess(pair, from, &Baseline::new(pair, to)) * f64::from(independent(pair))
 }
 
-/// Mean and largest length of a field over the mask (mm), from every third voxel along each axis.
-pub fn lengths(pair: &Pair<'_>, field: &SplineField) -> [f64; 2] {
+/// Mean and largest length over the mask (mm) of the displacement `at` a place (voxels), from every third voxel along each axis.
+pub fn lengths(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 2] {
     let [nx, ny, nz] = pair.shape;
     let (mut sum, mut count, mut largest) = (0.0, 0usize, 0.0f64);
     for (j, k) in (0..nz).step_by(3).flat_map(|k| (0..ny).step_by(3).map(move |j| (j, k))) {
         for i in (0..nx).step_by(3).filter(|i| pair.mask[i + nx * (j + ny * k)] != 0) {
-            let u = field.lattice.at(&field.coefficients, [i, j, k].map(|v| v as f64));
-            let length = distance(u, [0.0; 3]);
+            let length = distance(at([i, j, k].map(|v| v as f64)), [0.0; 3]);
             (sum, count, largest) = (sum + length, count + 1, largest.max(length));
         }
     }
     [sum / count.max(1) as f64, largest]
 }
 
-/// Whether the deformed volume shows what is at `p` (voxels) in the initial one, by a field.
-pub fn sees(pair: &Pair<'_>, field: &SplineField, p: [f64; 3]) -> bool {
-    let u = field.lattice.at(&field.coefficients, p);
+/// Whether the deformed volume shows what is at `p` (voxels) in the initial one and moves by `u` (mm).
+pub fn sees(pair: &Pair<'_>, p: [f64; 3], u: [f64; 3]) -> bool {
     let shape = pair.moving_shape;
     let along = |a: usize| p[a] + u[a] / pair.spacing[a] - pair.moving_origin[a];
     let there = VoxelPoint(std::array::from_fn(|a| if shape[a] > 1 { along(a) } else { 0.0 }));
     nearest(shape, there).is_some_and(|at| pair.moving[at].is_finite())
 }
 
-/// The part of the mask that the deformed volume does not show (1), from every third voxel along each axis.
-pub fn unseen(pair: &Pair<'_>, field: &SplineField) -> f64 {
+/// The part of the mask that the deformed volume does not show (1), from every third voxel along each axis; `at` gives the
+/// displacement (mm) at a place (voxels).
+pub fn unseen(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> f64 {
     let [nx, ny, nz] = pair.shape;
     let in_plane = |k: usize| -> [usize; 2] {
         let every = (0..ny).step_by(3).flat_map(|j| (0..nx).step_by(3).map(move |i| [i, j, k]));
         let inside = every.filter(|[i, j, k]| pair.mask[i + nx * (j + ny * k)] != 0);
-        inside.fold([0; 2], |[out, all], v| [out + usize::from(!sees(pair, field, v.map(|v| v as f64))), all + 1])
+        inside.fold([0; 2], |[out, all], v| {
+            let p = v.map(|v| v as f64);
+            [out + usize::from(!sees(pair, p, at(p))), all + 1]
+        })
     };
     let planes: Vec<usize> = (0..nz).step_by(3).collect();
     let [out, all] = planes.into_par_iter().map(in_plane).reduce(|| [0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
     out as f64 / all.max(1) as f64
 }
 
-/// How the two volumes differ under a field: the robust standard deviation of what is left (intensity), and by what factor the
+/// How the two volumes differ once the deformed one is warped: the robust standard deviation of what is left (intensity), and by what factor the
 /// gain varies ([`GainField::variation`]).
-pub fn misfit(pair: &Pair<'_>, field: &SplineField) -> [f32; 2] {
-    let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
-    let [gain, sharpened] = GainField::both(pair, &warped);
-    [residual::residual_sigma(pair, &warped, &gain), sharpened.variation(pair)]
+pub fn misfit(pair: &Pair<'_>, warped: &[f32]) -> [f32; 2] {
+    let [gain, sharpened] = GainField::both(pair, warped);
+    [residual::residual_sigma(pair, warped, &gain), sharpened.variation(pair)]
 }
 
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.

@@ -4,7 +4,7 @@ use crate::matching::brightness::Brightness;
 use crate::matching::levels::Aligned;
 use crate::matching::pair::Pair;
 use crate::numerics::ablation;
-use crate::pipeline::level::SplineField;
+use crate::pipeline::bodies::Bodies;
 
 /// What may be left of the difference, as a part of it, for the rest to be taken out. Of 82 pairs of all kinds those without a bias kept 0.75
 /// to 1.0 of it on the coarsest level, those with one of 5 % 0.18 to 0.86 and of 15 % 0.09 to 0.56.
@@ -62,15 +62,15 @@ impl Light {
         self.taken.is_none() && self.left.is_none()
     }
 
-    /// Looks on a level of `factor` under `field`, on it, for what differs between the volumes as they are, and takes that out of `pair` in
+    /// Looks on a level of `factor` under `motion`, on it, for what differs between the volumes as they are, and takes that out of `pair` in
     /// place of what was known before. Whether `pair` is another now.
     pub fn look<'a>(
         &mut self,
         pair: &mut Pair<'a>,
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),
-        field: &SplineField,
+        motion: &Bodies,
     ) -> bool {
-        self.judge(pair, (aligned, factor), field, (LEAVES, BOTH))
+        self.judge(pair, (aligned, factor), motion, (LEAVES, BOTH))
     }
 
     /// The same before the motion is known.
@@ -78,7 +78,7 @@ impl Light {
         &mut self,
         pair: &mut Pair<'a>,
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),
-        still: &SplineField,
+        still: &Bodies,
     ) -> bool {
         self.judge(pair, (aligned, factor), still, (LEAVES_AT_REST, BOTH_AT_REST))
     }
@@ -87,7 +87,7 @@ impl Light {
         &mut self,
         pair: &mut Pair<'a>,
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),
-        field: &SplineField,
+        motion: &Bodies,
         (leaves, both): (f64, f64),
     ) -> bool {
         let before = self.taken.take();
@@ -95,7 +95,8 @@ impl Light {
         if was_taken {
             pair.put(aligned.deformed(factor));
         }
-        let found = Brightness::measure(pair, (factor, aligned.shape()), (&field.lattice, &field.coefficients), both);
+        let warped = motion.warp(pair, &pair.spans);
+        let found = Brightness::measure(pair, (factor, aligned.shape()), &warped, |p| motion.at(p), both);
         let matters = |b: &Brightness| {
             ablation::is_on("brightness") && b.deviation[0] > MATTERS && explains(b, leaves) && b.uneven <= UNEVEN
         };

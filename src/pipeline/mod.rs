@@ -32,6 +32,7 @@ pub mod pressed;
 pub mod stress;
 
 mod background;
+mod bodies;
 mod course;
 mod finer;
 mod hypotheses;

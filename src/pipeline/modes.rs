@@ -7,7 +7,7 @@
 //! taken as leave what is noise: without a course of its own, white in time, and no more than a frame alone is uncertain by. Where
 //! a block's leftover is more than that in some frame, that frame keeps its own field there.
 
-use crate::field::spline::{FieldSpline, ScalarSpline};
+use crate::field::spline::{FieldSpline, ScalarSpline, Spline};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::eigen::symmetric;
 use crate::numerics::statistics::median;
@@ -66,13 +66,16 @@ impl Modes {
                 "each frame by itself: {FEWEST} beside the reference are needed to tell courses from noise"
             ));
         }
-        let lattice = &frames[0].field.lattice;
+        let fields: Option<Vec<&Spline>> = frames.iter().map(|f| f.field.only()).collect();
+        let fields = fields.ok_or("each frame by itself: bodies slide along each other in one of them at least")?;
+        let lattice = &fields[0].0;
         // In the order of time, the reference among them.
         let mut order: Vec<usize> = (0..frames.len()).collect();
         order.sort_by_key(|&f| frames[f].number);
         let before = order.iter().filter(|&&f| frames[f].number < origin).count();
         let still = Cow::Owned(vec![0.0; 3 * lattice.len()]);
-        let mut rows: Vec<Cow<'_, [f32]>> = order.iter().map(|&f| carried(frames[f].field.parts(), lattice)).collect();
+        let mut rows: Vec<Cow<'_, [f32]>> =
+            order.iter().map(|&f| carried((&fields[f].0, &fields[f].1), lattice)).collect();
         rows.insert(before, still);
         let nodes: Vec<usize> =
             (0..lattice.len()).filter(|&m| counts(lattice.within(m).map(|v| v.round() as usize))).collect();
@@ -100,8 +103,9 @@ impl Modes {
 
     /// The field of frame `at` of those that were given, by all of them.
     pub fn apply(&self, at: usize, field: &mut FieldSpline) {
-        let taken = carried((&self.lattice, &self.corrections[at]), &field.lattice);
-        field.coefficients.iter_mut().zip(taken.iter()).for_each(|(c, t)| *c -= t);
+        let Some((lattice, coefficients)) = field.only_mut() else { return };
+        let taken = carried((&self.lattice, &self.corrections[at]), lattice);
+        coefficients.iter_mut().zip(taken.iter()).for_each(|(c, t)| *c -= t);
     }
 }
 
@@ -365,9 +369,13 @@ mod tests {
         Lattice::new([40, 36, 32], [4; 3])
     }
 
+    fn coefficients(field: &FieldSpline) -> &[f32] {
+        &field.only().unwrap().1
+    }
+
     fn field(coefficients: Vec<f32>) -> FieldSpline {
         let grid = Grid::new([40, 36, 32], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
-        FieldSpline::new(grid, (lattice(), coefficients), Vec::new())
+        FieldSpline::new(grid, vec![(lattice(), coefficients)], Vec::new())
     }
 
     fn white(random: &mut Random) -> Vec<f64> {
@@ -428,7 +436,7 @@ mod tests {
             let mut after = fields[t - 1].clone();
             modes.apply(t - 1, &mut after);
             let error = |f: &FieldSpline| {
-                let squares = f.coefficients.iter().zip(&truth[t]).map(|(c, u)| (f64::from(*c) - u).powi(2));
+                let squares = coefficients(f).iter().zip(&truth[t]).map(|(c, u)| (f64::from(*c) - u).powi(2));
                 squares.sum::<f64>() / truth[t].len() as f64
             };
             let expected = NOISE * NOISE * (p(t, t) + p(0, 0) - 2.0 * p(t, 0));
@@ -465,7 +473,7 @@ mod tests {
             let all = lattice().len();
             let of: Vec<f64> = (0..3 * all)
                 .filter(|at| there(at % all))
-                .map(|at| f64::from(f.coefficients[at]) - two(6)[at])
+                .map(|at| f64::from(coefficients(f)[at]) - two(6)[at])
                 .collect();
             of.iter().sum::<f64>() / of.len() as f64
         };

@@ -5,7 +5,8 @@
 
 use crate::matching::levels::{factors, from_level, to_level};
 use crate::matching::pair::Pair;
-use crate::pipeline::level::{self, SplineField};
+use crate::pipeline::bodies::Bodies;
+use crate::pipeline::level;
 use crate::types::{FieldParams, Grid};
 
 /// Voxels between nodes at most. Five pairs of 160 x 192 x 160 (3 passes): errors as with 5, gradients 4 % less, and less time.
@@ -17,16 +18,15 @@ pub(super) fn next_finer(grid: &Grid, finest: usize, params: &FieldParams) -> Op
     wanted.then(|| factors(grid.shape(), grid.spacing(), finest / 2, 0.0)[0])
 }
 
-/// A field of a level of factor `from` brought to the residual on `pair`, of `factor`, with so many voxels between nodes.
+/// The fields of a level of factor `from` brought to the residual on `pair`, of `factor`, with so many voxels between nodes.
 pub(super) fn polish(
     (pair, factor, nodes): (&Pair<'_>, [usize; 3], usize),
-    (field, from): (&SplineField, [usize; 3]),
+    (bodies, from): (&Bodies, [usize; 3]),
     params: &FieldParams,
     tick: impl Fn(usize),
-) -> SplineField {
-    let lattice = level::lattice(pair, nodes);
-    let mut finer = level::carry(field, lattice, |p| to_level(from_level(p, factor), from));
-    level::refine(pair, &mut finer, params.finer_passes, params.seed, tick);
+) -> Bodies {
+    let mut finer = bodies.carried(&level::lattice(pair, nodes), |p| to_level(from_level(p, factor), from));
+    finer.refine(pair, params.finer_passes, params.seed, tick);
     finer
 }
 

@@ -152,16 +152,7 @@ impl Rest {
 
     /// What the field shows of the tissue at rest, at its nodes, with the information that the data give there.
     fn at_rest(&self, pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
-        let nodes = &field.lattice;
-        let shown = |(m, block): (usize, [f32; 6])| {
-            let at = nodes.within(m);
-            let here = nearest(pair.shape, VoxelPoint(at)).is_some_and(|at| pair.mask[at] != 0);
-            let covariance = if here && self.free_at(at) < 0.5 { inverse(&block.map(f64::from)) } else { None }?;
-            let displacement = nodes.at(&field.coefficients, at);
-            let place = std::array::from_fn(|a| at[a] * self.spacing[a]);
-            Some(Measured { place, displacement, covariance, field: displacement })
-        };
-        field.blocks.iter().enumerate().filter_map(shown).collect()
+        shown(pair, field, |at| self.free_at(at) < 0.5)
     }
 
     /// How much of the free field stands at a place of the windows' grid, or at the nearest to it.
@@ -207,6 +198,20 @@ impl Rest {
             }
         }
     }
+}
+
+/// What a field shows of the tissue at its nodes where `counts` holds (voxels), with the information that the data give there.
+pub(super) fn shown(pair: &Pair<'_>, field: &SplineField, counts: impl Fn([f64; 3]) -> bool) -> Vec<Measured> {
+    let nodes = &field.lattice;
+    let of = |(m, block): (usize, [f32; 6])| {
+        let at = nodes.within(m);
+        let here = nearest(pair.shape, VoxelPoint(at)).is_some_and(|at| pair.mask[at] != 0);
+        let covariance = if here && counts(at) { inverse(&block.map(f64::from)) } else { None }?;
+        let displacement = nodes.at(&field.coefficients, at);
+        let place = std::array::from_fn(|a| at[a] * pair.spacing[a]);
+        Some(Measured { place, displacement, covariance, field: displacement })
+    };
+    field.blocks.iter().enumerate().filter_map(of).collect()
 }
 
 /// See [`LENT`].

@@ -147,7 +147,7 @@ pub(super) fn measure(
     choice.evidence.extend(background::why_unseen(cut));
     let corners = reports.last().map_or(0, |r| r.counts.features_initial);
     choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
-    let unseen = level::unseen(&pair, &field);
+    let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
     clock.book("model");
     let (coarse, Posterior { deviation, .. }) = level::posterior(&field, pair.spacing, params.seed);
     let hidden = field::hidden(&pair, &field, &coarse);
@@ -159,14 +159,15 @@ pub(super) fn measure(
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
-    let mut coefficients = FieldSpline::new(grid, field::full_lattice(&grid, &field, factor, &choice), Vec::new());
-    let (smooth, _) = coefficients.unfold(&mask)?;
+    let mut coefficients =
+        FieldSpline::new(grid, vec![field::full_lattice(&grid, &field, factor, &choice)], Vec::new());
+    let smooth = coefficients.unfold(&mask)?;
     let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
-    let uncertainty = field::uncertainty(&grid, pair.spacing, (coarse, deviation), &hidden, Vec::new());
+    let uncertainty = field::uncertainty(&grid, pair.spacing, field::Stated { coarse, deviation, hidden }, Vec::new());
     let (uncertainty_median_mm, uncertainty_mean_mm) = field::average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
@@ -175,6 +176,7 @@ pub(super) fn measure(
         counts,
         model: choice.model,
         evidence: choice.evidence,
+        bodies: vec![BodyReport { label: 1, voxels: mask_voxels, model: choice.model, slides_mm: 0.0 }],
         levels: reports,
         folds,
         mask_voxels,
@@ -199,8 +201,9 @@ pub(super) fn measure(
     Ok(FieldResult {
         displacement,
         coefficients,
-        spline: Start { field, factor, followed: None },
+        spline: Start { motion: field.into(), factor, followed: None },
         uncertainty,
+        bodies: field::labelled(&mask, &[], |_| 1),
         matches: sparse,
         mesh,
         node_displacement,

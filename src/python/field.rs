@@ -78,6 +78,7 @@ pub fn field<'py>(
             displacement: &result.displacement,
             jacobian: &unseen,
             uncertainty: &unseen,
+            bodies: &unseen,
             matches: &result.matches,
             mesh: &result.mesh,
             node_displacement: &result.node_displacement,
@@ -100,6 +101,7 @@ pub fn field<'py>(
     out.set_item("warped", arrays::array3(py, warped)?)?;
     out.set_item("jacobian", arrays::array3(py, jacobian)?)?;
     out.set_item("uncertainty", arrays::array3(py, uncertainty)?)?;
+    out.set_item("bodies", arrays::array3(py, result.bodies)?)?;
     out.set_item("matches", arrays::match_rows(py, &matches))?;
     out.set_item("nodes", nodes)?;
     out.set_item("elements", elements)?;

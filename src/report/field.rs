@@ -30,6 +30,8 @@ pub struct FieldReport<'a> {
     pub jacobian: Values<'a>,
     /// One standard deviation of the displacement (mm).
     pub uncertainty: Values<'a>,
+    /// The body of each voxel, from 1; 0 outside the mask.
+    pub bodies: Values<'a>,
     /// All matches with covariance.
     pub matches: &'a SparseField,
     /// The mesh through the kept matches (initial positions).
@@ -46,7 +48,7 @@ pub struct FieldReport<'a> {
 pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{Affine, Counts, LevelReport, Match, MotionModel, TetMesh, Volume, WorldPoint};
+    use crate::types::{Affine, BodyReport, Counts, LevelReport, Match, MotionModel, TetMesh, Volume, WorldPoint};
 
     /// A made-up result with known numbers.
     pub(crate) struct Case {
@@ -97,6 +99,7 @@ pub(crate) mod tests {
                 counts,
                 model: MotionModel::Free,
                 evidence: vec!["free: 12 % lower".into()],
+                bodies: vec![BodyReport { label: 1, voxels: grid.len(), model: MotionModel::Free, slides_mm: 0.0 }],
                 levels: vec![level],
                 folds: 0,
                 mask_voxels: grid.len(),
@@ -136,6 +139,7 @@ pub(crate) mod tests {
                 displacement: &self.displacement,
                 jacobian: &*self.jacobian,
                 uncertainty: &*self.uncertainty,
+                bodies: &|_| 1.0,
                 matches: &self.matches,
                 mesh: &self.mesh,
                 node_displacement: &[[1.0, 0.0, 0.0]; 4],

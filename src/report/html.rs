@@ -63,6 +63,9 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
         let _ = write!(body, "<article><h3>Mesh nodes</h3><p>{note}</p>{drawing}{}</article>", legend(Some(scale)));
     }
     body.push_str(&card(&views.jacobian));
+    if let Some(bodies) = &views.bodies {
+        body.push_str(&card(bodies));
+    }
     body.push_str("</div></section><section><h2>How far to trust it</h2><div class=\"grid\">");
     body.push_str(&card(&views.uncertainty));
     let (dots, slab, precision) = &views.matches;
@@ -85,8 +88,9 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let evidence: String = report.summary.evidence.iter().map(|e| format!("<li>{}</li>", escape(e))).collect();
     let _ = write!(
         body,
-        "<article class=\"wide\"><h3>Coarse to fine</h3>{}</article><article><h3>Motion model</h3><ul>{evidence}</ul></article><article><h3>Time</h3>{}</article></div></section>",
+        "<article class=\"wide\"><h3>Coarse to fine</h3>{}</article><article><h3>Bodies</h3>{}</article><article><h3>Motion model</h3><ul>{evidence}</ul></article><article><h3>Time</h3>{}</article></div></section>",
         tables::levels(report),
+        tables::bodies(report),
         chart::stage_times(&report.summary.seconds)
     );
     let title = format!("{} to {}", escape(report.names[0]), escape(report.names[1]));

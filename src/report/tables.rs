@@ -3,7 +3,7 @@
 use crate::report::field::FieldReport;
 use crate::report::html::escape;
 use crate::report::scale::{short, thousands};
-use crate::types::{Metrics, MotionModel};
+use crate::types::{BodyReport, Metrics, MotionModel};
 use std::fmt::Write;
 
 /// A table from a head (may be empty) and rows; the first column is text, the others are numbers.
@@ -47,6 +47,17 @@ pub fn counts(report: &FieldReport<'_>) -> String {
         ("Motion model", model.into()),
     ];
     table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+}
+
+/// The bodies of the scene.
+pub fn bodies(report: &FieldReport<'_>) -> String {
+    let row = |b: &BodyReport| {
+        let share = 100.0 * b.voxels as f64 / report.summary.mask_voxels.max(1) as f64;
+        let model = format!("{:?}", b.model).to_lowercase();
+        vec![b.label.to_string(), thousands(b.voxels), format!("{share:.1}"), model, format!("{:.2}", b.slides_mm)]
+    };
+    let rows: Vec<_> = report.summary.bodies.iter().map(row).collect();
+    table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm"], &rows)
 }
 
 /// The levels, coarse to fine.

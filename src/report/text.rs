@@ -3,7 +3,7 @@
 use crate::report::field::FieldReport;
 use crate::report::scale::thousands;
 use crate::report::verdict::verdict;
-use crate::types::Metrics;
+use crate::types::{BodyReport, Metrics};
 use std::fmt::Write;
 
 /// What a field run found, a few lines.
@@ -33,6 +33,15 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
         s.max_mm,
         thousands(s.mask_voxels)
     );
+    if let [_, _, ..] = s.bodies.as_slice() {
+        let of = |b: &BodyReport| {
+            let share = 100.0 * b.voxels as f64 / s.mask_voxels.max(1) as f64;
+            let model = format!("{:?}", b.model).to_lowercase();
+            format!("{} ({share:.0} %, {model}, slides by {:.1} mm)", b.label, b.slides_mm)
+        };
+        let bodies: Vec<String> = s.bodies.iter().map(of).collect();
+        let _ = writeln!(out, "  bodies       {}", bodies.join(", "));
+    }
     let _ = writeln!(out, "  mesh         {} nodes, {} elements", thousands(c.nodes), thousands(c.tetrahedra));
     let _ = writeln!(out, "  folds        {}", thousands(s.folds));
     let _ = writeln!(out, "  trust        {}: {}", v.trust.name(), v.reasons.join("; "));

@@ -59,7 +59,11 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Affine => format!("One affine motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Free => {
-            format!("Tissue moved {} mm on average and {} mm at most", short2(s.mean_mm), short2(s.max_mm))
+            let bodies = match s.bodies.len() {
+                0 | 1 => String::new(),
+                n => format!(", in {n} bodies that slide along each other"),
+            };
+            format!("Tissue moved {} mm on average and {} mm at most{bodies}", short2(s.mean_mm), short2(s.max_mm))
         }
     };
     let residual =

@@ -9,7 +9,7 @@ use crate::report::picture::Picture;
 use crate::report::scale::{Scale, short};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
-use crate::types::{SparseField, WorldPoint};
+use crate::types::{SparseField, Voxels, WorldPoint};
 
 /// Everything that is cut from the volumes, and the scales that go with it.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,6 +24,8 @@ pub struct Views {
     pub magnitude: Panel,
     /// Jacobian determinant.
     pub jacobian: Panel,
+    /// The bodies, where there are several.
+    pub bodies: Option<Panel>,
     /// Uncertainty.
     pub uncertainty: Panel,
     /// Distance to the true displacement, where that is known.
@@ -34,6 +36,25 @@ pub struct Views {
     pub gray: ([f64; 2], [f32; 2]),
     /// One SVG a plane, how thick a slab is shown (mm), and the scale of the dots.
     pub matches: (Vec<String>, f64, Scale),
+}
+
+/// The bodies in colour, where there are several.
+fn bodies_of(
+    report: &FieldReport<'_>,
+    sections: &[Section],
+    base: (&Voxels<'_>, [f64; 2]),
+) -> Result<Option<Panel>, ReportError> {
+    let count = report.summary.bodies.len();
+    if count < 2 {
+        return Ok(None);
+    }
+    let scale = Scale { low: 1.0, high: count as f64, unit: "", map: ColorMap::Viridis };
+    // Outside the mask there is none.
+    let label = |o: usize| if (report.bodies)(o) > 0.0 { (report.bodies)(o) } else { f32::NAN };
+    let panel = Panel::coloured("Bodies", sections, base, report.mask, scale, label)?;
+    Ok(Some(panel.with_note(
+        "Parts that slide along each other, each with a motion of its own, by their labels in bodies.nii.gz.",
+    )))
 }
 
 impl Views {
@@ -102,6 +123,7 @@ impl Views {
                 difference("|initial − warped|, after", warped, after)?,
             ],
             magnitude: Panel::coloured("Length of the displacement", &sections, base, mask, lengths, motion)?,
+            bodies: bodies_of(report, &sections, base)?,
             jacobian: Panel::coloured("Jacobian determinant", &sections, base, mask, change, jacobian)?
                 .with_note("Blue: the tissue shrinks. Red: it grows. White: its volume stays."),
             uncertainty: Panel::coloured("Uncertainty of the displacement", &sections, base, mask, vague, uncertainty)?

@@ -44,7 +44,7 @@ pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
 pub use metrics::Metrics;
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
-pub use result::{Counts, FieldSummary, LevelReport, Mesh, MotionModel};
+pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel};
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};

@@ -28,6 +28,19 @@ pub enum Method {
     Sparse,
 }
 
+/// Which bodies a scene has: parts that slide along each other, each with a motion of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "lowercase")]
+pub enum BodySource {
+    /// As many as the volumes ask for; most scenes have one.
+    #[default]
+    Found,
+    /// One: nothing slides.
+    Bonded,
+    /// The labels of the mask.
+    Given,
+}
+
 /// How the dense field is made from the measured places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -75,6 +88,10 @@ pub struct FieldParams {
     pub consistency: bool,
     /// Whether matches are refined to a fraction of a voxel. Only for comparisons.
     pub sub_voxel: bool,
+    /// Which bodies there are.
+    pub bodies: BodySource,
+    /// Labels of the given bodies that move rigidly.
+    pub rigid: Vec<u8>,
     /// Seed of whatever is drawn at random.
     pub seed: u64,
 }
@@ -87,7 +104,7 @@ impl Default for FieldParams {
 
 impl FieldParams {
     /// Names of all parameters, as files have them.
-    pub const KEYS: [&str; 15] = [
+    pub const KEYS: [&str; 17] = [
         "preset",
         "method",
         "points",
@@ -102,6 +119,8 @@ impl FieldParams {
         "candidates",
         "consistency",
         "sub_voxel",
+        "bodies",
+        "rigid",
         "seed",
     ];
 
@@ -122,6 +141,8 @@ impl FieldParams {
             candidates: 8,
             consistency: true,
             sub_voxel: true,
+            bodies: BodySource::Found,
+            rigid: Vec::new(),
             seed: 1,
         };
         match preset {

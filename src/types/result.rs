@@ -65,6 +65,43 @@ pub struct LevelReport {
     pub residual_mm: f64,
 }
 
+impl LevelReport {
+    /// Of this part of a level and another: sums of the counts, and means by features and by matches.
+    #[must_use]
+    pub fn with(&self, other: &Self) -> Self {
+        let mean = |a: f64, b: f64, [n, m]: [usize; 2]| (a * n as f64 + b * m as f64) / (n + m).max(1) as f64;
+        let features = [self, other].map(|r| r.counts.features_initial);
+        let kept = [self, other].map(|r| r.counts.kept);
+        Self {
+            spacing_mm: self.spacing_mm,
+            counts: Counts {
+                features_initial: features[0] + features[1],
+                features_deformed: self.counts.features_deformed + other.counts.features_deformed,
+                candidates: self.counts.candidates + other.counts.candidates,
+                kept: kept[0] + kept[1],
+                nodes: self.counts.nodes + other.counts.nodes,
+                tetrahedra: self.counts.tetrahedra + other.counts.tetrahedra,
+            },
+            energy_before: mean(self.energy_before, other.energy_before, features),
+            energy_after: mean(self.energy_after, other.energy_after, features),
+            residual_mm: mean(self.residual_mm, other.residual_mm, kept),
+        }
+    }
+}
+
+/// A body of the scene: tissue that slides along the rest, or all of it where nothing slides.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BodyReport {
+    /// Its label, from 1.
+    pub label: u8,
+    /// Voxels of the mask that belong to it.
+    pub voxels: usize,
+    /// The smallest motion that explains it.
+    pub model: MotionModel,
+    /// How far the tissue beside it moves from where its own motion leads (mm, median along its border); 0 where it borders on none.
+    pub slides_mm: f64,
+}
+
 /// Everything but the volumes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FieldSummary {
@@ -74,6 +111,8 @@ pub struct FieldSummary {
     pub model: MotionModel,
     /// Why: the evidence for each model tried, in words with numbers.
     pub evidence: Vec<String>,
+    /// The bodies that were found: one where nothing slides.
+    pub bodies: Vec<BodyReport>,
     /// Coarse to fine.
     pub levels: Vec<LevelReport>,
     /// Voxels of the mask with a Jacobian determinant at or below zero.

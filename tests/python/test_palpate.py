@@ -36,6 +36,7 @@ def check_field(found, folder, summary):
     same(found.warped, volume(folder / "warped.nii.gz"))
     same(found.jacobian, volume(folder / "jacobian.nii.gz"))
     same(found.uncertainty, volume(folder / "uncertainty.nii.gz"))
+    same(found.bodies, volume(folder / "bodies.nii.gz"))
     same(found.affine, nibabel.load(folder / "displacement.nii.gz").affine)
     table = list(csv.reader(open(folder / "matches.csv")))
     assert table[0] == "x y z dx dy dz ncc sigma kept".split()

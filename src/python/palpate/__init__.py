@@ -137,6 +137,8 @@ class Field(_Result):
     jacobian: np.ndarray
     #: (nx, ny, nz), mm, one standard deviation.
     uncertainty: np.ndarray
+    #: (nx, ny, nz), the body of each voxel of the mask, from 1; 0 outside it.
+    bodies: np.ndarray
     #: (n, 9), the columns of matches.csv: x, y, z, dx, dy, dz (mm, RAS), ncc, sigma (mm), kept.
     matches: np.ndarray
     #: (n, 3), mm, RAS, initial places of the mesh's nodes.

@@ -1,0 +1,471 @@
+//! The bodies of a scene: parts of the tissue that slide along each other, each with a spline field of its own.
+//!
+//! Most scenes have one. Another is tried where two motions explain the matches better than one ([`grouping`]): passes within
+//! each body and sharing out of the voxels alternate, and it stays if what it explains of the misfit is worth its degrees of freedom.
+
+use crate::consistency::energy::distance;
+use crate::consistency::grouping;
+use crate::consistency::pruning::Measured;
+use crate::matching::gain::GainField;
+use crate::matching::pair::{Pair, Spans};
+use crate::matching::residual::{self, CAUCHY};
+use crate::numerics::bspline::Lattice;
+use crate::numerics::statistics::median;
+use crate::numerics::{ablation, filters, pyramid};
+use crate::pipeline::level::{self, GATE, LevelMatch, MatchParams, SplineField};
+use crate::types::LevelReport;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Passes between two times that voxels are shared out.
+const PASSES: usize = 2;
+
+/// Times that voxels are shared out in a trial; then it must explain more than it costs.
+const TRIAL: usize = 2;
+
+/// Part of what a trial explains worse at first that the first passes must make up for but for this. Of 22 scenes those with one body kept
+/// 0.31 to 0.97 of it, those with more 0.13 at most.
+const HOPE: f64 = 0.25;
+
+/// Misfit that each further degree of freedom must explain (Akaike 1974: twice what chance gives), and how many are counted at least: with
+/// fewer, chance and rounding weigh too much.
+const WORTH: (f64, f64) = (2.0, 100.0);
+
+/// Matches that a body rests on at least.
+const FEWEST: usize = 6;
+
+/// Jump of the motion at the border of two bodies, at least (voxels of the initial volume, median): less is one body.
+const JUMP: f64 = 1.0;
+
+/// Bodies at most.
+const MOST: usize = 8;
+
+/// Window in which residuals tell whose a voxel is (finest voxels, one standard deviation of a Gaussian). With .6 to 1.4 the errors of 12
+/// scenes that slide differ by 5 %.
+const WINDOW: f64 = 0.8;
+
+/// Log odds of a voxel all of whose surroundings belong to a body, and the width of these (finest voxels, one standard deviation).
+/// With 3 to 12, and with 1 to 2.2, the errors of 12 scenes that slide differ by 2 %.
+const COHERENCE: (f32, f64) = (5.0, 1.2);
+
+/// Times that shares are balanced against those around (mean field).
+const BALANCED: usize = 5;
+
+/// Tissue shared out among bodies, with their motions.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bodies {
+    /// The body of each voxel of the level; empty where there is one.
+    labels: Vec<u8>,
+    /// Whether the labels stay as they are.
+    fixed: bool,
+    /// Their fields, each on a lattice over the whole level.
+    pub fields: Vec<SplineField>,
+}
+
+/// Bodies that are given as labels at full resolution.
+pub(super) struct Given {
+    /// The label of each body, rising.
+    pub names: Vec<u8>,
+    /// The body of each voxel; outside the labels that of the nearest labelled voxel.
+    labels: Vec<u8>,
+    shape: [usize; 3],
+}
+
+impl Given {
+    /// From labels, 0 where there is no tissue.
+    pub fn new(labels: &[u8], shape: [usize; 3]) -> Self {
+        let mut seen = [false; 256];
+        labels.iter().for_each(|l| seen[usize::from(*l)] = true);
+        let names: Vec<u8> = (1..=255).filter(|l| seen[usize::from(*l)]).collect();
+        let body = |l: &u8| names.binary_search(l).map_or(u8::MAX, |b| b as u8);
+        let mut labels: Vec<u8> = labels.iter().map(body).collect();
+        let stride = [1, shape[0], shape[0] * shape[1]];
+        let mut front: Vec<usize> = (0..labels.len()).filter(|&at| labels[at] != u8::MAX).collect();
+        while !front.is_empty() {
+            let mut next = Vec::new();
+            for at in front {
+                for a in 0..3 {
+                    let v = at / stride[a] % shape[a];
+                    let below = (v > 0).then(|| at - stride[a]);
+                    let above = (v + 1 < shape[a]).then(|| at + stride[a]);
+                    for other in below.into_iter().chain(above).filter(|&o| labels[o] == u8::MAX).collect::<Vec<_>>() {
+                        labels[other] = labels[at];
+                        next.push(other);
+                    }
+                }
+            }
+            front = next;
+        }
+        Self { names, labels, shape }
+    }
+
+    /// The body of each voxel of a level of `shape`: the commonest among those it stands for, the first of several.
+    pub fn on(&self, shape: [usize; 3], factor: [usize; 3]) -> Vec<u8> {
+        if factor == [1; 3] {
+            return self.labels.clone();
+        }
+        let common = |at: usize| {
+            let v = [at % shape[0], at / shape[0] % shape[1], at / (shape[0] * shape[1])];
+            let [x, y, z]: [Range<usize>; 3] = std::array::from_fn(|a| {
+                (v[a] * factor[a]).min(self.shape[a] - 1)..((v[a] + 1) * factor[a]).min(self.shape[a])
+            });
+            let mut counts = vec![0usize; self.names.len()];
+            for (k, j) in z.flat_map(|k| y.clone().map(move |j| (k, j))) {
+                let row = self.shape[0] * (j + self.shape[1] * k);
+                self.labels[row + x.start..row + x.end].iter().for_each(|l| counts[usize::from(*l)] += 1);
+            }
+            (0..counts.len()).fold(0, |best, b| if counts[b] > counts[best] { b } else { best }) as u8
+        };
+        (0..shape.iter().product()).into_par_iter().map(common).collect()
+    }
+}
+
+/// A trial of one body more: what it explains.
+pub(super) struct Trial {
+    bodies: Bodies,
+    /// Misfit explained, in units of noise.
+    gain: f64,
+    /// Degrees of freedom more.
+    more: f64,
+    /// Jump of the motion at its border (mm, median).
+    jump: f64,
+}
+
+impl From<SplineField> for Bodies {
+    fn from(field: SplineField) -> Self {
+        Self { labels: Vec::new(), fixed: false, fields: vec![field] }
+    }
+}
+
+impl Bodies {
+    /// With labels that stay as they are, one field each.
+    pub(super) fn given(labels: Vec<u8>, fields: Vec<SplineField>) -> Self {
+        Self { labels, fixed: true, fields }
+    }
+
+    /// Puts the labels of this level in the place of those carried over.
+    pub(super) fn relabel(&mut self, labels: Vec<u8>) {
+        self.labels = labels;
+    }
+
+    /// How many there are.
+    pub fn count(&self) -> usize {
+        self.fields.len()
+    }
+
+    /// The field of all, where there is one body.
+    pub fn only(&self) -> Option<&SplineField> {
+        self.fields.first().filter(|_| self.count() == 1)
+    }
+
+    /// The body of a voxel of the level.
+    pub fn label(&self, voxel: usize) -> usize {
+        self.labels.get(voxel).copied().unwrap_or(0).into()
+    }
+
+    /// The body at a place of the level, or the nearest to it (voxels).
+    pub fn label_near(&self, p: [f64; 3]) -> usize {
+        if self.labels.is_empty() {
+            return 0;
+        }
+        let shape = self.fields[0].lattice.shape;
+        let v: [usize; 3] = std::array::from_fn(|a| (p[a].round().max(0.0) as usize).min(shape[a] - 1));
+        self.label(v[0] + shape[0] * (v[1] + shape[1] * v[2]))
+    }
+
+    /// The displacement (mm) at a place (voxels).
+    pub fn at(&self, p: [f64; 3]) -> [f64; 3] {
+        let field = &self.fields[self.label_near(p)];
+        field.lattice.at(&field.coefficients, p)
+    }
+
+    /// The same bodies on another level, on lattices as `lattice`; `place` maps its voxels to those here.
+    pub fn carried(&self, lattice: &Lattice, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Self {
+        let labels = self.labels_on(lattice.shape, &place);
+        let fields = self.fields.iter().map(|f| level::carry(f, lattice.clone(), &place)).collect();
+        Self { labels, fixed: self.fixed, fields }
+    }
+
+    /// The body of each voxel of another volume of `shape`, none where there is one body; `place` maps its voxels to those here.
+    pub fn labels_on(&self, shape: [usize; 3], place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<u8> {
+        let [nx, ny, nz] = shape;
+        let label = |at: usize| {
+            let v = [at % nx, at / nx % ny, at / (nx * ny)];
+            self.label_near(place(v.map(|v| v as f64))) as u8
+        };
+        let voxels = if self.labels.is_empty() { 0 } else { nx * ny * nz };
+        (0..voxels).into_par_iter().map(label).collect()
+    }
+
+    /// A pair where only one body counts.
+    pub fn part<'a>(&self, pair: &'a Pair<'_>, body: usize) -> Pair<'a> {
+        if self.labels.is_empty() {
+            return pair.within(pair.spans.clone());
+        }
+        let own = |(m, l): (&u8, &u8)| if usize::from(*l) == body { *m } else { 0 };
+        let mask: Vec<u8> = pair.mask.iter().zip(&self.labels).map(own).collect();
+        let inside = mask.iter().filter(|m| **m != 0).count();
+        let spans = Spans::new(&mask, pair.shape);
+        Pair { mask: mask.into(), inside, ..pair.within(spans) }
+    }
+
+    /// The deformed volume as all bodies together bring it back.
+    pub fn warp(&self, pair: &Pair<'_>, spans: &Spans) -> Vec<f32> {
+        let mut warps = self.fields.iter().map(|f| pair.warp(&f.lattice, &f.coefficients, spans));
+        let first = warps.next().unwrap_or_default();
+        warps.enumerate().fold(first, |mut all, (b, warp)| {
+            let own = self.labels.iter().zip(warp).zip(&mut all).filter(|((l, _), _)| usize::from(**l) == b + 1);
+            own.for_each(|((_, w), a)| *a = w);
+            all
+        })
+    }
+
+    /// Passes within each body, with voxels shared out between them.
+    pub fn refine(&mut self, pair: &Pair<'_>, passes: usize, seed: u64, tick: impl Fn(usize)) {
+        if let [field] = &mut self.fields[..] {
+            return level::refine(pair, field, passes, seed, tick);
+        }
+        let begun: Vec<Vec<f32>> = self.fields.iter().map(|f| f.coefficients.clone()).collect();
+        for done in (0..passes).step_by(PASSES) {
+            if done > 0 && !self.fixed {
+                self.share_out(pair);
+            }
+            for b in 0..self.count() {
+                let part = self.part(pair, b);
+                let (field, passes) = (&mut self.fields[b], PASSES.min(passes - done));
+                level::refine_from(&part, field, &begun[b], passes, seed, |_| ());
+            }
+            tick(done);
+        }
+    }
+
+    /// The matches of each body about its own field, with what the level reports of all.
+    pub fn matches(&self, pair: &Pair<'_>, params: MatchParams) -> (Vec<LevelMatch>, LevelReport) {
+        let of = |b: usize| {
+            let part = self.part(pair, b);
+            let points = (params.points * part.inside).div_ceil(pair.inside.max(1)).max(1);
+            let (matches, _, report) = level::matches(&part, Some(&self.fields[b]), MatchParams { points, ..params });
+            (matches, report)
+        };
+        let all = (0..self.count()).map(of).reduce(|(mut matches, first), (more, second)| {
+            matches.extend(more);
+            (matches, first.with(&second))
+        });
+        all.unwrap_or_default()
+    }
+
+    /// Divides bodies for as long as `matches` propose it and the volumes agree so much better; says of each what it explains.
+    pub fn divide(
+        &mut self,
+        pair: &Pair<'_>,
+        matches: &[LevelMatch],
+        (passes, finest): (usize, f64),
+        seed: u64,
+    ) -> Vec<String> {
+        let mut said = Vec::new();
+        if self.fixed || !ablation::is_on("bodies") {
+            return said;
+        }
+        while self.count() < MOST {
+            let tried = (0..self.count()).flat_map(|b| self.proposed(pair, matches, b));
+            let tried = tried.filter_map(|bodies| bodies.tried(pair, self, seed));
+            let rests = |t: &Trial| {
+                let own = matches.iter().filter(|m| t.bodies.label_near(m.voxel) == self.count());
+                own.count() >= FEWEST
+            };
+            let worth = |t: &Trial| t.gain > WORTH.0 * t.more.max(WORTH.1) && t.jump > JUMP * finest;
+            let Some(best) = tried.filter(|t| worth(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain)) else {
+                break;
+            };
+            said.push(best.why(self.count() + 1));
+            *self = best.bodies;
+            self.refine(pair, passes, seed, |_| ());
+        }
+        said
+    }
+
+    /// Each division of one body in two that the matches in it propose.
+    fn proposed(&self, pair: &Pair<'_>, matches: &[LevelMatch], body: usize) -> Vec<Self> {
+        let own: Vec<&LevelMatch> = matches.iter().filter(|m| self.label_near(m.voxel) == body).collect();
+        let field = &self.fields[body];
+        let measured =
+            |m: &&LevelMatch| Measured { field: field.lattice.at(&field.coefficients, m.voxel), ..m.measured };
+        let measured: Vec<Measured> = own.iter().map(measured).collect();
+        let splits = grouping::splits(&measured, pyramid::finest(pair.shape, pair.spacing));
+        splits.iter().map(|second| self.divided(pair, &own, second, body)).collect()
+    }
+
+    /// One body in two: voxels go with the matches around them, and each side's field is that of its matches.
+    fn divided(&self, pair: &Pair<'_>, matches: &[&LevelMatch], second: &[bool], body: usize) -> Self {
+        let [nx, ny, nz] = pair.shape;
+        let inside = pair.mask.iter().enumerate().filter(|(at, m)| **m != 0 && self.label(*at) == body).count();
+        let width = (inside as f64 / matches.len().max(1) as f64).cbrt();
+        let mut votes = vec![0.0f32; nx * ny * nz];
+        for (m, second) in matches.iter().zip(second) {
+            let v: [usize; 3] = std::array::from_fn(|a| (m.voxel[a].round().max(0.0) as usize).min(pair.shape[a] - 1));
+            votes[v[0] + nx * (v[1] + ny * v[2])] += if *second { 1.0 } else { -1.0 };
+        }
+        let votes = filters::gaussian(&votes, pair.shape, pair.in_voxels(1).map(|v| width / v as f64));
+        let new = self.count() as u8;
+        let label = |at: usize| match self.label(at) {
+            old if old == body && votes[at] > 0.0 => new,
+            old => old as u8,
+        };
+        let labels = (0..votes.len()).map(label).collect();
+        let side = |which: bool| {
+            let own: Vec<_> = matches
+                .iter()
+                .zip(second)
+                .filter(|(_, s)| **s == which)
+                .map(|(m, _)| (m.voxel, m.measured.displacement, m.measured.covariance))
+                .collect();
+            let (field, _) = level::couple(pair, own.into_iter(), (&pair.in_voxels(2), 0.3), None);
+            level::carry(&field, self.fields[body].lattice.clone(), |p| p).to_refine()
+        };
+        let mut fields = self.fields.clone();
+        fields[body] = side(false);
+        fields.push(side(true));
+        Self { labels, fixed: false, fields }
+    }
+
+    /// Whether the two volumes agree better under these than under `other`.
+    pub fn agree_better(&self, pair: &Pair<'_>, other: &Self) -> bool {
+        level::gained(pair, &other.warp(pair, &pair.spans), self.warp(pair, &pair.spans)) > 0.0
+    }
+
+    /// Those of two under which the volumes agree better.
+    pub fn better(pair: &Pair<'_>, a: Self, b: Self) -> Self {
+        if b.agree_better(pair, &a) { b } else { a }
+    }
+
+    /// A few passes, and what these then explain that `fewer` do not; none where it is nothing, or soon seems so.
+    fn tried(mut self, pair: &Pair<'_>, fewer: &Self, seed: u64) -> Option<Trial> {
+        let before = fewer.warp(pair, &pair.spans);
+        let gained = |bodies: &Self| level::gained(pair, &before, bodies.warp(pair, &pair.spans));
+        let mut gain = gained(&self);
+        for round in 0..TRIAL {
+            let last = gain;
+            self.refine(pair, PASSES, seed, |_| ());
+            self.share_out(pair);
+            gain = gained(&self);
+            if gain < last.min(0.0) * if round + 1 < TRIAL { HOPE } else { 0.0 } {
+                return None;
+            }
+        }
+        let determined = |bodies: &Self| -> f64 {
+            let parts = bodies.fields.iter().enumerate();
+            parts.map(|(b, field)| level::determined(&bodies.part(pair, b), field, seed)).sum()
+        };
+        let more = determined(&self) - determined(fewer);
+        let jump = self.jump(pair, self.count() - 1);
+        Some(Trial { bodies: self, gain, more, jump })
+    }
+
+    /// The jump of the motion (mm, median) where a body borders on others; 0 where it borders on none.
+    pub fn jump(&self, pair: &Pair<'_>, body: usize) -> f64 {
+        let [nx, ny, _] = pair.shape;
+        let beside = |at: usize| {
+            let v = [at % nx, at / nx % ny, at / (nx * ny)];
+            let after = [(0, 1), (1, nx), (2, nx * ny)].into_iter().filter(move |&(a, _)| v[a] + 1 < pair.shape[a]);
+            after.map(move |(a, stride)| {
+                let mut p = v.map(|v| v as f64);
+                p[a] += 0.5;
+                (at + stride, p)
+            })
+        };
+        let mut jumps = Vec::new();
+        for at in (0..self.labels.len()).filter(|&at| pair.mask[at] != 0) {
+            for (other, p) in beside(at).filter(|(other, _)| pair.mask[*other] != 0) {
+                let sides = [self.label(at), self.label(other)];
+                if sides[0] != sides[1] && sides.contains(&body) {
+                    let [a, b] = sides.map(|s| self.fields[s].lattice.at(&self.fields[s].coefficients, p));
+                    jumps.push(distance(a, b) as f32);
+                }
+            }
+        }
+        if jumps.is_empty() { 0.0 } else { f64::from(median(&mut jumps)) }
+    }
+
+    /// Gives each voxel to the body whose motion explains it and its surroundings best, and that most of these belong to (mean
+    /// field of a Potts model; the residuals' robust cost, in a window, as log likelihood).
+    fn share_out(&mut self, pair: &Pair<'_>) {
+        let all = self.warp(pair, &pair.spans);
+        let gain = GainField::measure(pair, &all);
+        let sigma = residual::residual_sigma(pair, &all, &gain).max(f32::MIN_POSITIVE);
+        drop(all);
+        let finest = pyramid::finest(pair.shape, pair.spacing);
+        let around = |values: &[f32], width: f64| {
+            filters::gaussian(
+                values,
+                pair.shape,
+                std::array::from_fn(|a| if pair.shape[a] > 1 { width * finest / pair.spacing[a] } else { 0.0 }),
+            )
+        };
+        // Voxels that the window stands for.
+        let held: f64 = (0..3)
+            .filter(|&a| pair.shape[a] > 1)
+            .map(|a| (window(WINDOW) * finest / pair.spacing[a]).max(1.0))
+            .product();
+        let trust = 0.5 * held as f32 * level::independent(pair);
+        let costs: Vec<Vec<f32>> = self
+            .fields
+            .iter()
+            .map(|f| around(&cost(pair, &pair.warp(&f.lattice, &f.coefficients, &pair.spans), &gain, sigma), WINDOW))
+            .collect();
+        let (together, width) = COHERENCE;
+        let of = |b: usize| move |(at, l): (usize, &u8)| f32::from(pair.mask[at] != 0 && usize::from(*l) == b);
+        let mut shares: Vec<Vec<f32>> =
+            (0..self.count()).map(|b| self.labels.iter().enumerate().map(of(b)).collect()).collect();
+        for _ in 0..BALANCED {
+            let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, width)).collect();
+            for at in (0..self.labels.len()).filter(|&at| pair.mask[at] != 0) {
+                let energy = |b: usize| trust * costs[b][at] - together * about[b][at];
+                let least = (0..costs.len()).map(energy).fold(f32::INFINITY, f32::min);
+                let sum: f32 = (0..costs.len()).map(|b| (least - energy(b)).exp()).sum();
+                shares.iter_mut().enumerate().for_each(|(b, s)| s[at] = (least - energy(b)).exp() / sum);
+            }
+        }
+        // Outside the tissue the nearest body goes on.
+        let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, width)).collect();
+        for (at, label) in self.labels.iter_mut().enumerate() {
+            let share = |b: usize| if pair.mask[at] != 0 { shares[b][at] } else { about[b][at] };
+            let best =
+                (0..costs.len()).fold(usize::from(*label), |best, b| if share(b) > share(best) { b } else { best });
+            *label = best as u8;
+        }
+    }
+}
+
+impl Trial {
+    /// What the trial found, in words.
+    fn why(&self, number: usize) -> String {
+        let Self { gain, more, jump, .. } = self;
+        format!(
+            "bodies: {number} taken; the last explains {gain:.0} of the misfit and takes {more:.0} degrees of freedom more (each must explain {}); \
+             it moves by {jump:.1} mm along its border (median)",
+            WORTH.0
+        )
+    }
+}
+
+/// Voxels along an axis that a Gaussian of so many stands for: those of a box of the same noise.
+fn window(width: f64) -> f64 {
+    2.0 * std::f64::consts::PI.sqrt() * width
+}
+
+/// Cauchy's cost of what is left at each voxel of the mask; much where the deformed volume does not show it.
+fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f32> {
+    let [nx, ny, _] = pair.shape;
+    let cut = 1.0 / (CAUCHY * sigma);
+    let mut out = vec![0.0f32; warped.len()];
+    let room = || (vec![0.0; nx], vec![0.0; nx]);
+    out.par_chunks_mut(nx).enumerate().for_each_init(room, |(a, b), (row, out)| {
+        gain.row(row % ny, row / ny, a, b);
+        for (i, out) in out.iter_mut().enumerate().filter(|(i, _)| pair.mask[row * nx + i] != 0) {
+            let at = row * nx + i;
+            let t = cut * (pair.fixed_smooth[at] - (a[i] * warped[at] + b[i]));
+            *out = if t.is_finite() { CAUCHY * CAUCHY * (t * t).ln_1p() } else { GATE as f32 };
+        }
+    });
+    out
+}
