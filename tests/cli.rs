@@ -458,7 +458,30 @@ fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
     assert!(summary["seconds"]["read"].as_f64().unwrap() >= 0.0);
     let page = fs::read_to_string(folder.path().join("one/report.html")).unwrap();
     assert!(page.contains("Trust is") && !page.contains("://"));
-    assert_eq!(fs::read_dir(folder.path().join("one")).unwrap().count(), 8);
+    assert_eq!(fs::read_dir(folder.path().join("one")).unwrap().count(), 9);
+}
+
+#[test]
+fn bodies_are_given_as_labels_or_refused_by_name() {
+    let folder = small_pair();
+    let field = |more: &[&str], status: i32| {
+        let files = ["field", "initial.nii.gz", "deformed.nii.gz", "--quiet"];
+        run(folder.path(), &[&files[..], more].concat(), status)
+    };
+    field(&["--bodies", "mask.nii.gz", "--rigid", "1", "-o", "given"], 0);
+    let summary = fs::read_to_string(folder.path().join("given/summary.json")).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+    assert_eq!(summary["bodies"][0]["model"], "rigid");
+    assert_eq!((&summary["params"]["bodies"], &summary["params"]["rigid"][0]), (&"given".into(), &1.into()));
+    let (_, said) = field(&["--bodies", "mask.nii.gz", "--rigid", "4", "-o", "no"], 1);
+    assert!(said.contains("mask.nii.gz: --rigid 4 is no body") && said.contains("there are 1"), "{said}");
+    let (_, said) = field(&["--bodies", "nothing.nii.gz", "-o", "no"], 1);
+    assert!(said.contains("nothing.nii.gz"), "{said}");
+    let (_, said) = field(&["--bodies", "mask.nii.gz", "--method", "sparse", "-o", "no"], 1);
+    assert!(said.contains("--bodies") && said.contains("--method"), "{said}");
+    field(&["--rigid", "1", "-o", "no"], 2);
+    field(&["--bodies", "mask.nii.gz", "--bonded", "-o", "no"], 2);
+    assert!(!folder.path().join("no").exists());
 }
 
 /// The chain test: a finger pad through every command, ending in a stable grasp; each stage has its truth and error.

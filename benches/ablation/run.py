@@ -27,7 +27,7 @@ FIELDS = ["case", "variant", "mean_mm", "p95_mm", "still_mm", "gradient", "folds
 # What PALPATE_WITHOUT knows in a build with the feature `ablation`.
 MECHANISMS = (
     "local-smoothness gradient-floor robust-range enclosed cut brightness consistency turned next-level unfold "
-    "sliding rest model"
+    "bodies rest model"
 ).split()
 
 

@@ -35,6 +35,9 @@ pub struct Options {
     /// One body: nothing slides
     #[arg(long, conflicts_with = "bodies")]
     bonded: bool,
+    /// Write the results even where the field folds, which tissue cannot do
+    #[arg(long)]
+    allow_folds: bool,
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     dry_run: bool,
@@ -120,10 +123,13 @@ fn method(name: &str) -> Result<Method, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, bodies, rigid, bonded, dry_run, tuning } = options;
+    let Options { initial, deformed, target, mask, bodies, rigid, bonded, allow_folds, dry_run, tuning } = options;
     let mut params = tuning.params()?;
     if *bonded {
         params.bodies = BodySource::Bonded;
+    }
+    if bodies.is_some() && params.method == Method::Sparse {
+        bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
     let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).chain(bodies).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FIELD_FILES))?;
@@ -161,6 +167,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let set = |stage: &str, part| progress.set(stage, part);
     let (mut result, [fixed, moving]) = pipeline::field::run_lent(fixed, moving, inside.as_ref(), &params, &set)
         .with_context(|| format!("{} to {}", names[0], names[1]))?;
+    if result.summary.folds > 0 && !allow_folds {
+        bail!(
+            "{} to {}: the field folds in {} voxels, which tissue cannot do; check that both show the same tissue, give --mask or \
+             --bodies, or write it all the same with --allow-folds",
+            names[0],
+            names[1],
+            result.summary.folds
+        );
+    }
     result.summary.seconds.insert(0, ("read".into(), read));
     result.summary.warnings.splice(0..0, warnings);
 

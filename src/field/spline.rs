@@ -1,11 +1,10 @@
 //! A spline lattice as a dense field.
 
-use crate::error::{FieldError, SpaceError};
+use crate::error::SpaceError;
 use crate::field::jacobian;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::simd::dispatch;
-use crate::numerics::unfold;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
 
@@ -60,9 +59,6 @@ pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
     std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
 }
 
-/// Times that what still folds between the knots of a lattice is smoothed.
-const UNFOLDED: usize = 20;
-
 /// A displacement field as its B-spline coefficients, one lattice a body that slides along others: all that a dense one is worked out
 /// from, and much smaller.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,8 +67,6 @@ pub struct FieldSpline {
     bodies: Vec<Spline>,
     /// The body of each voxel; empty where there is one.
     labels: Vec<u8>,
-    /// Voxels at borders between bodies that were smoothed so that nothing folds: offset, displacement (mm, RAS).
-    seams: Vec<(usize, [f32; 3])>,
     /// The grid it is asked for on, where that one's axes run otherwise.
     stored: Option<(Grid, Orientation)>,
 }
@@ -80,7 +74,7 @@ pub struct FieldSpline {
 impl FieldSpline {
     /// From the spline of each body over `grid` and the body of each voxel; no labels where there is one.
     pub fn new(grid: Grid, bodies: Vec<Spline>, labels: Vec<u8>) -> Self {
-        Self { grid, bodies, labels, seams: Vec::new(), stored: None }
+        Self { grid, bodies, labels, stored: None }
     }
 
     /// The same, to be asked for on the grid `stored` of the same voxels.
@@ -99,48 +93,18 @@ impl FieldSpline {
         self.bodies.first_mut().filter(|_| one)
     }
 
-    /// The displacement at every voxel (mm, RAS).
+    /// The displacement at every voxel (mm, RAS). What folds, between the knots of a lattice or at a border between bodies, is opened
+    /// ([`jacobian::unfold`]).
     ///
     /// # Errors
     /// [`SpaceError`] where the grid it is asked for on is not one of the same voxels.
     pub fn dense(&self) -> Result<DenseField, SpaceError> {
         let mut field = evaluated(&self.grid, &self.bodies, &self.labels);
-        let n = self.grid.len();
-        for (at, moved) in &self.seams {
-            moved.iter().enumerate().for_each(|(c, v)| field.as_mut_slice()[c * n + at] = *v);
-        }
+        jacobian::unfold(&mut field);
         match &self.stored {
             Some((grid, orientation)) => orientation.stored_field(field, grid),
             None => Ok(field),
         }
-    }
-
-    /// Undoes what folds in `mask`: by smoother coefficients of a single body, by the displacement itself where there are several. The displacement
-    /// on its own grid.
-    ///
-    /// # Errors
-    /// [`FieldError::GridMismatch`] when the mask has another shape.
-    pub(crate) fn unfold(&mut self, mask: &Mask) -> Result<DenseField, FieldError> {
-        let mut field = evaluated(&self.grid, &self.bodies, &self.labels);
-        if !self.labels.is_empty() {
-            let n = self.grid.len();
-            let changed = jacobian::unfold(&mut field);
-            let values = field.as_slice();
-            self.seams = changed.into_iter().map(|at| (at, [0, 1, 2].map(|c| values[c * n + at]))).collect();
-            return Ok(field);
-        }
-        for _ in 0..UNFOLDED {
-            let folds = jacobian::folds(&field, Some(mask))?;
-            if folds.is_empty() {
-                break;
-            }
-            let voxels: Vec<[usize; 3]> = folds.into_iter().map(|at| self.grid.voxel(at)).collect();
-            for (lattice, coefficients) in &mut self.bodies {
-                unfold::smooth_about(lattice, coefficients, voxels.iter().copied());
-            }
-            field = evaluated(&self.grid, &self.bodies, &self.labels);
-        }
-        Ok(field)
     }
 
     /// Voxels of `mask` beside another body, and how far that one moves from where the voxel's own does (mm).

@@ -1,8 +1,9 @@
 //! How a displacement strains the tissue.
 
-use crate::numerics::differences::displacement_gradient;
+use crate::error::FieldError;
+use crate::numerics::differences::{displacement_gradient, gradient_within};
 use crate::numerics::small::{Symmetric3, eigenvalues};
-use crate::types::{DenseField, Grid};
+use crate::types::{DenseField, Grid, Mask};
 use rayon::prelude::*;
 
 /// The Green-Lagrange strain E = (G + G^T + G^T G) / 2 of a displacement gradient G (rows: components; 1), that is
@@ -26,6 +27,25 @@ impl StrainField {
         let grid = *field.grid();
         let strain = |at| green_lagrange(&displacement_gradient(field, grid.voxel(at))).map(|v| v as f32);
         Self { grid, values: (0..grid.len()).into_par_iter().map(strain).collect() }
+    }
+
+    /// Of a displacement field of `bodies` (labels, 0 outside them) that slide along each other: no difference is taken from one to another.
+    ///
+    /// # Errors
+    /// [`FieldError::GridMismatch`] when the labels lie on another grid.
+    pub fn of_bodies(field: &DenseField, bodies: &Mask) -> Result<Self, FieldError> {
+        let grid = *field.grid();
+        if !bodies.grid().same_as(&grid) {
+            return Err(FieldError::GridMismatch {
+                what: "the bodies".into(),
+                found: bodies.grid().shape(),
+                reference: "the field".into(),
+                expected: grid.shape(),
+            });
+        }
+        let labels = bodies.as_slice();
+        let strain = |at| green_lagrange(&gradient_within(field, labels, grid.voxel(at))).map(|v| v as f32);
+        Ok(Self { grid, values: (0..grid.len()).into_par_iter().map(strain).collect() })
     }
 
     /// The lattice.

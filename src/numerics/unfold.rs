@@ -195,20 +195,6 @@ impl<'a> Knots<'a> {
     }
 }
 
-/// Smooths the coefficients (planar) of the nodes about `voxels` of the lattice's grid.
-pub fn smooth_about(lattice: &Lattice, coefficients: &mut [f32], voxels: impl Iterator<Item = [usize; 3]>) {
-    let knots = Knots::new(lattice, [1.0; 3]);
-    let n = lattice.nodes;
-    let node = |v: [usize; 3]| {
-        let p: [usize; 3] = std::array::from_fn(|a| if n[a] == 1 { 0 } else { v[a] / lattice.step[a] + 1 });
-        p[0] + n[0] * (p[1] + n[1] * p[2])
-    };
-    let mut nodes: Vec<usize> = voxels.map(node).collect();
-    nodes.sort_unstable();
-    nodes.dedup();
-    knots.smooth(coefficients, &knots.around(&nodes, 1));
-}
-
 /// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of what it was, until there is
 /// none, twenty rounds at most. `spacing` is that of the lattice's voxels (mm).
 pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {

@@ -322,7 +322,7 @@ fn canonical(
         BodyReport { label, voxels, model, slides_mm: bodies.jump(&pair, b) }
     };
     let body_reports: Vec<BodyReport> = models.into_iter().enumerate().map(reported).collect();
-    let mut coefficients = FieldSpline::new(grid, splines, labels);
+    let coefficients = FieldSpline::new(grid, splines, labels);
     let spacing = pair.spacing;
     drop(pair);
     drop(aligned);
@@ -332,7 +332,7 @@ fn canonical(
     progress("mesh", 0.92);
     let (mesh, source) = triangulate(&sparse, flat)?;
     clock.book("mesh");
-    let smooth = coefficients.unfold(&mask)?;
+    let smooth = coefficients.dense()?;
     // Given borders are not in doubt.
     let jumps = if given.is_some() { Vec::new() } else { coefficients.jumps(&mask) };
     let kept_matches: Vec<&Match> = sparse.kept().collect();
@@ -888,7 +888,11 @@ pub(super) fn interpolated(
 ) -> Result<DenseField, FieldError> {
     match interpolation {
         Interpolation::Spline => Ok(smooth),
-        Interpolation::Barycentric => barycentric(mesh, nodes, smooth),
+        Interpolation::Barycentric => {
+            let mut field = barycentric(mesh, nodes, smooth)?;
+            jacobian::unfold(&mut field);
+            Ok(field)
+        }
     }
 }
 

@@ -159,9 +159,8 @@ pub(super) fn measure(
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
-    let mut coefficients =
-        FieldSpline::new(grid, vec![field::full_lattice(&grid, &field, factor, &choice)], Vec::new());
-    let smooth = coefficients.unfold(&mask)?;
+    let coefficients = FieldSpline::new(grid, vec![field::full_lattice(&grid, &field, factor, &choice)], Vec::new());
+    let smooth = coefficients.dense()?;
     let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);

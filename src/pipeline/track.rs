@@ -111,7 +111,12 @@ pub fn run<'v, E: From<FieldError>>(
                 let sigma = |at| result.uncertainty.at(at);
                 said.extend(course.add(number, (&result.displacement, &sigma), volume));
                 // The field takes far more room than what it is worked out from.
-                result.displacement = DenseField::zeros(one_voxel(reference.grid())?);
+                let one = one_voxel(reference.grid())?;
+                result.displacement = DenseField::zeros(one);
+                // Where nothing slides the bodies say no more than the mask.
+                if result.summary.bodies.len() < 2 {
+                    result.bodies = Mask::filled(one, 1);
+                }
                 held.push(Held { number, result, seconds: started.elapsed().as_secs_f64() });
             }
             Err(error) => {
@@ -136,7 +141,10 @@ pub fn run<'v, E: From<FieldError>>(
         } else {
             result.displacement = displacement;
         }
-        let strain = StrainField::of(&result.displacement);
+        let strain = match result.summary.bodies.len() {
+            0 | 1 => StrainField::of(&result.displacement),
+            _ => StrainField::of_bodies(&result.displacement, &result.bodies)?,
+        };
         points.add(number, &result, volume.grid());
         for (label, offsets) in &regions {
             let StrainStatistics { voxels, mean, peak, shear, volume_change } =
