@@ -83,18 +83,18 @@ const ROUNDS: usize = 500;
 /// Determinant below which a voxel counts as a fold to be opened, and to which it is: more than rounding in a file.
 const OPENED: [f32; 2] = [0.01, 0.02];
 
-/// Moves the voxels about each fold by as little as opens it, until none is left or after 500 rounds; the offsets of those that moved,
-/// in order.
+/// Moves the voxels about each fold at the voxels that `count` (all where it is empty) by as little as opens it, until none is left or
+/// after 500 rounds.
 ///
 /// Each step is the shortest along which the determinant, linear in the displacement of the voxels on both sides, rises to a
 /// little above zero (Kaczmarz's method on one constraint after another).
-pub fn unfold(field: &mut DenseField) -> Vec<usize> {
-    let mut folds = up_to(field, None, OPENED[0]);
+pub fn unfold(field: &mut DenseField, count: &[u8]) {
+    let counts = |at: usize| count.get(at).is_none_or(|c| *c != 0);
+    let mut folds: Vec<usize> = up_to(field, None, OPENED[0]).into_iter().filter(|&at| counts(at)).collect();
     let shape = field.grid().shape();
     let inverse = *field.grid().affine().inverse_linear();
     let stride = [1, shape[0], shape[0] * shape[1]];
     let n = field.grid().len();
-    let mut moved = BTreeSet::new();
     for _ in 0..ROUNDS {
         if folds.is_empty() {
             break;
@@ -143,17 +143,15 @@ pub fn unfold(field: &mut DenseField) -> Vec<usize> {
                 }
             }
             for side in sides.into_iter().flatten() {
-                moved.insert(side);
                 let w = field.grid().voxel(side);
                 near.insert(side);
                 near.extend((0..3).filter(|&a| w[a] > 0).map(|a| side - stride[a]));
                 near.extend((0..3).filter(|&a| w[a] + 1 < shape[a]).map(|a| side + stride[a]));
             }
         }
-        let near: Vec<usize> = near.into_iter().collect();
+        let near: Vec<usize> = near.into_iter().filter(|&at| counts(at)).collect();
         folds = near.into_par_iter().filter(|&at| determinant_at(field, at) <= OPENED[0]).collect();
     }
-    moved.into_iter().collect()
 }
 
 /// What the determinants are worked out from.

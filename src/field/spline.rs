@@ -67,14 +67,17 @@ pub struct FieldSpline {
     bodies: Vec<Spline>,
     /// The body of each voxel; empty where there is one.
     labels: Vec<u8>,
+    /// Where nothing may fold (not 0); empty: everywhere.
+    tissue: Vec<u8>,
     /// The grid it is asked for on, where that one's axes run otherwise.
     stored: Option<(Grid, Orientation)>,
 }
 
 impl FieldSpline {
-    /// From the spline of each body over `grid` and the body of each voxel; no labels where there is one.
-    pub fn new(grid: Grid, bodies: Vec<Spline>, labels: Vec<u8>) -> Self {
-        Self { grid, bodies, labels, stored: None }
+    /// From the spline of each body over `grid`, the body of each voxel and where nothing may fold (not 0); neither where there is one
+    /// body.
+    pub fn new(grid: Grid, bodies: Vec<Spline>, labels: Vec<u8>, tissue: Vec<u8>) -> Self {
+        Self { grid, bodies, labels, tissue, stored: None }
     }
 
     /// The same, to be asked for on the grid `stored` of the same voxels.
@@ -100,7 +103,7 @@ impl FieldSpline {
     /// [`SpaceError`] where the grid it is asked for on is not one of the same voxels.
     pub fn dense(&self) -> Result<DenseField, SpaceError> {
         let mut field = evaluated(&self.grid, &self.bodies, &self.labels);
-        jacobian::unfold(&mut field);
+        jacobian::unfold(&mut field, &self.tissue);
         match &self.stored {
             Some((grid, orientation)) => orientation.stored_field(field, grid),
             None => Ok(field),

@@ -413,26 +413,36 @@ impl Bodies {
             .map(|f| around(&cost(pair, &pair.warp(&f.lattice, &f.coefficients, &pair.spans), &gain, sigma), WINDOW))
             .collect();
         let (together, width) = COHERENCE;
+        let tissue = around(&pair.mask.iter().map(|m| f32::from(u8::from(*m != 0))).collect::<Vec<_>>(), width);
         let of = |b: usize| move |(at, l): (usize, &u8)| f32::from(pair.mask[at] != 0 && usize::from(*l) == b);
+        // The shares of the last body are what those of the others leave.
+        let last = self.count() - 1;
         let mut shares: Vec<Vec<f32>> =
-            (0..self.count()).map(|b| self.labels.iter().enumerate().map(of(b)).collect()).collect();
+            (0..last).map(|b| self.labels.iter().enumerate().map(of(b)).collect()).collect();
+        let share_of = |all: &[Vec<f32>], whole: f32, b: usize, at: usize| match all.get(b) {
+            Some(own) => own[at],
+            None => whole - all.iter().map(|s| s[at]).sum::<f32>(),
+        };
         for _ in 0..BALANCED {
             let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, width)).collect();
-            for at in (0..self.labels.len()).filter(|&at| pair.mask[at] != 0) {
-                let energy = |b: usize| trust * costs[b][at] - together * about[b][at];
-                let least = (0..costs.len()).map(energy).fold(f32::INFINITY, f32::min);
-                let sum: f32 = (0..costs.len()).map(|b| (least - energy(b)).exp()).sum();
-                shares.iter_mut().enumerate().for_each(|(b, s)| s[at] = (least - energy(b)).exp() / sum);
+            let energy = |b: usize, at: usize| trust * costs[b][at] - together * share_of(&about, tissue[at], b, at);
+            for (b, share) in shares.iter_mut().enumerate() {
+                share.par_iter_mut().enumerate().filter(|(at, _)| pair.mask[*at] != 0).for_each(|(at, share)| {
+                    let own = energy(b, at);
+                    *share = 1.0 / (0..=last).map(|other| (own - energy(other, at)).exp()).sum::<f32>();
+                });
             }
         }
         // Outside the tissue the nearest body goes on.
         let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, width)).collect();
-        for (at, label) in self.labels.iter_mut().enumerate() {
-            let share = |b: usize| if pair.mask[at] != 0 { shares[b][at] } else { about[b][at] };
-            let best =
-                (0..costs.len()).fold(usize::from(*label), |best, b| if share(b) > share(best) { b } else { best });
+        self.labels.par_iter_mut().enumerate().for_each(|(at, label)| {
+            let share = |b: usize| match pair.mask[at] {
+                0 => share_of(&about, tissue[at], b, at),
+                _ => share_of(&shares, 1.0, b, at),
+            };
+            let best = (0..=last).fold(usize::from(*label), |best, b| if share(b) > share(best) { b } else { best });
             *label = best as u8;
-        }
+        });
     }
 }
 

@@ -7,7 +7,7 @@ use crate::error::{FieldError, MeshError};
 use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::field::{interpolation, jacobian, spline};
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
-use crate::matching::pair::Pair;
+use crate::matching::pair::{Pair, dilate};
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::ablation;
 use crate::numerics::blocks::Blocks;
@@ -75,6 +75,9 @@ impl FieldResult {
         Ok(())
     }
 }
+
+/// Voxels about the tissue in which nothing folds either.
+const BORDER: usize = 2;
 
 /// Fewest matches that a result may rest on.
 pub(super) const FEWEST: usize = 20;
@@ -322,7 +325,9 @@ fn canonical(
         BodyReport { label, voxels, model, slides_mm: bodies.jump(&pair, b) }
     };
     let body_reports: Vec<BodyReport> = models.into_iter().enumerate().map(reported).collect();
-    let coefficients = FieldSpline::new(grid, splines, labels);
+    // Where there is one body its field folds nowhere but between knots.
+    let tissue = if labels.is_empty() { Vec::new() } else { dilate(mask.as_slice(), grid.shape(), BORDER) };
+    let coefficients = FieldSpline::new(grid, splines, labels, tissue);
     let spacing = pair.spacing;
     drop(pair);
     drop(aligned);
@@ -890,7 +895,7 @@ pub(super) fn interpolated(
         Interpolation::Spline => Ok(smooth),
         Interpolation::Barycentric => {
             let mut field = barycentric(mesh, nodes, smooth)?;
-            jacobian::unfold(&mut field);
+            jacobian::unfold(&mut field, &[]);
             Ok(field)
         }
     }

@@ -375,7 +375,7 @@ mod tests {
 
     fn field(coefficients: Vec<f32>) -> FieldSpline {
         let grid = Grid::new([40, 36, 32], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
-        FieldSpline::new(grid, vec![(lattice(), coefficients)], Vec::new())
+        FieldSpline::new(grid, vec![(lattice(), coefficients)], Vec::new(), Vec::new())
     }
 
     fn white(random: &mut Random) -> Vec<f64> {

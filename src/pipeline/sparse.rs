@@ -159,7 +159,8 @@ pub(super) fn measure(
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
-    let coefficients = FieldSpline::new(grid, vec![field::full_lattice(&grid, &field, factor, &choice)], Vec::new());
+    let coefficients =
+        FieldSpline::new(grid, vec![field::full_lattice(&grid, &field, factor, &choice)], Vec::new(), Vec::new());
     let smooth = coefficients.dense()?;
     let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
