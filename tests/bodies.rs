@@ -6,6 +6,7 @@ use palpate::evaluate;
 use palpate::field::strain::StrainField;
 use palpate::numerics::random::Random;
 use palpate::pipeline::field::{FieldResult, run};
+use palpate::pipeline::track::Tracker;
 use palpate::types::params::BodySource;
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, MotionModel, Volume};
 
@@ -223,5 +224,21 @@ fn a_wall_makes_no_further_bodies() {
     for seed in [3, 4, 9] {
         let found = Scene::ball(0.35, seed).measured(None, &FieldParams::default());
         assert_eq!(found.summary.bodies.len(), 2, "seed {seed}: {:?}", found.summary.evidence);
+    }
+}
+
+/// A frame that starts from the frame before keeps its bodies.
+#[test]
+fn frames_of_a_sequence_hand_their_bodies_on() {
+    let angles = [0.15, 0.25, 0.35];
+    // Turned backwards, the deformed volume is that of rest and the initial one the frame.
+    let back = angles.map(|angle| Scene::ball(-angle, 3));
+    let params = FieldParams::default();
+    let mut tracker = Tracker::new(&back[0].deformed, None, &params);
+    for (angle, frame) in angles.into_iter().zip(&back) {
+        let found = tracker.next(&frame.initial, &|_, _| {}).unwrap();
+        assert_eq!(found.summary.bodies.len(), 2, "{angle}: {:?}", found.summary.evidence);
+        let error = Scene::ball(angle, 3).error(&found, 2);
+        assert!(error < 0.3, "{angle}: {error}");
     }
 }

@@ -48,6 +48,9 @@ const WINDOW: f64 = 0.8;
 /// With 3 to 12, and with 1 to 2.2, the errors of 12 scenes that slide differ by 2 %.
 const COHERENCE: (f32, f64) = (5.0, 1.2);
 
+/// Part of a body's largest connected part under which another joins what is around it.
+const ISLAND: f64 = 0.1;
+
 /// Times that shares are balanced against those around (mean field).
 const BALANCED: usize = 5;
 
@@ -79,16 +82,12 @@ impl Given {
         let names: Vec<u8> = (1..=255).filter(|l| seen[usize::from(*l)]).collect();
         let body = |l: &u8| names.binary_search(l).map_or(u8::MAX, |b| b as u8);
         let mut labels: Vec<u8> = labels.iter().map(body).collect();
-        let stride = [1, shape[0], shape[0] * shape[1]];
         let mut front: Vec<usize> = (0..labels.len()).filter(|&at| labels[at] != u8::MAX).collect();
         while !front.is_empty() {
             let mut next = Vec::new();
             for at in front {
-                for a in 0..3 {
-                    let v = at / stride[a] % shape[a];
-                    let below = (v > 0).then(|| at - stride[a]);
-                    let above = (v + 1 < shape[a]).then(|| at + stride[a]);
-                    for other in below.into_iter().chain(above).filter(|&o| labels[o] == u8::MAX).collect::<Vec<_>>() {
+                for other in beside(shape, at) {
+                    if labels[other] == u8::MAX {
                         labels[other] = labels[at];
                         next.push(other);
                     }
@@ -364,10 +363,10 @@ impl Bodies {
     /// The jump of the motion (mm, median) where a body borders on others; 0 where it borders on none.
     pub fn jump(&self, pair: &Pair<'_>, body: usize) -> f64 {
         let [nx, ny, _] = pair.shape;
-        let beside = |at: usize| {
+        let after = |at: usize| {
             let v = [at % nx, at / nx % ny, at / (nx * ny)];
-            let after = [(0, 1), (1, nx), (2, nx * ny)].into_iter().filter(move |&(a, _)| v[a] + 1 < pair.shape[a]);
-            after.map(move |(a, stride)| {
+            let steps = [(0, 1), (1, nx), (2, nx * ny)].into_iter().filter(move |&(a, _)| v[a] + 1 < pair.shape[a]);
+            steps.map(move |(a, stride)| {
                 let mut p = v.map(|v| v as f64);
                 p[a] += 0.5;
                 (at + stride, p)
@@ -375,7 +374,7 @@ impl Bodies {
         };
         let mut jumps = Vec::new();
         for at in (0..self.labels.len()).filter(|&at| pair.mask[at] != 0) {
-            for (other, p) in beside(at).filter(|(other, _)| pair.mask[*other] != 0) {
+            for (other, p) in after(at).filter(|(other, _)| pair.mask[*other] != 0) {
                 let sides = [self.label(at), self.label(other)];
                 if sides[0] != sides[1] && sides.contains(&body) {
                     let [a, b] = sides.map(|s| self.fields[s].lattice.at(&self.fields[s].coefficients, p));
@@ -443,7 +442,55 @@ impl Bodies {
             let best = (0..=last).fold(usize::from(*label), |best, b| if share(b) > share(best) { b } else { best });
             *label = best as u8;
         });
+        self.join_islands(pair);
     }
+
+    /// Gives parts of a body that are small beside its largest one, and apart from it, to the body that they touch most.
+    fn join_islands(&mut self, pair: &Pair<'_>) {
+        let mut part = vec![usize::MAX; self.labels.len()];
+        let mut parts: Vec<Vec<usize>> = Vec::new();
+        for start in (0..self.labels.len()).filter(|&at| pair.mask[at] != 0) {
+            if part[start] != usize::MAX {
+                continue;
+            }
+            part[start] = parts.len();
+            let mut own = vec![start];
+            let mut next = 0;
+            while let Some(&at) = own.get(next) {
+                next += 1;
+                for other in beside(pair.shape, at) {
+                    if pair.mask[other] != 0 && part[other] == usize::MAX && self.labels[other] == self.labels[at] {
+                        part[other] = parts.len();
+                        own.push(other);
+                    }
+                }
+            }
+            parts.push(own);
+        }
+        let mut largest = vec![0usize; self.count()];
+        parts.iter().for_each(|p| largest[self.label(p[0])] = largest[self.label(p[0])].max(p.len()));
+        parts.retain(|p| (p.len() as f64) < ISLAND * largest[self.label(p[0])] as f64);
+        for own in &parts {
+            let mut touched = vec![0usize; self.count()];
+            let around = own.iter().flat_map(|&at| beside(pair.shape, at)).filter(|&o| pair.mask[o] != 0);
+            around.filter(|&o| self.labels[o] != self.labels[own[0]]).for_each(|o| touched[self.label(o)] += 1);
+            let most = (0..touched.len()).fold(0, |best, b| if touched[b] > touched[best] { b } else { best });
+            if touched[most] > 0 {
+                own.iter().for_each(|&at| self.labels[at] = most as u8);
+            }
+        }
+    }
+}
+
+/// The voxels that share a face with one.
+fn beside(shape: [usize; 3], at: usize) -> impl Iterator<Item = usize> {
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    (0..3).flat_map(move |a| {
+        let v = at / stride[a] % shape[a];
+        let below = (v > 0).then(|| at - stride[a]);
+        let above = (v + 1 < shape[a]).then(|| at + stride[a]);
+        below.into_iter().chain(above)
+    })
 }
 
 impl Trial {
@@ -478,4 +525,46 @@ fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f3
         }
     });
     out
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::matching::levels::Aligned;
+    use crate::types::{Affine, Grid, Mask, Volume};
+
+    #[test]
+    fn given_labels_are_filled_outward_and_go_to_the_commonest_on_a_level() {
+        let shape = [6, 4, 2];
+        let label = |at: usize| match at % 6 {
+            0 | 1 => 5,
+            2 | 3 => 0,
+            _ => 9,
+        };
+        let labels: Vec<u8> = (0..48).map(label).collect();
+        let given = Given::new(&labels, shape);
+        assert_eq!(given.names, [5, 9]);
+        assert_eq!(given.on(shape, [1; 3])[..6], [0, 0, 0, 1, 1, 1]);
+        assert_eq!(given.on([3, 2, 1], [2; 3]), [0, 0, 1, 0, 0, 1]);
+    }
+
+    #[test]
+    fn islands_join_what_is_around_them_and_halves_stay() {
+        let shape = [24, 12, 12];
+        let grid = Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+        let volume = Volume::from_vec(grid, (0..grid.len()).map(|at| (at * 7919 % 101) as f32).collect()).unwrap();
+        let mask = Mask::filled(grid, 1);
+        let aligned = Aligned::new(&volume, &volume, &mask, 1.0).unwrap();
+        let pair = aligned.level([1; 3]);
+        let still = || SplineField::still(level::lattice(&pair, 4));
+        // Two halves of one body to either side of the other, and a speck of it inside that one.
+        let half = |at: usize| u8::from((8..16).contains(&(at % 24)));
+        let mut labels: Vec<u8> = (0..grid.len()).map(half).collect();
+        let speck = grid.index(12, 6, 6);
+        labels[speck] = 0;
+        let mut bodies = Bodies { labels, fixed: false, fields: vec![still(), still()] };
+        bodies.join_islands(&pair);
+        assert!((0..grid.len()).all(|at| bodies.label(at) == usize::from(half(at))));
+    }
 }
