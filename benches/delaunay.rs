@@ -1,4 +1,5 @@
-//! CPU seconds of the Delaunay tetrahedralisation of random points, and of the interpolation to a grid.
+//! CPU seconds of the Delaunay tetrahedralisation of random points, and of the interpolation to a
+//! grid.
 //!
 //! `cargo bench --bench delaunay [-- POINTS ...]`; the least of some runs is printed.
 

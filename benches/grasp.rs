@@ -1,8 +1,9 @@
-//! Simulated seconds per CPU second on the reference scene, for each integrator and formulation; one thread.
+//! Simulated seconds per CPU second on the reference scene, for each integrator and formulation;
+//! one thread.
 //!
-//! `cargo bench --bench grasp [-- REPEATS]`; the best of some runs is printed, with the largest error of the object's angle
-//! at the end of a hold, against the adaptive integrator at a tolerance of 1e-12. `benches/grasp_mujoco.py` runs this and
-//! MuJoCo side by side.
+//! `cargo bench --bench grasp [-- REPEATS]`; the best of some runs is printed, with the largest
+//! error of the object's angle at the end of a hold, against the adaptive integrator at a tolerance
+//! of 1e-12. `benches/grasp_mujoco.py` runs this and MuJoCo side by side.
 
 use palpate::grasp::simulate::simulate;
 use palpate::types::scene::{Formulation, Method, Scene};

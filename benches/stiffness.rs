@@ -1,10 +1,12 @@
-//! Moduli of bodies that are known exactly: their errors, whether two standard deviations hold them, and CPU seconds.
+//! Moduli of bodies that are known exactly: their errors, whether two standard deviations hold
+//! them, and CPU seconds.
 //!
-//! `cargo bench --bench stiffness [-- [bars|wrong] [SEEDS [FIRST]] [CASE ...]]`. `bars` (the default): each case with several
-//! seeds (3 from 21 on), from the exact displacement, with white and with correlated noise of 0.05 mm, and as `palpate field` measures
-//! it from the images. `wrong`: the exact displacement with a Poisson's ratio, labels or a held patch that are wrong.
-//! Cases: contrast-2, contrast-5, contrast-10, two, layers, fingertip. Nothing else may run in the process, so runs are
-//! one after the other.
+//! `cargo bench --bench stiffness [-- [bars|wrong] [SEEDS [FIRST]] [CASE ...]]`. `bars` (the
+//! default): each case with several seeds (3 from 21 on), from the exact displacement, with white
+//! and with correlated noise of 0.05 mm, and as `palpate field` measures it from the images.
+//! `wrong`: the exact displacement with a Poisson's ratio, labels or a held patch that are wrong.
+//! Cases: contrast-2, contrast-5, contrast-10, two, layers, fingertip. Nothing else may run in the
+//! process, so runs are one after the other.
 
 use palpate::numerics::random::Random;
 use palpate::pipeline::pressed::Pressed;

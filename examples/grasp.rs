@@ -1,5 +1,5 @@
-//! The eight joint-angle motions of the source, from the scene file beside this one: how the object stands after each,
-//! with and without tangential deformation of the tips.
+//! The eight joint-angle motions of the source, from the scene file beside this one: how the object
+//! stands after each, with and without tangential deformation of the tips.
 //!
 //! `cargo run --release --example grasp`; look at `out/grasp.html` afterwards.
 

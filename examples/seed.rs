@@ -1,6 +1,7 @@
-//! The source's own result by the source's own chain (`--method sparse`): 1,000 points of the initial volume against 5,000 of the
-//! deformed one, a Delaunay mesh through the kept matches, and the displacement magnitude at its nodes as a picture; then the
-//! fields from 10,000 and 30,000 points, and what energy-based consistency changes.
+//! The source's own result by the source's own chain (`--method sparse`): 1,000 points of the
+//! initial volume against 5,000 of the deformed one, a Delaunay mesh through the kept matches, and
+//! the displacement magnitude at its nodes as a picture; then the fields from 10,000 and 30,000
+//! points, and what energy-based consistency changes.
 //!
 //!     cargo run --release --example seed -- [--quick] [INITIAL DEFORMED [TRUTH [MASK]]]
 //!

@@ -1,4 +1,5 @@
-//! A sequence measured four ways: all frames together, each as it is followed, each on its own, and frame to frame in a chain.
+//! A sequence measured four ways: all frames together, each as it is followed, each on its own, and
+//! frame to frame in a chain.
 //!
 //!     cargo run --release --example sequence -- [pinch|pen|contraction] [FRAMES] [VOXELS ALONG X] [SEED]
 

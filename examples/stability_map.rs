@@ -1,7 +1,8 @@
-//! The largest stable step of each integrator and formulation over the stiffness of the tips, the object's mass, the
-//! damping, and the gain of the stabilisation: the map of docs/grasp.md.
+//! The largest stable step of each integrator and formulation over the stiffness of the tips, the
+//! object's mass, the damping, and the gain of the stabilisation: the map of docs/grasp.md.
 //!
-//! `cargo run --release --example stability_map [-- --quick]` prints a table and writes `out/stability-map.svg`.
+//! `cargo run --release --example stability_map [-- --quick]` prints a table and writes
+//! `out/stability-map.svg`.
 
 use palpate::grasp::{stability, stepping};
 use palpate::io;

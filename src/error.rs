@@ -1,6 +1,8 @@
-//! One small error enum an operation. Each message says what is wrong and, where it can be said, what to try.
+//! One small error enum an operation. Each message says what is wrong and, where it can be said,
+//! what to try.
 //!
-//! Errors about a file carry its path (added in `io`); the command line joins context with `anyhow`.
+//! Errors about a file carry its path (added in `io`); the command line joins context with
+//! `anyhow`.
 
 use std::path::PathBuf;
 use thiserror::Error;

@@ -1,4 +1,5 @@
-//! `palpate` measures how soft tissue deforms inside from a pair of MR volumes, and simulates soft-finger grasps.
+//! `palpate` measures how soft tissue deforms inside from a pair of MR volumes, and simulates
+//! soft-finger grasps.
 //!
 //! The modules stand in the order of the pipeline.
 

@@ -1,4 +1,5 @@
-//! `palpate batch`: tables with flaws, pairs that fail beside pairs that do not, and taking up where a run ended.
+//! `palpate batch`: tables with flaws, pairs that fail beside pairs that do not, and taking up
+//! where a run ended.
 #![allow(clippy::unwrap_used)]
 
 mod fixtures;
@@ -158,7 +159,8 @@ fn a_killed_run_is_taken_up() {
     let (first, last) =
         (folder.path().join("out/p0/field/summary.json"), folder.path().join("out/p3/field/summary.json"));
     let started = Instant::now();
-    // Its own files in the folder are whole by then: what is killed itself cannot take its own away.
+    // Its own files in the folder are whole by then: what is killed itself cannot take its own
+    // away.
     while !folder.path().join("out/p1/pair.json").exists() && started.elapsed() < Duration::from_secs(120) {
         std::thread::sleep(Duration::from_millis(2));
     }
@@ -227,7 +229,8 @@ fn the_whole_chain_runs_and_is_gathered() {
     assert_eq!(statuses(folder.path()), ["sub-1 skipped", "sub-2 done"]);
 }
 
-/// Results stood for other parameters than their table asked for: a changed --config or detached file of voxels was not seen.
+/// Results stood for other parameters than their table asked for: a changed --config or detached
+/// file of voxels was not seen.
 #[test]
 fn what_a_pair_was_made_from_is_seen_to_change() {
     let folder = folder(&["name,initial,deformed", "one,initial.nhdr,deformed.nii.gz"]);

@@ -69,7 +69,8 @@ impl Scene {
         }
     }
 
-    /// A ball of 15 mm about the middle that turns by `angle` (radians) inside tissue at rest, along its own wall.
+    /// A ball of 15 mm about the middle that turns by `angle` (radians) inside tissue at rest,
+    /// along its own wall.
     fn ball(angle: f64, seed: u64) -> Self {
         let from = |p: [f64; 3]| [p[0] - 30.0, p[1] - 28.0, p[2] - 26.0];
         let inside = move |p: [f64; 3]| from(p).iter().map(|v| v * v).sum::<f64>() < 15.0 * 15.0;
@@ -102,7 +103,8 @@ impl Scene {
         run(&self.initial, &self.deformed, mask, params, &|_, _| {}).unwrap()
     }
 
-    /// Mean error (mm) over the voxels of one label at least four voxels away from the volume's faces.
+    /// Mean error (mm) over the voxels of one label at least four voxels away from the volume's
+    /// faces.
     fn error(&self, found: &FieldResult, label: u8) -> f64 {
         let mut part = self.labels.clone();
         let grid = *part.grid();

@@ -52,7 +52,8 @@ fn wrong_usage_exits_with_2_and_writes_nothing() {
     }
 }
 
-/// Runs `palpate field` on a bad initial volume: it must fail, name the file and say `message`, and leave nothing.
+/// Runs `palpate field` on a bad initial volume: it must fail, name the file and say `message`, and
+/// leave nothing.
 fn refused(name: &str, bytes: &[u8], message: &str) {
     let folder = small_pair();
     fs::write(folder.path().join(name), bytes).unwrap();
@@ -404,7 +405,8 @@ fn the_inverse_undoes_the_field() {
     let folder = small_pair();
     let (out, _) = run(folder.path(), &["invert", "truth.nii.gz", "-o", "inverse.nii.gz"], 0);
     assert!(out.contains("undoes the field"), "{out}");
-    // At a voxel centre of the inverse nothing is interpolated on the way there, and the way back is the field's own.
+    // At a voxel centre of the inverse nothing is interpolated on the way there, and the way back
+    // is the field's own.
     let start = palpate::io::read_volume(folder.path().join("deformed.nii.gz")).unwrap().grid().world(14, 17, 19).0;
     fs::write(folder.path().join("p.csv"), format!("x,y,z\n{},{},{}\n", start[0], start[1], start[2])).unwrap();
     run(folder.path(), &["warp", "--points", "p.csv", "--field", "inverse.nii.gz", "-o", "q.csv"], 0);
@@ -484,7 +486,8 @@ fn bodies_are_given_as_labels_or_refused_by_name() {
     assert!(!folder.path().join("no").exists());
 }
 
-/// The chain test: a finger pad through every command, ending in a stable grasp; each stage has its truth and error.
+/// The chain test: a finger pad through every command, ending in a stable grasp; each stage has its
+/// truth and error.
 #[test]
 fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     let folder = TempDir::new().unwrap();
@@ -506,8 +509,8 @@ fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     assert!(!skin["bound"].is_null() || skin["error"].as_f64().unwrap().abs() < 0.4, "{skin}");
     // The field shows the plate's travel 10 % short, and force goes with its square.
     assert!(row("hemisphere")[2].abs() < 0.4, "{:?}", row("hemisphere"));
-    // The force is what the moduli were scaled by: their elements must give it back. A low bound in place of the skin's
-    // modulus makes the map softer, never stiffer.
+    // The force is what the moduli were scaled by: their elements must give it back. A low bound in
+    // place of the skin's modulus makes the map softer, never stiffer.
     let softer = if skin["bound"].is_null() { 0.1 } else { 0.25 };
     assert!((-softer..0.1).contains(&row("finite elements")[2]), "{:?}", row("finite elements"));
     let [turn, exact, _] = row("turn");

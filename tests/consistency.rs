@@ -32,8 +32,8 @@ fn places(count: usize, size: f64, seed: u64) -> Vec<[f64; 3]> {
 
 const ENERGY: EnergyParams = EnergyParams { lambda: 1.5, precision_mm: 1.0, strain: 0.3, neighbours: 16 };
 
-/// Places with three candidates each, best correlation first; the number of the right one comes with them. Two places
-/// in five have a wrong candidate that correlates better.
+/// Places with three candidates each, best correlation first; the number of the right one comes
+/// with them. Two places in five have a wrong candidate that correlates better.
 fn planted(places: &[[f64; 3]]) -> (Vec<Vec<Candidate>>, Vec<usize>) {
     let mut random = Random::new(9, 0);
     let wrong = |random: &mut Random, x: [f64; 3]| {
@@ -137,8 +137,8 @@ fn lattice() -> (Lattice, Smoothness) {
     (lattice, smoothness)
 }
 
-/// Information of one (`ranks` = 1) or two directions with a standard deviation of 0.1 mm, and a displacement that is
-/// the truth plus anything along what is not measured.
+/// Information of one (`ranks` = 1) or two directions with a standard deviation of 0.1 mm, and a
+/// displacement that is the truth plus anything along what is not measured.
 fn aperture(count: usize, ranks: usize, seed: u64) -> Vec<Evidence> {
     let mut random = Random::new(seed, 0);
     places(count, 24.0, seed)
@@ -178,8 +178,8 @@ fn coupling_recovers_an_affine_field_through_the_aperture() {
     }
 }
 
-/// A found bug: the fewer bends the evidence showed, the more the weight of the bending energy grew, until the rounding of what it
-/// multiplies sent a field of tenths of a millimetre to 25 mm.
+/// A found bug: the fewer bends the evidence showed, the more the weight of the bending energy
+/// grew, until the rounding of what it multiplies sent a field of tenths of a millimetre to 25 mm.
 #[test]
 fn evidence_that_does_not_bend_keeps_its_field() {
     let lattice = Lattice::new([32, 40, 30], [3; 3]);
@@ -225,7 +225,8 @@ fn coupling_withstands_outliers() {
     assert!(error < 0.1, "{error} mm");
 }
 
-/// Tissue that moves along one axis or in one place is held loosely there alone, and nothing is given up.
+/// Tissue that moves along one axis or in one place is held loosely there alone, and nothing is
+/// given up.
 #[test]
 fn each_place_and_axis_is_held_as_its_own_data_ask() {
     let nodes = [16, 16, 16];
@@ -242,7 +243,8 @@ fn each_place_and_axis_is_held_as_its_own_data_ask() {
         .collect();
     let weights = coupling::supported(&determined, &energy, nodes, n);
     let at = |c: usize, x: usize| weights[c * n + x + 16 * (8 + 16 * 8)];
-    // Deep inside the moving half the weight is determined / (2 energy), but for what is shared with the whole.
+    // Deep inside the moving half the weight is determined / (2 energy), but for what is shared
+    // with the whole.
     assert!((at(0, 14) - 0.1).abs() < 0.01, "{}", at(0, 14));
     assert!(at(0, 1) > 5.0 * at(0, 14) && at(1, 8) > 3.0 * at(0, 14) && at(2, 8) > at(1, 8));
     assert!(weights.iter().all(|w| w.is_finite() && *w < 100.0), "nothing is held without end");
@@ -257,7 +259,8 @@ fn each_place_and_axis_is_held_as_its_own_data_ask() {
 /// A small lattice's nodes, smoothness and dense smoothness matrix.
 fn small() -> ([usize; 3], Smoothness, Dense) {
     let nodes = [5, 4, 4];
-    // Distances of powers of two: in single precision the matrix is exact, and an affine motion costs nothing under any weight.
+    // Distances of powers of two: in single precision the matrix is exact, and an affine motion
+    // costs nothing under any weight.
     let smoothness = Smoothness::new(nodes, [2.0, 2.0, 4.0]);
     let matrix = dense(80, |x| {
         let mut out = vec![0.0; 80];
@@ -309,8 +312,9 @@ fn a_step_reaches_the_minimum() {
     assert!((f64::from(moved) - exact.sqrt()).abs() < 1e-4);
 }
 
-/// A found bug: where the weight had just changed, a few iterations from the last solution found -4,000 degrees of freedom where there
-/// were 600, the weight followed by its largest step, and the fields of a sequence came out now stiff, now loose.
+/// A found bug: where the weight had just changed, a few iterations from the last solution found
+/// -4,000 degrees of freedom where there were 600, the weight followed by its largest step, and the
+/// fields of a sequence came out now stiff, now loose.
 #[test]
 fn determined_degrees_of_freedom_follow_a_weight_that_swings() {
     let nodes = [30, 30, 20];
@@ -369,7 +373,8 @@ fn deviation_and_degrees_of_freedom_are_those_of_the_inverse() {
             *b = b.map(|v| 1e-3 * v);
         }
     }
-    // Where next to nothing bends the bending energy outweighs the data, and what is uncertain is an affine motion.
+    // Where next to nothing bends the bending energy outweighs the data, and what is uncertain is
+    // an affine motion.
     for lambda in [[2.0, 0.5, 8.0], [1e5; 3], [1e7; 3]] {
         let inverse = invert(&system(&l, lambda, &blocks));
         let variance: Vec<f32> =
@@ -382,7 +387,8 @@ fn deviation_and_degrees_of_freedom_are_those_of_the_inverse() {
             let entry = |a: usize, b: usize| f64::from(blocks[i][[[0, 3, 4], [3, 1, 5], [4, 5, 2]][a][b]]);
             (0..9).map(|k| inverse[80 * (k / 3) + i][80 * (k % 3) + i] * entry(k / 3, k % 3)).sum()
         };
-        // One draw is as far off as chi-square with one degree of freedom at worst: 0.1 by chance in 200.
+        // One draw is as far off as chi-square with one degree of freedom at worst: 0.1 by chance
+        // in 200.
         for (i, &found) in determined.iter().enumerate() {
             let exact = part(i);
             assert!(
@@ -496,7 +502,8 @@ fn moved(motion: &AffineMotion, bad: usize, flat: bool) -> Vec<Measured> {
         .collect()
 }
 
-/// The excess misfit of a map against the true field, in units of noise of 0.1 mm, at the good matches.
+/// The excess misfit of a map against the true field, in units of noise of 0.1 mm, at the good
+/// matches.
 fn excess(truth: &AffineMotion, m: &AffineMotion) -> f64 {
     places(400, 80.0, 12)
         .iter()

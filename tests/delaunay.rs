@@ -124,8 +124,8 @@ fn exact_insphere(p: [P; 4], e: P) -> f64 {
     -robust::insphere(a, b, c, d, Coord3D { x: e[0], y: e[1], z: e[2] })
 }
 
-/// Everything that makes a Delaunay tetrahedralisation one, with Shewchuk's predicates alone. `points` are the input up
-/// to a power of two.
+/// Everything that makes a Delaunay tetrahedralisation one, with Shewchuk's predicates alone.
+/// `points` are the input up to a power of two.
 fn check(points: &[P], d: &Delaunay<TetMesh, 4>) {
     let tetrahedra = d.mesh.tetrahedra();
     let nodes: Vec<P> = d.source.iter().map(|&i| points[i as usize]).collect();
@@ -161,7 +161,8 @@ fn check(points: &[P], d: &Delaunay<TetMesh, 4>) {
         }
     }
 
-    // A ball: every facet has two sides but those of the hull; Euler's formula; the hull is a sphere.
+    // A ball: every facet has two sides but those of the hull; Euler's formula; the hull is a
+    // sphere.
     let open = facets.values().filter(|&&n| n == 1).count();
     assert_eq!(open, hull.len());
     assert!(facets.values().all(|&n| n <= 2));
@@ -196,7 +197,8 @@ fn check_volume(d: &Delaunay<TetMesh, 4>) {
     assert!((sum - hull).abs() <= 1e-10 * hull + rounding, "{sum} is not {hull}");
 }
 
-/// Four points of an oblique lattice, in one plane up to rounding: exact by the predicates, though a volume of 3e-16 has no digits.
+/// Four points of an oblique lattice, in one plane up to rounding: exact by the predicates, though
+/// a volume of 3e-16 has no digits.
 #[test]
 fn four_points_in_a_plane_but_for_rounding_are_exact() {
     let points = family(8, 4, 7_956_423_612_311_333_904);
@@ -241,7 +243,8 @@ fn linear_field_comes_back(kind: usize, n: usize, seed: u64) {
     assert!(inside > 0 || kind == 7 || kind == 9);
 }
 
-/// Elements far smaller than a voxel, some with a height of rounding, were once taken for stout by their volume.
+/// Elements far smaller than a voxel, some with a height of rounding, were once taken for stout by
+/// their volume.
 #[test]
 fn small_elements_give_a_linear_field_too() {
     linear_field_comes_back(8, 241, 4_913_549_611_782_285_617);
@@ -277,7 +280,8 @@ proptest! {
         prop_assert_eq!(a.map(|d| d.mesh.tetrahedra().to_vec()), b.map(|d| d.mesh.tetrahedra().to_vec()));
     }
 
-    /// The sign of the orientation against integer arithmetic, on coordinates of 40 bits and any scale.
+    /// The sign of the orientation against integer arithmetic, on coordinates of 40 bits and any
+    /// scale.
     #[test]
     fn orientation_against_integers(
         p in prop::array::uniform4(prop::array::uniform3(-2i64..=2)),
@@ -309,7 +313,8 @@ proptest! {
         prop_assert_eq!(sign(insphere(&f[0], &f[1], &f[2], &f[3], &f[4])), inside.signum() as i32);
     }
 
-    /// In general position the tetrahedra are the four points whose sphere is empty, all of them and no others.
+    /// In general position the tetrahedra are the four points whose sphere is empty, all of them
+    /// and no others.
     #[test]
     fn brute_force_agrees(n in 4usize..14, seed: u64) {
         let points = family(0, n, seed);
@@ -328,7 +333,8 @@ proptest! {
         prop_assert_eq!(found, expected);
     }
 
-    /// Location against all elements: inside the hull the weights give the point back, outside there is none.
+    /// Location against all elements: inside the hull the weights give the point back, outside
+    /// there is none.
     #[test]
     fn located_like_brute_force(kind in 0..4usize, seed: u64) {
         let points = family(kind, 80, seed);
@@ -357,7 +363,8 @@ proptest! {
         }
     }
 
-    /// A linear displacement of the nodes comes back at every voxel in the hull, however the nodes lie.
+    /// A linear displacement of the nodes comes back at every voxel in the hull, however the nodes
+    /// lie.
     #[test]
     fn linear_fields_come_back_on_all_families(kind in 0..FAMILIES, n in 60usize..300, seed: u64) {
         linear_field_comes_back(kind, n, seed);
@@ -483,7 +490,8 @@ fn errors_name_the_degeneracy() {
     assert_eq!(delaunay2(&world(&plane)).unwrap().mesh.nodes().len(), 9);
 }
 
-/// Points within rounding of the hull are in it, others not, and no number is too strange to ask for.
+/// Points within rounding of the hull are in it, others not, and no number is too strange to ask
+/// for.
 #[test]
 fn the_hull_is_closed() {
     let points = family(8, 600, 5);

@@ -97,7 +97,8 @@ fn the_stability_map_falls_with_stiffness() {
         let row = out.lines().find(|l| l.contains("Stiffness") && l.contains(factor) && l.contains(name)).unwrap();
         row.split_whitespace().last().unwrap().parse().unwrap()
     };
-    // Frequencies grow with the root of the stiffness: a hundredfold E takes about a tenth of the step.
+    // Frequencies grow with the root of the stiffness: a hundredfold E takes about a tenth of the
+    // step.
     let fall = step(" 1.000", " rk4 ") / step(" 100.000", " rk4 ");
     assert!(fall > 2.0 && fall < 12.0, "{fall}: {out}");
     assert!(step(" 1.000", "semi-implicit ") < step(" 1.000", " rk4 "), "{out}");

@@ -38,7 +38,8 @@ fn the_response_peaks_at_a_corner() {
     let c = [15.3, 16.0, 14.6];
     let r = response(&octant(CUBE, c), CUBE, MM, HarrisParams::default());
     let found = spread(&r, CUBE, MM, None, 1, 0.0);
-    // The measure's top lies a little inside the bright octant, where the window holds all three faces.
+    // The measure's top lies a little inside the bright octant, where the window holds all three
+    // faces.
     for a in 0..3 {
         assert!((0.0..2.0).contains(&(found[0].voxel[a] - c[a])), "{found:?}");
     }
@@ -129,7 +130,8 @@ fn the_response_counts_in_millimetres() {
     let sagittal = at([21, 41, 41], [2.0, 1.0, 1.0]);
     assert!((slices / cubes - 1.0).abs() < 0.1, "{slices} and {cubes}");
     assert!((sagittal / slices - 1.0).abs() < 1e-3, "{sagittal} and {slices}");
-    // Twice the voxel at twice the size of everything: gradients a mm are halved, the measure goes with their square.
+    // Twice the voxel at twice the size of everything: gradients a mm are halved, the measure goes
+    // with their square.
     let shape = [41, 41, 41];
     let double = response(&blob(shape, [2.0; 3], [20.0; 3], 6.0), shape, [2.0; 3], params);
     assert!((4.0 * top(&double, shape).1 / cubes - 1.0).abs() < 1e-3);

@@ -92,7 +92,8 @@ fn a_jump_where_tissue_slides_is_kept_and_no_smooth_field_is_broken() {
 
 #[test]
 fn legs_that_move_far_are_searched_at_the_next_level_too() {
-    // Wrong islands of the coarse level, where patches are two centimetres: 1.36 and 1.34 mm without.
+    // Wrong islands of the coarse level, where patches are two centimetres: 1.36 and 1.34 mm
+    // without.
     for seed in [1, 3] {
         let calf = PhantomParams::new(PhantomKind::Calf);
         let p = phantom(&PhantomParams { amplitude: 16.0, seed, ..calf }).unwrap();
@@ -104,7 +105,8 @@ fn legs_that_move_far_are_searched_at_the_next_level_too() {
 
 #[test]
 fn a_long_slide_in_a_leg_does_not_run_on_where_nothing_holds_the_field() {
-    // Thick slices that glide by 14 mm either way: the passes took the field 98 mm along the leg, and the mean error was 6.0 mm.
+    // Thick slices that glide by 14 mm either way: the passes took the field 98 mm along the leg,
+    // and the mean error was 6.0 mm.
     let (motion, amplitude, calf) = (MotionKind::Slide, 14.0, PhantomParams::new(PhantomKind::Calf));
     let p = phantom(&PhantomParams { motion, amplitude, seed: 4, ..calf }).unwrap();
     let result = run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {}).unwrap();
@@ -114,7 +116,8 @@ fn a_long_slide_in_a_leg_does_not_run_on_where_nothing_holds_the_field() {
 
 #[test]
 fn in_a_small_mask_stillness_does_not_pass_for_motion() {
-    // Of 35 matches that agreed on 4 mm none was believed: degrees of freedom were counted where there are no data.
+    // Of 35 matches that agreed on 4 mm none was believed: degrees of freedom were counted where
+    // there are no data.
     let p = phantom(&PhantomParams { seed: 3, noise: 0.03, ..block(64, MotionKind::Smooth, 8.0) }).unwrap();
     let ball = |centre: [f64; 3], radius: f64| {
         let (mut mask, g) = (p.mask.clone(), *p.mask.grid());
@@ -132,7 +135,8 @@ fn in_a_small_mask_stillness_does_not_pass_for_motion() {
     }
 }
 
-/// Two volumes of `shape` voxels (1 mm) of one texture, in the first as `moved` takes it to the second, with exact truth.
+/// Two volumes of `shape` voxels (1 mm) of one texture, in the first as `moved` takes it to the
+/// second, with exact truth.
 fn carried(shape: [usize; 3], moved: impl Fn([f64; 3]) -> [f64; 3] + Sync, noise: f32) -> (Volume, Volume, DenseField) {
     let mut random = Random::new(7, 0);
     let waves: Vec<([f64; 3], f64)> = (0..60)
@@ -184,8 +188,9 @@ fn motion_that_reaches_the_search_range_is_looked_for_farther() {
     assert!(summary.evidence.iter().any(|e| e.starts_with("search range") && e.ends_with("taken")));
 }
 
-/// A core that had slid by 28 mm was found to come to 7 under a texture of its own: few features agreed, and the range was not reached (this one, which
-/// slides by 10 voxels where 6 are looked over, was called still: 3.1 mm off for 1.3).
+/// A core that had slid by 28 mm was found to come to 7 under a texture of its own: few features
+/// agreed, and the range was not reached (this one, which slides by 10 voxels where 6 are looked
+/// over, was called still: 3.1 mm off for 1.3).
 #[test]
 fn where_few_features_agree_motion_is_looked_for_farther() {
     let inside = |[x, _, z]: [f64; 3]| ((x - 20.0) / 13.0).powi(2) + ((z - 24.0) / 15.0).powi(2) < 1.0;
@@ -197,7 +202,8 @@ fn where_few_features_agree_motion_is_looked_for_farther() {
     assert!(result.summary.evidence.iter().any(asked) && m.mean_mm < 2.0, "{m:?} {:?}", result.summary.evidence);
 }
 
-/// Two people have no jump in common; jumps between them folded hundreds of voxels, and explained what is another shape.
+/// Two people have no jump in common; jumps between them folded hundreds of voxels, and explained
+/// what is another shape.
 #[test]
 fn no_jumps_are_made_between_two_people() {
     let head =
@@ -224,7 +230,8 @@ fn a_finer_lattice_is_taken_where_the_residual_asks_for_it_and_not_for_noise() {
 
 #[test]
 fn another_contrast_is_made_up_for_or_warned_of_and_noise_is_not() {
-    // Square root of the brightness: half a voxel off, and not a word about it. It is taken out now; one that goes up and down is not.
+    // Square root of the brightness: half a voxel off, and not a word about it. It is taken out
+    // now; one that goes up and down is not.
     let warned = |r: &FieldResult| r.summary.warnings.iter().any(|w| w.contains("differ by more than motion"));
     for kind in [PhantomKind::Block, PhantomKind::Head] {
         for noise in [0.002, 0.03, 0.1] {
@@ -289,7 +296,8 @@ fn tissue_without_texture_is_warned_of_and_noisy_tissue_is_not() {
 
 #[test]
 fn a_turned_head_is_not_taken_for_one_that_bends() {
-    // Small patches do not follow 36 degrees: the next level's search agreed better by thirteen times the bending, 18 mm off.
+    // Small patches do not follow 36 degrees: the next level's search agreed better by thirteen
+    // times the bending, 18 mm off.
     for seed in [1, 2] {
         let head = PhantomParams {
             motion: MotionKind::Rotate,
@@ -329,7 +337,8 @@ fn a_pressed_fingertip_is_measured_and_its_far_side_stays_still() {
     assert_eq!((m.folds, result.summary.folds, result.summary.model), (0.0, 0, MotionModel::Free));
 }
 
-/// Beside a local press in noisy volumes what stayed at rest followed the noise by 0.1 to 0.7 mm, more than doing nothing would have been off.
+/// Beside a local press in noisy volumes what stayed at rest followed the noise by 0.1 to 0.7 mm,
+/// more than doing nothing would have been off.
 #[test]
 fn what_a_press_leaves_at_rest_is_held_there_and_smooth_motion_is_not() {
     let press = |[x, y, z]: [f64; 3]| {
@@ -345,7 +354,8 @@ fn what_a_press_leaves_at_rest_is_held_there_and_smooth_motion_is_not() {
     let within = |[x, y, z]: [f64; 3], radius: f64| {
         (x - 32.0).powi(2) + (y - 32.0).powi(2) + (z - 24.0).powi(2) < radius.powi(2)
     };
-    // Mean error far from the press inside a ball, the mean uncertainty there over that of the press, and what is said.
+    // Mean error far from the press inside a ball, the mean uncertainty there over that of the
+    // press, and what is said.
     let off = |moved: &(dyn Fn([f64; 3]) -> [f64; 3] + Sync), radius: f64, words: &str| {
         let (initial, deformed, truth) = carried([64, 64, 48], moved, 60.0);
         let place = |o: usize| initial.grid().voxel(o).map(|v| v as f64);
@@ -373,7 +383,8 @@ fn what_a_press_leaves_at_rest_is_held_there_and_smooth_motion_is_not() {
     assert!(still < 0.01, "{still}");
     // 1.28 with the free field's everywhere.
     assert!(stated < 0.7, "{stated}");
-    // 0.055 mm without, 0.047 with a fit to the whole; inside a mask too, outside of which the field shows no rigid motion.
+    // 0.055 mm without, 0.047 with a fit to the whole; inside a mask too, outside of which the
+    // field shows no rigid motion.
     for radius in [100.0, 28.0] {
         let (moved, _) =
             off(&pressed_and_moved, radius, "follows one rigid motion, as far as the data tell; it is held");
@@ -486,7 +497,8 @@ fn a_block_that_is_not_finite_is_survived_with_a_warning() {
     assert!(result.summary.warnings.iter().any(|w| w.contains("216 voxels") && w.contains("not finite")));
 }
 
-/// A mask that cut through tissue in one volume, or in both at other places, moved with high trust: a leg at rest was 1.8 mm off.
+/// A mask that cut through tissue in one volume, or in both at other places, moved with high trust:
+/// a leg at rest was 1.8 mm off.
 #[test]
 fn a_background_that_was_cut_through_tissue_is_not_seen() {
     let whole = phantom(&block(64, MotionKind::Smooth, 2.0)).unwrap();
@@ -527,8 +539,9 @@ fn a_background_that_was_cut_through_tissue_is_not_seen() {
     }
 }
 
-/// Past the end of a volume that was resampled lies 0: a thigh whose lower part was missing so was 1.7 mm off for 0.6 without a word, since most of
-/// the border of that 0 lies in air (this head 1.04 mm for 0.56).
+/// Past the end of a volume that was resampled lies 0: a thigh whose lower part was missing so was
+/// 1.7 mm off for 0.6 without a word, since most of the border of that 0 lies in air (this head
+/// 1.04 mm for 0.56).
 #[test]
 fn a_part_that_was_set_to_zero_is_not_seen() {
     let head = PhantomParams { amplitude: 6.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
@@ -553,8 +566,9 @@ fn a_part_that_was_set_to_zero_is_not_seen() {
     assert!(told && off < 1.1 * missing, "{off} for {missing}: {:?}", summary.evidence);
 }
 
-/// What differs in brightness was taken for motion: a pressed head (0.08 mm off without) came out 0.25 mm off under a coil's profile in one volume alone, 0.33
-/// in another contrast (a cube root), 0.65 and without its bending in both; one in smooth motion (0.43) 0.66, 0.73 and 1.79.
+/// What differs in brightness was taken for motion: a pressed head (0.08 mm off without) came out
+/// 0.25 mm off under a coil's profile in one volume alone, 0.33 in another contrast (a cube root),
+/// 0.65 and without its bending in both; one in smooth motion (0.43) 0.66, 0.73 and 1.79.
 #[test]
 fn a_coil_profile_or_another_contrast_in_one_volume_is_not_taken_for_motion() {
     let told = |r: &FieldResult, what: &str| {
@@ -636,7 +650,8 @@ fn passes_on_the_next_finer_level_find_what_averages_of_voxels_hide() {
     assert_eq!(levels(3), [levels(0), vec![[48; 3]]].concat());
 }
 
-/// One half brighter, as from one element of a coil: a polynomial across the step was taken out, and a head at rest became a free motion of high trust.
+/// One half brighter, as from one element of a coil: a polynomial across the step was taken out,
+/// and a head at rest became a free motion of high trust.
 #[test]
 fn a_step_in_brightness_is_left_to_the_local_gain() {
     let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
@@ -659,7 +674,8 @@ fn a_step_in_brightness_is_left_to_the_local_gain() {
     }
 }
 
-/// A slice that a scanner or a converter dropped was matched as if it were tissue: a thigh came out 7 mm off.
+/// A slice that a scanner or a converter dropped was matched as if it were tissue: a thigh came out
+/// 7 mm off.
 #[test]
 fn lost_slices_are_left_out_and_said() {
     let whole = phantom(&block(40, MotionKind::Smooth, 2.0)).unwrap();
@@ -693,7 +709,8 @@ fn lost_slices_are_left_out_and_said() {
     assert!(!result.summary.warnings.iter().any(|w| w.contains("as lost")), "{:?}", result.summary.warnings);
 }
 
-/// Two of three slices along x as if they lay side by side: tissue was found squeezed to two thirds, without a word.
+/// Two of three slices along x as if they lay side by side: tissue was found squeezed to two
+/// thirds, without a word.
 #[test]
 fn tissue_that_does_not_keep_its_volume_is_told_of() {
     let p = phantom(&PhantomParams { noise: 0.02, ..block(48, MotionKind::Smooth, 1.0) }).unwrap();
@@ -732,7 +749,8 @@ fn the_number_of_threads_changes_nothing() {
     }
 }
 
-/// Shares of the components of the error inside of 1, 2 and 3 sigma where `of` holds; 0.68, 0.95 and 0.997 would be exact.
+/// Shares of the components of the error inside of 1, 2 and 3 sigma where `of` holds; 0.68, 0.95
+/// and 0.997 would be exact.
 fn inside(p: &Phantom, result: &FieldResult, of: impl Fn([usize; 3]) -> bool) -> [f64; 3] {
     let sigma = result.uncertainty.volume().into_vec();
     let (mut inside, mut all, g) = ([0usize; 3], 0, p.mask.grid());
@@ -760,7 +778,8 @@ fn the_uncertainty_is_calibrated_on_smooth_motions() {
     }
 }
 
-/// Across a slice there are no data: what a field that no data hold would do there was counted as its uncertainty, seven times too much.
+/// Across a slice there are no data: what a field that no data hold would do there was counted as
+/// its uncertainty, seven times too much.
 #[test]
 fn a_slice_is_as_uncertain_as_it_is_wrong_in_its_plane() {
     for noise in [0.01, 0.03] {
@@ -778,7 +797,8 @@ fn a_slice_is_as_uncertain_as_it_is_wrong_in_its_plane() {
     }
 }
 
-/// Where nothing bends the bending energy outweighs the data: the uncertainty was then all but nil, the more so the noisier the images.
+/// Where nothing bends the bending energy outweighs the data: the uncertainty was then all but nil,
+/// the more so the noisier the images.
 #[test]
 fn an_affine_motion_is_as_uncertain_as_the_noise_makes_it() {
     let mut sigmas = Vec::new();
@@ -792,7 +812,8 @@ fn an_affine_motion_is_as_uncertain_as_the_noise_makes_it() {
     assert!(sigmas[2] > 1.2 * sigmas[1] && sigmas[2] < 0.3, "{sigmas:?}");
 }
 
-/// What the deformed volume does not show is carried over from what it does: said so, and uncertain accordingly.
+/// What the deformed volume does not show is carried over from what it does: said so, and uncertain
+/// accordingly.
 #[test]
 fn tissue_out_of_view_is_warned_of_and_uncertain() {
     let params = block(48, MotionKind::Smooth, 3.0);

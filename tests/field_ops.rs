@@ -55,7 +55,8 @@ fn samples_are_reproduced_by_every_interpolation() {
     }
 }
 
-/// One voxel without a number made nearly all of a warped volume NaN: the prefilter of cubic interpolation carried it along every axis.
+/// One voxel without a number made nearly all of a warped volume NaN: the prefilter of cubic
+/// interpolation carried it along every axis.
 #[test]
 fn a_voxel_without_a_number_spoils_its_neighbours_alone() {
     let whole = image(cube(12, 12.0), waves);
@@ -109,7 +110,8 @@ fn one_slice_and_one_voxel_volumes_can_be_sampled() {
     assert!((Sampler::new(&two, Interpolation::Cubic, 0.0).at(VoxelPoint([0.5, 0.0, 0.0])) - 2.0).abs() < 1e-5);
 }
 
-/// Root-mean-square error of a warp of an analytic image over the middle third, clear of the borders.
+/// Root-mean-square error of a warp of an analytic image over the middle third, clear of the
+/// borders.
 fn warp_error(n: usize, how: Interpolation) -> f64 {
     let grid = cube(n, 48.0);
     let field = DenseField::from_fn(grid, swirl);
@@ -125,7 +127,8 @@ fn warp_error(n: usize, how: Interpolation) -> f64 {
     (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt()
 }
 
-/// The cubic spline passes through its samples: filtering the coefficients back gives them, on axes of any length.
+/// The cubic spline passes through its samples: filtering the coefficients back gives them, on axes
+/// of any length.
 #[test]
 fn values_at_voxel_centres_are_the_volume_again() {
     for shape in [[1, 1, 1], [2, 1, 3], [7, 2, 1], [9, 8, 7], [33, 5, 2]] {
@@ -247,7 +250,8 @@ fn the_inverse_of_a_translation_and_of_an_affine_field_is_exact() {
     let motion = linear(M, [0.3, -0.4, 0.2]);
     let inverse = invert(&DenseField::from_fn(grid, &motion), None);
     assert!(inverse.max_residual_mm < 2e-5, "{}", inverse.max_residual_mm);
-    // v(x + u(x)) = -u(x) where x + u(x) falls between voxels: v of an affine field is affine, so linear is exact.
+    // v(x + u(x)) = -u(x) where x + u(x) falls between voxels: v of an affine field is affine, so
+    // linear is exact.
     let x = grid.affine().to_world(VoxelPoint([6.4, 5.7, 4.2]));
     let back = warp_points(&[x.moved(motion(x))], &inverse.field)[0].unwrap();
     assert!(back.minus(x).iter().all(|d| d.abs() < 1e-4));

@@ -170,7 +170,8 @@ fn a_pad_becomes_a_tip_that_a_grasp_reads() {
     assert!(out.contains("grasp/report.html"), "{out}{err}");
 }
 
-/// A map as `palpate stiffness` leaves it: tissue of `modulus` by position (mm) under bone from z = `top` up, pressed from z-.
+/// A map as `palpate stiffness` leaves it: tissue of `modulus` by position (mm) under bone from z =
+/// `top` up, pressed from z-.
 fn pad_folder(map: Volume, poisson: f64, travel: f64, force: Option<f64>) -> StiffnessFolder {
     let known = |name: &str, youngs_modulus| StiffnessRegion { name: name.into(), youngs_modulus, bound: None };
     StiffnessFolder {
@@ -198,7 +199,8 @@ fn a_plate_presses_the_elements_of_a_block_by_the_neo_hookean_law() {
     for [d, f] in &plate.curve {
         let l = 1.0 - d / height;
         let truth = 1e-3 * side * side * 0.5 * f64::from(e) * (1.0 / l - l);
-        // The mesh rounds the block's edges by part of a voxel: 5 % of its face, less as they come into touch.
+        // The mesh rounds the block's edges by part of a voxel: 5 % of its face, less as they come
+        // into touch.
         let bound = if *d < 1.0 { 0.06 } else { 0.03 };
         assert!((f / truth - 1.0).abs() < bound, "{d} mm: {f} N, not {truth}");
     }
@@ -210,8 +212,9 @@ fn a_plate_presses_the_elements_of_a_block_by_the_neo_hookean_law() {
 
 #[test]
 fn elements_of_a_finger_pad_press_as_the_phantom_does() {
-    // The phantom's forces come from another solver, on hexahedra fitted to the exact shape. A voxel map tells where the
-    // foremost place lies to half a voxel, so the press goes by what it adds from one depth to another.
+    // The phantom's forces come from another solver, on hexahedra fitted to the exact shape. A
+    // voxel map tells where the foremost place lies to half a voxel, so the press goes by what it
+    // adds from one depth to another.
     let params = PhantomParams { amplitude: 1.5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(36);
     let body = phantom(&params).unwrap();
     let (known, told) = (body.stiffness.as_ref().unwrap(), body.description.elastic.as_ref().unwrap());
@@ -236,8 +239,8 @@ fn elements_of_a_finger_pad_press_as_the_phantom_does() {
 
 #[test]
 fn elements_that_give_way_before_the_press_leave_the_columns_alone() {
-    // A ball of 8 mm squeezed to a twentieth: the elements' forces end on the way, and a modulus fitted to what there is of them
-    // must not be scaled by what the columns give at the press.
+    // A ball of 8 mm squeezed to a twentieth: the elements' forces end on the way, and a modulus
+    // fitted to what there is of them must not be scaled by what the columns give at the press.
     let inside = |p: [f64; 3]| (p[0] - 9.0).powi(2) + (p[1] - 9.0).powi(2) + (p[2] - 9.0).powi(2) < 64.0;
     let map = pad([46, 46, 30], 0.4, 9.0, |p| if inside(p) { 40.0 } else { 0.0 });
     let folder = pad_folder(map, 0.49, 7.6, Some(3.0));

@@ -1,4 +1,5 @@
-//! NRRD, MetaImage, Slicer's points, and fields of other programs: written by hand, read back at known places.
+//! NRRD, MetaImage, Slicer's points, and fields of other programs: written by hand, read back at
+//! known places.
 #![allow(clippy::unwrap_used)]
 
 mod fixtures;
@@ -34,7 +35,8 @@ fn zlib(bytes: &[u8]) -> Vec<u8> {
     packed.finish().unwrap()
 }
 
-/// x of the voxels runs to the left, y up, z to the front; 2, 3 and 4 mm; the first voxel at R 10, A 20, S 30.
+/// x of the voxels runs to the left, y up, z to the front; 2, 3 and 4 mm; the first voxel at R 10,
+/// A 20, S 30.
 const NRRD: &str = "NRRD0004\n# made by hand\ntype: short\ndimension: 3\nspace: left-posterior-superior\nsizes: 4 3 2\n\
     space directions: (2,0,0) (0, 0, 3) (0,-4,0)\nkinds: domain domain domain\nspace origin: (-10,-20,30)\nname:=not a field\n";
 const META: &str = "ObjectType = Image\nNDims = 3\nBinaryData = True\nTransformMatrix = 1 0 0 0 0 1 0 -1 0\n\
@@ -260,7 +262,8 @@ fn niftyreg_fields_of_both_kinds_and_what_their_header_says() {
 #[test]
 fn fsl_warps_relative_and_absolute_on_one_grid_and_on_two() {
     let (folder, field) = small_field();
-    // FSL's coordinates: voxels times their size, x from the far end where the determinant is positive, as it is here.
+    // FSL's coordinates: voxels times their size, x from the far end where the determinant is
+    // positive, as it is here.
     let scaled = |g: &Grid, p: WorldPoint| {
         let [x, y, z]: [f64; 3] = std::array::from_fn(|a| g.affine().to_voxel(p).0[a] * g.spacing()[a]);
         [(g.shape()[0] - 1) as f64 * g.spacing()[0] - x, y, z]

@@ -1,9 +1,10 @@
-//! Readers against changed bytes: no panic, no more memory than the file could honestly need, no wrong voxels from a file
-//! that checks itself.
+//! Readers against changed bytes: no panic, no more memory than the file could honestly need, no
+//! wrong voxels from a file that checks itself.
 //!
-//! Two seconds for all in a usual run; `PALPATE_FUZZ_SECONDS=3600 cargo test --release --test fuzz -- --nocapture` takes that
-//! long for each reader, or ten million cases where they come first, and prints their number. `PALPATE_FUZZ_KINDS=v.nii,v.mha`
-//! takes those files alone.
+//! Two seconds for all in a usual run;
+//! `PALPATE_FUZZ_SECONDS=3600 cargo test --release --test fuzz -- --nocapture` takes that long for
+//! each reader, or ten million cases where they come first, and prints their number.
+//! `PALPATE_FUZZ_KINDS=v.nii,v.mha` takes those files alone.
 #![allow(clippy::unwrap_used)]
 
 #[path = "fixtures/slices.rs"]

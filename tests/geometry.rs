@@ -8,7 +8,8 @@ use palpate::types::{Affine, FieldParams, Grid, Mask, Volume, VoxelPoint};
 
 const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 
-/// The same voxels stored with stored axis `s` along axis `order[s]`, backwards where `flip` says so.
+/// The same voxels stored with stored axis `s` along axis `order[s]`, backwards where `flip` says
+/// so.
 fn stored<T: Copy + Default + Send + Sync>(v: &Volume<T>, order: [usize; 3], flip: [bool; 3]) -> Volume<T> {
     let from = *v.grid();
     let shape = order.map(|a| from.shape()[a]);

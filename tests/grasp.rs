@@ -1,5 +1,5 @@
-//! The grasp simulator against closed forms, springs summed one by one, convergence rates and symmetries; and every
-//! named failure is found.
+//! The grasp simulator against closed forms, springs summed one by one, convergence rates and
+//! symmetries; and every named failure is found.
 #![allow(clippy::unwrap_used)]
 
 use palpate::error::GraspError;
@@ -50,14 +50,16 @@ fn gauss(n: usize) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// Energy of linear springs (stiffness E dS / L each) that stand on a hemisphere's back plate along `axis` and are
-/// pressed by `d` against a face with the outward direction `normal` (from the tip to the face), their feet dragged by
-/// `d_t` along `tangent`; all in the world frame, summed over the cap that the face cuts off.
+/// Energy of linear springs (stiffness E dS / L each) that stand on a hemisphere's back plate along
+/// `axis` and are pressed by `d` against a face with the outward direction `normal` (from the tip
+/// to the face), their feet dragged by `d_t` along `tangent`; all in the world frame, summed over
+/// the cap that the face cuts off.
 fn summed_springs(axis: [f64; 2], normal: [f64; 2], tangent: [f64; 2], d: f64, d_t: f64) -> f64 {
     summed_unlike_springs(axis, normal, tangent, d, d_t, &|_| E)
 }
 
-/// The same where Young's modulus depends on how far (m) a spring ends behind the foremost one, along the axis.
+/// The same where Young's modulus depends on how far (m) a spring ends behind the foremost one,
+/// along the axis.
 fn summed_unlike_springs(
     axis: [f64; 2],
     normal: [f64; 2],
@@ -76,7 +78,8 @@ fn summed_unlike_springs(
         let s = (1.0 - c * c).sqrt();
         for k in 0..turns {
             let turn = 2.0 * PI * f64::from(k) / f64::from(turns);
-            // A point of the sphere; its third coordinate plays no part, as all motion is in the plane.
+            // A point of the sphere; its third coordinate plays no part, as all motion is in the
+            // plane.
             let u = [normal[0] * c + side[0] * s * turn.cos(), normal[1] * c + side[1] * s * turn.cos()];
             assert!(dot(u, axis) > 0.0, "a spring without length");
             let pressed = (A * dot(u, normal) - (A - d)) / dot(axis, normal);
@@ -115,7 +118,8 @@ fn closed_forms_are_the_exact_sums_of_springs() {
 
 #[test]
 fn the_radial_energy_is_the_first_term_of_the_exact_one() {
-    // Springs along radii: stiffness E dA / a on the cap's surface elements dA, pressed by a - (a - d) / cos.
+    // Springs along radii: stiffness E dA / a on the cap's surface elements dA, pressed by a - (a -
+    // d) / cos.
     for d in [1e-4, 1e-3, 4e-3] {
         let rim = 1.0 - d / A;
         let summed: f64 = gauss(40)
@@ -484,8 +488,8 @@ fn constraints_hold_with_a_proper_gain_and_drift_with_an_improper_one() {
         let improper = with(gain, Rolling::Integrated);
         assert!(improper.rolling > 30.0 * proper.rolling, "{gain}: {improper:?}");
     }
-    // Stabilised at velocity level alone, the rate is kept, but what the integral has lost it never gets back: it adds
-    // up over the motions, where the integrated form forgets.
+    // Stabilised at velocity level alone, the rate is kept, but what the integral has lost it never
+    // gets back: it adds up over the motions, where the integrated form forgets.
     let longer = |rolling: Rolling, rounds: usize| {
         let mut scene = Scene::reference();
         scene.motions = scene.motions.repeat(rounds);
@@ -564,7 +568,8 @@ fn ends_with(motions: &[[f64; 2]], change: impl Fn(&mut Scene)) -> (EventKind, f
 
 #[test]
 fn contact_loss_is_found_with_its_finger() {
-    // Finger 1 is pulled away sideways by a push to the right; with both opened slowly the object falls first.
+    // Finger 1 is pulled away sideways by a push to the right; with both opened slowly the object
+    // falls first.
     let push = |force: f64| {
         move |s: &mut Scene| {
             s.pushes = vec![Push { start: 0.1, duration: 0.2, force: [force, 0.0], at: [0.0, 0.0] }];
@@ -657,7 +662,8 @@ fn a_step_that_is_too_long_is_refused_with_the_stable_one() {
     }
 }
 
-/// Steps of the reference plant from a slightly disturbed pinch, without any watch: how far the last state is from rest.
+/// Steps of the reference plant from a slightly disturbed pinch, without any watch: how far the
+/// last state is from rest.
 fn disturbed<P: Stepper>(step: f64, steps: usize) -> f64 {
     let scene = Scene::reference();
     let tip = Parallel { stiffness: PI * E };
@@ -696,8 +702,8 @@ fn control_that_is_unstable_itself_is_not_blamed_on_the_step() {
     assert!(result.events.iter().all(|e| e.kind != EventKind::BadStep), "{:?}", result.events);
 }
 
-/// What blows up in each fiftieth of a step as well was taken for the grasp's own growth: 0.3 s passed as stable, and so did 1 ms with
-/// fingers that need 0.014.
+/// What blows up in each fiftieth of a step as well was taken for the grasp's own growth: 0.3 s
+/// passed as stable, and so did 1 ms with fingers that need 0.014.
 #[test]
 fn steps_far_beyond_the_limit_are_refused_too() {
     for step in [5e-3, 0.05, 0.3, 1.0] {

@@ -1,4 +1,5 @@
-//! `palpate grasp` and `palpate grasp-analysis` as a user meets them: files, exit codes, and what they say to bad scenes.
+//! `palpate grasp` and `palpate grasp-analysis` as a user meets them: files, exit codes, and what
+//! they say to bad scenes.
 #![allow(clippy::unwrap_used)]
 
 mod fixtures;
@@ -21,7 +22,8 @@ fn json(folder: &Path, name: &str) -> serde_json::Value {
     serde_json::from_str(&fs::read_to_string(folder.join(name)).unwrap()).unwrap()
 }
 
-/// Runs `palpate grasp` on a scene that must be refused with a message that holds all of `parts`, and leave nothing.
+/// Runs `palpate grasp` on a scene that must be refused with a message that holds all of `parts`,
+/// and leave nothing.
 fn refused(change: impl Fn(&str) -> String, parts: &[&str]) {
     let folder = folder(&change);
     let (out, err) = run(folder.path(), &["grasp", "scene.toml", "-o", "results"], 1);
@@ -215,7 +217,8 @@ fn an_ensemble_runs_every_combination_and_is_the_same_for_any_number_of_threads(
     let mut lines = table.lines();
     let header = "case,object.mass,fingertip.model,motion.1.theta,outcome,time,step,theta1_deg";
     assert!(lines.next().unwrap().starts_with(header), "{table}");
-    // The last table's values go fastest; parallel tips finish, radial ones leave their range at motion 7.
+    // The last table's values go fastest; parallel tips finish, radial ones leave their range at
+    // motion 7.
     let first = lines.next().unwrap();
     assert!(first.starts_with("1,0.05,\"\"\"parallel\"\"\",\"[20, -10]\",completed,12.5,0,0,0,"), "{first}");
     assert!(table.lines().any(|l| l.starts_with("12,0.2,\"\"\"radial\"\"\",\"[0, 0]\",validity-range,9.")), "{table}");
@@ -260,7 +263,8 @@ fn a_scene_that_would_be_overwritten() {
     assert!(err.contains("would be overwritten"), "{err}");
 }
 
-/// All rows said `completed` while their runs slipped; and a swept key that a flag replaced gave rows named after what they were not.
+/// All rows said `completed` while their runs slipped; and a swept key that a flag replaced gave
+/// rows named after what they were not.
 #[test]
 fn a_sweep_says_what_slipped_and_does_not_fight_with_flags() {
     let folder = folder(|s| format!("{s}\n[[sweep]]\nkey = \"object.friction\"\nvalues = [0.1, 5.0]\n"));

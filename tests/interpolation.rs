@@ -76,7 +76,8 @@ fn linear_fields_come_back() {
     }
 }
 
-/// Nodes at voxel centres, so that voxels lie on corners, edges, facets and in slivers made by rounding.
+/// Nodes at voxel centres, so that voxels lie on corners, edges, facets and in slivers made by
+/// rounding.
 #[test]
 fn lattice_nodes_leave_no_gap() {
     for affine in affines() {

@@ -315,7 +315,8 @@ fn targets_that_cannot_be_written_are_refused_at_once() {
     }
 }
 
-/// Runs one of the tests below in a process that may not write files past 64 kB: writes fail as on a full disk.
+/// Runs one of the tests below in a process that may not write files past 64 kB: writes fail as on
+/// a full disk.
 #[cfg(unix)]
 fn with_a_full_disk(test: &str, folder: &Path) {
     let me = std::env::current_exe().unwrap();

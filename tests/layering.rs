@@ -108,7 +108,8 @@ fn without_tests(code: &str) -> String {
     out + rest
 }
 
-/// Modules of this crate that `code` names: `crate::x`, `crate::{x::y, z}`, the same with `palpate::`.
+/// Modules of this crate that `code` names: `crate::x`, `crate::{x::y, z}`, the same with
+/// `palpate::`.
 fn imports(code: &str) -> Vec<String> {
     let word = |s: &str| s.chars().take_while(|x| x.is_alphanumeric() || *x == '_').collect::<String>();
     let mut found = Vec::new();

@@ -286,7 +286,8 @@ fn either_side_alone_finds_the_motion() {
     // No feature in the deformed volume: search alone.
     let list = &find(&[[14.0, 14.0, 12.0]], &[])[0];
     assert!(right(&list[0], spacing), "{list:?}");
-    // No patch around the initial feature (at the border): the deformed feature is found back beside it.
+    // No patch around the initial feature (at the border): the deformed feature is found back
+    // beside it.
     let list = &find(&[[2.0, 14.0, 12.0]], &[[6.0, 12.0, 13.0]])[0];
     assert!(right(&list[0], spacing), "{list:?}");
 }
@@ -385,7 +386,8 @@ fn the_covariance_of_a_match_is_calibrated() {
 
 #[test]
 fn what_is_noise_alone_counts_as_plain() {
-    // Slabs of texture under noise of a tenth of it, the first `even` of eight noise alone, in cubes and in thick slices.
+    // Slabs of texture under noise of a tenth of it, the first `even` of eight noise alone, in
+    // cubes and in thick slices.
     for spacing in [[1.0; 3], [1.0, 1.0, 3.5]] {
         let shape = [56, 42, 28];
         let (textured, _) = texture(shape, 6.0, 8);
@@ -457,8 +459,8 @@ fn a_gain_that_changes_its_sign_varies_beyond_all_bounds() {
     assert!(field.variation(&pair).is_infinite());
 }
 
-/// What an edge that is not in place yet leaves was taken for gain, most of all in the few voxels of a block at the skin: motion
-/// of a plate of 1.5 mm was found to 1.2.
+/// What an edge that is not in place yet leaves was taken for gain, most of all in the few voxels
+/// of a block at the skin: motion of a plate of 1.5 mm was found to 1.2.
 #[test]
 fn an_edge_that_moved_is_not_taken_for_gain() {
     let shape = [64, 40, 40];
@@ -470,7 +472,8 @@ fn an_edge_that_moved_is_not_taken_for_gain() {
     let mut alike = weighted.clone();
     assert!(weighted.mask.iter().all(|&m| m > 0) && weighted.mask.iter().any(|&m| m < 10));
     alike.mask.to_mut().fill(255);
-    // How far both volumes' own intensity is changed away from the edge, where nothing is to be changed.
+    // How far both volumes' own intensity is changed away from the edge, where nothing is to be
+    // changed.
     let changed = |pair: &Pair<'_>| {
         let (warped, mut sum) = (unmoved(pair), 0.0);
         let gain = GainField::sharpened(pair, &warped);
@@ -513,7 +516,8 @@ fn the_gain_field_follows_a_bias_that_curves() {
 
 // Brightness
 
-/// A pair of texture about 200 whose deformed volume is as bright as `seen` says of a brightness and a place.
+/// A pair of texture about 200 whose deformed volume is as bright as `seen` says of a brightness
+/// and a place.
 fn lit(shape: [usize; 3], spacing: [f64; 3], seen: impl Fn(f64, [f64; 3]) -> f64) -> Pair<'static> {
     let (f, _) = texture(shape, 12.0, 7);
     let g = plain(shape, spacing);
@@ -541,7 +545,8 @@ fn under(pair: &Pair<'_>, level: ([usize; 3], [usize; 3]), mm: f32) -> Option<Br
     Brightness::measure(pair, level, &warped, |p| lattice.at(&c, p), 0.95)
 }
 
-/// How far the deformed volume is from the initial one when it is evened out: the median of the logarithms' distances.
+/// How far the deformed volume is from the initial one when it is evened out: the median of the
+/// logarithms' distances.
 fn uneven(pair: &Pair<'_>, found: &Brightness) -> f32 {
     let mut even = pair.moving.to_vec();
     found.even_out(&mut even, pair.shape, [0.0; 3], [1; 3]);
@@ -585,7 +590,8 @@ fn what_a_volume_is_scaled_by_is_no_matter_for_its_contrast() {
 
 #[test]
 fn brightness_belongs_to_places_of_the_deformed_volume_on_every_level() {
-    // A deformed volume of its own shape, which starts 4 voxels before the initial one, tissue that moves by 3, a brightness that stays.
+    // A deformed volume of its own shape, which starts 4 voxels before the initial one, tissue that
+    // moves by 3, a brightness that stays.
     let (shape, there) = ([48, 44, 40], [56, 44, 40]);
     let (f, _) = texture([80, 44, 40], 8.0, 3);
     let at = |i: usize, j: usize, k: usize| f[i + 80 * (j + 44 * k)];
@@ -630,7 +636,8 @@ fn blocks_that_are_off_hardly_count() {
     assert!(brightness(&even).is_none_or(|b| b.variation.is_finite() && b.deviation[0] < 1e-6));
 }
 
-/// A polynomial across a step (one half of a head 1.4 times as bright) left little of it and did harm: 0.008 -> 0.208 mm.
+/// A polynomial across a step (one half of a head 1.4 times as bright) left little of it and did
+/// harm: 0.008 -> 0.208 mm.
 #[test]
 fn a_step_in_brightness_is_told_from_a_profile() {
     let profile = |v: f64, p: [f64; 3]| v / (0.8 * (p[0] / 47.0).powi(2) - 0.5 * p[1] / 39.0).exp();
@@ -642,7 +649,8 @@ fn a_step_in_brightness_is_told_from_a_profile() {
     }
 }
 
-/// A leg that the deformed volume does not show, or noise where a coil is far, was taken for a profile: 0.000 -> 0.298 mm, 0.31 -> 1.12.
+/// A leg that the deformed volume does not show, or noise where a coil is far, was taken for a
+/// profile: 0.000 -> 0.298 mm, 0.31 -> 1.12.
 #[test]
 fn what_is_dark_in_the_deformed_volume_tells_nothing_of_its_brightness() {
     let pair = lit([48; 3], [1.0; 3], |v, p| v / (0.01 * p[0]).exp());
@@ -753,7 +761,8 @@ fn the_right_hand_side_is_the_slope_of_the_misfit() {
         }
     }
     let (cosine, ratio) = (cross / (ff * gg).sqrt(), (gg / ff).sqrt());
-    // The mean of both images' gradients stands for the warped one's: equal but for the rest of the motion.
+    // The mean of both images' gradients stands for the warped one's: equal but for the rest of the
+    // motion.
     assert!(cosine > 0.995, "direction: {cosine}");
     assert!((0.93..1.07).contains(&ratio), "length: {ratio}");
 }
@@ -889,7 +898,8 @@ fn reductions_go_from_coarse_to_fine() {
     }
 }
 
-/// In volumes of 448 x ny x 448 voxels the rows from which the noise was told were all the first of their slice.
+/// In volumes of 448 x ny x 448 voxels the rows from which the noise was told were all the first of
+/// their slice.
 #[test]
 fn rows_are_sampled_all_over_a_volume() {
     for ny in 1..60 {

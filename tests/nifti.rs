@@ -1,5 +1,5 @@
-//! NIfTI files, byte by byte: each is built here, so that what must come out is known exactly (one file, as all tests
-//! share the header builder).
+//! NIfTI files, byte by byte: each is built here, so that what must come out is known exactly (one
+//! file, as all tests share the header builder).
 #![allow(clippy::unwrap_used)]
 
 use palpate::io::{
@@ -423,7 +423,8 @@ fn forged_dimensions_are_refused_before_anything_is_allocated() {
     assert_eq!(read(&bomb).unwrap().as_slice(), counting());
 }
 
-/// With 2^60 frames the number of bytes once came round to nothing, and a name was made for each frame.
+/// With 2^60 frames the number of bytes once came round to nothing, and a name was made for each
+/// frame.
 #[test]
 fn axes_whose_product_is_past_all_numbers_are_refused() {
     let huge = i64::MAX;

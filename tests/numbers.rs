@@ -1,4 +1,5 @@
-//! Intensities of any size, sign and resolution: what the volumes show decides, not the numbers they show it in.
+//! Intensities of any size, sign and resolution: what the volumes show decides, not the numbers
+//! they show it in.
 #![allow(clippy::unwrap_used)]
 
 use palpate::evaluate::metrics;

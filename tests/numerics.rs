@@ -1,4 +1,5 @@
-//! Splines, smoothness energy, filters and small algebra against closed forms and slow, obvious sums.
+//! Splines, smoothness energy, filters and small algebra against closed forms and slow, obvious
+//! sums.
 #![allow(clippy::unwrap_used)]
 
 #[path = "fixtures/truth.rs"]
@@ -224,7 +225,8 @@ fn smooth_sampling_ends_half_a_voxel_outside() {
     }
 }
 
-/// A wave sampled with a shift looks like the filtered wave at the shifted place, for any fraction of a voxel.
+/// A wave sampled with a shift looks like the filtered wave at the shifted place, for any fraction
+/// of a voxel.
 #[test]
 fn smooth_sampling_does_not_depend_on_the_fraction() {
     let (shape, k) = ([40, 1, 1], std::f64::consts::TAU / 8.0);
@@ -326,7 +328,8 @@ fn the_smoothness_matrix_is_that_of_the_energy() {
     }
 }
 
-/// Weights that differ from node to node stand on the differences about each node: the matrix is that of the weighted density.
+/// Weights that differ from node to node stand on the differences about each node: the matrix is
+/// that of the weighted density.
 #[test]
 fn weights_by_place_make_the_matrix_of_the_weighted_density() {
     for (nodes, h) in SMOOTHNESSES {
@@ -702,7 +705,8 @@ fn neighbours_are_the_nearest() {
             assert_eq!(tree.within(at, f64::INFINITY, points.len()), all);
             let near = tree.within(at, 1.5, points.len());
             assert_eq!(near, slow.iter().filter(|s| s.0 <= 2.25).map(|s| s.1).collect::<Vec<_>>());
-            // Of a tie at the cut either may stay: the distances are those of the nearest, and nobody comes twice.
+            // Of a tie at the cut either may stay: the distances are those of the nearest, and
+            // nobody comes twice.
             let mut some = tree.within(at, f64::INFINITY, 13);
             let distances: Vec<f64> = some.iter().map(|&i| square(points[i], at)).collect();
             assert_eq!(distances, slow[..13].iter().map(|s| s.0).collect::<Vec<_>>());
@@ -737,7 +741,8 @@ fn random_numbers_are_normal_and_uniform() {
     assert_ne!(a, b);
 }
 
-/// Symmetric matrices (xx, yy, zz, xy, xz, yz) of three sizes, some diagonal or with eigenvalues that are equal or nearly so.
+/// Symmetric matrices (xx, yy, zz, xy, xz, yz) of three sizes, some diagonal or with eigenvalues
+/// that are equal or nearly so.
 fn symmetric_matrices() -> impl Iterator<Item = (f64, [f64; 6])> {
     let mut random = Random::new(3, 1);
     (0..3000).map(move |n| {

@@ -21,7 +21,8 @@ fn clean(mut params: PhantomParams) -> Phantom {
     phantom(&params).unwrap()
 }
 
-/// Over the mask: root-mean-square difference of deformed(x + f u) and initial(x), as a share of that for f = 0.
+/// Over the mask: root-mean-square difference of deformed(x + f u) and initial(x), as a share of
+/// that for f = 0.
 fn unexplained(p: &Phantom, factor: f32) -> f64 {
     let difference = |factor: f32| {
         let scaled = p.truth.as_slice().iter().map(|u| factor * u).collect();
@@ -33,7 +34,8 @@ fn unexplained(p: &Phantom, factor: f32) -> f64 {
     difference(factor) / difference(0.0)
 }
 
-/// What is left is the interpolation of thin layers; a motion a tenth too small or too large leaves more.
+/// What is left is the interpolation of thin layers; a motion a tenth too small or too large leaves
+/// more.
 fn assert_explains(p: &Phantom, name: &str) {
     let shares = [0.9, 1.0, 1.1].map(|factor| unexplained(p, factor));
     assert!(shares[1] < 0.15 && shares[1] < 0.8 * shares[0].min(shares[2]), "{name}: {shares:.3?}");
@@ -124,7 +126,8 @@ fn noise_is_rician_and_independent_in_the_two_volumes() {
     let (noisy, exact) = (phantom(&params).unwrap(), clean(params));
     let sigma = noisy.description.noise_sigma;
     let n = noisy.initial.grid().len();
-    // In air the magnitude has a Rayleigh distribution: mean sigma sqrt(pi / 2), mean square 2 sigma^2.
+    // In air the magnitude has a Rayleigh distribution: mean sigma sqrt(pi / 2), mean square 2
+    // sigma^2.
     let air: Vec<f64> = (0..n)
         .filter(|&at| exact.initial.as_slice()[at] == 0.0)
         .map(|at| f64::from(noisy.initial.as_slice()[at]))
@@ -134,7 +137,8 @@ fn noise_is_rician_and_independent_in_the_two_volumes() {
     let square = air.iter().map(|v| v * v).sum::<f64>() / air.len() as f64;
     assert!((mean / (sigma * (std::f64::consts::PI / 2.0).sqrt()) - 1.0).abs() < 0.03);
     assert!((square / (2.0 * sigma * sigma) - 1.0).abs() < 0.05);
-    // In bright tissue it is nearly Gaussian of deviation sigma, and the two volumes share none of it.
+    // In bright tissue it is nearly Gaussian of deviation sigma, and the two volumes share none of
+    // it.
     let bright: Vec<[f64; 2]> = (0..n)
         .filter(|&at| exact.initial.as_slice()[at] > 15.0 * sigma as f32)
         .map(|at| {
@@ -177,7 +181,8 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
 
 #[test]
 fn landmarks_agree_with_the_truth_between_voxels_and_lie_in_the_mask() {
-    // Trilinear interpolation of a rotation is exact; of a smooth motion on voxels of 12 mm it is not.
+    // Trilinear interpolation of a rotation is exact; of a smooth motion on voxels of 12 mm it is
+    // not.
     for (motion, tolerance) in [(MotionKind::Rotate, 1e-4), (MotionKind::Smooth, 0.15)] {
         for kind in [PhantomKind::Calf, PhantomKind::Slice, PhantomKind::Head] {
             let p = phantom(&PhantomParams { motion, ..small(kind) }).unwrap();

@@ -119,8 +119,9 @@ fn the_force_is_the_slope_of_the_energy_and_balanced() {
 
 #[test]
 fn halving_the_elements_brings_the_solution_nearer_at_the_rate_of_quadratic_ones() {
-    // The gradient of a harmonic polynomial is a solution of linear elasticity at any Poisson's ratio; at strains of 1e-4
-    // neo-Hookean tissue is as good as linear. It is a cubic, which quadratic elements do not hold.
+    // The gradient of a harmonic polynomial is a solution of linear elasticity at any Poisson's
+    // ratio; at strains of 1e-4 neo-Hookean tissue is as good as linear. It is a cubic, which
+    // quadratic elements do not hold.
     let harmonic = |x: [f64; 3]| {
         let [a, b, c] = [0, 1, 2].map(|n| x[n] - SIDES[n] / 2.0);
         let scale = 1e-6;
@@ -177,7 +178,8 @@ fn a_ball_on_a_plate_neither_pierces_it_nor_sticks_to_it() {
             }
         }
     }
-    // Hertz (1881): a^2 = R d. The base is near and stiff, so the force is above his 4/3 E* (R d^3)^(1/2), but not far.
+    // Hertz (1881): a^2 = R d. The base is near and stiff, so the force is above his 4/3 E* (R
+    // d^3)^(1/2), but not far.
     let hertz = 4.0 / 3.0 * 20.0 / (1.0 - 0.49f64.powi(2)) * (radius * 0.6f64.powi(3)).sqrt();
     let force = s.levels[1].force;
     assert!(touching > 20 && (width / (radius * 0.6).sqrt() - 1.0).abs() < 0.25, "{touching} {width}");

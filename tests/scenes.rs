@@ -1,4 +1,5 @@
-//! Scenes in which grey values mislead: bright tissue that does not move, a bright background, hot voxels, padding. Each has an exact truth.
+//! Scenes in which grey values mislead: bright tissue that does not move, a bright background, hot
+//! voxels, padding. Each has an exact truth.
 
 #![allow(clippy::unwrap_used)]
 
@@ -29,7 +30,8 @@ impl Texture {
     }
 }
 
-/// A pair with its truth: muscle that slips along a limb's axis by 3 mm at most, inside a ring of fat that does not move.
+/// A pair with its truth: muscle that slips along a limb's axis by 3 mm at most, inside a ring of
+/// fat that does not move.
 #[derive(Clone)]
 struct Limb {
     initial: Volume,
@@ -86,7 +88,8 @@ fn measured(limb: &Limb, mask: bool) -> (FieldResult, f64) {
     (result, error)
 }
 
-/// Beside still fat several times as bright, the muscle inside it came out as "nothing moved", with high trust.
+/// Beside still fat several times as bright, the muscle inside it came out as "nothing moved", with
+/// high trust.
 #[test]
 fn a_still_bright_ring_does_not_hide_the_muscle_inside_it() {
     let (_, plain) = measured(&limb(1.2, 0.0, 3), false);

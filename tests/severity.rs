@@ -1,4 +1,5 @@
-//! Troubled phantoms: what is made worse is made worse by as much as was asked for, and the truth stays exact.
+//! Troubled phantoms: what is made worse is made worse by as much as was asked for, and the truth
+//! stays exact.
 #![allow(clippy::unwrap_used)]
 
 use palpate::numerics::differences::displacement_gradient;
@@ -39,7 +40,8 @@ fn mismatch(p: &Phantom) -> f64 {
     (inside.iter().map(square).sum::<f64>() / inside.len() as f64).sqrt()
 }
 
-/// Median of |deformed(x + u(x)) - initial(x)| over the mask: the body's outline, sharper than a voxel, does not count.
+/// Median of |deformed(x + u(x)) - initial(x)| over the mask: the body's outline, sharper than a
+/// voxel, does not count.
 fn median_mismatch(p: &Phantom) -> f64 {
     let inside = (0..p.mask.as_slice().len()).filter(|&at| p.mask.as_slice()[at] != 0);
     let mut off: Vec<f64> = inside.map(|at| (carried(p, at) - f64::from(p.initial.as_slice()[at])).abs()).collect();
@@ -87,7 +89,8 @@ fn an_even_ball_holds_its_share_and_missing_tissue_leaves_the_mask() {
     let even = troubled(&base, Trouble::NoTexture, 50.0).unwrap();
     let mut values: Vec<f32> = even.deformed.as_slice().to_vec();
     values.sort_by(f32::total_cmp);
-    // Half of the tissue is of one grey: the densest tenth of the bright values is hardly wide at all.
+    // Half of the tissue is of one grey: the densest tenth of the bright values is hardly wide at
+    // all.
     let tissue: Vec<f32> = values.into_iter().filter(|v| *v > 100.0).collect();
     let width = |w: &[f32]| w[w.len() - 1] - w[0];
     let narrowest = tissue.windows(tissue.len() / 4).map(width).fold(f32::INFINITY, f32::min);

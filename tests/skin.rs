@@ -96,7 +96,8 @@ fn a_long_hold_leaves_the_springs_alone() {
     close(held.stress, s.load.displacement / compliance, 1e-8, "hold");
 }
 
-/// Gigapascals over 15 micrometres held for minutes were lost in rounding: 66 MPa for 50, and an impulse below zero.
+/// Gigapascals over 15 micrometres held for minutes were lost in rounding: 66 MPa for 50, and an
+/// impulse below zero.
 #[test]
 fn a_thin_stiff_layer_keeps_its_closed_form() {
     let (h, e0, e1, tau) = (1.5e-5, 1e9, 1e9, 60.0);
@@ -186,7 +187,8 @@ fn dual_moduli_dashpots_change_when_the_load_goes() {
     assert_eq!(column::residual(&fluid, 1.0), None);
 }
 
-/// Largest difference of the stress, over the largest stress, and of the depth, over the indentation.
+/// Largest difference of the stress, over the largest stress, and of the depth, over the
+/// indentation.
 fn apart(scene: &SkinScene) -> [f64; 2] {
     let (exact, block) = (column::respond(scene), block::respond(scene).unwrap());
     let top = exact.iter().map(|p| p.stress).fold(0.0, f64::max);
@@ -217,8 +219,9 @@ fn a_thin_wide_block_is_a_column() {
 
 #[test]
 fn the_block_does_not_lock() {
-    // A confined layer: the punch is as wide as the block and all but incompressible tissue has nowhere to go but out at
-    // the side. Halfway between free and confined, it must not stiffen with nu as a locked mesh does.
+    // A confined layer: the punch is as wide as the block and all but incompressible tissue has
+    // nowhere to go but out at the side. Halfway between free and confined, it must not stiffen
+    // with nu as a locked mesh does.
     let stress = |poisson: f64| {
         let mut s = scene(vec![layer(ElementKind::StandardLinearSolid, 1e-2, 2e4, 0.0, &[[1.0, 1.0]])]);
         s.block = SkinBlock { width: 0.02, indenter: 0.02, poisson };

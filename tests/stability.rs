@@ -1,5 +1,5 @@
-//! Small versions of `palpate chart` and `palpate stress` on synthetic data, held against stored figures: worse than those
-//! by more than the seed-to-seed spread fails.
+//! Small versions of `palpate chart` and `palpate stress` on synthetic data, held against stored
+//! figures: worse than those by more than the seed-to-seed spread fails.
 #![allow(clippy::unwrap_used)]
 
 mod fixtures;
@@ -40,7 +40,8 @@ fn spread(values: &[f64]) -> [f64; 2] {
     [mean, square.sqrt()]
 }
 
-/// Trouble, severity, then for each body the mean error (mm) and its spread over the seeds, as measured.
+/// Trouble, severity, then for each body the mean error (mm) and its spread over the seeds, as
+/// measured.
 const STORED: [(Trouble, f64, [[f64; 2]; 2]); 7] = [
     (Trouble::Noise, 3.0, [[0.432, 0.078], [1.715, 0.211]]),
     (Trouble::Noise, 10.0, [[0.538, 0.085], [2.050, 0.180]]),
@@ -108,7 +109,8 @@ fn grasps_break_where_they_should_and_say_so() {
         let curve = curves.iter().find(|c| c.axis == axis && c.case.starts_with(case)).unwrap();
         (curve.holds_at.unwrap(), curve.breaks_at.unwrap())
     };
-    // Runge and Kutta's method is stable to 2.785 over the largest eigenvalue, the semi-implicit one to about 2 over it.
+    // Runge and Kutta's method is stable to 2.785 over the largest eigenvalue, the semi-implicit
+    // one to about 2 over it.
     let (rk4, euler) = (of("step", "rk4, minimal"), of("step", "semi-implicit-euler, minimal"));
     assert!(rk4.0 > euler.0 && rk4.0 > 1.5e-3 && rk4.1 < 5e-3, "{rk4:?} {euler:?}");
     let friction = of("friction", "rk4");

@@ -1,4 +1,5 @@
-//! Forward models against closed forms, sensitivities, and identification of fields with a closed form.
+//! Forward models against closed forms, sensitivities, and identification of fields with a closed
+//! form.
 #![allow(clippy::unwrap_used)]
 
 use palpate::mesh::tetrahedral::{Detail, Fineness, Mesher, mesh_labels};
@@ -82,7 +83,8 @@ fn uniform(body: &Body, e: f64, nu: f64) -> Vec<Material> {
 
 #[test]
 fn the_patch_test_is_passed_at_any_poisson_ratio() {
-    // Exact with straight edges; with curved ones the quadrature errs by a part in 10^4 of the largest displacement.
+    // Exact with straight edges; with curved ones the quadrature errs by a part in 10^4 of the
+    // largest displacement.
     for (body, tolerance) in [(straight(&block(), 2500), 1e-8), (body(&block(), 2500), 5e-6)] {
         for nu in [0.3, 0.49, 0.499] {
             let u = |p: [f64; 3]| [1e-3 * p[0] + 2e-3 * p[1], -1e-3 * p[1] + 5e-4 * p[2], 3e-3 * p[0]];
@@ -95,10 +97,12 @@ fn the_patch_test_is_passed_at_any_poisson_ratio() {
     }
 }
 
-/// u = 4 (1 - nu) psi - grad(x . psi) with psi harmonic solves the equations without body force (Papkovich, Neuber).
+/// u = 4 (1 - nu) psi - grad(x . psi) with psi harmonic solves the equations without body force
+/// (Papkovich, Neuber).
 #[test]
 fn polynomial_solutions_are_approached_at_third_order_up_to_incompressibility() {
-    // A ball: its edges bend by the square of their length. (A block's edges are rounded by the voxels, on any mesh.)
+    // A ball: its edges bend by the square of their length. (A block's edges are rounded by the
+    // voxels, on any mesh.)
     let ball = labels([20, 20, 20], 1.0, |p| u8::from(p.iter().map(|v| (v - 9.5).powi(2)).sum::<f64>() < 64.0));
     let bodies = [1200, 8000].map(|n| body(&ball, n));
     for nu in [0.3, 0.49, 0.499] {
@@ -165,7 +169,8 @@ fn a_bar_gives_its_modulus_back_and_forces_balance() {
     }
 }
 
-/// Nominal pressure of a neo-Hookean bar at stretch `l`: the transverse stretch makes the side's stress vanish.
+/// Nominal pressure of a neo-Hookean bar at stretch `l`: the transverse stretch makes the side's
+/// stress vanish.
 fn uniaxial(e: f64, nu: f64, l: f64) -> f64 {
     let (mu, lambda) = (e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)));
     let side = |t: f64| mu * (t - 1.0 / t) + lambda * (l * t * t).ln() / t;
@@ -185,7 +190,8 @@ fn neo_hookean_simple_shear_is_homogeneous_and_its_traction_exact() {
     let problem = Problem::new(&body, Law::NeoHookean, uniform(&body, e, nu), tied(&body, &surface_nodes(&body), u));
     let s = problem.solve(None, 1e-9).unwrap();
     assert!(errors(&body, &s.x, u)[1] < 1e-6);
-    // J = 1, so P = mu (F - F^-T): on the top P_xz = mu k. The work of all tractions is mu k^2 times the volume.
+    // J = 1, so P = mu (F - F^-T): on the top P_xz = mu k. The work of all tractions is mu k^2
+    // times the volume.
     let work: f64 = problem
         .ties
         .iter()
@@ -216,12 +222,14 @@ fn a_thick_sphere_follows_lame() {
     let problem = Problem::new(&body, Law::Linear, uniform(&body, 10.0, nu), tied(&body, &surface_nodes(&body), exact));
     let s = problem.solve(None, 1e-9).unwrap();
     let [rms, largest] = errors(&body, &s.x, exact);
-    // The displacement is 0.16 mm inside, 0.033 mm outside; the coarse shell has two elements across.
+    // The displacement is 0.16 mm inside, 0.033 mm outside; the coarse shell has two elements
+    // across.
     assert!(rms < 8e-4 && largest < 0.012, "{rms} {largest}");
 }
 
-/// A flat frictionless round punch on a half space: F = 2 E / (1 - nu^2) a d (Johnson, Contact Mechanics, 3.36). The block is
-/// 8 radii wide and 5 deep, which stiffens it; the edge of the punch is made of faces of the mesh.
+/// A flat frictionless round punch on a half space: F = 2 E / (1 - nu^2) a d (Johnson, Contact
+/// Mechanics, 3.36). The block is 8 radii wide and 5 deep, which stiffens it; the edge of the punch
+/// is made of faces of the mesh.
 #[test]
 fn a_punch_needs_the_force_of_a_half_space_and_what_its_block_adds() {
     let map = labels([52, 52, 34], 1.0, |p| {
@@ -341,8 +349,8 @@ fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
     }
 }
 
-/// A mesh found the tip of a finger curved and the next one flat: the flat one's few ties along its normal left no
-/// equilibrium, and the pair failed.
+/// A mesh found the tip of a finger curved and the next one flat: the flat one's few ties along its
+/// normal left no equilibrium, and the pair failed.
 #[test]
 fn meshes_of_a_body_agree_on_what_is_curved_as_the_finer_sees_it() {
     let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
@@ -375,7 +383,8 @@ fn meshes_of_a_body_agree_on_what_is_curved_as_the_finer_sees_it() {
     }
 }
 
-/// The field of a homogeneous block between frictionless plates, linear: closed form, whatever the modulus.
+/// The field of a homogeneous block between frictionless plates, linear: closed form, whatever the
+/// modulus.
 fn squeezed(strain: f64, nu: f64) -> DenseField {
     DenseField::from_fn(grid([20, 20, 20], 1.0), |p: WorldPoint| {
         [nu * strain * (p.0[0] - 9.5), nu * strain * (p.0[1] - 9.5), -strain * (p.0[2] - 1.5)]
@@ -405,7 +414,8 @@ fn a_homogeneous_block_in_two_labels_has_one_modulus_and_the_right_one() {
     let result = identify(&halves, &squeezed(strain, 0.49), &params);
     assert_eq!(result.patches[1].contact, Contact::Sliding);
     assert_eq!(result.law, Law::Linear, "{:?}", result.evidence);
-    // Where the faces lie within a voxel is worth some percent of 16 voxels; it is said so, and does not touch the ratio.
+    // Where the faces lie within a voxel is worth some percent of 16 voxels; it is said so, and
+    // does not touch the ratio.
     for r in &result.regions {
         assert!(r.identifiable && r.sd < 0.06 * e, "{r:?}");
         assert!((r.youngs_modulus - e).abs() < 2.0 * r.sd, "{r:?}");
@@ -414,7 +424,8 @@ fn a_homogeneous_block_in_two_labels_has_one_modulus_and_the_right_one() {
     assert!((result.model_force / force - 1.0).abs() < 0.05);
 }
 
-/// The first frame's bound once scaled the exported models when a later frame determined the region.
+/// The first frame's bound once scaled the exported models when a later frame determined the
+/// region.
 #[test]
 fn a_shared_map_and_its_models_hold_the_same_moduli() {
     let halves =
@@ -436,7 +447,8 @@ fn a_shared_map_and_its_models_hold_the_same_moduli() {
     }
 }
 
-/// Side by side between plates without friction every ratio leads to one field: both halves bear the force, in parts that nothing shows.
+/// Side by side between plates without friction every ratio leads to one field: both halves bear
+/// the force, in parts that nothing shows.
 #[test]
 fn of_halves_side_by_side_only_the_mean_is_claimed() {
     let halves = |p: [f64; 3]| if p.iter().all(|v| (2.0..18.0).contains(v)) { 1 + u8::from(p[0] > 9.0) } else { 0 };
@@ -484,7 +496,8 @@ fn a_turn_of_the_whole_body_changes_no_modulus() {
     assert!((a.0 / b.0 - 1.0).abs() < 1e-3 && a.1 == b.1, "{a:?} {b:?}");
 }
 
-/// Where voxels lie askew to a flat base the mesh rounds its rims, and 28 % of it was let go: 27.0 and 104 of 25 and 100 kPa.
+/// Where voxels lie askew to a flat base the mesh rounds its rims, and 28 % of it was let go: 27.0
+/// and 104 of 25 and 100 kPa.
 #[test]
 fn a_base_askew_to_the_voxels_is_held_nearly_whole() {
     let (half, strain) = ([20.0, 18.0, 15.0], 0.04);
@@ -528,7 +541,8 @@ fn a_body_that_ends_with_the_volume_is_warned_of() {
     assert_eq!(said(&block()), None);
 }
 
-/// On a coarse mesh the rounded rim of a cylinder's face lies millimetres below it, and more of its nodes than not lay off the plane of all.
+/// On a coarse mesh the rounded rim of a cylinder's face lies millimetres below it, and more of its
+/// nodes than not lay off the plane of all.
 #[test]
 fn a_flat_face_is_found_though_its_rim_is_rounded() {
     for (radius, half) in [(30.0, 24.0), (24.0, 20.0)] {
@@ -589,7 +603,8 @@ fn phantom_moduli(kind: PhantomKind, size: usize, nodes: usize) -> (Pressed, Sti
 
 #[test]
 fn layers_under_a_punch_are_told_though_the_edge_is_known_to_a_voxel_only() {
-    // Before the mesh was cut along the edge the skin was up to 18 % off on a finer grid, and 50 on a mesh that is not fine there.
+    // Before the mesh was cut along the edge the skin was up to 18 % off on a finer grid, and 50 on
+    // a mesh that is not fine there.
     let (body, result) = phantom_moduli(PhantomKind::Slab, 48, 15_000);
     assert_eq!(result.law, Law::NeoHookean, "{:?}", result.evidence);
     for (r, bar) in result.regions.iter().zip([0.1, 0.04, 0.02]) {
@@ -598,7 +613,8 @@ fn layers_under_a_punch_are_told_though_the_edge_is_known_to_a_voxel_only() {
     }
 }
 
-/// A found bug: small strain, which is not the law in the end, made a guided patch of a punch (from images a skin of 80 kPa came out as 101).
+/// A found bug: small strain, which is not the law in the end, made a guided patch of a punch (from
+/// images a skin of 80 kPa came out as 101).
 #[test]
 fn a_guided_patch_must_be_worth_it_under_the_law_that_is_taken() {
     let body = Pressed::new(&PhantomParams { seed: 3, ..PhantomParams::new(PhantomKind::Slab) }.sized(40)).unwrap();
@@ -639,7 +655,8 @@ fn held_where(
     run(&inputs, params, &|_, _| {}).unwrap()
 }
 
-/// A mask of the held side that leaves out a quarter of it made moduli 20 % too high without a word.
+/// A mask of the held side that leaves out a quarter of it made moduli 20 % too high without a
+/// word.
 #[test]
 fn a_held_side_that_its_mask_covers_in_part_is_warned_of() {
     let map = labels([20, 20, 20], 1.0, |p| u8::from(p.iter().all(|v| (2.0..18.0).contains(v))));
@@ -656,7 +673,8 @@ fn a_held_side_that_its_mask_covers_in_part_is_warned_of() {
     }
 }
 
-/// One modulus for a body with a ball ten times as stiff in it came out 18 % too high, and noise hid what it left over.
+/// One modulus for a body with a ball ten times as stiff in it came out 18 % too high, and noise
+/// hid what it left over.
 #[test]
 fn what_one_label_hides_is_warned_of_though_there_is_noise() {
     let body = inclusion(10.0, 41, 40);
@@ -673,7 +691,8 @@ fn what_one_label_hides_is_warned_of_though_there_is_noise() {
     }
 }
 
-/// `--held` and `--load` the other way round: the body is then held at a small plate and pressed all over its base.
+/// `--held` and `--load` the other way round: the body is then held at a small plate and pressed
+/// all over its base.
 #[test]
 fn a_body_held_at_a_tenth_of_what_is_pressed_is_asked_about() {
     let map = labels([20, 20, 20], 1.0, |p| u8::from(p.iter().all(|v| (2.0..18.0).contains(v))));
@@ -715,7 +734,8 @@ fn a_mean_over_a_block_of_a_curved_displacement_is_read_as_a_mean() {
     }
 }
 
-/// A found bias: matches were taken for the displacement in the middle of their patches, and stiff balls came out 5 % too soft from images.
+/// A found bias: matches were taken for the displacement in the middle of their patches, and stiff
+/// balls came out 5 % too soft from images.
 #[test]
 fn a_match_is_read_as_the_mean_over_its_patch() {
     let map = labels([44; 3], 1.0, |p| u8::from(p.iter().all(|v| (2.0..42.0).contains(v))));
@@ -845,8 +865,9 @@ fn a_region_found_without_labels_is_drawn_to_its_size() {
     assert!((ratio - 1.0).abs() < 2.0 * result.regions[1].ratio_sd / 5.0);
 }
 
-/// The bars of a labelled inclusion: its ratio to what is around it, and that one's modulus from the force, within 3 % from the exact
-/// field and 5 % with 0.05 mm of noise, and within two deviations.
+/// The bars of a labelled inclusion: its ratio to what is around it, and that one's modulus from
+/// the force, within 3 % from the exact field and 5 % with 0.05 mm of noise, and within two
+/// deviations.
 fn holds_its_bars(contrast: f64, seed: u64) {
     // They are for so many voxels: with half of them a ball ten times as stiff is 5 % off.
     let body = inclusion(contrast, seed, 96);
@@ -904,7 +925,8 @@ fn under_too_much_noise_no_second_region_is_claimed() {
 
 #[test]
 fn an_inclusion_is_found_that_stands_out_of_the_noise_of_means_and_not_of_a_voxel() {
-    // Its misfit of 0.04 mm was compared with the 0.1 mm of a voxel, where means over eight of them are measured.
+    // Its misfit of 0.04 mm was compared with the 0.1 mm of a voxel, where means over eight of them
+    // are measured.
     let body = inclusion(5.0, 73, 58);
     let found = without_labels(&body, &noisy(&body.phantom.truth, 0.1, 73), 4_500);
     let [around, within] = &found.regions[..] else { panic!("{:?}", found.evidence) };
@@ -932,8 +954,8 @@ fn noise_alone_makes_no_second_region_and_no_warning() {
     }
 }
 
-/// The displacement of a block of 50 x 40 x 36 voxels of 0.8 mm with two balls of the same 5 times the modulus, pressed by 5 %, by the
-/// model itself on a finer mesh; and its labels.
+/// The displacement of a block of 50 x 40 x 36 voxels of 0.8 mm with two balls of the same 5 times
+/// the modulus, pressed by 5 %, by the model itself on a finer mesh; and its labels.
 fn two_alike() -> (DenseField, Mask) {
     let middles = [-9.6, 9.6].map(|x| [24.0 + x, 20.0, 18.4]);
     let within = |p: [f64; 3], m: &[f64; 3]| (0..3).map(|a| (p[a] - m[a]).powi(2)).sum::<f64>() < 6.5 * 6.5;

@@ -1,4 +1,5 @@
-//! `palpate stiffness` as a user meets it: files, exit codes, what it says to bad input, and other programs on its models.
+//! `palpate stiffness` as a user meets it: files, exit codes, what it says to bad input, and other
+//! programs on its models.
 #![allow(clippy::unwrap_used)]
 
 mod fixtures;
@@ -14,8 +15,8 @@ fn grid(shape: [usize; 3]) -> Grid {
     Grid::new(shape, Affine::scaled([1.0; 3], [-3.0, 5.0, 1.0]).unwrap()).unwrap()
 }
 
-/// A block squeezed by 3 % between frictionless plates, and its label map of two halves, one on the other: of halves side by side
-/// nothing but the mean would be seen.
+/// A block squeezed by 3 % between frictionless plates, and its label map of two halves, one on the
+/// other: of halves side by side nothing but the mean would be seen.
 fn folder() -> TempDir {
     let folder = TempDir::new().unwrap();
     let g = grid([16, 16, 16]);
@@ -123,7 +124,8 @@ fn calculix_solves_our_model_to_our_displacements() {
     run_calculix(&results, &summary);
 }
 
-/// Of a plate that sticks and moves sideways as well, what acts across it was taken for the whole force: moduli were 12 % too high.
+/// Of a plate that sticks and moves sideways as well, what acts across it was taken for the whole
+/// force: moduli were 12 % too high.
 #[test]
 fn the_force_that_was_given_is_the_whole_one() {
     let folder = TempDir::new().unwrap();
@@ -148,14 +150,16 @@ fn the_force_that_was_given_is_the_whole_one() {
     let [x, y, z] = force[force.len() - 3..] else { panic!("{printed}") };
     let whole = (x * x + y * y + z * z).sqrt();
     println!("CalculiX: {force:?} N, {whole:.4} N in all");
-    // The moduli hold the faces' offsets and the exported mesh does not, which is worth a tenth of a field that no body has; taken for
-    // the part across the plate 0.1 N made 0.111 N in all.
+    // The moduli hold the faces' offsets and the exported mesh does not, which is worth a tenth of
+    // a field that no body has; taken for the part across the plate 0.1 N made 0.111 N in all.
     assert!((0.088..0.104).contains(&whole) && z.abs() < 0.08, "{force:?}");
 }
 
-/// The block of [`folder`] in `frames` noisy frames as `palpate track` leaves them; frame 1 is the reference, the last is at rest.
+/// The block of [`folder`] in `frames` noisy frames as `palpate track` leaves them; frame 1 is the
+/// reference, the last is at rest.
 ///
-/// Its halves lie one on the other here: side by side between plates that slide they would strain alike whatever their moduli.
+/// Its halves lie one on the other here: side by side between plates that slide they would strain
+/// alike whatever their moduli.
 fn tracked(frames: usize) -> TempDir {
     let folder = folder();
     let g = grid([16, 16, 16]);
@@ -181,7 +185,8 @@ fn tracked(frames: usize) -> TempDir {
 fn a_sequence_is_read_by_the_matches_and_frames_of_its_own_track() {
     let folder = tracked(4);
     let at = |name: &str| folder.path().join(name);
-    // A second track into the same folder measured frame 0, lost frame 2, and left the field of frame 3 behind.
+    // A second track into the same folder measured frame 0, lost frame 2, and left the field of
+    // frame 3 behind.
     let summary = r#"{"command": "track", "reference": 1, "frames": [{"frame": 0, "lost": null}, {"frame": 2, "lost": "noise"}]}"#;
     fs::write(at("summary.json"), summary).unwrap();
     let g = grid([16, 16, 16]);
@@ -265,7 +270,8 @@ fn what_is_no_sequence_is_refused() {
     }
     let (_, err) = run(folder.path(), &[&base[..], &["--forces", "0,0"]].concat(), 1);
     assert!(err.contains("no force acts"), "{err}");
-    // Each frame would find regions of its own, and their moduli would be averaged as if they were the same ones.
+    // Each frame would find regions of its own, and their moduli would be averaged as if they were
+    // the same ones.
     for body in [&["--mask", "labels.nii.gz"][..], &[]] {
         let (_, err) = run(folder.path(), &[&["stiffness", "--sequence", ".", "-o", "results"], body].concat(), 2);
         assert!(

@@ -108,7 +108,8 @@ fn layers_are_cut_where_they_meet() {
     assert!(least > 3.0);
 }
 
-/// Cubes of 8 mm do not show a ball of 1.6. With all of them smaller, until it showed, the mesh had 7,334 nodes.
+/// Cubes of 8 mm do not show a ball of 1.6. With all of them smaller, until it showed, the mesh had
+/// 7,334 nodes.
 #[test]
 fn a_small_part_is_meshed_finer_alone() {
     let map = labels([64, 64, 48], 0.5, |p| {
@@ -124,7 +125,8 @@ fn a_small_part_is_meshed_finer_alone() {
     assert!(volumes(&mesh)[&2] > 0.4 * exact && mesh.nodes().len() < 5000, "{} nodes", mesh.nodes().len());
 }
 
-/// More than a few parts may be too small at once; halved one after the other, not all had their turn.
+/// More than a few parts may be too small at once; halved one after the other, not all had their
+/// turn.
 #[test]
 fn many_small_parts_are_all_kept() {
     let ball = |p: [f64; 3]| {

@@ -1,4 +1,5 @@
-//! What the program is built from: licences that may be passed on, no system libraries, one place for each crate.
+//! What the program is built from: licences that may be passed on, no system libraries, one place
+//! for each crate.
 #![allow(clippy::unwrap_used)]
 
 use serde_json::Value;
@@ -27,11 +28,13 @@ fn cargo(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO")).args(arguments).current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap()
 }
 
-/// The packages that the program is built from on this system (not those of its tests), as `cargo metadata` tells.
+/// The packages that the program is built from on this system (not those of its tests), as
+/// `cargo metadata` tells.
 fn packages() -> Vec<Value> {
     let version = String::from_utf8(cargo(&["-vV"]).stdout).unwrap();
     let host = version.lines().find_map(|l| l.strip_prefix("host: ")).unwrap();
-    // Where this is the first build, those of other systems are not there: nothing had asked for them.
+    // Where this is the first build, those of other systems are not there: nothing had asked for
+    // them.
     let output = cargo(&["metadata", "--format-version", "1", "--locked", "--offline", "--filter-platform", host]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let all: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -53,7 +56,8 @@ fn packages() -> Vec<Value> {
     all["packages"].as_array().unwrap().iter().filter(|p| seen.contains(p["id"].as_str().unwrap())).cloned().collect()
 }
 
-/// Whether an SPDX expression allows one of the permissive licences (`a OR b`, `a AND b`, brackets, `a/b` of old).
+/// Whether an SPDX expression allows one of the permissive licences (`a OR b`, `a AND b`, brackets,
+/// `a/b` of old).
 fn allowed(expression: &str) -> bool {
     let expression = expression.replace('/', " OR ").replace(['(', ')'], "");
     let one = |name: &str| PERMISSIVE.contains(&name.trim());

@@ -34,8 +34,8 @@ fn the_readme_names_every_folder_and_no_file_is_large() {
     }
 }
 
-/// Elementary functions differ in the last digit between platforms: intensities may differ by one step, voxels at the
-/// mask's rim by their side.
+/// Elementary functions differ in the last digit between platforms: intensities may differ by one
+/// step, voxels at the mask's rim by their side.
 #[test]
 fn the_commands_of_the_readme_make_the_data_again() {
     let again = TempDir::new().unwrap();

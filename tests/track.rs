@@ -61,7 +61,8 @@ fn following_is_no_worse_than_pairs_and_far_better_than_a_chain() {
 
 #[test]
 fn the_first_frames_bring_no_error_into_the_next() {
-    // The field of the frame before, off by as much as has moved since, won by nothing: 1.5 times the error of the pair.
+    // The field of the frame before, off by as much as has moved since, won by nothing: 1.5 times
+    // the error of the pair.
     let params = SequenceParams { frames: 24, ..SequenceParams::new(SequenceKind::Pen).sized(56) };
     let s = Sequence::new(&params).unwrap();
     let (params, reference) = (FieldParams::default(), s.frame(0));
@@ -77,7 +78,8 @@ fn the_first_frames_bring_no_error_into_the_next() {
 
 #[test]
 fn followed_frames_forget_the_noise_that_they_begin_with() {
-    // In coarse steps a course is a poor start: refined as long as others it left up to 1.21 times the error of the pair.
+    // In coarse steps a course is a poor start: refined as long as others it left up to 1.21 times
+    // the error of the pair.
     let params = SequenceParams { frames: 10, seed: 2, ..SequenceParams::new(SequenceKind::Pen) };
     let s = Sequence::new(&params).unwrap();
     let (params, reference) = (FieldParams::default(), s.frame(0));
@@ -175,7 +177,8 @@ fn without_a_mask_strain_is_that_of_tissue() {
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
     let found = run((3, 0), &reference, (None, None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
-    // The mask that is made reaches a voxel into the air; all of the volume is three times the tissue.
+    // The mask that is made reaches a voxel into the air; all of the volume is three times the
+    // tissue.
     let tissue = s.mask.as_slice().iter().filter(|m| **m != 0).count() as f64;
     assert!(tissue < 0.4 * reference.grid().len() as f64);
     for row in &found.strain {
@@ -240,8 +243,8 @@ fn trajectories_follow_the_true_motion() {
     }
 }
 
-/// A muscle moves far more along the leg than across it, where it looks much alike: with one weight of the bending energy for
-/// all axes a third of the motion was missed.
+/// A muscle moves far more along the leg than across it, where it looks much alike: with one weight
+/// of the bending energy for all axes a third of the motion was missed.
 #[test]
 fn a_contraction_is_followed_along_the_leg() {
     for seed in [1, 2] {
@@ -317,7 +320,8 @@ fn a_sequence_is_exact_and_the_same_twice() {
     }
 }
 
-/// Frames of 12 that are lost or lie before the reference do not keep what all say together from being nearer to the truth than each alone.
+/// Frames of 12 that are lost or lie before the reference do not keep what all say together from
+/// being nearer to the truth than each alone.
 #[test]
 fn frames_together_are_nearer_to_the_truth_than_alone() {
     for (kind, origin, blank, modes) in [(SequenceKind::Pinch, 0, None, 4), (SequenceKind::Pen, 5, Some(8), 5)] {
@@ -358,7 +362,8 @@ fn frames_together_are_nearer_to_the_truth_than_alone() {
     }
 }
 
-/// What is said of a frame that keeps its own field was worked out anew, over voxels without a number as well.
+/// What is said of a frame that keeps its own field was worked out anew, over voxels without a
+/// number as well.
 #[test]
 fn a_frame_that_keeps_its_own_field_is_summed_up_as_a_pair() {
     let s = sequence(SequenceKind::Pinch, 3);

@@ -114,7 +114,8 @@ fn volumes_and_a_series_give_the_same() {
         let (said, _) = run(&["info", results.join(name).to_str().unwrap()], 0);
         assert!(said.contains(is) && !said.contains("does not read"), "{said}");
     }
-    // Each point stands once in the reference, where it was found, and its frame's own matches lie beside.
+    // Each point stands once in the reference, where it was found, and its frame's own matches lie
+    // beside.
     let start: Vec<_> = points.iter().filter(|r| r[1] == "0").collect();
     let numbers: std::collections::HashSet<_> = points.iter().map(|r| &r[0]).collect();
     assert!(start.len() == numbers.len() && start.iter().all(|r| r[6] == "0.000000" && r[7] == "measured"));

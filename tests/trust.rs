@@ -1,4 +1,5 @@
-//! What docs/trust.md promises of files, limits and repeated runs: killed, stopped, out of time, memory and permission.
+//! What docs/trust.md promises of files, limits and repeated runs: killed, stopped, out of time,
+//! memory and permission.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used)]
 

@@ -46,7 +46,8 @@ fn work(report: &Path) -> Option<String> {
     Some(dom[from + 15..from + dom[from..].find("</pre>").unwrap()].to_string())
 }
 
-/// All checks pass and are `least` in number; gives what the readout says at first, empty without a browser.
+/// All checks pass and are `least` in number; gives what the readout says at first, empty without a
+/// browser.
 fn all_is_well(report: &Path, least: usize) -> String {
     let Some(said) = work(report) else { return String::new() };
     assert!(!said.contains("FAILED"), "{said}");

@@ -1,7 +1,9 @@
-//! `palpate batch`: a table of pairs, each through field, stiffness, fingertip and grasp, in parallel and resumable.
+//! `palpate batch`: a table of pairs, each through field, stiffness, fingertip and grasp, in
+//! parallel and resumable.
 //!
-//! Each stage is a process of its own: a pair that fails, or is killed for memory, takes nothing else with it. What was run,
-//! with the size and time of every input, is kept in the pair's `pair.json`; a stage whose record still holds is not run again.
+//! Each stage is a process of its own: a pair that fails, or is killed for memory, takes nothing
+//! else with it. What was run, with the size and time of every input, is kept in the pair's
+//! `pair.json`; a stage whose record still holds is not run again.
 
 use super::Usage;
 use super::console::Console;
@@ -29,8 +31,8 @@ const RECORD: &str = "pair.json";
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Table of pairs (CSV): initial, deformed, and as wanted mask, labels, names, held, load, force_n, scene, name, subject,
-    /// session; paths count from the table's folder
+    /// Table of pairs (CSV): initial, deformed, and as wanted mask, labels, names, held, load,
+    /// force_n, scene, name, subject, session; paths count from the table's folder
     table: PathBuf,
     /// Folder for the results; those that are there already are not made again
     #[arg(short, long, value_name = "DIR")]
@@ -138,7 +140,8 @@ fn gather(folder: &Path, outcome: &mut PairOutcome) {
 fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
     let folder = output.join(&pair.name);
     let mut outcome = PairOutcome { status: Status::Done, ..PairOutcome::waiting(pair) };
-    // Made by a batch, a stage counts where its record stands: one that failed when it was run again has left older results.
+    // Made by a batch, a stage counts where its record stands: one that failed when it was run
+    // again has left older results.
     let recorded = io::read_json(folder.join(RECORD)).ok().and_then(|r| r["stages"].as_array().map(Vec::len));
     for (k, stage) in stages(pair, &folder, tuning, 0).into_iter().enumerate() {
         if !stage.marker.exists() || recorded.is_some_and(|n| n <= k) {
@@ -216,7 +219,8 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Batch<'_> {
-    /// All pairs, at most `jobs` at a time and as many as the memory holds; outcomes in the table's order.
+    /// All pairs, at most `jobs` at a time and as many as the memory holds; outcomes in the table's
+    /// order.
     fn run(&self, jobs: usize) -> Result<Vec<PairOutcome>> {
         let output = &self.options.output;
         let outcomes = Mutex::new(self.pairs.iter().map(PairOutcome::waiting).collect::<Vec<_>>());
@@ -243,7 +247,8 @@ impl Batch<'_> {
                         all[index] = outcome;
                         let done = all.iter().filter(|o| o.status != Status::Waiting).count();
                         progress.set(&format!("{done} of {} pairs", all.len()), done as f64 / all.len() as f64);
-                        // What is known so far; the end of the run says when this cannot be written.
+                        // What is known so far; the end of the run says when this cannot be
+                        // written.
                         let _ =
                             io::write_rows(output.join(TABLE), &report::COLUMNS, all.iter().map(report::row).collect());
                         drop(all);
@@ -257,7 +262,8 @@ impl Batch<'_> {
         Ok(outcomes.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// The first waiting pair that the memory left holds, once there is one; none when nothing waits.
+    /// The first waiting pair that the memory left holds, once there is one; none when nothing
+    /// waits.
     fn take(&self, free: &Mutex<Free>, ended: &Condvar, needs: &[Result<u64>]) -> Option<(usize, u64)> {
         let mut state = locked(free);
         loop {
@@ -314,7 +320,8 @@ impl Batch<'_> {
         outcome
     }
 
-    /// All stages of a pair that are not done yet; whether there was one. An error is the stage and the reason.
+    /// All stages of a pair that are not done yet; whether there was one. An error is the stage and
+    /// the reason.
     fn stages(&self, pair: &Pair, folder: &Path, threads: usize) -> Result<bool, (&'static str, String)> {
         let path = folder.join(RECORD);
         let earlier = io::read_json(&path).unwrap_or_default();
@@ -355,7 +362,8 @@ fn record(stage: &Stage) -> Result<Value> {
     Ok(json!({ "stage": stage.name, "version": version, "arguments": stage.arguments, "inputs": inputs }))
 }
 
-/// Runs a stage as a process of its own, which ends with this one; its words go to `<stage>.log` in `folder`.
+/// Runs a stage as a process of its own, which ends with this one; its words go to `<stage>.log` in
+/// `folder`.
 fn execute(stage: &Stage, folder: &Path, threads: usize) -> Result<()> {
     let mut command = Command::new(std::env::current_exe()?);
     command.args(&stage.arguments).args(["--threads", &threads.to_string()]).env(ATTENDED, "1");

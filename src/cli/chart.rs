@@ -24,11 +24,13 @@ use std::time::Instant;
 pub struct Options {
     #[command(flatten)]
     target: Target,
-    /// Folder with initial and deformed volume and their truth or landmarks, as `palpate phantom` writes it; may be given
-    /// several times; then only the field is charted [default: an embedded spread]
+    /// Folder with initial and deformed volume and their truth or landmarks, as `palpate phantom`
+    /// writes it; may be given several times; then only the field is charted
+    /// [default: an embedded spread]
     #[arg(long, value_name = "DIR")]
     case: Vec<PathBuf>,
-    /// Also run other tools that are installed: greedy, ANTs, elastix, demons, plastimatch, MuJoCo (needs python3)
+    /// Also run other tools that are installed: greedy, ANTs, elastix, demons, plastimatch, MuJoCo
+    /// (needs python3)
     #[arg(long)]
     peers: bool,
     /// A small version: fewer and smaller cases, fewer settings
@@ -47,8 +49,8 @@ fn one_of(folder: &Path, names: &[&str]) -> Option<PathBuf> {
     names.iter().map(|n| folder.join(n)).find(|p| p.is_file())
 }
 
-/// A case from a folder: `initial` or `fixed`, `deformed` or `moving`, `truth`, `mask`, `landmarks.csv`. Warns of landmarks
-/// outside the volume.
+/// A case from a folder: `initial` or `fixed`, `deformed` or `moving`, `truth`, `mask`,
+/// `landmarks.csv`. Warns of landmarks outside the volume.
 fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Case> {
     if !folder.is_dir() {
         let what = if folder.exists() { "is not a folder" } else { "does not exist" };
@@ -103,7 +105,8 @@ fn case_names(folders: &[PathBuf]) -> Result<Vec<String>> {
 const SIDES: [usize; 4] = [32, 48, 80, 128];
 /// Nodes that are tried for the stiffness, the default last.
 const NODES: [usize; 5] = [1000, 2000, 4000, 8000, 20_000];
-/// Voxels across the pressed bodies: a third less, and the punch on the layers is too small to be found on coarse meshes.
+/// Voxels across the pressed bodies: a third less, and the punch on the layers is too small to be
+/// found on coarse meshes.
 const PRESSED: usize = 48;
 
 /// What the flags ask for that cannot be had together.
@@ -210,7 +213,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     console.say(&format!("{}  results      {}", report::text(&groups), look.display()))
 }
 
-/// The other tools; says which are left out, and goes on without any where they cannot be looked for.
+/// The other tools; says which are left out, and goes on without any where they cannot be looked
+/// for.
 fn find_peers(between: &Path, wanted: &impl Fn(Part) -> bool, console: &Console) -> Option<Peers> {
     let [field, grasp] = [Part::Field, Part::Grasp].map(wanted);
     if !field && !grasp {

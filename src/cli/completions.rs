@@ -23,7 +23,8 @@ pub fn run(options: &Options, mut command: Command, console: &Console) -> Result
 
 #[derive(Debug, Args)]
 pub struct ManOptions {
-    /// Folder for a page a command (palpate.1, palpate-field.1 ...); without it the main page goes to stdout
+    /// Folder for a page a command (palpate.1, palpate-field.1 ...); without it the main page goes
+    /// to stdout
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
 }

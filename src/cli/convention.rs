@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 
 #[derive(Debug, Args)]
 pub struct Convention {
-    /// Whose numbers the field holds: lps (ITK, ANTs, greedy, Slicer, palpate), ras, fsl, fsl-absolute or niftyreg
+    /// Whose numbers the field holds: lps (ITK, ANTs, greedy, Slicer, palpate), ras, fsl,
+    /// fsl-absolute or niftyreg
     #[arg(long, value_name = "NAME", default_value = "lps")]
     field_convention: FieldConvention,
     /// The volume that an FSL field leads to, where its grid is not the field's

@@ -1,4 +1,5 @@
-//! `palpate demo`: the whole chain on a synthetic finger pad, every stage scored against its truth, on one page.
+//! `palpate demo`: the whole chain on a synthetic finger pad, every stage scored against its truth,
+//! on one page.
 
 use super::Cli;
 use super::console::Console;

@@ -98,8 +98,8 @@ fn body(labels: &Mask, labelled: bool, most: usize) -> (&'static str, String) {
     ("labels", regions.join(", "))
 }
 
-/// The plan of `palpate stiffness` for labels, or a mask where not `labelled`; `frames` are the forces of a sequence, whose first
-/// field `path` is.
+/// The plan of `palpate stiffness` for labels, or a mask where not `labelled`; `frames` are the
+/// forces of a sequence, whose first field `path` is.
 pub fn stiffness(
     path: &Path,
     (labels, labelled): (&Mask, bool),

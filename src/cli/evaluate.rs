@@ -19,8 +19,8 @@ pub struct Options {
     /// Where to compare, on the same grid, 0 outside [default: everywhere]
     #[arg(long, value_name = "M")]
     mask: Option<PathBuf>,
-    /// Known places: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed), world mm, RAS; or two files of points
-    /// (.csv, .fcsv, .mrk.json), initial and deformed
+    /// Known places: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed), world mm, RAS; or
+    /// two files of points (.csv, .fcsv, .mrk.json), initial and deformed
     #[arg(long, value_name = "L", num_args = 1..=2)]
     landmarks: Vec<PathBuf>,
     /// JSON instead of text

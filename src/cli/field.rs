@@ -17,7 +17,8 @@ use std::time::Instant;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Volume before the deformation (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a DICOM series)
+    /// Volume before the deformation (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a
+    /// DICOM series)
     initial: PathBuf,
     /// Volume after it, on any grid
     deformed: PathBuf,
@@ -26,7 +27,8 @@ pub struct Options {
     /// Where to measure: a mask on the initial volume's grid, 0 outside
     #[arg(long, value_name = "M")]
     mask: Option<PathBuf>,
-    /// Bodies that slide along each other: labels on the initial volume's grid, 0 outside [default: found from the volumes]
+    /// Bodies that slide along each other: labels on the initial volume's grid, 0 outside
+    /// [default: found from the volumes]
     #[arg(long, value_name = "LABELS")]
     bodies: Option<PathBuf>,
     /// A body of --bodies that moves rigidly (a bone), by its label; may be given several times
@@ -51,19 +53,22 @@ pub struct Tuning {
     /// Time against error: fast, balanced or accurate [default: balanced]
     #[arg(long, value_parser = preset, conflicts_with = "config")]
     preset: Option<Preset>,
-    /// What makes the field: full (all voxels) or sparse (matches alone, as in the source) [default: full]
+    /// What makes the field: full (all voxels) or sparse (matches alone, as in the source)
+    /// [default: full]
     #[arg(long, value_parser = method)]
     method: Option<Method>,
     /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
     #[arg(long, value_name = "N")]
     points: Option<usize>,
-    /// Largest motion to look for, up to 200 mm [default: by size, twice as far where motion reaches it]
+    /// Largest motion to look for, up to 200 mm
+    /// [default: by size, twice as far where motion reaches it]
     #[arg(long, value_name = "MM")]
     search: Option<f64>,
     /// Seed of whatever is drawn at random [default: 1]
     #[arg(long, value_name = "S")]
     seed: Option<u64>,
-    /// Parameters from a file: summary.json of an earlier run, or its keys as JSON or TOML; flags go before it
+    /// Parameters from a file: summary.json of an earlier run, or its keys as JSON or TOML; flags
+    /// go before it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
 }

@@ -88,7 +88,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     console.say(&format!("{text}  results      {}", output.display()))
 }
 
-/// Force over indentation of the map's finite elements, of its columns, of one modulus and of the hemispheres.
+/// Force over indentation of the map's finite elements, of its columns, of one modulus and of the
+/// hemispheres.
 fn picture(outcome: &PadOutcome, force_n: Option<f64>) -> String {
     let pad = &outcome.pad;
     let line = |name: &str, colour: usize, dashed: bool, f: &dyn Fn(&[f64; 3]) -> f64| {

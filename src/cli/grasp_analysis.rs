@@ -1,4 +1,5 @@
-//! `palpate grasp-analysis`: posture force, energy surfaces, stability, degrees of freedom, push, pinch map.
+//! `palpate grasp-analysis`: posture force, energy surfaces, stability, degrees of freedom, push,
+//! pinch map.
 
 use super::console::Console;
 use super::grasp::{Choices, check_inputs};

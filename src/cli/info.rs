@@ -14,7 +14,8 @@ use std::path::{Path, PathBuf};
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Volumes, fields, label maps, tables of points, scenes, summary.json, or a folder of palpate or of a DICOM series
+    /// Volumes, fields, label maps, tables of points, scenes, summary.json, or a folder of palpate
+    /// or of a DICOM series
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// JSON instead of text

@@ -70,7 +70,8 @@ pub fn warn_of_places(path: &Path, stored: &Stored, warnings: &mut Vec<String>) 
     warnings.extend(two_places(stored).map(|w| format!("{}: {w}", path.display())));
 }
 
-/// A volume to measure on; warns of two placements and about single voxels without a number and refuses a volume without any.
+/// A volume to measure on; warns of two placements and about single voxels without a number and
+/// refuses a volume without any.
 pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
     warn_of_two_places(path, warnings);
     usable(io::read_volume(path)?, &path.display().to_string(), warnings)
@@ -139,7 +140,8 @@ pub fn same_grid(path: &Path, found: &Grid, grid: &Grid, reference: &Path) -> Re
     Ok(())
 }
 
-/// Landmarks of one table, or of two files of points, in the volume on `grid`; warns of those that lie outside it.
+/// Landmarks of one table, or of two files of points, in the volume on `grid`; warns of those that
+/// lie outside it.
 ///
 /// # Errors
 /// When a file cannot be read, or all of them lie outside.

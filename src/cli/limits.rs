@@ -1,4 +1,5 @@
-//! What ends a run before its time: too little memory, Ctrl-C, a time limit, the end of the batch that it is a part of.
+//! What ends a run before its time: too little memory, Ctrl-C, a time limit, the end of the batch
+//! that it is a part of.
 
 use super::console::Console;
 use anyhow::{Result, bail};
@@ -17,7 +18,8 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
-/// Refuses a field run on two volumes that needs more memory than is left, before their voxels are read.
+/// Refuses a field run on two volumes that needs more memory than is left, before their voxels are
+/// read.
 pub fn field_fits(initial: &Path, deformed: &Path) -> Result<()> {
     // A header that cannot be read is reported by who reads the whole.
     let (Ok((a, _)), Ok((b, _))) = (io::read_header(initial), io::read_header(deformed)) else { return Ok(()) };
@@ -64,12 +66,12 @@ fn stop(console: &Console, why: &str, code: i32) -> ! {
     exit(code)
 }
 
-/// In the environment of a process that is to end when its standard input does: whoever started it holds the other end,
-/// however that one ends.
+/// In the environment of a process that is to end when its standard input does: whoever started it
+/// holds the other end, however that one ends.
 pub const ATTENDED: &str = "PALPATE_ATTENDED";
 
-/// Watches for Ctrl-C and the like (exit code 128 + the signal's number, as shells have it), for the end of `limit` and for
-/// that of whoever attends to this process (exit code 1).
+/// Watches for Ctrl-C and the like (exit code 128 + the signal's number, as shells have it), for
+/// the end of `limit` and for that of whoever attends to this process (exit code 1).
 pub fn watch(console: Console, limit: Option<Duration>) {
     let run_out = console.clone();
     let attended = console.clone();
@@ -90,8 +92,8 @@ pub fn watch(console: Console, limit: Option<Duration>) {
     }
 }
 
-/// Ends the program in its own way on SIGINT and SIGTERM; they are caught when this returns, so before anything is made. Without a
-/// thread for it they end the program in the system's way.
+/// Ends the program in its own way on SIGINT and SIGTERM; they are caught when this returns, so
+/// before anything is made. Without a thread for it they end the program in the system's way.
 #[cfg(unix)]
 fn catch_signals(console: Console) {
     use signal_hook::consts::{SIGINT, SIGTERM};

@@ -10,7 +10,8 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// matches.csv of a field run (the kept ones are taken), landmarks (fx,fy,fz,mx,my,mz) or points (x,y,z)
+    /// matches.csv of a field run (the kept ones are taken), landmarks (fx,fy,fz,mx,my,mz) or
+    /// points (x,y,z)
     points: PathBuf,
     /// File to write (.mrk.json)
     #[arg(short, long, value_name = "FILE")]

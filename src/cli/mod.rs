@@ -1,7 +1,7 @@
 //! Raw arguments to a checked plan to the pipeline; one file a subcommand.
 //!
-//! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0 done, 1 failed on
-//! this input, 2 wrong usage. A closed pipe ends the program quietly.
+//! Results go to files, a short summary to stdout, progress and warnings to stderr. Exit codes: 0
+//! done, 1 failed on this input, 2 wrong usage. A closed pipe ends the program quietly.
 
 mod batch;
 
@@ -111,11 +111,13 @@ enum Command {
     Stiffness(stiffness::Options),
     /// Reduce a stiffness map of a finger pad to a fingertip for grasps
     Fingertip(fingertip::Options),
-    /// Take a table of pairs through field, stiffness, fingertip and grasp, in parallel and resumable
+    /// Take a table of pairs through field, stiffness, fingertip and grasp, in parallel and
+    /// resumable
     Batch(batch::Options),
     /// Simulate a soft-finger grasp from a scene file
     Grasp(grasp::Options),
-    /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch map
+    /// Analyse a grasp: posture force, energy surfaces, stability, degrees of freedom, push, pinch
+    /// map
     GraspAnalysis(grasp_analysis::Options),
     /// Press, hold and let go layers of skin from a scene file
     Skin(skin::Options),
@@ -127,7 +129,8 @@ enum Command {
     Chart(chart::Options),
     /// Push each part until it breaks, and see whether it says so
     Stress(stress::Options),
-    /// Take a synthetic finger pad through every command, from images to a grasp, and score each step
+    /// Take a synthetic finger pad through every command, from images to a grasp, and score each
+    /// step
     Demo(demo::Options),
     /// Turn matches, landmarks or points into a point list of 3D Slicer
     Markups(markups::Options),
@@ -161,7 +164,8 @@ pub fn run() -> ExitCode {
         Cli::from_arg_matches(&whole().get_matches()).unwrap_or_else(|e| e.format(&mut whole()).exit());
     let console = Console::new(common.quiet, common.verbose);
     limits::watch(console.clone(), common.timeout);
-    // Everything runs inside the pool: work that starts on a thread of its own would wake the pool for each small step.
+    // Everything runs inside the pool: work that starts on a thread of its own would wake the pool
+    // for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
     let work = || dispatch(&command, &console);
     let done = match pool {

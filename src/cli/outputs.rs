@@ -74,8 +74,8 @@ pub struct Measured<'a> {
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
 }
 
-/// Voxels of a grid up to which what is made for a file is kept for the report. Of a larger one, files are made some rows at a time, and
-/// the report works out what it shows.
+/// Voxels of a grid up to which what is made for a file is kept for the report. Of a larger one,
+/// files are made some rows at a time, and the report works out what it shows.
 const KEPT: usize = 2_000_000;
 
 /// A scalar over the result's grid: kept, or worked out where it is asked for.
@@ -114,7 +114,8 @@ impl<'a> Layer<'a> {
     }
 }
 
-/// Stages all files, adds the times of warping and writing to the summary, and gives the short summary for stdout back.
+/// Stages all files, adds the times of warping and writing to the summary, and gives the short
+/// summary for stdout back.
 pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &mut FieldResult) -> Result<String> {
     let Measured { command, names, initial, deformed, mask, params, truth } = measured;
     let started = Instant::now();

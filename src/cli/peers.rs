@@ -1,4 +1,5 @@
-//! Other tools beside this one: each in a process of its own, by the script that the benchmarks use.
+//! Other tools beside this one: each in a process of its own, by the script that the benchmarks
+//! use.
 
 use anyhow::{Context, Result, bail};
 use palpate::io;
@@ -77,7 +78,8 @@ impl Peers {
         Ok(Self { folder: folder.into(), tools })
     }
 
-    /// Which tools are left out and what each of them needs; `field` and `grasp` say what is charted. None when all are here.
+    /// Which tools are left out and what each of them needs; `field` and `grasp` say what is
+    /// charted. None when all are here.
     pub fn left_out(&self, field: bool, grasp: bool) -> Option<String> {
         let asked = |t: &&Tool| if t.name == SIMULATOR { grasp } else { field };
         let mut by_need: Vec<(&str, Vec<&str>)> = Vec::new();
@@ -91,8 +93,8 @@ impl Peers {
         (!by_need.is_empty()).then(|| words.collect::<Vec<_>>().join("; "))
     }
 
-    /// Runs every method and this program's presets on `case`, each as a whole command with two threads. `progress` is called
-    /// with the part that is done.
+    /// Runs every method and this program's presets on `case`, each as a whole command with two
+    /// threads. `progress` is called with the part that is done.
     ///
     /// # Errors
     /// When the volumes cannot be written; a method that fails is a trial without a result.
@@ -155,8 +157,9 @@ impl Peers {
         Ok(Trial { whole: true, ..scored.unwrap_or_else(failed) })
     }
 
-    /// MuJoCo on the reference scene against the object's angles in `exact`, with that of its contact settings that comes
-    /// nearest; nothing where it is not installed or no setting keeps hold of the object.
+    /// MuJoCo on the reference scene against the object's angles in `exact`, with that of its
+    /// contact settings that comes nearest; nothing where it is not installed or no setting keeps
+    /// hold of the object.
     ///
     /// # Errors
     /// When the samples cannot be written, or MuJoCo is there and does not run.

@@ -18,7 +18,8 @@ const BIAS: f64 = 0.15;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// A pair: calf, slice, head, block, fingertip, inclusion or slab; a sequence: pinch, pen or contraction
+    /// A pair: calf, slice, head, block, fingertip, inclusion or slab; a sequence: pinch, pen or
+    /// contraction
     #[arg(value_parser = kind)]
     kind: Kind,
     /// Folder for the results
@@ -42,7 +43,8 @@ pub struct Options {
     /// none, translate, rotate, affine, smooth, press, slide, wave or elastic [default: by kind]
     #[arg(long)]
     motion: Option<MotionKind>,
-    /// Largest displacement in mm, degrees for rotate, largest strain in per cent for wave [default: by kind]
+    /// Largest displacement in mm, degrees for rotate, largest strain in per cent for wave
+    /// [default: by kind]
     #[arg(long, value_name = "MM")]
     amplitude: Option<f64>,
     /// Inclusion: Young's modulus of one inclusion over the background's [default: 5]

@@ -43,11 +43,13 @@ pub struct Options {
     /// A folder of palpate track: one stiffness map for all its frames
     #[arg(long, value_name = "DIR", conflicts_with_all = ["field", "matches", "force", "mask"])]
     sequence: Option<PathBuf>,
-    /// Sequence: total force in each frame but the reference, in order, lost ones too, in N (0: at rest); without, moduli are ratios
+    /// Sequence: total force in each frame but the reference, in order, lost ones too, in N (0: at
+    /// rest); without, moduli are ratios
     #[arg(long, value_name = "N,N,...", requires = "sequence", value_delimiter = ',', allow_hyphen_values = true)]
     pub(super) forces: Vec<f64>,
-    /// Matches to use inside the body, with their precision, in place of the field, which smoothness flattens; none for the
-    /// field itself [default: matches.csv of the same results of palpate field, if any]
+    /// Matches to use inside the body, with their precision, in place of the field, which
+    /// smoothness flattens; none for the field itself
+    /// [default: matches.csv of the same results of palpate field, if any]
     #[arg(long, value_name = "M.csv|none")]
     matches: Option<PathBuf>,
     /// The body: a mask on the field's grid; regions are then looked for
@@ -80,8 +82,8 @@ pub struct Options {
     /// Regions to try at most without labels, 1 to 8 [default: 4]
     #[arg(long, value_name = "N")]
     regions: Option<usize>,
-    /// Volume to show behind the maps in report.html; may be given several times [default: warped.nii.gz of the same results of
-    /// palpate field, if any: the deformed volume drawn back to where the initial one lies]
+    /// Volume to show behind the maps in report.html; may be given several times
+    /// [default: warped.nii.gz of the same results of palpate field, if any: the deformed volume drawn back to where the initial one lies]
     #[arg(long = "image", value_name = "FILE")]
     pub(super) images: Vec<PathBuf>,
     /// Folder for the results
@@ -130,8 +132,8 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
     named.map(PathBuf::from).collect()
 }
 
-/// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field; that is left out where it cannot
-/// be shown.
+/// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field; that
+/// is left out where it cannot be shown.
 pub(super) fn images(options: &Options, beside: Option<&Path>, grid: &Grid) -> Result<Vec<(String, Volume)>> {
     let read = |path: &Path| -> Result<Volume> {
         let shown = on_grid(io::read_volume(path)?, grid);
@@ -246,8 +248,8 @@ struct Source {
 }
 
 impl Source {
-    /// The matches of the same results are taken where none are named: the field between them is smoothed, which flattens
-    /// strain and with it a contrast.
+    /// The matches of the same results are taken where none are named: the field between them is
+    /// smoothed, which flattens strain and with it a contrast.
     fn of(given: &Path, matches: Option<&Path>) -> Self {
         let folder = given.is_dir();
         let field = if folder { given.join("displacement.nii.gz") } else { given.to_path_buf() };

@@ -109,7 +109,8 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
 /// What the summary of a track says.
 struct Tracked {
     reference: usize,
-    /// Numbers of all other frames, and whether each was measured; none in a summary that does not list them.
+    /// Numbers of all other frames, and whether each was measured; none in a summary that does not
+    /// list them.
     others: Option<Vec<(usize, bool)>>,
 }
 

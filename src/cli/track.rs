@@ -291,7 +291,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     console.say(&format!("{}{}", text(&report), target.look()))
 }
 
-/// Says so where files come in the order of their letters but not of their numbers: a shell lists frame_10 before frame_2.
+/// Says so where files come in the order of their letters but not of their numbers: a shell lists
+/// frame_10 before frame_2.
 fn out_of_order(volumes: &[PathBuf]) -> Option<String> {
     let names: Vec<String> = volumes.iter().map(|v| name(v)).collect();
     let (first, second) = names.iter().zip(&names[1..]).find(|(a, b)| numbers(a) > numbers(b))?;
@@ -350,8 +351,8 @@ fn none_against(error: anyhow::Error, reference: &str) -> anyhow::Error {
     error.context(format!("no volume can be measured against {reference}"))
 }
 
-/// What would be done, by the first frame that can be measured against the reference, which is number `origin`. Warns of frames that
-/// would be lost by what their headers say.
+/// What would be done, by the first frame that can be measured against the reference, which is
+/// number `origin`. Warns of frames that would be lost by what their headers say.
 fn plan(
     source: &mut Source<'_>,
     (origin, reference): (usize, &Volume),

@@ -26,7 +26,8 @@ pub struct Options {
     /// Image, label map or mask (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
     #[arg(required_unless_present = "points")]
     image: Option<PathBuf>,
-    /// Points to move instead: CSV with columns x,y,z (world mm, RAS), other columns are kept; or Slicer's .mrk.json, .fcsv
+    /// Points to move instead: CSV with columns x,y,z (world mm, RAS), other columns are kept; or
+    /// Slicer's .mrk.json, .fcsv
     #[arg(long, value_name = "P", conflicts_with_all = ["image", "reference", "interpolation"])]
     points: Option<PathBuf>,
     /// Displacement field (5-D NIfTI, .nrrd or .mha; LPS mm, as `palpate field` writes it)
@@ -102,7 +103,8 @@ fn grid_of(path: &Path, convention: &Convention) -> Result<Grid> {
     }
 }
 
-/// Points outside the field's grid keep their line in a table, with NaN for a place; a point list of Slicer has none of those.
+/// Points outside the field's grid keep their line in a table, with NaN for a place; a point list
+/// of Slicer has none of those.
 fn move_points(points: &Path, field: &DenseField, output: &Path, console: &Console) -> Result<()> {
     let mut table = io::read_points(points)?;
     let moved = warp_points(&table.points, field);

@@ -1,5 +1,5 @@
-//! Coupling of local evidence through a smooth field: each place pulls with its own information matrix, the bending
-//! energy of a spline lattice holds the places together.
+//! Coupling of local evidence through a smooth field: each place pulls with its own information
+//! matrix, the bending energy of a spline lattice holds the places together.
 
 use crate::numerics::ablation;
 use crate::numerics::bending::{Coupled, Smoothness, SolveReport};
@@ -10,8 +10,9 @@ use crate::numerics::random::Random;
 use crate::numerics::small::{Symmetric3, cholesky_solve, multiply, quadratic};
 use rayon::prelude::*;
 
-/// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises `1/2 d.A d - b.d + 1/2 (c + d).L (c + d)` with `A` and `L` the
-/// two parts of `matrix` (data and smoothness), and its root mean square length. `rhs` is `b`.
+/// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises
+/// `1/2 d.A d - b.d + 1/2 (c + d).L (c + d)` with `A` and `L` the two parts of `matrix` (data and
+/// smoothness), and its root mean square length. `rhs` is `b`.
 pub fn step(
     matrix: &Coupled<'_>,
     mut rhs: Vec<f32>,
@@ -34,18 +35,21 @@ pub fn step(
     (report, d, (moved / n as f64).sqrt() as f32)
 }
 
-/// How far the smoothness of a place and axis is drawn to that of the whole: weight of the mean over the lattice beside the
-/// window's own (dimensionless). Calibrated: docs/lab/2026-11-local-signal.md.
+/// How far the smoothness of a place and axis is drawn to that of the whole: weight of the mean
+/// over the lattice beside the window's own (dimensionless). Calibrated:
+/// docs/lab/2026-11-local-signal.md.
 const SHARED: f32 = 0.02;
 
-/// Width of the window over which smoothness is estimated (nodes, one standard deviation of a Gaussian).
+/// Width of the window over which smoothness is estimated (nodes, one standard deviation of a
+/// Gaussian).
 const WINDOW: f64 = 1.5;
 
-/// The weights of the bending energy that the data support at each node and axis (planar, three components).
+/// The weights of the bending energy that the data support at each node and axis (planar, three
+/// components).
 ///
-/// The evidence procedure (MacKay 1992), `determined / (2 energy)`, in a Gaussian window about each node under a gamma prior
-/// that draws each place and axis to the mean of all. `determined` and `energy` are planar and by node, `seen` the nodes
-/// that any data inform.
+/// The evidence procedure (MacKay 1992), `determined / (2 energy)`, in a Gaussian window about each
+/// node under a gamma prior that draws each place and axis to the mean of all. `determined` and
+/// `energy` are planar and by node, `seen` the nodes that any data inform.
 pub fn supported(determined: &[f32], energy: &[f32], nodes: [usize; 3], seen: usize) -> Vec<f32> {
     let n = determined.len() / 3;
     let shared = if ablation::is_on("local-smoothness") { SHARED } else { f32::MAX.sqrt() };
@@ -60,10 +64,11 @@ pub fn supported(determined: &[f32], energy: &[f32], nodes: [usize; 3], seen: us
     .collect()
 }
 
-/// How many degrees of freedom the data determine along each axis: `tr((A + L)^-1 A)` of its component (MacKay 1992).
+/// How many degrees of freedom the data determine along each axis: `tr((A + L)^-1 A)` of its
+/// component (MacKay 1992).
 ///
-/// The trace is estimated with one random sign vector `z` (Hutchinson 1990): `z.C^T (A + L)^-1 C z` with `C C^T = A`, which is
-/// good to about one part in the root of half of what it finds.
+/// The trace is estimated with one random sign vector `z` (Hutchinson 1990): `z.C^T (A + L)^-1 C z`
+/// with `C C^T = A`, which is good to about one part in the root of half of what it finds.
 pub fn determined(matrix: &Coupled<'_>, seed: u64, limit: usize) -> [f64; 3] {
     let by_node = Probe::new(matrix.blocks().len(), seed).determined(matrix, limit);
     total(&by_node)
@@ -75,8 +80,8 @@ pub fn total(planar: &[f32]) -> [f64; 3] {
     std::array::from_fn(|c| planar[c * n..(c + 1) * n].iter().map(|v| f64::from(*v)).sum())
 }
 
-/// The random sign vector of [`determined`] and its last solution, from which the next one starts: while a field settles, a
-/// few iterations a time suffice.
+/// The random sign vector of [`determined`] and its last solution, from which the next one starts:
+/// while a field settles, a few iterations a time suffice.
 #[derive(Debug, Clone)]
 pub struct Probe {
     signs: Vec<i8>,
@@ -91,10 +96,12 @@ impl Probe {
         Self { signs, solution: vec![0.0; 3 * nodes] }
     }
 
-    /// What each node and axis contributes to [`determined`] (planar); at most `limit` more iterations.
+    /// What each node and axis contributes to [`determined`] (planar); at most `limit` more
+    /// iterations.
     ///
-    /// With `b = C z` and `M = A + L` the sum is the greatest `(b.x)^2 / x.M x`: what the iterations are short of shows only
-    /// squared, and it is neither negative nor more than there is.
+    /// With `b = C z` and `M = A + L` the sum is the greatest `(b.x)^2 / x.M x`: what the
+    /// iterations are short of shows only squared, and it is neither negative nor more than there
+    /// is.
     pub fn determined(&mut self, matrix: &Coupled<'_>, limit: usize) -> Vec<f32> {
         let blocks = matrix.blocks();
         let n = blocks.len();
@@ -142,8 +149,8 @@ pub struct Evidence {
 /// What rounding of `lambda L c` may pull with, of what the evidence pulls with.
 const ROUNDING: f64 = 0.1;
 
-/// The largest weight of the bending energy in single precision: of an affine field `L c` is zero but for rounding, and that must
-/// not outweigh the evidence.
+/// The largest weight of the bending energy in single precision: of an affine field `L c` is zero
+/// but for rounding, and that must not outweigh the evidence.
 fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
     let pull = evidence.iter().map(|e| e.information[..3].iter().sum::<f64>() / 3.0).sum::<f64>();
     let rounded = smoothness.diagonal(&vec![1.0; smoothness.len()]).iter().map(|&v| f64::from(v)).sum::<f64>()
@@ -153,18 +160,20 @@ fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
 
 /// The smooth field nearest to scattered evidence, robustly.
 ///
-/// Minimises `sum_i rho(e_i . A_i e_i) + lambda c . L c` with `e_i = u(x_i) - d_i` by reweighted conjugate gradients:
-/// every place pulls only along the directions that its patch determines, so a match that slid along an edge does no
-/// harm (aperture). `rho` is Geman & McClure's, its scale falling from `start` to 3 standard deviations.
-/// `lambda` (per mm^3 of lattice cell) is set in each round from the evidence as in [`determined`], one for all axes: of an
-/// axis alone a few dozen matches tell too little. Where nothing bends, the evidence asks for ever more of it, up to what single
-/// precision bears.
+/// Minimises `sum_i rho(e_i . A_i e_i) + lambda c . L c` with `e_i = u(x_i) - d_i` by reweighted
+/// conjugate gradients: every place pulls only along the directions that its patch determines, so a
+/// match that slid along an edge does no harm (aperture). `rho` is Geman & McClure's, its scale
+/// falling from `start` to 3 standard deviations. `lambda` (per mm^3 of lattice cell) is set in
+/// each round from the evidence as in [`determined`], one for all axes: of an axis alone a few
+/// dozen matches tell too little. Where nothing bends, the evidence asks for ever more of it, up to
+/// what single precision bears.
 pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], rounds: usize) -> (Vec<f32>, f32) {
     fit_from(lattice, smoothness, evidence, None, rounds)
 }
 
-/// As [`fit`], from coefficients (mm, planar) and a weight (per lattice cell) that are nearly right: a few rounds of few iterations
-/// then suffice, the scale of `rho` starts low enough to end at 3 standard deviations, and `lambda` is set once.
+/// As [`fit`], from coefficients (mm, planar) and a weight (per lattice cell) that are nearly
+/// right: a few rounds of few iterations then suffice, the scale of `rho` starts low enough to end
+/// at 3 standard deviations, and `lambda` is set once.
 pub fn fit_from(
     lattice: &Lattice,
     smoothness: &Smoothness,
@@ -248,19 +257,22 @@ const SIDE_BY_SIDE: usize = 2;
 /// What the data leave open and what they determine, by node of a lattice.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Posterior {
-    /// Standard deviation of the coupled field along an axis (mm, root of the mean of the covariance's diagonal over the axes that
-    /// there are data of).
+    /// Standard deviation of the coupled field along an axis (mm, root of the mean of the
+    /// covariance's diagonal over the axes that there are data of).
     pub deviation: Vec<f32>,
-    /// Degrees of freedom that the data determine there, the node's part of `tr((A + L)^-1 A)` (see [`determined`]).
+    /// Degrees of freedom that the data determine there, the node's part of `tr((A + L)^-1 A)` (see
+    /// [`determined`]).
     pub determined: Vec<f32>,
 }
 
 /// Deviation and degrees of freedom of the coupled field at each node.
 ///
-/// The covariance is `(A + L)^-1` with `L` the weighted energy; random vectors with just that covariance are drawn by solving for
-/// right-hand sides with covariance `A + L` (perturb and optimise, Papandreou & Yuille 2010), and their squares (those under `A`
-/// too) averaged over `draws`, those of the deviation over neighbouring nodes as well. Each solution starts from the affine one: where nothing bends, `lambda L`
-/// outweighs the data by so much that iterations would leave out all that an affine motion is uncertain by.
+/// The covariance is `(A + L)^-1` with `L` the weighted energy; random vectors with just that
+/// covariance are drawn by solving for right-hand sides with covariance `A + L` (perturb and
+/// optimise, Papandreou & Yuille 2010), and their squares (those under `A` too) averaged over
+/// `draws`, those of the deviation over neighbouring nodes as well. Each solution starts from the
+/// affine one: where nothing bends, `lambda L` outweighs the data by so much that iterations would
+/// leave out all that an affine motion is uncertain by.
 pub fn posterior(
     smoothness: &Smoothness,
     weights: &[f32],

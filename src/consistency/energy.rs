@@ -2,8 +2,8 @@
 //!
 //! `E = sum_i (1 - ncc_i) + lambda sum_(i,j) min(1, (|d_i - d_j| / (s0 + s |x_i - x_j|))^2)`
 //!
-//! over the graph of each place's nearest neighbours. The pair term is bounded, so one false match costs its neighbours
-//! no more than a constant (truncated quadratic, Blake & Zisserman 1987).
+//! over the graph of each place's nearest neighbours. The pair term is bounded, so one false match
+//! costs its neighbours no more than a constant (truncated quadratic, Blake & Zisserman 1987).
 
 use crate::numerics::neighbours::Neighbours;
 use crate::types::Candidate;
@@ -22,8 +22,8 @@ pub struct EnergyParams {
     pub neighbours: usize,
 }
 
-/// Places and the neighbours of each, with the displacement difference `s0 + s |x_i - x_j|` (mm) at which a pair
-/// counts as contradicting.
+/// Places and the neighbours of each, with the displacement difference `s0 + s |x_i - x_j|` (mm) at
+/// which a pair counts as contradicting.
 #[derive(Debug, Clone)]
 pub struct Graph {
     /// For each place: neighbour and allowed difference (mm).
@@ -48,7 +48,8 @@ impl Graph {
         Self { edges, pair_weight: params.lambda / params.neighbours.max(1) as f64 }
     }
 
-    /// The energy of `chosen` (one candidate number a place; places without candidates are left out), per place.
+    /// The energy of `chosen` (one candidate number a place; places without candidates are left
+    /// out), per place.
     pub fn energy(&self, candidates: &[Vec<Candidate>], chosen: &[usize]) -> f64 {
         let pick = |i: usize| candidates[i].get(chosen[i]);
         let (mut sum, mut places) = (0.0, 0usize);

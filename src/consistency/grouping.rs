@@ -1,8 +1,10 @@
-//! Matches that two motions explain where one does not: the seeds of bodies that slide along each other.
+//! Matches that two motions explain where one does not: the seeds of bodies that slide along each
+//! other.
 //!
-//! About every match the affine motion of its neighbours is fitted and grown over all that agree with it (sequential
-//! consensus, Fischler & Bolles 1981; layers of affine motion, Wang & Adelson 1994). The motion that explains most of what a
-//! known one leaves open splits the matches in two; neighbours in space draw each other to the same side.
+//! About every match the affine motion of its neighbours is fitted and grown over all that agree
+//! with it (sequential consensus, Fischler & Bolles 1981; layers of affine motion, Wang & Adelson
+//! 1994). The motion that explains most of what a known one leaves open splits the matches in two;
+//! neighbours in space draw each other to the same side.
 
 use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
@@ -10,13 +12,15 @@ use crate::numerics::neighbours::Neighbours;
 use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, quadratic};
 use rayon::prelude::*;
 
-/// Squared Mahalanobis distance (three degrees of freedom, 99.9 %) at which a motion says nothing of a match.
+/// Squared Mahalanobis distance (three degrees of freedom, 99.9 %) at which a motion says nothing
+/// of a match.
 const GATE: f64 = 16.27;
 
 /// Neighbours about a match from which a motion is fitted.
 const NEIGHBOURS: usize = 8;
 
-/// Difference of displacement that neighbours of one body may show: a part of the voxel, and a strain.
+/// Difference of displacement that neighbours of one body may show: a part of the voxel, and a
+/// strain.
 const ALIKE: [f64; 2] = [0.5, 0.5];
 
 /// What an affine motion may be off beyond a match's covariance (voxels), as it grows.
@@ -40,12 +44,13 @@ const ROUNDS: usize = 10;
 /// Matches more, in whole ones, that a second motion must explain for a split to be looked at.
 const WORTH: f64 = 3.0;
 
-/// Squared distance that the second motion must take from each match on its side (mean): the degrees of freedom of one.
+/// Squared distance that the second motion must take from each match on its side (mean): the
+/// degrees of freedom of one.
 const FREEDOM: f64 = 3.0;
 
-/// The second side of each split of `matches` that two motions explain better than one: at most two, the first against what is
-/// known of them ([`Measured::field`]), the other against the affine motion that explains most of them. `voxel` is the level's
-/// finest edge (mm).
+/// The second side of each split of `matches` that two motions explain better than one: at most
+/// two, the first against what is known of them ([`Measured::field`]), the other against the affine
+/// motion that explains most of them. `voxel` is the level's finest edge (mm).
 pub fn splits(matches: &[Measured], voxel: f64) -> Vec<Vec<bool>> {
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.place).collect();
     let tree = Neighbours::new(&places);
@@ -99,7 +104,8 @@ impl<'a> Informed<'a> {
         Self { matches, information: OFF.map(with) }
     }
 
-    /// Squared distance of each match from the displacement `at` it, in its own standard deviations, up to [`GATE`].
+    /// Squared distance of each match from the displacement `at` it, in its own standard
+    /// deviations, up to [`GATE`].
     fn costs(&self, off: usize, at: impl Fn(&Measured) -> [f64; 3]) -> Vec<f64> {
         let cost = |(m, i): (&Measured, &Option<Symmetric3>)| {
             let at = at(m);
@@ -131,7 +137,8 @@ impl<'a> Informed<'a> {
     }
 }
 
-/// The affine displacement nearest to that of `held`, by place; each counts by its mean variance and that of being `off` (mm).
+/// The affine displacement nearest to that of `held`, by place; each counts by its mean variance
+/// and that of being `off` (mm).
 fn affine(held: &[Measured], off: f64) -> Option<impl Fn([f64; 3]) -> [f64; 3] + use<>> {
     let n = held.len() as f64;
     let centre: [f64; 3] = std::array::from_fn(|a| held.iter().map(|m| m.place[a]).sum::<f64>() / n);
@@ -151,7 +158,8 @@ fn affine(held: &[Measured], off: f64) -> Option<impl Fn([f64; 3]) -> [f64; 3] +
     Some(move |p| rows.map(|row| row.iter().zip(from(p)).map(|(r, x)| r * x).sum()))
 }
 
-/// Which matches lie on the second side, by what either motion leaves of them and by their neighbours (mean field).
+/// Which matches lie on the second side, by what either motion leaves of them and by their
+/// neighbours (mean field).
 fn sides(first: &[f64], second: &[f64], near: &[Vec<usize>]) -> Vec<bool> {
     let chance = |log_odds: f64| 1.0 / (1.0 + (-log_odds).exp());
     let own: Vec<f64> = first.iter().zip(second).map(|(a, b)| 0.5 * (a - b)).collect();

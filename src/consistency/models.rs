@@ -1,11 +1,12 @@
 //! The smallest motion that explains the data: identity, rigid, affine, or a free field.
 //!
-//! Rigid and affine maps are fitted to all kept matches with their own covariances, robustly. Each is then compared
-//! with the free field by the volumes themselves: how much worse they agree under the map, in units of noise (twice the
-//! log-likelihood ratio). Fitting noise alone, a free field agrees better by about as much as it has degrees of freedom
-//! that the data determine, so an excess per degree of freedom near 1 or below says that the field shows nothing that
-//! the map does not. The first model, from the simplest, whose ratio is under [`CHANCE`] is taken; else the field stays
-//! free.
+//! Rigid and affine maps are fitted to all kept matches with their own covariances, robustly. Each
+//! is then compared with the free field by the volumes themselves: how much worse they agree under
+//! the map, in units of noise (twice the log-likelihood ratio). Fitting noise alone, a free field
+//! agrees better by about as much as it has degrees of freedom that the data determine, so an
+//! excess per degree of freedom near 1 or below says that the field shows nothing that the map does
+//! not. The first model, from the simplest, whose ratio is under [`CHANCE`] is taken; else the
+//! field stays free.
 
 use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
@@ -46,23 +47,28 @@ pub struct Choice {
     pub evidence: Vec<String>,
 }
 
-/// Excess misfit per determined degree of freedom up to which a simpler model stands. Measured on 96 phantoms without motion
-/// (four kinds, three noise levels, two sizes, four seeds): median 0.49, nine in ten under 1.07, at most 1.39.
+/// Excess misfit per determined degree of freedom up to which a simpler model stands. Measured on
+/// 96 phantoms without motion (four kinds, three noise levels, two sizes, four seeds): median 0.49,
+/// nine in ten under 1.07, at most 1.39.
 pub const CHANCE: f64 = 1.7;
 
-/// Degrees of freedom that are counted at least: with fewer, chance and rounding in the noise model weigh too much.
+/// Degrees of freedom that are counted at least: with fewer, chance and rounding in the noise model
+/// weigh too much.
 const FEWEST: f64 = 100.0;
 
-/// Median distance of the matches from a model (in units of `model_mm`, a fiftieth of a voxel) beyond which it does not stand,
-/// whatever the misfit: in a mask of a hundredth of a volume the degrees of freedom are overrated, and stillness passed for a
-/// motion of four voxels on which 32 of 34 matches agreed.
+/// Median distance of the matches from a model (in units of `model_mm`, a fiftieth of a voxel)
+/// beyond which it does not stand, whatever the misfit: in a mask of a hundredth of a volume the
+/// degrees of freedom are overrated, and stillness passed for a motion of four voxels on which 32
+/// of 34 matches agreed.
 const CONTRADICTED: f64 = 50.0;
 
-/// ... and in units of how far they are from the free field: matches that agree with nothing speak against no model.
+/// ... and in units of how far they are from the free field: matches that agree with nothing speak
+/// against no model.
 const ASTRAY: f64 = 1.5;
 
-/// Excess misfit per degree of freedom about any one place beyond which nothing is called still: tissue that moves is not outvoted by
-/// more tissue that does not. At rest, under noise, a bias or another contrast, it reached 5; muscle that moved inside a still ring had 11 and more.
+/// Excess misfit per degree of freedom about any one place beyond which nothing is called still:
+/// tissue that moves is not outvoted by more tissue that does not. At rest, under noise, a bias or
+/// another contrast, it reached 5; muscle that moved inside a still ring had 11 and more.
 pub const PLACE: f64 = 8.0;
 
 /// How much worse the volumes agree under a map than under the free field, in units of noise.
@@ -70,12 +76,14 @@ pub const PLACE: f64 = 8.0;
 pub struct Excess {
     /// Of the whole.
     pub total: f64,
-    /// Per degree of freedom about the place that speaks most against the map; asked of stillness alone.
+    /// Per degree of freedom about the place that speaks most against the map; asked of stillness
+    /// alone.
     pub worst: f64,
 }
 
-/// Chooses a model. `excess(m)` gives the excess misfit of a map against the free field, `determined` the field's
-/// degrees of freedom, `model_mm` what a match may be off beyond its covariance (mm).
+/// Chooses a model. `excess(m)` gives the excess misfit of a map against the free field,
+/// `determined` the field's degrees of freedom, `model_mm` what a match may be off beyond its
+/// covariance (mm).
 pub fn choose(
     matches: &[Measured],
     mut excess: impl FnMut(MotionModel, &AffineMotion) -> Excess,
@@ -142,7 +150,8 @@ fn product(m: &Matrix3, v: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| m[r][0] * v[0] + m[r][1] * v[1] + m[r][2] * v[2])
 }
 
-/// One reweighted Gauss-Newton step for `N` parameters; `jacobian(m)` has a column of three a parameter.
+/// One reweighted Gauss-Newton step for `N` parameters; `jacobian(m)` has a column of three a
+/// parameter.
 fn step<const N: usize>(
     matches: &[Measured],
     information: &[Symmetric3],

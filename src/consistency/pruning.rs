@@ -1,4 +1,5 @@
-//! Survivors: matches that agree with the coupled field and with a robust local affine fit of their neighbours.
+//! Survivors: matches that agree with the coupled field and with a robust local affine fit of their
+//! neighbours.
 
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, quadratic};
@@ -19,10 +20,10 @@ pub struct Measured {
 
 /// Which matches to keep.
 ///
-/// Two tests, both with the match's own covariance enlarged by `model_mm` (what a smooth field or an affine fit may
-/// miss): the squared Mahalanobis distance to the coupled field, and that to the affine map fitted to the (at most 24)
-/// nearest matches with weights from their distance to the field, must not pass `gate` (the 99.9 % point of chi-square
-/// with 3 degrees of freedom is 16.3).
+/// Two tests, both with the match's own covariance enlarged by `model_mm` (what a smooth field or
+/// an affine fit may miss): the squared Mahalanobis distance to the coupled field, and that to the
+/// affine map fitted to the (at most 24) nearest matches with weights from their distance to the
+/// field, must not pass `gate` (the 99.9 % point of chi-square with 3 degrees of freedom is 16.3).
 pub fn prune(matches: &[Measured], model_mm: f64, gate: f64) -> Vec<bool> {
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.place).collect();
     let tree = Neighbours::new(&places);

@@ -1,9 +1,10 @@
 //! Choice of one candidate for each place by mean-field relaxation.
 //!
-//! Each place holds a probability over its candidates; in every round it becomes `exp(-beta (1 - ncc + expected pair
-//! terms))`, normalised (relaxation labelling, Rosenfeld, Hummel & Zucker 1976; mean field annealing, Geiger & Girosi
-//! 1991), while `beta` grows. All places are updated from the round before, so the result does not depend on order or
-//! threads. A local minimum: the energy is given before and after.
+//! Each place holds a probability over its candidates; in every round it becomes
+//! `exp(-beta (1 - ncc + expected pair terms))`, normalised (relaxation labelling, Rosenfeld,
+//! Hummel & Zucker 1976; mean field annealing, Geiger & Girosi 1991), while `beta` grows. All
+//! places are updated from the round before, so the result does not depend on order or threads. A
+//! local minimum: the energy is given before and after.
 
 use crate::consistency::energy::{Graph, penalty};
 use crate::types::Candidate;

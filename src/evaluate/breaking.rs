@@ -22,9 +22,9 @@ pub struct Breaking<R> {
     pub holds_at: Option<f64>,
 }
 
-/// Tries `coarse` severities (at least 2) over `range`, harmless end first, and halves the interval before the first that
-/// breaks `halvings` times, or until nothing lies between. `run` may find that a severity cannot be had at all (`None`): the
-/// range ends there.
+/// Tries `coarse` severities (at least 2) over `range`, harmless end first, and halves the interval
+/// before the first that breaks `halvings` times, or until nothing lies between. `run` may find
+/// that a severity cannot be had at all (`None`): the range ends there.
 ///
 /// What lies past the first break is tried too, but not searched: a curve need not be monotone.
 pub fn breaking_point<R>(

@@ -8,14 +8,15 @@ use rayon::prelude::*;
 /// Half width of the band that holds 95 % of a normal distribution, in standard deviations.
 pub const BAND: f64 = 1.959_964;
 
-/// Width of the window in which texture is looked for (voxels, one standard deviation of a Gaussian).
+/// Width of the window in which texture is looked for (voxels, one standard deviation of a
+/// Gaussian).
 const WINDOW: f64 = 2.0;
 
 /// Texture must stand out of the noise by this.
 const STANDS_OUT: f32 = 2.0;
 
-/// The voxels of `mask` about which `volume` shows texture: its standard deviation in a Gaussian window of two voxels is
-/// twice that of the noise or more.
+/// The voxels of `mask` about which `volume` shows texture: its standard deviation in a Gaussian
+/// window of two voxels is twice that of the noise or more.
 pub fn textured(volume: &Volume, mask: &Mask) -> Mask {
     let (data, shape) = (volume.as_slice(), volume.grid().shape());
     let inside = mask.as_slice();
@@ -28,8 +29,9 @@ pub fn textured(volume: &Volume, mask: &Mask) -> Mask {
     Mask::from_voxels(*volume.grid(), |at, _| u8::from(inside[at] != 0 && square[at] - mean[at] * mean[at] >= least))
 }
 
-/// The share of displacement components over `mask` whose error is inside 1.96 of `sigma` (mm, one standard deviation
-/// along an axis, by voxel); none for an empty mask. The axis across a single slice does not count.
+/// The share of displacement components over `mask` whose error is inside 1.96 of `sigma` (mm, one
+/// standard deviation along an axis, by voxel); none for an empty mask. The axis across a single
+/// slice does not count.
 pub fn coverage(
     field: &DenseField,
     truth: &DenseField,

@@ -6,17 +6,20 @@ use crate::types::{Standing, Trial};
 /// Motion below this is none (mm).
 const NONE_MM: f64 = 1e-3;
 
-/// Whether errors are told as what is left of the motion: where every case has one. Else they are means as they are.
+/// Whether errors are told as what is left of the motion: where every case has one. Else they are
+/// means as they are.
 pub fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
     trials.into_iter().all(|t| t.nothing.is_some_and(|n| n > NONE_MM))
 }
 
-/// Each method over its cases, in the order in which methods first appear; [`Standing::on_front`] is set.
+/// Each method over its cases, in the order in which methods first appear; [`Standing::on_front`]
+/// is set.
 ///
-/// All errors are of one kind, by [`is_relative`] over all trials. Where that holds, a case without a result counts as doing
-/// nothing; else it is left out. CPU time is that of the runs with a result: what ends early was not faster. A method that
-/// has failed on some case is not on the front, since it stands there for other cases than the rest do, and one that
-/// has failed on all has neither error nor time (NaN).
+/// All errors are of one kind, by [`is_relative`] over all trials. Where that holds, a case without
+/// a result counts as doing nothing; else it is left out. CPU time is that of the runs with a
+/// result: what ends early was not faster. A method that has failed on some case is not on the
+/// front, since it stands there for other cases than the rest do, and one that has failed on all
+/// has neither error nor time (NaN).
 pub fn standings<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> Vec<Standing> {
     let trials: Vec<&Trial> = trials.into_iter().collect();
     let relative = is_relative(trials.iter().copied());
@@ -62,8 +65,8 @@ fn standing(group: &[&Trial], relative: bool) -> Option<Standing> {
     })
 }
 
-/// Numbers of the places (cost, error) that no other place beats in one without losing in the other, cheapest first.
-/// Places that are not finite are left out.
+/// Numbers of the places (cost, error) that no other place beats in one without losing in the
+/// other, cheapest first. Places that are not finite are left out.
 pub fn pareto(places: &[[f64; 2]]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..places.len()).filter(|&i| places[i].iter().all(|v| v.is_finite())).collect();
     order.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]).then(places[a][1].total_cmp(&places[b][1])));

@@ -1,8 +1,9 @@
 //! A displacement field against exact truth.
 //!
-//! Both fields lie on one grid; gradients are those of [`crate::numerics::differences`], percentiles interpolate
-//! linearly, landmarks are read off trilinearly with the edge value beyond the grid. Nothing is compared where the
-//! mask is zero. Fails when grids differ or the mask is empty.
+//! Both fields lie on one grid; gradients are those of [`crate::numerics::differences`],
+//! percentiles interpolate linearly, landmarks are read off trilinearly with the edge value beyond
+//! the grid. Nothing is compared where the mask is zero. Fails when grids differ or the mask is
+//! empty.
 
 pub mod breaking;
 
@@ -24,7 +25,8 @@ const STILL_MM: f64 = 0.1;
 /// More still voxels than this are needed for [`Metrics::still_mm`].
 const STILL_VOXELS: usize = 1000;
 
-/// Scores `field` against `truth` over `mask` (everywhere when `None`) and at `landmarks` (none when empty).
+/// Scores `field` against `truth` over `mask` (everywhere when `None`) and at `landmarks` (none
+/// when empty).
 ///
 /// # Errors
 /// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when the mask is empty, or
@@ -80,7 +82,8 @@ pub fn landmarks(field: &DenseField, landmarks: &[Landmark]) -> Vec<f64> {
     landmarks.iter().map(error).collect()
 }
 
-/// Numbers of the landmarks whose initial place lies more than half a voxel outside `grid`, where the field is not known.
+/// Numbers of the landmarks whose initial place lies more than half a voxel outside `grid`, where
+/// the field is not known.
 pub fn beyond(grid: &Grid, landmarks: &[Landmark]) -> Vec<usize> {
     let within = |l: &Landmark| inside(grid.shape(), grid.affine().to_voxel(l.initial));
     (0..landmarks.len()).filter(|&i| !within(&landmarks[i])).collect()

@@ -20,27 +20,29 @@ impl Default for HarrisParams {
     }
 }
 
-/// Slices worked on at once, and values of one product where slices are large: bounds the memory of the six products.
+/// Slices worked on at once, and values of one product where slices are large: bounds the memory of
+/// the six products.
 const SLAB: usize = 24;
 const VALUES: usize = 5 << 20;
 
 /// Foerstner's measure `det M / trace(adj M) = 1 / trace(M^-1)` at each voxel, (intensity/mm)^2.
 ///
-/// `M = G * (grad I grad I^T)` with gradients per mm and windows of the same width in mm along each axis, so
-/// anisotropic voxels weigh right. The measure is the inverse of the variance with which the place can be matched
-/// (Foerstner & Guelch 1987), needs no constant `k`, and is low on edges and planes. For one slice the in-plane 2 x 2
-/// form is used.
+/// `M = G * (grad I grad I^T)` with gradients per mm and windows of the same width in mm along each
+/// axis, so anisotropic voxels weigh right. The measure is the inverse of the variance with which
+/// the place can be matched (Foerstner & Guelch 1987), needs no constant `k`, and is low on edges
+/// and planes. For one slice the in-plane 2 x 2 form is used.
 pub fn response(data: &[f32], shape: [usize; 3], spacing: [f64; 3], params: HarrisParams) -> Vec<f32> {
     let finest = pyramid::finest(shape, spacing);
     let smooth = gaussian(data, shape, spacing.map(|s| params.derivative_sigma * finest / s));
     block_response(&smooth, shape, spacing, params.integration_sigma, [1; 3])
 }
 
-/// As [`response`], of a volume that is smooth already, for blocks of `step` voxels: the products of the gradients are
-/// averaged over each block and the window is applied there. `integration_sigma` is in voxels of the finest axis.
+/// As [`response`], of a volume that is smooth already, for blocks of `step` voxels: the products
+/// of the gradients are averaged over each block and the window is applied there.
+/// `integration_sigma` is in voxels of the finest axis.
 ///
-/// The result has [`reduced_shape`] of `step`; block `b` is centred at `(b + 0.5) * step - 0.5` voxels. Not finite voxels
-/// make their neighbours' response zero.
+/// The result has [`reduced_shape`] of `step`; block `b` is centred at `(b + 0.5) * step - 0.5`
+/// voxels. Not finite voxels make their neighbours' response zero.
 pub fn block_response(
     smooth: &[f32],
     shape: [usize; 3],
@@ -53,8 +55,8 @@ pub fn block_response(
     out
 }
 
-/// As [`block_response`], some slices at a time, from the first to the last: calls `each` with the first of them and their values,
-/// and holds no others.
+/// As [`block_response`], some slices at a time, from the first to the last: calls `each` with the
+/// first of them and their values, and holds no others.
 pub fn slabs(
     smooth: &[f32],
     shape: [usize; 3],
@@ -142,7 +144,8 @@ pub fn slabs(
     }
 }
 
-/// `det / trace(adj)` of `[xx, yy, zz, xy, xz, yz]`; with a flat axis (all its entries are zero) the 2 x 2 form.
+/// `det / trace(adj)` of `[xx, yy, zz, xy, xz, yz]`; with a flat axis (all its entries are zero)
+/// the 2 x 2 form.
 #[inline(always)]
 fn foerstner(m: [f32; 6], flat: bool) -> f32 {
     let [a, b, c, d, e, f] = m;

@@ -1,6 +1,7 @@
 //! Distinct places of a volume: the 3D Harris corner measure with an even spread.
 //!
-//! Needs texture: a constant volume has no features, which the caller must report. Positions are sub-voxel.
+//! Needs texture: a constant volume has no features, which the caller must report. Positions are
+//! sub-voxel.
 
 pub mod harris;
 

@@ -17,10 +17,11 @@ pub struct Corner {
 
 /// At most `wanted` local maxima of `response` above `least`, spread evenly.
 ///
-/// The volume is cut into cubes (in mm) of the size at which `wanted` of them fill the mask; each cube gives its best
-/// maximum, then its second best, and so on until there are enough (Brown, Szeliski & Winder 2005 have the same aim).
-/// Global ranking would crowd the points on the brightest structure: measured, five times fewer usable points.
-/// Positions are refined by a parabola along each axis. The result's order does not depend on threads.
+/// The volume is cut into cubes (in mm) of the size at which `wanted` of them fill the mask; each
+/// cube gives its best maximum, then its second best, and so on until there are enough (Brown,
+/// Szeliski & Winder 2005 have the same aim). Global ranking would crowd the points on the
+/// brightest structure: measured, five times fewer usable points. Positions are refined by a
+/// parabola along each axis. The result's order does not depend on threads.
 pub fn spread(
     response: &[f32],
     shape: [usize; 3],
@@ -34,8 +35,9 @@ pub fn spread(
     cells.best(found, wanted)
 }
 
-/// The corners of a smoothed volume, the same as [`spread`] finds in its [`harris::block_response`], of which only some slices are
-/// held at a time. `mask` is on the blocks; places are in blocks.
+/// The corners of a smoothed volume, the same as [`spread`] finds in its
+/// [`harris::block_response`], of which only some slices are held at a time. `mask` is on the
+/// blocks; places are in blocks.
 pub fn corners(
     smooth: &[f32],
     (shape, spacing): ([usize; 3], [f64; 3]),
@@ -48,7 +50,8 @@ pub fn corners(
     let cells = Cells::new(blocks, std::array::from_fn(|a| spacing[a] * step[a] as f64), mask, wanted);
     let plane = blocks[0] * blocks[1];
     let mut found = Vec::new();
-    // The last two slices of the slab before go first: a maximum is known once the slice after it is.
+    // The last two slices of the slab before go first: a maximum is known once the slice after it
+    // is.
     let mut window: Vec<f32> = Vec::new();
     harris::slabs(smooth, shape, spacing, integration_sigma, step, |first, slab| {
         let held = window.len() / plane;
@@ -104,8 +107,9 @@ impl Cells {
     }
 }
 
-/// Local maxima above `least` of some slices of a volume, the first of which is its slice `from`, in the order of memory. `mask` is that
-/// of the whole volume. The first and the last of more slices than one have none.
+/// Local maxima above `least` of some slices of a volume, the first of which is its slice `from`,
+/// in the order of memory. `mask` is that of the whole volume. The first and the last of more
+/// slices than one have none.
 fn maxima(response: &[f32], shape: [usize; 3], from: usize, mask: Option<&[u8]>, least: f32) -> Vec<Corner> {
     let [nx, ny, nz] = shape;
     let skipped = from * nx * ny;
@@ -127,7 +131,8 @@ fn maxima(response: &[f32], shape: [usize; 3], from: usize, mask: Option<&[u8]>,
     (0..nz).into_par_iter().flat_map_iter(in_slice).collect()
 }
 
-/// Whether a voxel exceeds its 26 neighbours (ties go to the later voxel); border voxels of a thick axis do not count.
+/// Whether a voxel exceeds its 26 neighbours (ties go to the later voxel); border voxels of a thick
+/// axis do not count.
 fn is_maximum(v: &[f32], shape: [usize; 3], at: [usize; 3]) -> bool {
     let range = |a: usize| if shape[a] == 1 { 0..=0 } else { -1..=1 };
     if (0..3).any(|a| shape[a] > 1 && (at[a] == 0 || at[a] + 1 == shape[a])) {

@@ -1,25 +1,29 @@
-//! Node displacements of a mesh to a dense field: barycentric (piecewise linear), by filling each element.
+//! Node displacements of a mesh to a dense field: barycentric (piecewise linear), by filling each
+//! element.
 //!
-//! Promises: every voxel whose centre lies in the mesh gets a value, voxels on a shared facet get the same from either
-//! side up to rounding, a linear field comes back to f32 rounding, and the result does not depend on the number of
-//! threads. Voxels outside the mesh keep zero, and the mask says which those are. Time grows with the number of
-//! elements and the voxels they hold.
+//! Promises: every voxel whose centre lies in the mesh gets a value, voxels on a shared facet get
+//! the same from either side up to rounding, a linear field comes back to f32 rounding, and the
+//! result does not depend on the number of threads. Voxels outside the mesh keep zero, and the mask
+//! says which those are. Time grows with the number of elements and the voxels they hold.
 //!
-//! Elements are filled in voxel coordinates, where any affine grid is the unit lattice and barycentric weights are what
-//! they were. One that is flat up to rounding is left to its neighbours, which hold the same voxels.
+//! Elements are filled in voxel coordinates, where any affine grid is the unit lattice and
+//! barycentric weights are what they were. One that is flat up to rounding is left to its
+//! neighbours, which hold the same voxels.
 
 use crate::error::MeshError;
 use crate::types::space::{cross, dot};
 use crate::types::{DenseField, Grid, Mask, TetMesh, TriMesh, Volume, WorldPoint};
 use rayon::prelude::*;
 
-/// Voxel centres this far (voxels) outside of an element are filled too, so that rounding leaves no gaps.
+/// Voxel centres this far (voxels) outside of an element are filled too, so that rounding leaves no
+/// gaps.
 const TOLERANCE: f64 = 1e-9;
 
 /// Rounding of a determinant, per unit of the coordinates that it is made of.
 const ROUNDING: f64 = 1e-15;
 
-/// Up to so many rows, cutting each with the faces costs less than finding those that an element reaches in a slice.
+/// Up to so many rows, cutting each with the faces costs less than finding those that an element
+/// reaches in a slice.
 const FEW_ROWS: usize = 6;
 
 /// Slices filled by one task.
@@ -34,7 +38,8 @@ pub struct Interpolated {
     pub inside: Mask,
 }
 
-/// The displacement at the voxel centres of `grid` inside the tetrahedra, from one displacement (mm) a node.
+/// The displacement at the voxel centres of `grid` inside the tetrahedra, from one displacement
+/// (mm) a node.
 ///
 /// # Errors
 /// [`MeshError::Length`] when there are not as many displacements as nodes.
@@ -72,7 +77,8 @@ fn voxel_nodes(nodes: &[WorldPoint], displacement: &[[f64; 3]], grid: &Grid) -> 
     Ok(nodes.iter().map(|&p| grid.affine().to_voxel(p).0).collect())
 }
 
-/// The gradient of each barycentric weight, over the common determinant that comes second (six times the volume).
+/// The gradient of each barycentric weight, over the common determinant that comes second (six
+/// times the volume).
 fn tetrahedron_gradients(x: &[[f64; 3]; 4]) -> ([[f64; 3]; 4], f64) {
     let [u, v, w] = [1, 2, 3].map(|i| minus(x[i], x[0]));
     let (b, c, d) = (cross(v, w), cross(w, u), cross(u, v));
@@ -131,8 +137,9 @@ fn fill_elements<const N: usize>(
     Interpolated { displacement: displacements, inside }
 }
 
-/// Whether an element is so thin, or so nearly so up to rounding, that all of it lies within the tolerance of its
-/// neighbours. `weights` are the gradients over the determinant: the least height is the determinant over the largest.
+/// Whether an element is so thin, or so nearly so up to rounding, that all of it lies within the
+/// tolerance of its neighbours. `weights` are the gradients over the determinant: the least height
+/// is the determinant over the largest.
 fn is_flat<const N: usize>(x: &[[f64; 3]; N], weights: &[[f64; 3]; N], determinant: f64) -> bool {
     let norm = |v: [f64; 3]| dot(v, v).sqrt();
     let steepest = weights.iter().map(|&g| norm(g)).fold(0.0, f64::max);
@@ -154,10 +161,12 @@ fn queues(elements: usize, depth: usize, slices: impl Fn(u32) -> std::ops::Range
 }
 
 impl Slab<'_> {
-    /// Fills one element with corners `x` (voxels), `values` (mm) there, and the `gradients` of its weights.
+    /// Fills one element with corners `x` (voxels), `values` (mm) there, and the `gradients` of its
+    /// weights.
     fn fill<const N: usize>(&mut self, x: &[[f64; 3]; N], values: &[[f64; 3]; N], gradients: &[[f64; 3]; N]) {
-        // A voxel is inside where each distance from a face, `offset + normal . p`, is at least minus the tolerance. Along
-        // a row that is where x is above (normal to the right) or below `limit[0] + limit[1] y + limit[2] z`.
+        // A voxel is inside where each distance from a face, `offset + normal . p`, is at least
+        // minus the tolerance. Along a row that is where x is above (normal to the right) or below
+        // `limit[0] + limit[1] y + limit[2] z`.
         let faces: [(bool, [f64; 3]); N] = std::array::from_fn(|i| {
             let [right, front, up] = gradients[i].map(|v| v / dot(gradients[i], gradients[i]).sqrt());
             // A face along the row is turned by less than the tolerance, to cut far away.
@@ -205,7 +214,8 @@ impl Slab<'_> {
         }
     }
 
-    /// Fills `count` voxels of a row from offset `at`: `start` in the first and `step` (mm) more in each that follows.
+    /// Fills `count` voxels of a row from offset `at`: `start` in the first and `step` (mm) more in
+    /// each that follows.
     #[inline(always)]
     fn fill_row(&mut self, at: usize, count: usize, start: [f64; 3], step: [f64; 3]) {
         let [right, front, up] = self.components.each_mut().map(|c| &mut c[at..at + count]);
@@ -262,7 +272,8 @@ fn voxel_range([low, high]: [f64; 2], count: usize) -> std::ops::Range<usize> {
     from..to.min(count).max(from)
 }
 
-/// The least number of voxels not below `v` (conversions saturate; faster than `ceil` where that is a call).
+/// The least number of voxels not below `v` (conversions saturate; faster than `ceil` where that is
+/// a call).
 #[inline(always)]
 fn round_up(v: f64) -> usize {
     let n = v as u32;

@@ -1,9 +1,10 @@
 //! The field that undoes a field.
 //!
-//! For each y the inverse v solves v = -u(y + v), u being trilinear. The fixed point v <- -u(y + v) (Christensen and
-//! Johnson 2001; Chen et al., Medical Physics 35, 2008) converges where neighbouring displacements differ by less than
-//! their distance; where it is slow, a damped Newton step with the gradient of the trilinear u takes over. Beyond its
-//! grid, u is held at the value of the nearest edge. Where u folds there is no inverse or more than one: folds are counted, since
+//! For each y the inverse v solves v = -u(y + v), u being trilinear. The fixed point v <- -u(y + v)
+//! (Christensen and Johnson 2001; Chen et al., Medical Physics 35, 2008) converges where
+//! neighbouring displacements differ by less than their distance; where it is slow, a damped Newton
+//! step with the gradient of the trilinear u takes over. Beyond its grid, u is held at the value of
+//! the nearest edge. Where u folds there is no inverse or more than one: folds are counted, since
 //! each y may still have an x that leads to it.
 
 use crate::field::jacobian::count_folds;
@@ -18,11 +19,14 @@ use rayon::prelude::*;
 pub struct Inverse {
     /// Displacement from deformed to initial places (mm, RAS).
     pub field: DenseField,
-    /// Largest |v(y) + u(y + v(y))| over the voxels whose initial place is on the field's grid (mm).
+    /// Largest |v(y) + u(y + v(y))| over the voxels whose initial place is on the field's grid
+    /// (mm).
     pub max_residual_mm: f64,
-    /// Voxels of the field that fold or turn inside out: what lies there has no inverse, or more than one.
+    /// Voxels of the field that fold or turn inside out: what lies there has no inverse, or more
+    /// than one.
     pub folds: usize,
-    /// Voxels of the field without a finite displacement: what would come from there has no inverse.
+    /// Voxels of the field without a finite displacement: what would come from there has no
+    /// inverse.
     pub not_finite: usize,
     /// Voxels whose initial place lies off the field's grid, where v rests on the edge values.
     pub outside: usize,
@@ -51,7 +55,8 @@ pub fn invert(field: &DenseField, grid: Option<&Grid>) -> Inverse {
 
 /// v(y): from y, steps towards the x with x + u(x) = y.
 fn solve(field: &DenseField, y: WorldPoint) -> [f64; 3] {
-    /// Good enough (mm), well under f32's resolution of a millimetre-sized displacement on a metre-sized grid.
+    /// Good enough (mm), well under f32's resolution of a millimetre-sized displacement on a
+    /// metre-sized grid.
     const TOLERANCE: f64 = 1e-5;
     const STEPS: usize = 60;
     let mut x = y;
@@ -63,7 +68,8 @@ fn solve(field: &DenseField, y: WorldPoint) -> [f64; 3] {
             break;
         }
         let step = if newton { newton_step(field, x, r).unwrap_or(r) } else { r };
-        // Halve a step that does not help; the last, smallest one is taken so that the search leaves a kink.
+        // Halve a step that does not help; the last, smallest one is taken so that the search
+        // leaves a kink.
         let mut factor = 1.0;
         let (mut next, mut next_r) = trial(field, x, y, step, factor);
         while length(next_r) >= before && factor > 0.1 {
@@ -86,7 +92,8 @@ fn residual(field: &DenseField, x: WorldPoint, y: WorldPoint) -> [f64; 3] {
     y.minus(x.moved(displacement(field, x)))
 }
 
-/// The solution s of (I + grad u(x)) s = r by Cramer's rule, `None` where it is singular or reverses orientation.
+/// The solution s of (I + grad u(x)) s = r by Cramer's rule, `None` where it is singular or
+/// reverses orientation.
 fn newton_step(field: &DenseField, x: WorldPoint, r: [f64; 3]) -> Option<[f64; 3]> {
     let f = deformation_gradient(trilinear_gradient(field, x));
     let det = determinant(&f);
@@ -101,7 +108,8 @@ fn newton_step(field: &DenseField, x: WorldPoint, r: [f64; 3]) -> Option<[f64; 3
     })
 }
 
-/// The gradient of the trilinear interpolant by world mm, as [`crate::numerics::differences::displacement_gradient`].
+/// The gradient of the trilinear interpolant by world mm, as
+/// [`crate::numerics::differences::displacement_gradient`].
 fn trilinear_gradient(field: &DenseField, x: WorldPoint) -> Matrix3 {
     let grid = field.grid();
     let (shape, p) = (grid.shape(), grid.affine().to_voxel(x));

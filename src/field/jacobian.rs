@@ -1,7 +1,8 @@
 //! How much a field swells or shrinks the tissue, and where it folds.
 //!
-//! Derivatives are central differences, one-sided at the border. In a one-slice volume nothing is known of the motion's
-//! change through the slice, so that derivative is zero and the determinant is that of the in-plane 2 x 2 block.
+//! Derivatives are central differences, one-sided at the border. In a one-slice volume nothing is
+//! known of the motion's change through the slice, so that derivative is zero and the determinant
+//! is that of the in-plane 2 x 2 block.
 
 use crate::error::FieldError;
 use crate::numerics::simd::dispatch;
@@ -9,7 +10,8 @@ use crate::types::{DenseField, Mask, Volume};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
-/// The Jacobian determinant of x + u(x) with respect to world mm (1): 1 = volume kept, at or below 0 = folded.
+/// The Jacobian determinant of x + u(x) with respect to world mm (1): 1 = volume kept, at or below
+/// 0 = folded.
 pub fn jacobian_determinant(field: &DenseField) -> Volume {
     Volume::by_rows(*field.grid(), |first, out| determinant_rows(field, first, out))
 }
@@ -38,7 +40,8 @@ pub fn count_folds(field: &DenseField, mask: Option<&Mask>) -> Result<usize, Fie
     Ok(folds(field, mask)?.len())
 }
 
-/// The offsets (x fastest) of the voxels whose determinant is at or below zero, within `mask` (everywhere when `None`), in order.
+/// The offsets (x fastest) of the voxels whose determinant is at or below zero, within `mask`
+/// (everywhere when `None`), in order.
 ///
 /// # Errors
 /// [`FieldError::GridMismatch`] when the mask has another shape.
@@ -80,14 +83,15 @@ fn up_to(field: &DenseField, mask: Option<&Mask>, limit: f32) -> Vec<usize> {
 /// Times that all that folds is gone over.
 const ROUNDS: usize = 500;
 
-/// Determinant below which a voxel counts as a fold to be opened, and to which it is: more than rounding in a file.
+/// Determinant below which a voxel counts as a fold to be opened, and to which it is: more than
+/// rounding in a file.
 const OPENED: [f32; 2] = [0.01, 0.02];
 
-/// Moves the voxels about each fold at the voxels that `count` (all where it is empty) by as little as opens it, until none is left or
-/// after 500 rounds.
+/// Moves the voxels about each fold at the voxels that `count` (all where it is empty) by as little
+/// as opens it, until none is left or after 500 rounds.
 ///
-/// Each step is the shortest along which the determinant, linear in the displacement of the voxels on both sides, rises to a
-/// little above zero (Kaczmarz's method on one constraint after another).
+/// Each step is the shortest along which the determinant, linear in the displacement of the voxels
+/// on both sides, rises to a little above zero (Kaczmarz's method on one constraint after another).
 pub fn unfold(field: &mut DenseField, count: &[u8]) {
     let counts = |at: usize| count.get(at).is_none_or(|c| *c != 0);
     let mut folds: Vec<usize> = up_to(field, None, OPENED[0]).into_iter().filter(|&at| counts(at)).collect();
@@ -131,7 +135,8 @@ pub fn unfold(field: &mut DenseField, count: &[u8]) {
             if short <= 0.0 {
                 continue;
             }
-            // How the determinant grows with the displacement of the voxel after, and falls with that of the one before.
+            // How the determinant grows with the displacement of the voxel after, and falls with
+            // that of the one before.
             let slope = |c: usize, a: usize| per[a] * (0..3).map(|r| cofactor[c][r] * inverse[a][r]).sum::<f64>();
             let slopes: [[f64; 3]; 3] = std::array::from_fn(|c| std::array::from_fn(|a| slope(c, a)));
             let square: f64 = 2.0 * slopes.iter().flatten().map(|s| s * s).sum::<f64>();
@@ -183,7 +188,8 @@ impl<'a> Derivative<'a> {
         self.run([end, j, k], [1, 0], 1.0, last);
     }
 
-    /// The same for a run with the same differences along x: over `before` and `after` voxels, times `scale`.
+    /// The same for a run with the same differences along x: over `before` and `after` voxels,
+    /// times `scale`.
     fn run(&self, [i, j, k]: [usize; 3], [before, after]: [usize; 2], scale: f32, out: &mut [f32]) {
         if out.is_empty() {
             return;

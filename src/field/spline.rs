@@ -8,10 +8,12 @@ use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
 
-/// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at its nodes.
+/// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at
+/// its nodes.
 pub type Spline = (Lattice, Vec<f32>);
 
-/// Evaluates the spline of each voxel's body at every voxel and turns it into world mm (RAS); `labels` may be empty where there is one.
+/// Evaluates the spline of each voxel's body at every voxel and turns it into world mm (RAS);
+/// `labels` may be empty where there is one.
 ///
 /// The lattices must lie over `grid`'s shape.
 fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
@@ -59,8 +61,8 @@ pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
     std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
 }
 
-/// A displacement field as its B-spline coefficients, one lattice a body that slides along others: all that a dense one is worked out
-/// from, and much smaller.
+/// A displacement field as its B-spline coefficients, one lattice a body that slides along others:
+/// all that a dense one is worked out from, and much smaller.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FieldSpline {
     grid: Grid,
@@ -74,8 +76,8 @@ pub struct FieldSpline {
 }
 
 impl FieldSpline {
-    /// From the spline of each body over `grid`, the body of each voxel and where nothing may fold (not 0); neither where there is one
-    /// body.
+    /// From the spline of each body over `grid`, the body of each voxel and where nothing may fold
+    /// (not 0); neither where there is one body.
     pub fn new(grid: Grid, bodies: Vec<Spline>, labels: Vec<u8>, tissue: Vec<u8>) -> Self {
         Self { grid, bodies, labels, tissue, stored: None }
     }
@@ -96,8 +98,8 @@ impl FieldSpline {
         self.bodies.first_mut().filter(|_| one)
     }
 
-    /// The displacement at every voxel (mm, RAS). What folds, between the knots of a lattice or at a border between bodies, is opened
-    /// ([`jacobian::unfold`]).
+    /// The displacement at every voxel (mm, RAS). What folds, between the knots of a lattice or at
+    /// a border between bodies, is opened ([`jacobian::unfold`]).
     ///
     /// # Errors
     /// [`SpaceError`] where the grid it is asked for on is not one of the same voxels.
@@ -110,7 +112,8 @@ impl FieldSpline {
         }
     }
 
-    /// Voxels of `mask` beside another body, and how far that one moves from where the voxel's own does (mm).
+    /// Voxels of `mask` beside another body, and how far that one moves from where the voxel's own
+    /// does (mm).
     pub(crate) fn jumps(&self, mask: &Mask) -> Vec<([usize; 3], f32)> {
         let (shape, inside) = (self.grid.shape(), mask.as_slice());
         let stride = [1, shape[0], shape[0] * shape[1]];
@@ -130,7 +133,8 @@ impl FieldSpline {
     }
 }
 
-/// A smooth scalar over a grid, kept as its B-spline coefficients: small, and worked out where it is asked for.
+/// A smooth scalar over a grid, kept as its B-spline coefficients: small, and worked out where it
+/// is asked for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScalarSpline {
     grid: Grid,

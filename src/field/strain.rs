@@ -6,14 +6,16 @@ use crate::numerics::small::{Symmetric3, eigenvalues};
 use crate::types::{DenseField, Grid, Mask};
 use rayon::prelude::*;
 
-/// The Green-Lagrange strain E = (G + G^T + G^T G) / 2 of a displacement gradient G (rows: components; 1), that is
-/// (F^T F - I) / 2: free of rotation, on the initial configuration (Holzapfel 2000, eq. 2.69).
+/// The Green-Lagrange strain E = (G + G^T + G^T G) / 2 of a displacement gradient G (rows:
+/// components; 1), that is (F^T F - I) / 2: free of rotation, on the initial configuration
+/// (Holzapfel 2000, eq. 2.69).
 pub fn green_lagrange(g: &[[f64; 3]; 3]) -> Symmetric3 {
     let e = |r: usize, c: usize| 0.5 * (g[r][c] + g[c][r] + (0..3).map(|k| g[k][r] * g[k][c]).sum::<f64>());
     [e(0, 0), e(1, 1), e(2, 2), e(0, 1), e(0, 2), e(1, 2)]
 }
 
-/// Green-Lagrange strain at every voxel, from central differences (one-sided at the border), axes in RAS.
+/// Green-Lagrange strain at every voxel, from central differences (one-sided at the border), axes
+/// in RAS.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StrainField {
     grid: Grid,
@@ -29,7 +31,8 @@ impl StrainField {
         Self { grid, values: (0..grid.len()).into_par_iter().map(strain).collect() }
     }
 
-    /// Of a displacement field of `bodies` (labels, 0 outside them) that slide along each other: no difference is taken from one to another.
+    /// Of a displacement field of `bodies` (labels, 0 outside them) that slide along each other: no
+    /// difference is taken from one to another.
     ///
     /// # Errors
     /// [`FieldError::GridMismatch`] when the labels lie on another grid.

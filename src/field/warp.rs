@@ -1,15 +1,17 @@
 //! Images, labels and points carried along a displacement field.
 //!
-//! An image is resampled at x + u(x), so the deformed volume comes to look like the initial one; a point moves to
-//! p + u(p), so it goes from the initial to the deformed place. The image may lie on any grid. Where x lies outside
-//! the field's grid the field says nothing: such voxels get the background value, such points `None`.
+//! An image is resampled at x + u(x), so the deformed volume comes to look like the initial one; a
+//! point moves to p + u(p), so it goes from the initial to the deformed place. The image may lie on
+//! any grid. Where x lies outside the field's grid the field says nothing: such voxels get the
+//! background value, such points `None`.
 
 use crate::numerics::cubic::LANES;
 use crate::numerics::sampling::{Interpolation, Sampler, displacement, inside, nearest};
 use crate::numerics::simd::dispatch;
 use crate::types::{Displacement, Grid, Volume, Voxels, WorldPoint};
 
-/// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background` outside the image.
+/// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background`
+/// outside the image.
 pub fn warp_image(
     image: &Voxels<'_>,
     field: &Displacement<'_>,
@@ -25,7 +27,8 @@ pub fn warp_image(
     warp_with(field, reference, background, |target| sampler.at(affine.to_voxel(target)))
 }
 
-/// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be sampled.
+/// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be
+/// sampled.
 pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>) -> Volume {
     Volume::by_rows(*field.grid(), |first, out| warp_rows(sampler, image, field, first, out))
 }
@@ -69,7 +72,8 @@ pub fn warped_at(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, 
     sampler.at(image.affine().to_voxel(to))
 }
 
-/// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not there.
+/// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not
+/// there.
 pub fn warp_labels<T: Copy + Default + Send + Sync>(
     labels: &Volume<T>,
     field: &Displacement<'_>,

@@ -1,8 +1,9 @@
 //! A stiffness map of a finger pad reduced to a fingertip model: springs on a hard back plate.
 //!
-//! The parallel distributed model (Inoue & Hirai 2006) with springs that are not alike: each column of tissue between the
-//! surface and the back plate (the bone) is a spring whose compliance is the sum of its layers', `sum dz / E` for each unit
-//! of area. A plate pressed in by d shortens a column that lies `gap` behind the foremost one by d - gap, so
+//! The parallel distributed model (Inoue & Hirai 2006) with springs that are not alike: each column
+//! of tissue between the surface and the back plate (the bone) is a spring whose compliance is the
+//! sum of its layers', `sum dz / E` for each unit of area. A plate pressed in by d shortens a
+//! column that lies `gap` behind the foremost one by d - gap, so
 //! `F(d) = sum A (d - gap)+ / sum(dz / E)`. For a uniform hemisphere this is `pi E d^2`.
 
 use crate::error::FingertipError;
@@ -14,9 +15,10 @@ const FEWEST: usize = 20;
 
 /// The columns of a pad under its surface, along the voxel axis that faces the contact.
 ///
-/// `modulus` is Young's modulus (kPa; 0 outside), `bone` tells it from tissue by its offset. The contact comes from the
-/// end of `axis` (0, 1 or 2) that `from_end` names. Columns that pass the bone end at the depth where it begins nearest
-/// to the contact: the back plate is thought to go on there.
+/// `modulus` is Young's modulus (kPa; 0 outside), `bone` tells it from tissue by its offset. The
+/// contact comes from the end of `axis` (0, 1 or 2) that `from_end` names. Columns that pass the
+/// bone end at the depth where it begins nearest to the contact: the back plate is thought to go on
+/// there.
 ///
 /// # Errors
 /// [`FingertipError`] when no column meets bone, or too few have tissue.
@@ -78,8 +80,9 @@ fn uniform_force(columns: &[Column], modulus: f64, depth: f64) -> f64 {
 
 /// One modulus, layers, or the whole map: the smallest that gives the map's forces.
 ///
-/// `deepest` is the indentation up to which they are compared (mm). Layered means that all columns have the compliance of
-/// a mean column of their length, `length * p + q`: a surface layer of one thickness over a uniform rest.
+/// `deepest` is the indentation up to which they are compared (mm). Layered means that all columns
+/// have the compliance of a mean column of their length, `length * p + q`: a surface layer of one
+/// thickness over a uniform rest.
 pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     let depths: Vec<f64> = (1..=24).map(|i| deepest * f64::from(i) / 24.0).collect();
     let map: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
@@ -87,7 +90,8 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     let one: Vec<f64> = depths.iter().map(|&d| uniform_force(columns, 1.0, d)).collect();
     let effective = dot(&one, &map) / dot(&one, &one).max(f64::MIN_POSITIVE);
     let uniform: Vec<f64> = one.iter().map(|f| effective * f).collect();
-    // Least squares of compliance against length, weighted by area and what the deepest press asks of a column.
+    // Least squares of compliance against length, weighted by area and what the deepest press asks
+    // of a column.
     let (mut a, mut b) = ([[0.0; 2]; 2], [0.0; 2]);
     for c in columns {
         let w = c.area * (deepest - c.gap).max(0.0);
@@ -140,7 +144,8 @@ fn distance(model: &[f64], truth: &[f64]) -> f64 {
     (dot(&off, &off) / dot(truth, truth).max(f64::MIN_POSITIVE)).sqrt()
 }
 
-/// The hemispheres, of one modulus and of unlike springs, whose force is nearest to `force` (N) at `depths` (mm).
+/// The hemispheres, of one modulus and of unlike springs, whose force is nearest to `force` (N) at
+/// `depths` (mm).
 struct Tip {
     hemisphere_kpa: f64,
     hemisphere_residual: f64,
@@ -161,8 +166,8 @@ fn tip(depths: &[f64], force: &[f64]) -> Tip {
     }
 }
 
-/// The reduction of `columns` with its hemispheres fitted to the finite element forces `curve` (mm, N) of the same map, which
-/// was solved on `nodes` nodes.
+/// The reduction of `columns` with its hemispheres fitted to the finite element forces `curve` (mm,
+/// N) of the same map, which was solved on `nodes` nodes.
 pub fn against_plate(mut pad: PadReduction, columns: &[Column], curve: Vec<[f64; 2]>, nodes: usize) -> PadReduction {
     let (depths, forces): (Vec<f64>, Vec<f64>) = curve.iter().map(|c| (c[0], c[1])).unzip();
     let springs: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
@@ -180,8 +185,8 @@ const STIFF: f64 = 1e-4;
 /// Least modulus of a profile, over the mean.
 const LEAST: f64 = 0.02;
 
-/// Force (N) at `depth` (mm) of a hemisphere with moduli (kPa) by the depth at which its springs are reached:
-/// `F = int 2 pi E(s) (d - s) ds`, whatever its radius.
+/// Force (N) at `depth` (mm) of a hemisphere with moduli (kPa) by the depth at which its springs
+/// are reached: `F = int 2 pi E(s) (d - s) ds`, whatever its radius.
 pub fn profile_force(profile: &[[f64; 2]], depth: f64) -> f64 {
     (0..profile.len()).map(|k| profile[k][1] * hat_force(profile, k, depth)).sum()
 }
@@ -202,8 +207,8 @@ fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
     all.map(|s| 2e-3 * std::f64::consts::PI * hat(s) * (depth - s) * step).sum()
 }
 
-/// The moduli above [`LEAST`] whose forces are nearest to `force` at `depths`: least squares with a small weight on bends, by
-/// coordinate descent.
+/// The moduli above [`LEAST`] whose forces are nearest to `force` at `depths`: least squares with a
+/// small weight on bends, by coordinate descent.
 fn profile(depths: &[f64], force: &[f64], mean: f64) -> Vec<[f64; 2]> {
     let deepest = depths.last().copied().unwrap_or(1.0);
     let mut out: Vec<[f64; 2]> = (0..KNOTS).map(|k| [deepest * k as f64 / (KNOTS - 1) as f64, mean]).collect();
@@ -237,13 +242,15 @@ const ENOUGH: f64 = 0.02;
 /// Rounds of the fit of a sphere.
 const SPHERES: usize = 20;
 
-/// Radius (mm) of the sphere whose surface is nearest to that of the columns which a press of `deepest` mm touches: least squares of the
-/// gap along the press, from the paraboloid's on (Gauss and Newton). A paraboloid alone would give R less half of the deepest gap.
+/// Radius (mm) of the sphere whose surface is nearest to that of the columns which a press of
+/// `deepest` mm touches: least squares of the gap along the press, from the paraboloid's on (Gauss
+/// and Newton). A paraboloid alone would give R less half of the deepest gap.
 fn radius(columns: &[Column], deepest: f64) -> f64 {
     let near: Vec<&Column> = columns.iter().filter(|c| c.gap <= deepest).collect();
     let n = near.len().max(1) as f64;
     let middle = [0, 1].map(|a| near.iter().map(|c| c.place[a]).sum::<f64>() / n);
-    // gap = g + k s^2 / (1 + w) with s the distance from (x, y), w^2 = 1 - k^2 s^2 and k = 1 / R; w is 1 at first.
+    // gap = g + k s^2 / (1 + w) with s the distance from (x, y), w^2 = 1 - k^2 s^2 and k = 1 / R; w
+    // is 1 at first.
     let (mut k, mut at, mut g) = (0.0f64, [0.0; 2], 0.0);
     for round in 0..SPHERES {
         let (mut m, mut rhs) = ([[0.0; 4]; 4], [0.0; 4]);

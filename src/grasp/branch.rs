@@ -26,8 +26,8 @@ impl<'a> Branch<'a> {
         Self { statics, at: *start, limit: 0.1 * start.smallest_eigenvalue }
     }
 
-    /// Why the state `q`, `v` with the contact forces `f` is off the branch; none where it is on it. Unless `thorough`, a
-    /// stiff state is taken to be on it.
+    /// Why the state `q`, `v` with the contact forces `f` is off the branch; none where it is on
+    /// it. Unless `thorough`, a stiff state is taken to be on it.
     pub fn lost(&mut self, q: &Coordinates, v: &Coordinates, f: &[f64; 4], thorough: bool) -> Option<String> {
         if self.statics.tip.holds_normal() || (!thorough && self.statics.stiffer_than(self.limit, q, f)) {
             return None;

@@ -1,15 +1,17 @@
-//! Where the tips touch: displacements as functions of pose and joint angles, with their derivatives.
+//! Where the tips touch: displacements as functions of pose and joint angles, with their
+//! derivatives.
 //!
-//! With n = (cos theta, sin theta), t = (-sin theta, cos theta), tip centres O1, O2 and r_i = p - O_i, the normal
-//! constraints C_H and the integrated rolling constraints C_N of the source give
+//! With n = (cos theta, sin theta), t = (-sin theta, cos theta), tip centres O1, O2 and r_i = p -
+//! O_i, the normal constraints C_H and the integrated rolling constraints C_N of the source give
 //!
 //! ```text
 //! d_n1 = a + W/2 - r_1 . n        d_t1 = r_1 . t - a (theta_1 - theta)
 //! d_n2 = a + W/2 + r_2 . n        d_t2 = r_2 . t - a (theta_2 + theta)
 //! ```
 //!
-//! and the tilts are theta - theta_1 and -(theta + theta_2) (docs/grasp.md has both signs settled). Rows of a Jacobian
-//! stand in the order d_n1, d_n2, d_t1, d_t2; coordinates in the order x, y, theta, theta_1, theta_2.
+//! and the tilts are theta - theta_1 and -(theta + theta_2) (docs/grasp.md has both signs settled).
+//! Rows of a Jacobian stand in the order d_n1, d_n2, d_t1, d_t2; coordinates in the order x, y,
+//! theta, theta_1, theta_2.
 
 use crate::grasp::models::Tilt;
 use crate::numerics::trig::sin_cos;
@@ -134,8 +136,8 @@ impl Contact {
         [-n1, n2, t1, t2]
     }
 
-    /// J^T f plus the moments' part: generalised forces (N, N m) of the forces d_n1, d_n2, d_t1, d_t2 (N) and of the
-    /// moments on the tilts (N m).
+    /// J^T f plus the moments' part: generalised forces (N, N m) of the forces d_n1, d_n2, d_t1,
+    /// d_t2 (N) and of the moments on the tilts (N m).
     #[inline(always)]
     pub fn pull(&self, f: &[f64; 4], moments: &[f64; 2]) -> Coordinates {
         let [c, s] = self.face;
@@ -153,7 +155,8 @@ impl Contact {
         ]
     }
 
-    /// Moment about the object's centre (N m) of pushes, from [`crate::grasp::control::Inputs::moment`].
+    /// Moment about the object's centre (N m) of pushes, from
+    /// [`crate::grasp::control::Inputs::moment`].
     #[inline(always)]
     pub fn turn(&self, moment: [f64; 2]) -> f64 {
         moment[0] * self.face[0] - moment[1] * self.face[1]
@@ -164,7 +167,8 @@ impl Contact {
         std::array::from_fn(|row| self.pull(&std::array::from_fn(|k| f64::from(u8::from(k == row))), &[0.0; 2]))
     }
 
-    /// Sum of `f`_k times the second derivatives of d_k in (x, y, theta), joints fixed (N/m, N, N m).
+    /// Sum of `f`_k times the second derivatives of d_k in (x, y, theta), joints fixed (N/m, N, N
+    /// m).
     pub fn curvature(&self, f: &[f64; 4]) -> [[f64; 3]; 3] {
         let [c, s] = self.face;
         let [n1, n2, t1, t2] = *f;

@@ -1,6 +1,8 @@
-//! What drives the grasp from outside: desired joint angles along quintics, and pushes on the object.
+//! What drives the grasp from outside: desired joint angles along quintics, and pushes on the
+//! object.
 //!
-//! The joints are controlled by a PID law on their own angles alone; the object's pose is never fed back.
+//! The joints are controlled by a PID law on their own angles alone; the object's pose is never fed
+//! back.
 
 use crate::types::Scene;
 use crate::types::scene::{Motion, Push};
@@ -86,9 +88,11 @@ pub const SAME: f64 = 1e-9;
 /// The times of a run (s).
 #[derive(Debug, Clone)]
 pub struct Schedule {
-    /// Rising from 0: where motions, holds and pushes begin and end, and samples; between them the inputs are smooth.
+    /// Rising from 0: where motions, holds and pushes begin and end, and samples; between them the
+    /// inputs are smooth.
     pub times: Vec<f64>,
-    /// Ends of the rest and of each hold, with the number of the motion (0 for the rest) and its target (rad).
+    /// Ends of the rest and of each hold, with the number of the motion (0 for the rest) and its
+    /// target (rad).
     pub ends: Vec<(f64, usize, [f64; 2])>,
     /// The end.
     pub duration: f64,

@@ -1,5 +1,5 @@
-//! Degrees of freedom of rigid and of soft tips by the rank of the constraints' Jacobian, and what one or two 1-DOF
-//! fingers can set with their joint angles.
+//! Degrees of freedom of rigid and of soft tips by the rank of the constraints' Jacobian, and what
+//! one or two 1-DOF fingers can set with their joint angles.
 
 use crate::grasp::constraints::Coordinates;
 use crate::grasp::models::tip_of;
@@ -13,14 +13,15 @@ const TOLERANCE: f64 = 1e-9;
 /// Turn of a joint for the derivative of an equilibrium (rad).
 const TURN: f64 = 1e-5;
 
-/// The table for all models, at the pinch of a scene: two moving fingers, then one with the other locked.
+/// The table for all models, at the pinch of a scene: two moving fingers, then one with the other
+/// locked.
 pub fn table(scene: &Scene) -> Vec<Freedom> {
     let cases = FingertipModel::ALL.iter().flat_map(|(_, model)| [2, 1].map(|fingers| (*model, fingers)));
     cases.map(|(model, fingers)| freedom(scene, model, fingers)).collect()
 }
 
-/// Constraints C = D(q) - d = 0 as rows over (q, d): pose, the first `fingers` joints, and the displacements that the
-/// model allows.
+/// Constraints C = D(q) - d = 0 as rows over (q, d): pose, the first `fingers` joints, and the
+/// displacements that the model allows.
 fn freedom(scene: &Scene, model: FingertipModel, fingers: usize) -> Freedom {
     let tip = tip_of(&scene.fingertip, model);
     let scene = Scene { fingertip: crate::types::Fingertip { model, ..scene.fingertip.clone() }, ..scene.clone() };
@@ -44,7 +45,8 @@ fn freedom(scene: &Scene, model: FingertipModel, fingers: usize) -> Freedom {
     let displacements = soft.iter().filter(|s| **s).count();
     let (all, locked) = (rank(&over(fingers), TOLERANCE), rank(&over(0), TOLERANCE));
     let derivatives = if tip.holds_normal() {
-        // Without compliance no force follows from joint angles, and angles only move along the null space.
+        // Without compliance no force follows from joint angles, and angles only move along the
+        // null space.
         let turns = null_turn(&rows, fingers).map_or(Vec::new(), |t| vec![[t, 0.0]]);
         transposed(&turns)
     } else {
@@ -87,8 +89,8 @@ fn transposed(columns: &[[f64; 2]]) -> [[f64; 2]; 2] {
     out
 }
 
-/// Turn of the object along the one direction that four held rows leave of pose and joints, for a unit turn of joint 1;
-/// none where nothing is left, as with one finger.
+/// Turn of the object along the one direction that four held rows leave of pose and joints, for a
+/// unit turn of joint 1; none where nothing is left, as with one finger.
 fn null_turn(rows: &[Coordinates; 4], fingers: usize) -> Option<f64> {
     if fingers < 2 {
         return None;

@@ -1,15 +1,16 @@
-//! Steps through time: classical Runge-Kutta, semi-implicit Euler, and Dormand-Prince 5(4) with step control.
+//! Steps through time: classical Runge-Kutta, semi-implicit Euler, and Dormand-Prince 5(4) with
+//! step control.
 //!
-//! Sources: E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (II.1, II.4, II.5); E. Hairer,
-//! C. Lubich, G. Wanner, Geometric Numerical Integration (I.1.2).
+//! Sources: E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (II.1,
+//! II.4, II.5); E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (I.1.2).
 
 use crate::grasp::control::{Inputs, Phase};
 use crate::grasp::plant::Reading;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
-/// Equations of motion of first order. The first five entries of a state are positions, the next five their rates; from
-/// 13 on, four more positions and four more rates may follow.
+/// Equations of motion of first order. The first five entries of a state are positions, the next
+/// five their rates; from 13 on, four more positions and four more rates may follow.
 pub trait System<const N: usize> {
     /// The entry that holds the work done on the grasp; nothing depends on it.
     const WORK: usize;
@@ -107,7 +108,8 @@ impl Stepper for SemiImplicitEuler {
     }
 }
 
-/// Dormand and Prince's coefficients (Hairer et al., table II.5.2): nodes, stages, weights of order 5, error weights.
+/// Dormand and Prince's coefficients (Hairer et al., table II.5.2): nodes, stages, weights of order
+/// 5, error weights.
 const NODES: [f64; 7] = [0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0, 1.0];
 const STAGES: [[f64; 6]; 6] = [
     [0.2, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -124,8 +126,8 @@ const FLOOR: f64 = 1e-3;
 /// Shortest step that is tried (s).
 pub const SHORTEST: f64 = 1e-8;
 
-/// A step with control: the state, the contacts before it, the step taken and the one to try next (s). None where no
-/// step down to [`SHORTEST`] meets the tolerance.
+/// A step with control: the state, the contacts before it, the step taken and the one to try next
+/// (s). None where no step down to [`SHORTEST`] meets the tolerance.
 pub fn dormand_prince<const N: usize, S: System<N>>(
     system: &S,
     phase: &Phase,

@@ -1,8 +1,8 @@
-//! Equations of motion in minimal coordinates q = (x, y, theta, theta_1, theta_2):
-//! M q'' = -dU/dq - J^T diag(c_n, c_n, c_t, c_t) J q' + gravity + torques + pushes, M constant and diagonal.
+//! Equations of motion in minimal coordinates q = (x, y, theta, theta_1, theta_2): M q'' = -dU/dq -
+//! J^T diag(c_n, c_n, c_t, c_t) J q' + gravity + torques + pushes, M constant and diagonal.
 //!
-//! Nothing can drift. Rows that a model holds at 0 are kept by multipliers, and the coordinates are brought back onto
-//! them after each step.
+//! Nothing can drift. Rows that a model holds at 0 are kept by multipliers, and the coordinates are
+//! brought back onto them after each step.
 
 use crate::grasp::control::Inputs;
 use crate::grasp::integrators::System;

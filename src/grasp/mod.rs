@@ -1,4 +1,5 @@
-//! The soft-finger grasp simulator: two 1-DOF fingers with soft tips that hold a rectangular object.
+//! The soft-finger grasp simulator: two 1-DOF fingers with soft tips that hold a rectangular
+//! object.
 //!
 //! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue); docs/grasp.md has every
 //! equation and two signs of the slides that had to be settled. Order: [`models`] (fingertips), [`constraints`] (where
@@ -7,9 +8,10 @@
 //! [`simulate`] (the loop), then the
 //! analyses: [`stability`], [`freedom`], [`pinch`], [`posture`].
 //!
-//! Promises: SI units and radians everywhere; the same bits for the same scene; the object's pose is never fed back.
-//! Needs a scene that passes [`crate::types::Scene::check`]. Fails by name: every [`crate::types::grasp::EventKind`] is
-//! detected in the step where it happens, and a run ends there instead of going on without a meaning.
+//! Promises: SI units and radians everywhere; the same bits for the same scene; the object's pose
+//! is never fed back. Needs a scene that passes [`crate::types::Scene::check`]. Fails by name:
+//! every [`crate::types::grasp::EventKind`] is detected in the step where it happens, and a run
+//! ends there instead of going on without a meaning.
 
 pub mod models;
 

@@ -1,9 +1,10 @@
-//! Fingertip models behind one interface: energy as a function of normal displacement d, tangential displacement d_t
-//! and tilt, with its first and second derivatives.
+//! Fingertip models behind one interface: energy as a function of normal displacement d, tangential
+//! displacement d_t and tilt, with its first and second derivatives.
 //!
-//! Source: T. Inoue and S. Hirai, "Elastic Model of Deformable Fingertip for Soft-Fingered Manipulation", IEEE Trans.
-//! Robotics 22(6), 2006, and S. Hirai's slides. The tilt is the angle between the back plate and the object's face, with
-//! the sign of docs/grasp.md; SI units throughout.
+//! Source: T. Inoue and S. Hirai, "Elastic Model of Deformable Fingertip for Soft-Fingered
+//! Manipulation", IEEE Trans. Robotics 22(6), 2006, and S. Hirai's slides. The tilt is the angle
+//! between the back plate and the object's face, with the sign of docs/grasp.md; SI units
+//! throughout.
 
 use crate::grasp::tabulated::Tabulated;
 use crate::types::{Fingertip, FingertipModel};
@@ -86,8 +87,8 @@ impl<T: Tip + ?Sized> Tip for &T {
 /// Parallel distributed springs with tangential deformation:
 /// U = pi E (d^3 / (3 cos^2) + d^2 d_t tan + d d_t^2).
 ///
-/// The exact sum of linear springs that stand on the hemisphere along the back plate's normal, whose feet are pressed by
-/// d and dragged by d_t (tests/grasp.rs sums them).
+/// The exact sum of linear springs that stand on the hemisphere along the back plate's normal,
+/// whose feet are pressed by d and dragged by d_t (tests/grasp.rs sums them).
 #[derive(Debug, Clone, Copy)]
 pub struct Parallel {
     /// pi E (Pa).
@@ -131,7 +132,8 @@ impl Tip for Parallel {
     }
 }
 
-/// Parallel distributed springs, normal only: U = pi E d^3 / (3 cos^2); rolls without tangential deformation.
+/// Parallel distributed springs, normal only: U = pi E d^3 / (3 cos^2); rolls without tangential
+/// deformation.
 #[derive(Debug, Clone, Copy)]
 pub struct ParallelNormal {
     /// pi E (Pa).
@@ -156,7 +158,8 @@ impl Tip for ParallelNormal {
     }
 }
 
-/// Radially distributed springs as the source has them: f = pi E d^2, U = pi E d^3 / 3, whatever the posture.
+/// Radially distributed springs as the source has them: f = pi E d^2, U = pi E d^3 / 3, whatever
+/// the posture.
 #[derive(Debug, Clone, Copy)]
 pub struct Radial {
     /// pi E (Pa).
@@ -238,15 +241,17 @@ pub fn tip_of(fingertip: &Fingertip, model: FingertipModel) -> Box<dyn Tip> {
     }
 }
 
-/// Exact energy of springs along the radii of a hemisphere of radius `a` (m) that is pressed flat by `d` (m):
-/// pi E a^3 (1 - c^2 + 2 c ln c) with c = 1 - d / a (J). [`Radial`] is its first term in d / a.
+/// Exact energy of springs along the radii of a hemisphere of radius `a` (m) that is pressed flat
+/// by `d` (m): pi E a^3 (1 - c^2 + 2 c ln c) with c = 1 - d / a (J). [`Radial`] is its first term
+/// in d / a.
 pub fn exact_radial_energy(radius: f64, youngs_modulus: f64, d: f64) -> f64 {
     let part = d / radius;
     // 1 - c^2 and ln c without the difference to 1.
     PI * youngs_modulus * radius.powi(3) * (part * (2.0 - part) + 2.0 * (1.0 - part) * (-part).ln_1p())
 }
 
-/// Where the closed forms hold: 0 < d < a (1 - |sin tilt|), so that neither the face nor the back plate cuts the rim.
+/// Where the closed forms hold: 0 < d < a (1 - |sin tilt|), so that neither the face nor the back
+/// plate cuts the rim.
 #[inline(always)]
 pub fn in_range(radius: f64, d: f64, sin_tilt: f64) -> bool {
     d > 0.0 && d < radius * (1.0 - sin_tilt.abs())

@@ -1,10 +1,11 @@
-//! The source's equations of motion: Lagrange multipliers with constraint stabilisation (J. Baumgarte, Comput. Methods
-//! Appl. Mech. Eng. 1, 1972).
+//! The source's equations of motion: Lagrange multipliers with constraint stabilisation (J.
+//! Baumgarte, Comput. Methods Appl. Mech. Eng. 1, 1972).
 //!
-//! Displacements d and their rates w are coordinates of their own, tied to pose and joint angles by C = D(q) - d = 0.
-//! Tips have no mass, so their own equations say that the multipliers are the contact forces (lambda_H = -f_n,
-//! lambda_N = f_t); with these the object's and joints' equations give q'', and C'' + 2 g C' + g^2 C = 0 gives w'. The
-//! 13 x 13 system is block triangular and solved by substitution.
+//! Displacements d and their rates w are coordinates of their own, tied to pose and joint angles by
+//! C = D(q) - d = 0. Tips have no mass, so their own equations say that the multipliers are the
+//! contact forces (lambda_H = -f_n, lambda_N = f_t); with these the object's and joints' equations
+//! give q'', and C'' + 2 g C' + g^2 C = 0 gives w'. The 13 x 13 system is block triangular and
+//! solved by substitution.
 
 use crate::grasp::control::Inputs;
 use crate::grasp::integrators::System;
@@ -14,7 +15,8 @@ use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 use crate::types::scene::Rolling;
 
-/// Entries of a state: those of the minimal form, then d_n1, d_n2, d_t1, d_t2 (m) and their rates (m/s).
+/// Entries of a state: those of the minimal form, then d_n1, d_n2, d_t1, d_t2 (m) and their rates
+/// (m/s).
 pub const STATE: usize = 21;
 
 /// The multiplier form of a plant.

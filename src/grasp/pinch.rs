@@ -1,5 +1,5 @@
-//! The pinch map: over both joint angles, which postures can be reached from the pinch, are stable, hold without slip
-//! and lie in the model's range.
+//! The pinch map: over both joint angles, which postures can be reached from the pinch, are stable,
+//! hold without slip and lie in the model's range.
 
 use crate::grasp::models::tip_of;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
@@ -10,8 +10,9 @@ use std::collections::VecDeque;
 /// Called with the fraction that is done (0 to 1).
 pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 
-/// The map of `model` with `side` angles along each side from `-most` to `most` (rad); `side` is made odd, so that the
-/// pinch lies on it. Postures are reached from neighbour to neighbour, starting at the pinch, through such as hold.
+/// The map of `model` with `side` angles along each side from `-most` to `most` (rad); `side` is
+/// made odd, so that the pinch lies on it. Postures are reached from neighbour to neighbour,
+/// starting at the pinch, through such as hold.
 pub fn map(scene: &Scene, model: FingertipModel, most: f64, side: usize, progress: Progress<'_>) -> PinchMap {
     let side = side.max(3) | 1;
     let tip = tip_of(&scene.fingertip, model);

@@ -86,7 +86,8 @@ impl<T: Tip> Plant<T> {
         self.tip.holds_normal() || self.tip.holds_tangent()
     }
 
-    /// Forces of the displacements `d` at the rates `w` (N), and moments on the tilts (N m); held rows give none.
+    /// Forces of the displacements `d` at the rates `w` (N), and moments on the tilts (N m); held
+    /// rows give none.
     #[inline(always)]
     pub fn contact_forces(&self, contact: &Contact, d: &[f64; 4], w: &[f64; 4]) -> ([f64; 4], [f64; 2]) {
         let gradient = |i: usize| -> Gradient { self.tip.gradient(d[i], d[2 + i], contact.tilt(i)) };
@@ -99,8 +100,9 @@ impl<T: Tip> Plant<T> {
         (forces, [a.moment, b.moment])
     }
 
-    /// Accelerations under the contact forces `f` and `moments`. Held rows of `f` are solved for, so that their
-    /// constraints obey C'' + 2 g C' + g^2 C = 0 with the gain `g` (1/s), and put into `f`.
+    /// Accelerations under the contact forces `f` and `moments`. Held rows of `f` are solved for,
+    /// so that their constraints obey C'' + 2 g C' + g^2 C = 0 with the gain `g` (1/s), and put
+    /// into `f`.
     #[inline(always)]
     pub fn accelerations(
         &self,
@@ -203,7 +205,8 @@ impl<T: Tip> Plant<T> {
         pushed + torques[0] * v[3] + torques[1] * v[4] - lost
     }
 
-    /// Kinetic and potential energy (J) with the displacements `d`; and the elastic and kinetic part alone.
+    /// Kinetic and potential energy (J) with the displacements `d`; and the elastic and kinetic
+    /// part alone.
     pub fn energy(&self, contact: &Contact, q: &Coordinates, v: &Coordinates, d: &[f64; 4]) -> (f64, f64) {
         let kinetic: f64 = (0..5).map(|k| 0.5 * self.mass[k] * v[k] * v[k]).sum();
         let elastic: f64 = (0..2).map(|i| self.tip.energy(d[i], d[2 + i], contact.tilt(i))).sum();

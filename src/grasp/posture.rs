@@ -5,8 +5,9 @@ use crate::types::Fingertip;
 use crate::types::grasp::PostureForce;
 use std::f64::consts::PI;
 
-/// Forces along the back plate's normal, cos(tilt) dU/dd at d_t = 0 (N), for displacements to four tenths of the radius
-/// and tilts to 40 degrees: pi E d^2 / cos(tilt) for parallel springs, pi E d^2 for radial ones.
+/// Forces along the back plate's normal, cos(tilt) dU/dd at d_t = 0 (N), for displacements to four
+/// tenths of the radius and tilts to 40 degrees: pi E d^2 / cos(tilt) for parallel springs, pi E
+/// d^2 for radial ones.
 pub fn force(fingertip: &Fingertip) -> PostureForce {
     let stiffness = PI * fingertip.youngs_modulus;
     let (parallel_tip, radial_tip) = (Parallel { stiffness }, Radial { stiffness });

@@ -1,4 +1,5 @@
-//! A whole run: steps from border to border of the inputs, samples, and the watch over everything that can fail.
+//! A whole run: steps from border to border of the inputs, samples, and the watch over everything
+//! that can fail.
 
 use crate::error::GraspError;
 use crate::grasp::branch::{Branch, STRIDE};
@@ -25,7 +26,8 @@ const MOST_SLIPS: usize = 1000;
 
 /// Simulates a scene from its pinch at rest.
 ///
-/// The run ends early at the first event that [`EventKind::ends_run`]; what came before is given back.
+/// The run ends early at the first event that [`EventKind::ends_run`]; what came before is given
+/// back.
 ///
 /// # Errors
 /// [`GraspError`] where nothing can be simulated: a scene out of range, no stable equilibrium at the start, or a step or

@@ -1,7 +1,8 @@
-//! How the energy lies about the equilibria of the scene's postures: Hessians, their classes, and surfaces.
+//! How the energy lies about the equilibria of the scene's postures: Hessians, their classes, and
+//! surfaces.
 //!
-//! The parallel model is judged at its own equilibria, the radial one at the same poses: without tangential springs it
-//! has no equilibrium under gravity, so its gradient there is given too.
+//! The parallel model is judged at its own equilibria, the radial one at the same poses: without
+//! tangential springs it has no equilibrium under gravity, so its gradient there is given too.
 
 use crate::grasp::models::{in_range, tip_of};
 use crate::grasp::statics::{Equilibrium, Statics};
@@ -16,8 +17,8 @@ const POINTS: usize = 41;
 /// Models that are compared.
 pub const COMPARED: [FingertipModel; 2] = [FingertipModel::Parallel, FingertipModel::Radial];
 
-/// The equilibria of the pinch (step 0) and of each motion's target, on the branch from the pinch, with the model
-/// `model`; where one cannot be reached, the reason.
+/// The equilibria of the pinch (step 0) and of each motion's target, on the branch from the pinch,
+/// with the model `model`; where one cannot be reached, the reason.
 pub fn postures(scene: &Scene, model: FingertipModel) -> Vec<(usize, [f64; 2], Result<Equilibrium, String>)> {
     let tip = tip_of(&scene.fingertip, model);
     let statics = Statics::new(scene, tip.as_ref());
@@ -70,7 +71,8 @@ pub fn rows(scene: &Scene, step: usize, at: &Equilibrium) -> Vec<StabilityRow> {
     COMPARED.map(row).to_vec()
 }
 
-/// Energy over (theta, y) and (theta, x) about `at`, joints and the third coordinate fixed, for the compared models.
+/// Energy over (theta, y) and (theta, x) about `at`, joints and the third coordinate fixed, for the
+/// compared models.
 pub fn surfaces(scene: &Scene, step: usize, at: &Equilibrium) -> Vec<EnergySurface> {
     let a = scene.fingertip.radius;
     let least = at.displacements[0].min(at.displacements[1]);

@@ -117,7 +117,8 @@ impl<'a> Statics<'a> {
         [pull[0], pull[1] - self.weight, pull[2] / self.geometry.radius]
     }
 
-    /// Hessian of the energy in (x, y, a theta) (N/m), joints fixed; `f` are the contact forces, multipliers included.
+    /// Hessian of the energy in (x, y, a theta) (N/m), joints fixed; `f` are the contact forces,
+    /// multipliers included.
     pub fn hessian(&self, q: &Coordinates, f: &[f64; 4]) -> Square<3> {
         let contact = self.geometry.contact(q);
         let d = self.taken(&contact);
@@ -150,7 +151,8 @@ impl<'a> Statics<'a> {
         h
     }
 
-    /// Smallest eigenvalue of the Hessian along what the held constraints leave free (N/m). Without freedom: infinite.
+    /// Smallest eigenvalue of the Hessian along what the held constraints leave free (N/m). Without
+    /// freedom: infinite.
     pub fn smallest_eigenvalue(&self, q: &Coordinates, f: &[f64; 4]) -> f64 {
         let h = self.hessian(q, f);
         if self.tip.holds_normal() {
@@ -167,7 +169,8 @@ impl<'a> Statics<'a> {
         form / z.iter().map(|v| v * v).sum::<f64>()
     }
 
-    /// Whether the smallest eigenvalue is above `limit` (N/m), by the leading minors: much quicker than the value.
+    /// Whether the smallest eigenvalue is above `limit` (N/m), by the leading minors: much quicker
+    /// than the value.
     pub fn stiffer_than(&self, limit: f64, q: &Coordinates, f: &[f64; 4]) -> bool {
         if self.tip.holds_normal() || self.tip.holds_tangent() {
             return self.smallest_eigenvalue(q, f) > limit;
@@ -178,9 +181,10 @@ impl<'a> Statics<'a> {
         a > 0.0 && a * b - d * d > 0.0 && a * (b * c - g * g) - d * (d * c - g * e) + e * (d * g - b * e) > 0.0
     }
 
-    /// The closed form at joint angles 0 (docs/grasp.md): x = theta = 0, and for tips that deform along the face
-    /// y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the force that soft ones have at d_0. That of tabulated
-    /// tips is found next to it; its eigenvalue is not a number where there is none.
+    /// The closed form at joint angles 0 (docs/grasp.md): x = theta = 0, and for tips that deform
+    /// along the face y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the
+    /// force that soft ones have at d_0. That of tabulated tips is found next to it; its eigenvalue
+    /// is not a number where there is none.
     pub fn pinch(&self, scene: &Scene) -> Equilibrium {
         let d = scene.initial.normal_displacement;
         let stiffness = PI * scene.fingertip.youngs_modulus;
@@ -190,7 +194,8 @@ impl<'a> Statics<'a> {
         if scene.fingertip.model != FingertipModel::Tabulated {
             return self.at([0.0, sag - self.geometry.link, 0.0, 0.0, 0.0], forces);
         }
-        // Springs that are not alike have no closed form, but the same at the stiffness that they have along the face there.
+        // Springs that are not alike have no closed form, but the same at the stiffness that they
+        // have along the face there.
         let level = [0.0, -self.geometry.link, 0.0, 0.0, 0.0];
         let along = self.tip.curvature(d, 0.0, self.geometry.contact(&level).tilt(0))[1][1];
         let guess = self.at([0.0, self.weight / (2.0 * along) - self.geometry.link, 0.0, 0.0, 0.0], forces);
@@ -220,8 +225,9 @@ impl<'a> Statics<'a> {
         if k < 2 { self.tip.holds_normal() } else { self.tip.holds_tangent() }
     }
 
-    /// The equilibrium at `joints` (rad) next to the pose and forces of `guess`: Newton's method on the energy with
-    /// multipliers for held rows. None where it does not settle within a quarter of the radius.
+    /// The equilibrium at `joints` (rad) next to the pose and forces of `guess`: Newton's method on
+    /// the energy with multipliers for held rows. None where it does not settle within a quarter of
+    /// the radius.
     pub fn equilibrium(&self, joints: [f64; 2], guess: &Equilibrium) -> Option<Equilibrium> {
         let a = self.geometry.radius;
         let mut q = guess.q;
@@ -300,7 +306,8 @@ impl<'a> Statics<'a> {
         let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
         let most = (stride / whole).min(1.0);
         let (mut done, mut part) = (0.0, most);
-        // Pace here, as a way for the whole: from a tiny step, as a longer one's mean says little where the branch bends.
+        // Pace here, as a way for the whole: from a tiny step, as a longer one's mean says little
+        // where the branch bends.
         let tiny = 1e-6 / whole.max(1e-6);
         let pace = |here: &Equilibrium, done: f64| {
             let next = self.equilibrium(at(done + tiny), here)?;
@@ -313,7 +320,8 @@ impl<'a> Statics<'a> {
             let next = if done + part > 1.0 - 1e-6 { 1.0 } else { done + part };
             let step = next - done;
             let found = self.equilibrium(at(next), &here).filter(|e| e.smallest_eigenvalue > 0.0);
-            // A branch that is followed goes on as it went: another one, or a fold ahead, shows as a change of pace.
+            // A branch that is followed goes on as it went: another one, or a fold ahead, shows as
+            // a change of pace.
             let same = found.filter(|e| {
                 let moved = way(&here, e);
                 let off = std::array::from_fn(|k| moved[k] - speed[k] * step);

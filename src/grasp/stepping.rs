@@ -1,4 +1,5 @@
-//! Which steps are stable: the spectral radius of one step about a state, and the largest step that keeps it at 1.
+//! Which steps are stable: the spectral radius of one step about a state, and the largest step that
+//! keeps it at 1.
 
 use crate::grasp::control::Phase;
 use crate::grasp::integrators::{Rk4, SemiImplicitEuler, Stepper, System};
@@ -12,18 +13,20 @@ use crate::types::Scene;
 use crate::types::grasp::StableStep;
 use crate::types::scene::{Formulation, Method};
 
-/// Growth of a step that still counts as stable: rounding of the derivatives is far below, and it means a factor e in
-/// 100,000 steps.
+/// Growth of a step that still counts as stable: rounding of the derivatives is far below, and it
+/// means a factor e in 100,000 steps.
 pub const LIMIT: f64 = 1.0 + 1e-5;
 
-/// Spectral radius of one step of `h` seconds about `state`, from central differences of the step itself.
+/// Spectral radius of one step of `h` seconds about `state`, from central differences of the step
+/// itself.
 pub fn growth<P: Stepper, const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> f64 {
     let mut matrix = [[0.0; N]; N];
     for k in 0..N {
         if k == S::WORK {
             continue;
         }
-        // Displacements of a thousandth of a millimetre or a rad, rates of a millimetre or a rad a second.
+        // Displacements of a thousandth of a millimetre or a rad, rates of a millimetre or a rad a
+        // second.
         let delta = if (5..10).contains(&k) || k > 16 { 1e-4 } else { 1e-7 };
         let moved = |sign: f64| {
             let mut s = *state;
@@ -44,11 +47,13 @@ const PARTS: f64 = 50.0;
 /// Times that they are halved at most.
 const HALVINGS: usize = 24;
 
-/// Part of the exponent by which the growth of halved parts may differ for it to be the motion's own.
+/// Part of the exponent by which the growth of halved parts may differ for it to be the motion's
+/// own.
 const SETTLED: f64 = 0.005;
 
-/// By how much the motion itself grows in `h` seconds about `state`, from parts so short that halving them changes nothing; None where it
-/// does not. Longer parts would blow up by themselves, and what blows up in parts excused the step that blew up as a whole.
+/// By how much the motion itself grows in `h` seconds about `state`, from parts so short that
+/// halving them changes nothing; None where it does not. Longer parts would blow up by themselves,
+/// and what blows up in parts excused the step that blew up as a whole.
 fn own_growth<const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> Option<f64> {
     let mut parts = PARTS;
     let mut before = f64::NAN;
@@ -65,8 +70,9 @@ fn own_growth<const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, s
     None
 }
 
-/// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp itself is unstable (by
-/// its control, say) and the step follows that growth to 2 %, the step is not to blame, and 1 is given back.
+/// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp
+/// itself is unstable (by its control, say) and the step follows that growth to 2 %, the step is
+/// not to blame, and 1 is given back.
 pub fn growth_of<const N: usize, S: System<N>>(
     method: Method,
     system: &S,
@@ -88,10 +94,12 @@ pub fn growth_of<const N: usize, S: System<N>>(
     }
 }
 
-/// Largest value between `low` and `high` up to which `stable` holds, to 1 %; `low` where it does not hold even there.
+/// Largest value between `low` and `high` up to which `stable` holds, to 1 %; `low` where it does
+/// not hold even there.
 pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
     let (mut good, mut bad) = (low, low);
-    // Upwards in factors of 1.5, so that an island of stability further up is not taken for the border.
+    // Upwards in factors of 1.5, so that an island of stability further up is not taken for the
+    // border.
     while bad < high {
         bad *= 1.5;
         if !stable(bad) {
@@ -113,14 +121,15 @@ pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: 
     largest(1e-7, 1.0, |h| at.iter().all(|e| stable(h, e)))
 }
 
-/// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's step, to 1 %.
+/// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's
+/// step, to 1 %.
 pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
     let (method, step, tip) = (scene.integrator.method, scene.integrator.step, tip(&scene.fingertip));
     largest(1e-3, 1e9, |g| growth_at(scene, tip.as_ref(), method, Formulation::Multipliers, [step, g], at) <= LIMIT)
 }
 
-/// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tip`, with the gain `gain` (1/s) in the
-/// multiplier form.
+/// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tip`, with the
+/// gain `gain` (1/s) in the multiplier form.
 pub fn growth_at(
     scene: &Scene,
     tip: &dyn Tip,
@@ -143,7 +152,8 @@ pub fn growth_at(
     }
 }
 
-/// Largest stable steps of both fixed-step methods in both formulations, at all of the equilibria `at`.
+/// Largest stable steps of both fixed-step methods in both formulations, at all of the equilibria
+/// `at`.
 pub fn stable_steps(scene: &Scene, at: &[Equilibrium]) -> Vec<StableStep> {
     let cases = [
         (Method::Rk4, Formulation::Minimal),

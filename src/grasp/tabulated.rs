@@ -1,11 +1,13 @@
-//! A fingertip whose springs are not alike: the parallel distributed model with a modulus that changes from the pad's centre
-//! outwards.
+//! A fingertip whose springs are not alike: the parallel distributed model with a modulus that
+//! changes from the pad's centre outwards.
 //!
-//! Springs stand on the hemisphere as in the closed form (stiffness E dS / L = E a dOmega), with E a function of where the spring
-//! ends: of the depth a (1 - cos angle) at which a face that comes straight on reaches it. The energy keeps its form,
-//! `U = pi (eA d^3 / (3 cos^2) + eB d^2 d_t tan + eC d d_t^2)`, where eA, eB and eC are means of E over the part that the face
-//! cuts off, weighted by the square, the first power and the zeroth power of how far a spring is pressed. These means are smooth in
-//! depth and tilt and tabulated; with one E they are E, and the closed form comes back.
+//! Springs stand on the hemisphere as in the closed form (stiffness E dS / L = E a dOmega), with E
+//! a function of where the spring ends: of the depth a (1 - cos angle) at which a face that comes
+//! straight on reaches it. The energy keeps its form,
+//! `U = pi (eA d^3 / (3 cos^2) + eB d^2 d_t tan + eC d d_t^2)`, where eA, eB and eC are means of E
+//! over the part that the face cuts off, weighted by the square, the first power and the zeroth
+//! power of how far a spring is pressed. These means are smooth in depth and tilt and tabulated;
+//! with one E they are E, and the closed form comes back.
 
 use crate::grasp::models::{Curvature, Gradient, Tilt, Tip};
 use crate::numerics::surface::{Jet, Surface};
@@ -22,12 +24,14 @@ const NODES: [usize; 2] = [16, 16];
 /// The tables of a fingertip.
 #[derive(Debug, Clone)]
 pub struct Tabulated {
-    /// Means of E (Pa) weighted by the square, the first and the zeroth power of the springs' shortening.
+    /// Means of E (Pa) weighted by the square, the first and the zeroth power of the springs'
+    /// shortening.
     means: [Surface; 3],
 }
 
 impl Tabulated {
-    /// From `modulus` (Pa) of the springs by the depth (m, 0 to `radius`) at which a face that comes straight on reaches them.
+    /// From `modulus` (Pa) of the springs by the depth (m, 0 to `radius`) at which a face that
+    /// comes straight on reaches them.
     pub fn new(radius: f64, modulus: impl Fn(f64) -> f64) -> Self {
         let step = [radius / (PLACES[0] - 1) as f64, STEEPEST / (PLACES[1] - 1) as f64];
         let at = |i: usize| {
@@ -53,14 +57,15 @@ impl Tabulated {
     }
 }
 
-/// The means of E over the cap that a face at `tilt`, pressed in by `d`, cuts off a hemisphere, weighted by the square, the first
-/// and the zeroth power of the springs' shortening.
+/// The means of E over the cap that a face at `tilt`, pressed in by `d`, cuts off a hemisphere,
+/// weighted by the square, the first and the zeroth power of the springs' shortening.
 fn weighted_means(radius: f64, modulus: &impl Fn(f64) -> f64, d: f64, tilt: f64) -> [f64; 3] {
     let part = (d / radius).max(1e-6);
     let (sin, cos) = tilt.sin_cos();
     let (mut sum, mut total) = ([0.0; 3], [0.0; 3]);
     for i in 0..NODES[0] {
-        // Midpoints in the root of the height resolve the middle of the cap, where the face first touches.
+        // Midpoints in the root of the height resolve the middle of the cap, where the face first
+        // touches.
         let root = (i as f64 + 0.5) / NODES[0] as f64;
         let height = part * (1.0 - root * root);
         let c: f64 = 1.0 - part + height;

@@ -1,7 +1,8 @@
 //! Writing a file so that it is either there as a whole or not at all.
 //!
-//! The temporary file stands in the same folder, so that the rename cannot cross file systems; it is removed when
-//! anything fails. There is no fsync: a power cut may lose the file, a full disk or a crash cannot tear it.
+//! The temporary file stands in the same folder, so that the rename cannot cross file systems; it
+//! is removed when anything fails. There is no fsync: a power cut may lose the file, a full disk or
+//! a crash cannot tear it.
 
 use super::live::{Live, as_a_whole};
 use super::{format, os};

@@ -19,9 +19,10 @@ pub const PAIR_COLUMNS: [&str; 12] = [
     "initial", "deformed", "mask", "labels", "names", "held", "load", "force_n", "scene", "name", "subject", "session",
 ];
 
-/// Reads a table of pairs: comma-separated, one header line with some of [`PAIR_COLUMNS`] in any order, `initial` and
-/// `deformed` among them. Paths count from the table's folder. An empty place is as a column left out. Without a name a pair
-/// is called `sub-<subject>_ses-<session>`, or `pair-<line>` without a subject. Whether the files are there is not looked at.
+/// Reads a table of pairs: comma-separated, one header line with some of [`PAIR_COLUMNS`] in any
+/// order, `initial` and `deformed` among them. Paths count from the table's folder. An empty place
+/// is as a column left out. Without a name a pair is called `sub-<subject>_ses-<session>`, or
+/// `pair-<line>` without a subject. Whether the files are there is not looked at.
 ///
 /// # Errors
 /// [`IoError`] names the line: an unknown column (with the nearest known one), no initial or deformed volume, a force that is
@@ -104,7 +105,8 @@ pub fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String
     write_table(path.as_ref(), columns, rows.into_iter())
 }
 
-/// Bytes and the time of the last change (whole ns since 1970) of a file, or of all files in a folder together.
+/// Bytes and the time of the last change (whole ns since 1970) of a file, or of all files in a
+/// folder together.
 ///
 /// # Errors
 /// [`IoError`] when it is not there or cannot be read.

@@ -8,8 +8,8 @@ use std::path::Path;
 /// Columns of chain.csv.
 const COLUMNS: [&str; 7] = ["stage", "quantity", "unit", "found", "truth", "error", "bound"];
 
-/// Writes stage, quantity, unit, found, truth, error (relative for values, absolute for errors), bound (`lower`, `upper` or
-/// empty); each row serialises to these keys.
+/// Writes stage, quantity, unit, found, truth, error (relative for values, absolute for errors),
+/// bound (`lower`, `upper` or empty); each row serialises to these keys.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

@@ -1,4 +1,5 @@
-//! Parameters of the field pipeline from a file: `summary.json` of an earlier run, or its keys as JSON or TOML.
+//! Parameters of the field pipeline from a file: `summary.json` of an earlier run, or its keys as
+//! JSON or TOML.
 
 use super::scene::{known_names, parse_table};
 use super::{format, os};
@@ -13,8 +14,8 @@ use std::path::Path;
 /// No file of parameters is longer (bytes).
 const LONGEST: u64 = 1 << 24;
 
-/// Reads parameters under the keys that `summary.json` has in `params`: there, or alone at the top of a JSON or TOML file.
-/// Keys that are left out keep the preset's value (`balanced` without one).
+/// Reads parameters under the keys that `summary.json` has in `params`: there, or alone at the top
+/// of a JSON or TOML file. Keys that are left out keep the preset's value (`balanced` without one).
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read or is neither, a key is unknown (with the nearest known one), or a value is of

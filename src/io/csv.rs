@@ -60,7 +60,8 @@ pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
     }
 }
 
-/// Writes x,y,z,dx,dy,dz (mm), ncc, sigma (mm) and kept (1 or 0), all matches in order, with six decimals.
+/// Writes x,y,z,dx,dy,dz (mm), ncc, sigma (mm) and kept (1 or 0), all matches in order, with six
+/// decimals.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -95,7 +96,8 @@ pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
     Ok(SparseField { matches: matches.collect() })
 }
 
-/// What [`read_matches`] would read after [`write_matches`]: six decimals, one precision along all axes.
+/// What [`read_matches`] would read after [`write_matches`]: six decimals, one precision along all
+/// axes.
 pub fn stored_matches(field: &SparseField) -> SparseField {
     let kept = |v: f64| decimal(v).parse().unwrap_or(v);
     let one = |m: &Match| {
@@ -123,8 +125,8 @@ pub fn read_landmarks(path: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> 
     Ok(rows.into_iter().map(landmark).collect())
 }
 
-/// Landmarks from two files of points: the places in the initial volume and in the deformed one, paired by their labels
-/// where both files have all of them, else in order.
+/// Landmarks from two files of points: the places in the initial volume and in the deformed one,
+/// paired by their labels where both files have all of them, else in order.
 ///
 /// # Errors
 /// As [`read_points`]; also when there are not as many in both.
@@ -157,7 +159,8 @@ pub fn write_landmarks(path: impl AsRef<Path>, landmarks: &[Landmark]) -> Result
     write_table(path.as_ref(), &LANDMARK_COLUMNS, rows)
 }
 
-/// Reads points: columns x,y,z and any others; from 3D Slicer's `.mrk.json` and `.fcsv` with one column `label`.
+/// Reads points: columns x,y,z and any others; from 3D Slicer's `.mrk.json` and `.fcsv` with one
+/// column `label`.
 ///
 /// # Errors
 /// As [`read_landmarks`].
@@ -171,8 +174,8 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<PointTable, IoError> {
     Ok(PointTable { points, other_columns: table.other_columns, others: table.others })
 }
 
-/// Writes x,y,z and the other columns; with a name in `.mrk.json` a point list of Slicer, without the points that are not
-/// finite.
+/// Writes x,y,z and the other columns; with a name in `.mrk.json` a point list of Slicer, without
+/// the points that are not finite.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

@@ -1,8 +1,10 @@
-//! A DEFLATE encoder for voxels (RFC 1951): Huffman coding and runs of equal 4-byte words, nothing else.
+//! A DEFLATE encoder for voxels (RFC 1951): Huffman coding and runs of equal 4-byte words, nothing
+//! else.
 //!
-//! The mantissas of float32 voxels hardly ever repeat, so a general encoder spends most of its time looking for matches
-//! that are not there. Without that search a field of 59 MB (160 x 192 x 160, smooth with a little noise, rounded as
-//! `write_field` does) takes 0.26 s of CPU time instead of libdeflate's 0.74 s at level 1, and 39 MB instead of 34.
+//! The mantissas of float32 voxels hardly ever repeat, so a general encoder spends most of its time
+//! looking for matches that are not there. Without that search a field of 59 MB (160 x 192 x 160,
+//! smooth with a little noise, rounded as `write_field` does) takes 0.26 s of CPU time instead of
+//! libdeflate's 0.74 s at level 1, and 39 MB instead of 34.
 
 /// Bytes that share one Huffman code.
 const BLOCK: usize = 1 << 19;
@@ -54,7 +56,8 @@ fn deflate_block(block: &[u8], out: &mut BitWriter) {
     out.put(SYMBOLS as u64 - 257, 5);
     out.put(4 - 1, 5); // four distance codes
     out.put(19 - 4, 4);
-    // The code of the code lengths: 0 to 15 each in 4 bits; 16, 17, 18 (first in the file's order) unused.
+    // The code of the code lengths: 0 to 15 each in 4 bits; 16, 17, 18 (first in the file's order)
+    // unused.
     (0..19).for_each(|i| out.put(if i < 3 { 0 } else { 4 }, 3));
     let distances = [0, 0, 1, 1]; // distance 4 is the fourth symbol; the third makes the code complete
     for &length in lengths.iter().chain(&distances) {
@@ -111,9 +114,9 @@ fn run_symbol(words: usize) -> (usize, usize, u32) {
     (257 + at, LENGTH_BASE[at], if at < 8 { 0 } else { (at as u32 - 4) / 4 })
 }
 
-/// Lengths of an optimal prefix code with no length past [`LONGEST`] (package-merge; Larmore and Hirschberg 1990,
-/// doi:10.1145/79147.79150). A symbol that does not occur gets 0; at
-/// least two must occur.
+/// Lengths of an optimal prefix code with no length past [`LONGEST`] (package-merge; Larmore and
+/// Hirschberg 1990, doi:10.1145/79147.79150). A symbol that does not occur gets 0; at least two
+/// must occur.
 fn code_lengths(counts: &[u32; SYMBOLS]) -> [u8; SYMBOLS] {
     let mut leaves: Vec<(u32, usize)> = (0..SYMBOLS).filter(|&s| counts[s] > 0).map(|s| (counts[s], s)).collect();
     leaves.sort_unstable();
@@ -129,7 +132,8 @@ fn code_lengths(counts: &[u32; SYMBOLS]) -> [u8; SYMBOLS] {
         let next = row(&mut rows[level - 1].chunks_exact(2).map(|pair| pair[0].0 + pair[1].0));
         rows.push(next);
     }
-    // The first 2 n - 2 of the last row, and all that is packed in them: a symbol's length is how often it occurs.
+    // The first 2 n - 2 of the last row, and all that is packed in them: a symbol's length is how
+    // often it occurs.
     let mut lengths = [0; SYMBOLS];
     let mut taken = 2 * leaves.len() - 2;
     for row in rows.iter().rev() {
@@ -140,7 +144,8 @@ fn code_lengths(counts: &[u32; SYMBOLS]) -> [u8; SYMBOLS] {
     lengths
 }
 
-/// The code that follows from the lengths (RFC 1951, 3.2.2), with its bits in the order of the stream.
+/// The code that follows from the lengths (RFC 1951, 3.2.2), with its bits in the order of the
+/// stream.
 fn canonical_codes(lengths: &[u8; SYMBOLS]) -> [(u64, u32); SYMBOLS] {
     let mut codes = [(0, 0); SYMBOLS];
     let mut next = 0u16;

@@ -1,8 +1,9 @@
 //! A folder with one DICOM series of slices (PS3.3 C.7.6.2, the image plane).
 //!
-//! Uncompressed, little-endian, one number a voxel, one frame a file; slices are put in order by where they lie. Several
-//! series, several volumes at one place, gaps, tilted stacks and compressed or multi-frame files are errors that say what
-//! to do. The elements are walked by [`super::elements`]: no length in a file makes it allocate.
+//! Uncompressed, little-endian, one number a voxel, one frame a file; slices are put in order by
+//! where they lie. Several series, several volumes at one place, gaps, tilted stacks and compressed
+//! or multi-frame files are errors that say what to do. The elements are walked by
+//! [`super::elements`]: no length in a file makes it allocate.
 
 use super::elements::{Elements, Tag};
 use super::flaw::Flaw;

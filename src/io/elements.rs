@@ -1,6 +1,8 @@
-//! The elements of a DICOM file (PS3.5 section 7, PS3.10), little-endian: where each value of the outermost level stands.
+//! The elements of a DICOM file (PS3.5 section 7, PS3.10), little-endian: where each value of the
+//! outermost level stands.
 //!
-//! Values are never copied, sequences are stepped over, and every length is checked against the file's.
+//! Values are never copied, sequences are stepped over, and every length is checked against the
+//! file's.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -24,7 +26,8 @@ pub(super) struct Elements<'a> {
 }
 
 impl<'a> Elements<'a> {
-    /// Of a whole file; none where it is damaged or in another transfer syntax than implicit or explicit little-endian.
+    /// Of a whole file; none where it is damaged or in another transfer syntax than implicit or
+    /// explicit little-endian.
     pub(super) fn of(bytes: &'a [u8]) -> Option<Self> {
         if bytes.get(128..132)? != b"DICM" {
             return None;

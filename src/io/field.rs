@@ -7,8 +7,8 @@
 //! | `fsl`, `fsl-absolute` | displacement, or place, in FSL's scaled-voxel mm | FSL, FNIRT user guide; `applywarp --rel`, `--abs` |
 //! | `niftyreg` | displacement or place, mm, RAS, as the header says | `reg_transform -disp`, `-def`; _reg_maths.h |
 //!
-//! FSL's coordinates are voxels times the voxel size, with x counted from the far end where the affine has a positive
-//! determinant.
+//! FSL's coordinates are voxels times the voxel size, with x counted from the far end where the
+//! affine has a positive determinant.
 
 use super::flaw::Flaw;
 use super::image::{Format, raw_field};
@@ -50,8 +50,8 @@ impl FromStr for FieldConvention {
     }
 }
 
-/// Reads a displacement field (mm): NIfTI (nx, ny, nz, 1, 3) with intent 1007 or 1006, or NRRD or MetaImage with three
-/// numbers a voxel; LPS components on disk, RAS in memory.
+/// Reads a displacement field (mm): NIfTI (nx, ny, nz, 1, 3) with intent 1007 or 1006, or NRRD or
+/// MetaImage with three numbers a voxel; LPS components on disk, RAS in memory.
 ///
 /// The components are millimetres whatever `xyzt_units` says, as ITK takes them.
 ///
@@ -61,8 +61,8 @@ pub fn read_field(path: impl AsRef<Path>) -> Result<DenseField, IoError> {
     read_field_as(path, FieldConvention::Lps, None)
 }
 
-/// Reads a displacement field in another program's convention. `deformed` is the grid of the volume that the field leads
-/// to, which FSL's numbers refer to; the field's own without.
+/// Reads a displacement field in another program's convention. `deformed` is the grid of the volume
+/// that the field leads to, which FSL's numbers refer to; the field's own without.
 ///
 /// # Errors
 /// As [`read_field`]; also when the header says that the field is in another convention.
@@ -83,7 +83,8 @@ pub fn read_field_as(
                 };
                 return Err(flaw.at(path));
             }
-            // _reg_maths.h: 0 is a deformation, 1 a displacement; the others are control points and velocities.
+            // _reg_maths.h: 0 is a deformation, 1 a displacement; the others are control points and
+            // velocities.
             if intent.niftyreg && ![0.0, 1.0].contains(&intent.kind) {
                 let what = "holds NiftyReg's control points or velocities, not a field";
                 return Err(Flaw::new(what, "make one with reg_transform -disp").at(path));
@@ -124,7 +125,8 @@ fn each(grid: &Grid, values: &mut [f32], f: impl Fn(WorldPoint, [f64; 3]) -> [f6
     }
 }
 
-/// FSL's coordinates of a grid: voxels times their size, x from the far end where the determinant is positive.
+/// FSL's coordinates of a grid: voxels times their size, x from the far end where the determinant
+/// is positive.
 struct Scaled {
     grid: Grid,
     size: [f64; 3],

@@ -115,9 +115,10 @@ fn found_in<T>(path: &Path, what: &str, find: impl Fn(&toml::Table) -> Option<T>
     find(&table).ok_or_else(|| format(path, format!("has no {what}"), "give a file that `palpate fingertip` wrote"))
 }
 
-/// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of the hemisphere that
-/// presses like the pad, and how it was found under `[pad]`. `calibration` is the measured force over the model's (1 where
-/// none was measured); the hemisphere's modulus is multiplied by it.
+/// Writes a fingertip for `fingertip.file` of a grasp scene: radius (m) and Young's modulus (Pa) of
+/// the hemisphere that presses like the pad, and how it was found under `[pad]`. `calibration` is
+/// the measured force over the model's (1 where none was measured); the hemisphere's modulus is
+/// multiplied by it.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

@@ -172,8 +172,8 @@ pub fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Resu
     write_table(path.as_ref(), &columns, rows)
 }
 
-/// Writes theta1_deg, theta2_deg, state, and for what was reached x, y, theta_deg, displacements, forces and the smallest
-/// eigenvalue (N/m).
+/// Writes theta1_deg, theta2_deg, state, and for what was reached x, y, theta_deg, displacements,
+/// forces and the smallest eigenvalue (N/m).
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

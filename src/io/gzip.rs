@@ -1,7 +1,8 @@
 //! gzip (RFC 1952): one member written by all threads, any number of members read.
 //!
-//! What is written does not depend on the number of threads: the data is cut at fixed places and the packed chunks
-//! are joined in order into a single member, which even readers that stop after the first member accept.
+//! What is written does not depend on the number of threads: the data is cut at fixed places and
+//! the packed chunks are joined in order into a single member, which even readers that stop after
+//! the first member accept.
 
 use super::deflate::{FINISH, deflate};
 use super::flaw::Flaw;
@@ -99,13 +100,14 @@ impl<'a, W: Write> Member<'a, W> {
 /// The first `length` bytes, or fewer when there are no more or the stream is damaged.
 pub(super) fn peek(packed: impl BufRead, length: usize) -> Vec<u8> {
     let mut head = Vec::new();
-    // A damaged stream is reported by `unpack`; what came before the damage may already say what the file is.
+    // A damaged stream is reported by `unpack`; what came before the damage may already say what
+    // the file is.
     let _ = flate2::bufread::MultiGzDecoder::new(packed).take(length as u64).read_to_end(&mut head);
     head
 }
 
-/// Unpacks at least `needed` bytes where there are so many, and checks the checksums on the way; what follows the
-/// last member (padding) is ignored. Never holds more than `needed` and 1 MiB.
+/// Unpacks at least `needed` bytes where there are so many, and checks the checksums on the way;
+/// what follows the last member (padding) is ignored. Never holds more than `needed` and 1 MiB.
 pub(super) fn unpack(packed: &[u8], needed: usize) -> io::Result<Vec<u8>> {
     if let Some(data) = unpack_single(packed, needed) {
         return Ok(data);
@@ -126,7 +128,8 @@ pub(super) fn damaged(e: &io::Error) -> Flaw {
     Flaw::new(format!("its gzip stream is damaged or cut short ({e})"), "copy or export it again")
 }
 
-/// Unpacks members one after the other and checks the checksum of each; ends where no further member starts (padding).
+/// Unpacks members one after the other and checks the checksum of each; ends where no further
+/// member starts (padding).
 pub(super) struct Members<R>(Option<GzDecoder<R>>);
 
 impl<R: BufRead> Members<R> {

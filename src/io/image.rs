@@ -1,7 +1,8 @@
-//! Volumes, label maps and fields from any format that is read: NIfTI, NRRD, MetaImage, and a folder with a DICOM series.
+//! Volumes, label maps and fields from any format that is read: NIfTI, NRRD, MetaImage, and a
+//! folder with a DICOM series.
 //!
-//! The format is known by the first bytes, and by the name only for MetaImage, which has no magic. Everything comes to
-//! RAS: NRRD says which space it is in, MetaImage and DICOM are LPS.
+//! The format is known by the first bytes, and by the name only for MetaImage, which has no magic.
+//! Everything comes to RAS: NRRD says which space it is in, MetaImage and DICOM are LPS.
 
 use super::flaw::Flaw;
 use super::raw::RawImage;
@@ -28,7 +29,8 @@ impl Format {
             return Ok(Self::Folder);
         }
         let mut head = Vec::new();
-        // What is no regular file is refused by whoever reads it; a pipe must not be opened (that waits) or drained here.
+        // What is no regular file is refused by whoever reads it; a pipe must not be opened (that
+        // waits) or drained here.
         if fs::metadata(path).map_err(os(path, "read"))?.is_file() {
             File::open(path).and_then(|f| f.take(64).read_to_end(&mut head)).map_err(os(path, "read"))?;
         }
@@ -54,7 +56,8 @@ pub struct Stored {
     pub axes: Vec<usize>,
     /// Where the position in space comes from.
     pub placed: &'static str,
-    /// How far two placements in one header are apart at a corner of the volume, where there are two (mm).
+    /// How far two placements in one header are apart at a corner of the volume, where there are
+    /// two (mm).
     pub apart_mm: Option<f64>,
     /// The first three axes.
     pub grid: Grid,
@@ -147,13 +150,15 @@ fn raw(path: &Path, format: Format) -> Result<RawImage, IoError> {
     }
 }
 
-/// The file of voxels that a `.nhdr` or `.mhd` names; none where there is no other, or the header cannot be read.
+/// The file of voxels that a `.nhdr` or `.mhd` names; none where there is no other, or the header
+/// cannot be read.
 pub(super) fn voxels_beside(path: &Path) -> Option<PathBuf> {
     let format = Format::of(path).ok().filter(|f| matches!(f, Format::Nrrd | Format::MetaImage))?;
     raw(path, format).ok().map(|image| image.file).filter(|file| file != path)
 }
 
-/// Reads a scalar volume, in the file's intensity unit after its scaling: a file, or a folder with one DICOM series.
+/// Reads a scalar volume, in the file's intensity unit after its scaling: a file, or a folder with
+/// one DICOM series.
 ///
 /// Axes past the third must have length 1. Values that are not finite are given as they are (see
 /// [`count_non_finite`]); float64 beyond float32 becomes infinite.

@@ -1,4 +1,5 @@
-//! What stands on the disk only while the program runs, so that one that is stopped can take it away first.
+//! What stands on the disk only while the program runs, so that one that is stopped can take it
+//! away first.
 
 use std::fs;
 use std::io;
@@ -61,8 +62,8 @@ pub(super) fn as_a_whole<R>(work: impl FnOnce() -> R) -> R {
     work()
 }
 
-/// Removes all that is unfinished, for a program that stops at once: what is being moved to its final name is still moved,
-/// and nothing is made or moved after it.
+/// Removes all that is unfinished, for a program that stops at once: what is being moved to its
+/// final name is still moved, and nothing is made or moved after it.
 pub fn abandon() {
     let live = live();
     for entry in live.iter().rev() {

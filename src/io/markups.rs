@@ -1,6 +1,8 @@
-//! 3D Slicer's points: markups (`.mrk.json`, read and written) and the older fiducials (`.fcsv`, read).
+//! 3D Slicer's points: markups (`.mrk.json`, read and written) and the older fiducials (`.fcsv`,
+//! read).
 //!
-//! Both say whether they are RAS or LPS; without, `.mrk.json` is LPS and `.fcsv` RAS, as Slicer takes them.
+//! Both say whether they are RAS or LPS; without, `.mrk.json` is LPS and `.fcsv` RAS, as Slicer
+//! takes them.
 
 use super::csv::PointTable;
 use super::{format, os, write_json};
@@ -130,7 +132,8 @@ fn read_fcsv(path: &Path, text: &str) -> Result<Points, IoError> {
     Ok(out)
 }
 
-/// Writes points (world mm, RAS in memory, LPS on disk) as a Slicer point list; `labels` and `descriptions` may be shorter.
+/// Writes points (world mm, RAS in memory, LPS on disk) as a Slicer point list; `labels` and
+/// `descriptions` may be shorter.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

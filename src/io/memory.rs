@@ -4,8 +4,9 @@ use super::flaw::Flaw;
 use std::fs;
 use std::path::Path;
 
-/// Bytes that can still be taken: the least of what the machine has available, what each control group above the process
-/// leaves, and what its own limit on addresses leaves. None where the system does not tell.
+/// Bytes that can still be taken: the least of what the machine has available, what each control
+/// group above the process leaves, and what its own limit on addresses leaves. None where the
+/// system does not tell.
 pub fn memory_left() -> Option<u64> {
     let machine = meminfo(&fs::read_to_string("/proc/meminfo").ok()?);
     let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
@@ -29,8 +30,8 @@ fn meminfo(text: &str) -> Option<u64> {
     Some(1024 * line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?)
 }
 
-/// What the tightest group of a process leaves, under version 2 and version 1 of control groups (bytes). Files that
-/// are merely cached there can be given up, so they do not count.
+/// What the tightest group of a process leaves, under version 2 and version 1 of control groups
+/// (bytes). Files that are merely cached there can be given up, so they do not count.
 fn group_left(root: &Path, groups: &str) -> Option<u64> {
     let number = |path: &Path| fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
     let cached = |folder: &Path| {

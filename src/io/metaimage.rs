@@ -1,5 +1,6 @@
-//! MetaImage headers (ITK's MetaIO): `.mha`, or `.mhd` with one file of voxels beside it. Coordinates are LPS, as ITK has
-//! them; each row of `TransformMatrix` is the direction of one axis.
+//! MetaImage headers (ITK's MetaIO): `.mha`, or `.mhd` with one file of voxels beside it.
+//! Coordinates are LPS, as ITK has them; each row of `TransformMatrix` is the direction of one
+//! axis.
 
 use super::flaw::Flaw;
 use super::raw::{Packing, RawImage, Start, grid_from_lps, head, line, numbers};

@@ -1,8 +1,9 @@
 //! Files in and out: the only stage that opens one.
 //!
-//! Promises: every error names the file, what is wrong and what to try; no header can make it allocate more than the
-//! file could hold; nothing half-written ever stands under a final name (each file is written under a temporary name
-//! in the same folder, then renamed; [`OutputFolder`] does the same for a whole folder). Nothing here prints.
+//! Promises: every error names the file, what is wrong and what to try; no header can make it
+//! allocate more than the file could hold; nothing half-written ever stands under a final name
+//! (each file is written under a temporary name in the same folder, then renamed; [`OutputFolder`]
+//! does the same for a whole folder). Nothing here prints.
 
 pub mod image;
 

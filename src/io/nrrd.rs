@@ -1,7 +1,9 @@
-//! NRRD headers (teem.sourceforge.net/nrrd/format.html): `.nrrd`, or `.nhdr` with one file of voxels beside it.
+//! NRRD headers (teem.sourceforge.net/nrrd/format.html): `.nrrd`, or `.nhdr` with one file of
+//! voxels beside it.
 //!
-//! Two or three axes of space and at most one of components, first or last; every number type; raw or gzip. Spaces RAS,
-//! LAS and LPS; without any, the axes are taken as LPS, as ITK does. Lists of files, text, hex and bzip2 are errors.
+//! Two or three axes of space and at most one of components, first or last; every number type; raw
+//! or gzip. Spaces RAS, LAS and LPS; without any, the axes are taken as LPS, as ITK does. Lists of
+//! files, text, hex and bzip2 are errors.
 
 use super::flaw::Flaw;
 use super::raw::{Packing, RawImage, Start, grid_from_lps, head, line, numbers};

@@ -10,9 +10,10 @@ use tempfile::TempDir;
 
 /// Where a command puts its results.
 ///
-/// Files are first written into a hidden folder inside the target (same file system, so that moving them is a rename)
-/// and moved by [`OutputFolder::commit`]. Dropped without a commit, it leaves the target as it was; folders that it
-/// had created are removed again. A killed process may leave the hidden folder; it is ignored next time.
+/// Files are first written into a hidden folder inside the target (same file system, so that moving
+/// them is a rename) and moved by [`OutputFolder::commit`]. Dropped without a commit, it leaves the
+/// target as it was; folders that it had created are removed again. A killed process may leave the
+/// hidden folder; it is ignored next time.
 #[derive(Debug)]
 pub struct OutputFolder {
     path: PathBuf,
@@ -25,7 +26,8 @@ pub struct OutputFolder {
 }
 
 impl OutputFolder {
-    /// Checks that results can be written to `path`, and creates the folder (and those above it) where needed.
+    /// Checks that results can be written to `path`, and creates the folder (and those above it)
+    /// where needed.
     ///
     /// # Errors
     /// [`IoError`] when `path` is a file, cannot be created or written, or holds files and `force` is not set.
@@ -46,7 +48,8 @@ impl OutputFolder {
         Ok(folder)
     }
 
-    /// Checks what can be checked without writing: that `path` is no file, and holds none unless `force` is set.
+    /// Checks what can be checked without writing: that `path` is no file, and holds none unless
+    /// `force` is set.
     ///
     /// # Errors
     /// [`IoError`] when it is, does, or cannot be read.
@@ -74,7 +77,8 @@ impl OutputFolder {
         &self.path
     }
 
-    /// Stages the file `name` (no folders in it): `write` gets the path to write to, which ends in `name`.
+    /// Stages the file `name` (no folders in it): `write` gets the path to write to, which ends in
+    /// `name`.
     ///
     /// # Errors
     /// Those of `write`, with the file's final path.
@@ -98,8 +102,9 @@ impl OutputFolder {
         Ok(())
     }
 
-    /// Names the files in the folder that results of this kind consist of: those that an earlier run left and this one does not
-    /// write would pass for results of this one, and are removed by [`OutputFolder::commit`].
+    /// Names the files in the folder that results of this kind consist of: those that an earlier
+    /// run left and this one does not write would pass for results of this one, and are removed by
+    /// [`OutputFolder::commit`].
     ///
     /// # Errors
     /// [`IoError`] when the folder cannot be read.
@@ -112,8 +117,8 @@ impl OutputFolder {
         Ok(())
     }
 
-    /// Moves all files to their final names, and returns these in the order of writing. What stood under them goes only
-    /// when all are there.
+    /// Moves all files to their final names, and returns these in the order of writing. What stood
+    /// under them goes only when all are there.
     ///
     /// # Errors
     /// [`IoError`] when a rename is refused; then all stands as it did before.
@@ -141,7 +146,8 @@ impl OutputFolder {
     }
 }
 
-/// Moves `new`, if there is any, to `target`, what stands there to `earlier` first; `back` gets the renames that undo it, in order.
+/// Moves `new`, if there is any, to `target`, what stands there to `earlier` first; `back` gets the
+/// renames that undo it, in order.
 fn replace(
     new: Option<&PathBuf>,
     target: &Path,

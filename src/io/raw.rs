@@ -47,7 +47,8 @@ pub(super) struct RawImage {
     pub(super) file: PathBuf,
 }
 
-/// The first lines of a file as far as they can belong to a header (text up to the first byte that is none, or 1 MiB).
+/// The first lines of a file as far as they can belong to a header (text up to the first byte that
+/// is none, or 1 MiB).
 pub(super) fn head(path: &Path) -> Result<Vec<u8>, IoError> {
     let file = File::open(path).map_err(os(path, "read"))?;
     if !file.metadata().map_err(os(path, "read"))?.is_file() {
@@ -58,7 +59,8 @@ pub(super) fn head(path: &Path) -> Result<Vec<u8>, IoError> {
     Ok(bytes)
 }
 
-/// A line of `bytes` from `from`, without its end, and where the next one begins; none past the end.
+/// A line of `bytes` from `from`, without its end, and where the next one begins; none past the
+/// end.
 pub(super) fn line(bytes: &[u8], from: usize) -> Option<(String, usize)> {
     let rest = bytes.get(from..).filter(|r| !r.is_empty())?;
     let end = rest.iter().position(|&b| b == b'\n')?;

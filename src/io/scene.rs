@@ -1,4 +1,5 @@
-//! Grasp scenes: TOML, SI units, angles in degrees. Every error names the file, the key, what is wrong and what to try.
+//! Grasp scenes: TOML, SI units, angles in degrees. Every error names the file, the key, what is
+//! wrong and what to try.
 
 use super::{format, os};
 use crate::error::{IoError, SceneError};
@@ -42,7 +43,8 @@ impl SceneOverrides {
 pub struct SceneFile {
     /// The scene without any sweep.
     pub scene: Scene,
-    /// One case for each combination of the `[[sweep]]` tables' values, the last table's fastest; empty without one.
+    /// One case for each combination of the `[[sweep]]` tables' values, the last table's fastest;
+    /// empty without one.
     pub sweep: Vec<SweepCase>,
     /// The file that `fingertip.file` names, where it does.
     pub fingertip_file: Option<PathBuf>,
@@ -169,7 +171,8 @@ fn merge_fingertip(path: &Path, table: &mut Table) -> Result<Option<PathBuf>, Io
     };
     let file = path.parent().unwrap_or(Path::new("")).join(file);
     let mut other = read_table(&file)?;
-    // The keys may stand alone or under [fingertip]; other tables of the file say where it comes from.
+    // The keys may stand alone or under [fingertip]; other tables of the file say where it comes
+    // from.
     let keys = match other.remove("fingertip") {
         Some(Value::Table(keys)) => keys,
         _ => other.into_iter().filter(|(_, v)| !v.is_table()).collect(),

@@ -46,8 +46,8 @@ struct RawBlock {
     poisson: Option<f64>,
 }
 
-/// Reads a skin scene. Without `[block]` the block is 6 times as wide as it is thick, the punch 1.5 times, and Poisson's
-/// ratio 0.45.
+/// Reads a skin scene. Without `[block]` the block is 6 times as wide as it is thick, the punch 1.5
+/// times, and Poisson's ratio 0.45.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read or is no TOML, a key is unknown (with the nearest known one), missing or of a
@@ -113,7 +113,8 @@ pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
     Ok(scene)
 }
 
-/// Writes time (s), stress_pa, displacement_m and `strain_<layer>` (compression positive), a row for each sample.
+/// Writes time (s), stress_pa, displacement_m and `strain_<layer>` (compression positive), a row
+/// for each sample.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

@@ -1,7 +1,9 @@
-//! Tables and simulation models of a stiffness result: regions.csv, FEBio (`.feb`), Abaqus and CalculiX (`.inp`).
+//! Tables and simulation models of a stiffness result: regions.csv, FEBio (`.feb`), Abaqus and
+//! CalculiX (`.inp`).
 //!
-//! The models repeat the identified problem: the same quadratic tetrahedra, one material a region (or a class of modulus),
-//! the held and loaded nodes with their displacements. Units: mm, N, MPa (both programs take any consistent set).
+//! The models repeat the identified problem: the same quadratic tetrahedra, one material a region
+//! (or a class of modulus), the held and loaded nodes with their displacements. Units: mm, N, MPa
+//! (both programs take any consistent set).
 
 use super::atomic::write_atomic;
 use super::csv::write_table;
@@ -14,8 +16,9 @@ use std::path::Path;
 /// Columns of regions.csv.
 const COLUMNS: [&str; 6] = ["label", "name", "youngs_modulus_kpa", "sd_kpa", "ratio", "identifiable"];
 
-/// Writes a row for each frame and region: frame, motion_mm (mean), residual_mm, label, name, value (kPa, or the ratio without
-/// a force), sd, identifiable; a frame that tells nothing has one row with the reason in `why`.
+/// Writes a row for each frame and region: frame, motion_mm (mean), residual_mm, label, name, value
+/// (kPa, or the ratio without a force), sd, identifiable; a frame that tells nothing has one row
+/// with the reason in `why`.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -42,8 +45,9 @@ pub fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<
     write_table(path.as_ref(), &COLUMNS, rows)
 }
 
-/// Writes label, name, Young's modulus (kPa), standard deviation (kPa; empty where not identifiable), ratio to the reference
-/// region, identifiable (1 or 0). Without a force the kPa columns are empty.
+/// Writes label, name, Young's modulus (kPa), standard deviation (kPa; empty where not
+/// identifiable), ratio to the reference region, identifiable (1 or 0). Without a force the kPa
+/// columns are empty.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -94,15 +98,16 @@ fn components(p: &Prescribed) -> Vec<(usize, f64)> {
     }
 }
 
-/// Nodes and axes that hold the body where what is prescribed leaves it free to move as a rigid body (plates that slide):
-/// without force, as nothing else acts along them. Each holds what is still free better than any other would.
+/// Nodes and axes that hold the body where what is prescribed leaves it free to move as a rigid
+/// body (plates that slide): without force, as nothing else acts along them. Each holds what is
+/// still free better than any other would.
 fn pins(result: &StiffnessResult) -> Vec<(u32, usize)> {
     let place = |p: &Prescribed| result.mesh.nodes()[p.node as usize];
     let Some(first) = result.prescribed.first().map(place) else { return Vec::new() };
     let arm = |p: &Prescribed| place(p).minus(first);
     let size = result.prescribed.iter().map(|p| dot(arm(p), arm(p))).fold(0.0, f64::max).sqrt().max(f64::MIN_POSITIVE);
-    // How a component of a node moves with a translation of the body and a rotation about the first node; what is left of
-    // it beside the motions that are held already (orthonormal).
+    // How a component of a node moves with a translation of the body and a rotation about the first
+    // node; what is left of it beside the motions that are held already (orthonormal).
     let left = |held: &[[f64; 6]], p: &Prescribed, a: usize| {
         let mut axis = [0.0; 3];
         axis[a] = 1.0;
@@ -132,8 +137,9 @@ fn pins(result: &StiffnessResult) -> Vec<(u32, usize)> {
     out
 }
 
-/// Writes the model for Abaqus and CalculiX: C3D10 elements, `*ELASTIC` or `*HYPERELASTIC, NEO HOOKE`, one static step with
-/// the prescribed displacements; displacements and reaction forces are printed.
+/// Writes the model for Abaqus and CalculiX: C3D10 elements, `*ELASTIC` or
+/// `*HYPERELASTIC, NEO HOOKE`, one static step with the prescribed displacements; displacements and
+/// reaction forces are printed.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -194,8 +200,8 @@ fn node_set(w: &mut impl Write, name: &str, nodes: impl Iterator<Item = u32>) ->
     all.chunks(12).try_for_each(|line| writeln!(w, "{},", line.join(", ")))
 }
 
-/// Writes the model for FEBio 4: tet10 elements, `isotropic elastic` or `neo-Hookean` materials, prescribed displacements over
-/// one static step.
+/// Writes the model for FEBio 4: tet10 elements, `isotropic elastic` or `neo-Hookean` materials,
+/// prescribed displacements over one static step.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

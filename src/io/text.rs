@@ -41,7 +41,8 @@ pub fn list(folder: impl AsRef<Path>) -> Result<Vec<PathBuf>, IoError> {
     Ok(found)
 }
 
-/// Writes `value` as indented JSON with a newline at the end. Numbers that are not finite become `null`.
+/// Writes `value` as indented JSON with a newline at the end. Numbers that are not finite become
+/// `null`.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written or the value cannot be put in JSON (a map with keys that are not text).

@@ -6,9 +6,9 @@ use crate::types::{Match, SparseField, StrainRow, Trajectory, WorldPoint};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Writes a row for each point and frame in which its place is known: point, frame, time_s (empty when not known), x, y, z
-/// and sigma (world mm, RAS), state (measured, carried or outside). In the `reference` frame a point is where it was found, with
-/// sigma 0.
+/// Writes a row for each point and frame in which its place is known: point, frame, time_s (empty
+/// when not known), x, y, z and sigma (world mm, RAS), state (measured, carried or outside). In the
+/// `reference` frame a point is where it was found, with sigma 0.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -66,8 +66,9 @@ pub fn read_trajectories(path: impl AsRef<Path>, reference: usize) -> Result<BTr
     Ok(out)
 }
 
-/// Writes a row for each frame and label: mean principal strains e1 (largest) to e3, the 98th percentile of e1 and the
-/// 2nd of e3 as peaks, mean and 98th percentile of the largest shear, mean change of volume (1).
+/// Writes a row for each frame and label: mean principal strains e1 (largest) to e3, the 98th
+/// percentile of e1 and the 2nd of e3 as peaks, mean and 98th percentile of the largest shear, mean
+/// change of volume (1).
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

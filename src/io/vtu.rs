@@ -1,8 +1,9 @@
 //! Meshes as VTK XML unstructured grids (`.vtu`), for ParaView, PyVista, meshio and Slicer.
 //!
-//! Arrays are appended in base64, compressed with zlib; positions in world mm (RAS), float32. The form is that of the
-//! VTK file formats guide, section "XML file formats": each array is a header (number of blocks, block size, size of
-//! the last block where it is smaller, compressed sizes; all u64) and then its blocks, each part in base64 by itself.
+//! Arrays are appended in base64, compressed with zlib; positions in world mm (RAS), float32. The
+//! form is that of the VTK file formats guide, section "XML file formats": each array is a header
+//! (number of blocks, block size, size of the last block where it is smaller, compressed sizes; all
+//! u64) and then its blocks, each part in base64 by itself.
 
 use super::atomic::write_atomic;
 use super::{format, os};
@@ -21,8 +22,8 @@ const VTK_TRIANGLE: u8 = 5;
 const VTK_TETRA: u8 = 10;
 const VTK_QUADRATIC_TETRA: u8 = 24;
 
-/// Writes tetrahedra with `displacement` (mm, RAS) and its `magnitude` at the nodes, and one number a cell for each
-/// `(name, values)` of `cell_data`.
+/// Writes tetrahedra with `displacement` (mm, RAS) and its `magnitude` at the nodes, and one number
+/// a cell for each `(name, values)` of `cell_data`.
 ///
 /// # Errors
 /// [`IoError`] when a length does not fit the mesh or the file cannot be written.

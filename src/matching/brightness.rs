@@ -1,16 +1,18 @@
-//! Brightness that differs between the two volumes by place (a coil's profile, a bias field) or by itself (another contrast), taken out of
-//! the deformed one.
+//! Brightness that differs between the two volumes by place (a coil's profile, a bias field) or by
+//! itself (another contrast), taken out of the deformed one.
 //!
-//! With f and w the mean brightness of a block of voxels in both volumes, under the field found so far,
+//! With f and w the mean brightness of a block of voxels in both volumes, under the field found so
+//! far,
 //!
 //! ```text
 //! ln f - ln w = P + Q((ln f + ln w + P) / 2)
 //! ```
 //!
-//! P is a polynomial of the block's place in the deformed volume, Q one of its brightness (of both volumes alike: of one alone what the
-//! field still misses would flatten the contrast), with Cauchy weights (Holland and Welsch 1977): blocks that are off because the field is off
-//! there hardly count. Either alone serves where both explain little more. What varies less
-//! smoothly is left to [`crate::matching::gain`].
+//! P is a polynomial of the block's place in the deformed volume, Q one of its brightness (of both
+//! volumes alike: of one alone what the field still misses would flatten the contrast), with Cauchy
+//! weights (Holland and Welsch 1977): blocks that are off because the field is off there hardly
+//! count. Either alone serves where both explain little more. What varies less smoothly is left to
+//! [`crate::matching::gain`].
 
 use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
@@ -33,8 +35,9 @@ const BLOCKS_A_TERM: usize = 8;
 /// Brightness of a block, over the noise, from which its logarithm is believed.
 const ABOVE_NOISE: f64 = 5.0;
 
-/// How far above the noise of a voxel (not of a level's averages: magnitudes have a floor of 1.25 deviations that no average lowers) the deformed
-/// volume's blocks must be. Darker ones are air, a hole or a coil's far end, and their ratio says nothing.
+/// How far above the noise of a voxel (not of a level's averages: magnitudes have a floor of 1.25
+/// deviations that no average lowers) the deformed volume's blocks must be. Darker ones are air, a
+/// hole or a coil's far end, and their ratio says nothing.
 const ABOVE_FLOOR: f64 = 3.0;
 
 /// Part of the blocks that may be 0 or negative, in volumes of brightness.
@@ -43,8 +46,9 @@ const NOT_POSITIVE: f64 = 0.02;
 /// Blocks at most, about 25 times the terms.
 const BLOCKS: usize = 1000;
 
-/// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that tell it. Where it is more than `OFFSET` of the
-/// percentile at the other end of both volumes, it may be that although no value is negative.
+/// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that
+/// tell it. Where it is more than `OFFSET` of the percentile at the other end of both volumes, it
+/// may be that although no value is negative.
 const DARKEST: f64 = 0.5;
 const OFFSET: f64 = 0.2;
 const SAMPLED: usize = 100_000;
@@ -73,10 +77,12 @@ const SETTLED: usize = 40;
 /// How far past the values that were measured the polynomial is followed (logarithm).
 const BEYOND: f64 = 0.1;
 
-/// Steepest Q: a cube root has 1, a fourth root 1.2, and at 2 another brightness no longer grows with the first.
+/// Steepest Q: a cube root has 1, a fourth root 1.2, and at 2 another brightness no longer grows
+/// with the first.
 const STEEPEST: f64 = 1.5;
 
-/// Blocks about each whose middle difference is compared with their neighbours', and the neighbours.
+/// Blocks about each whose middle difference is compared with their neighbours', and the
+/// neighbours.
 const AROUND: usize = 12;
 const BESIDE: usize = 6;
 
@@ -91,21 +97,24 @@ pub struct Brightness {
     shape: [usize; 3],
     /// P: powers along each axis, and the term's coefficient.
     place: Vec<([usize; 3], f64)>,
-    /// Q for logarithms of the deformed volume's brightness (P in it) evenly over `tones`; none where place alone explains it.
+    /// Q for logarithms of the deformed volume's brightness (P in it) evenly over `tones`; none
+    /// where place alone explains it.
     tone: Vec<f64>,
     tones: [f64; 2],
     /// Lowest and highest P where it was measured.
     range: [f64; 2],
     /// The blocks' robust standard deviation of the logarithm as it is, and of what is left.
     pub deviation: [f64; 2],
-    /// What is left of how the logarithm varies between neighbours, as a part of it: by how much they differ (median), each the middle of the
-    /// blocks about it. The local gain takes what is the same nearby; a polynomial across a step trades that for a slope.
+    /// What is left of how the logarithm varies between neighbours, as a part of it: by how much
+    /// they differ (median), each the middle of the blocks about it. The local gain takes what is
+    /// the same nearby; a polynomial across a step trades that for a slope.
     pub uneven: f64,
     /// By what factor P varies over the tissue, from the tenth to the 90th percentile.
     pub variation: f64,
 }
 
-/// Where brightness begins in the initial and in the deformed volume, and whether it grows with the values (1) or against them (-1).
+/// Where brightness begins in the initial and in the deformed volume, and whether it grows with the
+/// values (1) or against them (-1).
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Zero {
     at: [f64; 2],
@@ -113,7 +122,8 @@ struct Zero {
 }
 
 impl Zero {
-    /// What may be it: 0 where hardly a value lies below, else the volumes' darkest or brightest values.
+    /// What may be it: 0 where hardly a value lies below, else the volumes' darkest or brightest
+    /// values.
     fn of(pair: &Pair<'_>) -> Vec<Self> {
         let sample = |v: &[f32]| -> Vec<f64> {
             v.iter().step_by((v.len() / SAMPLED).max(1)).filter(|v| v.is_finite()).map(|v| f64::from(*v)).collect()
@@ -149,9 +159,10 @@ impl Block {
 }
 
 impl Brightness {
-    /// From a level of `factor`, the deformed volume `warped` by a field and its displacement (mm) at a place (voxels); `shape` is the full
-    /// initial volume's. P and Q are taken together where they leave less than
-    /// `both` of what the better one leaves alone. None where there are too few blocks for it.
+    /// From a level of `factor`, the deformed volume `warped` by a field and its displacement (mm)
+    /// at a place (voxels); `shape` is the full initial volume's. P and Q are taken together where
+    /// they leave less than `both` of what the better one leaves alone. None where there are too
+    /// few blocks for it.
     pub fn measure(
         pair: &Pair<'_>,
         (factor, shape): ([usize; 3], [usize; 3]),
@@ -216,7 +227,8 @@ impl Brightness {
         Some(Self { uneven: left / as_it_is.max(EQUAL), ..best })
     }
 
-    /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume; `tone` is its [`Tone::of`].
+    /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume; `tone` is its
+    /// [`Tone::of`].
     fn logarithm(&self, tone: Option<&Tone>, at: [f64; 3], log: f64) -> f64 {
         let place: f64 = self.place.iter().map(|(p, t)| t * monomial(at, *p)).sum();
         place + tone.map_or(0.0, |t| f64::from(t.at((log + place) as f32)))
@@ -232,8 +244,8 @@ impl Brightness {
         self.place.len() > 1
     }
 
-    /// Brings a deformed volume, on a level of `factor` where it starts at `origin` (voxels of the level's initial lattice), to the initial
-    /// one's brightness.
+    /// Brings a deformed volume, on a level of `factor` where it starts at `origin` (voxels of the
+    /// level's initial lattice), to the initial one's brightness.
     pub fn even_out(&self, values: &mut [f32], shape: [usize; 3], origin: [f64; 3], factor: [usize; 3]) {
         let [nx, ny, _] = shape;
         let at = |voxel: [usize; 3]| {
@@ -358,7 +370,8 @@ fn slope(terms: &[f64], t: f64) -> f64 {
     terms.iter().enumerate().rev().fold(0.0, |sum, (i, c)| sum * t + (i + 1) as f64 * c)
 }
 
-/// Q for a logarithm of the deformed volume's brightness: at the middle between that and the initial one's that it leads to.
+/// Q for a logarithm of the deformed volume's brightness: at the middle between that and the
+/// initial one's that it leads to.
 fn tone_from(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
     (0..SETTLED).fold(0.0, |q, _| 0.5 * (q + of_tone(terms, toned(scale, log + q / 2.0))))
 }
@@ -368,7 +381,8 @@ fn steepest(terms: &[f64]) -> f64 {
     (-10..=10).map(|t| slope(terms, f64::from(t) / 10.0).abs()).fold(0.0, f64::max)
 }
 
-/// By how much each of two values of blocks differs between neighbours (median), each the middle of the blocks about it.
+/// By how much each of two values of blocks differs between neighbours (median), each the middle of
+/// the blocks about it.
 fn between_neighbours(blocks: &[Block], values: [&dyn Fn(&Block) -> f64; 2]) -> [f64; 2] {
     let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at).collect();
     let tree = Neighbours::new(&places);
@@ -389,8 +403,9 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Terms of place, then of tone where the brightness is scaled for them, with Cauchy weights; and the robust standard deviation of what
-/// they leave. `usual` is the middle of the logarithms' differences, where P starts.
+/// Terms of place, then of tone where the brightness is scaled for them, with Cauchy weights; and
+/// the robust standard deviation of what they leave. `usual` is the middle of the logarithms'
+/// differences, where P starts.
 fn robust(
     blocks: &[Block],
     by_place: impl Fn(&Block) -> Vec<f64>,
@@ -482,8 +497,8 @@ fn blocks(seen: &[BlockMeans], (zero, least): (Zero, [f64; 2]), factor: [usize; 
     Some(thinned.map(|(_, s)| block(s)).collect())
 }
 
-/// Centre (voxels), weight and mean brightness in both volumes of the block that starts at `first`; none where less than half of it is
-/// tissue that both show.
+/// Centre (voxels), weight and mean brightness in both volumes of the block that starts at `first`;
+/// none where less than half of it is tissue that both show.
 fn means(pair: &Pair<'_>, warped: &[f32], first: [usize; 3], side: [usize; 3]) -> Option<([f64; 3], f64, [f64; 2])> {
     let [nx, ny, _] = pair.shape;
     let last: [usize; 3] = std::array::from_fn(|a| (first[a] + side[a]).min(pair.shape[a]));

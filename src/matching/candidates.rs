@@ -1,8 +1,9 @@
-//! Candidate matches, many to many: each place of the initial volume keeps several places of the deformed one.
+//! Candidate matches, many to many: each place of the initial volume keeps several places of the
+//! deformed one.
 //!
-//! Four sources are joined (Zhang, Hirai, Endo & Morikawa 2007 use the first): features paired with features of the
-//! other volume through a k-d tree, from the initial side and from the deformed side, and exhaustive search of a
-//! feature's patch in the other volume, again from either side.
+//! Four sources are joined (Zhang, Hirai, Endo & Morikawa 2007 use the first): features paired with
+//! features of the other volume through a k-d tree, from the initial side and from the deformed
+//! side, and exhaustive search of a feature's patch in the other volume, again from either side.
 
 use crate::matching::correlation::Searchable;
 use crate::numerics::neighbours::Neighbours;
@@ -62,7 +63,8 @@ pub fn candidates(
             found.into_iter().map(candidate).collect()
         })
         .collect();
-    // A deformed feature found back at `p` in the initial volume speaks for the initial feature nearest to `p`.
+    // A deformed feature found back at `p` in the initial volume speaks for the initial feature
+    // nearest to `p`.
     for (found, &q) in from_deformed.iter().zip(strongest) {
         let q = deformed.mm(q, spacing);
         for &(p, ncc) in found {
@@ -87,7 +89,8 @@ pub fn candidates(
     all
 }
 
-/// For each of `features` (of `from`): the best places in `to` by search, then the best features of `to` (common mm, ncc).
+/// For each of `features` (of `from`): the best places in `to` by search, then the best features of
+/// `to` (common mm, ncc).
 fn one_way(
     from: &Side<'_>,
     to: &Side<'_>,

@@ -3,14 +3,15 @@
 use crate::numerics::filters::separable;
 use crate::numerics::simd::{dispatch, dot};
 
-/// A volume prepared for correlation with patches of one size: the patch sum of squares about the mean at each voxel.
+/// A volume prepared for correlation with patches of one size: the patch sum of squares about the
+/// mean at each voxel.
 #[derive(Debug, Clone)]
 pub struct Searchable<'a> {
     data: &'a [f32],
     shape: [usize; 3],
     radius: [usize; 3],
-    /// Square root of the sum of squares about the mean of the patch around each voxel; empty where it is worked out for
-    /// each place that is asked for.
+    /// Square root of the sum of squares about the mean of the patch around each voxel; empty where
+    /// it is worked out for each place that is asked for.
     norm: Vec<f32>,
 }
 
@@ -34,7 +35,8 @@ const ROUGH: usize = 2;
 /// Widest patch along x whose sums are made on the spot.
 const WIDTH: usize = 8;
 
-/// A place found: offset from the centre of the search in voxels, and the correlation there (-1 to 1).
+/// A place found: offset from the centre of the search in voxels, and the correlation there (-1 to
+/// 1).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Peak {
     /// Offset (voxels).
@@ -49,7 +51,8 @@ pub fn patch_radius(shape: [usize; 3], radius: [usize; 3]) -> [usize; 3] {
 }
 
 impl<'a> Searchable<'a> {
-    /// Prepares `data` for patches of `2 radius + 1` voxels. NaN voxels make every patch that holds them unmatched.
+    /// Prepares `data` for patches of `2 radius + 1` voxels. NaN voxels make every patch that holds
+    /// them unmatched.
     pub fn new(data: &'a [f32], shape: [usize; 3], radius: [usize; 3]) -> Self {
         let radius = patch_radius(shape, radius);
         let kernels = radius.map(|r| vec![1.0 / (2 * r + 1) as f32; r + 1]);
@@ -66,8 +69,8 @@ impl<'a> Searchable<'a> {
         Self { data, shape, radius, norm }
     }
 
-    /// As [`Searchable::new`] for few places and short searches: nothing is prepared. Patches wider than 8 voxels along x
-    /// are prepared all the same.
+    /// As [`Searchable::new`] for few places and short searches: nothing is prepared. Patches wider
+    /// than 8 voxels along x are prepared all the same.
     pub fn near(data: &'a [f32], shape: [usize; 3], radius: [usize; 3]) -> Self {
         let radius = patch_radius(shape, radius);
         if 2 * radius[0] + 1 > WIDTH {
@@ -76,7 +79,8 @@ impl<'a> Searchable<'a> {
         Self { data, shape, radius, norm: Vec::new() }
     }
 
-    /// Correlation with the patch around voxel `at`, which lies inside; not finite where there is none.
+    /// Correlation with the patch around voxel `at`, which lies inside; not finite where there is
+    /// none.
     #[inline(always)]
     fn direct(&self, template: &Template, at: [usize; 3]) -> f32 {
         let [rx, ry, rz] = self.radius;
@@ -104,8 +108,8 @@ impl<'a> Searchable<'a> {
         cross / (square - sum * sum / template.values.len() as f32).sqrt()
     }
 
-    /// Sums of products with the patches around the voxels from `at` on along x, as many as `line` holds (a multiple of [`LANES`]).
-    /// What lies past the volume's last voxel is not summed.
+    /// Sums of products with the patches around the voxels from `at` on along x, as many as `line`
+    /// holds (a multiple of [`LANES`]). What lies past the volume's last voxel is not summed.
     #[inline(always)]
     fn line(&self, template: &Template, at: [usize; 3], line: &mut [f32]) {
         let (wide, rest) = line.as_chunks_mut::<{ 2 * LANES }>();
@@ -222,11 +226,12 @@ impl<'a> Searchable<'a> {
         self.search(template, centre, [0; 3], 1).first().map(|p| p.ncc)
     }
 
-    /// The `keep` best local maxima of the correlation over shifts up to `reach` voxels about `centre`, best first.
+    /// The `keep` best local maxima of the correlation over shifts up to `reach` voxels about
+    /// `centre`, best first.
     ///
-    /// Shifts whose patch leaves the volume do not take part. Exhaustive where `reach` is short; along y and z, where it is not, every
-    /// second shift is looked at and then all that lie beside the best of these: a patch of a smoothed volume is still like itself
-    /// a voxel away.
+    /// Shifts whose patch leaves the volume do not take part. Exhaustive where `reach` is short;
+    /// along y and z, where it is not, every second shift is looked at and then all that lie beside
+    /// the best of these: a patch of a smoothed volume is still like itself a voxel away.
     pub fn search(&self, template: &Template, centre: [i64; 3], reach: [usize; 3], keep: usize) -> Vec<Peak> {
         // Shifts whose patch lies inside, along each axis.
         let within: [[i64; 2]; 3] = std::array::from_fn(|a| {

@@ -1,10 +1,13 @@
-//! Local gain and offset between two aligned volumes, so that a bias field or another contrast is not taken for motion.
+//! Local gain and offset between two aligned volumes, so that a bias field or another contrast is
+//! not taken for motion.
 //!
-//! In blocks of voxels the deformed volume's mean and spread are brought to the initial one's (ratio of standard
-//! deviations, signed by the correlation: unlike a regression it is not biased by noise or by what motion is left). A voxel
-//! counts the less the steeper the volume is there: what is left of the motion shows in proportion to that ([`weigh`]). The
-//! sums of the blocks are smoothed over their neighbours and interpolated linearly. For the passes, what smoothing flattens of a bias is
-//! measured again on the corrected blocks and put back (twicing; Tukey 1977): what was left of it looked like motion.
+//! In blocks of voxels the deformed volume's mean and spread are brought to the initial one's
+//! (ratio of standard deviations, signed by the correlation: unlike a regression it is not biased
+//! by noise or by what motion is left). A voxel counts the less the steeper the volume is there:
+//! what is left of the motion shows in proportion to that ([`weigh`]). The sums of the blocks are
+//! smoothed over their neighbours and interpolated linearly. For the passes, what smoothing
+//! flattens of a bias is measured again on the corrected blocks and put back (twicing; Tukey 1977):
+//! what was left of it looked like motion.
 
 use crate::matching::pair::{Pair, row_step};
 use crate::numerics::filters::gradient_rows;
@@ -33,18 +36,21 @@ const AGAIN: usize = 3;
 /// The greatest weight of a voxel.
 const FULL: f32 = 255.0;
 
-/// Variance of what is left of the motion along an axis, over that of the smoothed difference's noise in the volume's own
-/// (voxels^-2): half a voxel for a quarter of the noise's variance. 0.1 and 3 gave the same errors within 1 %, 10 was 3 % worse.
+/// Variance of what is left of the motion along an axis, over that of the smoothed difference's
+/// noise in the volume's own (voxels^-2): half a voxel for a quarter of the noise's variance. 0.1
+/// and 3 gave the same errors within 1 %, 10 was 3 % worse.
 const LEFT: f32 = 1.0;
 
-/// Least variance of the noise, in the mean square of the gradients: volumes without noise differ by interpolation at least.
+/// Least variance of the noise, in the mean square of the gradients: volumes without noise differ
+/// by interpolation at least.
 const LEAST_NOISE: f32 = 0.03;
 
 /// Rows from which the mean square of the gradients is taken, about.
 const SAMPLED: usize = 1000;
 
-/// A voxel's weight in [`GainField`] in place of each that is set in `mask`, 1 to 255: the inverse variance of the difference there,
-/// noise and the gradient times what is left of the motion. `smooth` is the initial volume (smoothed), `noise` its noise.
+/// A voxel's weight in [`GainField`] in place of each that is set in `mask`, 1 to 255: the inverse
+/// variance of the difference there, noise and the gradient times what is left of the motion.
+/// `smooth` is the initial volume (smoothed), `noise` its noise.
 pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 3], noise: f32) {
     let [nx, ny, _] = shape;
     let finest = pyramid::finest(shape, spacing);
@@ -92,17 +98,19 @@ pub struct GainField {
     values: Vec<[f32; 2]>,
 }
 
-/// Sums of a block: weight, f, w, ff, ww, fw, with f and w less the volumes' means so that no precision is lost.
+/// Sums of a block: weight, f, w, ff, ww, fw, with f and w less the volumes' means so that no
+/// precision is lost.
 type Sums = [f64; 6];
 
 impl GainField {
-    /// From the initial volume (smoothed) and the warped one, inside the mask; smooth enough to judge by how well the two agree.
+    /// From the initial volume (smoothed) and the warped one, inside the mask; smooth enough to
+    /// judge by how well the two agree.
     pub fn measure(pair: &Pair<'_>, warped: &[f32]) -> Self {
         Self::of(pair, &block_sums(pair, warped), 0)
     }
 
-    /// As [`GainField::measure`], with what its smoothing flattened put back: little of a bias is then taken for motion, but it
-    /// takes up more of another contrast as well.
+    /// As [`GainField::measure`], with what its smoothing flattened put back: little of a bias is
+    /// then taken for motion, but it takes up more of another contrast as well.
     pub fn sharpened(pair: &Pair<'_>, warped: &[f32]) -> Self {
         Self::of(pair, &block_sums(pair, warped), AGAIN)
     }
@@ -131,8 +139,8 @@ impl GainField {
         Self { blocks, values: values.into_iter().map(|v| v.map(|v| v as f32)).collect() }
     }
 
-    /// By what factor the gain varies across the tissue (its 90th percentile over its tenth, on every other voxel along each axis); infinite
-    /// where it changes its sign, 1 without tissue.
+    /// By what factor the gain varies across the tissue (its 90th percentile over its tenth, on
+    /// every other voxel along each axis); infinite where it changes its sign, 1 without tissue.
     pub fn variation(&self, pair: &Pair<'_>) -> f32 {
         let [nx, ny, nz] = pair.shape;
         let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);
@@ -175,7 +183,8 @@ impl GainField {
             }
             v
         };
-        // Half a block before the first centre, whole blocks between centres, half a block after the last.
+        // Half a block before the first centre, whole blocks between centres, half a block after
+        // the last.
         let (first, rest) = gain.split_at_mut((BLOCK / 2).min(gain.len()));
         let (first_offset, rest_offset) = offset.split_at_mut(first.len());
         let mut lo = at(0);
@@ -288,8 +297,8 @@ fn smooth(sums: &[Sums], blocks: [usize; 3]) -> Vec<Sums> {
     out
 }
 
-/// Gain and offset from sums; where there is too little (few voxels, hardly more spread than noise) the `fallback`
-/// gain with the local mean.
+/// Gain and offset from sums; where there is too little (few voxels, hardly more spread than noise)
+/// the `fallback` gain with the local mean.
 fn gain(s: &Sums, noise: f64, centre: [f64; 2], fallback: [f64; 2]) -> [f64; 2] {
     let n = s[0];
     if n < 16.0 {
@@ -299,7 +308,8 @@ fn gain(s: &Sums, noise: f64, centre: [f64; 2], fallback: [f64; 2]) -> [f64; 2] 
     let (vf, vw, cov) = (s[3] / n - f * f, s[4] / n - w * w, s[5] / n - f * w);
     let floor = noise * noise;
     let strong = vf > 4.0 * floor && vw > 0.0 && n > 200.0;
-    // A clear negative correlation means inverted contrast; anything else is taken as the same contrast.
+    // A clear negative correlation means inverted contrast; anything else is taken as the same
+    // contrast.
     let sign = if cov < -0.5 * (vf * vw).sqrt() { -1.0 } else { 1.0 };
     let g = if strong { sign * ((vf + floor) / (vw + floor)).sqrt().clamp(0.1, 10.0) } else { fallback[0] };
     [g, f + centre[0] - g * (w + centre[1])]

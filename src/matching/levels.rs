@@ -23,9 +23,10 @@ pub struct Aligned<'a> {
 }
 
 impl<'a> Aligned<'a> {
-    /// Puts the deformed volume on the initial volume's axes. Where its axes and voxel size are the same already
-    /// (whatever its origin and shape) its values are taken as they are, else it is resampled once (cubic) over its
-    /// own extent, cut to the initial volume's box widened by `reach_mm`.
+    /// Puts the deformed volume on the initial volume's axes. Where its axes and voxel size are the
+    /// same already (whatever its origin and shape) its values are taken as they are, else it is
+    /// resampled once (cubic) over its own extent, cut to the initial volume's box widened by
+    /// `reach_mm`.
     ///
     /// # Errors
     /// [`FieldError::NoOverlap`] when the two boxes, widened by `reach_mm`, do not meet.
@@ -122,9 +123,10 @@ pub fn from_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
     std::array::from_fn(|a| (p[a] + 0.5) * factor[a] as f64 - 0.5)
 }
 
-/// Reduction factors from coarse to fine. The finest is `finest` times the smallest voxel edge, each coarser one about
-/// twice as coarse, up to voxels of about `coarsest_mm`; a coarse axis (thick slices) is left alone until the others
-/// have caught up, and no axis is reduced below 12 voxels.
+/// Reduction factors from coarse to fine. The finest is `finest` times the smallest voxel edge,
+/// each coarser one about twice as coarse, up to voxels of about `coarsest_mm`; a coarse axis
+/// (thick slices) is left alone until the others have caught up, and no axis is reduced below 12
+/// voxels.
 pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm: f64) -> Vec<[usize; 3]> {
     let smallest = pyramid::finest(shape, spacing);
     let mut out: Vec<[usize; 3]> = Vec::new();
@@ -147,8 +149,9 @@ pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm:
     out
 }
 
-/// A mask of tissue where none is given: brighter than a tenth of the way from the dark to the bright end (2nd and
-/// 98th percentile) after smoothing; everything when that leaves less than 2 % of the volume.
+/// A mask of tissue where none is given: brighter than a tenth of the way from the dark to the
+/// bright end (2nd and 98th percentile) after smoothing; everything when that leaves less than 2 %
+/// of the volume.
 pub fn foreground(volume: &Voxels<'_>) -> Mask {
     let shape = volume.grid().shape();
     let smooth = filters::gaussian(volume.as_slice(), shape, [1.0; 3]);
@@ -168,8 +171,8 @@ pub fn foreground(volume: &Voxels<'_>) -> Mask {
     out
 }
 
-/// The mask with what it encloses in a slice across any axis: dark tissue inside a bright ring is tissue. Sought on blocks of two
-/// voxels.
+/// The mask with what it encloses in a slice across any axis: dark tissue inside a bright ring is
+/// tissue. Sought on blocks of two voxels.
 fn filled(mut mask: Vec<u8>, shape: [usize; 3]) -> Vec<u8> {
     let block = shape.map(|n| n.min(2));
     let coarse = pyramid::reduced_shape(shape, block);
@@ -212,8 +215,8 @@ fn filled(mut mask: Vec<u8>, shape: [usize; 3]) -> Vec<u8> {
     mask
 }
 
-/// The box that the deformed volume's grid has in common with the initial one's, widened by `reach_mm`: its lowest and its highest
-/// place, in voxels of the initial grid.
+/// The box that the deformed volume's grid has in common with the initial one's, widened by
+/// `reach_mm`: its lowest and its highest place, in voxels of the initial grid.
 ///
 /// # Errors
 /// [`FieldError::NoOverlap`] when they do not meet.
@@ -238,8 +241,9 @@ fn corners(g: &Grid) -> [VoxelPoint; 8] {
     std::array::from_fn(|c| VoxelPoint(std::array::from_fn(|a| if c >> a & 1 == 1 { (s[a] - 1) as f64 } else { 0.0 })))
 }
 
-/// `volume` on a lattice with `grid`'s axes that starts at `origin` (voxels of `grid`); smoothed first along its axes
-/// where its voxels are finer, so that nothing aliases. NaN beyond half a voxel outside it.
+/// `volume` on a lattice with `grid`'s axes that starts at `origin` (voxels of `grid`); smoothed
+/// first along its axes where its voxels are finer, so that nothing aliases. NaN beyond half a
+/// voxel outside it.
 fn resample(volume: &Voxels<'_>, grid: &Grid, origin: [f64; 3], shape: [usize; 3]) -> Result<Vec<f32>, FieldError> {
     let affine = {
         let mut rows = grid.affine().rows();

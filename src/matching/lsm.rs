@@ -1,15 +1,17 @@
 //! Least-squares matching: a candidate brought to sub-voxel precision, with its covariance.
 //!
-//! Gauss-Newton on the patch with gain and offset (Ackermann 1984; Gruen 1985; Zhang, Hirai & Endo for MR volumes).
-//! The patch's own gradients serve in every step (the compositional form of Baker & Matthews 2004), so the 3 x 3 matrix
-//! is built once; what gain and offset explain as well is taken from it, so a mere ramp has no information. The patch is not warped here: the deformed volume is handed in already warped by the field known so
-//! far, so only the rest of the motion is sought.
+//! Gauss-Newton on the patch with gain and offset (Ackermann 1984; Gruen 1985; Zhang, Hirai & Endo
+//! for MR volumes). The patch's own gradients serve in every step (the compositional form of Baker
+//! & Matthews 2004), so the 3 x 3 matrix is built once; what gain and offset explain as well is
+//! taken from it, so a mere ramp has no information. The patch is not warped here: the deformed
+//! volume is handed in already warped by the field known so far, so only the rest of the motion is
+//! sought.
 
 use crate::numerics::simd::{self, dispatch};
 use crate::numerics::small::{Symmetric3, inverse, multiply};
 
-/// Noise of neighbouring voxels after the cubic B-spline is alike; a patch holds that many times fewer independent
-/// voxels: 1 / sum(k^2) of the kernel, 2 along each axis.
+/// Noise of neighbouring voxels after the cubic B-spline is alike; a patch holds that many times
+/// fewer independent voxels: 1 / sum(k^2) of the kernel, 2 along each axis.
 pub const CORRELATION: f64 = 2.0;
 
 /// A match found.
@@ -34,7 +36,8 @@ pub struct Template<'a> {
     pub spacing: [f64; 3],
     /// Patch radius (voxels).
     pub radius: [usize; 3],
-    /// Standard deviation of the noise in either volume after smoothing (intensity): bounds the covariance from below.
+    /// Standard deviation of the noise in either volume after smoothing (intensity): bounds the
+    /// covariance from below.
     pub noise: f64,
 }
 
@@ -45,8 +48,8 @@ impl Template<'_> {
     }
 }
 
-/// What [`refine`] needs of the deformed volume, from its value at single places: `sample(offset)` with the offset from the
-/// patch's centre (voxels).
+/// What [`refine`] needs of the deformed volume, from its value at single places: `sample(offset)`
+/// with the offset from the patch's centre (voxels).
 pub fn pointwise(radius: [usize; 3], sample: impl Fn([f32; 3]) -> f32) -> impl Fn([f32; 3], &mut [f32]) {
     let width = radius.map(|r| 2 * r + 1);
     move |shift, out| {
@@ -57,10 +60,12 @@ pub fn pointwise(radius: [usize; 3], sample: impl Fn([f32; 3]) -> f32) -> impl F
     }
 }
 
-/// Refines the match of the patch around voxel `centre`. `patch(shift, out)` gives the deformed volume over the patch (x
-/// fastest), `shift` voxels beside the start; it must be smoothed alike and NaN outside.
+/// Refines the match of the patch around voxel `centre`. `patch(shift, out)` gives the deformed
+/// volume over the patch (x fastest), `shift` voxels beside the start; it must be smoothed alike
+/// and NaN outside.
 ///
-/// None where the patch leaves a volume, has no texture in some direction, or the step leaves `limit` voxels.
+/// None where the patch leaves a volume, has no texture in some direction, or the step leaves
+/// `limit` voxels.
 pub fn refine(
     template: &Template<'_>,
     centre: [usize; 3],
@@ -119,9 +124,9 @@ pub fn refine(
     (ncc.is_finite() && covariance.iter().all(|v| v.is_finite())).then_some(Refined { shift, covariance, ncc })
 }
 
-/// The patch less its mean, its gradients (per mm) less what a change of offset (their mean) or of gain (their part along
-/// the patch) explains as well, so that their products are the information with both unknown (Schur complement), and
-/// the patch's standard deviation.
+/// The patch less its mean, its gradients (per mm) less what a change of offset (their mean) or of
+/// gain (their part along the patch) explains as well, so that their products are the information
+/// with both unknown (Schur complement), and the patch's standard deviation.
 fn prepare(template: &Template<'_>, centre: [usize; 3]) -> (Vec<f32>, [Vec<f32>; 3], f64) {
     let Template { data, shape, spacing, .. } = *template;
     let radius = template.reach();

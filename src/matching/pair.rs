@@ -11,10 +11,12 @@ use std::ops::Range;
 /// Side of the blocks in which texture is looked for (finest voxels).
 const BLOCK: usize = 7;
 
-/// Standard deviation in a block, over the noise, from which there is texture; that of noise alone scatters by 4 % (343 voxels).
+/// Standard deviation in a block, over the noise, from which there is texture; that of noise alone
+/// scatters by 4 % (343 voxels).
 const STANDS_OUT: f32 = 1.25;
 
-/// An initial and a deformed volume whose voxels have the same axes and size; the second may start elsewhere.
+/// An initial and a deformed volume whose voxels have the same axes and size; the second may start
+/// elsewhere.
 #[derive(Debug, Clone)]
 pub struct Pair<'a> {
     /// Voxels of the initial volume.
@@ -25,8 +27,8 @@ pub struct Pair<'a> {
     pub fixed: Cow<'a, [f32]>,
     /// The same, smoothed by the cubic B-spline (see [`SmoothSampler`]).
     pub fixed_smooth: Cow<'a, [f32]>,
-    /// Where matches are wanted (not 0), on the initial lattice; the value is the voxel's weight in the local gain
-    /// ([`crate::matching::gain::weigh`]).
+    /// Where matches are wanted (not 0), on the initial lattice; the value is the voxel's weight in
+    /// the local gain ([`crate::matching::gain::weigh`]).
     pub mask: Cow<'a, [u8]>,
     /// Voxels of the mask.
     pub inside: usize,
@@ -86,14 +88,16 @@ impl<'a> Pair<'a> {
         std::array::from_fn(|a| (p[a] - self.moving_origin[a]) as f32)
     }
 
-    /// About as far along every axis (mm) as `n` of the finest axis' voxels, in voxels of each: at least one.
+    /// About as far along every axis (mm) as `n` of the finest axis' voxels, in voxels of each: at
+    /// least one.
     pub fn in_voxels(&self, n: usize) -> [usize; 3] {
         let finest = pyramid::finest(self.shape, self.spacing);
         self.spacing.map(|s| ((n as f64 * finest / s).round() as usize).max(1))
     }
 
-    /// The part of the mask where nothing stands out of the noise: blocks of about seven of the finest voxels along each axis in
-    /// which the initial volume's standard deviation is hardly more than the noise. How that moves only its surroundings tell.
+    /// The part of the mask where nothing stands out of the noise: blocks of about seven of the
+    /// finest voxels along each axis in which the initial volume's standard deviation is hardly
+    /// more than the noise. How that moves only its surroundings tell.
     pub fn plain(&self) -> f64 {
         let [nx, ny, nz] = self.shape;
         let side = self.in_voxels(BLOCK);
@@ -107,7 +111,8 @@ impl<'a> Pair<'a> {
         slabs.into_par_iter().map(in_slab).sum::<usize>() as f64 / self.inside.max(1) as f64
     }
 
-    /// The initial volume's variance over a block that ends at the volume's faces, and the block's voxels of the mask.
+    /// The initial volume's variance over a block that ends at the volume's faces, and the block's
+    /// voxels of the mask.
     fn block(&self, first: [usize; 3], side: [usize; 3]) -> (f64, usize) {
         let [xs, ys, zs]: [Range<usize>; 3] =
             std::array::from_fn(|a| first[a]..(first[a] + side[a]).min(self.shape[a]));
@@ -129,15 +134,16 @@ impl<'a> Pair<'a> {
         SmoothSampler { data: &self.moving, shape: self.moving_shape }
     }
 
-    /// The deformed volume sampled at `x + u(x)`: smoothed like `fixed_smooth`, NaN where it was not seen and outside
-    /// `spans`. `coefficients` are mm along the lattice's axes.
+    /// The deformed volume sampled at `x + u(x)`: smoothed like `fixed_smooth`, NaN where it was
+    /// not seen and outside `spans`. `coefficients` are mm along the lattice's axes.
     pub fn warp(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans) -> Vec<f32> {
         let mut out = self.unseen();
         self.warp_again(lattice, coefficients, spans, &mut out);
         out
     }
 
-    /// The deformed volume sampled within the pair's own spans. The rest is 0 and takes no memory; nothing may be read there.
+    /// The deformed volume sampled within the pair's own spans. The rest is 0 and takes no memory;
+    /// nothing may be read there.
     pub fn warp_sparsely(&self, lattice: &Lattice, coefficients: &[f32]) -> Vec<f32> {
         let mut out = vec![0.0; self.fixed.len()];
         self.warp_again(lattice, coefficients, &self.spans, &mut out);
@@ -190,8 +196,9 @@ pub fn about_mean(values: &[f32]) -> f32 {
     (sum / n.max(1) as f64) as f32
 }
 
-/// Step of at least `wanted` (and 1) through the rows `(j, k)` of a volume of `ny` rows a slice, as they lie in memory, that meets
-/// every `j` alike: it has no divisor in common with `ny`, which else could give the same few rows of each slice.
+/// Step of at least `wanted` (and 1) through the rows `(j, k)` of a volume of `ny` rows a slice, as
+/// they lie in memory, that meets every `j` alike: it has no divisor in common with `ny`, which
+/// else could give the same few rows of each slice.
 pub fn row_step(wanted: usize, ny: usize) -> usize {
     let divisor = |mut a: usize, mut b: usize| {
         while b > 0 {

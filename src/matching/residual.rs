@@ -1,11 +1,12 @@
 //! What is left of the difference between two volumes, as normal equations for a spline field.
 //!
-//! With `r = f - (a w + b)` (initial, gain, warped, offset) and `g` the mean of both images' gradients (the symmetric
-//! Gauss-Newton step of Benhimane & Malis 2004), every node of the lattice gets the information
-//! `A = sum_x B(x) rho(x) g g^T / sigma^2` and the right-hand side `sum_x B(x) rho(x) g r / sigma^2`. The sum of the
-//! basis functions is one, so the block diagonal `A` bounds the true Gauss-Newton matrix from above (each step cannot
-//! overshoot) and no pair of nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`, to which what
-//! interpolation leaves unsure adds in proportion to `g`: contrast beyond that tells no more.
+//! With `r = f - (a w + b)` (initial, gain, warped, offset) and `g` the mean of both images'
+//! gradients (the symmetric Gauss-Newton step of Benhimane & Malis 2004), every node of the lattice
+//! gets the information `A = sum_x B(x) rho(x) g g^T / sigma^2` and the right-hand side
+//! `sum_x B(x) rho(x) g r / sigma^2`. The sum of the basis functions is one, so the block diagonal
+//! `A` bounds the true Gauss-Newton matrix from above (each step cannot overshoot) and no pair of
+//! nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`, to which
+//! what interpolation leaves unsure adds in proportion to `g`: contrast beyond that tells no more.
 
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, row_step};
@@ -19,8 +20,9 @@ use rayon::prelude::*;
 /// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
 pub const CAUCHY: f32 = 2.385;
 
-/// Place that interpolation leaves unsure at any voxel, however steep (finest voxels): bright edges say no more than this. Measured
-/// on affine motions without noise, which come out .005 to .03 of a voxel off.
+/// Place that interpolation leaves unsure at any voxel, however steep (finest voxels): bright edges
+/// say no more than this. Measured on affine motions without noise, which come out .005 to .03 of a
+/// voxel off.
 const UNSURE: f64 = 0.02;
 
 /// Normal equations of one pass.
@@ -59,7 +61,8 @@ pub fn residual_sigma(pair: &Pair<'_>, warped: &[f32], gain: &GainField) -> f32 
     if r.is_empty() { 0.0 } else { 1.4826 * median(&mut r) }
 }
 
-/// Accumulates the normal equations of `lattice` for the present warp. `floor` bounds sigma from below (intensity).
+/// Accumulates the normal equations of `lattice` for the present warp. `floor` bounds sigma from
+/// below (intensity).
 pub fn normal_equations(
     pair: &Pair<'_>,
     warped: &[f32],
@@ -93,7 +96,8 @@ pub fn normal_equations(
         dispatch(
             #[inline(always)]
             || {
-                // One by one: mapped arrays are functions of their own here, and took as long as the sums.
+                // One by one: mapped arrays are functions of their own here, and took as long as
+                // the sums.
                 let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = &mut *rows;
                 // The first two rows hold gain and offset until they are overwritten.
                 gain.row(j, k, xx, yy);
@@ -155,8 +159,9 @@ impl Baseline {
 
 /// How much worse, in units of noise, the volumes agree under one warp than under another.
 ///
-/// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see, with Cauchy's cost
-/// `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread under the better warp `b`.
+/// `sum_x [rho(r_a / sigma) - rho(r_b / sigma)]` over the voxels of the mask that both warps see,
+/// with Cauchy's cost `rho(t) = c^2 ln(1 + t^2 / c^2)` (nearly `t^2`) and `sigma` the robust spread
+/// under the better warp `b`.
 pub fn excess(pair: &Pair<'_>, a: &[f32], b: &Baseline) -> f64 {
     let [_, ny, nz] = pair.shape;
     let compared = Compared::new(pair, a, b);
@@ -196,7 +201,8 @@ impl<'a> Compared<'a> {
         Self { pair, worse: (worse, GainField::measure(pair, worse)), better }
     }
 
-    /// Calls `sum` with the excess of a few voxels of a row at a time, and one of them that lies in the pair's spans.
+    /// Calls `sum` with the excess of a few voxels of a row at a time, and one of them that lies in
+    /// the pair's spans.
     fn row(&self, j: usize, k: usize, mut sum: impl FnMut(usize, f64)) {
         let Self { pair, worse, better } = self;
         let (nx, span) = (pair.shape[0], pair.spans.row(j, k));

@@ -4,9 +4,10 @@ use crate::types::space::dot;
 
 /// Weights, not negative and of sum one, of the element's point nearest to `p`.
 ///
-/// `parts` are the signed volumes (areas) with each corner moved to `p`. Their ratios are the weights, unless rounding
-/// outweighs them, in a sliver or beyond the hull, so that the weights do not lead back to within `tolerance` of `p`;
-/// then the nearest point is sought on each face of the element.
+/// `parts` are the signed volumes (areas) with each corner moved to `p`. Their ratios are the
+/// weights, unless rounding outweighs them, in a sliver or beyond the hull, so that the weights do
+/// not lead back to within `tolerance` of `p`; then the nearest point is sought on each face of the
+/// element.
 pub(super) fn weights<const N: usize>(
     corners: [[f64; 3]; N],
     p: [f64; 3],
@@ -39,7 +40,8 @@ fn distance<const N: usize>(corners: &[[f64; 3]; N], weights: &[f64; N], p: [f64
     dot(d, d).sqrt()
 }
 
-/// The weights of the foot of `p` on the flat space through a face; none if a weight is negative or the face is flat.
+/// The weights of the foot of `p` on the flat space through a face; none if a weight is negative or
+/// the face is flat.
 fn foot<const N: usize>(corners: &[[f64; 3]; N], face: u32, p: [f64; 3]) -> Option<[f64; N]> {
     let members: Vec<usize> = (0..N).filter(|i| face >> i & 1 == 1).collect();
     let (&origin, rest) = members.split_first()?;

@@ -1,10 +1,11 @@
 //! The growing tetrahedralisation: cells, links between them, and the insertion of one point.
 //!
-//! The space outside the hull is filled with *ghost* cells, one on each hull facet, whose fourth vertex is [`GHOST`];
-//! so every facet has a cell on both sides. A finite cell is in conflict with a point strictly inside its sphere; a
-//! ghost with one strictly beyond its facet, or in the facet's plane and strictly inside its circle. All signs are
-//! exact. Then the cells in conflict form a region that is star-shaped around the point, no facet of its surface is
-//! coplanar with the point, and joining each to the point (Bowyer 1981, Watson 1981) makes a tiling without flat
+//! The space outside the hull is filled with *ghost* cells, one on each hull facet, whose fourth
+//! vertex is [`GHOST`]; so every facet has a cell on both sides. A finite cell is in conflict with
+//! a point strictly inside its sphere; a ghost with one strictly beyond its facet, or in the
+//! facet's plane and strictly inside its circle. All signs are exact. Then the cells in conflict
+//! form a region that is star-shaped around the point, no facet of its surface is coplanar with the
+//! point, and joining each to the point (Bowyer 1981, Watson 1981) makes a tiling without flat
 //! cells again, whatever points lie on one sphere or plane.
 
 use super::edge_map::EdgeMap;
@@ -13,11 +14,12 @@ use super::predicates::{StaticBounds, insphere_bounded, orient3d_bounded};
 /// The vertex at infinity; always the last of its cell.
 pub(super) const GHOST: u32 = u32::MAX;
 
-/// Four vertices, positively oriented, and four links. Link `i` leads through the facet across from vertex `i`; it is
-/// the neighbour's number times four plus the facet's number there.
+/// Four vertices, positively oriented, and four links. Link `i` leads through the facet across from
+/// vertex `i`; it is the neighbour's number times four plus the facet's number there.
 pub(super) type Cell = [[u32; 4]; 2];
 
-/// For each apex, the other three facets, each with the two vertices of its edge across from the apex.
+/// For each apex, the other three facets, each with the two vertices of its edge across from the
+/// apex.
 const SIDES: [[[usize; 3]; 3]; 4] = [
     [[1, 2, 3], [2, 1, 3], [3, 1, 2]],
     [[0, 2, 3], [2, 0, 3], [3, 0, 2]],
@@ -25,8 +27,8 @@ const SIDES: [[[usize; 3]; 3]; 4] = [
     [[0, 1, 2], [1, 0, 2], [2, 0, 1]],
 ];
 
-/// A facet of the cavity's surface joined to the new point: the new cell's vertices, which of them is the new point,
-/// and the link outwards.
+/// A facet of the cavity's surface joined to the new point: the new cell's vertices, which of them
+/// is the new point, and the link outwards.
 struct Spoke {
     vertices: [u32; 4],
     apex: usize,
@@ -109,8 +111,9 @@ impl Cells {
 
     /// The finite cell that holds `p` in its closure, or a ghost that `p` lies strictly beyond.
     ///
-    /// Walks through any facet that separates, the first one drawn by chance: on points of one sphere a fixed choice
-    /// could go round for ever (Devillers, Pion, Teillaud, "Walking in a triangulation", 2002).
+    /// Walks through any facet that separates, the first one drawn by chance: on points of one
+    /// sphere a fixed choice could go round for ever (Devillers, Pion, Teillaud, "Walking in a
+    /// triangulation", 2002).
     fn locate(&mut self, p: &[f64; 3]) -> u32 {
         let (points, cells) = (self.points.as_slice(), self.cells.as_slice());
         let mut at = self.last;
@@ -251,7 +254,8 @@ fn conflicts(points: &[[f64; 3]], cells: &[Cell], bounds: &StaticBounds, cell: u
     }
     let facet = [v[0], v[1], v[2]].map(|i| &points[i as usize]);
     let side = orient3d_bounded(bounds, [facet[0], facet[1], facet[2], p]);
-    // In the facet's plane, the circle of the facet is where the inner cell's sphere cuts the plane.
+    // In the facet's plane, the circle of the facet is where the inner cell's sphere cuts the
+    // plane.
     let inner = &cells[(links[3] >> 2) as usize][0];
     side > 0.0 || side == 0.0 && insphere_bounded(bounds, corners(points, inner), p) > 0.0
 }

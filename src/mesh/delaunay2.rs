@@ -1,9 +1,10 @@
 //! Delaunay triangulation of points in one plane, which may lie anywhere in space.
 //!
-//! Promises: the triangles tile the convex hull of the points' feet on the plane, and no foot lies strictly inside the
-//! circle through any (exact on the feet; those are the coordinates themselves where the plane is parallel to two
-//! axes). Seen against the plane's normal, triangles turn counter-clockwise. Points that coincide in the plane become
-//! one node. Fails on fewer than three points and on points of one line.
+//! Promises: the triangles tile the convex hull of the points' feet on the plane, and no foot lies
+//! strictly inside the circle through any (exact on the feet; those are the coordinates themselves
+//! where the plane is parallel to two axes). Seen against the plane's normal, triangles turn
+//! counter-clockwise. Points that coincide in the plane become one node. Fails on fewer than three
+//! points and on points of one line.
 
 use super::delaunay3::number_nodes;
 use super::normalise::normalise;

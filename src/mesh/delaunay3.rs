@@ -1,9 +1,11 @@
 //! Exact Delaunay tetrahedralisation of points in space.
 //!
-//! Promises: the tetrahedra tile the convex hull, none is flat, each is positively oriented, and no point lies strictly
-//! inside the sphere through any (where more than four lie on one sphere, it is one of the valid choices, always the
-//! same). Needs finite points that do not all lie in one plane; points that coincide become one node. Time grows as
-//! n log n on points of bounded density; up to about 150 million points fit. Fails on fewer than four points, and on points in one plane or on one line.
+//! Promises: the tetrahedra tile the convex hull, none is flat, each is positively oriented, and no
+//! point lies strictly inside the sphere through any (where more than four lie on one sphere, it is
+//! one of the valid choices, always the same). Needs finite points that do not all lie in one
+//! plane; points that coincide become one node. Time grows as n log n on points of bounded density;
+//! up to about 150 million points fit. Fails on fewer than four points, and on points in one plane
+//! or on one line.
 
 use super::cells::Cells;
 use super::hilbert::insertion_order;
@@ -52,7 +54,8 @@ pub fn delaunay3(points: &[WorldPoint]) -> Result<Delaunay<TetMesh, 4>, MeshErro
     Ok(Delaunay { mesh: TetMesh::new(nodes, tetrahedra)?, neighbours, source, node })
 }
 
-/// Numbers the nodes in the order of the input. `place[i]` is a number that input points at the same place share.
+/// Numbers the nodes in the order of the input. `place[i]` is a number that input points at the
+/// same place share.
 ///
 /// Gives node to first input point, input point to node, and place to node.
 pub(super) fn number_nodes(place: Vec<u32>) -> (Vec<u32>, Vec<u32>, Vec<u32>) {

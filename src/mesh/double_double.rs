@@ -1,8 +1,8 @@
 //! Numbers of twice the precision of f64: an unevaluated sum of two.
 //!
-//! Source: M. Joldes, J.-M. Muller, V. Popescu, "Tight and rigorous error bounds for basic building blocks of
-//! double-word arithmetic", ACM TOMS 44 (2017): with u = 2^-53, a sum errs by at most about 3 u^2 of itself
-//! (`AccurateDWPlusDW`), a product by 5 u^2 (`DWTimesDW1`).
+//! Source: M. Joldes, J.-M. Muller, V. Popescu, "Tight and rigorous error bounds for basic building
+//! blocks of double-word arithmetic", ACM TOMS 44 (2017): with u = 2^-53, a sum errs by at most
+//! about 3 u^2 of itself (`AccurateDWPlusDW`), a product by 5 u^2 (`DWTimesDW1`).
 
 use std::ops::{Add, Mul, Neg, Sub};
 

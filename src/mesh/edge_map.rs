@@ -40,7 +40,8 @@ pub(super) struct Pairs<'a> {
 }
 
 impl Pairs<'_> {
-    /// The value stored for the edge between `a` and `b`, or none on its first visit, when `value` is stored.
+    /// The value stored for the edge between `a` and `b`, or none on its first visit, when `value`
+    /// is stored.
     #[inline(always)]
     pub(super) fn pair(&mut self, a: u32, b: u32, value: u32) -> Option<u32> {
         let edge = u64::from(a.min(b)) << 32 | u64::from(a.max(b));

@@ -1,15 +1,15 @@
 //! Insertion order: biased random rounds, each along a Hilbert curve.
 //!
-//! Sources: N. Amenta, S. Choi, G. Rote, "Incremental constructions con BRIO", SoCG 2003; J. Skilling, "Programming
-//! the Hilbert curve", AIP Conf. Proc. 707 (2004).
+//! Sources: N. Amenta, S. Choi, G. Rote, "Incremental constructions con BRIO", SoCG 2003; J.
+//! Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004).
 
 /// Bits an axis on the curve.
 const BITS: u32 = 16;
 
 /// The order in which to insert the points: a permutation of their numbers, the same every time.
 ///
-/// Each point is in the last round with probability 7/8, in the one before with 7/64 and so on; within a round the
-/// points follow the curve, so that each lies near the one before.
+/// Each point is in the last round with probability 7/8, in the one before with 7/64 and so on;
+/// within a round the points follow the curve, so that each lies near the one before.
 pub(super) fn insertion_order(points: &[[f64; 3]]) -> Vec<u32> {
     let mut low = [f64::INFINITY; 3];
     let mut high = [f64::NEG_INFINITY; 3];
@@ -30,7 +30,8 @@ pub(super) fn insertion_order(points: &[[f64; 3]]) -> Vec<u32> {
     keyed.into_iter().map(|(_, i)| i).collect()
 }
 
-/// How many rounds before the last point `i` is inserted, 0 to 15 (the finaliser of SplitMix64 as chance).
+/// How many rounds before the last point `i` is inserted, 0 to 15 (the finaliser of SplitMix64 as
+/// chance).
 fn round(i: u64) -> u32 {
     let mut h = i.wrapping_add(0x9e37_79b9_7f4a_7c15);
     h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -38,7 +39,8 @@ fn round(i: u64) -> u32 {
     ((h ^ (h >> 31)).trailing_zeros() / 3).min(15)
 }
 
-/// Position of a cell of the 2^16-cube along the Hilbert curve (Skilling's `AxestoTranspose`, then interleaved).
+/// Position of a cell of the 2^16-cube along the Hilbert curve (Skilling's `AxestoTranspose`, then
+/// interleaved).
 fn hilbert_index(mut x: [u32; 3]) -> u64 {
     for bit in (1..BITS).rev() {
         let (q, mask) = (1 << bit, (1 << bit) - 1);

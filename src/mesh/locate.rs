@@ -1,10 +1,11 @@
 //! Which element of a Delaunay mesh holds a point, and with which weights.
 //!
-//! Promises: exact signs choose the way, and the element found holds the point or lies within 1e-9 of the mesh's size of
-//! it; a point farther than twice that outside the hull is in none. Needs the mesh of a convex hull with its
-//! neighbour table, as the Delaunay functions give it.
+//! Promises: exact signs choose the way, and the element found holds the point or lies within 1e-9
+//! of the mesh's size of it; a point farther than twice that outside the hull is in none. Needs the
+//! mesh of a convex hull with its neighbour table, as the Delaunay functions give it.
 //!
-//! Source: O. Devillers, S. Pion, M. Teillaud, "Walking in a triangulation", Int. J. Found. Comput. Sci. 13 (2002).
+//! Source: O. Devillers, S. Pion, M. Teillaud, "Walking in a triangulation", Int. J. Found. Comput.
+//! Sci. 13 (2002).
 
 use super::barycentric::weights;
 use super::plane::Plane;
@@ -17,7 +18,8 @@ use crate::types::{TetMesh, TriMesh, WorldPoint};
 /// Points this part of the mesh's size outside of the hull still count as on it.
 const TOLERANCE: f64 = 1e-9;
 
-/// An element and the barycentric weights of a point in it: not negative, of sum one, in the order of its corners.
+/// An element and the barycentric weights of a point in it: not negative, of sum one, in the order
+/// of its corners.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Located<const N: usize> {
     /// The element's number.
@@ -41,8 +43,8 @@ impl<'a> TetrahedronLocator<'a> {
         Self { mesh: &delaunay.mesh, neighbours: &delaunay.neighbours, bounds }
     }
 
-    /// The tetrahedron that holds `p` (world mm, RAS), walking from tetrahedron `hint` (any; a near one is faster).
-    /// None outside the hull or where `p` is not finite.
+    /// The tetrahedron that holds `p` (world mm, RAS), walking from tetrahedron `hint` (any; a near
+    /// one is faster). None outside the hull or where `p` is not finite.
     pub fn locate(&self, p: WorldPoint, hint: u32) -> Option<Located<4>> {
         if !self.bounds.hold(p.0) {
             return None;
@@ -126,8 +128,8 @@ fn lift([x, y]: [f64; 2]) -> [f64; 3] {
     [x, y, 0.0]
 }
 
-/// Walks through facets that separate the element from the point (`part` negative) until there is none; through the
-/// hull only where the point is `far` outside.
+/// Walks through facets that separate the element from the point (`part` negative) until there is
+/// none; through the hull only where the point is `far` outside.
 fn walk<const N: usize>(
     neighbours: &[[u32; N]],
     hint: u32,
@@ -181,8 +183,8 @@ impl Bounds {
         Self { low, high, mean, tolerance: TOLERANCE * size }
     }
 
-    /// The point moved towards the mean by up to the tolerance: off the hull, where rounding makes slivers so thin that
-    /// a point beside them seems to be in one far from it.
+    /// The point moved towards the mean by up to the tolerance: off the hull, where rounding makes
+    /// slivers so thin that a point beside them seems to be in one far from it.
     fn inwards(&self, p: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|a| p[a] + TOLERANCE * (self.mean[a] - p[a]))
     }

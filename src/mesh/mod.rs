@@ -1,4 +1,5 @@
-//! Simplicial meshes through scattered points: exact Delaunay in space and in a plane, location, quality.
+//! Simplicial meshes through scattered points: exact Delaunay in space and in a plane, location,
+//! quality.
 //!
 //! Promises: every decision is taken by an exact predicate, so lattices, repeated points, thin slices and points on
 //! one sphere give a valid mesh that tiles the convex hull. Needs finite coordinates. Fails with a

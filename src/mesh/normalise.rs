@@ -1,4 +1,5 @@
-//! Points scaled by a power of two, so that the exact predicates can neither overflow nor underflow.
+//! Points scaled by a power of two, so that the exact predicates can neither overflow nor
+//! underflow.
 
 use crate::error::MeshError;
 use crate::types::WorldPoint;
@@ -8,7 +9,8 @@ const SMALLEST: f64 = 1.793662034335766e-43;
 
 /// The points with their largest coordinate brought to between 1/2 and 2.
 ///
-/// A power of two keeps every bit, so all exact signs stay what they were (but for coordinates under [`SMALLEST`]).
+/// A power of two keeps every bit, so all exact signs stay what they were (but for coordinates
+/// under [`SMALLEST`]).
 ///
 /// # Errors
 /// [`MeshError::NotFinite`] names the first point with NaN or infinity.

@@ -4,8 +4,8 @@ use crate::error::MeshError;
 use crate::types::WorldPoint;
 use crate::types::space::{cross, dot};
 
-/// Points are on one line when they lie within this part of their extent of it: two hundred times the rounding of an
-/// oblique line's coordinates.
+/// Points are on one line when they lie within this part of their extent of it: two hundred times
+/// the rounding of an oblique line's coordinates.
 const COLLINEAR: f64 = 1e-13;
 
 /// A plane anywhere in space.
@@ -17,8 +17,9 @@ pub struct Plane {
 }
 
 impl Plane {
-    /// The plane through three far points of a coplanar set (mm, RAS). Its axes are those of the world where the plane
-    /// is parallel to two of them; the largest component of the normal is positive.
+    /// The plane through three far points of a coplanar set (mm, RAS). Its axes are those of the
+    /// world where the plane is parallel to two of them; the largest component of the normal is
+    /// positive.
     ///
     /// # Errors
     /// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points; [`MeshError::Collinear`].

@@ -1,25 +1,28 @@
 //! Exact signs of the geometric determinants: orientation and in-sphere.
 //!
-//! Promises: the sign of each result is that of the exact determinant of the given floating-point coordinates, as long
-//! as every coordinate is zero or between 2^-142 and 2^200 in size. A floating-point value is used where its error
-//! bound proves the sign; the rest goes to Shewchuk's adaptive expansions (crate `robust`).
+//! Promises: the sign of each result is that of the exact determinant of the given floating-point
+//! coordinates, as long as every coordinate is zero or between 2^-142 and 2^200 in size. A
+//! floating-point value is used where its error bound proves the sign; the rest goes to Shewchuk's
+//! adaptive expansions (crate `robust`).
 //!
-//! Source: J. R. Shewchuk, "Adaptive precision floating-point arithmetic and fast robust geometric predicates",
-//! Discrete Comput. Geom. 18 (1997). The bounds here replace his permanents by products of the largest difference along
-//! each axis (Melquiond and Pion, "Formally certified floating-point filters", 2007).
+//! Source: J. R. Shewchuk, "Adaptive precision floating-point arithmetic and fast robust geometric
+//! predicates", Discrete Comput. Geom. 18 (1997). The bounds here replace his permanents by
+//! products of the largest difference along each axis (Melquiond and Pion, "Formally certified
+//! floating-point filters", 2007).
 
 use super::double_double::DoubleDouble;
 use robust::{Coord, Coord3D};
 use std::ops::{Add, Mul, Neg, Sub};
 
-/// `(7 + 56 e) e` (Shewchuk's o3derrboundA) times 6, the number of products in the permanent; e = 2^-53.
+/// `(7 + 56 e) e` (Shewchuk's o3derrboundA) times 6, the number of products in the permanent; e =
+/// 2^-53.
 const ORIENT3D_BOUND: f64 = 4.7e-15;
 
 /// `(16 + 224 e) e` (isperrboundA) times 72: 4 lifts of 3 squares, 6 products each.
 const INSPHERE_BOUND: f64 = 1.29e-13;
 
-/// The same bound in doubled precision over [`INSPHERE_BOUND`]: 72 times 41 u^2, u = 2^-53, by the errors that
-/// `double_double` cites.
+/// The same bound in doubled precision over [`INSPHERE_BOUND`]: 72 times 41 u^2, u = 2^-53, by the
+/// errors that `double_double` cites.
 const DOUBLED: f64 = 3e-16;
 
 fn coord(p: &[f64; 3]) -> Coord3D<f64> {
@@ -42,13 +45,15 @@ fn smaller(a: f64, b: f64) -> f64 {
     if a < b { a } else { b }
 }
 
-/// Positive where `a`, `b`, `c` turn counter-clockwise, negative where clockwise, zero where collinear.
+/// Positive where `a`, `b`, `c` turn counter-clockwise, negative where clockwise, zero where
+/// collinear.
 pub fn orient2d(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     let [a, b, c] = [a, b, c].map(|p| Coord { x: p[0], y: p[1] });
     robust::orient2d(a, b, c)
 }
 
-/// What is known of all points together, so that most signs need no more than the plain determinant.
+/// What is known of all points together, so that most signs need no more than the plain
+/// determinant.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StaticBounds {
     /// A determinant larger than this has the right sign.
@@ -64,8 +69,9 @@ impl StaticBounds {
     const NONE: Self =
         Self { orient3d: f64::INFINITY, insphere: f64::INFINITY, orient3d_exact: 0.0, insphere_exact: 0.0 };
 
-    /// Of normalised points. On a lattice, all numbers in a determinant of near points are whole multiples of the
-    /// lattice's unit, and small enough to have no rounding: 6 d^3 or 72 d^5 stays under 2^53.
+    /// Of normalised points. On a lattice, all numbers in a determinant of near points are whole
+    /// multiples of the lattice's unit, and small enough to have no rounding: 6 d^3 or 72 d^5 stays
+    /// under 2^53.
     pub(super) fn new(points: &[[f64; 3]]) -> Self {
         let size = [0, 1, 2].map(|k| {
             let range = |[l, h]: [f64; 2], p: &[f64; 3]| [smaller(l, p[k]), larger(h, p[k])];
@@ -87,7 +93,8 @@ fn last_bit(v: f64) -> i32 {
     (bits >> 52 & 0x7ff) as i32 - 1075 + mantissa.trailing_zeros() as i32
 }
 
-/// Bounds for differences of the given sizes along each axis; infinite where they could underflow or overflow.
+/// Bounds for differences of the given sizes along each axis; infinite where they could underflow
+/// or overflow.
 #[inline]
 fn bounds([x, y, z]: [f64; 3]) -> (f64, f64) {
     let (least, most) = (smaller(smaller(x, y), z), larger(larger(x, y), z));
@@ -99,7 +106,8 @@ fn bounds([x, y, z]: [f64; 3]) -> (f64, f64) {
     }
 }
 
-/// The sign of `det(b - a, c - a, d - a)`: positive for a positively oriented tetrahedron, zero where coplanar.
+/// The sign of `det(b - a, c - a, d - a)`: positive for a positively oriented tetrahedron, zero
+/// where coplanar.
 pub fn orient3d(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3]) -> f64 {
     orient3d_bounded(&StaticBounds::NONE, [a, b, c, d])
 }
@@ -128,8 +136,8 @@ fn close_orient3d(known: &StaticBounds, det: f64, [a, b, c, d]: [&[f64; 3]; 4]) 
     robust::orient3d(coord(b), coord(a), coord(c), coord(d))
 }
 
-/// Positive where `e` lies strictly inside the sphere through the positively oriented tetrahedron `a b c d`, zero where
-/// on it.
+/// Positive where `e` lies strictly inside the sphere through the positively oriented tetrahedron
+/// `a b c d`, zero where on it.
 pub fn insphere(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3], e: &[f64; 3]) -> f64 {
     insphere_bounded(&StaticBounds::NONE, [a, b, c, d], e)
 }
@@ -160,7 +168,8 @@ where
     (lift(0) * volume(1, 2, 3) - lift(1) * volume(2, 3, 0)) + (lift(2) * volume(3, 0, 1) - lift(3) * volume(0, 1, 2))
 }
 
-/// A determinant near zero: bounded by its own differences, exact on a lattice, in doubled precision, or in any.
+/// A determinant near zero: bounded by its own differences, exact on a lattice, in doubled
+/// precision, or in any.
 #[inline(never)]
 fn close_insphere(known: &StaticBounds, det: f64, corners: [&[f64; 3]; 4], e: &[f64; 3]) -> f64 {
     let size = [0, 1, 2].map(|k| corners.iter().fold(0.0, |m, p| larger(m, (p[k] - e[k]).abs())));

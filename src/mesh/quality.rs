@@ -11,7 +11,8 @@ pub struct Quality {
     pub volume: f64,
     /// Circumradius over the shortest edge (1): 0.612 for a regular tetrahedron, larger is worse.
     pub radius_edge_ratio: f64,
-    /// Least angle between two faces (radians): 1.231 for a regular tetrahedron, near zero for slivers.
+    /// Least angle between two faces (radians): 1.231 for a regular tetrahedron, near zero for
+    /// slivers.
     pub min_dihedral_angle: f64,
 }
 
@@ -55,7 +56,8 @@ pub fn total_volume(mesh: &TetMesh) -> f64 {
     elements(mesh).map(volume).sum()
 }
 
-/// The volume inside the mesh's surface (mm^3), from its outer facets alone by the divergence theorem.
+/// The volume inside the mesh's surface (mm^3), from its outer facets alone by the divergence
+/// theorem.
 pub fn hull_volume(delaunay: &Delaunay<TetMesh, 4>) -> f64 {
     let nodes = delaunay.mesh.nodes();
     let Some(&origin) = nodes.first() else { return 0.0 };

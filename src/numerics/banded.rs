@@ -22,7 +22,8 @@ impl Band {
         i * (self.width + 1) + self.width + j - i
     }
 
-    /// Adds to entry (i, j), and so to (j, i); entries above the diagonal are left to their mirror images.
+    /// Adds to entry (i, j), and so to (j, i); entries above the diagonal are left to their mirror
+    /// images.
     pub fn add(&mut self, i: usize, j: usize, value: f64) {
         if j <= i {
             let at = self.at(i, j);
@@ -30,8 +31,8 @@ impl Band {
         }
     }
 
-    /// Fixes the unknowns that `fixed` gives a value: their rows and columns become those of the identity, and what they
-    /// did to the others goes to the right-hand side.
+    /// Fixes the unknowns that `fixed` gives a value: their rows and columns become those of the
+    /// identity, and what they did to the others goes to the right-hand side.
     pub fn fix(&mut self, rhs: &mut [f64], fixed: &[Option<f64>]) {
         for i in 0..self.size() {
             for j in i.saturating_sub(self.width)..i {

@@ -1,7 +1,8 @@
 //! The smoothness energy of a lattice of vectors, and the sparse solve that couples data to it.
 //!
-//! Energy (per component): `sum over nodes of |second differences|^2 / mm^4` over all six second derivatives (a P-spline
-//! penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999). An affine field costs nothing.
+//! Energy (per component): `sum over nodes of |second differences|^2 / mm^4` over all six second
+//! derivatives (a P-spline penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999). An
+//! affine field costs nothing.
 
 use crate::numerics::blocks::Blocks;
 use crate::numerics::multilevel::Coarse;
@@ -17,7 +18,8 @@ pub struct Smoothness {
     nodes: [usize; 3],
     /// Node distances (mm).
     step_mm: [f64; 3],
-    /// Weights of the squared differences along x, y, z and of the mixed ones xy, xz, yz (1/mm^4); 0 along a flat axis.
+    /// Weights of the squared differences along x, y, z and of the mixed ones xy, xz, yz (1/mm^4);
+    /// 0 along a flat axis.
     scale: [f32; 6],
     /// Of a plane's nodes, 1 but on the last column; 1 but on the first and the last one.
     inner: [Vec<f32>; 2],
@@ -48,7 +50,8 @@ impl Smoothness {
         false
     }
 
-    /// `out = D^T W D x` for one planar component, with `weight` (one a node) on the squared differences about each node.
+    /// `out = D^T W D x` for one planar component, with `weight` (one a node) on the squared
+    /// differences about each node.
     pub fn apply(&self, weight: &[f32], x: &[f32], out: &mut [f32]) {
         let plane = self.nodes[0] * self.nodes[1];
         let slab = worthwhile(plane);
@@ -139,8 +142,8 @@ impl Smoothness {
         out
     }
 
-    /// A random vector with covariance `D^T W D` (one planar component): the transpose of the weighted differences applied
-    /// to independent standard normal numbers.
+    /// A random vector with covariance `D^T W D` (one planar component): the transpose of the
+    /// weighted differences applied to independent standard normal numbers.
     pub fn sample(&self, weight: &[f32], random: &mut Random) -> Vec<f32> {
         let mut out = vec![0.0f32; weight.len()];
         let mut spare = None;
@@ -162,8 +165,8 @@ impl Smoothness {
     }
 }
 
-/// Weighted differences of one component, plane by plane upwards. Each is zero where it has no taps, so rows follow one another
-/// without a seam.
+/// Weighted differences of one component, plane by plane upwards. Each is zero where it has no
+/// taps, so rows follow one another without a seam.
 struct Differences<'a> {
     of: &'a Smoothness,
     weight: &'a [f32],
@@ -336,9 +339,11 @@ pub struct SolveReport {
     pub residual: f64,
 }
 
-/// The matrix `A + D^T W D` with its preconditioner: information `A` of the data at the nodes and the weighted bending energy.
+/// The matrix `A + D^T W D` with its preconditioner: information `A` of the data at the nodes and
+/// the weighted bending energy.
 ///
-/// Preconditioned by its 3 x 3 blocks alone, smooth errors go slowly; with `multilevel` coarser lattices take them.
+/// Preconditioned by its 3 x 3 blocks alone, smooth errors go slowly; with `multilevel` coarser
+/// lattices take them.
 pub struct Coupled<'a> {
     smoothness: &'a Smoothness,
     /// Weight of the bending energy at each node, planar by component.
@@ -398,12 +403,14 @@ impl<'a> Coupled<'a> {
 
     /// Conjugate gradients (Hestenes & Stiefel 1952) for right-hand side `b`, `b` and `x` planar.
     ///
-    /// `x` holds the start and receives the result. Stops at `tolerance` (relative residual) or after `limit` iterations.
+    /// `x` holds the start and receives the result. Stops at `tolerance` (relative residual) or
+    /// after `limit` iterations.
     pub fn solve(&self, b: Vec<f32>, x: &mut [f32], tolerance: f64, limit: usize) -> SolveReport {
         self.iterate(b, x, tolerance, limit, |p, ap| self.apply(p, ap, None))
     }
 
-    /// The same where `data` writes what the data make of its first argument into its second (planar, three components).
+    /// The same where `data` writes what the data make of its first argument into its second
+    /// (planar, three components).
     pub fn solve_with(
         &self,
         data: impl Fn(&[f32], &mut [f32]),
@@ -419,8 +426,8 @@ impl<'a> Coupled<'a> {
         })
     }
 
-    /// `out = A x + D^T W D x`, with `A x` given or from the blocks; returns `x . out`. Sums go plane by plane, so that they are the
-    /// same whatever the number of threads.
+    /// `out = A x + D^T W D x`, with `A x` given or from the blocks; returns `x . out`. Sums go
+    /// plane by plane, so that they are the same whatever the number of threads.
     fn apply(&self, x: &[f32], out: &mut [f32], data: Option<&[f32]>) -> f64 {
         let n = x.len() / 3;
         for ((x, out), weight) in x.chunks_exact(n).zip(out.chunks_exact_mut(n)).zip(self.weights.chunks_exact(n)) {
@@ -494,7 +501,8 @@ impl<'a> Coupled<'a> {
         limit: usize,
         mut operator: impl FnMut(&[f32], &mut [f32]) -> f64,
     ) -> SolveReport {
-        // What the matrix makes of a direction, and by turns what the preconditioner makes of the residual.
+        // What the matrix makes of a direction, and by turns what the preconditioner makes of the
+        // residual.
         let mut made = vec![0.0f32; x.len()];
         if x.iter().any(|&v| v != 0.0) {
             operator(x, &mut made);

@@ -1,16 +1,19 @@
-//! Cubic B-spline lattices: a smooth vector field from few coefficients, its transpose, and shift-consistent sampling.
+//! Cubic B-spline lattices: a smooth vector field from few coefficients, its transpose, and
+//! shift-consistent sampling.
 //!
-//! A [`Lattice`] lies over a voxel grid with a whole number of voxels between nodes, so that the basis has few phases
-//! and a field is evaluated row by row (Rueckert et al. 1999, eq. 3, here separable). A side of one voxel has one node
-//! and no variation. Coefficients are planar: all first components, then all second, then all third.
+//! A [`Lattice`] lies over a voxel grid with a whole number of voxels between nodes, so that the
+//! basis has few phases and a field is evaluated row by row (Rueckert et al. 1999, eq. 3, here
+//! separable). A side of one voxel has one node and no variation. Coefficients are planar: all
+//! first components, then all second, then all third.
 
 use crate::numerics::cubic::{self, LANES, Places};
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Sums of cells of a lattice along z that are held at a time: so many values, where that is no fewer cells than keep the threads busy. Those of
-/// 128 cells of a lattice of 131 x 152 nodes a plane were 0.4 GB.
+/// Sums of cells of a lattice along z that are held at a time: so many values, where that is no
+/// fewer cells than keep the threads busy. Those of 128 cells of a lattice of 131 x 152 nodes a
+/// plane were 0.4 GB.
 const HELD: usize = 1 << 22;
 
 /// The four cubic B-spline weights at fraction `t` (0 to 1) between the second and the third node.
@@ -28,7 +31,8 @@ pub struct Lattice {
     pub shape: [usize; 3],
     /// Voxels between nodes.
     pub step: [usize; 3],
-    /// Nodes along each axis. Node `n` lies at voxel `(n - 1) * step` (at 0 for a side of one voxel).
+    /// Nodes along each axis. Node `n` lies at voxel `(n - 1) * step` (at 0 for a side of one
+    /// voxel).
     pub nodes: [usize; 3],
     phases: [Vec<[f32; 4]>; 3],
     /// The first phases along x, by node.
@@ -102,7 +106,8 @@ impl Lattice {
         (cell, weights((q - cell as f64) as f32))
     }
 
-    /// Calls `tap(node, weight)` for each of the at most 64 nodes that act at a fractional voxel position.
+    /// Calls `tap(node, weight)` for each of the at most 64 nodes that act at a fractional voxel
+    /// position.
     #[inline(always)]
     pub fn for_each_tap(&self, p: [f64; 3], mut tap: impl FnMut(usize, f32)) {
         let s: [(usize, [f32; 4]); 3] = std::array::from_fn(|a| self.stencil_at(a, p[a]));
@@ -117,7 +122,8 @@ impl Lattice {
         }
     }
 
-    /// The nodes that act at a fractional voxel position (clamped to the grid), to be used many times.
+    /// The nodes that act at a fractional voxel position (clamped to the grid), to be used many
+    /// times.
     pub fn stencil_near(&self, p: [f64; 3]) -> Stencil {
         let s: [(usize, [f32; 4]); 3] = std::array::from_fn(|a| self.stencil_at(a, p[a]));
         let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
@@ -137,7 +143,8 @@ impl Lattice {
         sum.map(f64::from)
     }
 
-    /// The node planes that act on slice `k`, combined: three planar components of nodes_x by nodes_y.
+    /// The node planes that act on slice `k`, combined: three planar components of nodes_x by
+    /// nodes_y.
     pub fn slice(&self, coefficients: &[f32], k: usize) -> Vec<f32> {
         let (n, plane) = (self.len(), self.nodes[0] * self.nodes[1]);
         let (first, w) = self.stencil(2, k);
@@ -168,7 +175,8 @@ impl Lattice {
         self.along(nodes, out);
     }
 
-    /// The values at the voxels of a row along x between nodes that are combined along the other axes.
+    /// The values at the voxels of a row along x between nodes that are combined along the other
+    /// axes.
     #[inline(always)]
     fn along(&self, nodes: &[f32], out: &mut [f32]) {
         if self.nodes[0] == 1 {
@@ -193,7 +201,8 @@ impl Lattice {
         }
     }
 
-    /// One component at all voxels of the grid along `axis` through one of them. `nodes` is working memory.
+    /// One component at all voxels of the grid along `axis` through one of them. `nodes` is working
+    /// memory.
     pub fn line(&self, component: &[f32], axis: usize, voxel: [usize; 3], nodes: &mut Vec<f32>, out: &mut [f32]) {
         let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
         let [b, c] = [[1, 2], [0, 2], [0, 1]][axis];
@@ -259,11 +268,13 @@ impl Lattice {
         out
     }
 
-    /// The transpose of evaluation: sums `Q` quantities of every voxel, times each basis function, at the nodes.
+    /// The transpose of evaluation: sums `Q` quantities of every voxel, times each basis function,
+    /// at the nodes.
     ///
-    /// `fill(j, k, rows)` writes the `Q` quantities of row `(j, k)` into `rows` and returns the voxels it wrote; all others
-    /// count as zero. The result has `Q` planar quantities of [`Lattice::len`] values. Cells of the lattice along z run in
-    /// parallel and are added in a fixed order.
+    /// `fill(j, k, rows)` writes the `Q` quantities of row `(j, k)` into `rows` and returns the
+    /// voxels it wrote; all others count as zero. The result has `Q` planar quantities of
+    /// [`Lattice::len`] values. Cells of the lattice along z run in parallel and are added in a
+    /// fixed order.
     pub fn accumulate<const Q: usize>(
         &self,
         fill: impl Fn(usize, usize, &mut [Vec<f32>; Q]) -> Range<usize> + Sync,
@@ -276,7 +287,8 @@ impl Lattice {
             let mut slab = vec![0.0f32; taps_z * Q * plane];
             let mut rows: [Vec<f32>; Q] = std::array::from_fn(|_| vec![0.0; nx]);
             let mut sums = vec![0.0f32; Q * plane];
-            // Voxel rows weighed for the node rows that act on them; each node row is reduced along x only once.
+            // Voxel rows weighed for the node rows that act on them; each node row is reduced along
+            // x only once.
             let mut ring: Vec<NodeRow> = (0..taps_y).map(|_| NodeRow::new(Q, nx)).collect();
             let mut nodes = vec![0.0f32; mx + 3];
             for k in cell * self.step[2]..((cell + 1) * self.step[2]).min(nz) {
@@ -316,7 +328,8 @@ impl Lattice {
             }
             slab
         };
-        // A few cells at a time, from the last to the first: each node plane sums them in that order, however many these are.
+        // A few cells at a time, from the last to the first: each node plane sums them in that
+        // order, however many these are.
         let most = (HELD / (taps_z * Q * plane)).max(2 * rayon::current_num_threads());
         let mut out = vec![0.0f32; Q * total];
         let mut end = nz.div_ceil(self.step[2]);
@@ -386,9 +399,9 @@ impl Lattice {
 
     /// Coefficients whose field takes (nearly) the values of `f` at the nodes.
     ///
-    /// Quasi-interpolation `c = v - (second differences of v) / 6`: exact for cubics, fourth order (de Boor 1978) up to
-    /// the ends, where the second differences are continued in a straight line. `f`
-    /// gets a node's voxel position, which may lie up to one step outside the grid.
+    /// Quasi-interpolation `c = v - (second differences of v) / 6`: exact for cubics, fourth order
+    /// (de Boor 1978) up to the ends, where the second differences are continued in a straight
+    /// line. `f` gets a node's voxel position, which may lie up to one step outside the grid.
     pub fn fit(&self, f: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<f32> {
         let [mx, my, _] = self.nodes;
         let n = self.len();
@@ -491,8 +504,9 @@ impl NodeRow {
 
 /// A volume to be sampled with the cubic B-spline itself as the kernel, without prefilter.
 ///
-/// That is a smoothing (standard deviation 0.58 voxel), the same for every fraction of a voxel, so a volume filtered
-/// with [`crate::numerics::filters::bspline`] and another sampled this way look alike at any shift.
+/// That is a smoothing (standard deviation 0.58 voxel), the same for every fraction of a voxel, so
+/// a volume filtered with [`crate::numerics::filters::bspline`] and another sampled this way look
+/// alike at any shift.
 #[derive(Clone, Copy)]
 pub struct SmoothSampler<'a> {
     /// Values, x fastest.
@@ -502,7 +516,8 @@ pub struct SmoothSampler<'a> {
 }
 
 impl SmoothSampler<'_> {
-    /// The smoothed value at a fractional voxel position; NaN outside the volume (beyond half a voxel).
+    /// The smoothed value at a fractional voxel position; NaN outside the volume (beyond half a
+    /// voxel).
     #[inline(always)]
     pub fn at(&self, p: [f32; 3]) -> f32 {
         let [nx, ny, nz] = self.shape;
@@ -546,7 +561,8 @@ impl SmoothSampler<'_> {
 }
 
 impl SmoothSampler<'_> {
-    /// Samples a row of places `start + [l, 0, 0] + scale * d[l] - origin` (voxels), as [`SmoothSampler::at`] does.
+    /// Samples a row of places `start + [l, 0, 0] + scale * d[l] - origin` (voxels), as
+    /// [`SmoothSampler::at`] does.
     #[inline(always)]
     pub fn row(&self, start: [f32; 3], d: [&[f32]; 3], scale: [f32; 3], origin: [f32; 3], out: &mut [f32]) {
         let mut places = Places::ORIGIN;
@@ -568,7 +584,8 @@ impl SmoothSampler<'_> {
 }
 
 impl SmoothSampler<'_> {
-    /// Samples the patch of `radius` about `centre` (voxels), x fastest, as [`SmoothSampler::at`] does.
+    /// Samples the patch of `radius` about `centre` (voxels), x fastest, as [`SmoothSampler::at`]
+    /// does.
     pub fn patch(&self, centre: [f32; 3], radius: [usize; 3], out: &mut [f32]) {
         let width: [usize; 3] = std::array::from_fn(|a| if self.shape[a] == 1 { 1 } else { 2 * radius[a] + 1 });
         let still = vec![0.0; width[0]];
@@ -585,7 +602,8 @@ impl SmoothSampler<'_> {
     }
 }
 
-/// First of the four voxels that act at `p`, and their weights. A side of one voxel acts with its only value.
+/// First of the four voxels that act at `p`, and their weights. A side of one voxel acts with its
+/// only value.
 #[inline(always)]
 fn corner(p: f32, n: usize) -> (i32, [f32; 4]) {
     if n == 1 {

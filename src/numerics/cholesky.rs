@@ -8,8 +8,8 @@ pub struct Cholesky {
 }
 
 impl Cholesky {
-    /// Factorises the `n` x `n` matrix `a` (row by row; the lower triangle is read); none when a pivot is not positive
-    /// beyond rounding.
+    /// Factorises the `n` x `n` matrix `a` (row by row; the lower triangle is read); none when a
+    /// pivot is not positive beyond rounding.
     pub fn new(mut a: Vec<f64>, n: usize) -> Option<Self> {
         for i in 0..n {
             let (done, rest) = a.split_at_mut(i * n);
@@ -54,8 +54,9 @@ impl Cholesky {
     }
 }
 
-/// The solution of `a x = b`, `a` symmetric and positive definite (row by row), within `room` (lowest, highest; zero inside): what would
-/// go past its limit stops there, and the others are solved for again. None where `a` is not positive definite.
+/// The solution of `a x = b`, `a` symmetric and positive definite (row by row), within `room`
+/// (lowest, highest; zero inside): what would go past its limit stops there, and the others are
+/// solved for again. None where `a` is not positive definite.
 pub fn within(a: &[f64], b: &[f64], room: &[[f64; 2]]) -> Option<Vec<f64>> {
     let n = b.len();
     let mut stopped: Vec<Option<f64>> = vec![None; n];

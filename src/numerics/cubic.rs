@@ -1,17 +1,20 @@
 //! Cubic B-spline sampling of whole rows: sixteen places at once.
 //!
-//! A displacement varies slowly, so neighbouring voxels of a row mostly fall into neighbouring cells of the sampled
-//! volume. Such a run needs no gather: each of the 64 taps is one load of consecutive values.
+//! A displacement varies slowly, so neighbouring voxels of a row mostly fall into neighbouring
+//! cells of the sampled volume. Such a run needs no gather: each of the 64 taps is one load of
+//! consecutive values.
 
 use crate::numerics::bspline::weights;
 
 /// Places treated at once.
 pub const LANES: usize = 16;
 
-/// The longest run of neighbouring places that is worked out at once: where tissue is strained most are shorter.
+/// The longest run of neighbouring places that is worked out at once: where tissue is strained most
+/// are shorter.
 const RUN: usize = 8;
 
-/// Sixteen places: the cell that holds each (the index below it along each axis) and the fraction inside the cell.
+/// Sixteen places: the cell that holds each (the index below it along each axis) and the fraction
+/// inside the cell.
 #[derive(Debug, Clone, Copy)]
 pub struct Places {
     /// Cell along x, y, z (voxels).
@@ -24,8 +27,8 @@ impl Places {
     /// All at the origin.
     pub const ORIGIN: Self = Self { cell: [[0; LANES]; 3], fraction: [[0.0; LANES]; 3] };
 
-    /// Sets places `p` (voxels) along axis `a`. Places beyond 2^31 go to cell `i32::MIN` or `i32::MAX`, NaN to 0 with
-    /// a fraction that is NaN.
+    /// Sets places `p` (voxels) along axis `a`. Places beyond 2^31 go to cell `i32::MIN` or
+    /// `i32::MAX`, NaN to 0 with a fraction that is NaN.
     #[inline(always)]
     pub fn set(&mut self, a: usize, p: &[f32; LANES]) {
         for l in 0..LANES {
@@ -46,10 +49,12 @@ impl Places {
     }
 }
 
-/// Samples `data` (x fastest) with the cubic B-spline kernel, without prefilter, at the first `count` places.
+/// Samples `data` (x fastest) with the cubic B-spline kernel, without prefilter, at the first
+/// `count` places.
 ///
-/// `edge(lane)` gives the value of a place whose 64 taps do not all lie inside; sides of one voxel always count so.
-/// The same code runs for runs of any length, so a value does not depend on its neighbours.
+/// `edge(lane)` gives the value of a place whose 64 taps do not all lie inside; sides of one voxel
+/// always count so. The same code runs for runs of any length, so a value does not depend on its
+/// neighbours.
 #[inline(always)]
 pub fn sample(
     data: &[f32],
@@ -104,8 +109,9 @@ pub fn sample(
     }
 }
 
-/// What the taps from `base` on give for the places of the lanes from `lane` on, were they one run; none where that would read past the
-/// end. Spelled out in arrays of eight, which the compiler keeps in registers.
+/// What the taps from `base` on give for the places of the lanes from `lane` on, were they one run;
+/// none where that would read past the end. Spelled out in arrays of eight, which the compiler
+/// keeps in registers.
 #[inline(always)]
 fn run(
     data: &[f32],
@@ -148,7 +154,8 @@ fn add_product(sum: &mut [f32; RUN], a: [f32; RUN], b: [f32; RUN]) {
     }
 }
 
-/// One place whose taps lie inside, the first of them at `tap`, in the same order of operations as a run.
+/// One place whose taps lie inside, the first of them at `tap`, in the same order of operations as
+/// a run.
 #[inline(always)]
 fn single(data: &[f32], [nx, ny, _]: [usize; 3], tap: usize, fraction: [f32; 3]) -> f32 {
     let w = fraction.map(weights);

@@ -3,7 +3,8 @@
 /// A square matrix, `m[row][column]`.
 pub type Square<const N: usize> = [[f64; N]; N];
 
-/// Solves `a x = b` by Gauss elimination with row pivots; none when a pivot vanishes against the largest entry.
+/// Solves `a x = b` by Gauss elimination with row pivots; none when a pivot vanishes against the
+/// largest entry.
 pub fn solve<const N: usize>(a: &Square<N>, b: &[f64; N]) -> Option<[f64; N]> {
     let (mut m, mut x) = (*a, *b);
     let largest = m.iter().flatten().fold(0.0, |l: f64, v| l.max(v.abs()));
@@ -32,8 +33,8 @@ pub fn solve<const N: usize>(a: &Square<N>, b: &[f64; N]) -> Option<[f64; N]> {
     x.iter().all(|v| v.is_finite()).then_some(x)
 }
 
-/// Rank of the matrix whose rows are `rows`: directions left by Gram-Schmidt with row pivots that are longer than
-/// `tolerance` times the longest row.
+/// Rank of the matrix whose rows are `rows`: directions left by Gram-Schmidt with row pivots that
+/// are longer than `tolerance` times the longest row.
 pub fn rank<const N: usize>(rows: &[[f64; N]], tolerance: f64) -> usize {
     let mut rest: Vec<[f64; N]> = rows.to_vec();
     let length = |r: &[f64; N]| r.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -56,8 +57,8 @@ pub fn rank<const N: usize>(rows: &[[f64; N]], tolerance: f64) -> usize {
     found
 }
 
-/// Eigenvalues of a symmetric matrix in rising order, with their unit vectors (Jacobi rotations; Golub and Van Loan,
-/// Matrix Computations, 8.5).
+/// Eigenvalues of a symmetric matrix in rising order, with their unit vectors (Jacobi rotations;
+/// Golub and Van Loan, Matrix Computations, 8.5).
 pub fn symmetric_eigen<const N: usize>(a: &Square<N>) -> [(f64, [f64; N]); N] {
     let mut m = *a;
     let mut v = [[0.0; N]; N];
@@ -94,8 +95,9 @@ pub fn symmetric_eigen<const N: usize>(a: &Square<N>) -> [(f64, [f64; N]); N] {
     pairs
 }
 
-/// Spectral radius of a square matrix: the growth of its powers, by repeated squaring (Gelfand's formula at the power
-/// 2^24, so a factor K that powers keep is felt as `K^(1/2^24)`). Infinite where the matrix holds NaN or infinity.
+/// Spectral radius of a square matrix: the growth of its powers, by repeated squaring (Gelfand's
+/// formula at the power 2^24, so a factor K that powers keep is felt as `K^(1/2^24)`). Infinite
+/// where the matrix holds NaN or infinity.
 pub fn spectral_radius<const N: usize>(a: &Square<N>) -> f64 {
     const SQUARINGS: i32 = 24;
     let mut m = *a;

@@ -1,8 +1,9 @@
 //! Gradients by finite differences on a grid, with respect to world millimetres.
 //!
-//! Central inside, one-sided at the borders, zero along an axis of one voxel; second order inside, first order at the
-//! borders. The affine may be oblique, flipped or anisotropic. These are `numpy.gradient`'s differences times the
-//! inverse of the affine's linear part, so that scores made elsewhere agree.
+//! Central inside, one-sided at the borders, zero along an axis of one voxel; second order inside,
+//! first order at the borders. The affine may be oblique, flipped or anisotropic. These are
+//! `numpy.gradient`'s differences times the inverse of the affine's linear part, so that scores
+//! made elsewhere agree.
 
 use crate::types::DenseField;
 use crate::types::space::{Grid, Matrix3};
@@ -13,7 +14,8 @@ pub fn gradient(values: &[f32], grid: &Grid, voxel: [usize; 3]) -> [f64; 3] {
     gradient_where(values, grid, voxel, |_| true)
 }
 
-/// As [`gradient`], from the voxel and those of its neighbours (offsets, x fastest) that count: one-sided beside one that does not.
+/// As [`gradient`], from the voxel and those of its neighbours (offsets, x fastest) that count:
+/// one-sided beside one that does not.
 #[inline]
 fn gradient_where(values: &[f32], grid: &Grid, voxel: [usize; 3], counts: impl Fn(usize) -> bool) -> [f64; 3] {
     let shape = grid.shape();
@@ -38,7 +40,8 @@ pub fn displacement_gradient(field: &DenseField, voxel: [usize; 3]) -> Matrix3 {
     std::array::from_fn(|c| gradient(field.component(c), field.grid(), voxel))
 }
 
-/// As [`displacement_gradient`], without differences to voxels of another body; `labels` (x fastest) are 0 outside all.
+/// As [`displacement_gradient`], without differences to voxels of another body; `labels` (x
+/// fastest) are 0 outside all.
 #[inline]
 pub fn gradient_within(field: &DenseField, labels: &[u8], voxel: [usize; 3]) -> Matrix3 {
     let own = labels[field.grid().index(voxel[0], voxel[1], voxel[2])];

@@ -5,8 +5,9 @@ use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::evd::{ComputeEigenvectors, self_adjoint_evd, self_adjoint_evd_scratch};
 use faer::{Mat, Par};
 
-/// Eigenvalues, largest first, each with its vector of length 1, of the symmetric `matrix(row, column)` of `n` rows; the lower triangle is asked
-/// for. None where it does not converge (entries that are not finite).
+/// Eigenvalues, largest first, each with its vector of length 1, of the symmetric
+/// `matrix(row, column)` of `n` rows; the lower triangle is asked for. None where it does not
+/// converge (entries that are not finite).
 pub fn symmetric(n: usize, matrix: impl Fn(usize, usize) -> f64) -> Option<Vec<(f64, Vec<f64>)>> {
     let a = Mat::from_fn(n, n, |i, j| matrix(i.max(j), i.min(j)));
     let (mut values, mut vectors) = (Diag::<f64>::zeros(n), Mat::<f64>::zeros(n, n));

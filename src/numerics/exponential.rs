@@ -1,5 +1,5 @@
-//! Exponential and logarithm in single precision, without branches, so that inner loops over them are vectorised; the same bits on every
-//! machine.
+//! Exponential and logarithm in single precision, without branches, so that inner loops over them
+//! are vectorised; the same bits on every machine.
 
 /// Terms of a series from the highest power down (Horner).
 #[inline(always)]
@@ -11,7 +11,8 @@ fn series<const N: usize>(x: f32, terms: [f32; N]) -> f32 {
     sum
 }
 
-/// 1.5 * 2^23: adding it rounds a small number to the nearest whole one, which then stands in the lowest bits.
+/// 1.5 * 2^23: adding it rounds a small number to the nearest whole one, which then stands in the
+/// lowest bits.
 pub const WHOLE: f32 = 12_582_912.0;
 
 /// ln 2 in two parts, of which the first has few digits: its multiples by exponents are exact.
@@ -19,7 +20,8 @@ const LN_2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
 
 /// `e^x` within 2e-7 of itself, for x held to -87 to 88 (what single precision holds); NaN for NaN.
 ///
-/// The power of two next to it times the Taylor series of what remains, |r| <= ln 2 / 2, to r^7 (5e-9).
+/// The power of two next to it times the Taylor series of what remains, |r| <= ln 2 / 2, to r^7
+/// (5e-9).
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
@@ -31,10 +33,11 @@ pub fn exp(x: f32) -> f32 {
     series(r, terms) * power
 }
 
-/// ln x within 1.5e-7 of the larger of itself and 1, for positive x that single precision holds at full length; what is less, and NaN, counts as the
-/// least of these.
+/// ln x within 1.5e-7 of the larger of itself and 1, for positive x that single precision holds at
+/// full length; what is less, and NaN, counts as the least of these.
 ///
-/// With x = 2^n m, m from sqrt(1/2) to sqrt(2): n ln 2 + 2 artanh s, s = (m - 1) / (m + 1), its series to s^9 (7e-10).
+/// With x = 2^n m, m from sqrt(1/2) to sqrt(2): n ln 2 + 2 artanh s, s = (m - 1) / (m + 1), its
+/// series to s^9 (7e-10).
 #[inline(always)]
 pub fn ln(x: f32) -> f32 {
     let bits = x.max(f32::MIN_POSITIVE).to_bits();

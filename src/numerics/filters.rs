@@ -1,10 +1,11 @@
-//! Separable filters and gradients on x-fastest volumes. Borders repeat the edge value. A side of one voxel is left
-//! alone: it has no direction to smooth or differentiate along.
+//! Separable filters and gradients on x-fastest volumes. Borders repeat the edge value. A side of
+//! one voxel is left alone: it has no direction to smooth or differentiate along.
 
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 
-/// Mean and number of the finite values among the 26 around place `at` (8 in one slice); none where there is no such value.
+/// Mean and number of the finite values among the 26 around place `at` (8 in one slice); none where
+/// there is no such value.
 pub fn mean_beside(data: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Option<(f32, usize)> {
     let near = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
     let (mut sum, mut count) = (0.0, 0);
@@ -19,7 +20,8 @@ pub fn mean_beside(data: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Option<
 /// A symmetric kernel, centre first: `[c0, c1, c2 ...]` stands for `... c2 c1 c0 c1 c2 ...`.
 pub type HalfKernel = Vec<f32>;
 
-/// Sampled Gaussian of standard deviation `sigma` (voxels), cut at 3 sigma, sum 1; the identity for `sigma` <= 0.
+/// Sampled Gaussian of standard deviation `sigma` (voxels), cut at 3 sigma, sum 1; the identity for
+/// `sigma` <= 0.
 pub fn gaussian_kernel(sigma: f64) -> HalfKernel {
     if sigma <= 1e-3 {
         return vec![1.0];
@@ -30,7 +32,8 @@ pub fn gaussian_kernel(sigma: f64) -> HalfKernel {
     raw.iter().map(|v| (v / sum) as f32).collect()
 }
 
-/// The cubic B-spline at integers, (1/6, 4/6, 1/6): what [`crate::numerics::bspline`] sampling does at a voxel centre.
+/// The cubic B-spline at integers, (1/6, 4/6, 1/6): what [`crate::numerics::bspline`] sampling does
+/// at a voxel centre.
 pub fn bspline_kernel() -> HalfKernel {
     vec![4.0 / 6.0, 1.0 / 6.0]
 }
@@ -121,7 +124,8 @@ pub fn bspline(data: &[f32], shape: [usize; 3]) -> Vec<f32> {
     separable(data, shape, [&k, &k, &k])
 }
 
-/// Central difference along x of the row at `(j, k)`, per voxel; one-sided at the ends, zero for a side of one.
+/// Central difference along x of the row at `(j, k)`, per voxel; one-sided at the ends, zero for a
+/// side of one.
 #[inline(always)]
 pub fn gradient_rows(data: &[f32], shape: [usize; 3], j: usize, k: usize, out: [&mut [f32]; 3]) {
     let [nx, ny, nz] = shape;

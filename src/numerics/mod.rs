@@ -1,8 +1,10 @@
-//! Numerical tools that every stage may use: filters, sampling, splines, small dense algebra, sparse solves.
+//! Numerical tools that every stage may use: filters, sampling, splines, small dense algebra,
+//! sparse solves.
 //!
-//! Everything here works on plain slices with x fastest and gives the same bits for any number of threads: work is cut
-//! into pieces by the data's shape alone, and sums are taken in a fixed order. Inner loops are plain multiplies and
-//! adds that the compiler vectorises for the machine at hand ([`simd::dispatch`]).
+//! Everything here works on plain slices with x fastest and gives the same bits for any number of
+//! threads: work is cut into pieces by the data's shape alone, and sums are taken in a fixed order.
+//! Inner loops are plain multiplies and adds that the compiler vectorises for the machine at hand
+//! ([`simd::dispatch`]).
 
 pub mod simd;
 

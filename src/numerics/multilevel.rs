@@ -1,9 +1,10 @@
-//! A multilevel preconditioner for spline lattices (Bramble, Pasciak & Xu 1990, doi:10.1090/S0025-5718-1990-1023042-6).
+//! A multilevel preconditioner for spline lattices (Bramble, Pasciak & Xu 1990,
+//! doi:10.1090/S0025-5718-1990-1023042-6).
 //!
-//! A smooth error cannot be seen in 3 x 3 blocks: with them alone conjugate gradients need as many iterations as the
-//! lattice is wide, squared, wherever the data are weak. Each coarser lattice, of twice the step, holds the same
-//! splines' smoother part exactly (two-scale relation: 1, 4, 6, 4, 1 eighths along each axis), so the inverse blocks of
-//! all lattices are added up.
+//! A smooth error cannot be seen in 3 x 3 blocks: with them alone conjugate gradients need as many
+//! iterations as the lattice is wide, squared, wherever the data are weak. Each coarser lattice, of
+//! twice the step, holds the same splines' smoother part exactly (two-scale relation: 1, 4, 6, 4, 1
+//! eighths along each axis), so the inverse blocks of all lattices are added up.
 
 use crate::numerics::simd::dispatch;
 use crate::numerics::small::inverse;
@@ -26,14 +27,16 @@ pub(super) struct Coarse {
 }
 
 impl Coarse {
-    /// For `A + D^T W D` on `fine` nodes `step_mm` apart, with `blocks` the planar blocks of `A` and `weights` (planar, three
-    /// components) the diagonal of `W`; none where the lattice is too small.
+    /// For `A + D^T W D` on `fine` nodes `step_mm` apart, with `blocks` the planar blocks of `A`
+    /// and `weights` (planar, three components) the diagonal of `W`; none where the lattice is too
+    /// small.
     pub(super) fn new(fine: [usize; 3], step_mm: [f64; 3], weights: &[f32], blocks: &[f32]) -> Option<Box<Self>> {
         let shape = fine.map(|n| if n > 1 { vec![1.0] } else { Vec::new() });
         Self::below(fine, step_mm, weights, blocks, &shape)
     }
 
-    /// `shape` is the lattice's basis function along each axis in coefficients of the finest lattice; empty for one node.
+    /// `shape` is the lattice's basis function along each axis in coefficients of the finest
+    /// lattice; empty for one node.
     fn below(
         fine: [usize; 3],
         step_mm: [f64; 3],
@@ -93,7 +96,8 @@ impl Coarse {
         own
     }
 
-    /// Adds plane `k` (of the finer lattice) of one component of a vector on this lattice. `room` is scratch.
+    /// Adds plane `k` (of the finer lattice) of one component of a vector on this lattice. `room`
+    /// is scratch.
     #[inline(always)]
     pub(super) fn add_plane(&self, coarse: &[f32], component: usize, k: usize, out: &mut [f32], room: &mut Vec<f32>) {
         let ([mx, my, mz], [nx, ny, nz]) = (self.nodes, self.fine);
@@ -142,7 +146,8 @@ fn nearest(values: &[f32], fine: [usize; 3], nodes: [usize; 3]) -> Vec<f32> {
     out
 }
 
-/// The coarse nodes that make up fine node `at` along an axis, with their weights (some may be zero).
+/// The coarse nodes that make up fine node `at` along an axis, with their weights (some may be
+/// zero).
 #[inline(always)]
 fn parents(at: usize, fine: usize, coarse: usize) -> [(usize, f32); 3] {
     if fine == coarse {

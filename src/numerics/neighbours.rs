@@ -15,8 +15,9 @@ impl Neighbours {
         Self { tree: usable.then(|| ImmutableKdTree::new_from_slice(points).ok()).flatten() }
     }
 
-    /// The numbers of at most `count` points within `radius` (inclusive) of `at`, nearest first, ties by number; which
-    /// of several equally far points is left out at the cut is up to the tree, but the same each time.
+    /// The numbers of at most `count` points within `radius` (inclusive) of `at`, nearest first,
+    /// ties by number; which of several equally far points is left out at the cut is up to the
+    /// tree, but the same each time.
     pub fn within(&self, at: [f64; 3], radius: f64, count: usize) -> Vec<usize> {
         let (Some(tree), Some(count)) = (&self.tree, NonZero::new(count)) else { return Vec::new() };
         if !at.iter().all(|v| v.is_finite()) {

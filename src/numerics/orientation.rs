@@ -1,10 +1,12 @@
-//! How a grid's axes lie in space, and the same voxels stored with axes that run right, forward and up.
+//! How a grid's axes lie in space, and the same voxels stored with axes that run right, forward and
+//! up.
 
 use crate::error::SpaceError;
 use crate::types::{Affine, DenseField, Grid, Volume, VoxelPoint, Voxels};
 use rayon::prelude::*;
 
-/// Which stored axis runs nearest along each world axis (right, anterior, superior), and which of them run backwards.
+/// Which stored axis runs nearest along each world axis (right, anterior, superior), and which of
+/// them run backwards.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Orientation {
     axis: [usize; 3],
@@ -15,12 +17,14 @@ pub struct Orientation {
 const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 
 impl Orientation {
-    /// Of a grid: the order of axes whose directions are nearest to the world's, by the sum of their cosines.
+    /// Of a grid: the order of axes whose directions are nearest to the world's, by the sum of
+    /// their cosines.
     pub fn of(grid: &Grid) -> Self {
         let (linear, spacing) = (grid.affine().linear(), grid.spacing());
         let cosine = |world: usize, stored: usize| linear[world][stored] / spacing[stored];
         let along = |order: &[usize; 3]| (0..3).map(|a| cosine(a, order[a]).abs()).sum::<f64>();
-        // A margin, so that rounding does not choose between axes that lie between two of the world's.
+        // A margin, so that rounding does not choose between axes that lie between two of the
+        // world's.
         let nearest = |best: [usize; 3], order| if along(&order) > along(&best) + 1e-6 { order } else { best };
         let axis = ORDERS.into_iter().reduce(nearest).unwrap_or([0, 1, 2]);
         Self { axis, backwards: std::array::from_fn(|a| cosine(a, axis[a]) < 0.0) }
@@ -53,7 +57,8 @@ impl Orientation {
         Self { axis, backwards: axis.map(|a| self.backwards[a]) }
     }
 
-    /// Where the canonical voxel 0 lies among those of the `stored` shape, and the steps between them along canonical axes.
+    /// Where the canonical voxel 0 lies among those of the `stored` shape, and the steps between
+    /// them along canonical axes.
     fn steps(&self, stored: [usize; 3]) -> (isize, [isize; 3]) {
         let stride = [1, stored[0], stored[0] * stored[1]].map(|s| s as isize);
         let mut first = 0;
@@ -69,7 +74,8 @@ impl Orientation {
         (first, steps)
     }
 
-    /// Where the stored voxel 0 lies among the canonical ones, and the steps between them along stored axes.
+    /// Where the stored voxel 0 lies among the canonical ones, and the steps between them along
+    /// stored axes.
     fn back(&self, stored: [usize; 3]) -> (isize, [isize; 3]) {
         self.inverse().steps(self.axis.map(|s| stored[s]))
     }
@@ -103,8 +109,8 @@ impl Orientation {
         out
     }
 
-    /// A field of the canonical grid, as it is stored on `grid`; its components are along the world's axes on both. Each is turned where
-    /// it is, so that no second field is held.
+    /// A field of the canonical grid, as it is stored on `grid`; its components are along the
+    /// world's axes on both. Each is turned where it is, so that no second field is held.
     ///
     /// # Errors
     /// [`SpaceError`] when the grids have different numbers of voxels.

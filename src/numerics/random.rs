@@ -8,8 +8,8 @@ pub struct Random(u64);
 const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
 
 impl Random {
-    /// A generator for each pair of seed and stream: streams of one seed are independent, so that things drawn in
-    /// parallel or in another order stay the same.
+    /// A generator for each pair of seed and stream: streams of one seed are independent, so that
+    /// things drawn in parallel or in another order stay the same.
     pub fn new(seed: u64, stream: u64) -> Self {
         Self(mix(mix(seed.wrapping_add(GOLDEN)) ^ stream.wrapping_mul(GOLDEN)))
     }

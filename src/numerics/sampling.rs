@@ -4,12 +4,12 @@
 //! is clamped to the centres' box, so an axis of one voxel is constant over that voxel. Elsewhere a volume has the
 //! background value the caller gives. Positions that are NaN are outside.
 //!
-//! Cubic interpolation is the cubic B-spline with its prefilter (Unser, Aldroubi, Eden 1993; mirror boundaries). It
-//! passes through the samples and was chosen over Catmull-Rom by measurement: on noise band-limited to 0.2, 0.3 and
-//! 0.4 cycles a voxel its root-mean-square error between samples is 0.2, 1.5 and 7.0 % of the signal's, against 1.4,
-//! 5.9 and 15.1 % (linear: 6.3, 13.7 and 23.8 %). It overshoots at sharp edges. A
-//! voxel that is not finite would spread along its lines in the prefilter: it is filled in before, and what lies beside it is NaN, as
-//! with linear interpolation.
+//! Cubic interpolation is the cubic B-spline with its prefilter (Unser, Aldroubi, Eden 1993; mirror
+//! boundaries). It passes through the samples and was chosen over Catmull-Rom by measurement: on
+//! noise band-limited to 0.2, 0.3 and 0.4 cycles a voxel its root-mean-square error between samples
+//! is 0.2, 1.5 and 7.0 % of the signal's, against 1.4, 5.9 and 15.1 % (linear: 6.3, 13.7 and 23.8
+//! %). It overshoots at sharp edges. A voxel that is not finite would spread along its lines in the
+//! prefilter: it is filled in before, and what lies beside it is NaN, as with linear interpolation.
 
 use crate::error::UnknownName;
 use crate::numerics::bspline;
@@ -59,7 +59,8 @@ pub fn nearest(shape: [usize; 3], p: VoxelPoint) -> Option<usize> {
     })
 }
 
-/// The cell of a position along one axis: lower index, upper index, fraction; clamped to the outermost centres.
+/// The cell of a position along one axis: lower index, upper index, fraction; clamped to the
+/// outermost centres.
 #[inline]
 fn cell(n: usize, p: f64) -> (usize, usize, f64) {
     let q = p.clamp(0.0, (n - 1) as f64);
@@ -99,7 +100,8 @@ impl Stencil {
     }
 }
 
-/// The displacement (mm) at a world position, trilinear; outside the grid the value of its nearest edge.
+/// The displacement (mm) at a world position, trilinear; outside the grid the value of its nearest
+/// edge.
 #[inline]
 pub fn displacement(field: &Displacement<'_>, p: WorldPoint) -> [f64; 3] {
     let grid = field.grid();
@@ -107,7 +109,8 @@ pub fn displacement(field: &Displacement<'_>, p: WorldPoint) -> [f64; 3] {
     std::array::from_fn(|c| stencil.of(field.component(c)))
 }
 
-/// The four weights of the cubic B-spline at fraction `t` of a cell, for the samples at -1, 0, 1, 2.
+/// The four weights of the cubic B-spline at fraction `t` of a cell, for the samples at -1, 0, 1,
+/// 2.
 #[inline]
 pub fn cubic_bspline(t: f64) -> [f64; 4] {
     let s = 1.0 - t;
@@ -138,7 +141,8 @@ impl Sampler<'static> {
 }
 
 impl<'a> Sampler<'a> {
-    /// Prepares `volume`; `background` is the value outside. Cubic filters a copy of the volume, the others borrow it.
+    /// Prepares `volume`; `background` is the value outside. Cubic filters a copy of the volume,
+    /// the others borrow it.
     pub fn new(volume: &'a Voxels<'a>, interpolation: Interpolation, background: f32) -> Self {
         if interpolation == Interpolation::Cubic {
             return Sampler::owning(volume.clone().into_volume(), background);
@@ -181,8 +185,8 @@ impl<'a> Sampler<'a> {
         around.index.iter().zip(around.weight).any(|(&at, w)| w > SLACK && self.missing[at])
     }
 
-    /// The values at the first `out.len()` (at most [`LANES`]) of some places (voxels), fast where they follow each other
-    /// along x.
+    /// The values at the first `out.len()` (at most [`LANES`]) of some places (voxels), fast where
+    /// they follow each other along x.
     #[inline(always)]
     pub fn block(&self, p: &[[f64; LANES]; 3], out: &mut [f32]) {
         let at = |l: usize| self.at(VoxelPoint([p[0][l], p[1][l], p[2][l]]));
@@ -231,7 +235,8 @@ impl<'a> Sampler<'a> {
     }
 }
 
-/// Puts the mean of the finite voxels beside it (of all, where there is none) where a value is not finite, and says where; empty where all are.
+/// Puts the mean of the finite voxels beside it (of all, where there is none) where a value is not
+/// finite, and says where; empty where all are.
 fn fill(values: &mut [f32], shape: [usize; 3]) -> Vec<bool> {
     if values.par_iter().all(|v| v.is_finite()) {
         return Vec::new();
@@ -263,7 +268,8 @@ fn bspline_coefficients(mut values: Vec<f32>, shape: [usize; 3]) -> Vec<f32> {
     values
 }
 
-/// Filters in place along x, y and z. `filter` takes a sequence of rows, and filters along it each entry of a row on its own.
+/// Filters in place along x, y and z. `filter` takes a sequence of rows, and filters along it each
+/// entry of a row on its own.
 fn along_axes(values: &mut [f32], [nx, ny, nz]: [usize; 3], filter: fn(Vec<&mut [f32]>)) {
     values.par_chunks_mut(nx).for_each(|row| filter(row.chunks_mut(1).collect()));
     values.par_chunks_mut(nx * ny).for_each(|slice| filter(slice.chunks_mut(nx).collect()));

@@ -5,16 +5,18 @@ use std::sync::OnceLock;
 
 static LEVEL: OnceLock<Arch> = OnceLock::new();
 
-/// Runs `work` compiled for the widest vector instructions that this machine and the build have (AVX2, NEON ... or plain).
+/// Runs `work` compiled for the widest vector instructions that this machine and the build have
+/// (AVX2, NEON ... or plain).
 ///
-/// The code inside must be inlined to profit. No fused multiply-add is used, so the result is the same for each.
+/// The code inside must be inlined to profit. No fused multiply-add is used, so the result is the
+/// same for each.
 #[inline(always)]
 pub fn dispatch<R>(work: impl FnOnce() -> R) -> R {
     LEVEL.get_or_init(level).dispatch(work)
 }
 
-/// What this machine has, or what every machine of its kind has where the environment says `PALPATE_SIMD=scalar`: so that
-/// tests can compare the two.
+/// What this machine has, or what every machine of its kind has where the environment says
+/// `PALPATE_SIMD=scalar`: so that tests can compare the two.
 fn level() -> Arch {
     match std::env::var("PALPATE_SIMD") {
         Ok(asked) if asked == "scalar" => Arch::Scalar,
@@ -22,7 +24,8 @@ fn level() -> Arch {
     }
 }
 
-/// Sum of products of two equally long slices, in 16 interleaved partial sums (a fixed order on every machine).
+/// Sum of products of two equally long slices, in 16 interleaved partial sums (a fixed order on
+/// every machine).
 #[inline(always)]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     let mut lanes = [0.0f32; 16];

@@ -78,7 +78,8 @@ pub fn cholesky_solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> 
     Some(b)
 }
 
-/// Eigenvalues of a symmetric matrix, largest first, in closed form (Smith 1961, Communications of the ACM 4:168).
+/// Eigenvalues of a symmetric matrix, largest first, in closed form (Smith 1961, Communications of
+/// the ACM 4:168).
 #[inline]
 pub fn eigenvalues(m: &Symmetric3) -> [f64; 3] {
     let mean = (m[0] + m[1] + m[2]) / 3.0;
@@ -100,7 +101,8 @@ fn full(m: &Symmetric3) -> [[f64; 3]; 3] {
     [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]]
 }
 
-/// A unit eigenvector of the largest eigenvalue: perpendicular to the two rows of `m` less that eigenvalue that span most.
+/// A unit eigenvector of the largest eigenvalue: perpendicular to the two rows of `m` less that
+/// eigenvalue that span most.
 pub fn principal(m: &Symmetric3) -> [f64; 3] {
     let high = eigenvalues(m)[0];
     let [x, y, z] = full(&[m[0] - high, m[1] - high, m[2] - high, m[3], m[4], m[5]]);

@@ -1,17 +1,20 @@
-//! Sparse symmetric systems made of element matrices: nested dissection, one symbolic factorisation, many numeric ones.
+//! Sparse symmetric systems made of element matrices: nested dissection, one symbolic
+//! factorisation, many numeric ones.
 //!
-//! A system is a mesh of *nodes*, each with some unknowns, and *elements* that couple all their nodes. Unknowns are numbered
-//! in the order of elimination, so the matrix needs no permutation. The ordering is geometric nested dissection over
-//! elements (George 1973): the elements are halved at the median along their longest extent, and the nodes that both
-//! halves touch are eliminated last.
+//! A system is a mesh of *nodes*, each with some unknowns, and *elements* that couple all their
+//! nodes. Unknowns are numbered in the order of elimination, so the matrix needs no permutation.
+//! The ordering is geometric nested dissection over elements (George 1973): the elements are halved
+//! at the median along their longest extent, and the nodes that both halves touch are eliminated
+//! last.
 //!
-//! The factorisation is L D L^T without pivots (faer), in single precision with solutions refined in double. It exists for
-//! positive definite and for symmetric quasi-definite matrices, [K B^T; B -C] with K and C positive definite, under any
-//! order (Vanderbei, SIAM J. Optim. 5, 1995). Within a part of the dissection the nodes keep their order, so nodes of the
-//! second block belong at the end.
+//! The factorisation is L D L^T without pivots (faer), in single precision with solutions refined
+//! in double. It exists for positive definite and for symmetric quasi-definite matrices,
+//! [K B^T; B -C] with K and C positive definite, under any order (Vanderbei, SIAM J. Optim. 5,
+//! 1995). Within a part of the dissection the nodes keep their order, so nodes of the second block
+//! belong at the end.
 //!
-//! Some nodes may be eliminated after all others: where a matrix changes at these alone, its factor is renewed there
-//! alone ([`Factor::renewed`]).
+//! Some nodes may be eliminated after all others: where a matrix changes at these alone, its factor
+//! is renewed there alone ([`Factor::renewed`]).
 
 use crate::numerics::tail::Tail;
 use faer::dyn_stack::{MemBuffer, MemStack};
@@ -32,7 +35,8 @@ const LEAF: usize = 60;
 const REFINED: f64 = 1e-7;
 /// Refinements at most: as many cost more than a factorisation.
 const REFINEMENTS: i32 = 16;
-/// Where refinements change the solution by more than this part of the last one on average, the factor is given up.
+/// Where refinements change the solution by more than this part of the last one on average, the
+/// factor is given up.
 const SLOWEST: f64 = 0.5;
 
 /// What keeps a system from being solved.
@@ -49,20 +53,22 @@ pub struct Pattern {
     unknowns: usize,
     column: Vec<usize>,
     row: Vec<u32>,
-    /// For each element and each pair of its nodes (i > j as in a lower triangle), where the block starts below the
-    /// diagonal block of the earlier node.
+    /// For each element and each pair of its nodes (i > j as in a lower triangle), where the block
+    /// starts below the diagonal block of the earlier node.
     blocks: Vec<u32>,
     elements: Vec<u32>,
     nodes_per_element: usize,
     symbolic: SymbolicCholesky<u32>,
     /// The columns of the nodes that come last, if any do.
     tail: Option<Tail>,
-    /// Numbers of factors that are no longer needed: fresh memory of this size takes a fifth of a factorisation's time.
+    /// Numbers of factors that are no longer needed: fresh memory of this size takes a fifth of a
+    /// factorisation's time.
     spare: Mutex<Vec<Vec<f32>>>,
 }
 
 impl Pattern {
-    /// The pattern of `elements`, `per` node numbers each, where node `i` lies at `places[i]` and has `width[i]` unknowns.
+    /// The pattern of `elements`, `per` node numbers each, where node `i` lies at `places[i]` and
+    /// has `width[i]` unknowns.
     ///
     /// # Errors
     /// [`Singular`] when the symbolic factorisation does not fit in memory.
@@ -308,9 +314,10 @@ enum Values {
 
 /// A matrix, and a factor of it or of one nearby.
 ///
-/// The factor is kept in single precision, which takes half the memory and half the time, and the solution is refined with the
-/// matrix in double precision (Wilkinson, Rounding Errors in Algebraic Processes, 1963; Carson and Higham, SIAM J. Sci.
-/// Comput. 40, 2018). Where that does not contract, a better factor is made: of the matrix itself, then in double precision.
+/// The factor is kept in single precision, which takes half the memory and half the time, and the
+/// solution is refined with the matrix in double precision (Wilkinson, Rounding Errors in Algebraic
+/// Processes, 1963; Carson and Higham, SIAM J. Sci. Comput. 40, 2018). Where that does not
+/// contract, a better factor is made: of the matrix itself, then in double precision.
 #[derive(Debug)]
 pub struct Factor<'a> {
     pattern: &'a Pattern,
@@ -354,9 +361,10 @@ impl<'a> Factor<'a> {
         !Arc::ptr_eq(&self.of, &self.matrix)
     }
 
-    /// A factor for another matrix with the same pattern. The columns of the nodes that come last are worked out anew alone where the matrix
-    /// changed there alone, or is `near` the one of the factor elsewhere; else all of them. Where none come last, a factor serves for a
-    /// matrix near its own as it is.
+    /// A factor for another matrix with the same pattern. The columns of the nodes that come last
+    /// are worked out anew alone where the matrix changed there alone, or is `near` the one of the
+    /// factor elsewhere; else all of them. Where none come last, a factor serves for a matrix near
+    /// its own as it is.
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes or is not finite.
@@ -390,8 +398,9 @@ impl<'a> Factor<'a> {
         pattern.factorise(matrix)
     }
 
-    /// Solves for several right-hand sides in place, one after the other in `x`. Relative error (2-norm over all unknowns of a
-    /// right-hand side): 10^-7 at most, about 10^-12 where the factor is of the matrix itself.
+    /// Solves for several right-hand sides in place, one after the other in `x`. Relative error
+    /// (2-norm over all unknowns of a right-hand side): 10^-7 at most, about 10^-12 where the
+    /// factor is of the matrix itself.
     ///
     /// # Errors
     /// [`Singular`] when the solution is not finite.
@@ -409,7 +418,8 @@ impl<'a> Factor<'a> {
         Ok(())
     }
 
-    /// As [`Factor::solve`]; a factor of a matrix nearby that does not serve is replaced, not kept beside the better one.
+    /// As [`Factor::solve`]; a factor of a matrix nearby that does not serve is replaced, not kept
+    /// beside the better one.
     ///
     /// # Errors
     /// As [`Factor::solve`].
@@ -425,8 +435,8 @@ impl<'a> Factor<'a> {
         self.solve(x)
     }
 
-    /// As [`Factor::solve`] without refinement, for steps whose residual is worked out anew: to about five digits, or as far as the matrix
-    /// nearby goes.
+    /// As [`Factor::solve`] without refinement, for steps whose residual is worked out anew: to
+    /// about five digits, or as far as the matrix nearby goes.
     ///
     /// # Errors
     /// [`Singular`] when the solution is not finite.
@@ -442,7 +452,8 @@ impl<'a> Factor<'a> {
         if x.iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Singular) }
     }
 
-    /// A factor of the matrix itself, for many right-hand sides: of a matrix nearby, each takes several refinements more.
+    /// A factor of the matrix itself, for many right-hand sides: of a matrix nearby, each takes
+    /// several refinements more.
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes or is not finite.
@@ -483,7 +494,8 @@ impl<'a> Factor<'a> {
             if change > SLOWEST.powi(round) {
                 return None;
             }
-            // What is left is the next change and those after it: each as much smaller as this one is than the last.
+            // What is left is the next change and those after it: each as much smaller as this one
+            // is than the last.
             if round > 0 && change * change < REFINED * last {
                 return Some(x);
             }
@@ -566,7 +578,8 @@ struct Dissection<'a> {
 }
 
 impl Dissection<'_> {
-    /// The unknowns that each cut between two elements of a sorted part leaves on both sides; cut `c` comes before element `c`.
+    /// The unknowns that each cut between two elements of a sorted part leaves on both sides; cut
+    /// `c` comes before element `c`.
     fn cuts(&mut self, part: &[u32], nodes: &[u32]) -> Vec<i64> {
         nodes.iter().for_each(|&n| self.spans[n as usize] = [u32::MAX, 0]);
         for (rank, &e) in part.iter().enumerate() {
@@ -635,7 +648,8 @@ mod tests {
     use super::*;
     use crate::numerics::random::Random;
 
-    /// A grid of bilinear-like elements with 3 unknowns on most nodes and 1 on the last ones, quasi-definite.
+    /// A grid of bilinear-like elements with 3 unknowns on most nodes and 1 on the last ones,
+    /// quasi-definite.
     #[test]
     fn a_quasi_definite_system_is_solved_whatever_the_widths() {
         let (nx, ny) = (9, 7);
@@ -747,8 +761,8 @@ mod tests {
         assert!(first.iter().zip(&second).all(|(a, b)| (a - 3.0 * b).abs() < 1e-12));
     }
 
-    /// The chain's matrix with its first nine elements `scale` times as stiff and a spring along an oblique direction of the
-    /// first one's unknowns.
+    /// The chain's matrix with its first nine elements `scale` times as stiff and a spring along an
+    /// oblique direction of the first one's unknowns.
     fn chained(pattern: &Pattern, scale: f64, spring: f64) -> Vec<f64> {
         let mut values = pattern.zeros();
         for e in 0..38 {
@@ -760,7 +774,8 @@ mod tests {
         values
     }
 
-    /// Largest error of the solution of a system whose solution is known, and whether a better factor was needed.
+    /// Largest error of the solution of a system whose solution is known, and whether a better
+    /// factor was needed.
     fn error(pattern: &Pattern, factor: &Factor<'_>, values: &[f64]) -> (f64, bool) {
         let truth: Vec<f64> = (0..pattern.unknowns()).map(|i| (1.3 * i as f64).sin()).collect();
         let mut x = [pattern.multiply(values, &truth), vec![0.0; pattern.unknowns()]].concat();
@@ -851,7 +866,8 @@ mod tests {
         let off =
             |a: &[f32], b: &[f32]| a.iter().zip(b).fold(0.0f32, |m, (a, b)| m.max((a - b).abs() / (1.0 + b.abs())));
         assert!(off(&renewed, &whole) < 1e-5, "{}", off(&renewed, &whole));
-        // Where it changed elsewhere as well all is worked out anew, and a spring that comes and goes leaves nothing behind.
+        // Where it changed elsewhere as well all is worked out anew, and a spring that comes and
+        // goes leaves nothing behind.
         for matrix in [after, pressed(&[5, last[40]], 300.0), pressed(&[], 0.0)] {
             let factor = pattern.factorise(before.clone()).unwrap();
             let factor =
@@ -861,7 +877,8 @@ mod tests {
             let whole = single(&pattern.factorise(matrix).unwrap());
             assert!(off(&single(&factor), &whole) < 1e-4, "{}", off(&single(&factor), &whole));
         }
-        // Near elsewhere, the end is that of the new matrix and refinement does the rest; too far away it is replaced.
+        // Near elsewhere, the end is that of the new matrix and refinement does the rest; too far
+        // away it is replaced.
         let truth: Vec<f64> = (0..pattern.unknowns()).map(|i| (1.3 * i as f64).sin()).collect();
         for (scale, replaced) in [(1.1, false), (8.0, true)] {
             let mut matrix: Vec<f64> = before.iter().map(|v| scale * v).collect();

@@ -1,6 +1,7 @@
 //! Order statistics and robust spread.
 
-/// The value at fraction `q` (0 to 1) of the sorted order (nearest rank); NaN for no values. Reorders its input.
+/// The value at fraction `q` (0 to 1) of the sorted order (nearest rank); NaN for no values.
+/// Reorders its input.
 pub fn quantile(values: &mut [f32], q: f64) -> f32 {
     if values.is_empty() {
         return f32::NAN;
@@ -34,13 +35,15 @@ pub fn robust_deviation(values: impl Iterator<Item = f64>) -> f64 {
     1.4826 * f64::from(median(&mut off))
 }
 
-/// Whether number `i` is among the `share` (1) that stands for all: multiples of the golden ratio, which meet rows and slices alike.
+/// Whether number `i` is among the `share` (1) that stands for all: multiples of the golden ratio,
+/// which meet rows and slices alike.
 pub fn stands_for_all(i: usize, share: f64) -> bool {
     const GOLDEN: f64 = 0.618_033_988_749_894_9;
     (i as f64 * GOLDEN).fract() < share
 }
 
-/// The `q`-th percentile (0 to 100) with linear interpolation between order statistics, as numpy does by default.
+/// The `q`-th percentile (0 to 100) with linear interpolation between order statistics, as numpy
+/// does by default.
 ///
 /// Reorders `values`; NaN sorts last. An empty slice gives NaN.
 pub fn percentile(values: &mut [f64], q: f64) -> f64 {
@@ -56,10 +59,12 @@ pub fn percentile(values: &mut [f64], q: f64) -> f64 {
     }
 }
 
-/// Standard deviation of white noise in a volume, from second differences along every thick axis at once.
+/// Standard deviation of white noise in a volume, from second differences along every thick axis at
+/// once.
 ///
-/// The median absolute value of the `(1, -2, 1)` products over 0.6745 times their norm (Immerkaer 1996, with the median
-/// for robustness): smooth structure and straight edges drop out. At most about 300,000 places are read.
+/// The median absolute value of the `(1, -2, 1)` products over 0.6745 times their norm (Immerkaer
+/// 1996, with the median for robustness): smooth structure and straight edges drop out. At most
+/// about 300,000 places are read.
 pub fn noise_sigma(data: &[f32], shape: [usize; 3], keep: impl Fn(usize) -> bool) -> f32 {
     let stride = [1, shape[0], shape[0] * shape[1]];
     let thick: Vec<usize> = (0..3).filter(|&a| shape[a] > 2).collect();

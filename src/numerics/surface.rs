@@ -1,8 +1,9 @@
 //! A bicubic spline over a rectangle, with its first and second derivatives.
 //!
-//! Interpolates values on a regular grid by cubic B-splines (Unser 1999): constant and linear data come back exactly, smooth data
-//! to fourth order inside. Ends along the first axis and the far end along the second are natural (no curvature); at 0 along
-//! the second the surface is mirrored, for functions that are even there.
+//! Interpolates values on a regular grid by cubic B-splines (Unser 1999): constant and linear data
+//! come back exactly, smooth data to fourth order inside. Ends along the first axis and the far end
+//! along the second are natural (no curvature); at 0 along the second the surface is mirrored, for
+//! functions that are even there.
 
 /// Value, first derivatives (x, y) and second derivatives (xx, xy, yy).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -73,7 +74,8 @@ fn basis(t: f64) -> [[f64; 4]; 3] {
     [value, slope, [s, 3.0 * t - 2.0, 3.0 * s - 2.0, t]]
 }
 
-/// The coefficients, one more on each side, that interpolate `values`: (c[i-1] + 4 c[i] + c[i+1]) / 6 = v[i].
+/// The coefficients, one more on each side, that interpolate `values`: (c[i-1] + 4 c[i] + c[i+1]) /
+/// 6 = v[i].
 fn fit(values: &[f64], mirrored: bool) -> Vec<f64> {
     let n = values.len();
     // A natural end has c = v there; a mirrored one 4 c[0] + 2 c[1] = 6 v[0].

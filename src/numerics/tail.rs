@@ -1,8 +1,9 @@
 //! The end of a factor, renewed where its matrix changed there alone.
 //!
-//! Of A = L D L^T, eliminated in order, the last columns of L see the rest of A only through their Schur complement S = L_t D_t L_t^T. A change of
-//! A within these columns and rows is the same change of S. So S is put together from the factor, changed and factorised as a dense matrix:
-//! the work of m^3 for m columns, whatever the size of A.
+//! Of A = L D L^T, eliminated in order, the last columns of L see the rest of A only through their
+//! Schur complement S = L_t D_t L_t^T. A change of A within these columns and rows is the same
+//! change of S. So S is put together from the factor, changed and factorised as a dense matrix: the
+//! work of m^3 for m columns, whatever the size of A.
 
 use crate::numerics::sparse::Singular;
 use faer::dyn_stack::{MemBuffer, MemStack};
@@ -25,8 +26,8 @@ pub(super) struct Tail {
 }
 
 impl Tail {
-    /// The last `columns` columns; none where there are none, or so many that the whole factor takes hardly more work, or the factor is not made
-    /// of supernodes.
+    /// The last `columns` columns; none where there are none, or so many that the whole factor
+    /// takes hardly more work, or the factor is not made of supernodes.
     pub fn of(symbolic: &SymbolicCholesky<u32>, columns: usize) -> Option<Self> {
         let supernodes = supernodes(symbolic).filter(|_| columns > 0)?;
         let whole: f64 = (0..supernodes.n_supernodes())
@@ -49,7 +50,8 @@ impl Tail {
         self.first
     }
 
-    /// Adds `changes` (row, column, value; of the lower triangle, from [`Self::first`] on) to the matrix of which `values` is the factor.
+    /// Adds `changes` (row, column, value; of the lower triangle, from [`Self::first`] on) to the
+    /// matrix of which `values` is the factor.
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes; the factor is spoilt then.
@@ -82,7 +84,8 @@ impl Tail {
         Ok(())
     }
 
-    /// Calls `with` for each number of the tail in a factor: where it is kept, and its row and column (from the first of the tail on).
+    /// Calls `with` for each number of the tail in a factor: where it is kept, and its row and
+    /// column (from the first of the tail on).
     fn each(&self, supernodes: &SymbolicSupernodalCholesky<u32>, mut with: impl FnMut(usize, usize, usize)) {
         for s in self.from..supernodes.n_supernodes() {
             let [begin, end] = ends(supernodes, s);

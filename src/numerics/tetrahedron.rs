@@ -1,4 +1,5 @@
-//! The quadratic tetrahedron: ten nodes, corners then the middles of the edges (VTK's order); edges may be curved.
+//! The quadratic tetrahedron: ten nodes, corners then the middles of the edges (VTK's order); edges
+//! may be curved.
 
 use crate::types::space::Matrix3;
 
@@ -32,8 +33,8 @@ pub fn slopes(l: [f64; 4]) -> [[f64; 3]; 10] {
     })
 }
 
-/// The Jacobian matrix (mm) of the element of nodes `p` (mm): row a, column b is the derivative of coordinate a with respect to
-/// barycentric coordinate b + 1. `slopes` are those at the place.
+/// The Jacobian matrix (mm) of the element of nodes `p` (mm): row a, column b is the derivative of
+/// coordinate a with respect to barycentric coordinate b + 1. `slopes` are those at the place.
 pub fn jacobian(p: &[[f64; 3]; 10], slopes: &[[f64; 3]; 10]) -> Matrix3 {
     let mut j = [[0.0; 3]; 3];
     for (q, s) in p.iter().zip(slopes) {

@@ -1,7 +1,7 @@
 //! Sine and cosine of a few angles at once, for inner loops.
 
-/// Coefficients of fdlibm's `__kernel_sin` and `__kernel_cos` (Sun Microsystems 1993), from the lowest power up; for
-/// angles to pi/4 both are within one unit in the last place.
+/// Coefficients of fdlibm's `__kernel_sin` and `__kernel_cos` (Sun Microsystems 1993), from the
+/// lowest power up; for angles to pi/4 both are within one unit in the last place.
 const SIN: [f64; 6] = [
     -1.666_666_666_666_663_2e-1,
     8.333_333_333_322_49e-3,
@@ -19,7 +19,8 @@ const COS: [f64; 6] = [
     -1.135_964_755_778_819_5e-11,
 ];
 
-/// Sines and cosines of `angles` (rad). Odd and even to the last bit, within 2e-16 of the exact values.
+/// Sines and cosines of `angles` (rad). Odd and even to the last bit, within 2e-16 of the exact
+/// values.
 #[inline(always)]
 pub fn sin_cos<const N: usize>(angles: [f64; N]) -> ([f64; N], [f64; N]) {
     let small = angles.iter().all(|v| v.abs() <= std::f64::consts::FRAC_PI_4);

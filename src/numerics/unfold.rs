@@ -108,8 +108,8 @@ impl<'a> Knots<'a> {
             .collect()
     }
 
-    /// All nodes at whose knot the volume may shrink below `least`, in order: the same determinants by whole rows and in single precision, with
-    /// room for their rounding.
+    /// All nodes at whose knot the volume may shrink below `least`, in order: the same determinants
+    /// by whole rows and in single precision, with room for their rounding.
     fn suspects(&self, coefficients: &[f32], least: f32) -> Vec<usize> {
         let [nx, ny, nz] = self.lattice.nodes;
         let total = self.lattice.len();
@@ -119,7 +119,8 @@ impl<'a> Knots<'a> {
         let inner = |n: usize| if n == 1 { 0..1 } else { 1..n - 2 };
         let near = |p: usize, n: usize| if n == 1 { [0; 3] } else { [p - 1, p, p + 1] };
         let in_plane = |k: usize| -> Vec<usize> {
-            // Of each component what its derivatives along x, y and z are made of along a row, and the room that a node has.
+            // Of each component what its derivatives along x, y and z are made of along a row, and
+            // the room that a node has.
             let mut sums: [[Vec<f32>; 3]; 3] = std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; nx]));
             let mut room = vec![0.0f32; nx - 3];
             let mut found = Vec::new();
@@ -195,8 +196,9 @@ impl<'a> Knots<'a> {
     }
 }
 
-/// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of what it was, until there is
-/// none, twenty rounds at most. `spacing` is that of the lattice's voxels (mm).
+/// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of
+/// what it was, until there is none, twenty rounds at most. `spacing` is that of the lattice's
+/// voxels (mm).
 pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
     let knots = Knots::new(lattice, spacing);
     let mut folded = knots.folded(coefficients, knots.suspects(coefficients, least).into_par_iter(), least);

@@ -1,5 +1,6 @@
-//! A background of one value that a cut through tissue made: a mask, a skull taken off, a volume resampled past its end. Its edge is none of
-//! the tissue and moves with the cut, so what lies behind it is not seen. The value is 0, or the least one where 0 was moved.
+//! A background of one value that a cut through tissue made: a mask, a skull taken off, a volume
+//! resampled past its end. Its edge is none of the tissue and moves with the cut, so what lies
+//! behind it is not seen. The value is 0, or the least one where 0 was moved.
 
 use crate::numerics::statistics::{quantile, sampled};
 use crate::numerics::{ablation, pyramid};
@@ -9,20 +10,24 @@ use rayon::prelude::*;
 /// Part of a volume that a background of one value takes at least.
 const BACKGROUND: f64 = 0.02;
 
-/// Part of the voxels beside such a background that is as bright as tissue from which all of it was cut: where tissue ends in air it is 0 in
-/// phantoms without noise and 0.1 to 0.25 beside padding, where a mask cut through tissue 0.48 to 0.91.
+/// Part of the voxels beside such a background that is as bright as tissue from which all of it was
+/// cut: where tissue ends in air it is 0 in phantoms without noise and 0.1 to 0.25 beside padding,
+/// where a mask cut through tissue 0.48 to 0.91.
 const CUT: f64 = 0.4;
 
-/// The same about one place from which it was cut there, and the part of the border at such places from which some was. Of volumes of which
-/// a box, an end or what lies past an oblique plane was set to 0 such places hold 0.06 to 0.27 of the border, 0.003 to 0.02 where their air
-/// was 0 before; of scans whose air was set to 0 up to a twentieth of the brightest 0.0002, up to a tenth 0.008 (where it costs next to nothing).
+/// The same about one place from which it was cut there, and the part of the border at such places
+/// from which some was. Of volumes of which a box, an end or what lies past an oblique plane was
+/// set to 0 such places hold 0.06 to 0.27 of the border, 0.003 to 0.02 where their air was 0
+/// before; of scans whose air was set to 0 up to a twentieth of the brightest 0.0002, up to a tenth
+/// 0.008 (where it costs next to nothing).
 const CUT_HERE: f64 = 0.6;
 const PLACES: f64 = 0.004;
 
 /// Part of the tissue's median intensity that is as bright as tissue.
 const BRIGHT: f32 = 0.5;
 
-/// Edge of the blocks by which a cut is looked for, in the finest voxels; three of them along each axis are one place.
+/// Edge of the blocks by which a cut is looked for, in the finest voxels; three of them along each
+/// axis are one place.
 const BLOCK: f64 = 8.0;
 
 /// A background of one value that was cut.
@@ -48,7 +53,8 @@ impl Cut {
     }
 }
 
-/// The one value of a volume's background, if it has such: 0, or the volume's `least` value if more voxels hold that.
+/// The one value of a volume's background, if it has such: 0, or the volume's `least` value if more
+/// voxels hold that.
 pub fn empty(volume: &Voxels<'_>, least: f32) -> Option<f32> {
     let values = volume.as_slice();
     let [zeros, others] = [held(values, 0.0), if least == 0.0 { 0 } else { held(values, least) }];
@@ -112,7 +118,8 @@ impl Blocks {
         Self { shape, edge, count: pyramid::reduced_shape(shape, edge) }
     }
 
-    /// Of each block the pairs of neighbours of which one is `empty` and the other not: those with one as bright as tissue, and all.
+    /// Of each block the pairs of neighbours of which one is `empty` and the other not: those with
+    /// one as bright as tissue, and all.
     fn border(&self, values: &[f32], empty: f32, bright: f32) -> Vec<[u32; 2]> {
         let [nx, ny, nz] = self.shape;
         let layer = self.count[0] * self.count[1];

@@ -1,7 +1,9 @@
-//! The bodies of a scene: parts of the tissue that slide along each other, each with a spline field of its own.
+//! The bodies of a scene: parts of the tissue that slide along each other, each with a spline field
+//! of its own.
 //!
-//! Most scenes have one. Another is tried where two motions explain the matches better than one ([`grouping`]): passes within
-//! each body and sharing out of the voxels alternate, and it stays if what it explains of the misfit is worth its degrees of freedom.
+//! Most scenes have one. Another is tried where two motions explain the matches better than one
+//! ([`grouping`]): passes within each body and sharing out of the voxels alternate, and it stays if
+//! what it explains of the misfit is worth its degrees of freedom.
 
 use crate::consistency::energy::distance;
 use crate::consistency::grouping;
@@ -23,29 +25,31 @@ const PASSES: usize = 2;
 /// Times that voxels are shared out in a trial; then it must explain more than it costs.
 const TRIAL: usize = 2;
 
-/// Part of what a trial explains worse at first that the first passes must make up for but for this. Of 22 scenes those with one body kept
-/// 0.31 to 0.97 of it, those with more 0.13 at most.
+/// Part of what a trial explains worse at first that the first passes must make up for but for
+/// this. Of 22 scenes those with one body kept 0.31 to 0.97 of it, those with more 0.13 at most.
 const HOPE: f64 = 0.25;
 
-/// Misfit that each further degree of freedom must explain (Akaike 1974: twice what chance gives), and how many are counted at least: with
-/// fewer, chance and rounding weigh too much.
+/// Misfit that each further degree of freedom must explain (Akaike 1974: twice what chance gives),
+/// and how many are counted at least: with fewer, chance and rounding weigh too much.
 const WORTH: (f64, f64) = (2.0, 100.0);
 
 /// Matches that a body rests on at least.
 const FEWEST: usize = 6;
 
-/// Jump of the motion at the border of two bodies, at least (voxels of the initial volume, median): less is one body.
+/// Jump of the motion at the border of two bodies, at least (voxels of the initial volume, median):
+/// less is one body.
 const JUMP: f64 = 1.0;
 
 /// Bodies at most.
 const MOST: usize = 8;
 
-/// Window in which residuals tell whose a voxel is (finest voxels, one standard deviation of a Gaussian). With .6 to 1.4 the errors of 12
-/// scenes that slide differ by 5 %.
+/// Window in which residuals tell whose a voxel is (finest voxels, one standard deviation of a
+/// Gaussian). With .6 to 1.4 the errors of 12 scenes that slide differ by 5 %.
 const WINDOW: f64 = 0.8;
 
-/// Log odds of a voxel all of whose surroundings belong to a body, and the width of these (finest voxels, one standard deviation).
-/// With 3 to 12, and with 1 to 2.2, the errors of 12 scenes that slide differ by 2 %.
+/// Log odds of a voxel all of whose surroundings belong to a body, and the width of these (finest
+/// voxels, one standard deviation). With 3 to 12, and with 1 to 2.2, the errors of 12 scenes that
+/// slide differ by 2 %.
 const COHERENCE: (f32, f64) = (5.0, 1.2);
 
 /// Part of a body's largest connected part under which another joins what is around it.
@@ -98,7 +102,8 @@ impl Given {
         Self { names, labels, shape }
     }
 
-    /// The body of each voxel of a level of `shape`: the commonest among those it stands for, the first of several.
+    /// The body of each voxel of a level of `shape`: the commonest among those it stands for, the
+    /// first of several.
     pub fn on(&self, shape: [usize; 3], factor: [usize; 3]) -> Vec<u8> {
         if factor == [1; 3] {
             return self.labels.clone();
@@ -178,14 +183,16 @@ impl Bodies {
         field.lattice.at(&field.coefficients, p)
     }
 
-    /// The same bodies on another level, on lattices as `lattice`; `place` maps its voxels to those here.
+    /// The same bodies on another level, on lattices as `lattice`; `place` maps its voxels to those
+    /// here.
     pub fn carried(&self, lattice: &Lattice, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Self {
         let labels = self.labels_on(lattice.shape, &place);
         let fields = self.fields.iter().map(|f| level::carry(f, lattice.clone(), &place)).collect();
         Self { labels, fixed: self.fixed, fields }
     }
 
-    /// The body of each voxel of another volume of `shape`, none where there is one body; `place` maps its voxels to those here.
+    /// The body of each voxel of another volume of `shape`, none where there is one body; `place`
+    /// maps its voxels to those here.
     pub fn labels_on(&self, shape: [usize; 3], place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<u8> {
         let [nx, ny, nz] = shape;
         let label = |at: usize| {
@@ -253,7 +260,8 @@ impl Bodies {
         all.unwrap_or_default()
     }
 
-    /// Divides bodies for as long as `matches` propose it and the volumes agree so much better; says of each what it explains.
+    /// Divides bodies for as long as `matches` propose it and the volumes agree so much better;
+    /// says of each what it explains.
     pub fn divide(
         &mut self,
         pair: &Pair<'_>,
@@ -294,7 +302,8 @@ impl Bodies {
         splits.iter().map(|second| self.divided(pair, &own, second, body)).collect()
     }
 
-    /// One body in two: voxels go with the matches around them, and each side's field is that of its matches.
+    /// One body in two: voxels go with the matches around them, and each side's field is that of
+    /// its matches.
     fn divided(&self, pair: &Pair<'_>, matches: &[&LevelMatch], second: &[bool], body: usize) -> Self {
         let [nx, ny, nz] = pair.shape;
         let inside = pair.mask.iter().enumerate().filter(|(at, m)| **m != 0 && self.label(*at) == body).count();
@@ -337,7 +346,8 @@ impl Bodies {
         if b.agree_better(pair, &a) { b } else { a }
     }
 
-    /// A few passes, and what these then explain that `fewer` do not; none where it is nothing, or soon seems so.
+    /// A few passes, and what these then explain that `fewer` do not; none where it is nothing, or
+    /// soon seems so.
     fn tried(mut self, pair: &Pair<'_>, fewer: &Self, seed: u64) -> Option<Trial> {
         let before = fewer.warp(pair, &pair.spans);
         let gained = |bodies: &Self| level::gained(pair, &before, bodies.warp(pair, &pair.spans));
@@ -360,7 +370,8 @@ impl Bodies {
         Some(Trial { bodies: self, gain, more, jump })
     }
 
-    /// The jump of the motion (mm, median) where a body borders on others; 0 where it borders on none.
+    /// The jump of the motion (mm, median) where a body borders on others; 0 where it borders on
+    /// none.
     pub fn jump(&self, pair: &Pair<'_>, body: usize) -> f64 {
         let [nx, ny, _] = pair.shape;
         let after = |at: usize| {
@@ -385,8 +396,9 @@ impl Bodies {
         if jumps.is_empty() { 0.0 } else { f64::from(median(&mut jumps)) }
     }
 
-    /// Gives each voxel to the body whose motion explains it and its surroundings best, and that most of these belong to (mean
-    /// field of a Potts model; the residuals' robust cost, in a window, as log likelihood).
+    /// Gives each voxel to the body whose motion explains it and its surroundings best, and that
+    /// most of these belong to (mean field of a Potts model; the residuals' robust cost, in a
+    /// window, as log likelihood).
     fn share_out(&mut self, pair: &Pair<'_>) {
         let all = self.warp(pair, &pair.spans);
         let gain = GainField::measure(pair, &all);
@@ -445,7 +457,8 @@ impl Bodies {
         self.join_islands(pair);
     }
 
-    /// Gives parts of a body that are small beside its largest one, and apart from it, to the body that they touch most.
+    /// Gives parts of a body that are small beside its largest one, and apart from it, to the body
+    /// that they touch most.
     fn join_islands(&mut self, pair: &Pair<'_>) {
         let mut part = vec![usize::MAX; self.labels.len()];
         let mut parts: Vec<Vec<usize>> = Vec::new();
@@ -510,7 +523,8 @@ fn window(width: f64) -> f64 {
     2.0 * std::f64::consts::PI.sqrt() * width
 }
 
-/// Cauchy's cost of what is left at each voxel of the mask; much where the deformed volume does not show it.
+/// Cauchy's cost of what is left at each voxel of the mask; much where the deformed volume does not
+/// show it.
 fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f32> {
     let [nx, ny, _] = pair.shape;
     let cut = 1.0 / (CAUCHY * sigma);

@@ -39,11 +39,13 @@ pub struct LostSlice {
 
 /// Checks the two volumes (as [`tamed`] gives them) and the mask, and makes them fit to work on.
 ///
-/// A slice inside the body that holds one value throughout is lost: left out of the mask in the initial volume, not finite in the
-/// deformed one. A voxel that is not finite among ones that are gets the mean of those around it; more of them in one place are 0 in the
-/// initial volume and stay unseen in the deformed one, and so does the background of both where a cut through tissue made that of one. Volumes whose
-/// intensities are so large, so small or so far from 0 that single precision loses them are shifted and scaled by a power of two, and so is
-/// a deformed volume whose spread is another than the initial one's.
+/// A slice inside the body that holds one value throughout is lost: left out of the mask in the
+/// initial volume, not finite in the deformed one. A voxel that is not finite among ones that are
+/// gets the mean of those around it; more of them in one place are 0 in the initial volume and stay
+/// unseen in the deformed one, and so does the background of both where a cut through tissue made
+/// that of one. Volumes whose intensities are so large, so small or so far from 0 that single
+/// precision loses them are shifted and scaled by a power of two, and so is a deformed volume whose
+/// spread is another than the initial one's.
 ///
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
@@ -116,8 +118,8 @@ fn slice(shape: [usize; 3], axis: usize, at: usize) -> impl Iterator<Item = usiz
     (0..shape[v]).flat_map(move |j| (0..shape[u]).map(move |i| at * stride[axis] + j * stride[v] + i * stride[u]))
 }
 
-/// Slices across each axis that hold one value throughout while the slices next to them that do not show tissue in the
-/// same places: an acquisition or a conversion that dropped them.
+/// Slices across each axis that hold one value throughout while the slices next to them that do not
+/// show tissue in the same places: an acquisition or a conversion that dropped them.
 fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
     let (grid, values) = (volume.grid(), volume.as_slice());
     let shape = grid.shape();
@@ -149,7 +151,8 @@ fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
     (0..3).filter(|&a| shape[a] > 2).flat_map(across).collect()
 }
 
-/// The volume with lost slices drawn over linearly from the ones next to them, so that no edge stands where nothing is measured.
+/// The volume with lost slices drawn over linearly from the ones next to them, so that no edge
+/// stands where nothing is measured.
 fn bridged<'a>(volume: &'a Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     let mut out = volume.view();
     let shape = volume.grid().shape();
@@ -177,13 +180,15 @@ fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     volume
 }
 
-/// Soft tissue keeps its volume: that it came out as this part of what it was or less, or as its inverse or more, is told.
+/// Soft tissue keeps its volume: that it came out as this part of what it was or less, or as its
+/// inverse or more, is told.
 const KEPT: f64 = 0.75;
 
 /// Voxels that are looked at for it.
 const SAMPLED: usize = 5000;
 
-/// What to say where the tissue as a whole does not keep its volume: most often a header is wrong. Nothing of one slice.
+/// What to say where the tissue as a whole does not keep its volume: most often a header is wrong.
+/// Nothing of one slice.
 pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
     let inside = || (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0);
     let share = SAMPLED as f64 / inside().count().max(1) as f64;
@@ -279,9 +284,10 @@ impl Range {
 /// Finite neighbours that a single voxel without a number needs to get one.
 const AROUND: usize = 13;
 
-/// Voxels by which tissue is drawn on past a cut, so that patches beside it can be matched and no edge stands there. Of five legs and small
-/// blocks that were cut, 0, 1, 2 and 3 left 0.13, 0.08, 0.12 and 0.34 mm of a press, 0.59, 0.49, 0.45 and 0.61 of 6 mm; without any of them
-/// small bodies keep too few matches.
+/// Voxels by which tissue is drawn on past a cut, so that patches beside it can be matched and no
+/// edge stands there. Of five legs and small blocks that were cut, 0, 1, 2 and 3 left 0.13, 0.08,
+/// 0.12 and 0.34 mm of a press, 0.59, 0.49, 0.45 and 0.61 of 6 mm; without any of them small bodies
+/// keep too few matches.
 const DRAWN_ON: usize = 2;
 
 /// The volume with what shows drawn on a little into what does not.
@@ -292,7 +298,8 @@ fn drawn_on(mut volume: Voxels<'_>) -> Voxels<'_> {
     volume
 }
 
-/// With the mean of the finite voxels around it in each that has no number and at least `least` of them.
+/// With the mean of the finite voxels around it in each that has no number and at least `least` of
+/// them.
 fn filled(volume: &Voxels<'_>, least: usize) -> Volume {
     let (values, shape) = (volume.as_slice(), volume.grid().shape());
     let mut out = volume.clone().into_volume();
@@ -310,7 +317,8 @@ const FAR: f64 = 100.0;
 /// Quantiles between which a volume's intensities are taken to lie.
 const ROBUST: [f64; 2] = [0.001, 0.999];
 
-/// The range of some intensities without far outliers (hot voxels, spikes); none where they are all alike.
+/// The range of some intensities without far outliers (hot voxels, spikes); none where they are all
+/// alike.
 fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
     let [low, high] = ROBUST.map(|q| quantile(sample, q));
     (high > low).then_some([low, high])
@@ -319,11 +327,12 @@ fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
 /// How far past its robust range a volume's intensities may lie, in widths of it.
 const PAST: f32 = 3.0;
 
-/// The most extreme neighbours that do not count when a voxel is held against them: hot voxels come in short runs.
+/// The most extreme neighbours that do not count when a voxel is held against them: hot voxels come
+/// in short runs.
 const RUN: usize = 3;
 
-/// The volume with padding that lies far from its intensities as the darkest of these, lone far outliers as the median of their
-/// neighbours, and others drawn in to the end of the range.
+/// The volume with padding that lies far from its intensities as the darkest of these, lone far
+/// outliers as the median of their neighbours, and others drawn in to the end of the range.
 pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
     let reached = Range::of(volume);
     let mut sample = sampled(volume.as_slice());
@@ -365,8 +374,9 @@ fn neighbours(values: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Vec<f32> {
     all.filter(|&other| other != at && values[other].is_finite()).map(|other| values[other]).collect()
 }
 
-/// With intensities that can be squared and summed in single precision, and with their spread, which comes near to `like`:
-/// gains between the volumes are bounded, and noise is measured in the initial one alone.
+/// With intensities that can be squared and summed in single precision, and with their spread,
+/// which comes near to `like`: gains between the volumes are bounded, and noise is measured in the
+/// initial one alone.
 fn in_range<'a>(mut volume: Voxels<'a>, like: Option<f64>) -> (Voxels<'a>, f64) {
     let reached = || {
         let Range { low, high, .. } = Range::of(&volume);

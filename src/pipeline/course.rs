@@ -1,8 +1,10 @@
-//! Whether what a frame of a sequence says is borne out: by the frames before and after it, or by its own image.
+//! Whether what a frame of a sequence says is borne out: by the frames before and after it, or by
+//! its own image.
 //!
-//! A void, an artefact or a wrong match moves tissue where no frame beside it has it, and the pair alone cannot tell. A jerk does
-//! so too, but then the image agrees better with the frame's own field than with the middle of its neighbours'. Tissue where neither holds
-//! is told of; where there is no texture nothing can be said.
+//! A void, an artefact or a wrong match moves tissue where no frame beside it has it, and the pair
+//! alone cannot tell. A jerk does so too, but then the image agrees better with the frame's own
+//! field than with the middle of its neighbours'. Tissue where neither holds is told of; where
+//! there is no texture nothing can be said.
 
 use crate::numerics::sampling::{Stencil, inside};
 use crate::numerics::statistics::noise_sigma;
@@ -10,21 +12,23 @@ use crate::types::space::length;
 use crate::types::{Displacement, Mask, Voxels};
 use rayon::prelude::*;
 
-/// How far apart the voxels that are looked at lie (the finest axis' voxels), and how many of them a block has along each axis, 64 in all; in one
-/// slice twice as many.
+/// How far apart the voxels that are looked at lie (the finest axis' voxels), and how many of them
+/// a block has along each axis, 64 in all; in one slice twice as many.
 const EVERY: usize = 2;
 const ALONG: usize = 4;
 
-/// Voxels of a block for it to count, and how much more than its noise the reference must vary there.
+/// Voxels of a block for it to count, and how much more than its noise the reference must vary
+/// there.
 const FEWEST: usize = 16;
 const CONTRAST: f64 = 2.0;
 
-/// How far a block is from where its neighbours in time have it, to be out of line: in edges of a voxel, and in
-/// standard deviations of the difference.
+/// How far a block is from where its neighbours in time have it, to be out of line: in edges of a
+/// voxel, and in standard deviations of the difference.
 const APART: f64 = 0.5;
 const DEVIATIONS: f64 = 4.0;
 
-/// Of the misfit (1 - correlation^2) under the neighbours' field, what a frame's own leaves at most where its image bears it out.
+/// Of the misfit (1 - correlation^2) under the neighbours' field, what a frame's own leaves at most
+/// where its image bears it out.
 const BORNE_OUT: f64 = 0.8;
 
 /// Part of the tissue from which it is said, and part of what is out of line.
@@ -75,7 +79,8 @@ impl<'a, 'v> Course<'a, 'v> {
         Self { reference, blocks, origin, before, last: None }
     }
 
-    /// Takes a frame, and says of the one before it what its number is and what is not borne out there.
+    /// Takes a frame, and says of the one before it what its number is and what is not borne out
+    /// there.
     pub fn add(
         &mut self,
         number: usize,
@@ -91,7 +96,8 @@ impl<'a, 'v> Course<'a, 'v> {
         said
     }
 
-    /// The same of the last frame, by the one before it alone; and begins again beside the reference.
+    /// The same of the last frame, by the one before it alone; and begins again beside the
+    /// reference.
     pub fn end(&mut self) -> Option<(usize, OutOfLine)> {
         let said = self.judge(None);
         self.before = still(self.origin, &self.blocks);
@@ -142,7 +148,8 @@ impl<'a, 'v> Course<'a, 'v> {
         })
     }
 
-    /// 1 - correlation^2 of a block of the reference and what a frame shows of it; none where that is not in view.
+    /// 1 - correlation^2 of a block of the reference and what a frame shows of it; none where that
+    /// is not in view.
     fn misfit(&self, block: &[usize], moved: &[([f32; 3], f32)], volume: &Voxels<'_>) -> Option<f64> {
         let (grid, there) = (self.reference.grid(), volume.grid());
         let pairs: Vec<[f64; 2]> = block
@@ -230,8 +237,9 @@ mod tests {
         p.minus(grid().world(20, 18, 16)).iter().map(|d| d * d).sum::<f64>() < 100.0
     }
 
-    /// What is told of frame 3 of frames 2 to 4, where all moved by 1 mm a frame along x, but in frame 3 a ball by 3 more along y; the image of
-    /// frame 3 shows the ball there, where it was without that, or not at all.
+    /// What is told of frame 3 of frames 2 to 4, where all moved by 1 mm a frame along x, but in
+    /// frame 3 a ball by 3 more along y; the image of frame 3 shows the ball there, where it was
+    /// without that, or not at all.
     fn told(shows: Option<f64>) -> Option<(usize, OutOfLine)> {
         let g = grid();
         let reference = Volume::from_voxels(g, |_, p| texture(p) as f32);
@@ -253,7 +261,8 @@ mod tests {
         assert!(second.is_none_or(|s| s.0 == 2));
         let fourth = Volume::from_voxels(g, |_, p| texture(p.moved([-4.0, 0.0, 0.0])) as f32);
         let said = course.add(4, (&field(4.0, 0.0), &sigma), fourth);
-        // The last frame is borne out by its image alone, and the first on the other side begins again.
+        // The last frame is borne out by its image alone, and the first on the other side begins
+        // again.
         assert_eq!(course.end(), None);
         assert_eq!(course.end(), None);
         said

@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-/// CPU seconds of all threads of this process so far, in user and system mode; none where the system does not tell.
+/// CPU seconds of all threads of this process so far, in user and system mode; none where the
+/// system does not tell.
 #[cfg(unix)]
 pub fn spent() -> Option<f64> {
     use rustix::time::{ClockId, clock_gettime};
@@ -10,14 +11,15 @@ pub fn spent() -> Option<f64> {
     Some(now.tv_sec as f64 + now.tv_nsec as f64 * 1e-9)
 }
 
-/// CPU seconds of all threads of this process so far, in user and system mode; none where the system does not tell.
+/// CPU seconds of all threads of this process so far, in user and system mode; none where the
+/// system does not tell.
 #[cfg(not(unix))]
 pub fn spent() -> Option<f64> {
     None
 }
 
-/// What `work` gives back, and the CPU seconds of this process meanwhile (wall seconds where those are not told).
-/// Nothing else may run in the process.
+/// What `work` gives back, and the CPU seconds of this process meanwhile (wall seconds where those
+/// are not told). Nothing else may run in the process.
 pub fn timed<R>(work: impl FnOnce() -> R) -> (R, f64) {
     let (started, before) = (std::time::Instant::now(), spent());
     let out = work();

@@ -31,7 +31,8 @@ use crate::types::*;
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
 
-/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
+/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
+/// from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
 /// The result of `palpate field`, on the initial volume's grid.
@@ -67,7 +68,8 @@ impl FieldResult {
         interpolated(interpolation, self.coefficients.dense()?, (&self.mesh, &self.node_displacement))
     }
 
-    /// Puts another displacement in the place of its own, and what the summary says of it over the mask.
+    /// Puts another displacement in the place of its own, and what the summary says of it over the
+    /// mask.
     pub(super) fn replace(&mut self, displacement: DenseField, mask: &Mask) -> Result<(), FieldError> {
         (self.summary.mean_mm, self.summary.max_mm, _) = lengths(&displacement, mask);
         self.summary.folds = jacobian::count_folds(&displacement, Some(mask))?;
@@ -98,7 +100,8 @@ impl Clock {
         self.add(stage, seconds);
     }
 
-    /// Books `seconds` that passed before now to `stage`, and leaves them out of what is booked next.
+    /// Books `seconds` that passed before now to `stage`, and leaves them out of what is booked
+    /// next.
     fn skip(&mut self, stage: &str, seconds: f64) {
         self.1 += Duration::from_secs_f64(seconds);
         self.add(stage, seconds);
@@ -114,8 +117,8 @@ impl Clock {
 
 /// Measures the displacement from `initial` to `deformed`.
 ///
-/// `mask` lies on the initial grid: features are taken, residuals weighed and statistics made inside it. The volumes
-/// may lie on different grids. Results lie on the initial grid.
+/// `mask` lies on the initial grid: features are taken, residuals weighed and statistics made
+/// inside it. The volumes may lie on different grids. Results lie on the initial grid.
 ///
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, the mask is empty or on another grid, the two volumes do not
@@ -130,8 +133,8 @@ pub fn run(
     run_from(initial, deformed, mask, params, &[], progress)
 }
 
-/// As [`run`], with fields from which the search may start beside the ones it finds itself; the agreement of the volumes
-/// decides.
+/// As [`run`], with fields from which the search may start beside the ones it finds itself; the
+/// agreement of the volumes decides.
 ///
 /// # Errors
 /// As [`run`].
@@ -152,7 +155,8 @@ pub fn run_from(
     stored(found, here, initial.grid())
 }
 
-/// As [`run`], of volumes that are lent and come back: where their axes run otherwise they are turned meanwhile, so that none is held twice.
+/// As [`run`], of volumes that are lent and come back: where their axes run otherwise they are
+/// turned meanwhile, so that none is held twice.
 ///
 /// # Errors
 /// As [`run`].
@@ -195,8 +199,8 @@ fn stored(found: FieldResult, here: Orientation, grid: &Grid) -> Result<FieldRes
     })
 }
 
-/// As [`run_from`], for volumes whose axes run right, anterior and superior, nearly: then the way in which voxels are
-/// stored changes nothing.
+/// As [`run_from`], for volumes whose axes run right, anterior and superior, nearly: then the way
+/// in which voxels are stored changes nothing.
 fn canonical(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
@@ -346,8 +350,8 @@ fn canonical(
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
     let doubted = begun.doubted();
-    // Features that do not bear each other out, few matches or volumes that do not agree in the end, and a motion past all that was
-    // looked for: not a measurement.
+    // Features that do not bear each other out, few matches or volumes that do not agree in the
+    // end, and a motion past all that was looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| most_move(&displacement, &mask) > search) {
         let survived = (kept, "matches survive", found.div_ceil(5));
         let agreed = (
@@ -454,8 +458,8 @@ struct Found<'a> {
 }
 
 impl<'a> CoarseToFine<'a, '_> {
-    /// From the coarsest level to the finest: where the passes begin, the passes, and the matches about their field. `tissue` gives
-    /// the mask with all tissue around it, where that is another.
+    /// From the coarsest level to the finest: where the passes begin, the passes, and the matches
+    /// about their field. `tissue` gives the mask with all tissue around it, where that is another.
     fn run(
         &self,
         range: f64,
@@ -572,7 +576,8 @@ impl<'a> CoarseToFine<'a, '_> {
         Err(too_few(0, range))
     }
 
-    /// Each given body's motion on the coarsest level: by a search of its own or that of the whole, whichever agrees better in it.
+    /// Each given body's motion on the coarsest level: by a search of its own or that of the whole,
+    /// whichever agrees better in it.
     fn each(
         &self,
         search: &Search<'_>,
@@ -597,8 +602,9 @@ impl<'a> CoarseToFine<'a, '_> {
         bodies
     }
 
-    /// Where the passes of the coarsest level begin: inside the mask, with all tissue `around` it where few features agree there, and
-    /// twice as far where the motion reaches the range or few agree.
+    /// Where the passes of the coarsest level begin: inside the mask, with all tissue `around` it
+    /// where few features agree there, and twice as far where the motion reaches the range or few
+    /// agree.
     fn begin(
         &self,
         search: &Search<'_>,
@@ -641,10 +647,12 @@ fn why_farther(range: f64, own: &Begun, wide: &Begun, taken: bool) -> String {
     )
 }
 
-/// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and [`FEWEST`] must be left.
+/// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and
+/// [`FEWEST`] must be left.
 const LEAST_SEARCHED: usize = 1500;
 
-/// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30 mm.
+/// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30
+/// mm.
 pub(super) fn search_mm(grid: &Grid, asked: f64) -> f64 {
     let (shape, spacing) = (grid.shape(), grid.spacing());
     let thick = || (0..3).filter(|&a| shape[a] > 1);
@@ -658,7 +666,8 @@ pub(super) fn inside(mask: &Mask) -> usize {
     mask.as_slice().iter().filter(|&&m| m != 0).count()
 }
 
-/// Reduction factors of the levels, coarse to fine: none but the finest with less tissue than [`LEAST_SEARCHED`].
+/// Reduction factors of the levels, coarse to fine: none but the finest with less tissue than
+/// [`LEAST_SEARCHED`].
 pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) -> Vec<[usize; 3]> {
     let inside = inside(mask);
     let mut all = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
@@ -673,7 +682,8 @@ const WORKED_ON: usize = 600_000;
 /// Voxels between the nodes of the lattice on levels above the finest.
 const COARSE: usize = 3;
 
-/// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`] voxels of tissue are left.
+/// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`]
+/// voxels of tissue are left.
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
     if asked > 0 {
         return asked;
@@ -715,7 +725,8 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     format!("points: {found} of {wanted} wanted, {source}{limit}")
 }
 
-/// The mask with the `name` of each voxel's body; `labels` (bodies from 0) may be empty where there is one.
+/// The mask with the `name` of each voxel's body; `labels` (bodies from 0) may be empty where there
+/// is one.
 pub(super) fn labelled(mask: &Mask, labels: &[u8], name: impl Fn(usize) -> u8) -> Mask {
     let mut out = mask.clone();
     for (at, voxel) in out.as_mut_slice().iter_mut().enumerate().filter(|(_, v)| **v != 0) {
@@ -733,8 +744,8 @@ struct Concluded {
 }
 
 impl Concluded {
-    /// The smallest motion that explains a body's matches, where it stays at rest, and what its data leave open.
-    /// `rigid` says that it moves rigidly, whatever the evidence.
+    /// The smallest motion that explains a body's matches, where it stays at rest, and what its
+    /// data leave open. `rigid` says that it moves rigidly, whatever the evidence.
     fn of(bodies: &Bodies, body: usize, pair: &Pair<'_>, matches: &[LevelMatch], (rigid, seed): (bool, u64)) -> Self {
         let (pair, field) = (bodies.part(pair, body), &bodies.fields[body]);
         let own = matches.iter().filter(|m| m.kept && bodies.label_near(m.voxel) == body);
@@ -771,7 +782,8 @@ impl Concluded {
     }
 }
 
-/// Standard deviations at the nodes of a lattice (mm), and which of these the deformed volume does not show.
+/// Standard deviations at the nodes of a lattice (mm), and which of these the deformed volume does
+/// not show.
 pub(super) struct Stated {
     pub coarse: Lattice,
     pub deviation: Vec<f32>,
@@ -917,25 +929,28 @@ fn barycentric(mesh: &Mesh, nodes: &[[f64; 3]], mut outside: DenseField) -> Resu
     Ok(outside)
 }
 
-/// What the posterior leaves out (how the lattice, the interpolation and a local gain fall short, and that one number stands for
-/// three axes) gives the errors longer tails than it says: of 27 pairs made from scans of a head, legs and a spine 16 had 90 %
-/// of their errors inside the 95 % band at 1.25, 24 at this; in the median of them it then holds 94 %.
+/// What the posterior leaves out (how the lattice, the interpolation and a local gain fall short,
+/// and that one number stands for three axes) gives the errors longer tails than it says: of 27
+/// pairs made from scans of a head, legs and a spine 16 had 90 % of their errors inside the 95 %
+/// band at 1.25, 24 at this; in the median of them it then holds 94 %.
 const CALIBRATION: f32 = 1.6;
 
-/// Standard deviation along an axis that a voxel at a border between bodies adds, as a part of the jump there: one in ten such voxels goes
-/// with the wrong side (13 scenes).
+/// Standard deviation along an axis that a voxel at a border between bodies adds, as a part of the
+/// jump there: one in ten such voxels goes with the wrong side (13 scenes).
 const SIDE: f32 = 0.18;
 
-/// What interpolation and a voxel's extent hide from any match, as a part of a voxel: motions that were affine to the last digit (blocks
-/// with sharp edges, legs shifted along thick slices) came out 0.005 to 0.03 of a voxel off along an axis where noise alone explained a
-/// fifth of it.
+/// What interpolation and a voxel's extent hide from any match, as a part of a voxel: motions that
+/// were affine to the last digit (blocks with sharp edges, legs shifted along thick slices) came
+/// out 0.005 to 0.03 of a voxel off along an axis where noise alone explained a fifth of it.
 const HIDDEN: f64 = 0.015;
 
-/// How much more uncertain tissue is that the deformed volume does not show than smoothness says: of a brain of which 11 to 75 % had
-/// moved out of view the 95 % bands held 0.86 to 0.49 of the errors there without it.
+/// How much more uncertain tissue is that the deformed volume does not show than smoothness says:
+/// of a brain of which 11 to 75 % had moved out of view the 95 % bands held 0.86 to 0.49 of the
+/// errors there without it.
 const EXTRAPOLATED: f32 = 3.0;
 
-/// Of each node of a lattice over the initial volume, whether the deformed volume does not show what is there.
+/// Of each node of a lattice over the initial volume, whether the deformed volume does not show
+/// what is there.
 pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
     let sees = |m: usize| {
         let p = lattice.within(m);
@@ -944,8 +959,9 @@ pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) ->
     (0..lattice.len()).into_par_iter().map(|m| !sees(m)).collect()
 }
 
-/// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match shows ([`HIDDEN`]), what is not in view
-/// ([`hidden`]), and what is in doubt beside `jumps` (voxel, mm).
+/// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match
+/// shows ([`HIDDEN`]), what is not in view ([`hidden`]), and what is in doubt beside `jumps`
+/// (voxel, mm).
 pub(super) fn uncertainty(
     grid: &Grid,
     spacing: [f64; 3],
@@ -992,9 +1008,10 @@ pub(super) fn average_inside(values: &ScalarSpline, mask: &Mask) -> (f64, f64) {
     (f64::from(median(&mut picked)), mean)
 }
 
-/// Length (mm) that all but a twentieth of the mask move at most, from at most about 25,000 of its voxels. A neck that shows in one volume alone goes
-/// anywhere; of the tissues that are not each other's (legs, heads, necks, upside down or noise) it was 1.1 to 2 times the search range, of two
-/// people 0.4 to 0.7.
+/// Length (mm) that all but a twentieth of the mask move at most, from at most about 25,000 of its
+/// voxels. A neck that shows in one volume alone goes anywhere; of the tissues that are not each
+/// other's (legs, heads, necks, upside down or noise) it was 1.1 to 2 times the search range, of
+/// two people 0.4 to 0.7.
 fn most_move(field: &DenseField, mask: &Mask) -> f64 {
     let parts = [0, 1, 2].map(|c| field.component(c));
     let length = |at: usize| parts.iter().map(|part| part[at] * part[at]).sum::<f32>().sqrt();
@@ -1025,17 +1042,20 @@ pub(super) fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
     (sum / n.max(1) as f64, f64::from(top), n)
 }
 
-/// Mean length of an error in space over the stated deviation along an axis: 2 sqrt(2 / pi) for normal errors, less here, since
-/// that deviation allows for long tails (1.35 in the median of the same 27 pairs).
+/// Mean length of an error in space over the stated deviation along an axis: 2 sqrt(2 / pi) for
+/// normal errors, less here, since that deviation allows for long tails (1.35 in the median of the
+/// same 27 pairs).
 const LENGTH: f64 = 1.35;
 
-/// Part of that limit from which it is said: the expected error is right to a tenth at best. Of 978 stressed runs two that were of
-/// no use lay at 0.97 and 0.99 of it; of 984 with other seeds none under 1.
+/// Part of that limit from which it is said: the expected error is right to a tenth at best. Of 978
+/// stressed runs two that were of no use lay at 0.97 and 0.99 of it; of 984 with other seeds none
+/// under 1.
 const NEARLY: f64 = 0.95;
 
-/// Says so where the field is expected to be off by about half of the motion or a voxel, or more: beyond that it is of
-/// little use (docs/failures.md shows how often this is right). A free field's own length holds its errors, as squares; under a
-/// smaller model that much bending would not have shown, and where nothing is seen to move a voxel alone counts.
+/// Says so where the field is expected to be off by about half of the motion or a voxel, or more:
+/// beyond that it is of little use (docs/failures.md shows how often this is right). A free field's
+/// own length holds its errors, as squares; under a smaller model that much bending would not have
+/// shown, and where nothing is seen to move a voxel alone counts.
 pub(super) fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
     let edge = pyramid::finest(grid.shape(), grid.spacing());
     let expected = LENGTH * sigma;
@@ -1058,8 +1078,8 @@ pub(super) fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) ->
     })
 }
 
-/// Tissue without texture from which it is said: pairs made from scans of heads, legs and a spine have 0 to 8 %, legs in slices
-/// four times as thick as their voxels are wide 10.
+/// Tissue without texture from which it is said: pairs made from scans of heads, legs and a spine
+/// have 0 to 8 %, legs in slices four times as thick as their voxels are wide 10.
 const PLAIN: f64 = 0.1;
 
 /// Says so where much of the tissue shows nothing that could be seen to move.

@@ -1,40 +1,46 @@
-//! A closer lattice where the volumes still differ by more than noise, and the closer field explains why.
+//! A closer lattice where the volumes still differ by more than noise, and the closer field
+//! explains why.
 
 use crate::matching::pair::Pair;
 use crate::numerics::statistics::deviation;
 use crate::pipeline::level::{self, SplineField};
 
-/// Residual (in standard deviations of the noise) beyond which a closer lattice is tried. The spline filter leaves noise alone at
-/// about 0.5. Same tissue at 3 % noise: 0.5 to 0.75 where the motion was found, 0.95 at most where not; brains of two people,
-/// 1.4 to 12.
+/// Residual (in standard deviations of the noise) beyond which a closer lattice is tried. The
+/// spline filter leaves noise alone at about 0.5. Same tissue at 3 % noise: 0.5 to 0.75 where the
+/// motion was found, 0.95 at most where not; brains of two people, 1.4 to 12.
 const NOISY: f32 = 1.1;
 
-/// Misfit per degree of freedom that a closer lattice must explain. Past the spacing that a scene asks for lattices explained .3 to .75 of noise
-/// and interpolation (docs/lab/2026-11-local-signal.md).
+/// Misfit per degree of freedom that a closer lattice must explain. Past the spacing that a scene
+/// asks for lattices explained .3 to .75 of noise and interpolation
+/// (docs/lab/2026-11-local-signal.md).
 const WORTH: f64 = 0.8;
 
 /// Passes on each closer lattice, and again where it is taken.
 const TRIAL: usize = 4;
 
-/// Nodes in the tissue from which on they lie further apart than [`APART`]: smoothness sets the scale of motion on any lattice, and
-/// bodies move on a scale of their own size. Calibrated: docs/lab/2026-11-local-signal.md.
+/// Nodes in the tissue from which on they lie further apart than [`APART`]: smoothness sets the
+/// scale of motion on any lattice, and bodies move on a scale of their own size. Calibrated:
+/// docs/lab/2026-11-local-signal.md.
 const ENOUGH: f64 = 6000.0;
 
 /// Voxels between nodes, at least, to begin with.
 const APART: usize = 4;
 
-/// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is no matter.
+/// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is
+/// no matter.
 const UNLIKE: f32 = 0.05;
 
-/// Variation of the gain beyond which it is warned of. In phantoms of a block, a head and a calf (two sizes, two to five seeds) it is 1.01 to 1.02 without
-/// bias, 1.10 to 1.19 at 15 % and 1.26 to 1.49 at 40, where the error is larger by 19 to 31 %; in 14 pairs made from scans (15 %) 1.10 to 1.19. Between
-/// the second and the 98th percentile one of those, in thick slices, had 1.55.
+/// Variation of the gain beyond which it is warned of. In phantoms of a block, a head and a calf
+/// (two sizes, two to five seeds) it is 1.01 to 1.02 without bias, 1.10 to 1.19 at 15 % and 1.26 to
+/// 1.49 at 40, where the error is larger by 19 to 31 %; in 14 pairs made from scans (15 %) 1.10 to
+/// 1.19. Between the second and the 98th percentile one of those, in thick slices, had 1.55.
 const UNEVEN: f32 = 1.25;
 
 /// Nodes at most, to bound memory.
 const NODES: usize = 4_000_000;
 
-/// Voxels between the nodes of the finest level to begin with: as asked, or by the `inside` voxels of tissue.
+/// Voxels between the nodes of the finest level to begin with: as asked, or by the `inside` voxels
+/// of tissue.
 pub(super) fn apart(asked: usize, inside: usize) -> usize {
     let wide = (inside as f64 / ENOUGH).cbrt().round() as usize;
     if asked > 0 { asked } else { wide.max(APART) }
@@ -49,8 +55,9 @@ pub(super) struct Explained {
     pub said: Vec<String>,
 }
 
-/// Brings the field to lattices of one voxel less between nodes, from `apart`, for as long as the residual is more than noise and
-/// each explains it. `refine` brings a field to the residual in so many passes.
+/// Brings the field to lattices of one voxel less between nodes, from `apart`, for as long as the
+/// residual is more than noise and each explains it. `refine` brings a field to the residual in so
+/// many passes.
 pub(super) fn finer(
     pair: &Pair<'_>,
     field: SplineField,
@@ -94,7 +101,8 @@ fn times(left: f32, noise: f32) -> f32 {
     left / noise.max(f32::MIN_POSITIVE)
 }
 
-/// Says so where what is `left` of the difference is more than noise, and not next to nothing in the tissue's contrast.
+/// Says so where what is `left` of the difference is more than noise, and not next to nothing in
+/// the tissue's contrast.
 pub(super) fn unlike(pair: &Pair<'_>, left: f32) -> Option<String> {
     let tissue =
         pair.fixed_smooth.iter().zip(&pair.mask[..]).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);

@@ -14,13 +14,15 @@ use crate::types::{Mask, Volume};
 /// Largest angle between the pressed side and a voxel axis (degrees).
 const ASKEW: f64 = 10.0;
 
-/// Part of the tissue's thickness to which forces are compared, where the press is not known to have gone further.
+/// Part of the tissue's thickness to which forces are compared, where the press is not known to
+/// have gone further.
 const DEPTH: f64 = 0.2;
 
 /// Depths at which the finite elements are solved.
 const DEPTHS: u32 = 12;
 
-/// Nodes of the finite elements of a map, about: forces on a fingertip change by 1 % up to eight times as many.
+/// Nodes of the finite elements of a map, about: forces on a fingertip change by 1 % up to eight
+/// times as many.
 pub const NODES: usize = 2000;
 
 /// Checks a number of nodes for the finite elements: 0 for none.
@@ -45,7 +47,8 @@ const HARDER: f64 = 100.0;
 pub struct PadOutcome {
     /// The model.
     pub pad: PadReduction,
-    /// Indentation that was measured (mm), and there the force (N) of the finite elements, or of the columns without them.
+    /// Indentation that was measured (mm), and there the force (N) of the finite elements, or of
+    /// the columns without them.
     pub at_press: Option<[f64; 2]>,
     /// Why there are no finite elements, where they were asked for.
     pub failure: Option<StiffnessError>,
@@ -58,7 +61,8 @@ impl PadOutcome {
         if self.pad.radius_mm.is_finite() { self.pad.radius_mm } else { self.pad.thickness_mm }
     }
 
-    /// The measured force (N) over the model's at the same press (1); 1 where one of them is not known.
+    /// The measured force (N) over the model's at the same press (1); 1 where one of them is not
+    /// known.
     pub fn calibration(&self, force_n: Option<f64>) -> f64 {
         self.at_press.zip(force_n).map_or(1.0, |([_, model], measured)| measured / model)
     }
@@ -68,7 +72,8 @@ impl PadOutcome {
         self.at_press.map(|[depth, _]| force(&self.columns, depth))
     }
 
-    /// What is to be said of it: tissue of `folder` that is known by a bound alone, and elements that could not be solved.
+    /// What is to be said of it: tissue of `folder` that is known by a bound alone, and elements
+    /// that could not be solved.
     pub fn warnings(&self, folder: &StiffnessFolder) -> Vec<String> {
         let vague = vague(folder).into_iter().map(|name| {
             format!("only a bound of {name}'s modulus is known, and the tip is made with that: press it further")
@@ -79,8 +84,8 @@ impl PadOutcome {
         vague.chain(self.failure.iter().map(alone)).chain(flat).collect()
     }
 
-    /// The hemispheres fitted to the forces on a flat plate that presses the finite elements of the map; as it is where
-    /// these cannot be solved, with the reason.
+    /// The hemispheres fitted to the forces on a flat plate that presses the finite elements of the
+    /// map; as it is where these cannot be solved, with the reason.
     fn pressed(mut self, elements: &Elements<'_>, progress: Progress<'_>) -> Self {
         let deepest = self.pad.curve.last().map_or(0.0, |c| c[0]);
         let depths: Vec<f64> = (1..=DEPTHS).map(|i| deepest * f64::from(i) / f64::from(DEPTHS)).collect();
@@ -89,7 +94,8 @@ impl PadOutcome {
                 let pad = against_plate(self.pad.clone(), &self.columns, curve, nodes);
                 let press = self.at_press.map(|[depth, _]| (depth, pad.plate.as_ref().and_then(|p| p.at(depth))));
                 match press {
-                    // What ends before the press cannot be held against the force that was measured there.
+                    // What ends before the press cannot be held against the force that was measured
+                    // there.
                     Some((_, None)) => self.failure = Some(StiffnessError::NoEquilibrium),
                     Some((depth, Some(force))) => (self.at_press, self.pad) = (Some([depth, force]), pad),
                     None => self.pad = pad,
@@ -129,8 +135,9 @@ impl Elements<'_> {
     }
 }
 
-/// Labels from 1 of the values of a map's tissue, and the modulus of each: a class a value, or of like logarithm where these
-/// are too many. The last is the bone, a hard back plate whatever bound of its modulus is known.
+/// Labels from 1 of the values of a map's tissue, and the modulus of each: a class a value, or of
+/// like logarithm where these are too many. The last is the bone, a hard back plate whatever bound
+/// of its modulus is known.
 fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f64>) {
     let tissue = map.as_slice().iter().enumerate().filter(|(o, v)| **v > 0.0 && !bone(*o));
     let mut values: Vec<f32> = tissue.map(|(_, v)| *v).collect();
@@ -161,8 +168,8 @@ fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f6
     (labels, moduli)
 }
 
-/// Reduces a map (kPa; 0 outside) that was pressed against `outward` (unit vector of the pressed side, RAS), by
-/// `indentation` mm where that is known.
+/// Reduces a map (kPa; 0 outside) that was pressed against `outward` (unit vector of the pressed
+/// side, RAS), by `indentation` mm where that is known.
 ///
 /// # Errors
 /// [`FingertipError`] when the grid is askew, no bone lies under the pad, or there is hardly any tissue.
@@ -208,8 +215,8 @@ fn outward(folder: &StiffnessFolder) -> [f64; 3] {
     d.map(|v| v / length)
 }
 
-/// Regions that stand for bone or a back plate: by name; where none is so named, those known by a lower bound; and those far
-/// stiffer than the softest.
+/// Regions that stand for bone or a back plate: by name; where none is so named, those known by a
+/// lower bound; and those far stiffer than the softest.
 fn hard(folder: &StiffnessFolder) -> Vec<&StiffnessRegion> {
     let named = |r: &StiffnessRegion| BONE.iter().any(|b| r.name.to_lowercase().contains(b));
     let some_named = folder.regions.iter().any(named);
@@ -228,8 +235,9 @@ fn vague(folder: &StiffnessFolder) -> Vec<&str> {
     tissue.map(|r| r.name.as_str()).collect()
 }
 
-/// Reduces what `palpate stiffness` found to a fingertip, bone and pressed side as it names them. Its hemispheres press as the
-/// map's finite elements do, on about `nodes` nodes; as the columns do where that is 0.
+/// Reduces what `palpate stiffness` found to a fingertip, bone and pressed side as it names them.
+/// Its hemispheres press as the map's finite elements do, on about `nodes` nodes; as the columns do
+/// where that is 0.
 ///
 /// # Errors
 /// [`FingertipError`] when `nodes` is out of range or the moduli are ratios, and as [`run`].

@@ -12,7 +12,8 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
+/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
+/// from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
 /// Largest joint angle of the pinch map (degrees), and angles along each side.
@@ -57,8 +58,8 @@ const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// How far past the end of a tabulated tip's profile it may be pressed.
 const PAST: f64 = 1.02;
 
-/// What a user should know of a run beside its events: joints that do not come to where they are told to, and tips that are pressed in
-/// further than their profile was measured.
+/// What a user should know of a run beside its events: joints that do not come to where they are
+/// told to, and tips that are pressed in further than their profile was measured.
 pub fn notes(scene: &Scene, run: &GraspRun) -> Vec<String> {
     let mut out = Vec::new();
     let off = |row: &MotionRow, i: usize| (row.reached.joints[i] - row.target[i]).abs();
@@ -111,7 +112,8 @@ pub fn ensemble(cases: &[SweepCase], progress: Progress<'_>) -> Vec<Result<Grasp
     cases.par_iter().map(one).collect()
 }
 
-/// Analyses the grasp of `scene`; `push` is the push on the object with both joints fixed at the first motion's target.
+/// Analyses the grasp of `scene`; `push` is the push on the object with both joints fixed at the
+/// first motion's target.
 ///
 /// # Errors
 /// [`GraspError`] where the pinch or the posture for the push is no stable equilibrium.
@@ -156,7 +158,8 @@ fn with_model(scene: &Scene, model: FingertipModel) -> Scene {
     scene
 }
 
-/// The scene's pushes, or one of 10 N below the object's centre, with both joints fixed at the first motion's target.
+/// The scene's pushes, or one of 10 N below the object's centre, with both joints fixed at the
+/// first motion's target.
 pub fn pushed(scene: &Scene) -> Scene {
     let mut scene = scene.clone();
     scene.finger.fixed = true;

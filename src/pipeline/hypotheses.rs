@@ -1,4 +1,5 @@
-//! Where the passes begin: with what a search of the volume says, with a field known from the frame before, or at rest.
+//! Where the passes begin: with what a search of the volume says, with a field known from the frame
+//! before, or at rest.
 
 use crate::consistency::models::nearest_rigid;
 use crate::matching::levels::{from_level, to_level};
@@ -47,14 +48,16 @@ impl Start {
 /// All is searched again after so many frames, whatever confirms the field.
 const FOLLOWED: usize = 5;
 
-/// Voxels of a level's mask for each feature, where a whole volume is searched; a quarter of it in one slice.
+/// Voxels of a level's mask for each feature, where a whole volume is searched; a quarter of it in
+/// one slice.
 const SHARE: usize = 24;
 
 /// The most features of the coarsest level.
 const POINTS: usize = 4000;
 
-/// The most features of the next level, times the voxels of the finest level for each of its points. Over 29 pairs, legs above all, 1,500
-/// and 600 features in the default left the same error, 400 and 190 left 0.7 and 0.9 % more.
+/// The most features of the next level, times the voxels of the finest level for each of its
+/// points. Over 29 pairs, legs above all, 1,500 and 600 features in the default left the same
+/// error, 400 and 190 left 0.7 and 0.9 % more.
 const CLOSER_POINTS: usize = 75_000;
 
 /// Features of the next level that are not saved on, however few points are wanted.
@@ -66,33 +69,39 @@ const CLOSER: f64 = 0.25;
 /// Fewest matches that a search may start from.
 const FEWEST: usize = 8;
 
-/// Where fewer of the features than this agree with each other, more is sought: about a rigid motion and outside the mask.
-/// Heads, pads and small motions keep nine tenths, legs in thick slices that moved by 16 mm four tenths.
+/// Where fewer of the features than this agree with each other, more is sought: about a rigid
+/// motion and outside the mask. Heads, pads and small motions keep nine tenths, legs in thick
+/// slices that moved by 16 mm four tenths.
 const AGREED: f64 = 0.75;
 
 /// The same for a search of the next level. Slides and legs that move far keep 0.4 to 0.81.
 const LOOSE: f64 = 0.85;
 
-/// The share of features that agree when a whole volume is searched: under it, what was found is doubtful. It was 0.73 or more
-/// where the motion was found (heads and legs, 3 to 20 mm), and 0.45 or less with inverted contrast.
+/// The share of features that agree when a whole volume is searched: under it, what was found is
+/// doubtful. It was 0.73 or more where the motion was found (heads and legs, 3 to 20 mm), and 0.45
+/// or less with inverted contrast.
 const BORNE_OUT: f64 = 0.5;
 
-/// Matches that must agree for their share to tell a search that found the motion from one that did not.
+/// Matches that must agree for their share to tell a search that found the motion from one that did
+/// not.
 const ENOUGH: usize = 20;
 
-/// Share of the features under which those that agree may do so on a part of what moved past the range: a core that slid by 28 mm in a head had 0.56
-/// to 0.6 under a texture of its own, and was found to reach 7 mm (of 20 small pairs whose motion lies in the range none had less than 0.75).
+/// Share of the features under which those that agree may do so on a part of what moved past the
+/// range: a core that slid by 28 mm in a head had 0.56 to 0.6 under a texture of its own, and was
+/// found to reach 7 mm (of 20 small pairs whose motion lies in the range none had less than 0.75).
 const FEW: f64 = 0.65;
 
 /// Part of the search range from which motion is called near the end of it.
 pub(super) const NEAR: f64 = 0.9;
 
-/// Share of the features that agree in a search twice as far, in that of the nearer one, from which its better agreement of the volumes is
-/// believed. Of 39 pairs whose motion reached the range the nine that it took on had 0.83 to 1.15 of it and 0.32 to 1.06 of the error;
-/// six with 0.6 to 0.66 of it had 1.00 to 1.7.
+/// Share of the features that agree in a search twice as far, in that of the nearer one, from which
+/// its better agreement of the volumes is believed. Of 39 pairs whose motion reached the range the
+/// nine that it took on had 0.83 to 1.15 of it and 0.32 to 1.06 of the error; six with 0.6 to 0.66
+/// of it had 1.00 to 1.7.
 const HARDLY_FEWER: f64 = 0.8;
 
-/// Searches about a rigid motion at most, and the part of the features agreed before that each must keep for another.
+/// Searches about a rigid motion at most, and the part of the features agreed before that each must
+/// keep for another.
 const TURNS: usize = 3;
 const KEPT: f64 = 0.9;
 
@@ -141,13 +150,15 @@ impl Begun {
         self.agrees_on_few() || self.report.is_some() && level::lengths(pair, |p| self.motion.at(p))[1] > NEAR * range
     }
 
-    /// Whether a search twice as far found what the nearer one, `own`, did not: the volumes agree better, and hardly fewer features.
+    /// Whether a search twice as far found what the nearer one, `own`, did not: the volumes agree
+    /// better, and hardly fewer features.
     pub fn outdoes(&self, pair: &Pair<'_>, own: &Self) -> bool {
         self.share() >= HARDLY_FEWER * own.share() && self.motion.agree_better(pair, &own.motion)
     }
 
-    /// Of an unsure search and a wider one the one in which more of the features agreed: the agreement of the volumes does not
-    /// tell a wrong island from the truth, neighbours do. Where there are too few features to count it is all there is.
+    /// Of an unsure search and a wider one the one in which more of the features agreed: the
+    /// agreement of the volumes does not tell a wrong island from the truth, neighbours do. Where
+    /// there are too few features to count it is all there is.
     pub fn surer(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
         let [few, many] = [&own, &wider].map(|s| s.counts().unwrap_or_default());
         let wider_is_surer = match (few.kept < ENOUGH, many.kept < ENOUGH) {
@@ -186,11 +197,13 @@ impl Search<'_> {
         motion
     }
 
-    /// What the coarsest level finds, from nothing or from `known` fields. Adds the seconds that matching takes to `seconds`.
+    /// What the coarsest level finds, from nothing or from `known` fields. Adds the seconds that
+    /// matching takes to `seconds`.
     ///
-    /// A known field that the features confirm is enough, but all is searched again every few frames. Else the field of the matches
-    /// (stillness, where there are none) and, where these are in doubt, the known fields compete, and the one that ends at the better
-    /// agreement goes on. A known field that goes on is refined twice: it begins with the noise of another frame.
+    /// A known field that the features confirm is enough, but all is searched again every few
+    /// frames. Else the field of the matches (stillness, where there are none) and, where these are
+    /// in doubt, the known fields compete, and the one that ends at the better agreement goes on. A
+    /// known field that goes on is refined twice: it begins with the noise of another frame.
     pub fn begin(
         &self,
         (pair, factor): (&Pair<'_>, [usize; 3]),
@@ -224,8 +237,9 @@ impl Search<'_> {
         Begun { motion, report: Some(report), matches, followed: 0 }
     }
 
-    /// The field of the matches of a whole volume; none where these are too few. Where few features agree they are sought again about
-    /// the rigid motion that most agree on, for as long as no fewer agree there: patches that turned by much are hardly alike.
+    /// The field of the matches of a whole volume; none where these are too few. Where few features
+    /// agree they are sought again about the rigid motion that most agree on, for as long as no
+    /// fewer agree there: patches that turned by much are hardly alike.
     fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
         let wide = self.wide(pair, self.range, POINTS);
         let agreed = |matches: &[LevelMatch]| matches.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
@@ -265,8 +279,8 @@ impl Search<'_> {
         motion.matches(pair, near).1.counts.kept_share() >= AGREED
     }
 
-    /// What a search of the next level about its field finds, if the volumes agree better there: smaller patches are distorted less,
-    /// and fine texture tells a wrong island from the truth.
+    /// What a search of the next level about its field finds, if the volumes agree better there:
+    /// smaller patches are distorted less, and fine texture tells a wrong island from the truth.
     pub fn closer(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
         let only = own.only().filter(|_| ablation::is_on("next-level"))?;
         let most = (CLOSER_POINTS / self.params.voxels_per_point.max(1)).clamp(CLOSER_LEAST, POINTS);

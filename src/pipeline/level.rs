@@ -1,4 +1,5 @@
-//! One level of the pyramid: matches by features, and the passes that bring the spline field to the residual.
+//! One level of the pyramid: matches by features, and the passes that bring the spline field to the
+//! residual.
 
 use crate::consistency::coupling::{self, Evidence, Posterior};
 use crate::consistency::energy::{EnergyParams, Graph, distance};
@@ -38,12 +39,13 @@ pub struct SplineField {
     pub blocks: Blocks,
 }
 
-/// Weight of the bending energy to start from at most, per mm^3 of lattice cell. A stiffer start holds a few moving parts to still
-/// ones around them for all passes.
+/// Weight of the bending energy to start from at most, per mm^3 of lattice cell. A stiffer start
+/// holds a few moving parts to still ones around them for all passes.
 const STIFFNESS: f32 = 30.0;
 
-/// How much stiffer passes start than matches alone suggest, up to [`STIFFNESS`]; the evidence takes over after two of them. A looser
-/// start follows false residuals where texture is weak: measured on a thigh, errors a fifth larger.
+/// How much stiffer passes start than matches alone suggest, up to [`STIFFNESS`]; the evidence
+/// takes over after two of them. A looser start follows false residuals where texture is weak:
+/// measured on a thigh, errors a fifth larger.
 const STIFFER: f32 = 30.0;
 
 impl SplineField {
@@ -75,34 +77,37 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
     Lattice::new(pair.shape, pair.in_voxels(step))
 }
 
-/// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each axis).
+/// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each
+/// axis).
 pub(super) fn independent(pair: &Pair<'_>) -> f32 {
     (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
 }
 
-/// How much of the last step is carried into the next (heavy ball, Polyak 1964): the block diagonal is an upper bound, so plain steps
-/// are short. With .7 small motions leave 2 % less error, large ones up to 40 % more: steps run past what the matches say.
+/// How much of the last step is carried into the next (heavy ball, Polyak 1964): the block diagonal
+/// is an upper bound, so plain steps are short. With .7 small motions leave 2 % less error, large
+/// ones up to 40 % more: steps run past what the matches say.
 const MOMENTUM: f32 = 0.5;
 
 /// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
 const SETTLED: f64 = 0.008;
 
-/// How far passes take a node along an axis (voxels of the finest one): the residual of smooth tissue does not point the way further, and
-/// where texture is weak nothing else would hold it.
+/// How far passes take a node along an axis (voxels of the finest one): the residual of smooth
+/// tissue does not point the way further, and where texture is weak nothing else would hold it.
 const REACH: f64 = 2.0;
 
 /// Conjugate gradient iterations a pass: each pass needs only a fair step.
 const ITERATIONS: usize = 10;
 
-/// Nodes of a lattice from which memory goes before time: one system is solved after the other in place of beside it, and the warped
-/// volume is not kept meanwhile.
+/// Nodes of a lattice from which memory goes before time: one system is solved after the other in
+/// place of beside it, and the warped volume is not kept meanwhile.
 const LARGE: usize = 500_000;
 
 /// What tissue is left of its volume at least; below it, the field is smoothed.
 const LEAST_VOLUME: f32 = 0.1;
 
-/// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the evidence by place and axis
-/// ([`coupling::supported`]). No node ends further than two voxels of the finest axis from where it began, along each axis. Calls `tick` after each pass.
+/// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the
+/// evidence by place and axis ([`coupling::supported`]). No node ends further than two voxels of
+/// the finest axis from where it began, along each axis. Calls `tick` after each pass.
 pub fn refine(pair: &Pair<'_>, field: &mut SplineField, passes: usize, seed: u64, tick: impl Fn(usize)) {
     let begun = field.coefficients.clone();
     refine_from(pair, field, &begun, passes, seed, tick);
@@ -148,10 +153,11 @@ pub(super) fn refine_from(
         let matrix = Coupled::new(&energy, &weights, &equations.blocks, false);
         let (rhs, coefficients) = (equations.rhs, &field.coefficients);
         let step = || coupling::step(&matrix, rhs, coefficients, 0.02, ITERATIONS);
-        // From the last pass's solution a few iterations suffice, though the blocks and weights have changed.
+        // From the last pass's solution a few iterations suffice, though the blocks and weights
+        // have changed.
         let mut determine = || settled.then(|| probe.determined(&matrix, limit));
-        // Neither needs the other, and the planes of a small lattice are not worth sharing out; those of a large one are, and only one
-        // of the two then needs its vectors.
+        // Neither needs the other, and the planes of a small lattice are not worth sharing out;
+        // those of a large one are, and only one of the two then needs its vectors.
         let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
         for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(begun) {
             let last = std::mem::replace(before, *c);
@@ -187,8 +193,9 @@ pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
     coupling::determined(&matrix, seed, 30).iter().sum::<f64>().max(12.0)
 }
 
-/// Voxels of the finest axis between the places about which a map is held against the free field, and a field against stillness. Errors of 24
-/// pairs were the same at 8, 12 and 16 within a hundredth.
+/// Voxels of the finest axis between the places about which a map is held against the free field,
+/// and a field against stillness. Errors of 24 pairs were the same at 8, 12 and 16 within a
+/// hundredth.
 const WINDOW: usize = 12;
 
 /// The places about which a map is held against the free field.
@@ -196,8 +203,9 @@ pub fn windows(pair: &Pair<'_>) -> Lattice {
     lattice(pair, WINDOW)
 }
 
-/// The excess misfit of a map against the free field about each of [`windows`], which adds up to that of the whole; from every fourth slice of a
-/// thick volume, every eighth of a very thick one, with the information that correlated noise leaves.
+/// The excess misfit of a map against the free field about each of [`windows`], which adds up to
+/// that of the whole; from every fourth slice of a thick volume, every eighth of a very thick one,
+/// with the information that correlated noise leaves.
 pub fn excess<'a>(
     pair: &'a Pair<'a>,
     field: &'a SplineField,
@@ -220,7 +228,8 @@ pub fn excess<'a>(
     }
 }
 
-/// What the data of the last pass leave open and what they determine, on a lattice twice as coarse as the field's own.
+/// What the data of the last pass leave open and what they determine, on a lattice twice as coarse
+/// as the field's own.
 pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> (Lattice, Posterior) {
     let coarse = Lattice::new(field.lattice.shape, field.lattice.step.map(|s| 2 * s));
     let mut blocks = vec![[0.0f32; 6]; coarse.len()];
@@ -239,12 +248,14 @@ pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> (Lattice,
     (coarse, posterior)
 }
 
-/// By how much the misfit shrinks from one warp to another, with the information that correlated noise leaves.
+/// By how much the misfit shrinks from one warp to another, with the information that correlated
+/// noise leaves.
 pub fn gained(pair: &Pair<'_>, from: &[f32], to: Vec<f32>) -> f64 {
     residual::excess(pair, from, &Baseline::new(pair, to)) * f64::from(independent(pair))
 }
 
-/// Mean and largest length over the mask (mm) of the displacement `at` a place (voxels), from every third voxel along each axis.
+/// Mean and largest length over the mask (mm) of the displacement `at` a place (voxels), from every
+/// third voxel along each axis.
 pub fn lengths(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 2] {
     let [nx, ny, nz] = pair.shape;
     let (mut sum, mut count, mut largest) = (0.0, 0usize, 0.0f64);
@@ -257,7 +268,8 @@ pub fn lengths(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 2] {
     [sum / count.max(1) as f64, largest]
 }
 
-/// Whether the deformed volume shows what is at `p` (voxels) in the initial one and moves by `u` (mm).
+/// Whether the deformed volume shows what is at `p` (voxels) in the initial one and moves by `u`
+/// (mm).
 pub fn sees(pair: &Pair<'_>, p: [f64; 3], u: [f64; 3]) -> bool {
     let shape = pair.moving_shape;
     let along = |a: usize| p[a] + u[a] / pair.spacing[a] - pair.moving_origin[a];
@@ -265,8 +277,8 @@ pub fn sees(pair: &Pair<'_>, p: [f64; 3], u: [f64; 3]) -> bool {
     nearest(shape, there).is_some_and(|at| pair.moving[at].is_finite())
 }
 
-/// The part of the mask that the deformed volume does not show (1), from every third voxel along each axis; `at` gives the
-/// displacement (mm) at a place (voxels).
+/// The part of the mask that the deformed volume does not show (1), from every third voxel along
+/// each axis; `at` gives the displacement (mm) at a place (voxels).
 pub fn unseen(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> f64 {
     let [nx, ny, nz] = pair.shape;
     let in_plane = |k: usize| -> [usize; 2] {
@@ -282,22 +294,23 @@ pub fn unseen(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> f64 
     out as f64 / all.max(1) as f64
 }
 
-/// How the two volumes differ once the deformed one is warped: the robust standard deviation of what is left (intensity), and by what factor the
-/// gain varies ([`GainField::variation`]).
+/// How the two volumes differ once the deformed one is warped: the robust standard deviation of
+/// what is left (intensity), and by what factor the gain varies ([`GainField::variation`]).
 pub fn misfit(pair: &Pair<'_>, warped: &[f32]) -> [f32; 2] {
     let [gain, sharpened] = GainField::both(pair, warped);
     [residual::residual_sigma(pair, warped, &gain), sharpened.variation(pair)]
 }
 
-/// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to that one's.
+/// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to
+/// that one's.
 pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> SplineField {
     let coefficients = lattice.fit(|p| coarse.lattice.at(&coarse.coefficients, from_here(p)));
     let smoothness = resampled(&coarse.lattice, &coarse.smoothness, &lattice, &from_here);
     SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }
 }
 
-/// Values at the nodes of one lattice (planar, three components) at those of another; `place` maps the voxels of `to` to those of
-/// `from`. Positive values stay so.
+/// Values at the nodes of one lattice (planar, three components) at those of another; `place` maps
+/// the voxels of `to` to those of `from`. Positive values stay so.
 fn resampled(from: &Lattice, values: &[f32], to: &Lattice, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<f32> {
     let n = to.len();
     let at: Vec<[f64; 3]> = (0..n).into_par_iter().map(|m| from.at(values, place(to.place(m)))).collect();
@@ -309,7 +322,8 @@ fn resampled(from: &Lattice, values: &[f32], to: &Lattice, place: impl Fn([f64; 
 pub struct MatchParams {
     /// Features wanted in the initial volume; up to five times as many in the deformed one.
     pub points: usize,
-    /// Whether just so many were asked for: then corners are sought voxel by voxel even where there is room for blocks.
+    /// Whether just so many were asked for: then corners are sought voxel by voxel even where there
+    /// is room for blocks.
     pub thorough: bool,
     /// Reach of the search about the known field (mm).
     pub reach_mm: f64,
@@ -351,11 +365,12 @@ pub struct LevelMatch {
     pub kept: bool,
 }
 
-/// Features of both volumes, many-to-many candidates, relaxation, least-squares matching, coupling, pruning.
+/// Features of both volumes, many-to-many candidates, relaxation, least-squares matching, coupling,
+/// pruning.
 ///
-/// With `known`, the deformed volume is first warped by that field and only the rest is sought; the field itself then
-/// serves as the coupled one. Without, the search is over the deformed volume as it is, and a coupled field is fitted:
-/// it is returned, on a lattice of its own.
+/// With `known`, the deformed volume is first warped by that field and only the rest is sought; the
+/// field itself then serves as the coupled one. Without, the search is over the deformed volume as
+/// it is, and a coupled field is fitted: it is returned, on a lattice of its own.
 pub fn matches(
     pair: &Pair<'_>,
     known: Option<&SplineField>,
@@ -366,7 +381,8 @@ pub fn matches(
     let radius = pair.in_voxels(params.patch);
     let noise = pair.noise;
     let room = pair.inside as f64 / params.points as f64;
-    // The deformed side: as it is, or warped by the known field, where both volumes' features share one frame.
+    // The deformed side: as it is, or warped by the known field, where both volumes' features share
+    // one frame.
     let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &pair.spans.grown(radius[0] + 3)));
     let smooth;
     let (data, shape, origin) = match &warped {
@@ -490,8 +506,9 @@ pub fn matches(
     (matches, fitted, report)
 }
 
-/// Least-squares matching alone, about a field that has each place within two voxels: what is left there is measured in the deformed
-/// volume warped by it. One match a place (voxels) that has one, none rejected yet.
+/// Least-squares matching alone, about a field that has each place within two voxels: what is left
+/// there is measured in the deformed volume warped by it. One match a place (voxels) that has one,
+/// none rejected yet.
 pub(super) fn follow(
     pair: &Pair<'_>,
     known: &SplineField,
@@ -524,8 +541,9 @@ fn template<'a>(pair: &'a Pair<'_>, radius: [usize; 3]) -> Template<'a> {
     Template { data: &pair.fixed_smooth, shape: pair.shape, spacing: pair.spacing, radius, noise }
 }
 
-/// The field that matches suggest once the deformed volume is warped by `field`: where that one is right their patches are
-/// no longer sheared, and where it is wrong what is missing has neighbours that are in place.
+/// The field that matches suggest once the deformed volume is warped by `field`: where that one is
+/// right their patches are no longer sheared, and where it is wrong what is missing has neighbours
+/// that are in place.
 pub fn matches_again(
     pair: &Pair<'_>,
     field: &SplineField,
@@ -561,9 +579,9 @@ pub fn matches_again(
 /// 99.9 % point of chi-square with 3 degrees of freedom.
 pub(super) const GATE: f64 = 16.27;
 
-/// Scales all covariances so that the kept matches scatter about the coupled field as they say: by the median squared
-/// Mahalanobis distance over chi-square's median, 2.366. Noise alone does not tell what interpolation, strain inside
-/// a patch and contrast changes add.
+/// Scales all covariances so that the kept matches scatter about the coupled field as they say: by
+/// the median squared Mahalanobis distance over chi-square's median, 2.366. Noise alone does not
+/// tell what interpolation, strain inside a patch and contrast changes add.
 pub(super) fn calibrate(measured: &mut [Measured], kept: &[bool]) {
     let mut q: Vec<f32> = measured
         .iter()
@@ -596,8 +614,9 @@ fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
 /// Voxels a point from which on corners are sought on blocks of two voxels.
 const BLOCKS: f64 = 100.0;
 
-/// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with less of it the window is
-/// narrower, which has more maxima. `quick` works the structure tensor out on blocks of two voxels, at an eighth of the cost.
+/// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with less of
+/// it the window is narrower, which has more maxima. `quick` works the structure tensor out on
+/// blocks of two voxels, at an eighth of the cost.
 fn corners(
     smooth: &[f32],
     shape: [usize; 3],
@@ -611,7 +630,8 @@ fn corners(
     let finest = pyramid::finest(shape, spacing);
     let widest = HarrisParams::default().integration_sigma;
     let sigma = (room.cbrt() / 8.0).clamp(0.7, widest);
-    // Noise alone answers with about a thousandth of its variance per squared voxel where it is weakest.
+    // Noise alone answers with about a thousandth of its variance per squared voxel where it is
+    // weakest.
     let least = 0.002 * (f64::from(noise) / finest).powi(2) as f32;
     let halved = |a: usize| quick && shape[a] >= 24 && spacing[a] < 1.5 * finest;
     let step: [usize; 3] = std::array::from_fn(|a| if halved(a) { 2 } else { 1 });
@@ -630,8 +650,8 @@ const ROUNDS: usize = 7;
 /// The same from a field that is nearly right.
 const AGAIN: usize = 3;
 
-/// Voxels between the nodes that matches alone are coupled on: about as far apart as they lie. Over 37 pairs 3, 4, 5 and 6 left the
-/// same error to 0.1 %, and 6 takes an eighth of the nodes of 3.
+/// Voxels between the nodes that matches alone are coupled on: about as far apart as they lie. Over
+/// 37 pairs 3, 4, 5 and 6 left the same error to 0.1 %, and 6 takes an eighth of the nodes of 3.
 const APART: usize = 6;
 
 /// Couples the matches of a level into a spline field.
@@ -646,9 +666,10 @@ fn fit(
     couple(pair, measured, (radius, 0.3), None).0
 }
 
-/// Couples displacements measured on a level (place in voxels, displacement in mm, covariance in mm^2) into a spline field, from one
-/// that is nearly right and on its lattice where there is one; with the evidence used. Each may be off by `floor` voxels beyond its
-/// covariance, and was found with a patch of `radius` voxels.
+/// Couples displacements measured on a level (place in voxels, displacement in mm, covariance in
+/// mm^2) into a spline field, from one that is nearly right and on its lattice where there is one;
+/// with the evidence used. Each may be off by `floor` voxels beyond its covariance, and was found
+/// with a patch of `radius` voxels.
 pub(super) fn couple(
     pair: &Pair<'_>,
     measured: impl ExactSizeIterator<Item = ([f64; 3], [f64; 3], Symmetric3)>,
@@ -684,7 +705,8 @@ pub(super) fn couple(
     (SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }, evidence)
 }
 
-/// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it leaves the volume.
+/// Trilinear samples of the patch of `radius` about `centre` (voxels), x fastest; NaN where it
+/// leaves the volume.
 fn trilinear_patch(data: &[f32], shape: [usize; 3], centre: [f32; 3], radius: [usize; 3], out: &mut [f32]) {
     let stride = [1, shape[0], shape[0] * shape[1]];
     let (mut base, mut t, mut step) = (0usize, [0.0f32; 3], [0usize; 3]);

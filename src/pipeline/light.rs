@@ -6,29 +6,36 @@ use crate::matching::pair::Pair;
 use crate::numerics::ablation;
 use crate::pipeline::bodies::Bodies;
 
-/// What may be left of the difference, as a part of it, for the rest to be taken out. Of 82 pairs of all kinds those without a bias kept 0.75
-/// to 1.0 of it on the coarsest level, those with one of 5 % 0.18 to 0.86 and of 15 % 0.09 to 0.56.
+/// What may be left of the difference, as a part of it, for the rest to be taken out. Of 82 pairs
+/// of all kinds those without a bias kept 0.75 to 1.0 of it on the coarsest level, those with one
+/// of 5 % 0.18 to 0.86 and of 15 % 0.09 to 0.56.
 const LEAVES: f64 = 0.6;
 
-/// The same at rest, before anything is found: motion shows as well. Of the same pairs a calf whose halves move past each other was 12 %
-/// worse with 0.32 left taken out. Coils beside the tissue leave 0.02, small presses at a bias of 15 % 0.09.
+/// The same at rest, before anything is found: motion shows as well. Of the same pairs a calf whose
+/// halves move past each other was 12 % worse with 0.32 left taken out. Coils beside the tissue
+/// leave 0.02, small presses at a bias of 15 % 0.09.
 const LEAVES_AT_REST: f64 = 0.2;
 
-/// What place and contrast may leave together, as a part of what the better one leaves alone, to be taken together. Under a bias alone they leave
-/// 0.76 to 1.08 of what place does, in another contrast 0.08 to 0.8; and place alone, taken out in another contrast, does harm (a thigh in a
+/// What place and contrast may leave together, as a part of what the better one leaves alone, to be
+/// taken together. Under a bias alone they leave 0.76 to 1.08 of what place does, in another
+/// contrast 0.08 to 0.8; and place alone, taken out in another contrast, does harm (a thigh in a
 /// cube root 0.73 -> 1.85 mm), while both under a bias alone do none.
 const BOTH: f64 = 0.95;
 
-/// The same at rest, where motion passes for contrast: a calf whose halves slide under a bias of 40 % was 0.87 in place of 0.67 mm off with 0.95.
+/// The same at rest, where motion passes for contrast: a calf whose halves slide under a bias of 40
+/// % was 0.87 in place of 0.67 mm off with 0.95.
 const BOTH_AT_REST: f64 = 0.7;
 
-/// What may be left of how the difference varies between neighbours ([`Brightness::uneven`]), as a part of it. Of 64 pairs with a coil's profile, a
-/// bias of 5 to 40 % or another contrast those under their field kept 0.03 to 0.56 (of 15 % and more 0.37 at most), those at rest that [`LEAVES_AT_REST`]
-/// lets pass 0.05 to 0.34. Of 11 whose one half is 1.4 to 3 times as bright it was 0.44 to 1.9, and 0.42 to 15, and smooth polynomials across the
-/// step did harm (a head turned by 5 degrees 0.008 -> 0.208 mm, calves that slide 0.18 -> 0.56).
+/// What may be left of how the difference varies between neighbours ([`Brightness::uneven`]), as a
+/// part of it. Of 64 pairs with a coil's profile, a bias of 5 to 40 % or another contrast those
+/// under their field kept 0.03 to 0.56 (of 15 % and more 0.37 at most), those at rest that
+/// [`LEAVES_AT_REST`] lets pass 0.05 to 0.34. Of 11 whose one half is 1.4 to 3 times as bright it
+/// was 0.44 to 1.9, and 0.42 to 15, and smooth polynomials across the step did harm (a head turned
+/// by 5 degrees 0.008 -> 0.208 mm, calves that slide 0.18 -> 0.56).
 const UNEVEN: f64 = 0.4;
 
-/// Difference in brightness (logarithm, robust standard deviation over blocks) below which it is no matter.
+/// Difference in brightness (logarithm, robust standard deviation over blocks) below which it is no
+/// matter.
 const MATTERS: f64 = 0.005;
 
 /// The difference as far as it is known.
@@ -62,8 +69,9 @@ impl Light {
         self.taken.is_none() && self.left.is_none()
     }
 
-    /// Looks on a level of `factor` under `motion`, on it, for what differs between the volumes as they are, and takes that out of `pair` in
-    /// place of what was known before. Whether `pair` is another now.
+    /// Looks on a level of `factor` under `motion`, on it, for what differs between the volumes as
+    /// they are, and takes that out of `pair` in place of what was known before. Whether `pair` is
+    /// another now.
     pub fn look<'a>(
         &mut self,
         pair: &mut Pair<'a>,

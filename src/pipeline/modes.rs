@@ -1,11 +1,15 @@
-//! What the frames of a sequence say together: the few courses over time that their motion is made of.
+//! What the frames of a sequence say together: the few courses over time that their motion is made
+//! of.
 //!
-//! Each frame's field has its own noise, and all of them have that of the reference. Motion has far fewer courses than there are frames: in
-//! displacements u_t(x) = sum_k (a_k(t) - a_k(0)) m_k(x) a frame's noise is that of the few numbers a_k(t), and the reference's is told
-//! from motion as well, for it is one frame among the others, whose displacement is known to be 0. The courses are the principal components
-//! of the coefficients of all frames' splines (Jolliffe, Principal Component Analysis, 2002), each coefficient in units of its noise; as few are
-//! taken as leave what is noise: without a course of its own, white in time, and no more than a frame alone is uncertain by. Where
-//! a block's leftover is more than that in some frame, that frame keeps its own field there.
+//! Each frame's field has its own noise, and all of them have that of the reference. Motion has far
+//! fewer courses than there are frames: in displacements u_t(x) = sum_k (a_k(t) - a_k(0)) m_k(x) a
+//! frame's noise is that of the few numbers a_k(t), and the reference's is told from motion as
+//! well, for it is one frame among the others, whose displacement is known to be 0. The courses are
+//! the principal components of the coefficients of all frames' splines (Jolliffe, Principal
+//! Component Analysis, 2002), each coefficient in units of its noise; as few are taken as leave
+//! what is noise: without a course of its own, white in time, and no more than a frame alone is
+//! uncertain by. Where a block's leftover is more than that in some frame, that frame keeps its own
+//! field there.
 
 use crate::field::spline::{FieldSpline, ScalarSpline, Spline};
 use crate::numerics::bspline::Lattice;
@@ -14,20 +18,25 @@ use crate::numerics::statistics::median;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Fewest frames beside the reference: with fewer a course is as many numbers as the frames themselves.
+/// Fewest frames beside the reference: with fewer a course is as many numbers as the frames
+/// themselves.
 const FEWEST: usize = 5;
 
-/// A course counts whose variance is so many times the mean of those after it. Noise alone has up to 3 (5 of 24 frames that follow each other).
+/// A course counts whose variance is so many times the mean of those after it. Noise alone has up
+/// to 3 (5 of 24 frames that follow each other).
 const STANDS_OUT: f64 = 4.0;
 
-/// Least change of what is left from one frame to the next over that of white noise (1): motion that goes on from frame to frame has less.
+/// Least change of what is left from one frame to the next over that of white noise (1): motion
+/// that goes on from frame to frame has less.
 const WHITE: f64 = 0.75;
 
-/// Most that is left, in variances of the frames' stated uncertainty, which holds what smoothing takes as well: noise has 0.01 to 0.05 of it.
+/// Most that is left, in variances of the frames' stated uncertainty, which holds what smoothing
+/// takes as well: noise has 0.01 to 0.05 of it.
 const UNCERTAIN: f64 = 0.08;
 
-/// A block of two nodes along each axis keeps a frame's own field where more than so many times the noise there is left; a block that has more than so many times
-/// the median of all in all frames does in each of them.
+/// A block of two nodes along each axis keeps a frame's own field where more than so many times the
+/// noise there is left; a block that has more than so many times the median of all in all frames
+/// does in each of them.
 const OWN: f32 = 4.0;
 const ALWAYS: f32 = 6.0;
 
@@ -58,8 +67,8 @@ pub(super) struct Modes {
 }
 
 impl Modes {
-    /// Of `frames`, measured against frame `origin`; `counts` says of a voxel of the fields' own grid whether it is tissue. Else why there are
-    /// none, in words.
+    /// Of `frames`, measured against frame `origin`; `counts` says of a voxel of the fields' own
+    /// grid whether it is tissue. Else why there are none, in words.
     pub fn find(frames: &[Frame<'_>], origin: usize, counts: impl Fn([usize; 3]) -> bool) -> Result<Self, String> {
         if frames.len() < FEWEST {
             return Err(format!(
@@ -382,7 +391,8 @@ mod tests {
         (0..3 * lattice().len()).map(|_| random.normals()[0]).collect()
     }
 
-    /// True coefficients of frames 0 to `frames`, that of frame 0 all 0, and measured ones of the others, with noise of their own and frame 0's.
+    /// True coefficients of frames 0 to `frames`, that of frame 0 all 0, and measured ones of the
+    /// others, with noise of their own and frame 0's.
     fn measured(frames: usize, truth: impl Fn(usize) -> Vec<f64>, seed: u64) -> (Vec<Vec<f64>>, Vec<FieldSpline>) {
         let mut random = Random::new(seed, 1);
         let noise: Vec<Vec<f64>> = (0..=frames).map(|_| white(&mut random)).collect();
@@ -414,8 +424,8 @@ mod tests {
         a.iter().zip(&b).map(|(a, b)| 0.5 * a * s + 0.3 * b * (3.0 * s).sin()).collect()
     }
 
-    /// What is left of white noise is that of the fit of the true courses: for frame t s^2 (P_tt + P_00 - 2 P_t0), P the projector on them and on
-    /// what is common to all frames.
+    /// What is left of white noise is that of the fit of the true courses: for frame t s^2 (P_tt +
+    /// P_00 - 2 P_t0), P the projector on them and on what is common to all frames.
     #[test]
     fn the_noise_of_two_courses_is_as_least_squares_have_it() {
         let (truth, fields) = measured(12, two, 7);
@@ -457,7 +467,8 @@ mod tests {
         assert!(find(&vec![field(vec![0.0; 3 * lattice().len()]); 8]).is_err());
     }
 
-    /// A block of 8 voxels that moves by five times the noise in one frame alone is no course of the whole.
+    /// A block of 8 voxels that moves by five times the noise in one frame alone is no course of
+    /// the whole.
     #[test]
     fn what_one_place_does_in_one_frame_stays() {
         let there = |m: usize| lattice().place(m).iter().all(|p| (8.0..16.0).contains(p));

@@ -16,7 +16,8 @@ pub struct FieldPlan {
     pub search_mm: f64,
     /// Voxels of tissue.
     pub mask_voxels: usize,
-    /// Shape of the initial volume on each level, coarse to fine, with the one of the finer passes where there are any.
+    /// Shape of the initial volume on each level, coarse to fine, with the one of the finer passes
+    /// where there are any.
     pub levels: Vec<[usize; 3]>,
     /// Feature points wanted on the finest level.
     pub points: usize,
@@ -66,8 +67,9 @@ pub fn field(
     })
 }
 
-/// Makes the checks of [`field`] that the two grids are enough for: both volumes have two axes or more, and overlap as far as
-/// the search reaches. A slice for a volume is refused too, and so are two to four: nothing is found in them that could be matched in space.
+/// Makes the checks of [`field`] that the two grids are enough for: both volumes have two axes or
+/// more, and overlap as far as the search reaches. A slice for a volume is refused too, and so are
+/// two to four: nothing is found in them that could be matched in space.
 ///
 /// # Errors
 /// [`FieldError::Volume`], [`FieldError::TooFew`] and [`FieldError::NoOverlap`].
@@ -84,9 +86,10 @@ pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<()
     overlap(initial, deformed, search_mm(initial, params.search_mm)).map(drop)
 }
 
-/// Memory of a field run on these grids (bytes): 14 MB, 18 bytes a voxel of both volumes up to 20 million voxels and 13
-/// past them, and 4 for a volume whose axes do not run right, anterior and superior, of which a copy is made. Measured on
-/// head phantoms of 0.6 to 313 million voxels (docs/performance.md), which it meets to 8 %.
+/// Memory of a field run on these grids (bytes): 14 MB, 18 bytes a voxel of both volumes up to 20
+/// million voxels and 13 past them, and 4 for a volume whose axes do not run right, anterior and
+/// superior, of which a copy is made. Measured on head phantoms of 0.6 to 313 million voxels
+/// (docs/performance.md), which it meets to 8 %.
 pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
     let voxels = (initial.len() + deformed.len()) as u64;
     let copy = |grid: &Grid| if Orientation::of(grid).is_canonical() { 0 } else { 4 * grid.len() as u64 };
@@ -94,10 +97,11 @@ pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
     14_000_000 + 18 * voxels.min(20_000_000) + 13 * voxels.saturating_sub(20_000_000) + copies
 }
 
-/// Memory of a stiffness run on a mesh of so many nodes (bytes), at most: 150 MB and 40 kB a node to 20,000, growing with the
-/// cube root past them, as the factors of a sparse matrix in space do. Measured on finger pads with three labels, layers
-/// under a punch and inclusions with and without labels: 0.15 to 0.23 GB at 2,000 nodes, 0.27 to 0.43 at 8,000, 0.69 to 0.85
-/// at 20,000, 1.7 to 1.9 at 40,000.
+/// Memory of a stiffness run on a mesh of so many nodes (bytes), at most: 150 MB and 40 kB a node
+/// to 20,000, growing with the cube root past them, as the factors of a sparse matrix in space do.
+/// Measured on finger pads with three labels, layers under a punch and inclusions with and without
+/// labels: 0.15 to 0.23 GB at 2,000 nodes, 0.27 to 0.43 at 8,000, 0.69 to 0.85 at 20,000, 1.7 to
+/// 1.9 at 40,000.
 pub fn stiffness_memory(nodes: usize) -> u64 {
     let n = nodes as f64;
     150_000_000 + (40_000.0 * n * (n / 20_000.0).cbrt().max(1.0)) as u64

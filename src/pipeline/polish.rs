@@ -1,7 +1,8 @@
-//! The last passes of a preset that works on averages of voxels: on the next finer level, where the same tissue shows more.
+//! The last passes of a preset that works on averages of voxels: on the next finer level, where the
+//! same tissue shows more.
 //!
-//! Features, the choice of the model, jumps and warnings stay with the coarser level; what averages hide of the motion is small, smooth
-//! and in place, and a few passes find it.
+//! Features, the choice of the model, jumps and warnings stay with the coarser level; what averages
+//! hide of the motion is small, smooth and in place, and a few passes find it.
 
 use crate::matching::levels::{factors, from_level, to_level};
 use crate::matching::pair::Pair;
@@ -9,16 +10,19 @@ use crate::pipeline::bodies::Bodies;
 use crate::pipeline::level;
 use crate::types::{FieldParams, Grid};
 
-/// Voxels between nodes at most. Five pairs of 160 x 192 x 160 (3 passes): errors as with 5, gradients 4 % less, and less time.
+/// Voxels between nodes at most. Five pairs of 160 x 192 x 160 (3 passes): errors as with 5,
+/// gradients 4 % less, and less time.
 pub(super) const WIDEST: usize = 6;
 
-/// The level below the one that `finest` asks for; none where that is full resolution, or no passes are wanted there.
+/// The level below the one that `finest` asks for; none where that is full resolution, or no passes
+/// are wanted there.
 pub(super) fn next_finer(grid: &Grid, finest: usize, params: &FieldParams) -> Option<[usize; 3]> {
     let wanted = params.finer_passes > 0 && finest > 1;
     wanted.then(|| factors(grid.shape(), grid.spacing(), finest / 2, 0.0)[0])
 }
 
-/// The fields of a level of factor `from` brought to the residual on `pair`, of `factor`, with so many voxels between nodes.
+/// The fields of a level of factor `from` brought to the residual on `pair`, of `factor`, with so
+/// many voxels between nodes.
 pub(super) fn polish(
     (pair, factor, nodes): (&Pair<'_>, [usize; 3], usize),
     (bodies, from): (&Bodies, [usize; 3]),

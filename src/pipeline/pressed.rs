@@ -38,8 +38,8 @@ impl Pressed {
         self.held = Place::Mask(Box::new(mask), name.into());
     }
 
-    /// Region by region from `field` on the phantom's grid, by `labels`; with `matches`, they count in place of the field
-    /// inside the body.
+    /// Region by region from `field` on the phantom's grid, by `labels`; with `matches`, they count
+    /// in place of the field inside the body.
     ///
     /// # Errors
     /// As [`stiffness::run`].
@@ -69,7 +69,8 @@ impl Pressed {
     }
 }
 
-/// Moduli from exact displacements against the nodes of the mesh: a ball in a block and layers under a punch.
+/// Moduli from exact displacements against the nodes of the mesh: a ball in a block and layers
+/// under a punch.
 ///
 /// # Errors
 /// As [`phantom()`].

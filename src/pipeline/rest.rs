@@ -1,8 +1,10 @@
-//! The smallest model, place by place: where nothing says that tissue moves otherwise than as the whole does, the field is that motion.
+//! The smallest model, place by place: where nothing says that tissue moves otherwise than as the
+//! whole does, the field is that motion.
 //!
-//! Smoothness that varies by place still leaves what stays at rest free to follow the noise. About every
-//! place the excess misfit of stillness, or of one rigid motion, against the free field is held against the degrees of freedom that the data
-//! determine there, as [`crate::consistency::models`] does for the whole.
+//! Smoothness that varies by place still leaves what stays at rest free to follow the noise. About
+//! every place the excess misfit of stillness, or of one rigid motion, against the free field is
+//! held against the degrees of freedom that the data determine there, as
+//! [`crate::consistency::models`] does for the whole.
 
 use crate::consistency::coupling::Posterior;
 use crate::consistency::models::{AffineMotion, nearest_rigid};
@@ -15,25 +17,30 @@ use crate::numerics::small::inverse;
 use crate::pipeline::level::SplineField;
 use crate::types::{MotionModel, VoxelPoint};
 
-/// Excess misfit for each degree of freedom up to which tissue is at rest, and from which the free field stands. Over 31 pairs made from scans, most
-/// of them pressed, with 1 and 3 the mean error is 0.769 of what it was, its gradient's 0.549; with 1.5 and 4 0.754 and 0.500, with 2 and 5 0.751 and 0.471,
-/// but tissue that slides loses 16 % in place of 8; with 3 and 7 smooth motion under noise loses up to a sixth.
+/// Excess misfit for each degree of freedom up to which tissue is at rest, and from which the free
+/// field stands. Over 31 pairs made from scans, most of them pressed, with 1 and 3 the mean error
+/// is 0.769 of what it was, its gradient's 0.549; with 1.5 and 4 0.754 and 0.500, with 2 and 5
+/// 0.751 and 0.471, but tissue that slides loses 16 % in place of 8; with 3 and 7 smooth motion
+/// under noise loses up to a sixth.
 const AT_REST: [f32; 2] = [1.5, 4.0];
 
-/// The uncertainty of a place, as a part of the free field's, is its excess misfit for each degree of freedom over this, and no less than [`NARROWEST`]:
-/// over 23 presses errors were 0.01 to 0.15 of the free field's deviation up to 1.5, 0.03 to 0.2 up to 3; of five pairs whose rest was not
-/// quite at rest (halves that slide in noise, slices five times as thick as wide) 0.3 to 0.9, but hardly any tissue was under 1.5.
+/// The uncertainty of a place, as a part of the free field's, is its excess misfit for each degree
+/// of freedom over this, and no less than [`NARROWEST`]: over 23 presses errors were 0.01 to 0.15
+/// of the free field's deviation up to 1.5, 0.03 to 0.2 up to 3; of five pairs whose rest was not
+/// quite at rest (halves that slide in noise, slices five times as thick as wide) 0.3 to 0.9, but
+/// hardly any tissue was under 1.5.
 const NARROW: f32 = 3.0;
 
 /// See [`NARROW`]: how well so little motion would have shown is not known better.
 const NARROWEST: f32 = 1.0 / 3.0;
 
-/// What places about it add to the misfit and the degrees of freedom of a place, with a Gaussian of so many windows: where little is determined (no
-/// texture, nothing in view) they decide.
+/// What places about it add to the misfit and the degrees of freedom of a place, with a Gaussian of
+/// so many windows: where little is determined (no texture, nothing in view) they decide.
 const LENT: (f32, f64) = (0.02, 3.0);
 
-/// Part of the tissue that must be at rest for any to be held there. Of 37 pairs that moved smoothly or slid 34 had 0 to 0.11 (one 0.16, slides up to 0.24), of 23
-/// pressed ones all but one 0.32 to 0.87 (0.16 where the press went through the whole head).
+/// Part of the tissue that must be at rest for any to be held there. Of 37 pairs that moved
+/// smoothly or slid 34 had 0 to 0.11 (one 0.16, slides up to 0.24), of 23 pressed ones all but one
+/// 0.32 to 0.87 (0.16 where the press went through the whole head).
 const LEAST: f64 = 0.15;
 
 /// How much more must be at rest under a rigid motion than where nothing moves at all.
@@ -50,7 +57,8 @@ pub(super) struct Tried {
     pub excess: Vec<f32>,
 }
 
-/// Degrees of freedom that a place counts for at least when it speaks against a model: with fewer, chance decides.
+/// Degrees of freedom that a place counts for at least when it speaks against a model: with fewer,
+/// chance decides.
 const FEWEST: f32 = 5.0;
 
 /// What each of the windows holds.
@@ -112,8 +120,9 @@ pub(super) struct Rest {
 }
 
 impl Rest {
-    /// Where `field` shows no motion, or none but one rigid motion where that holds more tissue. `excess` gives the excess misfit of a map
-    /// about each of the windows. None where neither map was tried.
+    /// Where `field` shows no motion, or none but one rigid motion where that holds more tissue.
+    /// `excess` gives the excess misfit of a map about each of the windows. None where neither map
+    /// was tried.
     pub fn find(
         (pair, field): (&Pair<'_>, &SplineField),
         windows: &Lattice,
@@ -150,7 +159,8 @@ impl Rest {
         rigid.filter(more).map(refit).filter(more).or(still)
     }
 
-    /// What the field shows of the tissue at rest, at its nodes, with the information that the data give there.
+    /// What the field shows of the tissue at rest, at its nodes, with the information that the data
+    /// give there.
     fn at_rest(&self, pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
         shown(pair, field, |at| self.free_at(at) < 0.5)
     }
@@ -183,7 +193,8 @@ impl Rest {
         format!("at rest: {:.0} % of the tissue {how}, as far as the data tell; {held}", 100.0 * self.share)
     }
 
-    /// Holds `field` where tissue is at rest; `place` leads from its voxels to those in which it was judged.
+    /// Holds `field` where tissue is at rest; `place` leads from its voxels to those in which it
+    /// was judged.
     pub fn bring(&self, field: &mut SplineField, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) {
         let motion = |p: [f64; 3]| {
             let at = place(p);
@@ -200,7 +211,8 @@ impl Rest {
     }
 }
 
-/// What a field shows of the tissue at its nodes where `counts` holds (voxels), with the information that the data give there.
+/// What a field shows of the tissue at its nodes where `counts` holds (voxels), with the
+/// information that the data give there.
 pub(super) fn shown(pair: &Pair<'_>, field: &SplineField, counts: impl Fn([f64; 3]) -> bool) -> Vec<Measured> {
     let nodes = &field.lattice;
     let of = |(m, block): (usize, [f32; 6])| {
@@ -222,7 +234,8 @@ fn with_lent(mut values: Vec<f32>, nodes: [usize; 3]) -> Vec<f32> {
     values
 }
 
-/// How much of the free field stands at an excess misfit for each degree of freedom, without a step.
+/// How much of the free field stands at an excess misfit for each degree of freedom, without a
+/// step.
 fn stands(ratio: f32) -> f32 {
     let [low, high] = AT_REST;
     let t = ((ratio - low) / (high - low)).clamp(0.0, 1.0);

@@ -61,8 +61,8 @@ impl Search<'_> {
         Ok(Candidate { labels, level, estimate })
     }
 
-    /// `count` regions of the map. Two that are alike are one class of moduli in two pieces: of all numbers of classes, the one
-    /// that explains most.
+    /// `count` regions of the map. Two that are alike are one class of moduli in two pieces: of all
+    /// numbers of classes, the one that explains most.
     fn cut(&self, map: &Map, count: usize, from: (&Level, &State)) -> Result<Option<Candidate>, StiffnessError> {
         let mut best: Option<Candidate> = None;
         for classes in 2..=count {
@@ -78,7 +78,8 @@ impl Search<'_> {
         Ok(best)
     }
 
-    /// The regions of a candidate with their surfaces moved to where the data put them; none where they stay.
+    /// The regions of a candidate with their surfaces moved to where the data put them; none where
+    /// they stay.
     fn redrawn(&self, old: &Candidate) -> Result<Option<Candidate>, StiffnessError> {
         let (inclusions, grid) = (Inclusion::all(&old.labels), old.labels.grid());
         if inclusions.is_empty() {

@@ -1,4 +1,5 @@
-//! Layered skin: a scene to the response of the column and of the block, with and without its layers.
+//! Layered skin: a scene to the response of the column and of the block, with and without its
+//! layers.
 
 use crate::skin::{block, column};
 use crate::types::skin::{BlockRun, SkinSample, SkinScene};

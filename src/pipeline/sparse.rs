@@ -1,9 +1,12 @@
-//! The source's own chain, coarse to fine (Zhang, Hirai, Endo & Morikawa 2007): corners, many-to-many candidates, energy-based
-//! consistency, least-squares matching, the smooth field through the matches and their Delaunay mesh.
+//! The source's own chain, coarse to fine (Zhang, Hirai, Endo & Morikawa 2007): corners,
+//! many-to-many candidates, energy-based consistency, least-squares matching, the smooth field
+//! through the matches and their Delaunay mesh.
 //!
-//! Each level seeks matches about the field of the one before. It then alternates: the deformed volume is warped by the field, each
-//! match is measured again by least squares, and the field is fitted to all of them through its bending energy. The residual of all
-//! voxels is never used. Where the motion varies within a patch or between matches, that detail is lost: the full method is better there.
+//! Each level seeks matches about the field of the one before. It then alternates: the deformed
+//! volume is warped by the field, each match is measured again by least squares, and the field is
+//! fitted to all of them through its bending energy. The residual of all voxels is never used.
+//! Where the motion varies within a patch or between matches, that detail is lost: the full method
+//! is better there.
 
 use crate::consistency::coupling::{Evidence, Posterior};
 use crate::consistency::energy::distance;
@@ -27,44 +30,51 @@ use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::types::*;
 use rayon::prelude::*;
 
-/// Patch radius (voxels of the finest axis). Five pairs (heads and calves, 3 to 16 mm): 3 leaves 7 % more error, at more time.
+/// Patch radius (voxels of the finest axis). Five pairs (heads and calves, 3 to 16 mm): 3 leaves 7
+/// % more error, at more time.
 const PATCH: usize = 2;
 
-/// Voxels of the finest axis between lattice nodes. The same five pairs: 4 and 6 leave 2 % less and 10 % more error.
+/// Voxels of the finest axis between lattice nodes. The same five pairs: 4 and 6 leave 2 % less and
+/// 10 % more error.
 const APART: usize = 5;
 
-/// What a match may be off beyond its covariance (voxels). The same five pairs: 0.05 leaves 2 % more error, 0.3 a third more.
+/// What a match may be off beyond its covariance (voxels). The same five pairs: 0.05 leaves 2 %
+/// more error, 0.3 a third more.
 const FLOOR: f64 = 0.02;
 
 /// Strain that neighbours may show against the field of the level before (1).
 const STRAIN: f64 = 0.1;
 
-/// Reach of the search about the field of the level before (voxels of the finest axis), on coarser levels and on the finest. The
-/// same five pairs: 2 on the finest leaves 1 % less error.
+/// Reach of the search about the field of the level before (voxels of the finest axis), on coarser
+/// levels and on the finest. The same five pairs: 2 on the finest leaves 1 % less error.
 const REACH: [f64; 2] = [2.0, 1.0];
 
-/// Rounds of warping, least-squares matching and fitting, on coarser levels and on the finest. The same five pairs: 1 and 5 on the
-/// finest leave 13 % more and 2 % less error.
+/// Rounds of warping, least-squares matching and fitting, on coarser levels and on the finest. The
+/// same five pairs: 1 and 5 on the finest leave 13 % more and 2 % less error.
 const ROUNDS: [usize; 2] = [2, 3];
 
-/// What neighbouring matches may be off together (voxels), when a simpler motion is asked for: a block at rest whose brightness
-/// differs by 15 % across the volume passed for an affine motion without it.
+/// What neighbouring matches may be off together (voxels), when a simpler motion is asked for: a
+/// block at rest whose brightness differs by 15 % across the volume passed for an affine motion
+/// without it.
 const SHARED: f64 = 0.1;
 
-/// Voxels of tissue for each point on coarser levels. The same five pairs: 12 and 48 leave the same error.
+/// Voxels of tissue for each point on coarser levels. The same five pairs: 12 and 48 leave the same
+/// error.
 const COARSE_ROOM: usize = 24;
 
-/// Points on the finest level, for each one of the full method, which needs them only to begin. The same five pairs: half as many
-/// leave 40 % more error, twice as many the same.
+/// Points on the finest level, for each one of the full method, which needs them only to begin. The
+/// same five pairs: half as many leave 40 % more error, twice as many the same.
 const MORE: f64 = 2.5;
 
-/// Voxels of tissue that each point asked for needs at least: with less the next finer level is worked on.
+/// Voxels of tissue that each point asked for needs at least: with less the next finer level is
+/// worked on.
 const ROOM: usize = 24;
 
 /// Least volume that tissue keeps (1); below it the field is smoothed.
 const LEAST_VOLUME: f32 = 0.1;
 
-/// The finest level worked on: the coarsest with room for the points asked for, or the one with at most 600,000 voxels of tissue.
+/// The finest level worked on: the coarsest with room for the points asked for, or the one with at
+/// most 600,000 voxels of tissue.
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, params: &FieldParams) -> usize {
     let automatic = field::finest_level(grid, mask, 0).max(params.finest);
     let tissue = field::inside(mask);
@@ -95,7 +105,8 @@ struct Found {
     report: LevelReport,
 }
 
-/// Measures the displacement of two volumes whose axes run right, anterior and superior, by matches alone.
+/// Measures the displacement of two volumes whose axes run right, anterior and superior, by matches
+/// alone.
 ///
 /// # Errors
 /// As [`field::run`].
@@ -247,7 +258,8 @@ fn on_level(pair: &Pair<'_>, begun: SplineField, last: bool, params: &FieldParam
     found
 }
 
-/// The smooth field through matches, from one that is nearly right, and which of them agree with it and with their neighbours.
+/// The smooth field through matches, from one that is nearly right, and which of them agree with it
+/// and with their neighbours.
 fn coupled(
     pair: &Pair<'_>,
     known: &SplineField,
@@ -277,7 +289,8 @@ fn coupled(
     Found { field, matches, report }
 }
 
-/// Sets the information that the evidence gives at each node (1/mm^2), of which the posterior is made.
+/// Sets the information that the evidence gives at each node (1/mm^2), of which the posterior is
+/// made.
 fn informed<'a>(field: &mut SplineField, evidence: impl Iterator<Item = &'a Evidence>) {
     let mut blocks = vec![[0.0f32; 6]; field.lattice.len()];
     for e in evidence {
@@ -290,7 +303,8 @@ fn informed<'a>(field: &mut SplineField, evidence: impl Iterator<Item = &'a Evid
     field.blocks = Blocks::from(&blocks[..]);
 }
 
-/// What the matches alone say against a map: squared distances from it in standard deviations, less those from the field.
+/// What the matches alone say against a map: squared distances from it in standard deviations, less
+/// those from the field.
 fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: u64) -> Choice {
     let measured: Vec<Measured> = matches.iter().filter(|m| m.kept).map(|m| m.measured).collect();
     let finest = pyramid::finest(pair.shape, pair.spacing);

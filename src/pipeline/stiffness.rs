@@ -18,7 +18,8 @@ use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessR
 use crate::types::{Displacement, Mask, QuadraticMesh, SparseField, WorldPoint};
 use std::time::Instant;
 
-/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called from any thread.
+/// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
+/// from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
 /// What is given.
@@ -40,8 +41,9 @@ pub struct Inputs<'a> {
     pub names: &'a dyn Fn(u8) -> String,
 }
 
-/// Matches that a body must hold for them to be taken unasked: what an identification needs, and a tenth that the mesh may leave out at the
-/// surface. Of fingertips with 104 to 134 the pulp came out right within its deviation, from their fields wrong by two to five of them.
+/// Matches that a body must hold for them to be taken unasked: what an identification needs, and a
+/// tenth that the mesh may leave out at the surface. Of fingertips with 104 to 134 the pulp came
+/// out right within its deviation, from their fields wrong by two to five of them.
 pub const ENOUGH: usize = 110;
 
 /// Kept matches in the body.
@@ -169,7 +171,8 @@ fn labelled(
                 false => mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize)),
             };
         }
-        // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the finest within the limit.
+        // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the
+        // finest within the limit.
         let mut best: Option<(f64, Fineness, Detail<'_>)> = None;
         for coarser in COARSER {
             for elsewhere in ELSEWHERE {

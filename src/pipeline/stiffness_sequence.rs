@@ -8,7 +8,8 @@ use crate::types::stiffness::{
 };
 use crate::types::{Displacement, Mask};
 
-/// Collects frames, the one that moved most first, so that a sequence is never in memory as a whole.
+/// Collects frames, the one that moved most first, so that a sequence is never in memory as a
+/// whole.
 #[derive(Debug, Default)]
 pub struct Sequence {
     law: Option<Law>,

@@ -1,4 +1,5 @@
-//! Stability: each chain pushed along one axis after the other until it breaks, with what it says about itself.
+//! Stability: each chain pushed along one axis after the other until it breaks, with what it says
+//! about itself.
 
 use crate::error::{StiffnessError, SynthError};
 use crate::evaluate;
@@ -18,8 +19,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 /// Called with the fraction that is done (0 to 1); may be called from any thread.
 pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 
-/// What the program says against a field that it measured on this initial volume without a mask; nothing when it has
-/// nothing to say.
+/// What the program says against a field that it measured on this initial volume without a mask;
+/// nothing when it has nothing to say.
 pub type Judge<'a> = &'a (dyn Fn(&Volume, &FieldResult) -> Vec<String> + Sync);
 
 /// How thorough a search is.
@@ -52,7 +53,8 @@ impl Effort {
     }
 }
 
-/// Mean error beyond which a field is of no use: this part of the motion, or the finest voxel edge where that is less.
+/// Mean error beyond which a field is of no use: this part of the motion, or the finest voxel edge
+/// where that is less.
 const USEFUL: f64 = 0.5;
 
 /// The field on every body along every axis of `troubles`.
@@ -102,7 +104,8 @@ fn curve(
     StressCurve { part, axis: axis.into(), unit, error_unit, case, range, runs, breaks_at, holds_at, told_at, quiet_at }
 }
 
-/// One phantom in trouble, measured without a mask and scored over the tissue that both volumes show.
+/// One phantom in trouble, measured without a mask and scored over the tissue that both volumes
+/// show.
 ///
 /// # Errors
 /// [`SynthError`] when there is no such phantom.
@@ -173,8 +176,8 @@ impl StiffnessAxis {
     ];
 }
 
-/// The stiffness of a ball in a block from exact displacements, made worse along each of `axes`; with fewer severities when
-/// `quick`.
+/// The stiffness of a ball in a block from exact displacements, made worse along each of `axes`;
+/// with fewer severities when `quick`.
 ///
 /// # Errors
 /// As [`Pressed::new`].
@@ -316,8 +319,8 @@ impl GraspAxis {
     }
 }
 
-/// The reference scene's eight motions made worse along each of `axes`: the step with every method and formulation, all else
-/// with Runge and Kutta's in minimal coordinates.
+/// The reference scene's eight motions made worse along each of `axes`: the step with every method
+/// and formulation, all else with Runge and Kutta's in minimal coordinates.
 pub fn grasp_curves(effort: &Effort, axes: &[GraspAxis], progress: Progress<'_>) -> Vec<StressCurve> {
     let forms: Vec<(Method, Formulation)> = [Method::Rk4, Method::SemiImplicitEuler]
         .into_iter()
@@ -347,8 +350,8 @@ pub fn grasp_curves(effort: &Effort, axes: &[GraspAxis], progress: Progress<'_>)
     all.par_iter().map(one).collect()
 }
 
-/// One scene against the same scene by the adaptive integrator. With `friction` the error is the largest share of the
-/// friction that the contacts ask for.
+/// One scene against the same scene by the adaptive integrator. With `friction` the error is the
+/// largest share of the friction that the contacts ask for.
 fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
     let limit = if friction { 1.0 } else { POSTURE };
     let (mut error, mut refused, mut said) = (f64::NAN, None, Vec::new());

@@ -1,9 +1,11 @@
 //! A sequence of volumes: the displacement from one of them to each other, frame by frame.
 //!
-//! Every frame is measured against the reference itself, so that errors do not add up; the search starts from where the
-//! tissue was in the frame before and where steady motion would take it, beside the starts that a pair of volumes has. Then what all frames
-//! say together takes from each what is its own noise and the reference's (`pipeline::modes`).
-//! Of volumes only the reference, the frame at hand and the one before are held, and of fields one; the others as their coefficients.
+//! Every frame is measured against the reference itself, so that errors do not add up; the search
+//! starts from where the tissue was in the frame before and where steady motion would take it,
+//! beside the starts that a pair of volumes has. Then what all frames say together takes from each
+//! what is its own noise and the reference's (`pipeline::modes`). Of volumes only the reference,
+//! the frame at hand and the one before are held, and of fields one; the others as their
+//! coefficients.
 
 use crate::error::FieldError;
 use crate::field::strain::{StrainField, StrainStatistics};
@@ -69,13 +71,14 @@ pub struct Frame<'a> {
     pub strain: &'a StrainField,
 }
 
-/// Measures `frames` volumes against number `origin` of them: forward from it to the last, then backward to the first.
+/// Measures `frames` volumes against number `origin` of them: forward from it to the last, then
+/// backward to the first.
 ///
-/// `read` gives a volume by its number, twice each; `keep` gets each result once all are measured. Where `together` holds, each field is what all frames
-/// say of it. `labels` (on the reference's
-/// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them, and what stands out of the background
-/// without either. A frame that cannot be
-/// measured is reported as lost, and the next one starts from the frames before it.
+/// `read` gives a volume by its number, twice each; `keep` gets each result once all are measured.
+/// Where `together` holds, each field is what all frames say of it. `labels` (on the reference's
+/// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them,
+/// and what stands out of the background without either. A frame that cannot be measured is
+/// reported as lost, and the next one starts from the frames before it.
 ///
 /// # Errors
 /// Those of `read` and `keep`, and [`FieldError`] when no frame at all can be measured.
@@ -214,7 +217,8 @@ fn regions(reference: &Voxels<'_>, mask: Option<&Mask>, labels: Option<&Mask>) -
 /// Part of a label out of view from which it is said.
 const OUT_OF_VIEW: f64 = 0.2;
 
-/// Names the labels of which much lies outside a frame: their strain there is what tissue in view carries over.
+/// Names the labels of which much lies outside a frame: their strain there is what tissue in view
+/// carries over.
 fn out_of_view(regions: &[(u8, Vec<usize>)], field: &DenseField, there: &Grid) -> Option<String> {
     let grid = field.grid();
     let outside = |&at: &usize| {
@@ -254,7 +258,8 @@ fn summary(frame: usize, result: &FieldResult, seconds: f64) -> FrameSummary {
     }
 }
 
-/// A warning of a pair in the words of a sequence, which has the page in the place of the pair's volumes.
+/// A warning of a pair in the words of a sequence, which has the page in the place of the pair's
+/// volumes.
 fn of_a_frame(warning: &str) -> String {
     ["warped.nii.gz", "uncertainty.nii.gz"]
         .iter()
@@ -291,7 +296,8 @@ impl Points {
         Self { frames, list: Vec::new(), known: HashMap::new() }
     }
 
-    /// Books a frame: features matched for the first time become known, the others are measured or carried.
+    /// Books a frame: features matched for the first time become known, the others are measured or
+    /// carried.
     fn add(&mut self, frame: usize, result: &FieldResult, there: &Grid) {
         let field = &result.displacement;
         let grid = *field.grid();

@@ -1,5 +1,5 @@
-//! Speed against accuracy: each chain with many settings on cases with a known answer, one run at a time, timed by the
-//! CPU time of this process.
+//! Speed against accuracy: each chain with many settings on cases with a known answer, one run at a
+//! time, timed by the CPU time of this process.
 
 use crate::error::{FieldError, GraspError, SynthError};
 use crate::evaluate::{self, mean};
@@ -58,7 +58,8 @@ impl Variant {
         vec![preset("fast", Preset::Fast), preset("balanced", Preset::Balanced), preset("accurate", Preset::Accurate)]
     }
 
-    /// Presets, point budgets and changes of single stages of the balanced preset; fewer when `quick`.
+    /// Presets, point budgets and changes of single stages of the balanced preset; fewer when
+    /// `quick`.
     pub fn all(quick: bool) -> Vec<Self> {
         let mut out = Self::presets();
         let budgets: &[usize] = if quick { &[500] } else { &[200, 1000, 5000, 25_000] };
@@ -100,7 +101,8 @@ impl Variant {
     }
 }
 
-/// The embedded spread of field cases: bodies, motions, thick slices and one slice; three small ones when `quick`.
+/// The embedded spread of field cases: bodies, motions, thick slices and one slice; three small
+/// ones when `quick`.
 pub fn spread(quick: bool, seed: u64) -> Vec<PhantomParams> {
     let case = |kind, motion, size| PhantomParams { seed, ..PhantomParams::new(kind).moving(motion).sized(size) };
     if quick {
@@ -156,7 +158,8 @@ impl Case {
         Ok(trial)
     }
 
-    /// Error of doing nothing (mm): the mean motion where errors count, or the landmarks' mean distance.
+    /// Error of doing nothing (mm): the mean motion where errors count, or the landmarks' mean
+    /// distance.
     pub fn nothing(&self) -> f64 {
         let Some(truth) = &self.truth else {
             return mean(&self.landmarks.iter().map(|l| length(l.initial.minus(l.deformed))).collect::<Vec<_>>());
@@ -211,7 +214,8 @@ pub fn sizes(sides: &[usize], progress: &dyn Fn(f64)) -> Result<Vec<Trial>, Synt
     Ok(out)
 }
 
-/// Largest difference of the object's angle from `exact` at any sample (degrees); NaN where samples are missing.
+/// Largest difference of the object's angle from `exact` at any sample (degrees); NaN where samples
+/// are missing.
 pub fn posture_error(run: &GraspRun, exact: &GraspRun) -> f64 {
     if run.samples.len() != exact.samples.len() {
         return f64::NAN;
@@ -228,8 +232,9 @@ pub fn exact(scene: &Scene) -> Scene {
     scene
 }
 
-/// The reference scene's eight motions with every integrator, formulation and a range of steps or tolerances; each run
-/// is repeated for at least `least_s` CPU seconds. Errors are of the object's angle, in degrees, against [`exact`].
+/// The reference scene's eight motions with every integrator, formulation and a range of steps or
+/// tolerances; each run is repeated for at least `least_s` CPU seconds. Errors are of the object's
+/// angle, in degrees, against [`exact`].
 ///
 /// # Errors
 /// [`GraspError`] when the exact run cannot be made.

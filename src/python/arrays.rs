@@ -148,8 +148,8 @@ pub fn python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>
 /// Most threads that can be asked for, as on the command line.
 const MOST_THREADS: i64 = 1024;
 
-/// Runs `work` without the interpreter, on `threads` threads (all cores without a number), and tells `callback` how far it is.
-/// What the callback raises is raised when the work is done.
+/// Runs `work` without the interpreter, on `threads` threads (all cores without a number), and
+/// tells `callback` how far it is. What the callback raises is raised when the work is done.
 pub fn run<R: Send>(
     py: Python<'_>,
     callback: Callback,

@@ -1,8 +1,9 @@
 //! The Python module `palpate._palpate` (feature `python`): the pipelines on arrays.
 //!
-//! What a user imports is the package in `src/python/palpate`, which turns images into arrays and results into objects. Arrays
-//! come in Fortran order (x fastest). Volumes and displacements are worked on where they lie and without the interpreter, so the caller
-//! leaves them alone meanwhile; masks, label maps and matches are taken over first. Numbers are rounded as the files of the
+//! What a user imports is the package in `src/python/palpate`, which turns images into arrays and
+//! results into objects. Arrays come in Fortran order (x fastest). Volumes and displacements are
+//! worked on where they lie and without the interpreter, so the caller leaves them alone meanwhile;
+//! masks, label maps and matches are taken over first. Numbers are rounded as the files of the
 //! command line keep them, so that both give the same bits.
 
 mod arrays;
@@ -29,7 +30,8 @@ pyo3::create_exception!(
     "What the command line would say after `error:`."
 );
 
-/// Of the command line's flags, by command, where the package's functions have them in their signatures.
+/// Of the command line's flags, by command, where the package's functions have them in their
+/// signatures.
 fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
     let StiffnessParams { poisson, nodes, regions, .. } = StiffnessParams::default();
     let stiffness = json!({ "poisson": poisson, "nodes": nodes, "regions": regions });

@@ -34,7 +34,8 @@ fn place(patch: &Patch<'_>, grid: &Grid, name: &str) -> PyResult<Place> {
     }
 }
 
-/// Young's modulus from a displacement (mm, RAS), with all that `palpate stiffness` writes but the models.
+/// Young's modulus from a displacement (mm, RAS), with all that `palpate stiffness` writes but the
+/// models.
 #[pyfunction]
 #[pyo3(signature = (displacement, affine, matches, unasked, body, labelled, names, held, load, force, poisson, model, nodes, regions, called, progress=None, threads=None))]
 pub fn stiffness<'py>(

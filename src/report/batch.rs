@@ -1,4 +1,5 @@
-//! Many pairs as tables and one page: what failed and why, moduli over all, and what to look at twice.
+//! Many pairs as tables and one page: what failed and why, moduli over all, and what to look at
+//! twice.
 
 use crate::report::html::{document, escape};
 use crate::report::plot::ticks;
@@ -155,7 +156,8 @@ impl Spread {
     }
 }
 
-/// Number of pairs, and counts, medians and quartiles of each region; the keys are those of docs/file-formats.md.
+/// Number of pairs, and counts, medians and quartiles of each region; the keys are those of
+/// docs/file-formats.md.
 pub fn summary(outcomes: &[PairOutcome]) -> Value {
     let quartile = |s: &Spread, q: f64| (s.seen() > 0).then(|| s.at(q)).filter(|v| v.is_finite());
     let spread = |s: &Spread| {
@@ -177,7 +179,8 @@ pub fn summary(outcomes: &[PairOutcome]) -> Value {
     })
 }
 
-/// A row a region: a dot a pair over a logarithmic axis, full where determined, hollow for a bound; a bar at the median.
+/// A row a region: a dot a pair over a logarithmic axis, full where determined, hollow for a bound;
+/// a bar at the median.
 fn strips(spreads: &[&Spread]) -> String {
     let logs = || spreads.iter().flat_map(|s| &s.values).map(|v| v.0.log10());
     let (low, high) = (logs().fold(f64::INFINITY, f64::min) - 0.1, logs().fold(f64::NEG_INFINITY, f64::max) + 0.1);

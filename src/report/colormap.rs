@@ -13,8 +13,8 @@ pub enum ColorMap {
     Diverging,
 }
 
-/// Sixth-degree polynomial fits of the two Matplotlib tables, lowest power first (M. Zucker, public domain,
-/// shadertoy.com/view/WlfXRN).
+/// Sixth-degree polynomial fits of the two Matplotlib tables, lowest power first (M. Zucker, public
+/// domain, shadertoy.com/view/WlfXRN).
 const VIRIDIS: [[f64; 3]; 7] = [
     [0.277_727, 0.005_407, 0.334_100],
     [0.105_093, 1.404_614, 1.384_590],
@@ -37,7 +37,8 @@ const DIVERGING: [[f64; 3]; 5] =
     [[33.0, 102.0, 172.0], [146.0, 197.0, 222.0], [247.0, 247.0, 247.0], [244.0, 165.0, 130.0], [178.0, 24.0, 43.0]];
 
 impl ColorMap {
-    /// The sRGB colour at `t`; outside 0 to 1 it is that of the nearer end, and NaN gives the lower end.
+    /// The sRGB colour at `t`; outside 0 to 1 it is that of the nearer end, and NaN gives the lower
+    /// end.
     pub fn rgb(self, t: f64) -> [u8; 3] {
         let t = if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) };
         let byte = |v: f64| (255.0 * v.clamp(0.0, 1.0)).round() as u8;

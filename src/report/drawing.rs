@@ -20,8 +20,8 @@ fn over(picture: &Picture, label: &str, content: &str) -> String {
     )
 }
 
-/// The part of the displacement that lies in the section, as arrows `factor` times as long as in truth, coloured by
-/// the whole length. `background` must be of the same section.
+/// The part of the displacement that lies in the section, as arrows `factor` times as long as in
+/// truth, coloured by the whole length. `background` must be of the same section.
 pub fn arrows(
     section: &Section,
     background: &Picture,
@@ -48,7 +48,8 @@ pub fn arrows(
             let _ = write!(svg, r#"<path stroke="{colour}" d="M{x:.1} {y:.1}h0"/>"#);
             continue;
         }
-        // The head: two strokes at 30 degrees, a third of the arrow long and no longer than half a lattice step.
+        // The head: two strokes at 30 degrees, a third of the arrow long and no longer than half a
+        // lattice step.
         let head = (length / 3.0).min(step / 2.0) / length;
         let (bx, by) = (-0.866 * head * dx, -0.866 * head * dy);
         let (sx, sy) = (-0.5 * head * dy, 0.5 * head * dx);
@@ -67,15 +68,16 @@ pub fn arrows(
     over(background, &format!("displacement arrows, {} plane", section.plane.name()), &svg)
 }
 
-/// How many times longer than in truth arrows should be, so that one of `length` mm fills about two lattice steps.
+/// How many times longer than in truth arrows should be, so that one of `length` mm fills about two
+/// lattice steps.
 pub fn arrow_factor(sections: &[Section], length: f64) -> f64 {
     let step = sections.iter().map(|s| s.lattice(ACROSS).1).fold(f64::INFINITY, f64::min);
     let wanted = 2.0 * step / length.max(1e-6);
     [1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0].into_iter().rfind(|f| *f <= wanted).unwrap_or(1.0)
 }
 
-/// Matches within `slab` mm of the section: the kept ones as dots coloured by their precision, the rejected ones as
-/// crosses. At most 1,200 are drawn, evenly thinned.
+/// Matches within `slab` mm of the section: the kept ones as dots coloured by their precision, the
+/// rejected ones as crosses. At most 1,200 are drawn, evenly thinned.
 pub fn matches(section: &Section, background: &Picture, matches: &[Match], slab: f64, scale: &Scale) -> String {
     let near: Vec<_> =
         matches.iter().map(|m| (m, section.place(m.initial))).filter(|(_, (_, behind))| behind.abs() <= slab).collect();

@@ -2,7 +2,8 @@
 
 use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Voxels};
 
-/// A value for each voxel offset (x fastest): a volume, or what can be worked out where a picture asks for it.
+/// A value for each voxel offset (x fastest): a volume, or what can be worked out where a picture
+/// asks for it.
 pub type Values<'a> = &'a (dyn Fn(usize) -> f32 + Sync);
 
 /// A result with the volumes it came from. All on the initial volume's grid.

@@ -1,4 +1,5 @@
-//! Panels as one SVG file that stands alone: a row a quantity, a column a plane, colour bars to the right.
+//! Panels as one SVG file that stands alone: a row a quantity, a column a plane, colour bars to the
+//! right.
 
 use crate::report::html::escape;
 use crate::report::panels::Panel;
@@ -68,7 +69,8 @@ pub fn sheet(title: &str, plots: &[String], columns: usize) -> String {
     stand_alone([LEFT + columns as f64 * wide, 60.0 + rows as f64 * tall], &body)
 }
 
-/// A scale from `place` (its upper left corner) down, `tall` high, with three ticks; `number` sets it apart from others.
+/// A scale from `place` (its upper left corner) down, `tall` high, with three ticks; `number` sets
+/// it apart from others.
 pub(super) fn colour_bar(scale: &Scale, number: usize, [x, top]: [f64; 2], tall: f64) -> String {
     let stops: String = (0..9)
         .zip(scale.stops())

@@ -1,4 +1,5 @@
-//! A film of a sequence: sections of every frame with a mesh that moves with the tissue, coloured by its strain.
+//! A film of a sequence: sections of every frame with a mesh that moves with the tissue, coloured
+//! by its strain.
 
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
@@ -57,7 +58,8 @@ impl Film {
         Self { grid: *grid, range, planes, frames: Vec::new() }
     }
 
-    /// Adds frame `number`: its `image` on the reference's grid, its displacement, the largest principal strain at a voxel.
+    /// Adds frame `number`: its `image` on the reference's grid, its displacement, the largest
+    /// principal strain at a voxel.
     ///
     /// # Errors
     /// [`ReportError`] when a picture cannot be encoded.
@@ -101,7 +103,8 @@ impl Film {
             order.len().saturating_sub(1),
             legend(Some(&scale))
         );
-        // As it is read: values of all nodes and frames would take many times the room of their text.
+        // As it is read: values of all nodes and frames would take many times the room of their
+        // text.
         out.push_str("<script type=\"application/json\">{\"planes\":[");
         for (n, plane) in self.planes.iter().enumerate() {
             out.push_str(if n == 0 { "" } else { "," });

@@ -114,8 +114,8 @@ fn name(s: &Standing) -> String {
     }
 }
 
-/// Where a name of `letters` beside a dot begins, and the end of a line that leads to it where it is not close by; none where
-/// there is no room, pointing at the dot still tells.
+/// Where a name of `letters` beside a dot begins, and the end of a line that leads to it where it
+/// is not close by; none where there is no room, pointing at the dot still tells.
 fn room(
     panel: &Panel,
     [x, y]: [f64; 2],
@@ -175,7 +175,8 @@ fn against_size(trials: &[Trial]) -> Option<(Panel, String)> {
     Some((panel, out))
 }
 
-/// Error of the moduli against the nodes that the mesh has, a line a body; none where nodes were not varied.
+/// Error of the moduli against the nodes that the mesh has, a line a body; none where nodes were
+/// not varied.
 fn against_nodes(trials: &[Trial]) -> Option<(Panel, String)> {
     let lines = lines(trials.iter().filter(|t| t.varied == "nodes"), |t| &t.case);
     let all = || lines.iter().flat_map(|l| &l.1);

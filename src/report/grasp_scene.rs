@@ -1,6 +1,8 @@
-//! Drawings of a grasp: fingers, tips, object and contact forces; one moment, or an animation that runs in the page.
+//! Drawings of a grasp: fingers, tips, object and contact forces; one moment, or an animation that
+//! runs in the page.
 //!
-//! Millimetres, y up. A finger is drawn once, hanging from its joint, and turned by its joint angle.
+//! Millimetres, y up. A finger is drawn once, hanging from its joint, and turned by its joint
+//! angle.
 
 use crate::types::Scene;
 use crate::types::grasp::Sample;
@@ -106,7 +108,8 @@ pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> Stri
     svg
 }
 
-/// An animation of samples at even times, with play, pause and a slider; without scripts it shows the first moment.
+/// An animation of samples at even times, with play, pause and a slider; without scripts it shows
+/// the first moment.
 pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
     let Some(first) = samples.first() else { return String::new() };
     let largest = largest_force(samples);

@@ -14,8 +14,9 @@ const ZOOM: usize = 6;
 /// Colour bands on either side of zero.
 const BANDS: usize = 11;
 
-/// A surface as a picture with axes: theta in degrees across, the other coordinate in mm upwards. Bands are even in the
-/// root of the energy, red above that at the posture and blue below, up to `largest` (J); gray is out of range.
+/// A surface as a picture with axes: theta in degrees across, the other coordinate in mm upwards.
+/// Bands are even in the root of the energy, red above that at the posture and blue below, up to
+/// `largest` (J); gray is out of range.
 ///
 /// # Errors
 /// [`ReportError`] when the picture cannot be encoded.
@@ -100,7 +101,8 @@ pub fn state_words(state: PinchState) -> &'static str {
     }
 }
 
-/// The pinch map as SVG, theta 1 across and theta 2 upwards (degrees); `postures` are the scene's joint angles (rad).
+/// The pinch map as SVG, theta 1 across and theta 2 upwards (degrees); `postures` are the scene's
+/// joint angles (rad).
 pub fn pinch_map(map: &PinchMap, postures: &[(usize, [f64; 2])]) -> String {
     let side = map.angles.len();
     let (left, top, size) = (40.0, 8.0, 380.0);

@@ -30,8 +30,8 @@ pub fn looks_like_labels(volume: &Volume) -> bool {
     seen.iter().filter(|s| **s).count() <= 32
 }
 
-/// The world direction that each voxel axis runs along most (R or L, A or P, S or I), and how far the axes are off the
-/// world's at most (degrees).
+/// The world direction that each voxel axis runs along most (R or L, A or P, S or I), and how far
+/// the axes are off the world's at most (degrees).
 pub fn orientation(grid: &Grid) -> (String, f64) {
     const ENDS: [[char; 2]; 3] = [['L', 'R'], ['P', 'A'], ['I', 'S']];
     let (linear, size) = (grid.affine().linear(), grid.spacing());

@@ -5,7 +5,8 @@ use crate::report::verdict::verdict;
 use crate::types::Grid;
 use serde_json::{Map, Value, json};
 
-/// Shape, spacing (mm) and affine (rows of the 4 x 4 voxel-to-world matrix without the last, mm, RAS) of a grid.
+/// Shape, spacing (mm) and affine (rows of the 4 x 4 voxel-to-world matrix without the last, mm,
+/// RAS) of a grid.
 pub fn grid(g: &Grid) -> Value {
     json!({ "shape": g.shape(), "spacing_mm": g.spacing(), "affine_ras": g.affine().rows() })
 }

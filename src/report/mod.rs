@@ -1,8 +1,9 @@
 //! Results as text, JSON, SVG and HTML: pure functions from data to strings and bytes.
 //!
-//! Pictures show the grid in the nearest canonical orientation (right of the picture = right or front of the patient,
-//! top = front or head), with true proportions in mm. Nothing here opens a file or prints. Volumes given together must
-//! lie on one grid; where they do not, pictures are of what lies at the same offsets.
+//! Pictures show the grid in the nearest canonical orientation (right of the picture = right or
+//! front of the patient, top = front or head), with true proportions in mm. Nothing here opens a
+//! file or prints. Volumes given together must lie on one grid; where they do not, pictures are of
+//! what lies at the same offsets.
 
 pub mod colormap;
 

@@ -11,14 +11,16 @@ const NODES: usize = 4000;
 const WIDTH: f64 = 560.0;
 const HEIGHT: f64 = 440.0;
 
-/// Parallel projection: seen from behind and the left, a little from above. Right, up, and away from the eye.
+/// Parallel projection: seen from behind and the left, a little from above. Right, up, and away
+/// from the eye.
 fn project(p: [f64; 3]) -> [f64; 3] {
     let (turn, tilt) = (35f64.to_radians(), 22f64.to_radians());
     let (right, away) = (p[0] * turn.cos() - p[1] * turn.sin(), p[0] * turn.sin() + p[1] * turn.cos());
     [right, p[2] * tilt.cos() + away * tilt.sin(), away * tilt.cos() - p[2] * tilt.sin()]
 }
 
-/// An SVG of the nodes (mm, RAS) coloured by the length of their displacement (mm), in their bounding box.
+/// An SVG of the nodes (mm, RAS) coloured by the length of their displacement (mm), in their
+/// bounding box.
 pub fn scatter(nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -> String {
     let bound = |f: fn(f64, f64) -> f64, start: f64| -> [f64; 3] {
         std::array::from_fn(|a| nodes.iter().map(|p| p.0[a]).fold(start, f))

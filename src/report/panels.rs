@@ -77,8 +77,8 @@ pub fn length(field: &DenseField, offset: usize) -> f32 {
     field.at(offset).iter().map(|v| v * v).sum::<f32>().sqrt()
 }
 
-/// Where to cut: the centre of the motion inside the mask (weights are squared lengths), the grid's middle when
-/// nothing moves.
+/// Where to cut: the centre of the motion inside the mask (weights are squared lengths), the grid's
+/// middle when nothing moves.
 pub fn centre_of_motion(field: &DenseField, mask: Option<&Mask>) -> WorldPoint {
     let grid = field.grid();
     let (mut sum, mut weight) = ([0.0; 3], 0.0);

@@ -1,4 +1,5 @@
-//! A section as a PNG with 256 colours: gray where only anatomy is shown, colour where there is a value.
+//! A section as a PNG with 256 colours: gray where only anatomy is shown, colour where there is a
+//! value.
 
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;

@@ -1,4 +1,5 @@
-//! Line plots as SVG: axes with round ticks, several lines, marks along the bottom axis, a legend under it.
+//! Line plots as SVG: axes with round ticks, several lines, marks along the bottom axis, a legend
+//! under it.
 
 use crate::report::html::escape;
 use crate::report::scale::short;
@@ -12,7 +13,8 @@ const TOP: f64 = 26.0;
 const BOTTOM: f64 = 38.0;
 /// From one row of the legend to the next.
 const ROW: f64 = 17.0;
-/// The stroke that stands before a name in the legend, with the room after it; what is left free between two entries.
+/// The stroke that stands before a name in the legend, with the room after it; what is left free
+/// between two entries.
 const STROKE: f64 = 21.0;
 const APART: f64 = 10.0;
 
@@ -61,8 +63,8 @@ fn width(text: &str) -> f64 {
     text.chars().map(of).sum()
 }
 
-/// Where the names of a legend stand, each with its stroke: from the left and row, in as many rows as it takes. The first row
-/// ends before `across`, which stands at its right.
+/// Where the names of a legend stand, each with its stroke: from the left and row, in as many rows
+/// as it takes. The first row ends before `across`, which stands at its right.
 fn legend<'a>(names: impl Iterator<Item = &'a str>, across: &str) -> Vec<[f64; 2]> {
     let (mut left, mut row, mut end) = (LEFT, 0.0, WIDTH - RIGHT - width(across) - APART);
     let place = |name: &str| {
@@ -77,7 +79,8 @@ fn legend<'a>(names: impl Iterator<Item = &'a str>, across: &str) -> Vec<[f64; 2
     names.map(place).collect()
 }
 
-/// Ticks from `low` to `high`; where all `places` are whole, as the numbers of frames are, so are the ticks.
+/// Ticks from `low` to `high`; where all `places` are whole, as the numbers of frames are, so are
+/// the ticks.
 fn places_ticks(low: f64, high: f64, mut places: impl Iterator<Item = f64>) -> Vec<f64> {
     let whole = |v: f64| (v - v.round()).abs() < 1e-9;
     let mut found = ticks(low, high, 6.0);

@@ -48,7 +48,8 @@ impl Scale {
     }
 }
 
-/// The smallest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is at or above `v` (1e-3 at least).
+/// The smallest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is at or above `v` (1e-3 at
+/// least).
 pub fn round_up(v: f64) -> f64 {
     let v = if v.is_finite() { v.max(1e-3) } else { 1.0 };
     let power = 10f64.powf(v.log10().floor());
@@ -64,7 +65,8 @@ pub fn short(v: f64) -> String {
     if s == "-0" { "0".into() } else { s.into() }
 }
 
-/// A number rounded to three digits that count: 0.00146, 2.80, 26700; below a thousandth as 1.46e-4.
+/// A number rounded to three digits that count: 0.00146, 2.80, 26700; below a thousandth as
+/// 1.46e-4.
 pub fn significant(v: f64) -> String {
     match v.abs() {
         a if a == 0.0 || !a.is_finite() => short(v),

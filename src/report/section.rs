@@ -1,7 +1,8 @@
 //! A plane cut through a grid, in the nearest canonical orientation.
 //!
-//! The voxel axis that lies closest to each of right, front and up stands for it, with its sign, so that any affine,
-//! oblique or flipped, is shown the same way up. Pixels keep the voxels' proportions; nothing is interpolated.
+//! The voxel axis that lies closest to each of right, front and up stands for it, with its sign, so
+//! that any affine, oblique or flipped, is shown the same way up. Pixels keep the voxels'
+//! proportions; nothing is interpolated.
 
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
@@ -79,7 +80,8 @@ fn canonical_axes(grid: &Grid) -> [Axis; 3] {
     })
 }
 
-/// A grid seen along right, front and up: places are mm from its first corner along the voxel axes nearest to these.
+/// A grid seen along right, front and up: places are mm from its first corner along the voxel axes
+/// nearest to these.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Canonical {
     grid: Grid,
@@ -176,7 +178,8 @@ pub struct Section {
 }
 
 impl Section {
-    /// The planes through the voxel nearest to `centre` (mm); only those more than one voxel wide and high.
+    /// The planes through the voxel nearest to `centre` (mm); only those more than one voxel wide
+    /// and high.
     pub fn through(grid: &Grid, centre: WorldPoint) -> Vec<Section> {
         let axes = canonical_axes(grid);
         let at = grid.affine().to_voxel(centre).0;
@@ -197,7 +200,8 @@ impl Section {
         [0, 1].map(|i| (pixels[i] * self.step) as f64 * self.axes[i].spacing)
     }
 
-    /// Voxel offset (x fastest) at a distance of `right` and `down` voxels from the upper left corner.
+    /// Voxel offset (x fastest) at a distance of `right` and `down` voxels from the upper left
+    /// corner.
     fn offset(&self, right: usize, down: usize) -> usize {
         let [h, v, n] = self.axes;
         let mut voxel = [0; 3];
@@ -226,8 +230,8 @@ impl Section {
         (0..self.height).flat_map(|py| (0..self.width).map(move |px| (px, py))).map(|(px, py)| mean(px, py)).collect()
     }
 
-    /// Where a place is drawn, in mm to the right and down from the upper left corner, and how far it lies behind
-    /// the plane (mm, signed).
+    /// Where a place is drawn, in mm to the right and down from the upper left corner, and how far
+    /// it lies behind the plane (mm, signed).
     pub fn place(&self, p: WorldPoint) -> ([f64; 2], f64) {
         let voxel = self.grid.affine().to_voxel(p).0;
         let [h, v, n] = self.axes;
@@ -236,14 +240,16 @@ impl Section {
         ([right, down], (voxel[n.voxel] - self.index as f64) * n.spacing)
     }
 
-    /// A displacement (mm, RAS) as drawn: mm to the right and down, the part out of the plane left out.
+    /// A displacement (mm, RAS) as drawn: mm to the right and down, the part out of the plane left
+    /// out.
     pub fn direct(&self, d: [f64; 3]) -> [f64; 2] {
         let voxel = self.grid.affine().vector_to_voxel(d);
         let along = |a: &Axis| voxel[a.voxel] * a.spacing * if a.reversed { -1.0 } else { 1.0 };
         [along(&self.axes[0]), -along(&self.axes[1])]
     }
 
-    /// Voxel offsets on an even lattice with about `across` nodes along the longer side, and the lattice's step (mm).
+    /// Voxel offsets on an even lattice with about `across` nodes along the longer side, and the
+    /// lattice's step (mm).
     pub fn lattice(&self, across: usize) -> (Vec<usize>, f64) {
         let (columns, step_mm) = self.columns(across);
         (columns.concat(), step_mm)

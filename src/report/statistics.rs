@@ -2,10 +2,12 @@
 
 use crate::types::Mask;
 
-/// Numbers taken at most: enough for a picture (a part of them is known to 0.2 %), cheap for any volume.
+/// Numbers taken at most: enough for a picture (a part of them is known to 0.2 %), cheap for any
+/// volume.
 const SAMPLES: usize = 50_000;
 
-/// Offsets of the voxels inside `mask` (all of `len` without one), evenly thinned to at most 50,000.
+/// Offsets of the voxels inside `mask` (all of `len` without one), evenly thinned to at most
+/// 50,000.
 pub fn sample(len: usize, mask: Option<&Mask>) -> Vec<usize> {
     match mask.map(Mask::as_slice) {
         Some(mask) => {
@@ -17,7 +19,8 @@ pub fn sample(len: usize, mask: Option<&Mask>) -> Vec<usize> {
     }
 }
 
-/// The value below which the fraction `q` (0 to 1) of the finite `values` lies; 0 when there is none.
+/// The value below which the fraction `q` (0 to 1) of the finite `values` lies; 0 when there is
+/// none.
 pub fn quantile(values: impl IntoIterator<Item = f64>, q: f64) -> f64 {
     let mut v: Vec<f64> = values.into_iter().filter(|x| x.is_finite()).collect();
     if v.is_empty() {
@@ -27,7 +30,8 @@ pub fn quantile(values: impl IntoIterator<Item = f64>, q: f64) -> f64 {
     *v.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
-/// Counts in equal bins between `low` and `high`; what lies outside counts in the end bins, NaN nowhere.
+/// Counts in equal bins between `low` and `high`; what lies outside counts in the end bins, NaN
+/// nowhere.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Histogram {
     /// Lower edge of the first bin.

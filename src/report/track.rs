@@ -98,7 +98,8 @@ impl TrackReport<'_> {
 /// A frame is looked at anew when it moves so many times further than the one before.
 const WORTH_A_LOOK: f64 = 1.1;
 
-/// The frames that the viewer holds: as many as the page has room for, evenly spread, and the one that moves most.
+/// The frames that the viewer holds: as many as the page has room for, evenly spread, and the one
+/// that moves most.
 pub struct Looks {
     frames: usize,
     room: usize,
@@ -267,8 +268,8 @@ fn of_frames(tracked: &Tracked) -> impl Iterator<Item = (usize, &str)> {
     })
 }
 
-/// All that a reader is to be warned of: what the volumes gave rise to, then frame by frame, where what differs in its numbers alone is
-/// said once, for the first of the frames.
+/// All that a reader is to be warned of: what the volumes gave rise to, then frame by frame, where
+/// what differs in its numbers alone is said once, for the first of the frames.
 pub fn warnings(report: &TrackReport<'_>) -> Vec<String> {
     let wording = |text: &str| -> String { text.chars().filter(|c| !c.is_ascii_digit()).collect() };
     let mut kinds: Vec<(String, &str, Vec<usize>)> = Vec::new();

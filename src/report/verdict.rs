@@ -40,18 +40,22 @@ pub struct Verdict {
 
 const MEDIAN: &str = "median uncertainty";
 
-/// The part of the tissue outside the deformed volume from which trust is low: what is carried over so far is off by millimetres.
+/// The part of the tissue outside the deformed volume from which trust is low: what is carried over
+/// so far is off by millimetres.
 const UNSEEN: f64 = 0.25;
 
-/// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under 100 matches, folds in
-/// more than one voxel of a thousand, a median uncertainty above that edge, or one above the mean motion of a free field, and where
-/// more than a quarter of the tissue moves out of the deformed volume or the field is in doubt; high when nothing folds, the median uncertainty is under
-/// half an edge, under a tenth of the voxels are uncertain by more than an edge, and nothing is warned of.
+/// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under
+/// 100 matches, folds in more than one voxel of a thousand, a median uncertainty above that edge,
+/// or one above the mean motion of a free field, and where more than a quarter of the tissue moves
+/// out of the deformed volume or the field is in doubt; high when nothing folds, the median
+/// uncertainty is under half an edge, under a tenth of the voxels are uncertain by more than an
+/// edge, and nothing is warned of.
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     judge(report.initial.grid(), report.mask, report.uncertainty, report.summary)
 }
 
-/// As [`verdict`], from the initial volume's grid, the mask, the uncertainty by voxel (mm) and the summary alone.
+/// As [`verdict`], from the initial volume's grid, the mask, the uncertainty by voxel (mm) and the
+/// summary alone.
 pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
     let edge = grid.spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
@@ -190,7 +194,8 @@ pub(super) fn named(which: &[usize]) -> Option<String> {
     (!which.is_empty()).then(|| format!("{noun} {}{more}", shown.join(", ")))
 }
 
-/// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they lie to one side.
+/// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they
+/// lie to one side.
 fn uncertain(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, limit: f64) -> (f64, String) {
     let picked = sample(grid.len(), mask);
     let world = |&o: &usize| {

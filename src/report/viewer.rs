@@ -1,8 +1,10 @@
-//! A viewer for the page: linked orthogonal slices through whole volumes, with overlays, drawn on plain canvases.
+//! A viewer for the page: linked orthogonal slices through whole volumes, with overlays, drawn on
+//! plain canvases.
 //!
-//! Images are thinned to about a million and a half voxels, smooth quantities to 120,000, packed with zlib, and unpacked by
-//! the browser; nothing is fetched. Values are kept in 8 bits of their scale, displacements to 0.01 mm, places in 16 bits of
-//! the extent. Thinned voxels are picked, not averaged: what is shown was measured.
+//! Images are thinned to about a million and a half voxels, smooth quantities to 120,000, packed
+//! with zlib, and unpacked by the browser; nothing is fetched. Values are kept in 8 bits of their
+//! scale, displacements to 0.01 mm, places in 16 bits of the extent. Thinned voxels are picked, not
+//! averaged: what is shown was measured.
 
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
@@ -39,9 +41,11 @@ pub struct Layer<'a> {
     pub scale: Scale,
 }
 
-/// What a viewer shows at one moment: all of it, or what changes over a sequence. On the viewer's grid.
+/// What a viewer shows at one moment: all of it, or what changes over a sequence. On the viewer's
+/// grid.
 pub struct Moment<'a> {
-    /// What it is called where it is one of several; None where it is the only one, which has twice as many voxels of what is smooth.
+    /// What it is called where it is one of several; None where it is the only one, which has twice
+    /// as many voxels of what is smooth.
     pub name: Option<&'a str>,
     /// In gray, after those that all moments share.
     pub images: &'a [Layer<'a>],
@@ -61,7 +65,8 @@ pub struct PackedMoment {
     maps: Vec<ColorMap>,
 }
 
-/// Linked slices with controls. The moments are of one kind: as many images and overlays each, in the same order.
+/// Linked slices with controls. The moments are of one kind: as many images and overlays each, in
+/// the same order.
 pub struct Viewer<'a> {
     /// The grid.
     pub grid: &'a Grid,
@@ -149,7 +154,8 @@ fn byte(scale: &Scale, value: f32) -> u8 {
     (255.0 * scale.position(f64::from(value)) + 0.5) as u8
 }
 
-/// The byte of an overlay for the end of its scale; the next one is for what lies past it, the last for what is not known.
+/// The byte of an overlay for the end of its scale; the next one is for what lies past it, the last
+/// for what is not known.
 const END: u8 = 253;
 
 /// `value`, which an overlay shows, in 8 bits; what is not finite is not known.
@@ -243,7 +249,8 @@ impl Moment<'_> {
         PackedMoment { data, maps }
     }
 
-    /// How many moments of so many images and overlays (with a field) a page has room for; at least one.
+    /// How many moments of so many images and overlays (with a field) a page has room for; at least
+    /// one.
     pub fn room(grid: &Grid, images: usize, overlays: usize) -> usize {
         let canonical = Canonical::of(grid);
         let voxels = |most| Thinned::new(&canonical, most).shape.iter().product::<usize>();

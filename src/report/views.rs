@@ -32,7 +32,8 @@ pub struct Views {
     pub error: Option<Panel>,
     /// One SVG a plane, and how many times longer than in truth the arrows are.
     pub arrows: (Vec<String>, f64),
-    /// Black and white of the initial volume, and the gains of the deformed and the warped one to it.
+    /// Black and white of the initial volume, and the gains of the deformed and the warped one to
+    /// it.
     pub gray: ([f64; 2], [f32; 2]),
     /// One SVG a plane, how thick a slab is shown (mm), and the scale of the dots.
     pub matches: (Vec<String>, f64, Scale),
@@ -172,7 +173,8 @@ impl Scales {
     }
 }
 
-/// The gain that brings `volume` closest to `reference` in the least squares over `offsets`; 1 where there is none.
+/// The gain that brings `volume` closest to `reference` in the least squares over `offsets`; 1
+/// where there is none.
 pub(super) fn matched(reference: &[f32], volume: Values<'_>, offsets: &[usize]) -> f32 {
     let pairs = || {
         offsets.iter().map(|&o| (f64::from(reference[o]), f64::from(volume(o)))).filter(|(x, y)| (x * y).is_finite())

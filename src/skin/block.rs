@@ -1,11 +1,13 @@
-//! A layered block under a flat punch that sticks: plane strain, small strain, the same laws as the column.
+//! A layered block under a flat punch that sticks: plane strain, small strain, the same laws as the
+//! column.
 //!
-//! Bilinear quadrilaterals with mean dilatation (B-bar; Hughes 1980), so that layers that hardly change their volume do
-//! not lock. The stress is `D (e0 e + c0 e' + sum s_i)` with D the elasticity of modulus 1 and the scene's Poisson's
-//! ratio, and each component follows the element. Time steps are implicit: Maxwell branches by their exponential with the
-//! strain linear within the step (Herrmann & Peterson 1968), the lone dashpot by backward differences of order 2 (of order 1
-//! right after a corner of the load); stiff layers do not limit the step. The block is
-//! symmetric, so half of it is modelled.
+//! Bilinear quadrilaterals with mean dilatation (B-bar; Hughes 1980), so that layers that hardly
+//! change their volume do not lock. The stress is `D (e0 e + c0 e' + sum s_i)` with D the
+//! elasticity of modulus 1 and the scene's Poisson's ratio, and each component follows the element.
+//! Time steps are implicit: Maxwell branches by their exponential with the strain linear within the
+//! step (Herrmann & Peterson 1968), the lone dashpot by backward differences of order 2 (of order 1
+//! right after a corner of the load); stiff layers do not limit the step. The block is symmetric,
+//! so half of it is modelled.
 
 use crate::numerics::banded::Band;
 use crate::skin::column::times;
@@ -173,8 +175,8 @@ impl StepLaw {
     }
 }
 
-/// The response of the scene's block; none when a step has no solution (values beyond all measure). A scene must have
-/// been checked.
+/// The response of the scene's block; none when a step has no solution (values beyond all measure).
+/// A scene must have been checked.
 pub fn respond(scene: &SkinScene) -> Option<BlockRun> {
     let mesh = Mesh::new(scene);
     let [nx, ny] = mesh.cells();

@@ -1,10 +1,12 @@
-//! A column of layers in series: they share the stress, and their compressions add up to the indentation.
+//! A column of layers in series: they share the stress, and their compressions add up to the
+//! indentation.
 //!
-//! With d_i the dashpot strain of a Maxwell branch, s_i = E_i (e - d_i) and d_i' = s_i / c_i. A layer with a lone dashpot
-//! has its strain as a state, e' = (sigma - e0 e - sum s_i) / c0; one without has e = (sigma + sum E_i d_i) / (e0 + sum E_i).
-//! Under a given indentation the stress follows from sum h_j e_j = u (or from its rate, where every layer has a dashpot);
-//! let go, it is zero. In each phase of the load this is linear with constant coefficients, so `exp(A h)` takes it from
-//! any time to any other without a step error.
+//! With d_i the dashpot strain of a Maxwell branch, s_i = E_i (e - d_i) and d_i' = s_i / c_i. A
+//! layer with a lone dashpot has its strain as a state, e' = (sigma - e0 e - sum s_i) / c0; one
+//! without has e = (sigma + sum E_i d_i) / (e0 + sum E_i). Under a given indentation the stress
+//! follows from sum h_j e_j = u (or from its rate, where every layer has a dashpot); let go, it is
+//! zero. In each phase of the load this is linear with constant coefficients, so `exp(A h)` takes
+//! it from any time to any other without a step error.
 
 use crate::skin::exponential::{exponential, rounding};
 use crate::types::skin::{Layer, SkinLoad, SkinSample, SkinScene};
@@ -24,7 +26,8 @@ struct Part {
     strain: Option<usize>,
 }
 
-/// The linear system of one phase. After the states come the indentation, the impulse and the number 1.
+/// The linear system of one phase. After the states come the indentation, the impulse and the
+/// number 1.
 struct Phase {
     parts: Vec<Part>,
     /// Rows of A.
@@ -58,7 +61,8 @@ impl Phase {
         phase
     }
 
-    /// The pull of a layer's spring and branches at strain `e` less that of its dashpots: (factor of e, factors of d).
+    /// The pull of a layer's spring and branches at strain `e` less that of its dashpots: (factor
+    /// of e, factors of d).
     fn spring(part: &Part) -> f64 {
         part.e0 + part.branches.iter().map(|b| b[0]).sum::<f64>()
     }
@@ -147,8 +151,8 @@ impl Phase {
     }
 }
 
-/// Part of the largest value by which rounding alone may be off at the end of the longest phase of the load (1): it grows with how much
-/// faster the fastest layer is.
+/// Part of the largest value by which rounding alone may be off at the end of the longest phase of
+/// the load (1): it grows with how much faster the fastest layer is.
 pub fn precision(scene: &SkinScene) -> f64 {
     let SkinLoad { ramp, hold, end, .. } = scene.load;
     let loaded = Phase::new(&scene.layers, false, Some(0.0));
@@ -159,13 +163,14 @@ pub fn precision(scene: &SkinScene) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// The response of a column to the scene's load; exact at each sample. A scene must have been checked.
+/// The response of a column to the scene's load; exact at each sample. A scene must have been
+/// checked.
 pub fn respond(scene: &SkinScene) -> Vec<SkinSample> {
     respond_at(scene, &times(scene))
 }
 
-/// The same at the times (s) of each phase: ramp, hold, after. Where a phase begins with a time of its own, that time is
-/// sampled on both sides of the corner.
+/// The same at the times (s) of each phase: ramp, hold, after. Where a phase begins with a time of
+/// its own, that time is sampled on both sides of the corner.
 pub fn respond_at(scene: &SkinScene, times: &[Vec<f64>; 3]) -> Vec<SkinSample> {
     let load = &scene.load;
     let phases = [
@@ -217,8 +222,9 @@ pub fn times(scene: &SkinScene) -> [Vec<f64>; 3] {
     [ramp, growing(load.ramp, load.hold, SAMPLES[1]), growing(unload, load.end - unload, SAMPLES[2])]
 }
 
-/// The strain that stays after all time in a layer without a lone spring: the integral of the stress over the sum of its
-/// dashpots; none where a spring brings it back, or where the dashpots change.
+/// The strain that stays after all time in a layer without a lone spring: the integral of the
+/// stress over the sum of its dashpots; none where a spring brings it back, or where the dashpots
+/// change.
 pub fn residual(layer: &Layer, impulse: f64) -> Option<f64> {
     let constant = layer.e0 == 0.0 && layer.c_unload.is_empty();
     constant.then(|| impulse / (layer.c0 + layer.maxwell.iter().map(|b| b[1]).sum::<f64>()))

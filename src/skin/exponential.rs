@@ -1,7 +1,7 @@
 //! The matrix exponential.
 
-/// `exp(a h)` of an `n` x `n` matrix (rows): balanced, scaled to norm 1/2, Taylor to degree 18 (error below 1e-22), squared back
-/// (Moler & Van Loan 2003, method 3).
+/// `exp(a h)` of an `n` x `n` matrix (rows): balanced, scaled to norm 1/2, Taylor to degree 18
+/// (error below 1e-22), squared back (Moler & Van Loan 2003, method 3).
 pub(super) fn exponential(a: &[f64], n: usize, h: f64) -> Vec<f64> {
     let (size, balanced) = balanced(a, n, h);
     let norm = norm(&balanced, n);
@@ -38,11 +38,13 @@ fn norm(a: &[f64], n: usize) -> f64 {
     a.chunks_exact(n).map(|row| row.iter().map(|v| v.abs()).sum::<f64>()).fold(0.0, f64::max)
 }
 
-/// What is left of the size of a row or column of which nothing comes back: the sum that a quantity is, or a constant.
+/// What is left of the size of a row or column of which nothing comes back: the sum that a quantity
+/// is, or a constant.
 const LOOSE: f64 = 0.0625;
 
-/// Sizes (powers of two) of the quantities for which rows and columns of `a` are about as large as each other (Parlett & Reinsch 1969):
-/// else stresses of gigapascals over layers of micrometres set the number of squarings, and rates that matter are lost in rounding.
+/// Sizes (powers of two) of the quantities for which rows and columns of `a` are about as large as
+/// each other (Parlett & Reinsch 1969): else stresses of gigapascals over layers of micrometres set
+/// the number of squarings, and rates that matter are lost in rounding.
 fn balance(a: &[f64], n: usize) -> Vec<f64> {
     let mut size = vec![1.0f64; n];
     for _ in 0..60 {

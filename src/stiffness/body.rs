@@ -93,8 +93,9 @@ impl Body {
         Ok(Self { places, cells, pressures, region, labels, quadrature, pattern, surface, volumes })
     }
 
-    /// Has the displacements of some nodes eliminated last, which makes matrices that differ at these alone cheap to factorise in turn; not where
-    /// there are too many for that. Unknowns are numbered anew.
+    /// Has the displacements of some nodes eliminated last, which makes matrices that differ at
+    /// these alone cheap to factorise in turn; not where there are too many for that. Unknowns are
+    /// numbered anew.
     ///
     /// # Errors
     /// As [`Self::new`].

@@ -9,10 +9,12 @@ use crate::stiffness::summary;
 use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Evidence, Law, LawChoice};
 
-/// A model must beat a smaller one by this much (Kass and Raftery 1995: more than 10 is very strong).
+/// A model must beat a smaller one by this much (Kass and Raftery 1995: more than 10 is very
+/// strong).
 pub const MARGIN: f64 = 10.0;
-/// Largest principal strain (95th percentile over the body) up to which the law is left to the data. What a linear law leaves out is of the
-/// order of the strain (4.71 for a contrast of 5 at 7 %), and a field from images is off by more than tells the two apart.
+/// Largest principal strain (95th percentile over the body) up to which the law is left to the
+/// data. What a linear law leaves out is of the order of the strain (4.71 for a contrast of 5 at 7
+/// %), and a field from images is off by more than tells the two apart.
 const SMALL_STRAIN: f64 = 0.05;
 /// Precision of forward solutions on the coarse mesh (mm).
 const COARSE: f64 = 1e-4;
@@ -28,7 +30,8 @@ const LONGEST: f64 = 2.0;
 /// Shorter ones are left to the last step with all offsets (voxels).
 const SETTLED: f64 = 0.1;
 
-/// A guided patch takes over what the field says along the plate, with its errors: the squares must fall by so much (in ln).
+/// A guided patch takes over what the field says along the plate, with its errors: the squares must
+/// fall by so much (in ln).
 const DECISIVE: f64 = 0.2;
 
 /// What was chosen on the coarse mesh.
@@ -47,7 +50,8 @@ pub fn bic(squares: f64, samples: f64, parameters: usize) -> f64 {
     samples * (squares.max(1e-300) / samples).ln() + parameters as f64 * samples.max(2.0).ln()
 }
 
-/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or guided, or either where noise hides it.
+/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or
+/// guided, or either where noise hides it.
 fn candidates(level: &Level) -> [Vec<Contact>; 2] {
     let [held, load] = &level.patches;
     let travel = travel(&level.patches);
@@ -93,7 +97,8 @@ fn large_strain_from(
     settle(level, Law::NeoHookean, poisson, reference, large, (LAW_MOVES, COARSE))
 }
 
-/// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the contact chosen.
+/// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the
+/// contact chosen.
 ///
 /// # Errors
 /// [`StiffnessError`] where no candidate can be solved.
@@ -226,8 +231,8 @@ pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usi
     Ok(Choice { law, estimate, evidence })
 }
 
-/// Moves the edge of a punch to where the data put it, and identifies again, until it stays, or has moved `moves` times.
-/// `precision`: of the forward solutions (mm).
+/// Moves the edge of a punch to where the data put it, and identifies again, until it stays, or has
+/// moved `moves` times. `precision`: of the forward solutions (mm).
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].

@@ -1,8 +1,9 @@
-//! The Taylor-Hood tetrahedron: quadratic displacement (ten nodes, edges may be curved), linear pressure.
+//! The Taylor-Hood tetrahedron: quadratic displacement (ten nodes, edges may be curved), linear
+//! pressure.
 //!
-//! Source: C. Taylor and P. Hood, Computers & Fluids 1 (1973). It satisfies the inf-sup condition, so it does not lock as
-//! Poisson's ratio nears 0.5. The pressure is continuous within a region and jumps between regions, as it does where the
-//! shear modulus jumps.
+//! Source: C. Taylor and P. Hood, Computers & Fluids 1 (1973). It satisfies the inf-sup condition,
+//! so it does not lock as Poisson's ratio nears 0.5. The pressure is continuous within a region and
+//! jumps between regions, as it does where the shear modulus jumps.
 
 use crate::numerics::tetrahedron::{self, slopes};
 use crate::types::space::{cross, determinant, dot};
@@ -10,11 +11,13 @@ use crate::types::space::{cross, determinant, dot};
 const A: f64 = 0.585_410_196_624_968_5;
 const B: f64 = 0.138_196_601_125_010_5;
 
-/// Quadrature of degree 2: barycentric coordinates and weight (sum 1) of each of four points (Keast 1986).
+/// Quadrature of degree 2: barycentric coordinates and weight (sum 1) of each of four points (Keast
+/// 1986).
 pub const RULE: [([f64; 4], f64); 4] =
     [([A, B, B, B], 0.25), ([B, A, B, B], 0.25), ([B, B, A, B], 0.25), ([B, B, B, A], 0.25)];
 
-/// Gradients of the ten shape functions (1/mm) and the Jacobian determinant (mm^3) at `l` in the element of nodes `p` (mm).
+/// Gradients of the ten shape functions (1/mm) and the Jacobian determinant (mm^3) at `l` in the
+/// element of nodes `p` (mm).
 pub fn jacobian(p: &[[f64; 3]; 10], l: [f64; 4]) -> ([[f64; 3]; 10], f64) {
     let slopes = slopes(l);
     let j = tetrahedron::jacobian(p, &slopes);
@@ -49,13 +52,15 @@ pub fn points(p: &[[f64; 3]; 10]) -> [Point; 4] {
     })
 }
 
-/// An element's places as a polynomial of the second to fourth barycentric coordinate `l`, and the straight element of its corners.
+/// An element's places as a polynomial of the second to fourth barycentric coordinate `l`, and the
+/// straight element of its corners.
 #[derive(Debug, Clone, Copy)]
 pub struct Mapping {
     origin: [f64; 3],
     /// What stands beside each `l_b`.
     linear: [[f64; 3]; 3],
-    /// What stands beside `l_b^2`, doubled, on the diagonal and beside `l_b l_c` elsewhere (mm); zero where edges are straight.
+    /// What stands beside `l_b^2`, doubled, on the diagonal and beside `l_b l_c` elsewhere (mm);
+    /// zero where edges are straight.
     bent: [[[f64; 3]; 3]; 3],
     /// Gradients of the coordinates in the straight element (1/mm).
     gradient: [[f64; 3]; 3],
@@ -64,7 +69,8 @@ pub struct Mapping {
 impl Mapping {
     /// That of the element of nodes `p` (mm).
     pub fn of(p: &[[f64; 3]; 10]) -> Self {
-        // The nodes in the middle of the edges from the first corner, and of those between the others.
+        // The nodes in the middle of the edges from the first corner, and of those between the
+        // others.
         let from_first = [p[4], p[6], p[7]];
         let between = |b: usize, c: usize| p[[5, 8, 9][b + c - 1]];
         let each = |f: &dyn Fn(usize, usize) -> f64| [0, 1, 2].map(|b| [0, 1, 2].map(|a| f(b, a)));
@@ -90,8 +96,8 @@ impl Mapping {
         [1.0 - b - c - e, b, c, e]
     }
 
-    /// Barycentric coordinates of the place `x` (mm), by Newton's method from those in the straight element, to about 10^-10; none when it
-    /// does not converge.
+    /// Barycentric coordinates of the place `x` (mm), by Newton's method from those in the straight
+    /// element, to about 10^-10; none when it does not converge.
     pub fn locate(&self, x: [f64; 3]) -> Option<[f64; 4]> {
         let [_, mut l @ ..] = self.straight(x);
         for _ in 0..12 {

@@ -1,8 +1,10 @@
-//! The forward problem: displacement and pressure of a body whose surface is held and pressed in places.
+//! The forward problem: displacement and pressure of a body whose surface is held and pressed in
+//! places.
 //!
-//! Prescribed displacements are ties, springs 10^6 times as stiff as the tissue around them (a tied node misses its place by
-//! about 10^-6 of an element's size times the strain; stiffer ones would leave nothing of the tissue in single precision);
-//! the rest of the surface is free of traction. Newton's method on the mixed residual; the linear law takes one step.
+//! Prescribed displacements are ties, springs 10^6 times as stiff as the tissue around them (a tied
+//! node misses its place by about 10^-6 of an element's size times the strain; stiffer ones would
+//! leave nothing of the tissue in single precision); the rest of the surface is free of traction.
+//! Newton's method on the mixed residual; the linear law takes one step.
 
 use crate::error::StiffnessError;
 use crate::numerics::sparse::Factor;
@@ -18,9 +20,11 @@ const TIE: f64 = 1e6;
 const STEPS: usize = 25;
 /// A tangent is kept while a step is at most this part of the one before.
 const CONTRACTS: f64 = 0.4;
-/// A tangent serves for derivatives at a solution this part of the largest displacement away: about their relative error.
+/// A tangent serves for derivatives at a solution this part of the largest displacement away: about
+/// their relative error.
 const STALE: f64 = 0.01;
-/// At a solution this part of the largest displacement away its factor still refines solutions of the tangent there quickly.
+/// At a solution this part of the largest displacement away its factor still refines solutions of
+/// the tangent there quickly.
 const NEAR: f64 = 0.2;
 /// Elements computed together.
 const CHUNK: usize = 256;
@@ -34,7 +38,8 @@ pub struct Tie {
     pub direction: Option<[f64; 3]>,
     /// The displacement (mm).
     pub target: [f64; 3],
-    /// Spring constant over that of a firm tie (1): 1 to prescribe, far less to hold a body that would else slip away.
+    /// Spring constant over that of a firm tie (1): 1 to prescribe, far less to hold a body that
+    /// would else slip away.
     pub strength: f64,
 }
 
@@ -67,7 +72,8 @@ pub struct Problem<'a> {
 }
 
 impl<'a> Problem<'a> {
-    /// A problem with the spring constants that go with the element size and the stiffest element at each node.
+    /// A problem with the spring constants that go with the element size and the stiffest element
+    /// at each node.
     pub fn new(body: &'a Body, law: Law, materials: Vec<Material>, ties: Vec<Tie>) -> Self {
         let mut springs = vec![0.0f64; body.places.len()];
         for (cell, material) in body.cells.iter().zip(&materials) {
@@ -257,8 +263,8 @@ impl<'a> Problem<'a> {
         }
     }
 
-    /// Solves from `start` by steps with the factorised tangent of a problem nearby (the chord method); none where these do
-    /// not contract. `precision` (mm) ends it.
+    /// Solves from `start` by steps with the factorised tangent of a problem nearby (the chord
+    /// method); none where these do not contract. `precision` (mm) ends it.
     pub fn solve_near(&self, start: &[f64], factor: &Factor<'_>, precision: f64) -> Option<Vec<f64>> {
         let (mut x, mut last) = (start.to_vec(), f64::INFINITY);
         for _ in 0..STEPS {
@@ -284,8 +290,8 @@ impl<'a> Problem<'a> {
         all.fold(0.0, |m: f64, v| m.max(v.abs()))
     }
 
-    /// Newton's method that keeps a factorised tangent as long as it contracts. One that is further than `stale` (of the
-    /// largest displacement) from the solution is factorised again at the end.
+    /// Newton's method that keeps a factorised tangent as long as it contracts. One that is further
+    /// than `stale` (of the largest displacement) from the solution is factorised again at the end.
     fn newton(&self, mut x: Vec<f64>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         let mut factor = Some(self.factorise(&x)?);
         let (mut factorisations, mut last, mut fresh) = (1, f64::INFINITY, true);

@@ -1,13 +1,16 @@
-//! What a voxel map or a field tells of the body's shape to a part of a voxel only: flat faces, and the edge of a punch.
+//! What a voxel map or a field tells of the body's shape to a part of a voxel only: flat faces, and
+//! the edge of a punch.
 //!
-//! A flat face along the voxels' axes lies anywhere within one voxel: 0.29 voxel, one standard deviation (a curved one crosses
-//! the voxels at all heights, and is known much better). A plate half a voxel away from where the mesh has it changes strain
-//! and modulus by a percent or two. So each such face gets an offset of its own, with that prior, and is fitted together
-//! with moduli and plates in one Gauss-Newton step on the coarse mesh; its columns are differences of two solutions.
+//! A flat face along the voxels' axes lies anywhere within one voxel: 0.29 voxel, one standard
+//! deviation (a curved one crosses the voxels at all heights, and is known much better). A plate
+//! half a voxel away from where the mesh has it changes strain and modulus by a percent or two. So
+//! each such face gets an offset of its own, with that prior, and is fitted together with moduli
+//! and plates in one Gauss-Newton step on the coarse mesh; its columns are differences of two
+//! solutions.
 //!
-//! Where the surface beside a flat punch is free, strain under its edge is singular, and a thin layer there hangs on where
-//! the edge is. A field tells that to half a voxel at best, and rounds it where it was measured from images. So the edge has an
-//! offset as well, all around.
+//! Where the surface beside a flat punch is free, strain under its edge is singular, and a thin
+//! layer there hangs on where the edge is. A field tells that to half a voxel at best, and rounds
+//! it where it was measured from images. So the edge has an offset as well, all around.
 
 use crate::error::StiffnessError;
 use crate::stiffness::body::Body;
@@ -23,16 +26,18 @@ use crate::types::{Grid, VoxelPoint, WorldPoint};
 const FACE: f64 = 0.288_675;
 /// One standard deviation of the edge of a punch (voxels).
 const EDGE: f64 = 3.0;
-/// One standard deviation with which a mesh keeps to a flat interface (voxels): surfaces are moved by hundredths until volumes agree.
+/// One standard deviation with which a mesh keeps to a flat interface (voxels): surfaces are moved
+/// by hundredths until volumes agree.
 const MESHED: f64 = 0.02;
 /// Free surface beside a punch at least (voxels).
 const BESIDE: f64 = 3.0;
 /// Least part of the box's face that a flat face fills.
 const FLAT: f64 = 0.2;
-/// Samples (components) for each independent one, at least: on a body of a few hundred cubic voxels' size the errors of a
-/// rounded edge reach that far.
+/// Samples (components) for each independent one, at least: on a body of a few hundred cubic
+/// voxels' size the errors of a rounded edge reach that far.
 const DILUTION: f64 = 100.0;
-/// Power of the distance from the middle with which an offset fades inwards: the outermost tenth moves by two thirds or more.
+/// Power of the distance from the middle with which an offset fades inwards: the outermost tenth
+/// moves by two thirds or more.
 const FADE: i32 = 4;
 /// Precision of the solutions (mm).
 const PRECISION: f64 = 1e-6;
@@ -46,8 +51,8 @@ enum Part<'a> {
     Edge(Edge),
     /// A flat border between two labels.
     Interface(&'a Interface),
-    /// The surface of a region that was found without labels: how its shapes move the nodes (mm), which one, and one standard
-    /// deviation (mm).
+    /// The surface of a region that was found without labels: how its shapes move the nodes (mm),
+    /// which one, and one standard deviation (mm).
     Inclusion(&'a [[[f64; 3]; SHAPES]], usize, f64),
 }
 
@@ -61,8 +66,9 @@ impl Part<'_> {
         }
     }
 
-    /// The most standard deviations that it may come to. The mesh rounds the edges in which the walls of a hole meet, which makes it stiffer
-    /// there, and the walls answer for that as well: a channel of 12 by 10 voxels came to 1.5 voxels.
+    /// The most standard deviations that it may come to. The mesh rounds the edges in which the
+    /// walls of a hole meet, which makes it stiffer there, and the walls answer for that as well: a
+    /// channel of 12 by 10 voxels came to 1.5 voxels.
     fn most(self) -> f64 {
         match self {
             Part::Interface(interface) if interface.is_wall() => 6.0,
@@ -105,14 +111,16 @@ impl Part<'_> {
 pub struct Edge {
     middle: [f64; 3],
     normal: [f64; 3],
-    /// Of the punch (mm): of a round one, or between the half side and the half diagonal of a square one.
+    /// Of the punch (mm): of a round one, or between the half side and the half diagonal of a
+    /// square one.
     radius: f64,
     /// Distance from the edge over which the surface beside it gives way (mm).
     beside: f64,
 }
 
 impl Edge {
-    /// None where a patch is curved, or reaches to the end of its side. `voxel` is the least voxel size (mm).
+    /// None where a patch is curved, or reaches to the end of its side. `voxel` is the least voxel
+    /// size (mm).
     pub fn of(patch: &Patch, body: &Body, voxel: f64) -> Option<Self> {
         if patch.curved() {
             return None;
@@ -139,7 +147,8 @@ impl Edge {
         (std::array::from_fn(|a| d[a] - height * self.normal[a]), height)
     }
 
-    /// Where `p` comes to lie when the punch is wider by `offset` (mm) all around: what is below moves less and less.
+    /// Where `p` comes to lie when the punch is wider by `offset` (mm) all around: what is below
+    /// moves less and less.
     pub fn widened(&self, p: [f64; 3], offset: f64) -> [f64; 3] {
         let (across, height) = self.apart(p);
         let beyond = ((length(across) - self.radius) / self.beside).max(0.0);
@@ -152,7 +161,8 @@ impl Edge {
 /// What the offsets change.
 #[derive(Debug, Clone, Default)]
 pub struct Geometry {
-    /// Faces, as `+0` ... by voxel axis, `edge`, and interfaces ([`Interface::name`]), and their offsets outwards or up the axis (voxels).
+    /// Faces, as `+0` ... by voxel axis, `edge`, and interfaces ([`Interface::name`]), and their
+    /// offsets outwards or up the axis (voxels).
     pub faces: Vec<(String, f64)>,
     /// Offsets of the inclusions' shapes (voxels), one inclusion after the other.
     pub shapes: Vec<f64>,
@@ -164,8 +174,8 @@ pub struct Geometry {
     pub force_slope: Vec<f64>,
 }
 
-/// Fits the offsets about an estimate; none when the body has no flat face, no punch and no `interfaces` or `inclusions` whose place or shape
-/// is open.
+/// Fits the offsets about an estimate; none when the body has no flat face, no punch and no
+/// `interfaces` or `inclusions` whose place or shape is open.
 ///
 /// # Errors
 /// As [`Setup::run`].
@@ -184,7 +194,8 @@ pub fn fit(
     parts.extend(borders.into_iter().map(Part::Interface));
     let without_walls = parts.len();
     parts.extend(walls.into_iter().map(Part::Interface));
-    // Labels that are wrong by more than a voxel do not take the faces with them, nor walls the labels.
+    // Labels that are wrong by more than a voxel do not take the faces with them, nor walls the
+    // labels.
     let mut counts = vec![parts.len(), without_walls, without];
     counts.dedup();
     for count in counts {
@@ -195,7 +206,8 @@ pub fn fit(
     Ok(None)
 }
 
-/// How much further outwards the edge of the punch lies (voxels), for all that the data say; none where there is no such edge.
+/// How much further outwards the edge of the punch lies (voxels), for all that the data say; none
+/// where there is no such edge.
 ///
 /// # Errors
 /// As [`Setup::run`].
@@ -245,8 +257,8 @@ fn offsets(
     prior.extend(parts.iter().map(|part| (part.sigma(voxel).powi(-2), moved(part))));
     let scale = setup.scale(&estimate.residuals);
     let weights = setup.weights(&estimate.residuals, scale);
-    // Residuals hang together: as many independent samples as the estimate found, and no more than a model that knows the
-    // surface this badly can claim.
+    // Residuals hang together: as many independent samples as the estimate found, and no more than
+    // a model that knows the surface this badly can claim.
     let dilution = (3.0 * estimate.residuals.len() as f64 / estimate.effective).max(DILUTION);
     let blocks = grouped_normal(setup.observations, &rows, &estimate.residuals, &weights);
     let variance = estimate.squares / (3.0 * estimate.residuals.len() as f64) * dilution;
@@ -271,7 +283,8 @@ fn offsets(
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
     let (mut covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
     let first = p - parts.len();
-    // What the mesh itself is off by, however well the data tell the place: all else follows it as it would another place.
+    // What the mesh itself is off by, however well the data tell the place: all else follows it as
+    // it would another place.
     let by_data = covariance.clone();
     for k in (first..p).filter(|k| matches!(parts[k - first], Part::Interface(_))) {
         let follows: Vec<f64> = (0..p).map(|i| MESHED * by_data[i * p + k] / by_data[k * p + k]).collect();

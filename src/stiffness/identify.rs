@@ -1,8 +1,9 @@
 //! Gauss-Newton on the logarithms of the regions' shear moduli and on the motion of the plates.
 //!
-//! Unknowns are theta_r = ln(mu_r / mu_reference) and six (sliding: three) numbers for each plate. The misfit is the sum of
-//! Huber's rho over the observations, (H u - d) / sigma. One factorisation an iteration gives all sensitivities exactly:
-//! A y = -dR/dtheta for a modulus, A y = K b for a plate's motion b tied by springs K; the rows of the Jacobian are H y.
+//! Unknowns are theta_r = ln(mu_r / mu_reference) and six (sliding: three) numbers for each plate.
+//! The misfit is the sum of Huber's rho over the observations, (H u - d) / sigma. One factorisation
+//! an iteration gives all sensitivities exactly: A y = -dR/dtheta for a modulus, A y = K b for a
+//! plate's motion b tied by springs K; the rows of the Jacobian are H y.
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::{Cholesky, within};
@@ -17,26 +18,33 @@ use crate::stiffness::patches::{Patch, travel};
 use crate::types::space::{dot, length};
 use crate::types::stiffness::{Contact, Law};
 
-/// Steps below this (in ln E, and of the plates over their travel) are taken to first order: what that leaves out is 0.1 %.
+/// Steps below this (in ln E, and of the plates over their travel) are taken to first order: what
+/// that leaves out is 0.1 %.
 const FIRST_ORDER: f64 = 0.03;
-/// A tangent serves while no ln mu changes by more than this: about the relative error of the sensitivities.
+/// A tangent serves while no ln mu changes by more than this: about the relative error of the
+/// sensitivities.
 const SAME_TANGENT: f64 = 0.05;
 /// Under the linear law its factor still refines solutions, and what it serves for is exact.
 const NEAR_TANGENT: f64 = 0.2;
-/// Steps that would lower the squares by less than this part of them are not worth a solution: about a third of a standard
-/// deviation. What the data hardly see (a rigid region) would else wander on.
+/// Steps that would lower the squares by less than this part of them are not worth a solution:
+/// about a third of a standard deviation. What the data hardly see (a rigid region) would else
+/// wander on.
 const SPENT: f64 = 1e-4;
-/// Largest change of ln mu in one step (contrasts of 0.02 to 600 converged from 1, in fewer steps than with half of it).
+/// Largest change of ln mu in one step (contrasts of 0.02 to 600 converged from 1, in fewer steps
+/// than with half of it).
 const LONGEST: f64 = 3.0;
-/// Where a modulus still changes by more than this (ln mu) a forward solution need not be better than [`ROUGH`] times its precision.
+/// Where a modulus still changes by more than this (ln mu) a forward solution need not be better
+/// than [`ROUGH`] times its precision.
 const FAR: f64 = 0.3;
 /// See [`FAR`].
 const ROUGH: f64 = 30.0;
 /// Bound of |ln(mu / mu_reference)| (200): beyond, a region is as good as rigid or empty.
 const BOUND: f64 = 5.3;
-/// Huber's constant (Huber 1981: 95 % efficiency for normal errors), times the root mean square length of three components.
+/// Huber's constant (Huber 1981: 95 % efficiency for normal errors), times the root mean square
+/// length of three components.
 const HUBER: f64 = 1.345;
-/// Standard deviation of the prior of ln mu: weak, it only keeps what the data do not see from wandering.
+/// Standard deviation of the prior of ln mu: weak, it only keeps what the data do not see from
+/// wandering.
 const PRIOR: f64 = 5.0;
 /// Blocks that the body is cut into for the covariance.
 const BLOCKS: f64 = 160.0;
@@ -60,7 +68,8 @@ pub struct Setup<'a> {
     pub reference: usize,
     /// Standard deviation of the prior of the plates' motion about the fitted one (mm).
     pub plate_prior: f64,
-    /// The model's own error (in units of the observations' sigma): no residual is taken to be smaller.
+    /// The model's own error (in units of the observations' sigma): no residual is taken to be
+    /// smaller.
     pub floor: f64,
     /// The edge of a punch, and how far it has been moved outwards (voxels).
     pub edge: Option<(Edge, f64)>,
@@ -96,13 +105,16 @@ pub struct Estimate {
     pub rms: f64,
     /// Sum of the weighted squares (in units of the observations' sigma).
     pub squares: f64,
-    /// The squares as they were over these: less than 1 where no residual was taken to be smaller than the model's own error.
+    /// The squares as they were over these: less than 1 where no residual was taken to be smaller
+    /// than the model's own error.
     pub raw: f64,
     /// How many independent samples (components) the data are worth.
     pub effective: f64,
-    /// Force across the loaded and across the held plate for a reference shear modulus of 1 kPa (kPa mm^2).
+    /// Force across the loaded and across the held plate for a reference shear modulus of 1 kPa
+    /// (kPa mm^2).
     pub force: [f64; 2],
-    /// By how many times the whole force on the loaded plate is more than that, which is its part across the plate (1 at least).
+    /// By how many times the whole force on the loaded plate is more than that, which is its part
+    /// across the plate (1 at least).
     pub leaning: f64,
     /// Derivative of the logarithm of the force on the loaded plate by each parameter.
     pub force_slope: Vec<f64>,
@@ -133,8 +145,9 @@ impl Setup<'_> {
         }
         let slides = |p: &Patch| p.contact == Contact::Sliding;
         if self.patches.iter().all(slides) {
-            // Two frictionless plates leave the body free to move along them: springs as soft as the tissue, to where the
-            // surface was measured to go, hold it and pull next to nothing.
+            // Two frictionless plates leave the body free to move along them: springs as soft as
+            // the tissue, to where the surface was measured to go, hold it and pull next to
+            // nothing.
             for patch in &self.patches {
                 let mut guided = patch.clone();
                 guided.contact = Contact::Guided;
@@ -146,8 +159,8 @@ impl Setup<'_> {
         Problem { plate, ..Problem::new(self.body, self.law, materials, ties) }
     }
 
-    /// Nodes of the facets with which a curved body touches its plate, ascending, and the area of the contact (mm^2); none
-    /// where the patch is flat or sticks.
+    /// Nodes of the facets with which a curved body touches its plate, ascending, and the area of
+    /// the contact (mm^2); none where the patch is flat or sticks.
     pub fn touching(&self, state: &State) -> Option<(Vec<u32>, f64)> {
         let x = state.x.as_deref()?;
         Some(self.problem(state).plate?.contact(self.body, x))
@@ -222,8 +235,9 @@ impl Setup<'_> {
         ties.iter().map(|t| problem.pull(t, x)).fold([0.0; 3], |sum, f| std::array::from_fn(|a| sum[a] + f[a]))
     }
 
-    /// Force (kPa mm^2) with which each plate pushes the body across it (loaded, held). That of a plate on a curved body is what the ties
-    /// hold against it: linear in `x`, so it needs no better solution than that.
+    /// Force (kPa mm^2) with which each plate pushes the body across it (loaded, held). That of a
+    /// plate on a curved body is what the ties hold against it: linear in `x`, so it needs no
+    /// better solution than that.
     pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
         let held = self.reaction(problem, state, x, 0);
         let n = self.patches[1].normal;
@@ -231,7 +245,8 @@ impl Setup<'_> {
         [counter, -dot(held, self.patches[0].normal)]
     }
 
-    /// By how many times the whole force on the loaded plate is more than its part across it (1 at least), told as in `forces`.
+    /// By how many times the whole force on the loaded plate is more than its part across it (1 at
+    /// least), told as in `forces`.
     fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
         let whole = self.reaction(problem, state, x, usize::from(problem.plate.is_none()));
         length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
@@ -273,7 +288,8 @@ impl Setup<'_> {
         moduli + plates
     }
 
-    /// Identifies from `start`; `most` iterations at most, `precision` (mm) of each forward solution.
+    /// Identifies from `start`; `most` iterations at most, `precision` (mm) of each forward
+    /// solution.
     ///
     /// # Errors
     /// [`StiffnessError`] when the forward problem cannot be solved.
@@ -339,7 +355,8 @@ impl Setup<'_> {
                 let shorter: Vec<f64> = step.iter().map(|s| part * s).collect();
                 let trial = self.advanced(&state, &x, &columns, &shorter);
                 let change = trial.theta.iter().zip(&factorised).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-                // A factor that is not good enough goes before the next one is made: two take twice the memory.
+                // A factor that is not good enough goes before the next one is made: two take twice
+                // the memory.
                 tangent.take_if(|_| change > if problem.is_linear() { NEAR_TANGENT } else { SAME_TANGENT });
                 let precision = if change > FAR { ROUGH * precision } else { precision };
                 if let Ok((p, s)) = self.follow(&trial, tangent.take(), problem.springs.clone(), precision) {
@@ -370,8 +387,9 @@ impl Setup<'_> {
         }
     }
 
-    /// Solves from a state nearby, with its tangent where one is given and leads there. The ties keep the tangent's `springs`:
-    /// the force is that times a gap which no step would close that is measured in mm.
+    /// Solves from a state nearby, with its tangent where one is given and leads there. The ties
+    /// keep the tangent's `springs`: the force is that times a gap which no step would close that
+    /// is measured in mm.
     fn follow<'a>(
         &'a self,
         state: &State,
@@ -398,7 +416,8 @@ impl Setup<'_> {
         Ok(columns)
     }
 
-    /// The state a step further: moduli and plates by the step, the solution to first order by its derivatives.
+    /// The state a step further: moduli and plates by the step, the solution to first order by its
+    /// derivatives.
     pub fn advanced(&self, state: &State, x: &[f64], columns: &[f64], step: &[f64]) -> State {
         let mut out = State { x: None, ..state.clone() };
         let mut values = step.iter().copied();
@@ -557,8 +576,9 @@ pub(super) fn grouped_normal(
     grouped(observations).par_iter().map(one).collect()
 }
 
-/// Covariance with residuals that hang together within a block (the sandwich of Liang and Zeger, Biometrika 73, 1986, never
-/// below the plain one), the plain information, and by how much the variances grow on average.
+/// Covariance with residuals that hang together within a block (the sandwich of Liang and Zeger,
+/// Biometrika 73, 1986, never below the plain one), the plain information, and by how much the
+/// variances grow on average.
 pub(super) fn covariance(
     blocks: &[Block],
     prior: &[(f64, f64)],

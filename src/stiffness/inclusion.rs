@@ -1,10 +1,11 @@
 //! A region that was found without labels, with its shape open.
 //!
-//! A map of the modulus tells where a region is, but not to a voxel where it ends; drawn a tenth too small across, a ball came
-//! out a quarter too stiff. So the surface between such a region and the first one is moved along its normal by a sum of nine
-//! functions of the direction from its middle: size, place and flatness (spherical harmonics up to the second degree), fitted
-//! together with the moduli. What is around it gives way less and less. Where the region reaches the surface of the body, it
-//! moves along that surface only.
+//! A map of the modulus tells where a region is, but not to a voxel where it ends; drawn a tenth
+//! too small across, a ball came out a quarter too stiff. So the surface between such a region and
+//! the first one is moved along its normal by a sum of nine functions of the direction from its
+//! middle: size, place and flatness (spherical harmonics up to the second degree), fitted together
+//! with the moduli. What is around it gives way less and less. Where the region reaches the surface
+//! of the body, it moves along that surface only.
 
 use crate::numerics::filters::gaussian;
 use crate::numerics::neighbours::Neighbours;
@@ -16,17 +17,21 @@ use rayon::prelude::*;
 pub const SHAPES: usize = 9;
 /// One standard deviation of each offset before anything is known (parts of the radius).
 const PRIOR: f64 = 0.25;
-/// Least distance (voxels) from another region, and from the surface of the body for a region inside it.
+/// Least distance (voxels) from another region, and from the surface of the body for a region
+/// inside it.
 const CLEAR: f64 = 2.0;
-/// Part of the reach that all offsets together may move the surface by at once: beyond, what is around it would fold.
+/// Part of the reach that all offsets together may move the surface by at once: beyond, what is
+/// around it would fold.
 const ONCE: f64 = 0.4;
-/// Smoothing before a region is drawn anew (voxels): takes out stairs, and moves the surface of a ball of 14 voxels by 0.02.
+/// Smoothing before a region is drawn anew (voxels): takes out stairs, and moves the surface of a
+/// ball of 14 voxels by 0.02.
 const SMOOTHED: f64 = 0.7;
 /// Faces of voxels whose mean is the normal without the stairs.
 const FACES: usize = 32;
 /// The same where the edges of a surface shall not be rounded.
 const FEW: usize = 9;
-/// Length of a mean of normals below which a surface has an edge there, and above which it has none.
+/// Length of a mean of normals below which a surface has an edge there, and above which it has
+/// none.
 const SHARP: [f64; 2] = [0.85, 0.95];
 
 fn apart(p: [f64; 3], q: [f64; 3]) -> [f64; 3] {
@@ -43,8 +48,8 @@ struct Sheet {
 }
 
 impl Sheet {
-    /// From the middles of faces and their normals, each as long as its face is large, with a mean over `count` of these for
-    /// each.
+    /// From the middles of faces and their normals, each as long as its face is large, with a mean
+    /// over `count` of these for each.
     fn new(faces: &[([f64; 3], [f64; 3])], count: usize) -> Self {
         let places: Vec<[f64; 3]> = faces.iter().map(|f| f.0).collect();
         let near = Neighbours::new(&places);
@@ -203,8 +208,8 @@ impl Inclusion {
         values.map(|v| step.map(|n| v * n))
     }
 
-    /// Draws the region anew with its surface moved by all offsets (mm), as far as it may go at once; the other voxels of
-    /// region 1 and of its own take each other's place.
+    /// Draws the region anew with its surface moved by all offsets (mm), as far as it may go at
+    /// once; the other voxels of region 1 and of its own take each other's place.
     pub fn draw(&self, labels: &mut Mask, offsets: &[f64; SHAPES]) {
         let grid = *labels.grid();
         let shape = grid.shape();
@@ -321,7 +326,8 @@ mod tests {
         assert!((z - 1.0).abs() < 0.05 && (x + 0.5).abs() < 0.05, "{z} {x}");
     }
 
-    /// A disc of a radius (voxels) through a plate of 12 voxels of half a millimetre, its axis `at`.
+    /// A disc of a radius (voxels) through a plate of 12 voxels of half a millimetre, its axis
+    /// `at`.
     fn disc(at: [f64; 2], radius: f64) -> Mask {
         let grid = Grid::new([60, 60, 16], Affine::scaled([0.5; 3], [0.0; 3]).unwrap()).unwrap();
         Mask::from_voxels(grid, |o, _| {

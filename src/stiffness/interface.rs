@@ -1,23 +1,27 @@
-//! Flat interfaces between labels: like a flat face of the body, one along the voxels' axes lies anywhere within a voxel.
+//! Flat interfaces between labels: like a flat face of the body, one along the voxels' axes lies
+//! anywhere within a voxel.
 //!
-//! Of a curved or slanted interface the voxels' errors go both ways and cancel; of a flat one they are all alike. A layer is
-//! that much thicker and its neighbour thinner, which strain answers for: between 20 kPa above and below a layer of 1 kPa, a
-//! third of a voxel of 10 made 23 and 18 of the 20. So it is with the walls of a hole in the body, or of a notch: where they were taken
-//! for known, a body with a channel came out 5 to 8 % too soft.
+//! Of a curved or slanted interface the voxels' errors go both ways and cancel; of a flat one they
+//! are all alike. A layer is that much thicker and its neighbour thinner, which strain answers for:
+//! between 20 kPa above and below a layer of 1 kPa, a third of a voxel of 10 made 23 and 18 of
+//! the 20. So it is with the walls of a hole in the body, or of a notch: where they were taken for
+//! known, a body with a channel came out 5 to 8 % too soft.
 
 use crate::types::{Grid, Mask, VoxelPoint, WorldPoint};
 use std::collections::BTreeMap;
 
 /// Least part of the border between two regions, in faces between voxels, that lies in one plane.
 const FLAT: f64 = 0.04;
-/// How many times more of it lies there than in the planes next to it: of a ball about as much, of a cylinder along it 2.4 times.
+/// How many times more of it lies there than in the planes next to it: of a ball about as much, of
+/// a cylinder along it 2.4 times.
 const STANDS_OUT: usize = 4;
 /// Faces between voxels that are fewer say nothing.
 const FEWEST: usize = 16;
 /// So many planes, the largest ones, are looked at: each takes a solution.
 const MOST: usize = 12;
 
-/// A part of the border between two regions, or between one and a hole (label 0), that lies in one plane between voxels.
+/// A part of the border between two regions, or between one and a hole (label 0), that lies in one
+/// plane between voxels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Interface {
     labels: [u8; 2],
@@ -25,7 +29,8 @@ pub struct Interface {
     axis: usize,
     /// Where it lies along that axis (voxels).
     plane: f64,
-    /// From there to what lies next along the axis, downwards and upwards (voxels): another interface or the body's end.
+    /// From there to what lies next along the axis, downwards and upwards (voxels): another
+    /// interface or the body's end.
     reach: [f64; 2],
     /// First and last place along the other two axes, in order (voxels).
     sides: [[f64; 2]; 2],
@@ -114,8 +119,8 @@ impl Interface {
         format!("{}|{} across axis {} at {}", self.labels[0], self.labels[1], self.axis, self.plane)
     }
 
-    /// Where `p` (mm, RAS) comes to lie when the interface moves up its axis by `offset` voxels: what is between it and what lies next
-    /// moves less and less.
+    /// Where `p` (mm, RAS) comes to lie when the interface moves up its axis by `offset` voxels:
+    /// what is between it and what lies next moves less and less.
     pub fn moved(&self, p: [f64; 3], grid: &Grid, offset: f64) -> [f64; 3] {
         let mut q = grid.affine().to_voxel(WorldPoint(p)).0;
         let off = q[self.axis] - self.plane;

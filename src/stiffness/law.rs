@@ -1,14 +1,15 @@
 //! Residual and tangent of one element for either law.
 //!
-//! Both are the stationary point of a functional of displacement u and pressure p (mixed form; lambda = 2 mu nu / (1 - 2 nu)):
+//! Both are the stationary point of a functional of displacement u and pressure p (mixed form;
+//! lambda = 2 mu nu / (1 - 2 nu)):
 //!
 //! ```text
 //! linear:       int mu eps:eps + p div u - p^2 / (2 lambda)
 //! neo-Hookean:  int mu/2 (F:F - 3) - mu ln J + p ln J - p^2 / (2 lambda)
 //! ```
 //!
-//! so the tangent is symmetric. Eliminating p gives W = mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2 (Bonet and Wood, Nonlinear
-//! Continuum Mechanics, 2008, eq. 6.27).
+//! so the tangent is symmetric. Eliminating p gives W = mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2
+//! (Bonet and Wood, Nonlinear Continuum Mechanics, 2008, eq. 6.27).
 
 use crate::numerics::dense::symmetric_eigen;
 use crate::stiffness::body::SIDE;
@@ -167,7 +168,8 @@ pub fn tangent(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> O
     Some(k)
 }
 
-/// The largest principal strain (1) at a point of the element, of the symmetric part of the displacement's gradient, by size.
+/// The largest principal strain (1) at a point of the element, of the symmetric part of the
+/// displacement's gradient, by size.
 pub fn largest_principal_strain(q: &Point, x: &[f64; SIDE]) -> f64 {
     let g = gradient(q, x);
     let strain: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (g[i][j] + g[j][i])));

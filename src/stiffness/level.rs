@@ -50,7 +50,8 @@ pub struct Level {
 }
 
 impl Level {
-    /// Noise of a sample, a mean over its block, in a field that is rough by `noise` a voxel (mm, one component).
+    /// Noise of a sample, a mean over its block, in a field that is rough by `noise` a voxel (mm,
+    /// one component).
     pub fn sample_noise(&self, noise: f64) -> f64 {
         noise / (self.block.max(1) as f64).powf(1.5)
     }
@@ -118,8 +119,9 @@ impl Level {
         }
     }
 
-    /// Makes both meshes of a body agree on which patches are curved: the one with more nodes there knows better, as a
-    /// coarse mesh rounds the rim of a flat face. Unknowns are numbered anew where a plate presses a curved one.
+    /// Makes both meshes of a body agree on which patches are curved: the one with more nodes there
+    /// knows better, as a coarse mesh rounds the rim of a flat face. Unknowns are numbered anew
+    /// where a plate presses a curved one.
     ///
     /// # Errors
     /// As [`Body::new`].
@@ -143,7 +145,8 @@ impl Level {
         self.settle_shape()
     }
 
-    /// What follows from a loaded patch that is flat or curved: the edge of a punch, or the order of elimination (unknowns are numbered anew).
+    /// What follows from a loaded patch that is flat or curved: the edge of a punch, or the order
+    /// of elimination (unknowns are numbered anew).
     ///
     /// # Errors
     /// As [`Body::new`].
@@ -156,13 +159,14 @@ impl Level {
         Ok(())
     }
 
-    /// The edge of the punch where it lies before it is moved; none where the loaded patch is curved.
+    /// The edge of the punch where it lies before it is moved; none where the loaded patch is
+    /// curved.
     fn find_edge(&mut self) {
         self.edge = Edge::of(&self.patches[1], &self.body, self.voxel).map(|edge| (edge, 0.0));
     }
 
-    /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere, an edge of the punch that
-    /// makes the patch as large.
+    /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere,
+    /// an edge of the punch that makes the patch as large.
     ///
     /// # Errors
     /// As [`Body::new`].
@@ -195,7 +199,8 @@ impl Level {
             patches: self.patches.clone(),
             observations: &self.observations,
             reference,
-            // The surface motion is extrapolated by half a voxel; the plate may be off by as much of the motion's change.
+            // The surface motion is extrapolated by half a voxel; the plate may be off by as much
+            // of the motion's change.
             plate_prior: 0.25 * self.voxel + 3.0 * self.surface_error,
             floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
             edge: self.edge,

@@ -68,8 +68,8 @@ pub fn node_displacement(body: &Body, state: &State) -> Vec<[f64; 3]> {
     (0..body.places.len() as u32).map(|n| body.displacement(x, n)).collect()
 }
 
-/// What the patches prescribe: the ties, and of the nodes with which a curved patch touches its plate the solution.
-/// `touching` are these for each patch.
+/// What the patches prescribe: the ties, and of the nodes with which a curved patch touches its
+/// plate the solution. `touching` are these for each patch.
 pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2]) -> Vec<Prescribed> {
     let mut out = Vec::new();
     for (number, (patch, touching)) in (0u8..).zip(setup.patches.iter().zip(touching)) {
@@ -92,8 +92,8 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2
 /// Excess of the whole force over its part across the plate from which it is said.
 const LEANING: f64 = 0.01;
 
-/// Says so where the plate also pushes the body sideways, so that it matters which force is known; `whole` is it over its part
-/// across the plate.
+/// Says so where the plate also pushes the body sideways, so that it matters which force is known;
+/// `whole` is it over its part across the plate.
 pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
     (whole > 1.0 + LEANING).then(|| {
         format!(
@@ -119,7 +119,8 @@ pub fn left_over(left: LeftOver) -> Option<String> {
 /// Part of the plates' motion that the model may leave over without a word.
 const LEFT: f64 = 0.1;
 
-/// What of the field was left out, and whether the model leaves over much more than its noise (mm, of a voxel).
+/// What of the field was left out, and whether the model leaves over much more than its noise (mm,
+/// of a voxel).
 pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &Estimate, noise: f64) -> Vec<String> {
     let mut out = Vec::new();
     let body = labels.as_slice().iter().enumerate().filter(|(_, l)| **l > 0);
@@ -149,17 +150,21 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &
     out
 }
 
-/// The part of the plates' motion from which it is said to be much. Phantoms with the right assumptions, the linear law among them, leave 0.003 to
-/// 0.015, layers from images 0.02, fingertips from images 0.03 to 0.04 (these are warned of). A body of which a part was cut off leaves 0.08, one
-/// beside a wall that was not modelled 0.06, one label over a ball five times as stiff 0.027.
+/// The part of the plates' motion from which it is said to be much. Phantoms with the right
+/// assumptions, the linear law among them, leave 0.003 to 0.015, layers from images 0.02,
+/// fingertips from images 0.03 to 0.04 (these are warned of). A body of which a part was cut off
+/// leaves 0.08, one beside a wall that was not modelled 0.06, one label over a ball five times as
+/// stiff 0.027.
 const MUCH: f64 = 0.025;
-/// The least misfit over the noise of a sample that stands out of it: together they are then 1.03 times that noise.
+/// The least misfit over the noise of a sample that stands out of it: together they are then 1.03
+/// times that noise.
 const ROUGH: f64 = 0.25;
 
 /// Part of the surface that may lie on the volume's border without a word.
 const CUT_OFF: f64 = 0.02;
 
-/// Says so where the body ends with the volume, away from the patches: nobody knows what pulls there.
+/// Says so where the body ends with the volume, away from the patches: nobody knows what pulls
+/// there.
 fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
     let (body, grid) = (&level.body, labels.grid());
     let patches: HashSet<usize> = level.patches.iter().flat_map(|p| p.facets.iter().copied()).collect();
@@ -275,12 +280,15 @@ pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usiz
 
 /// Held over loaded area below which it is asked whether they were mistaken for each other.
 const SMALL: f64 = 0.1;
-/// Part of a patch's area that may move with it beside it without a word: its rim is known to a voxel.
+/// Part of a patch's area that may move with it beside it without a word: its rim is known to a
+/// voxel.
 const BESIDE: f64 = 0.07;
-/// Thickness (voxels) from which a field measured from images resolves a region: two of its lattice's steps.
+/// Thickness (voxels) from which a field measured from images resolves a region: two of its
+/// lattice's steps.
 const RESOLVED: usize = 8;
 
-/// Thickness of a region where it is thickest (voxels): of each of its voxels the shortest run through it along an axis of the grid.
+/// Thickness of a region where it is thickest (voxels): of each of its voxels the shortest run
+/// through it along an axis of the grid.
 fn thickness(labels: &Mask, label: u8) -> usize {
     let (shape, inside) = (labels.grid().shape(), labels.as_slice());
     let mut shortest = vec![u16::MAX; inside.len()];

@@ -1,8 +1,10 @@
-//! Young's modulus from a displacement field: finite elements, identification, uncertainty, choice of model.
+//! Young's modulus from a displacement field: finite elements, identification, uncertainty, choice
+//! of model.
 //!
-//! Promises: exact sensitivities; results that do not depend on the number of threads; a region that the data cannot see is
-//! said to be so. Needs a mesh whose elements lie in one region each, a field that covers it, and two patches of the
-//! surface that move against each other. Fails with a [`StiffnessError`](crate::error::StiffnessError).
+//! Promises: exact sensitivities; results that do not depend on the number of threads; a region
+//! that the data cannot see is said to be so. Needs a mesh whose elements lie in one region each, a
+//! field that covers it, and two patches of the surface that move against each other. Fails with a
+//! [`StiffnessError`](crate::error::StiffnessError).
 
 pub mod elements;
 

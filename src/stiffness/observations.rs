@@ -23,7 +23,8 @@ const SIDES: [[f64; 3]; 4] = [[-1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 
 /// An element and the weights of its nodes.
 pub type Reading = (u32, [f64; 10]);
 
-/// A measured displacement: at a place, or the mean over a block of voxels or a match's patch about it.
+/// A measured displacement: at a place, or the mean over a block of voxels or a match's patch about
+/// it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
     /// Where (mm, RAS); the middle of the block or patch.
@@ -90,7 +91,8 @@ fn mean(found: &[Reading]) -> Vec<Reading> {
     out
 }
 
-/// The element that holds each place (mm, RAS) and the shape functions there; none outside the body.
+/// The element that holds each place (mm, RAS) and the shape functions there; none outside the
+/// body.
 pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for p in &body.places {
@@ -164,15 +166,15 @@ fn located(body: &Body, observations: Vec<Observation>) -> Vec<Observation> {
     observations.into_iter().zip(found).filter_map(join).collect()
 }
 
-/// How far from the middle of a block of voxels, along each axis and in voxels, lie four corners of a cube that have the
-/// block's mean and second moments.
+/// How far from the middle of a block of voxels, along each axis and in voxels, lie four corners of
+/// a cube that have the block's mean and second moments.
 fn spread(block: usize) -> f64 {
     ((block * block - 1) as f64 / 12.0).sqrt()
 }
 
-/// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The second value is the number of
-/// voxels along a block's edge. The model's mean is taken as well: where strain changes, that is not the displacement at the
-/// middle.
+/// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The
+/// second value is the number of voxels along a block's edge. The model's mean is taken as well:
+/// where strain changes, that is not the displacement at the middle.
 pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Observation>, usize) {
     let grid = field.grid();
     let [nx, ny, nz] = grid.shape();
@@ -220,9 +222,10 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
 
 /// The kept matches that lie in the body, as means over their patches.
 ///
-/// A match is sought in the deformed volume warped by the field, so it is the field at its place and the mean over its patch of what
-/// the field is short of. With the field's mean over the patch in place of the field at its place it is the mean of the displacement,
-/// which a model's mean is held against. Of a patch that reaches past the body only what lies in it counts.
+/// A match is sought in the deformed volume warped by the field, so it is the field at its place
+/// and the mean over its patch of what the field is short of. With the field's mean over the patch
+/// in place of the field at its place it is the mean of the displacement, which a model's mean is
+/// held against. Of a patch that reaches past the body only what lies in it counts.
 pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField) -> Vec<Observation> {
     let grid = field.grid();
     let finest = grid.least_spacing();
@@ -273,8 +276,9 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
     patches.filter_map(one).collect()
 }
 
-/// The field and its standard error (mm, a component) at a place of the surface: an affine fit to the voxels of the mask
-/// within `reach` voxels, so that nothing outside the body is read and noise is averaged.
+/// The field and its standard error (mm, a component) at a place of the surface: an affine fit to
+/// the voxels of the mask within `reach` voxels, so that nothing outside the body is read and noise
+/// is averaged.
 pub fn at_surface(field: &Displacement<'_>, mask: &Mask, p: [f64; 3], reach: f64) -> Option<([f64; 3], f64)> {
     let grid = field.grid();
     let (shape, at) = (grid.shape(), grid.affine().to_voxel(WorldPoint(p)).0);

@@ -1,11 +1,13 @@
-//! Where the body is held and pressed, found on its surface from the measured motion, and what is prescribed there.
+//! Where the body is held and pressed, found on its surface from the measured motion, and what is
+//! prescribed there.
 //!
-//! A **held** base is the flat end of the undeformed body on that side. A **loaded** patch is what comes to lie on one plane:
-//! the surface that is pushed in the furthest gives the plane, by least squares on its deformed places, and the patch is
-//! the surface that ends within a tolerance of it. On a curved body that is where the contact is looked for first only: a
-//! plate that nothing goes through, and that pulls nothing, finds it with the solution ([`crate::stiffness::plate`]). The
-//! displacement of a patch is that of a plate, six numbers fitted to all its nodes, and these are fitted again with the moduli:
-//! no node's own noise is imposed on the solution.
+//! A **held** base is the flat end of the undeformed body on that side. A **loaded** patch is what
+//! comes to lie on one plane: the surface that is pushed in the furthest gives the plane, by least
+//! squares on its deformed places, and the patch is the surface that ends within a tolerance of it.
+//! On a curved body that is where the contact is looked for first only: a plate that nothing goes
+//! through, and that pulls nothing, finds it with the solution ([`crate::stiffness::plate`]). The
+//! displacement of a patch is that of a plate, six numbers fitted to all its nodes, and these are
+//! fitted again with the moduli: no node's own noise is imposed on the solution.
 
 use crate::error::StiffnessError;
 use crate::numerics::dense::{solve, symmetric_eigen};
@@ -22,7 +24,8 @@ use rayon::prelude::*;
 
 /// Voxels around a surface node that are read for its motion.
 const REACH: f64 = 3.0;
-/// Voxels that are read to tell whether a node touches the plate: fewer, as the edge of a punch is sharp.
+/// Voxels that are read to tell whether a node touches the plate: fewer, as the edge of a punch is
+/// sharp.
 const NEAR: f64 = 1.8;
 
 /// Noise of that (voxels) beyond which it tells a touch worse than a reading from further around.
@@ -53,7 +56,8 @@ impl Place {
     }
 }
 
-/// The measured displacement of the surface nodes (by node number) and its typical standard error (mm).
+/// The measured displacement of the surface nodes (by node number) and its typical standard error
+/// (mm).
 #[derive(Debug, Clone)]
 pub struct SurfaceMotion {
     /// Displacement (mm, RAS); none where the field gives nothing.
@@ -109,9 +113,11 @@ pub struct Patch {
     pub rigid: [f64; 6],
     /// How it touches.
     pub contact: Contact,
-    /// For each node the tangential motion besides the rigid one (mm), a quadratic fit; used by [`Contact::Guided`].
+    /// For each node the tangential motion besides the rigid one (mm), a quadratic fit; used by
+    /// [`Contact::Guided`].
     guided: Vec<[f64; 3]>,
-    /// For each node the motion besides the plate's (mm) of one that lies a little inside of a flat face, on its rounded rim.
+    /// For each node the motion besides the plate's (mm) of one that lies a little inside of a flat
+    /// face, on its rounded rim.
     rim: Vec<[f64; 3]>,
     /// Root mean square distance of the nodes' motion from rigid along the normal and across (mm).
     pub residual: [f64; 2],
@@ -119,7 +125,8 @@ pub struct Patch {
     landing: Option<Landing>,
     /// Whether it takes more than the plate's motion to bring it there.
     bends: bool,
-    /// Area (mm^2) of the surface beside a patch given by a mask that lies on its plane and moves with it.
+    /// Area (mm^2) of the surface beside a patch given by a mask that lies on its plane and moves
+    /// with it.
     pub beside: f64,
 }
 
@@ -128,7 +135,8 @@ pub struct Patch {
 struct Landing {
     /// Where it is.
     plane: Plane,
-    /// Facets that may touch it (numbers in [`Body::surface`]): what was not seen to pass beside it.
+    /// Facets that may touch it (numbers in [`Body::surface`]): what was not seen to pass beside
+    /// it.
     facets: Vec<usize>,
 }
 
@@ -186,8 +194,9 @@ impl Patch {
         self.nodes.iter().enumerate().flat_map(one).collect()
     }
 
-    /// The plate that a curved patch slides along, for plate parameters `change` from the fitted motion; none where the patch
-    /// is flat or sticks. `modulus` (kPa) is the shear modulus of an element.
+    /// The plate that a curved patch slides along, for plate parameters `change` from the fitted
+    /// motion; none where the patch is flat or sticks. `modulus` (kPa) is the shear modulus of an
+    /// element.
     pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<plate::Plate> {
         let Landing { plane: (q, _), facets } = self.landed().filter(|_| self.contact != Contact::Sticking)?;
         let stiffness = plate::STIFF * self.backing(body, modulus) / self.area(body);
@@ -217,7 +226,8 @@ impl Patch {
         self.landing.as_ref().filter(|_| self.bends)
     }
 
-    /// Nodes that may touch the plate, where it is curved: those that were seen to, and of the facets beside them (ascending).
+    /// Nodes that may touch the plate, where it is curved: those that were seen to, and of the
+    /// facets beside them (ascending).
     pub fn near_contact(&self, body: &Body) -> Option<Vec<u32>> {
         let Landing { facets, .. } = self.landed()?;
         let touches = |n: &u32| self.nodes.binary_search(n).is_ok();
@@ -225,13 +235,14 @@ impl Patch {
         Some(sorted(self.nodes.iter().copied().chain(beside.flatten())))
     }
 
-    /// Takes over from the same patch of another mesh whether it is curved: near the limit, facets that end elsewhere say
-    /// otherwise, and the two would solve different problems.
+    /// Takes over from the same patch of another mesh whether it is curved: near the limit, facets
+    /// that end elsewhere say otherwise, and the two would solve different problems.
     pub fn bend_like(&mut self, other: &Self) {
         self.bends = other.curved();
     }
 
-    /// How far inwards its foremost place goes (mm): the largest motion of its nodes against the normal.
+    /// How far inwards its foremost place goes (mm): the largest motion of its nodes against the
+    /// normal.
     pub fn travelled(&self, body: &Body) -> f64 {
         let inward = |p: [f64; 3]| match self.landed() {
             Some(Landing { plane: (q, normal), .. }) => dot(sub(p, *q), *normal),
@@ -279,8 +290,8 @@ pub fn travel([held, load]: &[Patch; 2]) -> [f64; 3] {
     std::array::from_fn(|a| load.rigid[a] - held.rigid[a])
 }
 
-/// Finds the held and the loaded patch. `voxel` is the least voxel size (mm); `outline` that of a punch on the loaded side, where
-/// it is known.
+/// Finds the held and the loaded patch. `voxel` is the least voxel size (mm); `outline` that of a
+/// punch on the loaded side, where it is known.
 ///
 /// # Errors
 /// [`StiffnessError::Patch`] for a patch without surface, [`StiffnessError::NoLoad`] when they do not move against each other.
@@ -377,8 +388,9 @@ fn moving_with(body: &Body, motion: &SurfaceMotion, patch: &Patch, voxel: f64) -
     others.map(|facet| facet.area * part(facet)).sum()
 }
 
-/// The mesh rounds the rim of a flat face by a part of a voxel, so its nodes lie inside of the plate's plane. They do not move
-/// as the plate but as tissue at that depth, to first order: between the two plates in proportion.
+/// The mesh rounds the rim of a flat face by a part of a voxel, so its nodes lie inside of the
+/// plate's plane. They do not move as the plate but as tissue at that depth, to first order:
+/// between the two plates in proportion.
 fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
     let height = |p: [f64; 3]| dot(sub(p, patch.middle), patch.normal);
     let mut all: Vec<f64> = patch.nodes.iter().map(|&n| height(body.places[n as usize])).collect();
@@ -397,11 +409,13 @@ fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
     patch.rim = patch.nodes.iter().map(lag).collect();
 }
 
-/// Part of what faces a side from which its end is a flat face: of a ball of 20 voxels a sixth lies within a voxel of its end.
+/// Part of what faces a side from which its end is a flat face: of a ball of 20 voxels a sixth lies
+/// within a voxel of its end.
 const FLAT: f64 = 0.6;
 
-/// Facets whose nodes lie within a voxel of the end of the undeformed body. Of a flat face those of which half do: where the body lies
-/// askew in its voxels the mesh rounds its rims, and as a whole only 1,034 of 1,440 mm^2 of a base turned by 35 degrees lay there.
+/// Facets whose nodes lie within a voxel of the end of the undeformed body. Of a flat face those of
+/// which half do: where the body lies askew in its voxels the mesh rounds its rims, and as a whole
+/// only 1,034 of 1,440 mm^2 of a base turned by 35 degrees lay there.
 pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
     let d = side.direction();
     let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > 0.7).collect();
@@ -440,12 +454,14 @@ fn facets_within(body: &Body, side: Side, outline: &Outline) -> Vec<usize> {
 /// A plane: a point (mm) and its outward unit normal.
 type Plane = ([f64; 3], [f64; 3]);
 
-/// Steps in which nodes off a common plane are left out, at most, and the part that stays in each (as Rousseeuw and Van Driessen 1999).
+/// Steps in which nodes off a common plane are left out, at most, and the part that stays in each
+/// (as Rousseeuw and Van Driessen 1999).
 const CONCENTRATIONS: usize = 5;
 /// See [`CONCENTRATIONS`].
 const KEPT: f64 = 0.75;
 
-/// The facets that come to lie on the plane of those pushed in the furthest, that plane, and how far they went in (mm).
+/// The facets that come to lie on the plane of those pushed in the furthest, that plane, and how
+/// far they went in (mm).
 fn pressed_facets(
     body: &Body,
     motion: &SurfaceMotion,
@@ -472,7 +488,8 @@ fn pressed_facets(
         return Some((Vec::new(), None, most));
     }
     let tolerance = on_plane(voxel, motion.sharp_error);
-    // A rounded rim ends far below a face that is coarsely meshed, and draws the plane down with it: then what lies together comes first.
+    // A rounded rim ends far below a face that is coarsely meshed, and draws the plane down with
+    // it: then what lies together comes first.
     for _ in 0..CONCENTRATIONS {
         let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
         let found = fit_plane(&ends, d)?;
@@ -501,7 +518,8 @@ fn pressed_facets(
             return Some((Vec::new(), None, most));
         }
     }
-    // The rim of a flat face is rounded in the mesh: it ends a little short of the plane, but moves with the plate.
+    // The rim of a flat face is rounded in the mesh: it ends a little short of the plane, but moves
+    // with the plate.
     let (middle, count) = (mean_place(body, &chosen), chosen.len() as f64);
     let spread: f64 = chosen.iter().map(|&n| square(sub(body.places[n as usize], middle))).sum::<f64>() / count;
     let radius = spread.sqrt().max(voxel);
@@ -519,7 +537,8 @@ fn pressed_facets(
     chosen.sort_unstable();
     chosen.dedup();
     let on = |n: &u32| chosen.binary_search(n).is_ok();
-    // On a coarse mesh hardly a facet of a small contact lies on the plane as a whole; what to add and to let go is told later.
+    // On a coarse mesh hardly a facet of a small contact lies on the plane as a whole; what to add
+    // and to let go is told later.
     let with = |least: usize| -> Vec<usize> {
         let enough = |f: &usize| body.surface[*f].nodes.iter().filter(|n| on(n)).count() >= least;
         facing.iter().copied().filter(enough).collect()
@@ -654,7 +673,8 @@ fn bent(
     let tolerance = on_plane(voxel, motion.error);
     let bend = |&n: &u32| {
         let p = body.places[n as usize];
-        // The rim of a flat face is rounded in the mesh: it ends short of the plane and moves with the plate as it is.
+        // The rim of a flat face is rounded in the mesh: it ends short of the plane and moves with
+        // the plate as it is.
         let on = beyond(body, motion, plane, n).is_some_and(|h| h.abs() < tolerance);
         if on { dot(sub(sub(q, p), rigid(p)), normal).abs() } else { 0.0 }
     };
@@ -668,7 +688,8 @@ fn facets_before(body: &Body, motion: &SurfaceMotion, plane: Plane, voxel: f64) 
     (0..body.surface.len()).filter(|&f| body.surface[f].nodes.iter().all(may)).collect()
 }
 
-/// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers weighted down.
+/// Translation and rotation by least squares (Gauss-Newton on the exact rotation), far outliers
+/// weighted down.
 fn fit_rigid(seen: &[([f64; 3], [f64; 3])], middle: [f64; 3], radius: f64) -> Option<[f64; 6]> {
     let mut rigid = [0.0; 6];
     for _ in 0..8 {
@@ -702,7 +723,8 @@ fn fit_rigid(seen: &[([f64; 3], [f64; 3])], middle: [f64; 3], radius: f64) -> Op
     Some(rigid)
 }
 
-/// A quadratic polynomial of the place in the patch's plane, fitted to the part of the motion across `normal`.
+/// A quadratic polynomial of the place in the patch's plane, fitted to the part of the motion
+/// across `normal`.
 fn fit_quadratic(
     rest: &[([f64; 3], [f64; 3])],
     middle: [f64; 3],

@@ -1,9 +1,11 @@
-//! A flat plate without friction against a surface, and force over depth of a body of known moduli under one.
+//! A flat plate without friction against a surface, and force over depth of a body of known moduli
+//! under one.
 //!
-//! Where the surface would go through the plate, a pressure that grows with how far it does holds it back (Wriggers,
-//! Computational Contact Mechanics, 2006, ch. 6), at points within each facet, so that the contact grows evenly. The plate is
-//! as soft as Newton's method needs it, and its own squeeze, the mean penetration by force, is taken off the depth.
-//! The curve ends where no equilibrium is found.
+//! Where the surface would go through the plate, a pressure that grows with how far it does holds
+//! it back (Wriggers, Computational Contact Mechanics, 2006, ch. 6), at points within each facet,
+//! so that the contact grows evenly. The plate is as soft as Newton's method needs it, and its own
+//! squeeze, the mean penetration by force, is taken off the depth. The curve ends where no
+//! equilibrium is found.
 
 use crate::error::StiffnessError;
 use crate::stiffness::body::{Body, Facet, SIDE, sorted};
@@ -13,7 +15,8 @@ use crate::stiffness::patches::base_facets;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, Side};
 
-/// Pressure for a penetration of one element's size, over the shear modulus of what is touched (of a press: the softest part).
+/// Pressure for a penetration of one element's size, over the shear modulus of what is touched (of
+/// a press: the softest part).
 pub const STIFF: f64 = 50.0;
 /// Penetration over which a plate comes to its stiffness (parts of an element's size).
 const ONSET: f64 = 0.02;
@@ -70,8 +73,8 @@ fn shapes() -> [[f64; 6]; POINTS] {
 }
 
 impl Plate {
-    /// A plate that just touches those facets of the body that face it. `stiffness`: pressure for a penetration of one
-    /// element's size (kPa).
+    /// A plate that just touches those facets of the body that face it. `stiffness`: pressure for a
+    /// penetration of one element's size (kPa).
     pub fn touching<'a>(
         body: &'a Body,
         facets: impl Iterator<Item = &'a Facet>,
@@ -97,7 +100,8 @@ impl Plate {
         heights.fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Displacements under which the nodes of `touching` (ascending) touch it, and no others that face it: what contact is sought from.
+    /// Displacements under which the nodes of `touching` (ascending) touch it, and no others that
+    /// face it: what contact is sought from.
     pub(super) fn guess(&self, body: &Body, touching: &[u32]) -> Vec<f64> {
         let mut x = vec![0.0; body.pattern.unknowns()];
         for n in sorted(self.spots.iter().flat_map(|s| s.nodes)) {
@@ -115,8 +119,9 @@ impl Plate {
         Self { height: height + part * (self.height - height), tilt: self.tilt.map(|t| part * t), ..self.clone() }
     }
 
-    /// Calls `pushed` with each facet that touches: its element, its nodes among the element's, and of each point in touch the
-    /// shape functions, the penetration (mm), the pressure times its area (kPa mm^2) and the derivative of that (kPa mm).
+    /// Calls `pushed` with each facet that touches: its element, its nodes among the element's, and
+    /// of each point in touch the shape functions, the penetration (mm), the pressure times its
+    /// area (kPa mm^2) and the derivative of that (kPa mm).
     fn touched(&self, body: &Body, x: &[f64], mut pushed: impl FnMut(&Spot, &[f64; 6], [f64; 3])) {
         let shapes = shapes();
         for spot in &self.spots {
@@ -167,7 +172,8 @@ impl Plate {
         });
     }
 
-    /// Forces on the body's nodes for a plate that moves along its normal by `motion` (mm) of the place.
+    /// Forces on the body's nodes for a plate that moves along its normal by `motion` (mm) of the
+    /// place.
     pub(super) fn moved(&self, body: &Body, x: &[f64], motion: impl Fn([f64; 3]) -> f64) -> Vec<f64> {
         let mut out = vec![0.0; body.pattern.unknowns()];
         self.touched(body, x, |spot, shape, [_, _, slope]| {
@@ -222,8 +228,9 @@ pub fn base(body: &Body, side: Side, voxel: f64) -> Vec<u32> {
 }
 
 impl Press<'_> {
-    /// Indentation (mm) and force (N) of the plate at about each of `depths` (mm, rising) beyond its first touch, by the
-    /// neo-Hookean law; fewer where the body is pressed further than an equilibrium is found.
+    /// Indentation (mm) and force (N) of the plate at about each of `depths` (mm, rising) beyond
+    /// its first touch, by the neo-Hookean law; fewer where the body is pressed further than an
+    /// equilibrium is found.
     ///
     /// # Errors
     /// [`StiffnessError`] when not even the first depth can be solved.

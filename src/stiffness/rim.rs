@@ -1,7 +1,9 @@
-//! The rim of a flat punch on the surface around it: where the mesh must be fine, and where its faces must end.
+//! The rim of a flat punch on the surface around it: where the mesh must be fine, and where its
+//! faces must end.
 //!
-//! Under the edge of a punch strain has a singularity, and what is near it (a thin skin) hangs on where that edge is. So it is
-//! looked for among the surface voxels: those that moved with the plate next to those that did not.
+//! Under the edge of a punch strain has a singularity, and what is near it (a thin skin) hangs on
+//! where that edge is. So it is looked for among the surface voxels: those that moved with the
+//! plate next to those that did not.
 
 use crate::numerics::dense::solve;
 use crate::numerics::statistics::percentile;
@@ -23,8 +25,8 @@ const RAYS: usize = 256;
 const SEEN: [f64; 2] = [1.0, 6.0];
 /// Half of the arc over which the outline's distance is the median (voxels).
 const ARC: f64 = 1.5;
-/// How far the outline may lie from the last voxel that moved with the punch (voxels): in noise much counts as moving with it that lies
-/// beside it.
+/// How far the outline may lie from the last voxel that moved with the punch (voxels): in noise
+/// much counts as moving with it that lies beside it.
 const OFF: f64 = 3.0;
 /// Times that the outline is fitted, each from where the one before put it.
 const ROUNDS: usize = 4;
@@ -79,7 +81,8 @@ impl Outline {
 
 /// The rim of `patch`; empty for a patch on a curved surface, and where the whole side is pressed.
 ///
-/// A voxel's motion is read from those within `reach` (voxels), and is that of the plate within `tolerance` (mm).
+/// A voxel's motion is read from those within `reach` (voxels), and is that of the plate within
+/// `tolerance` (mm).
 pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f64, reach: f64) -> Rim {
     if patch.curved() {
         return Rim::default();
@@ -101,7 +104,8 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
         at
     };
     let width = shape[u];
-    // For each column the outermost voxel of the body, and by how much it moved otherwise than the plate (mm).
+    // For each column the outermost voxel of the body, and by how much it moved otherwise than the
+    // plate (mm).
     let column = |c: usize| {
         let (i, j) = (c % width, c / width);
         let mut all = 0..shape[axis];
@@ -175,11 +179,13 @@ struct Face {
 }
 
 impl Face {
-    /// Distance of the punch's edge from `middle` (columns) in each direction (mm); none where the middle is not below it.
+    /// Distance of the punch's edge from `middle` (columns) in each direction (mm); none where the
+    /// middle is not below it.
     ///
-    /// Beside the edge of a punch the surface gives way as the root of the distance (Johnson, Contact Mechanics, 1985, sec. 2.8), so
-    /// the square of that begins as a straight line where the punch ends; a parabola takes up the bend further out. It is fitted
-    /// to each direction by itself, and where noise leaves the edge open to those over an arc at once.
+    /// Beside the edge of a punch the surface gives way as the root of the distance (Johnson,
+    /// Contact Mechanics, 1985, sec. 2.8), so the square of that begins as a straight line where
+    /// the punch ends; a parabola takes up the bend further out. It is fitted to each direction by
+    /// itself, and where noise leaves the edge open to those over an arc at once.
     fn outline(&self, middle: [f64; 2]) -> Option<Vec<f64>> {
         let step = 0.5 * self.spacing[0].min(self.spacing[1]);
         let voxel = 2.0 * step;
@@ -258,8 +264,8 @@ impl Face {
     }
 }
 
-/// Where the parabola through `samples` (place from about there, value) is 0 and rises, next to 0, and how far that is open: one standard
-/// deviation, as if all samples were independent.
+/// Where the parabola through `samples` (place from about there, value) is 0 and rises, next to 0,
+/// and how far that is open: one standard deviation, as if all samples were independent.
 fn zero(samples: &[[f64; 2]]) -> Option<(f64, f64)> {
     if samples.len() < 6 {
         return None;
@@ -306,8 +312,8 @@ fn voted(short: &[Option<(usize, f64)>], c: usize, width: usize, tolerance: f64)
     Some((top, 2 * with > all))
 }
 
-/// Columns that a punch leaves free: in patches that are wide and stay well behind it. A corner that is badly read, or noise
-/// that hangs together, is neither.
+/// Columns that a punch leaves free: in patches that are wide and stay well behind it. A corner
+/// that is badly read, or noise that hangs together, is neither.
 fn clear_of(
     columns: &[Option<(usize, bool)>],
     short: &[Option<(usize, f64)>],
@@ -366,8 +372,9 @@ mod tests {
         assert_eq!(clear(|i, _| if i < 8 { 0.3 } else { 0.0 }), 160);
     }
 
-    /// The outline that is found of a punch whose edge lies `far` (columns) beyond a place on a face of 60 by 50 columns of
-    /// 0.5 by 0.6 mm; the surface gives way as the root of that, and a little less further away.
+    /// The outline that is found of a punch whose edge lies `far` (columns) beyond a place on a
+    /// face of 60 by 50 columns of 0.5 by 0.6 mm; the surface gives way as the root of that, and a
+    /// little less further away.
     fn outline(far: impl Fn([f64; 2]) -> f64, noise: f64) -> Vec<f64> {
         outline_of(far, noise, 0.3)
     }
@@ -404,7 +411,8 @@ mod tests {
         }
     }
 
-    /// In many directions no edge was seen, and what counted as moving with the punch was kept: the area was 30 % too large here.
+    /// In many directions no edge was seen, and what counted as moving with the punch was kept: the
+    /// area was 30 % too large here.
     #[test]
     fn noise_does_not_widen_the_outline_of_a_punch() {
         let far = |[i, j]: [f64; 2]| ((0.5 * (i - 29.1)).hypot(0.6 * (j - 25.2)) - 8.2) / 0.5;

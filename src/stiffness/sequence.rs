@@ -1,24 +1,26 @@
 //! One stiffness map from many frames.
 //!
-//! Tissue keeps its moduli while it moves, so frames are measurements of the same numbers. The noise of each frame is its own:
-//! means of ln E weighted by the inverse variance lower it, as a joint fit would to first order. What frames have in common
-//! (mesh, interfaces, where the surface is) does not fall, and counts for more in frames that move less. Where frames differ by more than
-//! both explain, their own part is raised by the root of chi^2 per degree of freedom (Birge 1932).
+//! Tissue keeps its moduli while it moves, so frames are measurements of the same numbers. The
+//! noise of each frame is its own: means of ln E weighted by the inverse variance lower it, as a
+//! joint fit would to first order. What frames have in common (mesh, interfaces, where the surface
+//! is) does not fall, and counts for more in frames that move less. Where frames differ by more
+//! than both explain, their own part is raised by the root of chi^2 per degree of freedom (Birge
+//! 1932).
 
 use crate::types::stiffness::{Gain, RegionStiffness};
 
 /// Least relative standard deviation of one frame that is believed.
 const LEAST: f64 = 1e-4;
 
-/// Common parts that differ by less than this factor count as the same: how large they are is itself known to about a tenth, and the
-/// frame that claims the least would count alone.
+/// Common parts that differ by less than this factor count as the same: how large they are is
+/// itself known to about a tenth, and the frame that claims the least would count alone.
 const ALIKE: f64 = 1.1;
 
 /// What a frame says of a region, and its mean motion (mm).
 pub type Said<'a> = (&'a RegionStiffness, f64);
 
-/// Combines what frames say of one region, in the order given; element 1 of `which` is the ratio, 0 the modulus. The last
-/// entry holds all frames; empty where none determines the region.
+/// Combines what frames say of one region, in the order given; element 1 of `which` is the ratio, 0
+/// the modulus. The last entry holds all frames; empty where none determines the region.
 pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
     let value = |r: &RegionStiffness| [r.youngs_modulus, r.ratio][which];
     let one = |&(r, motion): &Said<'_>| {
@@ -32,8 +34,9 @@ pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
     (1..=seen.len()).map(|n| gain(&seen[..n])).collect()
 }
 
-/// Puts what the common parts are by the frames' motion in the place of what each frame claims: a power of it from -1 (errors of
-/// so many mm) to 0 (of so many per cent) by least squares of logarithms, and the same for frames that differ by [`ALIKE`].
+/// Puts what the common parts are by the frames' motion in the place of what each frame claims: a
+/// power of it from -1 (errors of so many mm) to 0 (of so many per cent) by least squares of
+/// logarithms, and the same for frames that differ by [`ALIKE`].
 fn even_out(frames: &mut [Frame]) {
     let is_known = |v: f64| v.is_finite() && v > 0.0;
     let known: Vec<[f64; 2]> = frames
@@ -57,7 +60,8 @@ fn gain(frames: &[Frame]) -> Gain {
     let sum = |f: &dyn Fn(&Frame) -> f64| frames.iter().zip(&weights).map(|(frame, w)| w * f(frame)).sum::<f64>();
     let (log, model) = (sum(&|f| f.log), sum(&|f| f.model));
     let own = frames.iter().zip(&weights).map(|(f, w)| (w * f.data).powi(2)).sum::<f64>();
-    // The mean of frames has a part of each one's noise, and what is common moves frames apart where it weighs more in one than in another.
+    // The mean of frames has a part of each one's noise, and what is common moves frames apart
+    // where it weighs more in one than in another.
     let off = |f: &Frame, w: f64| {
         let others = (own - (w * f.data).powi(2)).max(0.0);
         let expected = (f.data * (1.0 - w)).powi(2) + others + (f.model - model).powi(2);
@@ -89,9 +93,10 @@ struct Frame {
     motion: f64,
 }
 
-/// Weights (sum 1, none below 0) of the mean with the least variance when noise is each frame's own and the rest is common:
-/// `(D + m m^T)^-1 1` (Sherman & Morrison 1950). A frame that moves less knows the common part worse (a voxel at a face is more of its
-/// motion), and may be worth nothing beside the others: so no further frame makes the mean worse.
+/// Weights (sum 1, none below 0) of the mean with the least variance when noise is each frame's own
+/// and the rest is common: `(D + m m^T)^-1 1` (Sherman & Morrison 1950). A frame that moves less
+/// knows the common part worse (a voxel at a face is more of its motion), and may be worth nothing
+/// beside the others: so no further frame makes the mean worse.
 fn weights(frames: &[Frame]) -> Vec<f64> {
     let mut taken = vec![true; frames.len()];
     loop {
@@ -178,8 +183,8 @@ mod tests {
         assert_eq!(gains[4].weighed, 1);
     }
 
-    /// Eight frames of one load, whose claims of the common part differed by a tenth, were those of the one that claimed the least: the own part
-    /// fell from 4.2 to 3.0 % and not at all.
+    /// Eight frames of one load, whose claims of the common part differed by a tenth, were those of
+    /// the one that claimed the least: the own part fell from 4.2 to 3.0 % and not at all.
     #[test]
     fn frames_of_one_load_all_count() {
         let mut random = Random::new(5, 1);
@@ -200,7 +205,8 @@ mod tests {
         assert!((scatter / (0.04 / 8f64.sqrt()) - 1.0).abs() < 0.15, "{scatter}");
     }
 
-    /// Two frames of a light load, off by what is common to all but weighs more in them, raised the deviation of the six before them from 1.4 to 2.1 %.
+    /// Two frames of a light load, off by what is common to all but weighs more in them, raised the
+    /// deviation of the six before them from 1.4 to 2.1 %.
     #[test]
     fn what_is_common_is_no_disagreement() {
         let mut random = Random::new(6, 1);

@@ -11,14 +11,18 @@ use crate::stiffness::law::largest_principal_strain;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, RegionStiffness};
 
-/// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies within two of them).
+/// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies
+/// within two of them).
 const VAGUE: f64 = 0.35;
-/// What is left at surface and interfaces of a label map, as a standard deviation of ln E: this, and this much more for each unit
-/// of |ln contrast| (the displacement tells less and less of a stiffer inclusion). From the spread over the phantoms.
+/// What is left at surface and interfaces of a label map, as a standard deviation of ln E: this,
+/// and this much more for each unit of |ln contrast| (the displacement tells less and less of a
+/// stiffer inclusion). From the spread over the phantoms.
 const INTERFACE: [f64; 2] = [0.006, 0.005];
-/// In place of the latter where a region was found without labels and has the shape that the map gave it. From six phantoms.
+/// In place of the latter where a region was found without labels and has the shape that the map
+/// gave it. From six phantoms.
 const CUT: f64 = 0.15;
-/// The same where its shape was drawn anew: nine functions leave more of it open than labels do. From bodies of an independent solver.
+/// The same where its shape was drawn anew: nine functions leave more of it open than labels do.
+/// From bodies of an independent solver.
 const DRAWN: f64 = 0.02;
 /// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
 const RESOLVED: f64 = 0.1;
@@ -35,7 +39,8 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Standard deviation of ln E for each unit of |ln contrast|, for what the shape is not known to (1).
+    /// Standard deviation of ln E for each unit of |ln contrast|, for what the shape is not known
+    /// to (1).
     fn slope(self) -> f64 {
         match self {
             Shape::Given => INTERFACE[1],
@@ -45,11 +50,13 @@ impl Shape {
     }
 }
 
-/// A region is looked at more closely where a modulus e times as large moves no tissue by this part of the plates' motion.
+/// A region is looked at more closely where a modulus e times as large moves no tissue by this part
+/// of the plates' motion.
 const DOUBTED: f64 = 0.02;
-/// It is not seen where, all moduli alike, that is less than this (two halves side by side came to 0.0003, a rod along a limb to 0.001,
-/// all that is to be seen in phantoms to 0.027 and more), or where it is so at the modulus found and hardly more if all are alike (a skin
-/// along a limb, which the rounded rim of the mesh lets in).
+/// It is not seen where, all moduli alike, that is less than this (two halves side by side came to
+/// 0.0003, a rod along a limb to 0.001, all that is to be seen in phantoms to 0.027 and more), or
+/// where it is so at the modulus found and hardly more if all are alike (a skin along a limb, which
+/// the rounded rim of the mesh lets in).
 const SHOWN: f64 = 0.005;
 /// Part of the body that a region moves, at most.
 const MOST_MOVED: f64 = 0.02;
@@ -59,16 +66,18 @@ const ALIKE: f64 = 0.02;
 pub(super) const BEARS: f64 = 0.03;
 /// Contrasts beyond e^this are checked against a rigid region (12).
 const HIGH: f64 = 2.5;
-/// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and labels leave open.
+/// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and
+/// labels leave open.
 const SEEN: f64 = 3.9;
 
-/// Variance of the moduli over what the scatter over blocks says, where the misfit is not the field's own noise. Errors of meshes,
-/// contacts and measured fields are everywhere at once, which blocks of one body do not show: over the phantoms (three kinds,
-/// three seeds, exact fields and images) moduli were off by 4 to 5 times that.
+/// Variance of the moduli over what the scatter over blocks says, where the misfit is not the
+/// field's own noise. Errors of meshes, contacts and measured fields are everywhere at once, which
+/// blocks of one body do not show: over the phantoms (three kinds, three seeds, exact fields and
+/// images) moduli were off by 4 to 5 times that.
 const COHERENT: f64 = 20.0;
 
-/// By how much the variance of the data grows for misfit beyond the noise of a sample, `own` (mm, one component), and beyond
-/// the floor that is counted as such already. Added to 1.
+/// By how much the variance of the data grows for misfit beyond the noise of a sample, `own` (mm,
+/// one component), and beyond the floor that is counted as such already. Added to 1.
 pub fn coherent(estimate: &Estimate, own: f64) -> f64 {
     let all = (estimate.rms * estimate.rms).max(f64::MIN_POSITIVE);
     (1.0 - own * own / all).max(0.0) * estimate.raw * (COHERENT - 1.0)
@@ -95,7 +104,8 @@ impl Moduli {
     }
 }
 
-/// The moduli of an estimate; `force_n`, the whole force on the plate (N), sets the scale, `geometry` corrects for the faces' offsets.
+/// The moduli of an estimate; `force_n`, the whole force on the plate (N), sets the scale,
+/// `geometry` corrects for the faces' offsets.
 pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry>, force_n: Option<f64>) -> Moduli {
     let regions = setup.body.labels.len();
     let none = vec![0.0; estimate.parameters];
@@ -132,17 +142,19 @@ pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry
 pub struct Hidden {
     /// Its label.
     pub label: u8,
-    /// By how much a modulus e times as large moves the tissue where it moves it most, the others and the plates fitted again (mm).
+    /// By how much a modulus e times as large moves the tissue where it moves it most, the others
+    /// and the plates fitted again (mm).
     pub moved: f64,
     /// The part of the force that it bears if all regions are alike (1).
     pub share: f64,
 }
 
-/// The free region that the data show least of, if it is so little that they tell nothing: of bodies side by side between two plates
-/// without friction every ratio leads to one field, and what a fit makes of it is the model's own error at the rim.
+/// The free region that the data show least of, if it is so little that they tell nothing: of
+/// bodies side by side between two plates without friction every ratio leads to one field, and what
+/// a fit makes of it is the model's own error at the rim.
 ///
-/// It is looked for where all moduli are alike, under the linear law: a modulus that went astray would hide itself. None as well where
-/// that cannot be solved.
+/// It is looked for where all moduli are alike, under the linear law: a modulus that went astray
+/// would hide itself. None as well where that cannot be solved.
 pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
     let travel = setup.travel();
     let found = shown(setup, estimate);
@@ -162,8 +174,9 @@ pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
     })
 }
 
-/// By how much a modulus e times as large moves the tissue, the other parameters fitted again (mm), for each free region: what a
-/// volume as large as the region, but a fiftieth of the body at most, is moved by and more.
+/// By how much a modulus e times as large moves the tissue, the other parameters fitted again (mm),
+/// for each free region: what a volume as large as the region, but a fiftieth of the body at most,
+/// is moved by and more.
 fn shown(setup: &Setup<'_>, estimate: &Estimate) -> Vec<f64> {
     let (p, free) = (estimate.parameters, setup.free());
     let one = |k: usize| {
@@ -194,8 +207,9 @@ fn shown(setup: &Setup<'_>, estimate: &Estimate) -> Vec<f64> {
     (0..free.len()).map(one).collect()
 }
 
-/// Whether region `r` could as well be rigid (`lower`) or empty (`upper`) for all the data say: the misfit with its modulus at
-/// the bound, the others fitted again, rises by less than two standard deviations (4 in -2 ln likelihood).
+/// Whether region `r` could as well be rigid (`lower`) or empty (`upper`) for all the data say: the
+/// misfit with its modulus at the bound, the others fitted again, rises by less than two standard
+/// deviations (4 in -2 ln likelihood).
 ///
 /// # Errors
 /// As [`Setup::run`].
@@ -224,12 +238,13 @@ pub fn unseen(
     Ok((rise < 4.0).then_some(side))
 }
 
-/// Everything about the regions. `alone` are the moduli as if the surface were known: the part of the uncertainty that more
-/// data of the same body lower. `mesh_change` is the change of ln E from the coarse to the fine mesh, of which a third
-/// counts as the error of the fine one, or all of it where it is large. `shapes` says where each region's came from.
+/// Everything about the regions. `alone` are the moduli as if the surface were known: the part of
+/// the uncertainty that more data of the same body lower. `mesh_change` is the change of ln E from
+/// the coarse to the fine mesh, of which a third counts as the error of the fine one, or all of it
+/// where it is large. `shapes` says where each region's came from.
 ///
-/// What is `hidden` can bear anything from none to all of its share of the force, where one is known (`absolute`): so much are all
-/// moduli at most.
+/// What is `hidden` can bear anything from none to all of its share of the force, where one is
+/// known (`absolute`): so much are all moduli at most.
 pub fn regions(
     body: &Body,
     [moduli, alone]: [&Moduli; 2],
@@ -270,9 +285,9 @@ pub fn regions(
                 moduli.log[r] - at_most.unwrap_or(1.0).ln()
                     + 2.0 * moduli.covariance[reference * count + reference].max(0.0).sqrt()
             }
-            // Two standard deviations from the estimate, towards the side that the data exclude. What is all but rigid
-            // moves in proportion to its compliance, what is all but empty to its modulus: there the deviation of the
-            // logarithm is a relative one.
+            // Two standard deviations from the estimate, towards the side that the data exclude.
+            // What is all but rigid moves in proportion to its compliance, what is all but empty to
+            // its modulus: there the deviation of the logarithm is a relative one.
             Some("lower") => moduli.log[r] - (2.0 * sd).ln_1p(),
             Some(_) => moduli.log[r] + (2.0 * sd).ln_1p(),
         };

@@ -29,7 +29,8 @@ pub struct Support {
     noise: [f64; 2],
     /// What geometry alone may do (mm).
     geometry: f64,
-    /// Squares, misfit beyond the noise (mm), effective samples and parameters of the model that stands.
+    /// Squares, misfit beyond the noise (mm), effective samples and parameters of the model that
+    /// stands.
     squares: f64,
     misfit: f64,
     effective: f64,
@@ -218,7 +219,8 @@ mod tests {
         assert_eq!(too_little(4.0), "the criterion falls by 4 only, 10 are needed");
     }
 
-    /// What is said of one region with a misfit (mm) under noise of a voxel and of a sample of eight.
+    /// What is said of one region with a misfit (mm) under noise of a voxel and of a sample of
+    /// eight.
     fn said(noise: f64, misfit: f64) -> (bool, Option<LeftOver>) {
         let noise = [noise, noise / 8f64.sqrt()];
         let (squares, effective, parameters, rms) = (1.0, 100.0, 6, misfit);

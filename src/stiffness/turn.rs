@@ -1,14 +1,16 @@
 //! A body that turned as a whole.
 //!
-//! The moduli do not feel it, but plates are fitted by small turns and the linear law knows no large ones: what the whole body
-//! turned by is taken out of the field first. It is the rotation of the affine motion nearest to the field over the body
-//! (polar decomposition by Newton's iteration, Higham, SIAM J. Sci. Stat. Comput. 7, 1986).
+//! The moduli do not feel it, but plates are fitted by small turns and the linear law knows no
+//! large ones: what the whole body turned by is taken out of the field first. It is the rotation of
+//! the affine motion nearest to the field over the body (polar decomposition by Newton's iteration,
+//! Higham, SIAM J. Sci. Stat. Comput. 7, 1986).
 
 use crate::numerics::small::cholesky_solve;
 use crate::types::space::{Matrix3, cross, determinant, dot};
 use crate::types::{DenseField, Displacement, Mask, SparseField, WorldPoint};
 
-/// Turns that are left in (degrees): taken for small, one moves what lies 30 mm away by 5 micrometres too far.
+/// Turns that are left in (degrees): taken for small, one moves what lies 30 mm away by 5
+/// micrometres too far.
 const LEAST: f64 = 1.0;
 
 /// A rotation about the middle of a body after its motion.
@@ -20,7 +22,8 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// By how much the body of `labels` turned; none where that is under a degree, or the field says nothing of it.
+    /// By how much the body of `labels` turned; none where that is under a degree, or the field
+    /// says nothing of it.
     pub fn of(field: &Displacement<'_>, labels: &Mask) -> Option<Self> {
         let grid = field.grid();
         let moved = |o: usize| -> Option<([f64; 3], [f64; 3])> {

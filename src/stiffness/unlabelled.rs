@@ -1,9 +1,10 @@
 //! A map of ln mu without labels, and the regions that it falls into.
 //!
-//! ln mu is trilinear on a lattice of nodes over the body. Gauss-Newton with exact sensitivities minimises the misfit plus
-//! kappa times the total variation along the lattice's edges (smoothed absolute differences, reweighted each iteration;
-//! Vogel and Oman 1996); kappa falls until the residual is that of the noise (discrepancy principle, Morozov 1966). Total
-//! variation loses contrast, so the map only tells *where*: it is cut into connected regions, whose moduli are then
+//! ln mu is trilinear on a lattice of nodes over the body. Gauss-Newton with exact sensitivities
+//! minimises the misfit plus kappa times the total variation along the lattice's edges (smoothed
+//! absolute differences, reweighted each iteration; Vogel and Oman 1996); kappa falls until the
+//! residual is that of the noise (discrepancy principle, Morozov 1966). Total variation loses
+//! contrast, so the map only tells *where*: it is cut into connected regions, whose moduli are then
 //! identified as if they had been labelled.
 
 use crate::error::StiffnessError;
@@ -127,7 +128,8 @@ pub struct Map {
     pub rms: f64,
 }
 
-/// Finds the map from a homogeneous state. `target` (mm, one component) is the residual that ends the search.
+/// Finds the map from a homogeneous state. `target` (mm, one component) is the residual that ends
+/// the search.
 ///
 /// # Errors
 /// As [`Setup::run`].
@@ -265,8 +267,9 @@ fn jacobian(
     Ok(sides.par_chunks(n).flat_map_iter(|y| picked.iter().flat_map(move |o| o.read(body, y))).collect())
 }
 
-/// The body's voxels in `wanted` regions of like ln mu: k-means of the map at the voxels in so many `classes`, then the largest
-/// connected pieces. Label 1 is the largest region. None when fewer come out.
+/// The body's voxels in `wanted` regions of like ln mu: k-means of the map at the voxels in so many
+/// `classes`, then the largest connected pieces. Label 1 is the largest region. None when fewer
+/// come out.
 pub fn regions(map: &Map, body: &Mask, classes: usize, wanted: usize) -> Option<Mask> {
     let grid = *body.grid();
     let inside: Vec<usize> = (0..grid.len()).filter(|&o| body.as_slice()[o] > 0).collect();
@@ -300,7 +303,8 @@ pub fn regions(map: &Map, body: &Mask, classes: usize, wanted: usize) -> Option<
     (1..=wanted as u8).all(|l| labels.contains(&l)).then(|| Mask::from_vec(grid, labels).ok()).flatten()
 }
 
-/// Each voxel takes the label that weighs most in a Gaussian around it: the map cannot tell spikes from noise.
+/// Each voxel takes the label that weighs most in a Gaussian around it: the map cannot tell spikes
+/// from noise.
 fn rounded(labels: &[u8], shape: [usize; 3], sigma: [f64; 3], count: usize) -> Vec<u8> {
     let mut best = vec![(0.0f32, 0u8); labels.len()];
     for label in 1..=count as u8 {

@@ -1,7 +1,8 @@
 //! What each kind of phantom is made of.
 //!
-//! Positions and radii are fractions of half the field of view, x to the right, y to the front, z up; intensities are
-//! those of a T1-weighted image with fat at 1000. The shapes are drawn after anatomy atlases by eye, not measured.
+//! Positions and radii are fractions of half the field of view, x to the right, y to the front, z
+//! up; intensities are those of a T1-weighted image with fat at 1000. The shapes are drawn after
+//! anatomy atlases by eye, not measured.
 
 use crate::synth::body::{Body, Region, Superellipsoid, extent};
 use crate::synth::params::PhantomKind;
@@ -34,7 +35,8 @@ fn region(unit: [f64; 3], centre: [f64; 3], radii: [f64; 3], turn_degrees: f64, 
     Region { shape, mean, texture }
 }
 
-/// Skin, fat, deep fascia, muscles with their fasciae, tibia and fibula with cortex and marrow, vessels.
+/// Skin, fat, deep fascia, muscles with their fasciae, tibia and fibula with cortex and marrow,
+/// vessels.
 fn leg(unit: [f64; 3]) -> Vec<Region> {
     let tube = |x: f64, y: f64, a: f64, b: f64, turn: f64, mean: f64, texture: f64| {
         region(unit, [x, y, 0.0], [a, b, INFINITE], turn, mean, texture)
@@ -45,8 +47,8 @@ fn leg(unit: [f64; 3]) -> Vec<Region> {
         tube(0.0, 0.01, 0.87, 0.86, 0.0, 150.0, 0.0),
         tube(0.0, 0.01, 0.85, 0.84, 0.0, 560.0, 0.15),
     ];
-    // x, y, semi-axes, turn, intensity: soleus, gastrocnemius (medial, lateral), tibialis posterior, flexors, tibialis
-    // anterior, extensors, peroneus.
+    // x, y, semi-axes, turn, intensity: soleus, gastrocnemius (medial, lateral), tibialis
+    // posterior, flexors, tibialis anterior, extensors, peroneus.
     let muscles = [
         (0.02, -0.22, 0.60, 0.24, 4.0, 345.0),
         (-0.36, -0.52, 0.38, 0.22, -28.0, 360.0),
@@ -105,7 +107,8 @@ fn block(half: [f64; 3]) -> Vec<Region> {
     out
 }
 
-/// A finger along y with its tip to the front and the pulp down: skin, pulp, phalanx with marrow, nail bed.
+/// A finger along y with its tip to the front and the pulp down: skin, pulp, phalanx with marrow,
+/// nail bed.
 fn fingertip(half: [f64; 3]) -> Vec<Region> {
     let part = |c: [f64; 3], r: [f64; 3], mean: f64, texture: f64| region(half, c, r, 0.0, mean, texture);
     vec![

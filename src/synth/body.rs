@@ -1,9 +1,10 @@
 //! A body as an intensity that is defined at every world position.
 //!
-//! Regions are painted one over the other. Each is a tapered superellipsoid with an edge two voxels wide (10 to 90 %),
-//! a mean intensity, and a share of one fine texture that runs through the whole body. The outlines are bent by a
-//! coarse smooth displacement, so that nothing is symmetric. Texture cells are at least two voxels along each axis:
-//! the function can be sampled and interpolated without much aliasing.
+//! Regions are painted one over the other. Each is a tapered superellipsoid with an edge two voxels
+//! wide (10 to 90 %), a mean intensity, and a share of one fine texture that runs through the whole
+//! body. The outlines are bent by a coarse smooth displacement, so that nothing is symmetric.
+//! Texture cells are at least two voxels along each axis: the function can be sampled and
+//! interpolated without much aliasing.
 
 use crate::numerics::random::Random;
 use crate::synth::noise::{COARSE, SmoothNoise, Texture};
@@ -42,7 +43,8 @@ pub struct Body {
     /// Rotation (rows) and centre (mm) of the body's frame in the world.
     rotation: Matrix3,
     centre: [f64; 3],
-    /// Voxel edges as rows of the transposed linear part: how far (mm) the world axes run in one voxel step.
+    /// Voxel edges as rows of the transposed linear part: how far (mm) the world axes run in one
+    /// voxel step.
     edges: Matrix3,
     /// Longest voxel edge, in space and seen along z (mm).
     edge: f64,
@@ -54,11 +56,11 @@ pub struct Body {
 }
 
 impl Body {
-    /// The body of `regions` in the middle of `grid`, turned by up to 3 degrees and shifted by 0.3 to 0.7 mm or
-    /// voxels, whichever is less, so that no lattice is symmetric to it.
+    /// The body of `regions` in the middle of `grid`, turned by up to 3 degrees and shifted by 0.3
+    /// to 0.7 mm or voxels, whichever is less, so that no lattice is symmetric to it.
     ///
-    /// `taper` is the relative growth of all radii and offsets across the axis a mm upwards; `bend_mm` the standard
-    /// deviation of the outlines' bending.
+    /// `taper` is the relative growth of all radii and offsets across the axis a mm upwards;
+    /// `bend_mm` the standard deviation of the outlines' bending.
     pub fn new(regions: Vec<Region>, grid: &Grid, taper: f64, bend_mm: f64, seed: u64) -> Self {
         let mut random = Random::new(seed, 1);
         let angles: [f64; 3] = std::array::from_fn(|_| random.uniform(-3.0, 3.0).to_radians());
@@ -141,7 +143,8 @@ impl Body {
             return 0.0;
         }
         let (value, gradient) = shape.level(d);
-        // Rate of change a voxel step; the body's turn of a few degrees is left out, as it hardly changes the width.
+        // Rate of change a voxel step; the body's turn of a few degrees is left out, as it hardly
+        // changes the width.
         let rate = self.edges.iter().map(|e| (0..3).map(|w| e[w] * gradient[w]).sum::<f64>().powi(2)).sum::<f64>();
         let voxels = (1.0 - value) / rate.sqrt().max(1e-12);
         if voxels < -FAR { 0.0 } else { 1.0 / (1.0 + (-voxels / WIDTH).exp()) }
@@ -149,7 +152,8 @@ impl Body {
 }
 
 impl Superellipsoid {
-    /// The level function (1 on the outline, less inside) and its gradient (a mm) at `d` mm from the centre.
+    /// The level function (1 on the outline, less inside) and its gradient (a mm) at `d` mm from
+    /// the centre.
     fn level(&self, d: [f64; 3]) -> (f64, [f64; 3]) {
         let [cos, sin] = self.turn;
         let own = [cos * d[0] + sin * d[1], cos * d[1] - sin * d[0], d[2]];

@@ -5,9 +5,9 @@ use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::types::{Landmark, Mask, Volume, VoxelPoint, WorldPoint};
 
-/// Up to `wanted` random places between voxel centres, two voxels inside `mask`, where the gradient of `clean` is among
-/// its upper 40 %, and four times the shortest voxel edge apart; each with its place after the motion that `displacements`
-/// gives (mm).
+/// Up to `wanted` random places between voxel centres, two voxels inside `mask`, where the gradient
+/// of `clean` is among its upper 40 %, and four times the shortest voxel edge apart; each with its
+/// place after the motion that `displacements` gives (mm).
 pub fn landmarks(
     clean: &Volume,
     mask: &Mask,

@@ -1,8 +1,9 @@
 //! Phantoms: pairs of volumes whose displacement is known exactly.
 //!
-//! A body is an intensity B(p) at every world position, a motion a displacement u(x) in closed form or, for the elastic
-//! ones, that of finite elements; so neither volume is interpolated. The same settings give the same bytes for any number
-//! of threads. Fails when a setting is out of range or the motion folds.
+//! A body is an intensity B(p) at every world position, a motion a displacement u(x) in closed form
+//! or, for the elastic ones, that of finite elements; so neither volume is interpolated. The same
+//! settings give the same bytes for any number of threads. Fails when a setting is out of range or
+//! the motion folds.
 
 mod anatomy;
 

@@ -14,14 +14,17 @@ enum Law {
     Linear { m: Matrix3, shift: [f64; 3] },
     /// Coarse plus a share of fine.
     Smooth { coarse: SmoothNoise<4>, fine: SmoothNoise<4> },
-    /// A Gaussian of `radius` around the axis through `contact` along `inward`, decaying over `depth`.
+    /// A Gaussian of `radius` around the axis through `contact` along `inward`, decaying over
+    /// `depth`.
     Press { contact: [f64; 3], inward: [f64; 3], radius: f64, depth: f64 },
-    /// A flat plate moving up (+z) by `travel` into a body whose lowest point is `contact` and whose outline there
-    /// rises by half `curvature` (a mm) times the squared offset along x and y.
+    /// A flat plate moving up (+z) by `travel` into a body whose lowest point is `contact` and
+    /// whose outline there rises by half `curvature` (a mm) times the squared offset along x and y.
     Plate { contact: [f64; 3], curvature: [f64; 2], travel: f64, depth: f64 },
-    /// A displacement along `axis` that goes as the sine of the place along it; `wave` is 2 pi over the wavelength.
+    /// A displacement along `axis` that goes as the sine of the place along it; `wave` is 2 pi over
+    /// the wavelength.
     Wave { axis: [f64; 3], wave: f64 },
-    /// Half a jump along `along` on each side of the plane with `normal`, fading over `radius` across both.
+    /// Half a jump along `along` on each side of the plane with `normal`, fading over `radius`
+    /// across both.
     Slide { normal: [f64; 3], along: [f64; 3], across: [f64; 3], offset: f64, radius: f64, smooth: SmoothNoise<4> },
 }
 
@@ -77,7 +80,8 @@ impl Motion {
         Self::new(Law::Linear { m, shift: random.direction().map(|v| 0.5 * v) }, grid)
     }
 
-    /// Random cubic B-splines with control points every `spacing` and, at 35 %, every half `spacing` mm; to be scaled.
+    /// Random cubic B-splines with control points every `spacing` and, at 35 %, every half
+    /// `spacing` mm; to be scaled.
     pub fn smooth(grid: &Grid, spacing: f64, seed: u64) -> Self {
         let noise = |stream, h| SmoothNoise::new(Random::new(seed, stream), [h; 3], COARSE);
         Self::new(Law::Smooth { coarse: noise(40, spacing), fine: noise(41, spacing / 2.0) }, grid)
@@ -93,8 +97,8 @@ impl Motion {
         Self::new(Law::Press { contact, inward, radius, depth: 0.35 * e[1] }, grid)
     }
 
-    /// A flat plate that flattens the pulp of a fingertip with semi-axes `radii` (mm) about the point
-    /// `0.9` half fields of view behind the middle, moving up by `travel` mm.
+    /// A flat plate that flattens the pulp of a fingertip with semi-axes `radii` (mm) about the
+    /// point `0.9` half fields of view behind the middle, moving up by `travel` mm.
     pub fn plate(grid: &Grid, radii: [f64; 3], travel: f64) -> Self {
         let (c, e) = (centre(grid), extent(grid));
         let contact = [c[0], c[1] - 0.45 * e[1], c[2] - radii[2]];
@@ -102,7 +106,8 @@ impl Motion {
         Self::new(Law::Plate { contact, curvature, travel, depth: 0.9 * radii[2] }, grid)
     }
 
-    /// A standing wave along a random axis with a largest strain of `percent`: two wavelengths in the shortest side.
+    /// A standing wave along a random axis with a largest strain of `percent`: two wavelengths in
+    /// the shortest side.
     pub fn wave(grid: &Grid, percent: f64, mut random: Random) -> Self {
         let (sides, shape) = (extent(grid), grid.shape());
         let shortest = (0..3).filter(|&a| shape[a] > 1).map(|a| sides[a]).fold(f64::INFINITY, f64::min);
@@ -135,7 +140,8 @@ impl Motion {
         Self::new(law, grid)
     }
 
-    /// Takes the mean over `tissue` off (a smooth law only) and makes `amplitude` mm the largest displacement there.
+    /// Takes the mean over `tissue` off (a smooth law only) and makes `amplitude` mm the largest
+    /// displacement there.
     pub fn scaled(mut self, amplitude: f64, tissue: &[WorldPoint]) -> Self {
         let raw: Vec<[f64; 3]> = tissue.par_iter().map(|p| self.planar(p.0)).collect();
         if matches!(self.law, Law::Smooth { .. }) {
@@ -153,7 +159,8 @@ impl Motion {
         std::array::from_fn(|a| (u[a] - self.offset[a]) * self.scale)
     }
 
-    /// The x with x + u(x) = y, by fixed point to 1e-9 mm; for motions whose gradient stays under 1, as a press has.
+    /// The x with x + u(x) = y, by fixed point to 1e-9 mm; for motions whose gradient stays under
+    /// 1, as a press has.
     pub fn origin_of(&self, y: WorldPoint) -> WorldPoint {
         let mut x = y;
         for _ in 0..200 {
@@ -166,7 +173,8 @@ impl Motion {
         x
     }
 
-    /// Whether neighbouring places may part (a jump, so that difference quotients are not the Jacobian).
+    /// Whether neighbouring places may part (a jump, so that difference quotients are not the
+    /// Jacobian).
     pub fn is_discontinuous(&self) -> bool {
         matches!(self.law, Law::Slide { .. })
     }
@@ -218,8 +226,8 @@ fn slice_normal(grid: &Grid) -> Option<[f64; 3]> {
     Some(unit(cross(edge(axis + 1), edge(axis + 2))))
 }
 
-/// A push of 1 at `contact` along the unit vector `inward`: a Gaussian of `radius` across it and `depth` along it (mm),
-/// with a bulge around.
+/// A push of 1 at `contact` along the unit vector `inward`: a Gaussian of `radius` across it and
+/// `depth` along it (mm), with a bulge around.
 pub(super) fn press(p: [f64; 3], contact: [f64; 3], inward: [f64; 3], radius: f64, depth: f64) -> [f64; 3] {
     let d = add(p, contact, -1.0);
     let inside = dot(d, inward);

@@ -4,8 +4,8 @@ use crate::numerics::random::Random;
 use crate::numerics::sampling::cubic_bspline;
 use crate::types::{Grid, WorldPoint};
 
-/// Root of the integral of the squared three-dimensional cubic B-spline, (151/315)^(3/2): the function's deviation
-/// for independent coefficients of deviation 1.
+/// Root of the integral of the squared three-dimensional cubic B-spline, (151/315)^(3/2): the
+/// function's deviation for independent coefficients of deviation 1.
 const DEVIATION: f64 = 0.331_893;
 
 /// Coefficients along each axis of a texture: it repeats after so many cells.
@@ -14,7 +14,8 @@ const FINE: usize = 64;
 /// Coefficients along each axis of a function with at most a dozen cells in the field of view.
 pub const COARSE: usize = 16;
 
-/// N independent functions of position with mean 0 and standard deviation 1, twice continuously differentiable.
+/// N independent functions of position with mean 0 and standard deviation 1, twice continuously
+/// differentiable.
 ///
 /// Nearly all power lies below one cycle in two cells, so cells of two voxels survive sampling.
 #[derive(Debug, Clone)]

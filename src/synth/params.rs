@@ -40,13 +40,16 @@ pub enum MotionKind {
     Affine,
     /// A random cubic B-spline.
     Smooth,
-    /// A blunt indenter: a push that decays with depth, with a bulge around it; a fingertip is pressed on a flat plate.
+    /// A blunt indenter: a push that decays with depth, with a bulge around it; a fingertip is
+    /// pressed on a flat plate.
     Press,
-    /// As elasticity has it: held on one side, pressed on the other (fingertip, inclusion and slab only).
+    /// As elasticity has it: held on one side, pressed on the other (fingertip, inclusion and slab
+    /// only).
     Elastic,
     /// The two sides of a plane glide in opposite directions, with a little smooth motion on top.
     Slide,
-    /// Bands compressed and stretched in turn along a random axis; the amplitude is the largest strain in per cent.
+    /// Bands compressed and stretched in turn along a random axis; the amplitude is the largest
+    /// strain in per cent.
     Wave,
 }
 
@@ -70,7 +73,8 @@ impl PhantomKind {
         }
     }
 
-    /// The amplitude that is taken if none is asked for (mm, degrees for a rotation, per cent for a wave).
+    /// The amplitude that is taken if none is asked for (mm, degrees for a rotation, per cent for a
+    /// wave).
     fn usual_amplitude(self, motion: MotionKind) -> f64 {
         match (self, motion) {
             (_, MotionKind::Wave) => 20.0,
@@ -127,15 +131,16 @@ pub struct ElasticParams {
     pub poisson: f64,
 }
 
-/// All settings of a phantom. The body fills the field of view, so size times spacing is also its scale.
+/// All settings of a phantom. The body fills the field of view, so size times spacing is also its
+/// scale.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PhantomParams {
     /// What is imaged.
     pub kind: PhantomKind,
     /// How it moves.
     pub motion: MotionKind,
-    /// Largest displacement over the body's outline at rest (mm); for a rotation its angle (degrees), for a wave its
-    /// largest strain (per cent).
+    /// Largest displacement over the body's outline at rest (mm); for a rotation its angle
+    /// (degrees), for a wave its largest strain (per cent).
     pub amplitude: f64,
     /// Voxels along x, y, z; each 1 or at least 8, at most one of them 1.
     pub size: [usize; 3],
@@ -143,7 +148,8 @@ pub struct PhantomParams {
     pub spacing: [f64; 3],
     /// Of everything random.
     pub seed: u64,
-    /// Standard deviation of the Rician noise, relative to the 99th percentile of the clean deformed image (1).
+    /// Standard deviation of the Rician noise, relative to the 99th percentile of the clean
+    /// deformed image (1).
     pub noise: f64,
     /// Largest logarithm of the deformed image's multiplicative bias (1); 0.15 is about 15 %.
     pub bias: f64,
@@ -155,7 +161,8 @@ pub struct PhantomParams {
 }
 
 impl PhantomParams {
-    /// The defaults of a kind: seed 1, noise 3 %, bias 15 %, 200 landmarks, and a size, spacing and motion that suit it.
+    /// The defaults of a kind: seed 1, noise 3 %, bias 15 %, 200 landmarks, and a size, spacing and
+    /// motion that suit it.
     pub fn new(kind: PhantomKind) -> Self {
         let (size, spacing) = match kind {
             PhantomKind::Calf => ([96, 96, 40], [1.5, 1.5, 5.0]),
@@ -198,7 +205,8 @@ impl PhantomParams {
         self
     }
 
-    /// The grid they ask for: axis-aligned, its middle near the world's origin but on no voxel centre.
+    /// The grid they ask for: axis-aligned, its middle near the world's origin but on no voxel
+    /// centre.
     ///
     /// # Errors
     /// [`SynthError`] when a value is out of range.

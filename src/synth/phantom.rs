@@ -1,10 +1,12 @@
 //! A pair of volumes and the exact displacement between them.
 //!
-//! With B the body's intensity and u the motion, the initial volume is B(x + u(x)) and the deformed one B(y) times a
-//! slow bias, so deformed(x + u(x)) = initial(x) without any interpolation; both get independent Rician noise. A press
-//! shows the body at rest in the initial volume, B(x), and dented in the deformed one, B(x(y)) with y = x + u(x). The
-//! true Jacobian determinant, by differences on the initial grid, stays above [`MIN_JACOBIAN`] everywhere (a slide
-//! excepted, which shears along its plane); a motion that would break this is made coarser if smooth, else refused.
+//! With B the body's intensity and u the motion, the initial volume is B(x + u(x)) and the deformed
+//! one B(y) times a slow bias, so deformed(x + u(x)) = initial(x) without any interpolation; both
+//! get independent Rician noise. A press shows the body at rest in the initial volume, B(x), and
+//! dented in the deformed one, B(x(y)) with y = x + u(x). The true Jacobian determinant, by
+//! differences on the initial grid, stays above [`MIN_JACOBIAN`] everywhere (a slide excepted,
+//! which shears along its plane); a motion that would break this is made coarser if smooth, else
+//! refused.
 
 use crate::error::{ParamError, SynthError};
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
@@ -35,7 +37,8 @@ pub struct Phantom {
     pub deformed: Volume,
     /// The exact displacement at the initial grid's voxel centres, rounded to f32 (mm).
     pub truth: DenseField,
-    /// Tissue on the initial grid whose deformed place is at least a voxel inside the deformed grid.
+    /// Tissue on the initial grid whose deformed place is at least a voxel inside the deformed
+    /// grid.
     pub mask: Mask,
     /// Places with contrast inside the mask, between voxel centres, and where they go, exact.
     pub landmarks: Vec<Landmark>,
@@ -90,8 +93,8 @@ pub fn phantom(params: &PhantomParams) -> Result<Phantom, SynthError> {
     phantom_on(params, grid, grid)
 }
 
-/// The same with the volumes on given grids (oblique, flipped, different ...); size and spacing of `params` play no
-/// part. The body fills the axis-aligned box around the initial grid.
+/// The same with the volumes on given grids (oblique, flipped, different ...); size and spacing of
+/// `params` play no part. The body fills the axis-aligned box around the initial grid.
 ///
 /// # Errors
 /// As [`phantom`].
@@ -100,11 +103,12 @@ pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Resu
     Ok(imaged(params, pair(params, initial, deformed)?, initial, deformed))
 }
 
-/// What a body shows: from a place in it, its intensity there and whether it is tissue, to what is imaged.
+/// What a body shows: from a place in it, its intensity there and whether it is tissue, to what is
+/// imaged.
 pub(super) type Paint<'a> = &'a (dyn Fn(WorldPoint, (f64, bool)) -> f64 + Sync);
 
-/// As [`phantom_on`] for a motion in closed form, with the body painted over: by `both` in either volume, then by
-/// `after` in the deformed one alone.
+/// As [`phantom_on`] for a motion in closed form, with the body painted over: by `both` in either
+/// volume, then by `after` in the deformed one alone.
 ///
 /// # Errors
 /// As [`phantom`]; [`SynthError::NotElastic`] for an elastic motion.
@@ -326,7 +330,8 @@ fn intensities(imaged: &Imaged) -> Volume {
     Volume::from_voxels(*imaged.grid(), |at, _| imaged.as_slice()[at].0 as f32)
 }
 
-/// Tissue off the initial grid's border whose deformed place lies a voxel or more inside the deformed grid.
+/// Tissue off the initial grid's border whose deformed place lies a voxel or more inside the
+/// deformed grid.
 fn mask(before: &Imaged, truth: &DenseField, deformed: &Grid) -> Mask {
     let grid = *truth.grid();
     let clear = |shape: [usize; 3], p: [f64; 3]| {
@@ -339,7 +344,8 @@ fn mask(before: &Imaged, truth: &DenseField, deformed: &Grid) -> Mask {
     })
 }
 
-/// The clean image times exp(bias b), where b is smooth with mean 0 and largest magnitude 1 in the tissue.
+/// The clean image times exp(bias b), where b is smooth with mean 0 and largest magnitude 1 in the
+/// tissue.
 fn biased(clean: &Imaged, params: &PhantomParams) -> Volume {
     let grid = *clean.grid();
     let cell = extent(&grid).iter().fold(0.0, |m: f64, &e| m.max(e)) / 2.0;
@@ -354,7 +360,8 @@ fn biased(clean: &Imaged, params: &PhantomParams) -> Volume {
     })
 }
 
-/// Magnitude of the clean value plus complex Gaussian noise of deviation `sigma` a channel (Gudbjartsson, Patz 1995).
+/// Magnitude of the clean value plus complex Gaussian noise of deviation `sigma` a channel
+/// (Gudbjartsson, Patz 1995).
 pub(super) fn rician(clean: &Volume, sigma: f64, seed: u64, stream: u64) -> Volume {
     let base = Random::new(seed, stream).bits();
     Volume::from_voxels(*clean.grid(), |at, _| {

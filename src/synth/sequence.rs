@@ -1,8 +1,9 @@
 //! Sequences: a body whose inside moves over time, exactly known at every frame.
 //!
-//! The first frame shows the body at rest, B(x); frame t shows B(x(y)) with y = x + u_t(x), so that no frame is made by
-//! interpolation. The motions are sums of smooth presses, a bending or a muscle's contraction, each growing and
-//! falling with the time s from 0 to 1; what is pressed bulges. Noise is Rician, independent in each frame.
+//! The first frame shows the body at rest, B(x); frame t shows B(x(y)) with y = x + u_t(x), so that
+//! no frame is made by interpolation. The motions are sums of smooth presses, a bending or a
+//! muscle's contraction, each growing and falling with the time s from 0 to 1; what is pressed
+//! bulges. Noise is Rician, independent in each frame.
 
 use crate::error::{ParamError, SynthError, UnknownName};
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
@@ -68,7 +69,8 @@ pub struct SequenceParams {
     pub spacing: [f64; 3],
     /// Of everything random.
     pub seed: u64,
-    /// Standard deviation of the Rician noise, relative to the 99th percentile of the first frame (1).
+    /// Standard deviation of the Rician noise, relative to the 99th percentile of the first frame
+    /// (1).
     pub noise: f64,
 }
 
@@ -151,11 +153,13 @@ struct Part {
 enum Shape {
     /// A blunt contact, see [`press`].
     Press { contact: [f64; 3], inward: [f64; 3], radius: f64, depth: f64 },
-    /// A turn about the y axis through `centre` that grows with depth below it and fades behind `reach` mm.
+    /// A turn about the y axis through `centre` that grows with depth below it and fades behind
+    /// `reach` mm.
     Roll { centre: [f64; 3], reach: f64 },
     /// Bending of a beam along y that is held at `root`: z changes with the square of the distance.
     Bend { root: f64, middle: f64 },
-    /// A muscle along z: shortens by the strain 1 on its axis and thickens so that its volume stays.
+    /// A muscle along z: shortens by the strain 1 on its axis and thickens so that its volume
+    /// stays.
     Shorten { centre: [f64; 3], radius: f64, half_length: f64 },
 }
 

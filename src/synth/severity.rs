@@ -1,8 +1,10 @@
-//! Phantoms made worse in one respect, by a severity: what a measurement can be pushed with until it breaks.
+//! Phantoms made worse in one respect, by a severity: what a measurement can be pushed with until
+//! it breaks.
 //!
-//! Each [`Trouble`] has a range from harmless to hopeless; all else stays as in the phantom it starts from. Changes of
-//! what the body looks like are made to the body itself, before motion, bias and noise, so that the truth stays exact.
-//! Fails when a severity is outside the range of its trouble, or the motion folds.
+//! Each [`Trouble`] has a range from harmless to hopeless; all else stays as in the phantom it
+//! starts from. Changes of what the body looks like are made to the body itself, before motion,
+//! bias and noise, so that the truth stays exact. Fails when a severity is outside the range of its
+//! trouble, or the motion folds.
 
 use crate::error::{ParamError, SynthError};
 use crate::numerics::filters;
@@ -36,16 +38,18 @@ pub enum Trouble {
     NoTexture,
     /// Share of the tissue in a ball that is gone from the deformed volume (per cent).
     MissingTissue,
-    /// Exponent to whose root the deformed volume's intensities are taken (1): 2 is the square root.
+    /// Exponent to whose root the deformed volume's intensities are taken (1): 2 is the square
+    /// root.
     ContrastChange,
-    /// Share of the inverted contrast in the deformed volume (per cent): at 50 nothing is left, 100 is inverted.
+    /// Share of the inverted contrast in the deformed volume (per cent): at 50 nothing is left, 100
+    /// is inverted.
     ContrastInversion,
     /// Largest displacement of two halves that glide along each other (mm).
     Sliding,
     /// Share of the deformed volume cut off at its right end (per cent).
     Crop,
-    /// Shift of the deformed volume's field of view against the initial one's (per cent of its length); at 100 and
-    /// above the two have nothing in common.
+    /// Shift of the deformed volume's field of view against the initial one's (per cent of its
+    /// length); at 100 and above the two have nothing in common.
     NoOverlap,
 }
 
@@ -97,7 +101,8 @@ const BRIGHTEST: f64 = 1000.0;
 
 /// The phantom of `base` with `trouble` of the given severity, in [`Trouble::unit`].
 ///
-/// The mask holds the tissue that the deformed volume shows: not what is gone, cut off or shifted away; it may be empty.
+/// The mask holds the tissue that the deformed volume shows: not what is gone, cut off or shifted
+/// away; it may be empty.
 ///
 /// # Errors
 /// [`SynthError`] when the severity is outside [`Trouble::range`], or as [`phantom`] has it.
@@ -178,7 +183,8 @@ fn window(grid: &Grid, first: usize, count: usize) -> Result<Grid, SynthError> {
     Ok(Grid::new([count, ny, nz], Affine::new(rows)?)?)
 }
 
-/// Slices of `thickness` mm or the nearest multiple of the in-plane voxel edge: thin ones averaged, then noise.
+/// Slices of `thickness` mm or the nearest multiple of the in-plane voxel edge: thin ones averaged,
+/// then noise.
 fn thick_slices(base: &PhantomParams, thickness: f64) -> Result<Phantom, SynthError> {
     let thin = base.spacing[0];
     let count = ((thickness / thin).round() as usize).max(1);
@@ -227,8 +233,8 @@ fn thick_slices(base: &PhantomParams, thickness: f64) -> Result<Phantom, SynthEr
     })
 }
 
-/// `truth` with errors as a measurement has them: normal with a standard deviation of `sigma` (mm) along each axis,
-/// correlated over about three voxels.
+/// `truth` with errors as a measurement has them: normal with a standard deviation of `sigma` (mm)
+/// along each axis, correlated over about three voxels.
 pub fn disturbed(truth: &DenseField, sigma: f64, seed: u64) -> DenseField {
     let (grid, n) = (*truth.grid(), truth.grid().len());
     let mut out = truth.clone();
@@ -293,7 +299,8 @@ impl Tissue {
 }
 
 impl Ball {
-    /// 1 inside, 0 outside, going over within some `edge` (mm) of the surface; 0 everywhere for a ball of no size.
+    /// 1 inside, 0 outside, going over within some `edge` (mm) of the surface; 0 everywhere for a
+    /// ball of no size.
     fn cover(&self, p: WorldPoint, edge: f64) -> f64 {
         if self.radius == 0.0 {
             return 0.0;

@@ -8,8 +8,8 @@ use std::borrow::Cow;
 
 /// Displacements on the initial volume's grid, in world mm, RAS components, initial to deformed.
 ///
-/// The array has shape (nx, ny, nz, 3) with x fastest, so each component is one contiguous volume. (On disk the
-/// components are LPS; `io` converts.)
+/// The array has shape (nx, ny, nz, 3) with x fastest, so each component is one contiguous volume.
+/// (On disk the components are LPS; `io` converts.)
 #[derive(Debug, Clone, PartialEq)]
 pub struct Displacement<'a> {
     grid: Grid,
@@ -53,7 +53,8 @@ impl DenseField {
         out
     }
 
-    /// The same in parallel; `f` also gets the voxel's x-fastest offset, and must not depend on the order of calls.
+    /// The same in parallel; `f` also gets the voxel's x-fastest offset, and must not depend on the
+    /// order of calls.
     pub fn from_voxels(grid: Grid, f: impl Fn(usize, WorldPoint) -> [f64; 3] + Sync) -> Self {
         let mut out = Self::zeros(grid);
         let [nx, ny, _] = grid.shape();

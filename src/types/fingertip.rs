@@ -14,11 +14,13 @@ pub enum FingertipModel {
     Parallel,
     /// The same springs without tangential deformation: the tip rolls, d_t = 0.
     ParallelNormal,
-    /// Springs towards the centre, without posture and without tangential deformation: the tip rolls, d_t = 0.
+    /// Springs towards the centre, without posture and without tangential deformation: the tip
+    /// rolls, d_t = 0.
     Radial,
     /// No deformation: d_n = d_t = 0.
     Rigid,
-    /// As `Parallel`, with springs that are not alike: their modulus changes outwards as the profile says.
+    /// As `Parallel`, with springs that are not alike: their modulus changes outwards as the
+    /// profile says.
     Tabulated,
 }
 
@@ -57,14 +59,16 @@ pub struct Fingertip {
     pub damping: [f64; 2],
     /// How it answers.
     pub model: FingertipModel,
-    /// Depth (m) at which a face that comes straight on reaches springs, and their modulus (Pa), by rising depth; linear
-    /// between, constant beyond. Of tabulated tips only; empty is `youngs_modulus` everywhere.
+    /// Depth (m) at which a face that comes straight on reaches springs, and their modulus (Pa), by
+    /// rising depth; linear between, constant beyond. Of tabulated tips only; empty is
+    /// `youngs_modulus` everywhere.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub profile: Vec<[f64; 2]>,
 }
 
 impl Fingertip {
-    /// A fingertip with values in range: `radius` (m) and `youngs_modulus` (Pa) above 0, `damping` (N s/m) not negative.
+    /// A fingertip with values in range: `radius` (m) and `youngs_modulus` (Pa) above 0, `damping`
+    /// (N s/m) not negative.
     ///
     /// # Errors
     /// [`ParamError`] names the first value out of range.
@@ -182,13 +186,15 @@ pub struct PadReduction {
     pub residuals: [f64; 3],
     /// Indentation (mm), force of the map and of one modulus (N).
     pub curve: Vec<[f64; 3]>,
-    /// Depth (mm) and Young's modulus (kPa) of unlike springs on a hemisphere whose force is nearest to the map's.
+    /// Depth (mm) and Young's modulus (kPa) of unlike springs on a hemisphere whose force is
+    /// nearest to the map's.
     pub profile: Vec<[f64; 2]>,
     /// Relative distance of that force from the map's (1).
     pub profile_residual: f64,
     /// Columns.
     pub columns: usize,
-    /// The forces of the map's finite elements, where they were solved; the hemispheres are then fitted to these.
+    /// The forces of the map's finite elements, where they were solved; the hemispheres are then
+    /// fitted to these.
     pub plate: Option<PlateCurve>,
 }
 
@@ -206,7 +212,8 @@ pub struct PlateCurve {
 }
 
 impl PlateCurve {
-    /// Force (N) at an indentation (mm): as a power of it between the points around, and for a twentieth beyond the last.
+    /// Force (N) at an indentation (mm): as a power of it between the points around, and for a
+    /// twentieth beyond the last.
     pub fn at(&self, depth: f64) -> Option<f64> {
         let last = self.curve.len().checked_sub(1)?;
         let after = self.curve.partition_point(|p| p[0] < depth);
@@ -221,7 +228,8 @@ impl PlateCurve {
 }
 
 impl PadReduction {
-    /// Whether a hemisphere of one modulus is not enough (forces off by more than 2 %) and unlike springs are nearer.
+    /// Whether a hemisphere of one modulus is not enough (forces off by more than 2 %) and unlike
+    /// springs are nearer.
     pub fn tabulated(&self) -> bool {
         self.hemisphere_residual > 0.02 && self.profile_residual < 0.5 * self.hemisphere_residual
     }

@@ -1,4 +1,5 @@
-//! What the grasp simulator gives back. SI units, radians; index 0 is the left finger, 1 the right one.
+//! What the grasp simulator gives back. SI units, radians; index 0 is the left finger, 1 the right
+//! one.
 
 use crate::types::FingertipModel;
 use serde::Serialize;
@@ -71,7 +72,8 @@ pub enum EventKind {
     ValidityRange,
     /// |f_t / f_n| above the coefficient of friction.
     Slip,
-    /// The smallest eigenvalue of the Hessian at fixed joints is no longer positive: the branch of equilibria ends.
+    /// The smallest eigenvalue of the Hessian at fixed joints is no longer positive: the branch of
+    /// equilibria ends.
     Fold,
     /// The step is too long for the stiffness and damping.
     BadStep,
@@ -144,7 +146,8 @@ pub struct GraspRun {
     pub motions: Vec<MotionRow>,
     /// What went wrong, in order of time.
     pub events: Vec<Event>,
-    /// Largest difference between the change of energy and the work done on the grasp, over the largest energy (1).
+    /// Largest difference between the change of energy and the work done on the grasp, over the
+    /// largest energy (1).
     pub energy_drift: f64,
     /// Largest violations of the constraints.
     pub constraint_drift: ConstraintDrift,
@@ -157,8 +160,8 @@ pub struct GraspRun {
 }
 
 impl GraspRun {
-    /// What ended the run, or else the first slip: what comes after that the model knows nothing of. None where it came to its end
-    /// and nothing slipped.
+    /// What ended the run, or else the first slip: what comes after that the model knows nothing
+    /// of. None where it came to its end and nothing slipped.
     pub fn flaw(&self) -> Option<&Event> {
         self.events.iter().find(|e| e.kind.ends_run()).or(self.events.first())
     }
@@ -205,7 +208,8 @@ pub struct StabilityRow {
     pub normal: [f64; 2],
     /// Eigenvalues of the Hessian in (x, y, a theta), rising (N/m).
     pub eigenvalues: [f64; 3],
-    /// Length of the energy's gradient in (x, y, a theta) (N): 0 where this pose is the model's equilibrium.
+    /// Length of the energy's gradient in (x, y, a theta) (N): 0 where this pose is the model's
+    /// equilibrium.
     pub residual: f64,
     /// What they mean.
     pub class: Stability,
@@ -320,7 +324,8 @@ pub struct PinchCell {
     pub state: PinchState,
     /// The equilibrium; all zero but the joints where there is none.
     pub sample: Sample,
-    /// Smallest eigenvalue of the Hessian in (x, y, a theta) (N/m); NaN where there is no equilibrium.
+    /// Smallest eigenvalue of the Hessian in (x, y, a theta) (N/m); NaN where there is no
+    /// equilibrium.
     pub smallest_eigenvalue: f64,
 }
 
@@ -342,7 +347,8 @@ pub struct GraspAnalysis {
     pub surfaces: Vec<EnergySurface>,
     /// Hessians.
     pub stability: Vec<StabilityRow>,
-    /// Postures of the scene that could not be reached on the branch from the pinch, with the reason.
+    /// Postures of the scene that could not be reached on the branch from the pinch, with the
+    /// reason.
     pub lost: Vec<(usize, String)>,
     /// Degrees of freedom.
     pub freedom: Vec<Freedom>,

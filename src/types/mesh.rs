@@ -3,7 +3,8 @@
 use crate::error::MeshError;
 use crate::types::space::WorldPoint;
 
-/// A tetrahedral mesh. Each tetrahedron `[a, b, c, d]` is positively oriented: `det(b - a, c - a, d - a) > 0`.
+/// A tetrahedral mesh. Each tetrahedron `[a, b, c, d]` is positively oriented:
+/// `det(b - a, c - a, d - a) > 0`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TetMesh {
     nodes: Vec<WorldPoint>,
@@ -61,8 +62,8 @@ impl TriMesh {
 
 /// A mesh of quadratic tetrahedra, each in one region.
 ///
-/// The ten nodes of an element are its four corners, positively oriented, and then the middles of the edges 01, 12, 02, 03,
-/// 13, 23 (the order of VTK, Abaqus and FEBio). Edges may be curved.
+/// The ten nodes of an element are its four corners, positively oriented, and then the middles of
+/// the edges 01, 12, 02, 03, 13, 23 (the order of VTK, Abaqus and FEBio). Edges may be curved.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct QuadraticMesh {
     nodes: Vec<WorldPoint>,

@@ -1,8 +1,9 @@
 //! Data only: geometry, volumes, points, fields, meshes, parameters, metrics, grasp scenes.
 //!
-//! Every constructor checks what it is given, so that a value that exists is valid. Nothing here computes more than
-//! its own geometry, opens a file or prints. Frames: a [`VoxelPoint`] counts voxels (centre of the first voxel =
-//! `(0, 0, 0)`), a [`WorldPoint`] is in millimetres, RAS (x to the right, y to the front, z up), as in NIfTI.
+//! Every constructor checks what it is given, so that a value that exists is valid. Nothing here
+//! computes more than its own geometry, opens a file or prints. Frames: a [`VoxelPoint`] counts
+//! voxels (centre of the first voxel = `(0, 0, 0)`), a [`WorldPoint`] is in millimetres, RAS (x to
+//! the right, y to the front, z up), as in NIfTI.
 
 pub mod space;
 

@@ -2,7 +2,8 @@
 
 use crate::error::UnknownName;
 
-/// The choice called `found`, where `what` says what is chosen (for the message). Case plays no part.
+/// The choice called `found`, where `what` says what is chosen (for the message). Case plays no
+/// part.
 ///
 /// # Errors
 /// [`UnknownName`] lists the known names and suggests the nearest one (at most a third of its letters wrong).
@@ -20,7 +21,8 @@ pub fn choose<T: Copy>(what: &'static str, found: &str, known: &[(&'static str, 
     Err(UnknownName { what, found: found.into(), known: known.iter().map(|(name, _)| *name).collect(), nearest })
 }
 
-/// Insertions, deletions, replacements and swaps of neighbours that turn `a` into `b` (optimal string alignment).
+/// Insertions, deletions, replacements and swaps of neighbours that turn `a` into `b` (optimal
+/// string alignment).
 fn edit_distance(a: &str, b: &str) -> usize {
     let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());
     let mut rows: Vec<Vec<usize>> = vec![(0..=b.len()).collect()];

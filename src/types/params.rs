@@ -23,8 +23,8 @@ pub enum Method {
     /// Matches find the motion, the residual of all voxels makes the field.
     #[default]
     Full,
-    /// Matches alone: many-to-many candidates, energy-based consistency, least-squares matching and the field through
-    /// them, coarse to fine (Zhang, Hirai, Endo & Morikawa 2007).
+    /// Matches alone: many-to-many candidates, energy-based consistency, least-squares matching and
+    /// the field through them, coarse to fine (Zhang, Hirai, Endo & Morikawa 2007).
     Sparse,
 }
 
@@ -47,7 +47,8 @@ pub enum BodySource {
 pub enum Interpolation {
     /// The coupled spline field, brought to the last residual of the two volumes.
     Spline,
-    /// Piecewise linear in the tetrahedra (triangles) of the kept matches, as in the source; the spline outside.
+    /// Piecewise linear in the tetrahedra (triangles) of the kept matches, as in the source; the
+    /// spline outside.
     Barycentric,
 }
 
@@ -59,32 +60,36 @@ pub struct FieldParams {
     pub preset: Preset,
     /// Which stages make the field.
     pub method: Method,
-    /// Feature points wanted in the initial volume at full resolution (the deformed one gets up to five times as
-    /// many, as in the source); 0 = one for each `voxels_per_point` voxels of the mask.
+    /// Feature points wanted in the initial volume at full resolution (the deformed one gets up to
+    /// five times as many, as in the source); 0 = one for each `voxels_per_point` voxels of the
+    /// mask.
     pub points: usize,
-    /// Voxels of the mask for each automatic point (1); 27 to 1000. Measured: more points than one in 64 voxels gain
-    /// nothing, since their patches overlap.
+    /// Voxels of the mask for each automatic point (1); 27 to 1000. Measured: more points than one
+    /// in 64 voxels gain nothing, since their patches overlap.
     pub voxels_per_point: usize,
-    /// Largest motion looked for (mm); 0 = 15 % of the volume's smallest side, 2 voxels to 30 mm, and twice as far
-    /// where the motion reaches that.
+    /// Largest motion looked for (mm); 0 = 15 % of the volume's smallest side, 2 voxels to 30 mm,
+    /// and twice as far where the motion reaches that.
     pub search_mm: f64,
-    /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000 voxels of tissue.
+    /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000
+    /// voxels of tissue.
     pub finest: usize,
-    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 16, or 0 = 10 to 2, by evidence.
+    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 16, or 0 = 10
+    /// to 2, by evidence.
     pub node_spacing: usize,
     /// Residual passes on the finest level; 1 to 40.
     pub passes: usize,
     /// Residual passes on each coarser level; 1 to 60.
     pub coarse_passes: usize,
-    /// Residual passes on the level that is twice as fine as the finest one worked on, where that is not full resolution, for a field that
-    /// is free; 0 to 100.
+    /// Residual passes on the level that is twice as fine as the finest one worked on, where that
+    /// is not full resolution, for a field that is free; 0 to 100.
     pub finer_passes: usize,
     /// How the dense field is made.
     pub interpolation: Interpolation,
-    /// Candidates kept from each source of matches on the coarsest level, at most 3 on the finest; 1 to 20.
+    /// Candidates kept from each source of matches on the coarsest level, at most 3 on the finest;
+    /// 1 to 20.
     pub candidates: usize,
-    /// Whether neighbours choose among the candidates and cast out those that fit nowhere; without, the best
-    /// correlation counts. Only for comparisons.
+    /// Whether neighbours choose among the candidates and cast out those that fit nowhere; without,
+    /// the best correlation counts. Only for comparisons.
     pub consistency: bool,
     /// Whether matches are refined to a fraction of a voxel. Only for comparisons.
     pub sub_voxel: bool,
@@ -150,7 +155,8 @@ impl FieldParams {
                 Self { finest: 0, passes: 5, coarse_passes: 8, finer_passes: 3, voxels_per_point: 1000, ..balanced }
             }
             Preset::Balanced => balanced,
-            // 12 and 16 passes leave 1 % less error over 35 pairs, at a quarter more time: only the matches are more.
+            // 12 and 16 passes leave 1 % less error over 35 pairs, at a quarter more time: only the
+            // matches are more.
             Preset::Accurate => Self { voxels_per_point: 64, ..balanced },
         }
     }

@@ -9,7 +9,8 @@ pub struct FeaturePoint {
     pub voxel: VoxelPoint,
     /// The same in world mm (RAS).
     pub world: WorldPoint,
-    /// Corner response; larger is more distinct. Its unit is intensity^2 / mm^2 (Foerstner) or as the measure says.
+    /// Corner response; larger is more distinct. Its unit is intensity^2 / mm^2 (Foerstner) or as
+    /// the measure says.
     pub response: f32,
 }
 
@@ -22,7 +23,8 @@ pub struct Candidate {
     pub ncc: f32,
 }
 
-/// One correspondence: the tissue at `initial` is found at `initial + displacement` in the deformed volume.
+/// One correspondence: the tissue at `initial` is found at `initial + displacement` in the deformed
+/// volume.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Match {
     /// Place in the initial volume, world mm (RAS).
@@ -52,8 +54,9 @@ pub struct SparseField {
 }
 
 impl SparseField {
-    /// Voxels of the finest axis between the middle one of a match's patch and its outermost ones: a match tells the mean over 7 x 7 x 7
-    /// (over fewer along the normal of thick slices, at least 3).
+    /// Voxels of the finest axis between the middle one of a match's patch and its outermost ones:
+    /// a match tells the mean over 7 x 7 x 7 (over fewer along the normal of thick slices, at least
+    /// 3).
     pub const PATCH: usize = 3;
 
     /// The matches that consistency kept.

@@ -66,7 +66,8 @@ pub struct LevelReport {
 }
 
 impl LevelReport {
-    /// Of this part of a level and another: sums of the counts, and means by features and by matches.
+    /// Of this part of a level and another: sums of the counts, and means by features and by
+    /// matches.
     #[must_use]
     pub fn with(&self, other: &Self) -> Self {
         let mean = |a: f64, b: f64, [n, m]: [usize; 2]| (a * n as f64 + b * m as f64) / (n + m).max(1) as f64;
@@ -98,7 +99,8 @@ pub struct BodyReport {
     pub voxels: usize,
     /// The smallest motion that explains it.
     pub model: MotionModel,
-    /// How far the tissue beside it moves from where its own motion leads (mm, median along its border); 0 where it borders on none.
+    /// How far the tissue beside it moves from where its own motion leads (mm, median along its
+    /// border); 0 where it borders on none.
     pub slides_mm: f64,
 }
 
@@ -125,10 +127,12 @@ pub struct FieldSummary {
     pub max_mm: f64,
     /// Median of the uncertainty over the mask (mm, 1 sigma).
     pub uncertainty_median_mm: f64,
-    /// The part of the mask that lies outside the deformed volume after the motion, or where that is not finite (1).
+    /// The part of the mask that lies outside the deformed volume after the motion, or where that
+    /// is not finite (1).
     pub unseen: f64,
-    /// Whether fewer than half of the features agreed with their neighbours when the whole volume was searched, and the volumes stay different
-    /// by more than noise: another tissue, or another motion.
+    /// Whether fewer than half of the features agreed with their neighbours when the whole volume
+    /// was searched, and the volumes stay different by more than noise: another tissue, or another
+    /// motion.
     pub in_doubt: bool,
     /// Stage names and wall seconds, in order.
     pub seconds: Vec<(String, f64)>,

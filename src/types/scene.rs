@@ -1,7 +1,7 @@
 //! A grasp scene: two 1-DOF fingers with soft tips that hold a rectangular object between them.
 //!
-//! SI units, planar, x right, y up. Angles are in radians and counter-clockwise, except the second joint angle, which
-//! is clockwise, so that a positive angle closes either finger:
+//! SI units, planar, x right, y up. Angles are in radians and counter-clockwise, except the second
+//! joint angle, which is clockwise, so that a positive angle closes either finger:
 //!
 //! ```text
 //!      (-half_span, 0)          (+half_span, 0)
@@ -19,7 +19,8 @@ use crate::types::names;
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
-/// PID gains of a joint: torque = -kp e - kd e' - ki (integral of e), with e = angle - desired angle.
+/// PID gains of a joint: torque = -kp e - kd e' - ki (integral of e), with e = angle - desired
+/// angle.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Gains {
@@ -64,7 +65,8 @@ pub struct Object {
 /// The start: at rest in an equilibrium.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Initial {
-    /// Normal displacement d_0 of both tips at joint angles 0 (m); equals radius + width / 2 - half_span.
+    /// Normal displacement d_0 of both tips at joint angles 0 (m); equals radius + width / 2 -
+    /// half_span.
     pub normal_displacement: f64,
     /// Joint angles at the start (rad), usually 0.
     pub joints: [f64; 2],
@@ -79,7 +81,8 @@ pub enum Formulation {
     /// Pose and joint angles alone; displacements follow from them. Nothing can drift.
     #[default]
     Minimal,
-    /// Displacements as coordinates of their own, Lagrange multipliers, and constraint stabilisation (the source's).
+    /// Displacements as coordinates of their own, Lagrange multipliers, and constraint
+    /// stabilisation (the source's).
     Multipliers,
 }
 
@@ -220,12 +223,14 @@ pub struct Scene {
 pub const EIGHT_MOTIONS: [[f64; 2]; 8] =
     [[6.0, 6.0], [20.0, -10.0], [-2.0, 13.0], [-10.0, 20.0], [-7.0, 17.0], [17.0, -7.0], [-15.0, 25.0], [5.0, 5.0]];
 
-/// Most steps and most samples of one run, so that a slip of the pen does not run for days or fill the memory.
+/// Most steps and most samples of one run, so that a slip of the pen does not run for days or fill
+/// the memory.
 const MOST_STEPS: f64 = 2e9;
 const MOST_SAMPLES: f64 = 2e6;
 
 impl Scene {
-    /// Half the distance between the joints (m). Rigid tips cannot be pressed in, so theirs stand apart until they just touch.
+    /// Half the distance between the joints (m). Rigid tips cannot be pressed in, so theirs stand
+    /// apart until they just touch.
     pub fn half_span(&self) -> f64 {
         match self.fingertip.model {
             FingertipModel::Rigid => self.fingertip.radius + 0.5 * self.object.width,
@@ -233,7 +238,8 @@ impl Scene {
         }
     }
 
-    /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest (docs/grasp.md).
+    /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest
+    /// (docs/grasp.md).
     pub fn reference() -> Self {
         let motion = |degrees: [f64; 2]| Motion { target: degrees.map(f64::to_radians), duration: 0.5, hold: 1.0 };
         Self {
@@ -274,8 +280,9 @@ impl Scene {
         }
     }
 
-    /// The same grasp of an object `width` wide (m): the joints move apart or together so that the tips keep their
-    /// normal displacement, and the object keeps its density's inertia for its mass.
+    /// The same grasp of an object `width` wide (m): the joints move apart or together so that the
+    /// tips keep their normal displacement, and the object keeps its density's inertia for its
+    /// mass.
     pub fn with_width(mut self, width: f64) -> Self {
         self.object.width = width;
         self.object.inertia = rectangle_inertia(self.object.mass, width, self.object.height);

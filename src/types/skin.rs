@@ -5,8 +5,8 @@ use crate::types::names::choose;
 use serde::Serialize;
 use std::str::FromStr;
 
-/// A rheological element: `sigma = e0 e + c0 e' + sum_i s_i` with `s_i' = E_i e' - (E_i / c_i) s_i`, a spring and a dashpot
-/// beside Maxwell branches.
+/// A rheological element: `sigma = e0 e + c0 e' + sum_i s_i` with
+/// `s_i' = E_i e' - (E_i / c_i) s_i`, a spring and a dashpot beside Maxwell branches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ElementKind {
@@ -29,8 +29,8 @@ impl ElementKind {
         ("five-element", Self::FiveElement),
     ];
 
-    /// Whether there is a spring, and a dashpot, beside the branches (a dashpot is optional in a standard linear solid);
-    /// and the number of branches.
+    /// Whether there is a spring, and a dashpot, beside the branches (a dashpot is optional in a
+    /// standard linear solid); and the number of branches.
     fn parts(self) -> (bool, bool, usize) {
         match self {
             Self::KelvinVoigt => (true, true, 0),
@@ -64,8 +64,8 @@ pub struct Layer {
     pub c0: f64,
     /// Modulus (Pa) and dashpot (Pa s) of each Maxwell branch.
     pub maxwell: Vec<[f64; 2]>,
-    /// Coefficients of all dashpots (Pa s) once the load is off, the lone one first; empty when they stay (dual moduli:
-    /// Wang & Hirai 2012).
+    /// Coefficients of all dashpots (Pa s) once the load is off, the lone one first; empty when
+    /// they stay (dual moduli: Wang & Hirai 2012).
     pub c_unload: Vec<f64>,
 }
 
@@ -139,7 +139,8 @@ pub struct SkinLoad {
     pub end: f64,
 }
 
-/// The block of the finite element model: plane strain, fixed at its base, pressed by a flat punch that sticks.
+/// The block of the finite element model: plane strain, fixed at its base, pressed by a flat punch
+/// that sticks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct SkinBlock {
     /// Width (m).
@@ -207,7 +208,8 @@ impl SkinScene {
         Ok(())
     }
 
-    /// One layer in place of all: as thick, with the mean compliance of each part; none where the elements differ.
+    /// One layer in place of all: as thick, with the mean compliance of each part; none where the
+    /// elements differ.
     pub fn without_layers(&self) -> Option<Self> {
         let first = self.layers.first()?;
         if self.layers.iter().any(|l| l.element != first.element || (l.c0 > 0.0) != (first.c0 > 0.0)) {
@@ -262,7 +264,8 @@ pub struct SkinSample {
 pub struct BlockShape {
     /// Time (s).
     pub time: f64,
-    /// Node places (m): x from the middle of the punch, y up from the base; column by column, from the base up.
+    /// Node places (m): x from the middle of the punch, y up from the base; column by column, from
+    /// the base up.
     pub nodes: Vec<[f64; 2]>,
     /// Compression (1) of each cell along y, column by column.
     pub compression: Vec<f64>,
@@ -275,7 +278,8 @@ pub struct BlockRun {
     pub cells: [usize; 2],
     /// The layer of each row of cells, from the base up.
     pub layer: Vec<usize>,
-    /// Mean pressure under the punch and its depth; strains are means of each layer under the punch.
+    /// Mean pressure under the punch and its depth; strains are means of each layer under the
+    /// punch.
     pub samples: Vec<SkinSample>,
     /// At the end of the hold, and at the end.
     pub shapes: Vec<BlockShape>,

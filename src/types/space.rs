@@ -1,15 +1,18 @@
 //! Frames: voxel indices, world millimetres (RAS), and the affine between them.
 //!
-//! The two kinds of point are different types, so that one cannot be used for the other. A *displacement* is a plain
-//! `[f64; 3]` in world millimetres, pointing from the initial to the deformed place of the same tissue.
+//! The two kinds of point are different types, so that one cannot be used for the other. A
+//! *displacement* is a plain `[f64; 3]` in world millimetres, pointing from the initial to the
+//! deformed place of the same tissue.
 
 use crate::error::SpaceError;
 
-/// A position in voxels: the centre of voxel `(i, j, k)` is `[i, j, k]`; fractions lie between centres.
+/// A position in voxels: the centre of voxel `(i, j, k)` is `[i, j, k]`; fractions lie between
+/// centres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoxelPoint(pub [f64; 3]);
 
-/// A position in world millimetres, RAS: x grows to the patient's right, y to the front, z to the head.
+/// A position in world millimetres, RAS: x grows to the patient's right, y to the front, z to the
+/// head.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WorldPoint(pub [f64; 3]);
 
@@ -225,7 +228,8 @@ impl Grid {
         self.affine.to_world(VoxelPoint([i as f64, j as f64, k as f64]))
     }
 
-    /// Whether the two grids have the same shape and their corners coincide to 1e-3 of a voxel (NIfTI stores float32).
+    /// Whether the two grids have the same shape and their corners coincide to 1e-3 of a voxel
+    /// (NIfTI stores float32).
     pub fn same_as(&self, other: &Grid) -> bool {
         let far = |g: &Grid, c: usize| {
             let s = self.shape;

@@ -12,7 +12,8 @@ use std::str::FromStr;
 pub enum Law {
     /// Small strain: stress = 2 mu strain + p I, p = lambda div u.
     Linear,
-    /// Compressible neo-Hookean: first Piola-Kirchhoff stress P = mu (F - F^-T) + p F^-T, p = lambda ln J.
+    /// Compressible neo-Hookean: first Piola-Kirchhoff stress P = mu (F - F^-T) + p F^-T, p =
+    /// lambda ln J.
     NeoHookean,
 }
 
@@ -57,7 +58,8 @@ impl FromStr for LawChoice {
     }
 }
 
-/// A side of the body in world axes: the outward unit vector is `sign` along `axis` (0 = x, 1 = y, 2 = z; RAS).
+/// A side of the body in world axes: the outward unit vector is `sign` along `axis` (0 = x, 1 = y,
+/// 2 = z; RAS).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Side {
     /// 0, 1 or 2.
@@ -117,8 +119,8 @@ impl Contact {
 /// Parameters of [`crate::pipeline::stiffness`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StiffnessParams {
-    /// Poisson's ratio of all regions (1): 0 to below 0.5. Soft tissue is nearly incompressible; 0.49 is usual in
-    /// elastography (Goenezen, Barbone, Oberai 2011).
+    /// Poisson's ratio of all regions (1): 0 to below 0.5. Soft tissue is nearly incompressible;
+    /// 0.49 is usual in elastography (Goenezen, Barbone, Oberai 2011).
     pub poisson: f64,
     /// The law.
     pub model: LawChoice,
@@ -169,8 +171,8 @@ pub struct RegionStiffness {
     pub label: u8,
     /// Its name.
     pub name: String,
-    /// Young's modulus: kPa where a force is known, else over that of the reference region. Of a region that is not
-    /// identifiable, the bound that the data give.
+    /// Young's modulus: kPa where a force is known, else over that of the reference region. Of a
+    /// region that is not identifiable, the bound that the data give.
     pub youngs_modulus: f64,
     /// One standard deviation, in the same unit; infinite where not identifiable.
     pub sd: f64,
@@ -180,11 +182,13 @@ pub struct RegionStiffness {
     pub ratio_sd: f64,
     /// Whether the data determine it.
     pub identifiable: bool,
-    /// `lower` or `upper` where it is not: the modulus lies beyond `youngs_modulus`; `unknown` where it may be any.
+    /// `lower` or `upper` where it is not: the modulus lies beyond `youngs_modulus`; `unknown`
+    /// where it may be any.
     pub bound: Option<&'static str>,
     /// Volume (mm^3).
     pub volume: f64,
-    /// The part of the relative standard deviation of the modulus that more data lower, and of the ratio (1).
+    /// The part of the relative standard deviation of the modulus that more data lower, and of the
+    /// ratio (1).
     #[serde(skip)]
     pub data_sd: [f64; 2],
 }
@@ -200,7 +204,8 @@ pub struct Evidence {
     pub parameters: usize,
     /// Root mean square residual (mm, one component); infinite where it was not tried.
     pub residual_mm: f64,
-    /// Bayesian information criterion, by the effective number of samples; lower is better. Infinite where it was not tried.
+    /// Bayesian information criterion, by the effective number of samples; lower is better.
+    /// Infinite where it was not tried.
     pub bic: f64,
     /// Whether it was chosen.
     pub chosen: bool,
@@ -237,7 +242,8 @@ pub struct PatchReport {
     pub contact: Contact,
     /// Translation of the patch's middle (mm, RAS).
     pub translation: [f64; 3],
-    /// How far inwards its foremost place went (mm), which is the plate's travel also where a curved surface is pressed flat.
+    /// How far inwards its foremost place went (mm), which is the plate's travel also where a
+    /// curved surface is pressed flat.
     pub travel_mm: f64,
     /// Root mean square distance of the measured displacement from that of the plate (mm).
     pub residual_mm: f64,
@@ -282,9 +288,11 @@ pub struct StiffnessResult {
     pub displacement: Vec<[f64; 3]>,
     /// Nodes that are held or loaded, with what is prescribed there.
     pub prescribed: Vec<Prescribed>,
-    /// Flat faces of the body (side and voxel axis) and between labels, and how far outwards (up the axis) the data put them (voxels).
+    /// Flat faces of the body (side and voxel axis) and between labels, and how far outwards (up
+    /// the axis) the data put them (voxels).
     pub faces: Vec<(String, f64)>,
-    /// Force of the model on the loaded patch for the moduli found (N; kPa mm^2 / 1000 without a force).
+    /// Force of the model on the loaded patch for the moduli found (N; kPa mm^2 / 1000 without a
+    /// force).
     pub model_force: f64,
     /// Relative change of each region's modulus from the coarse to the fine mesh.
     pub mesh_change: Vec<f64>,
@@ -335,7 +343,8 @@ pub struct FrameStiffness {
 pub struct Gain {
     /// Frames that determine it.
     pub frames: usize,
-    /// Those that count in the mean; the others moved less, and know what all frames have in common worse.
+    /// Those that count in the mean; the others moved less, and know what all frames have in common
+    /// worse.
     pub weighed: usize,
     /// The modulus, or the ratio where no force is known.
     pub value: f64,
@@ -343,14 +352,16 @@ pub struct Gain {
     pub sd: f64,
     /// The part of it that more frames lower.
     pub data_sd: f64,
-    /// Root of chi^2 per degree of freedom between the frames, beside what they have in common; 1 where they agree as well as they claim.
+    /// Root of chi^2 per degree of freedom between the frames, beside what they have in common; 1
+    /// where they agree as well as they claim.
     pub disagreement: f64,
 }
 
 /// The stiffness map that all frames of a sequence share.
 #[derive(Debug)]
 pub struct SharedStiffness {
-    /// The result of the frame that moved most of those that determine most regions, with the shared moduli.
+    /// The result of the frame that moved most of those that determine most regions, with the
+    /// shared moduli.
     pub result: StiffnessResult,
     /// Every frame.
     pub frames: Vec<FrameStiffness>,

@@ -43,12 +43,14 @@ pub struct Place {
 pub struct Trajectory {
     /// In the reference volume, world mm (RAS).
     pub initial: WorldPoint,
-    /// One a frame; none before it was first matched, in frames that could not be measured, and in the reference.
+    /// One a frame; none before it was first matched, in frames that could not be measured, and in
+    /// the reference.
     pub places: Vec<Option<Place>>,
 }
 
 impl Trajectory {
-    /// The frames in which its place is known, and that place; in the `reference` it is where it was found, with sigma 0.
+    /// The frames in which its place is known, and that place; in the `reference` it is where it
+    /// was found, with sigma 0.
     pub fn known(&self, reference: usize) -> impl Iterator<Item = (usize, Place)> + '_ {
         let start = Place { position: self.initial, sigma: 0.0, state: PointState::Measured };
         let place = move |(frame, place): (usize, &Option<Place>)| {
@@ -72,7 +74,8 @@ pub struct StrainRow {
     pub mean: [f64; 3],
     /// 98th percentile of the largest principal strain, 2nd of the smallest.
     pub peak: [f64; 2],
-    /// Mean and 98th percentile of the largest shear, half the difference of the largest and the smallest.
+    /// Mean and 98th percentile of the largest shear, half the difference of the largest and the
+    /// smallest.
     pub shear: [f64; 2],
     /// Mean relative change of volume.
     pub volume_change: f64,
@@ -101,7 +104,8 @@ pub struct FrameSummary {
     pub uncertainty_median_mm: f64,
     /// Voxels of the mask that fold.
     pub folds: usize,
-    /// Part of the tissue (1) that lies elsewhere than the frames before and after have it, without its image bearing that out.
+    /// Part of the tissue (1) that lies elsewhere than the frames before and after have it, without
+    /// its image bearing that out.
     pub out_of_line: f64,
     /// Wall seconds of the measurement.
     pub seconds: f64,
@@ -112,7 +116,8 @@ pub struct FrameSummary {
 /// What the frames of a sequence say together.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Together {
-    /// Courses over time that the motion of all frames is made of; none where each frame's field is its own.
+    /// Courses over time that the motion of all frames is made of; none where each frame's field is
+    /// its own.
     pub modes: Option<usize>,
     /// Why, in words.
     pub why: String,

@@ -1,4 +1,5 @@
-//! Runs with a known answer: what charts of speed against accuracy and of breaking points are made of.
+//! Runs with a known answer: what charts of speed against accuracy and of breaking points are made
+//! of.
 
 use serde::Serialize;
 
@@ -38,7 +39,8 @@ pub struct Trial {
     pub settings: String,
     /// What it was run on.
     pub case: String,
-    /// Mean error: mm (field), per cent of the moduli (stiffness), degrees (grasp); NaN where it failed.
+    /// Mean error: mm (field), per cent of the moduli (stiffness), degrees (grasp); NaN where it
+    /// failed.
     pub error: f64,
     /// Its 95th percentile, where there is one.
     pub error_p95: Option<f64>,
@@ -65,8 +67,8 @@ pub struct Standing {
     pub method: String,
     /// All that sets it apart.
     pub settings: String,
-    /// Per cent that is left of the error of doing nothing (geometric mean) where all cases have that, else the mean error;
-    /// NaN without any result.
+    /// Per cent that is left of the error of doing nothing (geometric mean) where all cases have
+    /// that, else the mean error; NaN without any result.
     pub error: f64,
     /// Mean CPU seconds of the runs with a result; NaN without any.
     pub cpu_s: f64,

@@ -6,8 +6,8 @@ use ndarray::{Array3, ArrayView3, ShapeBuilder};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Values on a [`Grid`], its own or lent to it; the array has shape (nx, ny, nz) and lies in memory with x fastest
-/// (NIfTI's order).
+/// Values on a [`Grid`], its own or lent to it; the array has shape (nx, ny, nz) and lies in memory
+/// with x fastest (NIfTI's order).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Voxels<'a, T: Clone = f32> {
     grid: Grid,
@@ -42,8 +42,8 @@ impl<T: Clone> Volume<T> {
         Self::from_vec(grid, values)
     }
 
-    /// The value that `f` gives for each voxel's x-fastest offset and centre, in parallel: `f` must not depend on the
-    /// order of calls.
+    /// The value that `f` gives for each voxel's x-fastest offset and centre, in parallel: `f` must
+    /// not depend on the order of calls.
     pub fn from_voxels(grid: Grid, f: impl Fn(usize, WorldPoint) -> T + Sync) -> Self
     where
         T: Send + Sync + Default,
@@ -56,7 +56,8 @@ impl<T: Clone> Volume<T> {
         })
     }
 
-    /// What `f` fills each row of voxels with, by its number (`j + ny k`), in parallel: `f` must not depend on the order of calls.
+    /// What `f` fills each row of voxels with, by its number (`j + ny k`), in parallel: `f` must
+    /// not depend on the order of calls.
     pub fn by_rows(grid: Grid, f: impl Fn(usize, &mut [T]) + Sync) -> Self
     where
         T: Send + Sync + Default,

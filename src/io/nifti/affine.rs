@@ -1,24 +1,26 @@
 //! Voxel to world: sform, qform or neither, and back to a quaternion.
 //!
-//! Formulas: nifti1.h, "3D IMAGE (VOLUME) ORIENTATION AND LOCATION IN SPACE" and `nifti_quatern_to_mat44`,
-//! `nifti_mat44_to_quatern` in nifti1_io.c.
+//! Formulas: nifti1.h, "3D IMAGE (VOLUME) ORIENTATION AND LOCATION IN SPACE" and
+//! `nifti_quatern_to_mat44`, `nifti_mat44_to_quatern` in nifti1_io.c.
 
 use super::header::Header;
 use crate::io::flaw::Flaw;
 use crate::types::space::Matrix3;
 use crate::types::{Affine, VoxelPoint};
 
-/// Largest cosine between two axes that still counts as a right angle; 200 mm away it moves a voxel by 2 um.
+/// Largest cosine between two axes that still counts as a right angle; 200 mm away it moves a voxel
+/// by 2 um.
 const SHEAR: f64 = 1e-5;
 
-/// The affine (mm, RAS): the sform where its code is positive, else the qform where its code is, else the voxel size
-/// with the first voxel at the origin. `axes` are the first three, to excuse an unset size along an axis of one voxel.
+/// The affine (mm, RAS): the sform where its code is positive, else the qform where its code is,
+/// else the voxel size with the first voxel at the origin. `axes` are the first three, to excuse an
+/// unset size along an axis of one voxel.
 pub(super) fn affine(h: &Header, axes: [usize; 3]) -> Result<Affine, Flaw> {
     if h.sform_code > 0 { in_mm(h, h.srow) } else { in_mm(h, quatern_rows(h, axes)?) }
 }
 
-/// The largest distance between where the sform and the qform of a header place a corner of its volume (mm); None where it
-/// has not both.
+/// The largest distance between where the sform and the qform of a header place a corner of its
+/// volume (mm); None where it has not both.
 pub(super) fn disagreement(h: &Header, axes: [usize; 3]) -> Option<f64> {
     if h.sform_code <= 0 || h.qform_code <= 0 {
         return None;

@@ -146,7 +146,8 @@ impl Header {
         }
     }
 
-    /// Slope and intercept of `value = slope * stored + intercept`; a slope of 0 or NaN stands for none, as in nibabel.
+    /// Slope and intercept of `value = slope * stored + intercept`; a slope of 0 or NaN stands for
+    /// none, as in nibabel.
     pub(super) fn scaling(&self) -> Result<(f64, f64), Flaw> {
         if self.scl_slope == 0.0 || !self.scl_slope.is_finite() {
             Ok((1.0, 0.0))

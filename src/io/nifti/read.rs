@@ -18,7 +18,8 @@ pub(in crate::io) fn volume(path: &Path) -> Result<(Grid, Vec<f32>), IoError> {
     load(path, scalar_layout).map(|(plan, values)| (plan.grid, values))
 }
 
-/// The grid and the three components of a field, one after the other, as they are stored; and who wrote it how.
+/// The grid and the three components of a field, one after the other, as they are stored; and who
+/// wrote it how.
 pub(in crate::io) fn field(path: &Path, flat: bool) -> Result<(Grid, Vec<f32>, Intent), IoError> {
     let (plan, values) = load(path, if flat { flat_field_layout } else { field_layout })?;
     Ok((plan.grid, values, plan.intent))
@@ -29,7 +30,8 @@ pub(in crate::io) fn header(path: &Path) -> Result<(Stored, i64), IoError> {
     open(path)?.stored().map_err(|flaw| flaw.at(path))
 }
 
-/// What the header says about a scalar volume; refuses what [`volume`] would by it and the file's size.
+/// What the header says about a scalar volume; refuses what [`volume`] would by it and the file's
+/// size.
 pub(in crate::io) fn volume_header(path: &Path) -> Result<Stored, IoError> {
     let opened = open(path)?;
     let plan = Plan::new(&opened.head, scalar_layout).and_then(|plan| plan.end_within(opened.most()));
@@ -146,7 +148,8 @@ pub(super) fn open(path: &Path) -> Result<Opened, IoError> {
     Ok(Opened { file, size: metadata.len(), head, packed })
 }
 
-/// The grid and all values, component after component; `layout` judges the axes and gives the number of components.
+/// The grid and all values, component after component; `layout` judges the axes and gives the
+/// number of components.
 fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
     let opened = open(path)?;
     let plan = Plan::new(&opened.head, layout).map_err(|flaw| flaw.at(path))?;

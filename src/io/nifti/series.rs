@@ -75,7 +75,8 @@ impl Series {
         &self.plan.grid
     }
 
-    /// Volume number `at`, counted from 0. Cheap in rising order; going back unpacks a packed file from its start.
+    /// Volume number `at`, counted from 0. Cheap in rising order; going back unpacks a packed file
+    /// from its start.
     ///
     /// # Errors
     /// [`IoError`] when there are not so many, or the file cannot be read, is damaged or cut short.

@@ -29,8 +29,8 @@ const COARSE: f64 = 0.25;
 
 /// Writes a scalar volume as float32; `description` (up to 79 bytes) goes into the header.
 ///
-/// Values are rounded to 16 significant bits (relative error at most 2^-16; whole numbers up to 65,536 are exact), so
-/// that they pack.
+/// Values are rounded to 16 significant bits (relative error at most 2^-16; whole numbers up to
+/// 65,536 are exact), so that they pack.
 ///
 /// # Errors
 /// [`IoError`] when the name ends in neither `.nii` nor `.nii.gz`, an axis has more than 32,767 voxels or the file
@@ -49,7 +49,8 @@ pub fn write_exact(path: impl AsRef<Path>, volume: &Volume, description: &str) -
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v: f32| v.to_le_bytes()).map(drop)
 }
 
-/// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it packs well.
+/// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it
+/// packs well.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -59,8 +60,9 @@ pub fn write_steps(path: impl AsRef<Path>, volume: &Volume, description: &str, b
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| step(v).to_le_bytes()).map(drop)
 }
 
-/// As [`write_volume`], or as [`write_steps`] where `bits` are named, of values that are worked out while they are written: `rows` gives
-/// those of whole rows from row `first` of the grid on (`j + ny k`). Of a large volume no more than some rows are ever held.
+/// As [`write_volume`], or as [`write_steps`] where `bits` are named, of values that are worked out
+/// while they are written: `rows` gives those of whole rows from row `first` of the grid on
+/// (`j + ny k`). Of a large volume no more than some rows are ever held.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -89,7 +91,8 @@ pub fn write_by_rows(
     write_made(path.as_ref(), grid, form, 1, made, kept).map(drop)
 }
 
-/// Writes a volume as int16, each value rounded to the nearest whole number: half the size of [`write_volume`].
+/// Writes a volume as int16, each value rounded to the nearest whole number: half the size of
+/// [`write_volume`].
 ///
 /// # Errors
 /// As [`write_volume`]; also when a value is not finite or does not fit.
@@ -113,10 +116,11 @@ pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) ->
     write(path.as_ref(), labels.grid(), form, &[labels.as_slice()], |_, v: u8| [v]).map(drop)
 }
 
-/// Writes a displacement field (mm) as ITK, ANTs and Slicer read it: (nx, ny, nz, 1, 3), intent 1007, float32, LPS.
+/// Writes a displacement field (mm) as ITK, ANTs and Slicer read it: (nx, ny, nz, 1, 3), intent
+/// 1007, float32, LPS.
 ///
-/// Components are rounded to multiples of 2^-12 mm (error at most 2^-13 mm, 0.12 um), or of a thousandth of the finest voxel edge where
-/// that is less ([`stored_length`]), so that they pack.
+/// Components are rounded to multiples of 2^-12 mm (error at most 2^-13 mm, 0.12 um), or of a
+/// thousandth of the finest voxel edge where that is less ([`stored_length`]), so that they pack.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -124,7 +128,8 @@ pub fn write_field(path: impl AsRef<Path>, field: &DenseField) -> Result<(), IoE
     write_series_field(path, field).map(drop)
 }
 
-/// As [`write_field`]; what is given back puts the field into a series (see [`write_field_series`]).
+/// As [`write_field`]; what is given back puts the field into a series (see
+/// [`write_field_series`]).
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -149,8 +154,9 @@ pub struct PackedField {
     runs: Vec<Run>,
 }
 
-/// Joins fields on one grid into a series over time, (nx, ny, nz, nt, 3), intent 1007, LPS mm, without packing them
-/// again; a frame without a field is NaN. `step_s` is the time between frames (s; 0 when not known).
+/// Joins fields on one grid into a series over time, (nx, ny, nz, nt, 3), intent 1007, LPS mm,
+/// without packing them again; a frame without a field is NaN. `step_s` is the time between frames
+/// (s; 0 when not known).
 ///
 /// # Errors
 /// [`IoError`] when a frame's file cannot be read any more, or as [`write_volume`].
@@ -183,8 +189,9 @@ pub fn write_field_series(
     })
 }
 
-/// Writes a symmetric tensor a voxel as NIfTI's intent 1005 has it: (nx, ny, nz, 1, 6), the lower triangle row by row,
-/// with axes in LPS. `tensors` are xx, yy, zz, xy, xz, yz in RAS, x fastest; rounded to multiples of 2^-18.
+/// Writes a symmetric tensor a voxel as NIfTI's intent 1005 has it: (nx, ny, nz, 1, 6), the lower
+/// triangle row by row, with axes in LPS. `tensors` are xx, yy, zz, xy, xz, yz in RAS, x fastest;
+/// rounded to multiples of 2^-18.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -225,7 +232,8 @@ pub fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
     move |v| (v * up).round_ties_even() * down + 0.0
 }
 
-/// A value as [`write_volume`] keeps it: the nearest number with 16 significant bits, ties to even; NaN and infinity stay.
+/// A value as [`write_volume`] keeps it: the nearest number with 16 significant bits, ties to even;
+/// NaN and infinity stay.
 pub fn stored(v: f32) -> f32 {
     if !v.is_finite() {
         return v;
@@ -256,8 +264,8 @@ impl Form<'_> {
     const VECTORS: Self = Self { components: 3, intent: 1007, ..Self::FLOATS };
 }
 
-/// Header, then the parts one after the other; `stored` turns a value of a part (by its number) into bytes. Gives the
-/// place of each part in a packed file.
+/// Header, then the parts one after the other; `stored` turns a value of a part (by its number)
+/// into bytes. Gives the place of each part in a packed file.
 fn write<T: Copy + Sync, const N: usize>(
     path: &Path,
     grid: &Grid,
@@ -268,7 +276,8 @@ fn write<T: Copy + Sync, const N: usize>(
     write_made(path, grid, form, parts.len(), |part, range| Cow::Borrowed(&parts[part][range]), stored)
 }
 
-/// As [`write`], of parts some of whose values are made at a time: `made` gives those of a range of a part.
+/// As [`write`], of parts some of whose values are made at a time: `made` gives those of a range of
+/// a part.
 fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
     path: &Path,
     grid: &Grid,

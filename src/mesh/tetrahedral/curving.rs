@@ -146,7 +146,8 @@ pub fn least_determinant(p: [[f64; 3]; 10]) -> f64 {
     least / straight
 }
 
-/// Volume (mm^3) of a curved element: the determinant is of degree three, and Keast's five points integrate that exactly.
+/// Volume (mm^3) of a curved element: the determinant is of degree three, and Keast's five points
+/// integrate that exactly.
 pub fn volume(p: [[f64; 3]; 10]) -> f64 {
     let at = |l: [f64; 4]| determinant_at(&p, l);
     let sixth = 1.0 / 6.0;

@@ -1,13 +1,15 @@
 //! Cutting a tetrahedral mesh along the zero of a level function.
 //!
-//! Where the zero crosses an edge near one of its ends, that vertex is moved onto it (Labelle and Shewchuk 2007); the edges
-//! still crossed get a new vertex there, and their tetrahedra are divided into pieces that lie on one side. Quadrilaterals
-//! are divided along the diagonal from their vertex of least number, so that neighbours agree.
+//! Where the zero crosses an edge near one of its ends, that vertex is moved onto it (Labelle and
+//! Shewchuk 2007); the edges still crossed get a new vertex there, and their tetrahedra are divided
+//! into pieces that lie on one side. Quadrilaterals are divided along the diagonal from their
+//! vertex of least number, so that neighbours agree.
 
 use std::collections::HashMap;
 
-/// A vertex is moved when a crossing is nearer than this part of the edge: with 0.25 the least dihedral angle of the balls,
-/// blocks and layers of the tests was largest (0.25 and 0.41 are the proven limits for one cut of an ungraded lattice).
+/// A vertex is moved when a crossing is nearer than this part of the edge: with 0.25 the least
+/// dihedral angle of the balls, blocks and layers of the tests was largest (0.25 and 0.41 are the
+/// proven limits for one cut of an ungraded lattice).
 const NEAR: f64 = 0.25;
 /// Level values this near to zero are zero.
 const ZERO: f64 = 0.02;
@@ -34,8 +36,9 @@ impl Cut {
         Self { surfaces: vec![0; places.len()], part: vec![NO_PART; cells.len()], places, cells }
     }
 
-    /// Cuts along the zero of `level`; new and moved vertices get `bit`. `along` says which edges a vertex that lies on a
-    /// surface already may move along. Gives for each cell whether it is on the positive side.
+    /// Cuts along the zero of `level`; new and moved vertices get `bit`. `along` says which edges a
+    /// vertex that lies on a surface already may move along. Gives for each cell whether it is on
+    /// the positive side.
     pub fn along(
         &mut self,
         level: impl Fn([f64; 3]) -> f64 + Sync,

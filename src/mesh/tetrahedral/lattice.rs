@@ -1,9 +1,9 @@
 //! A graded body-centred cubic lattice of tetrahedra: the background of the mesh.
 //!
-//! Cubes are halved where a finer mesh is wanted, and their neighbours so far that sizes differ at most by two (octree, 2:1
-//! balanced over faces, edges and corners). Each face joins the centres on its two sides with its edges, as Labelle and
-//! Shewchuk ("Isosurface stuffing", SIGGRAPH 2007) do; a face between two sizes is cut along the diagonals that lead to
-//! its centre.
+//! Cubes are halved where a finer mesh is wanted, and their neighbours so far that sizes differ at
+//! most by two (octree, 2:1 balanced over faces, edges and corners). Each face joins the centres on
+//! its two sides with its edges, as Labelle and Shewchuk ("Isosurface stuffing", SIGGRAPH 2007) do;
+//! a face between two sizes is cut along the diagonals that lead to its centre.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -13,7 +13,8 @@ pub const MAX_LEVEL: u32 = 5;
 /// Vertices (grid mm) and tetrahedra.
 pub type Lattice = (Vec<[f64; 3]>, Vec<[u32; 4]>);
 
-/// A cube: halvings, then its number along each axis at that level (the margin of one base cube makes all positive).
+/// A cube: halvings, then its number along each axis at that level (the margin of one base cube
+/// makes all positive).
 type Cube = (u32, [i32; 3]);
 
 /// The base cubes and which of them are divided.
@@ -26,7 +27,8 @@ pub struct Octree {
 }
 
 impl Octree {
-    /// Base cubes of about `size` (mm) that fill the box `[low, high]` exactly, with one more on each side.
+    /// Base cubes of about `size` (mm) that fill the box `[low, high]` exactly, with one more on
+    /// each side.
     pub fn new([low, high]: [[f64; 3]; 2], size: f64) -> Self {
         let n: [f64; 3] = std::array::from_fn(|a| ((high[a] - low[a]) / size).round().max(1.0));
         let size: [f64; 3] = std::array::from_fn(|a| (high[a] - low[a]) / n[a]);

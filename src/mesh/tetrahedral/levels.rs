@@ -1,6 +1,8 @@
-//! Smooth level functions of a label map: where the body and each of its parts ends, to a fraction of a voxel.
+//! Smooth level functions of a label map: where the body and each of its parts ends, to a fraction
+//! of a voxel.
 //!
-//! A voxel map has stairs; [`rounding`](super::rounding) takes them out of the body and of each part.
+//! A voxel map has stairs; [`rounding`](super::rounding) takes them out of the body and of each
+//! part.
 //!
 //! All positions here are in *grid millimetres*: voxel index times voxel size.
 
@@ -158,8 +160,9 @@ impl Levels {
         }
     }
 
-    /// Twice the distance (mm) of the part's innermost voxels from another part or the outside, for each part; the
-    /// thickness of a layer, the diameter of a ball. The thickest hundredth of the voxels decides.
+    /// Twice the distance (mm) of the part's innermost voxels from another part or the outside, for
+    /// each part; the thickness of a layer, the diameter of a ball. The thickest hundredth of the
+    /// voxels decides.
     pub fn thickness(&self) -> Vec<f64> {
         let least = self.voxel();
         let mut depth: Vec<u16> = vec![0; self.map.len()];

@@ -1,14 +1,16 @@
-//! A quality tetrahedral mesh of a label map, for elasticity: quadratic, graded, with faces on the body's surface and on
-//! the interfaces between its parts.
+//! A quality tetrahedral mesh of a label map, for elasticity: quadratic, graded, with faces on the
+//! body's surface and on the interfaces between its parts.
 //!
-//! A graded body-centred cubic lattice ([`lattice`]) is cut along the smooth surface of the body and then along that of
-//! each part ([`levels`], [`rounding`], [`cutting`]), its inner vertices are moved where that makes the worst shapes better
-//! ([`smoothing`]), and edges on surfaces are bent onto them ([`curving`]).
+//! A graded body-centred cubic lattice ([`lattice`]) is cut along the smooth surface of the body
+//! and then along that of each part ([`levels`], [`rounding`], [`cutting`]), its inner vertices are
+//! moved where that makes the worst shapes better ([`smoothing`]), and edges on surfaces are bent
+//! onto them ([`curving`]).
 //!
-//! Promises: neighbours share whole faces; every element lies in one part and has a positive Jacobian determinant at its
-//! corners, mid-edges and quadrature points; at least four intervals between nodes lie across the thinnest part, as
-//! far as the limit on the number of nodes allows. Needs a body in one piece. Where parts meet at edges thinner than a
-//! cell, elements go to the part that holds their centre.
+//! Promises: neighbours share whole faces; every element lies in one part and has a positive
+//! Jacobian determinant at its corners, mid-edges and quadrature points; at least four intervals
+//! between nodes lie across the thinnest part, as far as the limit on the number of nodes allows.
+//! Needs a body in one piece. Where parts meet at edges thinner than a cell, elements go to the
+//! part that holds their centre.
 
 pub mod levels;
 
@@ -41,7 +43,8 @@ pub struct Fineness {
 }
 
 impl Fineness {
-    /// Base cubes so that a body of `volume` (mm^3) gets about `nodes` nodes (16 a cube inside, 22 with the surface's).
+    /// Base cubes so that a body of `volume` (mm^3) gets about `nodes` nodes (16 a cube inside, 22
+    /// with the surface's).
     pub fn for_nodes(volume: f64, nodes: usize) -> Self {
         Self { size: (22.0 * volume / nodes as f64).cbrt(), layers: 2.0, nodes: nodes + nodes / 2 }
     }
@@ -127,7 +130,8 @@ impl Mesher {
         self.mesh_finer(fineness, Detail::default())
     }
 
-    /// With some places in more detail. Where parts get no element, smaller cubes are tried in these, down to half a voxel.
+    /// With some places in more detail. Where parts get no element, smaller cubes are tried in
+    /// these, down to half a voxel.
     ///
     /// # Errors
     /// As [`mesh_labels`].
@@ -150,7 +154,8 @@ impl Mesher {
         }
     }
 
-    /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this fineness itself.
+    /// About how many nodes [`Self::mesh_finer`] makes; none where it makes no mesh with this
+    /// fineness itself.
     pub fn nodes(&self, fineness: &Fineness, detail: Detail<'_>) -> Option<usize> {
         let lattice = self.lattice(fineness, detail, &self.halvings(fineness));
         let cut = cut_up(&lattice, &self.levels, detail.wall).ok()?;
@@ -166,7 +171,8 @@ impl Mesher {
         lattice::Octree::new(self.levels.bounds(), fineness.size)
     }
 
-    /// How often the cubes of each part are halved: where it is thin, as far as the estimated number of nodes stays within the limit.
+    /// How often the cubes of each part are halved: where it is thin, as far as the estimated
+    /// number of nodes stays within the limit.
     fn halvings(&self, fineness: &Fineness) -> BTreeMap<u8, u32> {
         halvings(&self.levels, fineness, self.cubes(fineness).base())
     }
@@ -256,7 +262,8 @@ fn build(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) ->
     Ok(Made { places, tetrahedra, part: cut.part })
 }
 
-/// Moves the surfaces by the missing volume over their area: chords of curved surfaces lie inside of them.
+/// Moves the surfaces by the missing volume over their area: chords of curved surfaces lie inside
+/// of them.
 fn calibrate(made: &Made, levels: &mut Levels) {
     let wanted = levels.volumes();
     let mut volume = vec![0.0; wanted.len()];
@@ -300,8 +307,8 @@ fn cut_edge(edges: &std::collections::HashSet<(u32, u32)>, a: u32, b: u32) -> bo
     edges.contains(&(a.min(b), a.max(b)))
 }
 
-/// How often cubes of side `base` (mm) are halved in each part: where it is thin, as far as the estimated number of nodes stays
-/// within the limit.
+/// How often cubes of side `base` (mm) are halved in each part: where it is thin, as far as the
+/// estimated number of nodes stays within the limit.
 fn halvings(levels: &Levels, fineness: &Fineness, base: f64) -> BTreeMap<u8, u32> {
     let wanted: BTreeMap<u8, f64> =
         levels.labels().iter().copied().zip(levels.thickness().iter().map(|t| t / fineness.layers)).collect();

@@ -1,13 +1,15 @@
 //! Signed distance from the surface of a set of voxels, as smooth as the voxels allow.
 //!
-//! Where a surface lies nearly along the voxels its stairs are wide, and no kernel of a fixed width takes them out. But each
-//! voxel says on which side of the surface its centre is, and how far away the surface is at most: at the nearest centre of
-//! the other kind. Among the functions within these bounds this finds the one of least bending, the integral of the squared
-//! Laplacian, with a weak pull to the middle of the bounds, by Nesterov's projected gradient (Beck and Teboulle, SIAM J. Imaging
-//! Sciences 2, 2009) in a band around the surface. The Laplacian of the Laplacian of a sphere's distance is 0, so spheres keep
-//! their size. Sharp edges of a body would be bent round, and the faces beside them with it: so bending does not count where
-//! the distance, smoothed a little, bends as only an edge does (the known creases of a weak plate: Blake and Zisserman, Visual
-//! Reconstruction, 1987).
+//! Where a surface lies nearly along the voxels its stairs are wide, and no kernel of a fixed width
+//! takes them out. But each voxel says on which side of the surface its centre is, and how far away
+//! the surface is at most: at the nearest centre of the other kind. Among the functions within
+//! these bounds this finds the one of least bending, the integral of the squared Laplacian, with a
+//! weak pull to the middle of the bounds, by Nesterov's projected gradient (Beck and Teboulle, SIAM
+//! J. Imaging Sciences 2, 2009) in a band around the surface. The Laplacian of the Laplacian of a
+//! sphere's distance is 0, so spheres keep their size. Sharp edges of a body would be bent round,
+//! and the faces beside them with it: so bending does not count where the distance, smoothed a
+//! little, bends as only an edge does (the known creases of a weak plate: Blake and Zisserman,
+//! Visual Reconstruction, 1987).
 
 use crate::numerics::filters::gaussian;
 use crate::numerics::small::eigenvalues;
@@ -19,7 +21,8 @@ const BAND: f32 = 4.0;
 const FURTHEST: i32 = 6;
 /// Steps of the projected gradient.
 const STEPS: usize = 60;
-/// Smoothing before edges are looked for (voxels): of stairs it leaves little, a right angle bends by 0.47 then.
+/// Smoothing before edges are looked for (voxels): of stairs it leaves little, a right angle bends
+/// by 0.47 then.
 const SMOOTHED: f64 = 1.2;
 /// Curvature (1/voxel) that is as likely an edge's as not: that of a ball of 3.2 voxels' radius.
 const CREASE: f32 = 0.31;
@@ -32,8 +35,8 @@ const CLEAR: f32 = 0.02;
 /// Voxels of the band at work together.
 const CHUNK: usize = 1 << 14;
 
-/// Signed distance (voxels, positive inside) of each voxel's centre; x fastest. Voxels within two of the box's border keep the
-/// middle of their bounds, and no distance exceeds 6.
+/// Signed distance (voxels, positive inside) of each voxel's centre; x fastest. Voxels within two
+/// of the box's border keep the middle of their bounds, and no distance exceeds 6.
 pub fn signed_distance(inside: &[bool], shape: [usize; 3]) -> Vec<f32> {
     let [within, without] = [true, false].map(|side| to_other(inside, shape, side));
     let middle = |o: usize| if inside[o] { within[o] - 0.5 } else { 0.5 - without[o] };
@@ -106,7 +109,8 @@ fn curvature(v: &[f32], o: usize, stride: [usize; 3]) -> f32 {
     most.abs().max(least.abs()) as f32
 }
 
-/// Distance (voxels) of each voxel on a side from the nearest centre on the other, [`FURTHEST`] at most.
+/// Distance (voxels) of each voxel on a side from the nearest centre on the other, [`FURTHEST`] at
+/// most.
 fn to_other(inside: &[bool], shape: [usize; 3], side: bool) -> Vec<f32> {
     const FAR: i32 = FURTHEST * FURTHEST;
     let mut square: Vec<i32> = inside.iter().map(|&v| if v == side { FAR } else { 0 }).collect();
@@ -141,7 +145,8 @@ mod tests {
         [o % SIDE, o / SIDE % SIDE, o / (SIDE * SIDE)].map(|v| v as f64)
     }
 
-    /// Mean and standard deviation (voxels) of a surface's distance from where it was cut into voxels: `truth` is positive inside.
+    /// Mean and standard deviation (voxels) of a surface's distance from where it was cut into
+    /// voxels: `truth` is positive inside.
     fn errors(truth: impl Fn([f64; 3]) -> f64) -> [f64; 2] {
         let inside: Vec<bool> = (0..SIDE.pow(3)).map(|o| truth(voxel(o)) > 0.0).collect();
         let found = signed_distance(&inside, [SIDE; 3]);
@@ -163,8 +168,8 @@ mod tests {
 
     #[test]
     fn a_ball_is_found_from_its_voxels_without_stairs() {
-        // A kernel of one voxel leaves 0.085 voxels, the voxels alone 0.29. What all of a surface is off by falls away when its
-        // volume is made that of its voxels.
+        // A kernel of one voxel leaves 0.085 voxels, the voxels alone 0.29. What all of a surface
+        // is off by falls away when its volume is made that of its voxels.
         for (radius, middle) in [(23.0, [31.3, 31.7, 31.4]), (22.6, [31.0, 32.0, 31.5]), (6.0, [31.2, 31.9, 31.6])] {
             let ball = |p: [f64; 3]| radius - (0..3).map(|a| (p[a] - middle[a]).powi(2)).sum::<f64>().sqrt();
             let [mean, spread] = errors(ball);
@@ -175,7 +180,8 @@ mod tests {
 
     #[test]
     fn a_block_keeps_its_faces_and_edges() {
-        // A kernel of one voxel rounds the edge by 0.32, bending that counts everywhere by 0.47 and by 0.2 for six voxels.
+        // A kernel of one voxel rounds the edge by 0.32, bending that counts everywhere by 0.47 and
+        // by 0.2 for six voxels.
         let block = |p: [f64; 3]| (0..3).map(|a| 15.5 - (p[a] - 31.0).abs()).fold(f64::INFINITY, f64::min);
         let inside: Vec<bool> = (0..SIDE.pow(3)).map(|o| block(voxel(o)) > 0.0).collect();
         let found = signed_distance(&inside, [SIDE; 3]);

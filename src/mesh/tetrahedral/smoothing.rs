@@ -1,11 +1,13 @@
-//! Moving vertices to the middle of their neighbours where that improves the worst shape around them.
+//! Moving vertices to the middle of their neighbours where that improves the worst shape around
+//! them.
 
 use super::cutting::{Cut, distance, volume};
 
 /// Passes over all inner vertices; more changed the worst angle by under half a degree.
 const PASSES: usize = 4;
 
-/// Shape of a tetrahedron, 1 for a regular one, 0 for a flat one: volume over the cube of the root mean square edge.
+/// Shape of a tetrahedron, 1 for a regular one, 0 for a flat one: volume over the cube of the root
+/// mean square edge.
 pub(super) fn shape(p: [[f64; 3]; 4]) -> f64 {
     let mut square = 0.0;
     for i in 0..4 {
@@ -16,7 +18,8 @@ pub(super) fn shape(p: [[f64; 3]; 4]) -> f64 {
     6.0 * std::f64::consts::SQRT_2 * volume(p) / (square / 6.0).powf(1.5)
 }
 
-/// Moves vertices on no surface towards their neighbours' mean, where the worst shape around gets better.
+/// Moves vertices on no surface towards their neighbours' mean, where the worst shape around gets
+/// better.
 pub fn smooth(cut: &mut Cut) {
     let mut around: Vec<Vec<u32>> = vec![Vec::new(); cut.places.len()];
     for (e, c) in cut.cells.iter().enumerate() {

@@ -17,7 +17,8 @@ fn side(corners: &[u32; 8], axis: usize, high: usize) -> [u32; 4] {
     std::array::from_fn(|n| corners[(high << axis) | ((n & 1) << u) | ((n >> 1) << v)])
 }
 
-/// A lattice of cells with planes at `planes` along each axis; vertices are moved by `shift`, and on `surfaces`.
+/// A lattice of cells with planes at `planes` along each axis; vertices are moved by `shift`, and
+/// on `surfaces`.
 fn lattice(
     mesh: &mut HexMesh,
     planes: &[Vec<f64>; 3],
@@ -45,8 +46,8 @@ fn lattice(
     cells
 }
 
-/// A block from `low` to `high` (mm), held below and pressed above, with balls side by side along x in its middle;
-/// ball `n` is region `n + 1` and has the curved surface `n`.
+/// A block from `low` to `high` (mm), held below and pressed above, with balls side by side along x
+/// in its middle; ball `n` is region `n + 1` and has the curved surface `n`.
 pub fn block_with_balls(low: [f64; 3], high: [f64; 3], balls: &[Ball]) -> HexMesh {
     // How far from a ball's centre the planes of its cell lie: not all the way to what comes next.
     let reach = |ball: &Ball, room: f64| ball.radius + (0.45 * (room - ball.radius)).min(0.8 * ball.radius);
@@ -118,9 +119,9 @@ fn ball_in_cell(mesh: &mut HexMesh, cell: &[u32; 8], ball: &Ball, number: usize)
     }
 }
 
-/// A block from `low` to `high` (mm) of layers, from the top down; `interface(n, x, y)` is the height between layers n and
-/// n + 1, the curved surface n. Held below; pressed above on the rectangle `punch` (low and high x, y). Planes crowd at the
-/// punch's rim.
+/// A block from `low` to `high` (mm) of layers, from the top down; `interface(n, x, y)` is the
+/// height between layers n and n + 1, the curved surface n. Held below; pressed above on the
+/// rectangle `punch` (low and high x, y). Planes crowd at the punch's rim.
 pub fn layered_block(
     low: [f64; 3],
     high: [f64; 3],
@@ -180,10 +181,12 @@ pub fn layered_block(
     mesh
 }
 
-/// Half ellipsoids, one in the other, that hang from a flat face at the height of `centre`, which is held. `radii` from the
-/// outside in; surface n is curved surface n, and the outermost is pressed. The space within surface n is region n.
+/// Half ellipsoids, one in the other, that hang from a flat face at the height of `centre`, which
+/// is held. `radii` from the outside in; surface n is curved surface n, and the outermost is
+/// pressed. The space within surface n is region n.
 ///
-/// The innermost holds a box of 4 x 4 x 3 cells; from its lower side and its four flanks a cell a layer leads out.
+/// The innermost holds a box of 4 x 4 x 3 cells; from its lower side and its four flanks a cell a
+/// layer leads out.
 pub fn dome(centre: [f64; 3], radii: &[[f64; 3]]) -> HexMesh {
     const CELLS: [usize; 3] = [4, 4, 3];
     // Place of a lattice point on the box, which is as wide as 1 and as deep as this.

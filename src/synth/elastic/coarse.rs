@@ -14,7 +14,8 @@ pub struct Coarse {
     factor: Vec<Vec<f64>>,
 }
 
-/// Stiffness of one hexahedron at rest: mu times the symmetric gradients, plus lambda times the mean divergence squared.
+/// Stiffness of one hexahedron at rest: mu times the symmetric gradients, plus lambda times the
+/// mean divergence squared.
 fn stiffness(corners: &[[f64; 3]; 8], Lame { mu, lambda }: Lame) -> [[f64; 24]; 24] {
     let point = 1.0 / 3f64.sqrt();
     let mut out = [[0.0; 24]; 24];
@@ -96,7 +97,8 @@ impl Coarse {
         Self { row, first, matrix, factor: Vec::new() }
     }
 
-    /// Factorises for the components where `free` is 1 (one line a node, at least as many as there are vertices).
+    /// Factorises for the components where `free` is 1 (one line a node, at least as many as there
+    /// are vertices).
     pub fn hold(&mut self, free: &[[f32; 3]]) {
         let mut is_free = vec![true; self.row.len()];
         for (u, &r) in self.row.iter().enumerate() {

@@ -40,8 +40,8 @@ struct Block {
 pub type Project<'a> = dyn Fn(Surfaces, [f64; 3]) -> [f64; 3] + 'a;
 
 impl Block {
-    /// The place at `t`: the transfinite blend (Gordon and Hall 1973) of the faces, those of the edges, those of the corners;
-    /// each face and edge that lies on a surface is brought onto it.
+    /// The place at `t`: the transfinite blend (Gordon and Hall 1973) of the faces, those of the
+    /// edges, those of the corners; each face and edge that lies on a surface is brought onto it.
     fn at(&self, t: [f64; 3], project: &Project<'_>) -> [f64; 3] {
         let free: Vec<usize> = (0..3).filter(|&a| t[a] != 0.0 && t[a] != 1.0).collect();
         let on_it = |c: usize| (0..3).all(|a| free.contains(&a) || (t[a] == 1.0) == (c >> a & 1 == 1));
@@ -80,7 +80,8 @@ impl HexMesh {
         (self.vertices.len() - 1) as u32
     }
 
-    /// Adds the hexahedron between two quadrilaterals (corners `i + 2 j` each), turned to be right-handed.
+    /// Adds the hexahedron between two quadrilaterals (corners `i + 2 j` each), turned to be
+    /// right-handed.
     pub fn between(&mut self, low: [u32; 4], high: [u32; 4], region: u8) {
         let mut hex = [low[0], low[1], low[2], low[3], high[0], high[1], high[2], high[3]];
         let at = |c: usize| self.vertices[hex[c] as usize];
@@ -99,7 +100,8 @@ impl HexMesh {
         self.region.push(region);
     }
 
-    /// Each hexahedron cut into eight (child `c` of hexahedron `e` is number `8 e + c`), and its lattice.
+    /// Each hexahedron cut into eight (child `c` of hexahedron `e` is number `8 e + c`), and its
+    /// lattice.
     ///
     /// Vertices keep their numbers; `project` keeps the new ones on the curved surfaces.
     pub fn refined(&self, project: &Project<'_>) -> (HexMesh, Vec<Lattice>) {

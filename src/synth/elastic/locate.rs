@@ -6,7 +6,8 @@ use crate::types::space::{Matrix3, determinant};
 use crate::types::{Grid, WorldPoint};
 use rayon::prelude::*;
 
-/// A place in an element by its local coordinates; outside of [-1, 1] on the linear continuation of the element's side.
+/// A place in an element by its local coordinates; outside of [-1, 1] on the linear continuation of
+/// the element's side.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Place {
     /// The element.
@@ -22,7 +23,8 @@ pub fn interpolate(values: &[[f64; 3]], lattice: &Lattice, local: [f64; 3]) -> [
     extended(|n| values[lattice[n] as usize], local).0
 }
 
-/// Value at `local`, the derivatives (`[component][axis]`), and how far the value lies from that at the nearest inside.
+/// Value at `local`, the derivatives (`[component][axis]`), and how far the value lies from that at
+/// the nearest inside.
 #[inline(always)]
 fn extended(value: impl Fn(usize) -> [f64; 3], local: [f64; 3]) -> ([f64; 3], Matrix3, f64) {
     let inside = local.map(|t| t.clamp(-1.0, 1.0));
@@ -53,7 +55,8 @@ pub struct Locator<'a> {
     elements: &'a [Lattice],
     /// Places of the nodes (voxels).
     nodes: Vec<[f64; 3]>,
-    /// Low and high corner of the box around each element (voxels), widened where it has a free side.
+    /// Low and high corner of the box around each element (voxels), widened where it has a free
+    /// side.
     boxes: Vec<[[f64; 3]; 2]>,
     /// Whether an element has a free side.
     rim: Vec<bool>,

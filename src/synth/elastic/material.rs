@@ -1,9 +1,10 @@
 //! Energy, forces and tangent of compressible neo-Hookean tissue without locking.
 //!
-//! The energy of an element is the integral of `mu/2 (tr F^T F - 3 - 2 ln J) + lambda/2 (ln J projected)^2` over its rest
-//! state, so that `P = mu (F - F^-T) + p F^-T` with the pressure-like `p = lambda` times ln J's L2 projection on linear
-//! functions of the element. With triquadratic displacements this is the Q2/P1 pair, stable to Poisson's ratio 0.5
-//! (Brezzi and Fortin 1991, VI.3), and symmetric.
+//! The energy of an element is the integral of
+//! `mu/2 (tr F^T F - 3 - 2 ln J) + lambda/2 (ln J projected)^2` over its rest state, so that
+//! `P = mu (F - F^-T) + p F^-T` with the pressure-like `p = lambda` times ln J's L2 projection on
+//! linear functions of the element. With triquadratic displacements this is the Q2/P1 pair, stable
+//! to Poisson's ratio 0.5 (Brezzi and Fortin 1991, VI.3), and symmetric.
 
 use crate::synth::elastic::quadratic::{GAUSS, NODES, Nodal, Tables, divergence, gradient, line, weight};
 use crate::synth::elastic::space::{Entries, LANES, Space, entries};
@@ -110,7 +111,8 @@ fn at(d: &Derivatives, q: usize, l: usize) -> Matrix3 {
     std::array::from_fn(|r| std::array::from_fn(|c| d[r][c][q][l]))
 }
 
-/// Adds the element in lane `l` with places at rest `x`; the energy, and the stress that [`divergence`] sums up.
+/// Adds the element in lane `l` with places at rest `x`; the energy, and the stress that
+/// [`divergence`] sums up.
 #[inline(always)]
 fn element(
     rest: &Derivatives,
@@ -173,8 +175,8 @@ fn moved(space: &Space, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
     space.nodes.iter().zip(u).map(|(x, u)| std::array::from_fn(|c| x[c] + u[c])).collect()
 }
 
-/// Energy, forces and tangent at displacement `u`; `lame` by region. The tangent takes the pressure of its turning term from
-/// `pressure`, by element.
+/// Energy, forces and tangent at displacement `u`; `lame` by region. The tangent takes the pressure
+/// of its turning term from `pressure`, by element.
 pub fn state(space: &Space, lame: &[Lame], u: &[[f64; 3]], pressure: &[Pressure]) -> State {
     let tables = Tables::new(|v| v);
     let moved = moved(space, u);

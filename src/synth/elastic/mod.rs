@@ -1,9 +1,10 @@
 //! Elastic phantoms: a body of known Young's modulus, pressed, with its displacement solved.
 //!
-//! The solver shares nothing with the one that identifies stiffness: triquadratic hexahedra with a linear pressure, fitted to
-//! the regions and refined until the change from one level to the next is a few micrometres; a matrix-free Newton method
-//! with multigrid. The displacement is that of the elements, everywhere; images are drawn through its inverse. Fails where
-//! the body is pressed too far to find an equilibrium.
+//! The solver shares nothing with the one that identifies stiffness: triquadratic hexahedra with a
+//! linear pressure, fitted to the regions and refined until the change from one level to the next
+//! is a few micrometres; a matrix-free Newton method with multigrid. The displacement is that of
+//! the elements, everywhere; images are drawn through its inverse. Fails where the body is pressed
+//! too far to find an equilibrium.
 
 pub mod blocks;
 

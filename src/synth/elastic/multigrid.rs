@@ -1,7 +1,9 @@
-//! Conjugate gradients on the tangent, preconditioned by a multigrid cycle on the stiffness at rest.
+//! Conjugate gradients on the tangent, preconditioned by a multigrid cycle on the stiffness at
+//! rest.
 //!
-//! The levels are nested, each fitted to the regions; Chebyshev polynomials smooth (Adams, Brezina, Hu and Tuminaro
-//! 2003, doi:10.1016/S0021-9991(03)00194-3). All in single precision: Newton's method corrects what that loses.
+//! The levels are nested, each fitted to the regions; Chebyshev polynomials smooth (Adams, Brezina,
+//! Hu and Tuminaro 2003, doi:10.1016/S0021-9991(03)00194-3). All in single precision: Newton's
+//! method corrects what that loses.
 
 use crate::numerics::random::Random;
 use crate::synth::elastic::coarse::Coarse;
@@ -50,7 +52,8 @@ impl<'a> Multigrid<'a> {
         self.levels.push(Level { stiffness, inverse_diagonal, transfer, free: Vec::new(), largest: 0.0 });
     }
 
-    /// Sets which components are free (1) and which held (0) on the finest level; nodes of a coarser one come first.
+    /// Sets which components are free (1) and which held (0) on the finest level; nodes of a
+    /// coarser one come first.
     pub fn hold(&mut self, free: &[[f32; 3]]) {
         self.coarse.hold(free);
         for level in &mut self.levels {
@@ -122,7 +125,8 @@ fn mask(x: &mut [[f32; 3]], free: &[[f32; 3]]) {
 }
 
 impl Level<'_> {
-    /// Adds a Chebyshev polynomial of the residual `left` to x; `left` stays the residual if `keep`.
+    /// Adds a Chebyshev polynomial of the residual `left` to x; `left` stays the residual if
+    /// `keep`.
     fn smooth(&self, x: &mut [[f32; 3]], left: &mut [[f32; 3]], keep: bool) {
         let (high, low) = (self.largest, SHARE * self.largest);
         let (middle, half) = ((high + low) / 2.0, (high - low) / 2.0);

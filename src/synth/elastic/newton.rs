@@ -16,7 +16,8 @@ pub struct Problem<'a> {
     pub project: &'a Project<'a>,
     /// Moduli by region (kPa).
     pub lame: Vec<Lame>,
-    /// The displacement (mm) of the components that are held or pressed, from a node's surfaces and place.
+    /// The displacement (mm) of the components that are held or pressed, from a node's surfaces and
+    /// place.
     pub boundary: &'a dyn Fn(Surfaces, [f64; 3]) -> [Option<f64>; 3],
     /// Where to start from.
     pub guess: &'a dyn Fn([f64; 3]) -> [f64; 3],
@@ -66,7 +67,8 @@ const SLACK: f64 = 2e-4;
 const MOST_STEPS: usize = 60;
 const MOST_ITERATIONS: usize = 400;
 
-/// The displacement in equilibrium; `None` where Newton's method fails, because the tissue is pressed too far.
+/// The displacement in equilibrium; `None` where Newton's method fails, because the tissue is
+/// pressed too far.
 pub fn equilibrium(problem: &Problem<'_>) -> Option<Equilibrium> {
     let (spaces, transfers) = hierarchy(problem);
     let mut multigrid = Multigrid::new(&problem.mesh, &problem.lame);
@@ -131,7 +133,8 @@ struct Newton<'p, 'm, 's> {
     space: &'s Space,
     multigrid: &'m mut Multigrid<'s>,
     u: Vec<[f64; 3]>,
-    /// An unknown of its own: computed from u, it would make the tangent indefinite far from the solution.
+    /// An unknown of its own: computed from u, it would make the tangent indefinite far from the
+    /// solution.
     pressure: Vec<Pressure>,
     free: Nodal,
     /// Nodes on the plate.
@@ -231,7 +234,8 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
         None
     }
 
-    /// Lets nodes less than `near` (mm) above the plate touch it, and lets go those that it would pull; whether anything changed.
+    /// Lets nodes less than `near` (mm) above the plate touch it, and lets go those that it would
+    /// pull; whether anything changed.
     fn touch(&mut self, near: f64) -> bool {
         let Some(height) = self.problem.plate else { return false };
         let slack = SLACK * self.state.forces.iter().fold(0.0, |m: f64, f| m.max(f[2]));

@@ -48,8 +48,8 @@ pub struct Accuracy {
     pub change_max_mm: f64,
     /// Change of the force by the last halving, over the force (1).
     pub force_change: f64,
-    /// What is left of the displacement's error (mm, root mean square): the change times r / (1 - r), where r is the ratio of the
-    /// last two changes.
+    /// What is left of the displacement's error (mm, root mean square): the change times r / (1 -
+    /// r), where r is the ratio of the last two changes.
     pub error_rms_mm: f64,
     /// The same for the force, over the force (1).
     pub force_error: f64,
@@ -114,7 +114,8 @@ fn accuracy(solved: &Equilibrium) -> Accuracy {
         let (level, before) = (levels.get(levels.len().wrapping_sub(n)), levels.get(levels.len().wrapping_sub(n + 1)));
         level.zip(before).map(|(a, b)| (a.force - b.force).abs() / force)
     };
-    // Without two changes, a halving is taken to halve the error; no faith is put in more than a quarter.
+    // Without two changes, a halving is taken to halve the error; no faith is put in more than a
+    // quarter.
     let left = |change: f64, before: Option<f64>| {
         let ratio = before.map_or(0.5, |b| change / b.max(f64::MIN_POSITIVE)).clamp(0.25, 0.8);
         change * ratio / (1.0 - ratio)

@@ -1,8 +1,9 @@
-//! The tangent stiffness, applied without being assembled: eight elements side by side in single precision.
+//! The tangent stiffness, applied without being assembled: eight elements side by side in single
+//! precision.
 //!
-//! With G the local derivatives of a displacement, B the inverse of the moved element's Jacobian and A that of the
-//! element at rest, the local stress is `mu G A A^T + (mu - p) (B G B)^T + q B^T` times the point's volume, where q is
-//! lambda times the projected trace of `G B`.
+//! With G the local derivatives of a displacement, B the inverse of the moved element's Jacobian
+//! and A that of the element at rest, the local stress is `mu G A A^T + (mu - p) (B G B)^T + q B^T`
+//! times the point's volume, where q is lambda times the projected trace of `G B`.
 
 use crate::numerics::simd::dispatch;
 use crate::synth::elastic::quadratic::{GAUSS, NODES, Nodal, Tables, divergence, gradient, line};
@@ -54,8 +55,8 @@ impl Point {
         }
     }
 
-    /// Turns the local derivatives `g[component][axis][q]` into the local stress; `share` is the sum over all points of
-    /// pressure times trace.
+    /// Turns the local derivatives `g[component][axis][q]` into the local stress; `share` is the
+    /// sum over all points of pressure times trace.
     #[inline(always)]
     fn stress(&self, g: &mut [[Nodal<f32, LANES>; 3]; 3], q: usize, share: &[Lanes; 4]) {
         let m = &self.metric;

@@ -205,7 +205,8 @@ impl Tissue {
                 [0.0, 0.0, -amplitude * (p[2] - low[2]) / (high[2] - low[2])]
             }
             Shape::Dome { centre, radii } => {
-                // The bone stays; what is around it moves the more the nearer it is to the skin, and the lower.
+                // The bone stays; what is around it moves the more the nearer it is to the skin,
+                // and the lower.
                 let below = (-self.within(radii.len() - 1, p)).max(0.0);
                 let share = below / (below + self.within(0, p).max(0.0)).max(1e-9);
                 [0.0, 0.0, amplitude * share * (centre[2] - p[2]) / radii[0][2]]
