@@ -1,8 +1,5 @@
 //! Two volumes to a dense displacement field: the main chain, in order.
 
-use crate::consistency::coupling::Posterior;
-use crate::consistency::models::{AffineMotion, Choice, Excess, choose, nearest_rigid};
-use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, MeshError};
 use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::field::{interpolation, jacobian, spline};
@@ -18,13 +15,14 @@ use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::background;
 use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::check::{self, Checked};
+use crate::pipeline::conclusion::{Concluded, Stated, labelled};
 use crate::pipeline::finer::{self, Explained, finer, uneven, unlike};
 pub use crate::pipeline::hypotheses::Start;
 use crate::pipeline::hypotheses::{Begun, NEAR, Search};
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
-use crate::pipeline::rest::{self, Places, Rest, Tried};
+use crate::pipeline::rest::Rest;
 use crate::pipeline::sparse;
 use crate::types::params::{BodySource, Interpolation, Method};
 use crate::types::*;
@@ -296,27 +294,10 @@ fn canonical(
         evidence.push(polish::why(&pair, nodes, params));
         clock.book("residual");
     }
-    let judged = |p| to_level(from_level(p, factor), searched);
     let models: Vec<MotionModel> = concluded.iter().map(|c| c.choice.model).collect();
-    let mut splines = Vec::new();
-    let mut stated = Vec::new();
-    for (b, Concluded { choice, rest, posterior }) in concluded.into_iter().enumerate() {
-        let field = &mut bodies.fields[b];
-        let (coarse, mut posterior) =
-            if next.is_some() { level::posterior(field, pair.spacing, params.seed) } else { posterior };
-        let rest = rest.filter(Rest::is_taken);
-        if let Some(rest) = &rest {
-            rest.bring(field, judged);
-        }
-        splines.push(full_lattice(&grid, field, factor, &choice));
-        let hidden = hidden(&pair, field, &coarse);
-        if let Some(rest) = rest {
-            let seen = posterior.deviation.iter_mut().enumerate().filter(|&(m, _)| !hidden[m]);
-            seen.for_each(|(m, v)| *v *= rest.narrowed(judged(coarse.within(m))));
-        }
-        stated.push(Stated { coarse, deviation: posterior.deviation, hidden });
-    }
-    let stated = Stated::by_place(stated, &bodies);
+    let judged = |p| to_level(from_level(p, factor), searched);
+    let again = next.map(|_| params.seed);
+    let (splines, stated) = Concluded::on_grid(concluded, &mut bodies, (&pair, factor), (judged, again), &grid);
     let labels = match &given {
         Some(given) => given.on(grid.shape(), [1; 3]),
         None => bodies.labels_on(grid.shape(), |p| to_level(p, factor)),
@@ -350,20 +331,8 @@ fn canonical(
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
     let doubted = begun.doubted();
-    // Features that do not bear each other out, few matches or volumes that do not agree in the
-    // end, and a motion past all that was looked for: not a measurement.
     if let Some(seen) = doubted.filter(|_| most_move(&displacement, &mask) > search) {
-        let survived = (kept, "matches survive", found.div_ceil(5));
-        let agreed = (
-            seen.kept,
-            "features agree with their neighbours in the search of the whole volume",
-            seen.features_initial.div_ceil(3),
-        );
-        let agreed = unlike.is_some().then_some(agreed);
-        if let Some((found, what, needed)) = [Some(survived), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
-            let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
-            return Err(FieldError::TooFew { found, what, needed, hint });
-        }
+        no_measurement(kept, found, unlike.is_some().then_some(seen))?;
     }
 
     progress("jacobian", 0.94);
@@ -417,6 +386,24 @@ fn canonical(
         node_displacement,
         summary,
     })
+}
+
+/// Refuses a motion past all that was looked for where few matches survive, `kept` of `found`
+/// features, or where the volumes stay different and few of the features `seen` agreed in the
+/// search of the whole.
+fn no_measurement(kept: usize, found: usize, seen: Option<Counts>) -> Result<(), FieldError> {
+    let survived = (kept, "matches survive", found.div_ceil(5));
+    let agreed = seen.map(|seen| {
+        let what = "features agree with their neighbours in the search of the whole volume";
+        (seen.kept, what, seen.features_initial.div_ceil(3))
+    });
+    match [Some(survived), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
+        None => Ok(()),
+        Some((found, what, needed)) => {
+            let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
+            Err(FieldError::TooFew { found, what, needed, hint })
+        }
+    }
 }
 
 /// The levels of the pyramid, from the coarsest one, and how they are worked on.
@@ -725,136 +712,6 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     format!("points: {found} of {wanted} wanted, {source}{limit}")
 }
 
-/// The mask with the `name` of each voxel's body; `labels` (bodies from 0) may be empty where there
-/// is one.
-pub(super) fn labelled(mask: &Mask, labels: &[u8], name: impl Fn(usize) -> u8) -> Mask {
-    let mut out = mask.clone();
-    for (at, voxel) in out.as_mut_slice().iter_mut().enumerate().filter(|(_, v)| **v != 0) {
-        *voxel = name(labels.get(at).copied().unwrap_or(0).into());
-    }
-    out
-}
-
-/// What is concluded of one body.
-struct Concluded {
-    choice: Choice,
-    rest: Option<Rest>,
-    /// On a lattice twice as coarse as the field's own.
-    posterior: (Lattice, Posterior),
-}
-
-impl Concluded {
-    /// The smallest motion that explains a body's matches, where it stays at rest, and what its
-    /// data leave open. `rigid` says that it moves rigidly, whatever the evidence.
-    fn of(bodies: &Bodies, body: usize, pair: &Pair<'_>, matches: &[LevelMatch], (rigid, seed): (bool, u64)) -> Self {
-        let (pair, field) = (bodies.part(pair, body), &bodies.fields[body]);
-        let own = matches.iter().filter(|m| m.kept && bodies.label_near(m.voxel) == body);
-        let measured: Vec<Measured> = own.map(|m| m.measured).collect();
-        let windows = level::windows(&pair);
-        let by_place = level::excess(&pair, field, &windows);
-        let posterior = level::posterior(field, pair.spacing, seed);
-        let places_of = Places::new(&pair, &windows, &posterior);
-        let (mut choice, tried) = smallest(&measured, &pair, field, &by_place, &places_of, seed);
-        if rigid {
-            let motion = nearest_rigid(&rest::shown(&pair, field, |_| true));
-            choice.evidence.push("rigid: as asked".into());
-            choice = Choice { model: MotionModel::Rigid, motion: Some(motion), ..choice };
-        }
-        let free = choice.motion.is_none() && ablation::is_on("rest");
-        let rest = free.then(|| Rest::find((&pair, field), &windows, &places_of, &tried, &by_place)).flatten();
-        drop(by_place);
-        Self { choice, rest, posterior }
-    }
-
-    /// The model of the whole, and the evidence for each body's.
-    fn together(concluded: &[Self], bodies: &Bodies, pair: &Pair<'_>) -> (MotionModel, Vec<String>) {
-        if let [Self { choice, .. }] = concluded {
-            return (choice.model, choice.evidence.clone());
-        }
-        let of = |(b, Self { choice, .. }): (usize, &Self)| {
-            let share = 100.0 * bodies.part(pair, b).inside as f64 / pair.inside.max(1) as f64;
-            let model = format!("{:?}", choice.model).to_lowercase();
-            let head = format!("body {}: {model}, {share:.0} % of the tissue", b + 1);
-            let why = choice.evidence.iter().map(|e| format!("body {}: {e}", b + 1));
-            [head].into_iter().chain(why).collect::<Vec<_>>()
-        };
-        (MotionModel::Free, concluded.iter().enumerate().flat_map(of).collect())
-    }
-}
-
-/// Standard deviations at the nodes of a lattice (mm), and which of these the deformed volume does
-/// not show.
-pub(super) struct Stated {
-    pub coarse: Lattice,
-    pub deviation: Vec<f32>,
-    pub hidden: Vec<bool>,
-}
-
-impl Stated {
-    /// On the closest lattice of all bodies, each node's from the body there.
-    fn by_place(mut all: Vec<Self>, bodies: &Bodies) -> Self {
-        let closest = (0..all.len()).max_by_key(|&b| all[b].coarse.len()).unwrap_or(0);
-        let lattice = all[closest].coarse.clone();
-        let at = |m: usize| {
-            let place = lattice.within(m);
-            let Self { coarse, deviation, hidden } = &all[bodies.label_near(place)];
-            if *coarse == lattice {
-                return (deviation[m], hidden[m]);
-            }
-            let stencil = coarse.stencil_near(place);
-            let mut nearest = (0.0, 0);
-            coarse.for_each_tap(place, |node, w| nearest = if w > nearest.0 { (w, node) } else { nearest });
-            (stencil.gather(deviation), hidden[nearest.1])
-        };
-        if all.len() == 1 {
-            return all.remove(0);
-        }
-        let (deviation, hidden) = (0..lattice.len()).map(at).unzip();
-        Self { deviation, hidden, coarse: lattice }
-    }
-}
-
-/// Chooses the model from the kept matches and the free field; with what was tried.
-fn smallest(
-    measured: &[Measured],
-    pair: &Pair<'_>,
-    field: &SplineField,
-    by_place: impl Fn(&AffineMotion) -> Vec<f32>,
-    places: &Places,
-    seed: u64,
-) -> (Choice, Vec<Tried>) {
-    let finest = pyramid::finest(pair.shape, pair.spacing);
-    let mut tried = Vec::new();
-    let excess = |model, motion: &AffineMotion| {
-        let excess = by_place(motion);
-        let found = Excess { total: excess.iter().map(|&v| f64::from(v)).sum(), worst: places.worst(&excess) };
-        tried.push(Tried { model, motion: *motion, excess });
-        found
-    };
-    let choice = choose(measured, excess, level::determined(pair, field, seed), 0.02 * finest);
-    (choice, tried)
-}
-
-/// The chosen motion on a lattice over the full-resolution grid.
-pub(super) fn full_lattice(
-    grid: &Grid,
-    field: &SplineField,
-    factor: [usize; 3],
-    choice: &Choice,
-) -> (Lattice, Vec<f32>) {
-    let step = std::array::from_fn(|a| field.lattice.step[a] * factor[a]);
-    let lattice = Lattice::new(grid.shape(), step);
-    let spacing = grid.spacing();
-    let coefficients = match &choice.motion {
-        Some(motion) => lattice.fit(|p| {
-            motion.displacement(std::array::from_fn(|a| to_level(p, factor)[a] * spacing[a] * factor[a] as f64))
-        }),
-        None if factor == [1; 3] => field.coefficients.clone(),
-        None => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
-    };
-    (lattice, coefficients)
-}
-
 /// A level's match in world mm (RAS).
 pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
     let axes = spline::axes(grid);
@@ -948,16 +805,6 @@ const HIDDEN: f64 = 0.015;
 /// of a brain of which 11 to 75 % had moved out of view the 95 % bands held 0.86 to 0.49 of the
 /// errors there without it.
 const EXTRAPOLATED: f32 = 3.0;
-
-/// Of each node of a lattice over the initial volume, whether the deformed volume does not show
-/// what is there.
-pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
-    let sees = |m: usize| {
-        let p = lattice.within(m);
-        level::sees(pair, p, field.lattice.at(&field.coefficients, p))
-    };
-    (0..lattice.len()).into_par_iter().map(|m| !sees(m)).collect()
-}
 
 /// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match
 /// shows ([`HIDDEN`]), what is not in view ([`hidden`]), and what is in doubt beside `jumps`

@@ -33,6 +33,7 @@ pub mod stress;
 
 mod background;
 mod bodies;
+mod conclusion;
 mod course;
 mod finer;
 mod hypotheses;

@@ -24,6 +24,7 @@ use crate::numerics::statistics::median;
 use crate::numerics::unfold::unfold;
 use crate::pipeline::background;
 use crate::pipeline::check::{self, Checked};
+use crate::pipeline::conclusion;
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
 use crate::pipeline::hypotheses::Search;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
@@ -161,7 +162,7 @@ pub(super) fn measure(
     let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
     clock.book("model");
     let (coarse, Posterior { deviation, .. }) = level::posterior(&field, pair.spacing, params.seed);
-    let hidden = field::hidden(&pair, &field, &coarse);
+    let hidden = conclusion::hidden(&pair, &field, &coarse);
     clock.book("uncertainty");
 
     progress("mesh", 0.92);
@@ -171,14 +172,15 @@ pub(super) fn measure(
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
     let coefficients =
-        FieldSpline::new(grid, vec![field::full_lattice(&grid, &field, factor, &choice)], Vec::new(), Vec::new());
+        FieldSpline::new(grid, vec![conclusion::full_lattice(&grid, &field, factor, &choice)], Vec::new(), Vec::new());
     let smooth = coefficients.dense()?;
     let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
-    let uncertainty = field::uncertainty(&grid, pair.spacing, field::Stated { coarse, deviation, hidden }, Vec::new());
+    let uncertainty =
+        field::uncertainty(&grid, pair.spacing, conclusion::Stated { coarse, deviation, hidden }, Vec::new());
     let (uncertainty_median_mm, uncertainty_mean_mm) = field::average_inside(&uncertainty, &mask);
     clock.book("uncertainty");
 
@@ -214,7 +216,7 @@ pub(super) fn measure(
         coefficients,
         spline: Start { motion: field.into(), factor, followed: None },
         uncertainty,
-        bodies: field::labelled(&mask, &[], |_| 1),
+        bodies: conclusion::labelled(&mask, &[], |_| 1),
         matches: sparse,
         mesh,
         node_displacement,
