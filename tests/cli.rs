@@ -481,6 +481,8 @@ fn bodies_are_given_as_labels_or_refused_by_name() {
     assert!(said.contains("nothing.nii.gz"), "{said}");
     let (_, said) = field(&["--bodies", "mask.nii.gz", "--method", "sparse", "-o", "no"], 1);
     assert!(said.contains("--bodies") && said.contains("--method"), "{said}");
+    let (_, said) = field(&["--config", "given/summary.json", "-o", "no"], 1);
+    assert!(said.contains("made with --bodies"), "{said}");
     field(&["--rigid", "1", "-o", "no"], 2);
     field(&["--bodies", "mask.nii.gz", "--bonded", "-o", "no"], 2);
     assert!(!folder.path().join("no").exists());

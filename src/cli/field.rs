@@ -133,6 +133,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if *bonded {
         params.bodies = BodySource::Bonded;
     }
+    if bodies.is_none() && params.bodies == BodySource::Given {
+        bail!("--config: the run was made with --bodies; give the label map again");
+    }
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }

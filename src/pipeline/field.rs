@@ -211,6 +211,10 @@ fn canonical(
     if params.method == Method::Sparse {
         return sparse::measure(initial, deformed, mask, params, progress);
     }
+    if params.bodies == BodySource::Given && mask.is_none() {
+        let (what, hint) = ("is missing".into(), "give the label map of the bodies as mask".into());
+        return Err(FieldError::Volume { volume: "mask", what, hint });
+    }
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
     let given = mask.is_some();
