@@ -7,14 +7,10 @@
 //! neighbours in space draw each other to the same side.
 
 use crate::consistency::energy::distance;
-use crate::consistency::pruning::Measured;
+use crate::consistency::pruning::{GATE, Measured};
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, quadratic};
 use rayon::prelude::*;
-
-/// Squared Mahalanobis distance (three degrees of freedom, 99.9 %) at which a motion says nothing
-/// of a match.
-const GATE: f64 = 16.27;
 
 /// Neighbours about a match from which a motion is fitted.
 const NEIGHBOURS: usize = 8;

@@ -115,7 +115,7 @@ pub fn choose(
         let Excess { total, worst } = excess(model, &motion);
         let ratio = total / determined.max(FEWEST);
         let off = middle(&|m| distance(motion.displacement(m.place), m.displacement));
-        let name = format!("{model:?}").to_lowercase();
+        let name = model.name();
         let contradicted = off > CONTRADICTED * model_mm && off > ASTRAY * astray;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
         let still = model == MotionModel::Identity;

@@ -18,6 +18,10 @@ pub struct Measured {
     pub field: [f64; 3],
 }
 
+/// 99.9 % point of chi-square with three degrees of freedom: a match further off, as a squared
+/// Mahalanobis distance, does not fit.
+pub const GATE: f64 = 16.27;
+
 /// Which matches to keep.
 ///
 /// Two tests, both with the match's own covariance enlarged by `model_mm` (what a smooth field or

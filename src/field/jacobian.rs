@@ -5,6 +5,7 @@
 //! is that of the in-plane 2 x 2 block.
 
 use crate::error::FieldError;
+use crate::numerics::sampling::beside;
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Mask, Volume};
 use rayon::prelude::*;
@@ -148,10 +149,8 @@ pub fn unfold(field: &mut DenseField, count: &[u8]) {
                 }
             }
             for side in sides.into_iter().flatten() {
-                let w = field.grid().voxel(side);
                 near.insert(side);
-                near.extend((0..3).filter(|&a| w[a] > 0).map(|a| side - stride[a]));
-                near.extend((0..3).filter(|&a| w[a] + 1 < shape[a]).map(|a| side + stride[a]));
+                near.extend(beside(shape, side));
             }
         }
         let near: Vec<usize> = near.into_iter().filter(|&at| counts(at)).collect();

@@ -4,6 +4,7 @@ use crate::error::SpaceError;
 use crate::field::jacobian;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
+use crate::numerics::sampling::beside;
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, Grid, Mask, Volume};
 use rayon::prelude::*;
@@ -116,15 +117,11 @@ impl FieldSpline {
     /// does (mm).
     pub(crate) fn jumps(&self, mask: &Mask) -> Vec<([usize; 3], f32)> {
         let (shape, inside) = (self.grid.shape(), mask.as_slice());
-        let stride = [1, shape[0], shape[0] * shape[1]];
         let at_border = |at: usize| {
             let v = self.grid.voxel(at);
             let own = usize::from(self.labels[at]);
-            let other = (0..3).find_map(|a| {
-                let below = (v[a] > 0).then(|| at - stride[a]);
-                let above = (v[a] + 1 < shape[a]).then(|| at + stride[a]);
-                below.into_iter().chain(above).find(|&o| inside[o] != 0 && usize::from(self.labels[o]) != own)
-            })?;
+            let is_other = |&o: &usize| inside[o] != 0 && usize::from(self.labels[o]) != own;
+            let other = beside(shape, at).find(is_other)?;
             let at = |b: usize| self.bodies[b].0.at(&self.bodies[b].1, v.map(|v| v as f64));
             let (own, other) = (at(own), at(self.labels[other].into()));
             Some((v, (0..3).map(|a| (own[a] - other[a]).powi(2)).sum::<f64>().sqrt() as f32))

@@ -50,6 +50,17 @@ pub fn inside(shape: [usize; 3], p: VoxelPoint) -> bool {
     (0..3).all(|a| p.0[a] >= -0.5 - SLACK && p.0[a] <= shape[a] as f64 - 0.5 + SLACK)
 }
 
+/// The voxels (x fastest) of a volume of `shape` that share a face with voxel `at`, along x first.
+pub fn beside(shape: [usize; 3], at: usize) -> impl Iterator<Item = usize> {
+    let stride = [1, shape[0], shape[0] * shape[1]];
+    (0..3).flat_map(move |a| {
+        let v = at / stride[a] % shape[a];
+        let below = (v > 0).then(|| at - stride[a]);
+        let above = (v + 1 < shape[a]).then(|| at + stride[a]);
+        below.into_iter().chain(above)
+    })
+}
+
 /// The offset (x fastest) of the voxel that holds `p`, or `None` outside.
 #[inline]
 pub fn nearest(shape: [usize; 3], p: VoxelPoint) -> Option<usize> {

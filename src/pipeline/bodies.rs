@@ -7,14 +7,15 @@
 
 use crate::consistency::energy::distance;
 use crate::consistency::grouping;
-use crate::consistency::pruning::Measured;
+use crate::consistency::pruning::{GATE, Measured};
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, Spans};
 use crate::matching::residual::{self, CAUCHY};
 use crate::numerics::bspline::Lattice;
+use crate::numerics::sampling::beside;
 use crate::numerics::statistics::median;
 use crate::numerics::{ablation, filters, pyramid};
-use crate::pipeline::level::{self, GATE, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::types::LevelReport;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -25,8 +26,8 @@ const PASSES: usize = 2;
 /// Times that voxels are shared out in a trial; then it must explain more than it costs.
 const TRIAL: usize = 2;
 
-/// Part of what a trial explains worse at first that the first passes must make up for but for
-/// this. Of 22 scenes those with one body kept 0.31 to 0.97 of it, those with more 0.13 at most.
+/// Part of its first loss that a trial may still have after the first passes, or it ends. Of 22
+/// scenes those with one body had 0.31 to 0.97 of it, those with more 0.13 at most.
 const HOPE: f64 = 0.25;
 
 /// Misfit that each further degree of freedom must explain (Akaike 1974: twice what chance gives),
@@ -172,9 +173,7 @@ impl Bodies {
         if self.labels.is_empty() {
             return 0;
         }
-        let shape = self.fields[0].lattice.shape;
-        let v: [usize; 3] = std::array::from_fn(|a| (p[a].round().max(0.0) as usize).min(shape[a] - 1));
-        self.label(v[0] + shape[0] * (v[1] + shape[1] * v[2]))
+        self.label(voxel_near(self.fields[0].lattice.shape, p))
     }
 
     /// The displacement (mm) at a place (voxels).
@@ -305,13 +304,11 @@ impl Bodies {
     /// One body in two: voxels go with the matches around them, and each side's field is that of
     /// its matches.
     fn divided(&self, pair: &Pair<'_>, matches: &[&LevelMatch], second: &[bool], body: usize) -> Self {
-        let [nx, ny, nz] = pair.shape;
         let inside = pair.mask.iter().enumerate().filter(|(at, m)| **m != 0 && self.label(*at) == body).count();
         let width = (inside as f64 / matches.len().max(1) as f64).cbrt();
-        let mut votes = vec![0.0f32; nx * ny * nz];
+        let mut votes = vec![0.0f32; pair.mask.len()];
         for (m, second) in matches.iter().zip(second) {
-            let v: [usize; 3] = std::array::from_fn(|a| (m.voxel[a].round().max(0.0) as usize).min(pair.shape[a] - 1));
-            votes[v[0] + nx * (v[1] + ny * v[2])] += if *second { 1.0 } else { -1.0 };
+            votes[voxel_near(pair.shape, m.voxel)] += if *second { 1.0 } else { -1.0 };
         }
         let votes = filters::gaussian(&votes, pair.shape, pair.in_voxels(1).map(|v| width / v as f64));
         let new = self.count() as u8;
@@ -495,24 +492,21 @@ impl Bodies {
     }
 }
 
-/// The voxels that share a face with one.
-fn beside(shape: [usize; 3], at: usize) -> impl Iterator<Item = usize> {
-    let stride = [1, shape[0], shape[0] * shape[1]];
-    (0..3).flat_map(move |a| {
-        let v = at / stride[a] % shape[a];
-        let below = (v > 0).then(|| at - stride[a]);
-        let above = (v + 1 < shape[a]).then(|| at + stride[a]);
-        below.into_iter().chain(above)
-    })
+/// The voxel at a place (voxels), or the nearest to it.
+fn voxel_near(shape: [usize; 3], p: [f64; 3]) -> usize {
+    let v: [usize; 3] = std::array::from_fn(|a| (p[a].round().max(0.0) as usize).min(shape[a] - 1));
+    v[0] + shape[0] * (v[1] + shape[1] * v[2])
 }
 
 impl Trial {
     /// What the trial found, in words.
     fn why(&self, number: usize) -> String {
         let Self { gain, more, jump, .. } = self;
+        let than = if *more < 0.0 { "fewer" } else { "more" };
         format!(
-            "bodies: {number} taken; the last explains {gain:.0} of the misfit and takes {more:.0} degrees of freedom more (each must explain {}); \
-             it moves by {jump:.1} mm along its border (median)",
+            "bodies: {number} taken; the last explains {gain:.0} of the misfit with {:.0} degrees of freedom {than} (each more must explain {}); \
+             its motion differs by {jump:.1} mm from its neighbours' along their border (median)",
+            more.abs(),
             WORTH.0
         )
     }

@@ -62,27 +62,29 @@ impl Concluded {
         Self { choice, rest, posterior }
     }
 
-    /// The model of the whole, and the evidence for each body's.
-    pub fn together(concluded: &[Self], bodies: &Bodies, pair: &Pair<'_>) -> (MotionModel, Vec<String>) {
+    /// The model of the whole, and the evidence for each body's; `name` gives a body's label.
+    pub fn together(
+        concluded: &[Self],
+        bodies: &Bodies,
+        pair: &Pair<'_>,
+        name: impl Fn(usize) -> u8,
+    ) -> (MotionModel, Vec<String>) {
         if let [Self { choice, .. }] = concluded {
             return (choice.model, choice.evidence.clone());
         }
         let of = |(b, Self { choice, .. }): (usize, &Self)| {
             let share = 100.0 * bodies.part(pair, b).inside as f64 / pair.inside.max(1) as f64;
-            let model = format!("{:?}", choice.model).to_lowercase();
-            let head = format!("body {}: {model}, {share:.0} % of the tissue", b + 1);
-            let why = choice.evidence.iter().map(|e| format!("body {}: {e}", b + 1));
+            let head = format!("body {}: {}, {share:.0} % of the tissue", name(b), choice.model.name());
+            let why = choice.evidence.iter().map(|e| format!("body {}: {e}", name(b)));
             [head].into_iter().chain(why).collect::<Vec<_>>()
         };
         (MotionModel::Free, concluded.iter().enumerate().flat_map(of).collect())
     }
-}
 
-impl Concluded {
-    /// The spline of each body over `grid`, and how sure they are together. `fields` lie on `pair`,
-    /// a level of `factor`; `judged` maps its places to those of the level on which this was
-    /// concluded; with a seed the posterior is made again.
-    pub(super) fn on_grid(
+    /// The spline of each body over `grid`, and how sure they are together. The bodies' fields lie
+    /// on `pair`, a level of `factor`; `judged` maps its places to those of the level on which this
+    /// was concluded. With a seed the posterior is made again.
+    pub fn on_grid(
         all: Vec<Self>,
         bodies: &mut Bodies,
         (pair, factor): (&Pair<'_>, [usize; 3]),

@@ -217,7 +217,7 @@ fn canonical(
     }
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
-    let given = mask.is_some();
+    let masked = mask.is_some();
     let [initial, deformed] = match ablation::is_on("robust-range") {
         true => [initial, deformed].map(check::tamed),
         false => [initial, deformed].map(Voxels::view),
@@ -231,7 +231,7 @@ fn canonical(
     let factors = worked_on(&grid, &mask, finest, search);
     clock.book("pyramid");
     // Without a mask all tissue is searched from the start.
-    let tissue = || given.then(|| around(&mask, &clean));
+    let tissue = || masked.then(|| around(&mask, &clean));
     let given = (params.bodies == BodySource::Given).then(|| Given::new(mask.as_slice(), grid.shape()));
     let chain = CoarseToFine {
         given: given.as_ref(),
@@ -269,7 +269,8 @@ fn canonical(
     let concluded: Vec<Concluded> =
         (0..bodies.count()).map(|b| Concluded::of(&bodies, b, &pair, &matches, (is_rigid(b), params.seed))).collect();
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
-    let (model, mut evidence) = Concluded::together(&concluded, &bodies, &pair);
+    let name = |b: usize| given.as_ref().map_or(b as u8 + 1, |g| g.names[b]);
+    let (model, mut evidence) = Concluded::together(&concluded, &bodies, &pair, name);
     evidence.extend(background::why_unseen(cut));
     evidence.extend(light.why());
     evidence.extend(asked);
@@ -306,7 +307,6 @@ fn canonical(
         Some(given) => given.on(grid.shape(), [1; 3]),
         None => bodies.labels_on(grid.shape(), |p| to_level(p, factor)),
     };
-    let name = |b: usize| given.as_ref().map_or(b as u8 + 1, |g| g.names[b]);
     let labelled = labelled(&mask, &labels, name);
     let reported = |(b, model): (usize, MotionModel)| {
         let label = name(b);
@@ -924,7 +924,7 @@ pub(super) fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) ->
             "the smallest model that explains the volumes was taken ({}), but bending by {expected:.2} mm would not have shown: about half of the \
              mean motion ({length:.2} mm) or a voxel ({edge:.2} mm), or more; do not read its strain as measured, and image with less noise or a \
              larger motion",
-            format!("{model:?}").to_lowercase()
+            model.name()
         ),
     })
 }

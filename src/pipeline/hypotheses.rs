@@ -31,9 +31,8 @@ impl Start {
     pub fn extrapolated(&self, before: &Self) -> Self {
         let mut next = self.clone();
         for field in &mut next.motion.fields {
-            let before = before.on(&field.lattice, self.factor);
             // Where the frame before had other bodies, this one's own places tell how it moved.
-            let moved = field.lattice.fit(|p| before.at(p));
+            let moved = field.lattice.fit(|p| before.motion.at(to_level(from_level(p, self.factor), before.factor)));
             field.coefficients.iter_mut().zip(&moved).for_each(|(n, b)| *n += *n - b);
         }
         next

@@ -4,7 +4,7 @@
 use crate::consistency::coupling::{self, Evidence, Posterior};
 use crate::consistency::energy::{EnergyParams, Graph, distance};
 use crate::consistency::models::AffineMotion;
-use crate::consistency::pruning::{Measured, prune};
+use crate::consistency::pruning::{GATE, Measured, prune};
 use crate::consistency::relaxation::relax;
 use crate::features::{self, Corner, HarrisParams};
 use crate::matching::candidates::{CandidateParams, Side, candidates};
@@ -575,10 +575,6 @@ pub fn matches_again(
     }
     (found, joined, report)
 }
-
-/// 99.9 % point of chi-square with 3 degrees of freedom.
-pub(super) const GATE: f64 = 16.27;
-
 /// Scales all covariances so that the kept matches scatter about the coupled field as they say: by
 /// the median squared Mahalanobis distance over chi-square's median, 2.366. Noise alone does not
 /// tell what interpolation, strain inside a patch and contrast changes add.

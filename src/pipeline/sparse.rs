@@ -11,7 +11,7 @@
 use crate::consistency::coupling::{Evidence, Posterior};
 use crate::consistency::energy::distance;
 use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
-use crate::consistency::pruning::{Measured, prune};
+use crate::consistency::pruning::{GATE, Measured, prune};
 use crate::error::FieldError;
 use crate::field::jacobian;
 use crate::field::spline::FieldSpline;
@@ -275,7 +275,7 @@ fn coupled(
     let at = |m: &LevelMatch| field.lattice.at(&field.coefficients, m.voxel);
     let mut measured: Vec<Measured> = matches.iter().map(|m| Measured { field: at(m), ..m.measured }).collect();
     let kept = match params.consistency {
-        true => prune(&measured, 0.2 * pyramid::finest(pair.shape, pair.spacing), level::GATE),
+        true => prune(&measured, 0.2 * pyramid::finest(pair.shape, pair.spacing), GATE),
         false => vec![true; measured.len()],
     };
     level::calibrate(&mut measured, &kept);

@@ -53,8 +53,14 @@ pub fn counts(report: &FieldReport<'_>) -> String {
 pub fn bodies(report: &FieldReport<'_>) -> String {
     let row = |b: &BodyReport| {
         let share = 100.0 * b.voxels as f64 / report.summary.mask_voxels.max(1) as f64;
-        let model = format!("{:?}", b.model).to_lowercase();
-        vec![b.label.to_string(), thousands(b.voxels), format!("{share:.1}"), model, format!("{:.2}", b.slides_mm)]
+        let model = b.model.name();
+        vec![
+            b.label.to_string(),
+            thousands(b.voxels),
+            format!("{share:.1}"),
+            model.into(),
+            format!("{:.2}", b.slides_mm),
+        ]
     };
     let rows: Vec<_> = report.summary.bodies.iter().map(row).collect();
     table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm"], &rows)

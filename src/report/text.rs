@@ -36,7 +36,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
     if let [_, _, ..] = s.bodies.as_slice() {
         let of = |b: &BodyReport| {
             let share = 100.0 * b.voxels as f64 / s.mask_voxels.max(1) as f64;
-            let model = format!("{:?}", b.model).to_lowercase();
+            let model = b.model.name();
             format!("{} ({share:.0} %, {model}, slides by {:.1} mm)", b.label, b.slides_mm)
         };
         let bodies: Vec<String> = s.bodies.iter().map(of).collect();

@@ -339,7 +339,7 @@ pub fn page(report: &TrackReport<'_>) -> String {
                 None => vec![
                     f.frame.to_string(),
                     name,
-                    f.model.map_or_else(String::new, |m| format!("{m:?}").to_lowercase()),
+                    f.model.map_or("", crate::types::MotionModel::name).into(),
                     short2(f.mean_mm),
                     short2(f.max_mm),
                     thousands(f.counts.kept),

@@ -73,8 +73,8 @@ pub struct FieldParams {
     /// Finest level worked on: 1 = full resolution, 2 = half; 0 = the finest with at most 600,000
     /// voxels of tissue.
     pub finest: usize,
-    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 16, or 0 = 10
-    /// to 2, by evidence.
+    /// Voxels between the nodes of the spline lattice on the finest level (1); 2 to 16, or 0 = by
+    /// the size of the tissue, and closer by evidence.
     pub node_spacing: usize,
     /// Residual passes on the finest level; 1 to 40.
     pub passes: usize,

@@ -26,6 +26,18 @@ pub enum MotionModel {
     Free,
 }
 
+impl MotionModel {
+    /// Its name in files and messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Identity => "identity",
+            Self::Rigid => "rigid",
+            Self::Affine => "affine",
+            Self::Free => "free",
+        }
+    }
+}
+
 /// How many of what (at full resolution).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
