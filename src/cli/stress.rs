@@ -35,7 +35,7 @@ pub fn part(name: &str) -> Result<Part, UnknownName> {
 }
 
 /// Axes of the field by name.
-fn field_axes() -> [(&'static str, Trouble); 14] {
+fn field_axes() -> [(&'static str, Trouble); 22] {
     Trouble::ALL.map(|t| (t.1, t.0))
 }
 

@@ -104,7 +104,12 @@ impl Body {
 
     /// Whether a world position lies in the body's outline.
     pub fn contains(&self, p: WorldPoint) -> bool {
-        self.outline(self.own_frame(p)) > 0.5
+        self.share(p) > 0.5
+    }
+
+    /// How much of a voxel at a world position the body fills, 0 to 1.
+    pub fn share(&self, p: WorldPoint) -> f64 {
+        self.outline(self.own_frame(p))
     }
 
     /// The region that shows at a world position, counted from 1; 0 outside the body.

@@ -7,11 +7,15 @@
 
 mod anatomy;
 
+mod artefacts;
+
 mod body;
 
 pub mod elastic;
 
 mod landmarks;
+
+mod looks;
 
 mod motion;
 
@@ -20,6 +24,8 @@ mod noise;
 pub mod params;
 
 pub mod phantom;
+
+mod scenes;
 
 pub mod sequence;
 

@@ -140,6 +140,11 @@ impl Motion {
         Self::new(law, grid)
     }
 
+    /// The same about another centre (mm).
+    pub fn about(self, centre: [f64; 3]) -> Self {
+        Self { centre, ..self }
+    }
+
     /// Takes the mean over `tissue` off (a smooth law only) and makes `amplitude` mm the largest
     /// displacement there.
     pub fn scaled(mut self, amplitude: f64, tissue: &[WorldPoint]) -> Self {

@@ -131,6 +131,29 @@ pub(super) fn painted(
     Ok(imaged(params, pair, initial, deformed))
 }
 
+/// As [`phantom_on`] for a body that shows `sample` at a place in it and moves by `motion` (mm), on
+/// one grid; with `jumps` neighbouring places may part.
+///
+/// # Errors
+/// [`SynthError`] when the motion folds without `jumps`.
+pub(super) fn staged(
+    params: &PhantomParams,
+    grid: Grid,
+    sample: &(dyn Fn(WorldPoint) -> (f64, bool) + Sync),
+    motion: impl Fn(WorldPoint) -> [f64; 3] + Sync + 'static,
+    jumps: bool,
+) -> Result<Phantom, SynthError> {
+    let truth = DenseField::from_voxels(grid, |_, x| motion(x));
+    if !jumps && jacobian_range(&truth, |_| true).0 <= MIN_JACOBIAN {
+        return Err(folds(params.amplitude).into());
+    }
+    let before = Volume::from_voxels(grid, |at, x| sample(x.moved(truth.at(at).map(f64::from))));
+    let after = Volume::from_voxels(grid, |_, y| sample(y));
+    let displacements = Box::new(move |points: &[WorldPoint]| points.iter().map(|&p| motion(p)).collect());
+    let pair = Pair { before, after, truth, displacements, control_spacing_mm: None, stiffness: None, elastic: None };
+    Ok(imaged(params, pair, grid, grid))
+}
+
 /// Both volumes with bias and noise, and what is known of them.
 fn imaged(params: &PhantomParams, pair: Pair, initial: Grid, deformed: Grid) -> Phantom {
     let Pair { before, after, truth, displacements, .. } = &pair;
@@ -257,8 +280,15 @@ fn stiffness(tissue: &Tissue, grid: Grid) -> Stiffness {
     }
 }
 
-/// The motion asked for, its field on `grid`, and the control spacing (mm) if it is smooth.
-fn motion(
+/// A motion that folds at this amplitude.
+fn folds(amplitude: f64) -> ParamError {
+    let range = "less for this motion: the Jacobian determinant of the truth falls to 0.1";
+    ParamError { name: "amplitude", value: amplitude, range }
+}
+
+/// The motion asked for, its field on `grid`, and the control spacing (mm) if it is smooth; an
+/// error when it folds.
+pub(super) fn motion(
     params: &PhantomParams,
     inside: &(dyn Fn(WorldPoint) -> bool + Sync),
     grid: Grid,
@@ -275,11 +305,6 @@ fn motion(
     let unfolded = |motion: &Motion, truth: &DenseField| {
         motion.is_discontinuous() || jacobian_range(truth, |_| true).0 > MIN_JACOBIAN
     };
-    let folds = ParamError {
-        name: "amplitude",
-        value: amplitude,
-        range: "less for this motion: the Jacobian determinant of the truth falls to 0.1",
-    };
     if params.motion == MotionKind::Smooth {
         let largest = 2.0 * half.iter().fold(0.0, |m: f64, &h| m.max(h));
         let mut spacing = largest / 6.0;
@@ -291,7 +316,7 @@ fn motion(
             }
             spacing *= 1.08;
         }
-        return Err(folds.into());
+        return Err(folds(amplitude).into());
     }
     let motion = match params.motion {
         MotionKind::None | MotionKind::Smooth | MotionKind::Elastic => Motion::none(&grid),
@@ -308,7 +333,7 @@ fn motion(
     let field = truth(&motion);
     match unfolded(&motion, &field) {
         true => Ok((motion, field, None)),
-        false => Err(folds.into()),
+        false => Err(folds(amplitude).into()),
     }
 }
 
