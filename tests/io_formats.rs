@@ -41,6 +41,7 @@ fn a_match(i: usize, kept: bool) -> Match {
         ncc: 0.75,
         covariance: [0.04, 0.04, 0.04, 0.0, 0.0, 0.0],
         kept,
+        raw: None,
     }
 }
 
@@ -54,8 +55,8 @@ fn matches_round_trip() {
     assert_eq!(
         text.lines().take(2).collect::<Vec<_>>(),
         [
-            "x,y,z,dx,dy,dz,ncc,sigma,kept",
-            "1.000000,-2.500000,100.125000,0.500000,-0.000001,3.000000,0.750000,0.200000,1"
+            "x,y,z,dx,dy,dz,ncc,sigma,kept,raw_dx,raw_dy,raw_dz,raw_sigma",
+            "1.000000,-2.500000,100.125000,0.500000,-0.000001,3.000000,0.750000,0.200000,1,0.500000,-0.000001,3.000000,0.200000"
         ]
     );
     let back = read_matches(&path).unwrap();
@@ -63,6 +64,11 @@ fn matches_round_trip() {
         assert_eq!((a.initial, a.displacement, a.ncc, a.kept), (b.initial, b.displacement, b.ncc, b.kept));
         assert!((a.sigma() - 0.2).abs() < 1e-12);
     }
+    // An estimate goes before what was measured, which stays beside it.
+    let estimated = a_match(1, true).with_estimate([0.25, 0.0, 2.5], 0.1);
+    write_matches(&path, &SparseField { matches: vec![estimated] }).unwrap();
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert!(text.contains(",0.250000,0.000000,2.500000,0.750000,0.100000,1,0.500000,-0.000001,3.000000,0.200000\n"));
     write_matches(&path, &SparseField::default()).unwrap();
     assert_eq!(read_matches(&path).unwrap(), SparseField::default());
 }

@@ -14,6 +14,7 @@ use palpate::matching::levels::{Aligned, factors, from_level, to_level};
 use palpate::matching::lsm::{self, Template};
 use palpate::matching::pair::{Pair, Spans, dilate, row_step};
 use palpate::matching::residual::{normal_equations, residual_sigma};
+use palpate::numerics::blocks::Blocks;
 use palpate::numerics::bspline::{Lattice, SmoothSampler};
 use palpate::numerics::filters;
 use palpate::numerics::small::{inverse, quadratic};
@@ -765,6 +766,41 @@ fn the_right_hand_side_is_the_slope_of_the_misfit() {
     // motion.
     assert!(cosine > 0.995, "direction: {cosine}");
     assert!((0.93..1.07).contains(&ratio), "length: {ratio}");
+}
+
+/// The gradient of the noise is no information: noise alone gives next to none, and texture under
+/// noise gives what it gives without.
+#[test]
+fn noise_adds_no_information() {
+    let shape = [40, 38, 36];
+    let (texture, _) = texture(shape, 6.0, 8);
+    let n = texture.len();
+    let mean_of = |contrast: f32| {
+        let noisy = |seed: u64| -> Vec<f32> {
+            texture.iter().zip(normals(n, seed)).map(|(t, e)| 500.0 + contrast * (t - 500.0) + 20.0 * e).collect()
+        };
+        let mut pair = Pair { noise: 20.0, ..pair(shape, [1.0; 3], &noisy(1), &noisy(2)) };
+        // At the border differences are one-sided.
+        for (m, p) in pair.mask.to_mut().iter_mut().zip(voxels(shape)) {
+            *m = u8::from((0..3).all(|a| p[a] > 0 && p[a] + 1 < shape[a]));
+        }
+        let warped = unmoved(&pair);
+        let gain = GainField::measure(&Pair { noise: 0.0, ..pair.clone() }, &warped);
+        let found = normal_equations(&pair, &warped, &gain, &Lattice::new(shape, [6; 3]), 1.0);
+        let trace = |blocks: &Blocks| blocks.iter().map(|b| f64::from(b[0] + b[1] + b[2])).sum::<f64>();
+        [trace(&found.blocks), trace(&found.information())]
+    };
+    let [all, without] = mean_of(0.0);
+    // No block may turn negative, so chance leaves a part.
+    assert!(without < 0.15 * all, "{without} of {all}");
+    let slope = |a: usize| {
+        let step = [1, shape[0], shape[0] * shape[1]][a];
+        texture.windows(2 * step + 1).map(|w| f64::from(w[2 * step] - w[0]).powi(2) / 4.0).sum::<f64>()
+    };
+    let clean = (0..3).map(slope).sum::<f64>();
+    let [weak, strong] = [0.3, 3.0].map(|contrast| mean_of(contrast)[1] / (f64::from(contrast).powi(2) * clean));
+    // Where texture is strong its own steepness counts less, so weak texture may tell more of it.
+    assert!((0.9..1.4).contains(&(weak / strong)), "{weak} {strong}");
 }
 
 #[test]

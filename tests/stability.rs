@@ -5,21 +5,13 @@
 mod fixtures;
 
 use fixtures::{palpate, text};
-use palpate::pipeline::field::FieldResult;
 use palpate::pipeline::stress::{Effort, GraspAxis, field_curves, field_run, grasp_curves};
 use palpate::pipeline::trials::{Case, Variant, posture_error};
-use palpate::report::verdict::{Trust, judge};
 use palpate::synth::{PhantomKind, PhantomParams, Trouble};
-use palpate::types::{Part, StressRun, Volume};
+use palpate::types::{Part, StressRun};
 use rayon::prelude::*;
 use std::fs;
 use tempfile::TempDir;
-
-fn said(initial: &Volume, result: &FieldResult) -> Vec<String> {
-    let verdict = judge(initial.grid(), None, &|at| result.uncertainty.at(at), &result.summary);
-    let low = (verdict.trust == Trust::Low).then(|| "trust is low".to_string());
-    result.summary.warnings.iter().cloned().chain(low).collect()
-}
 
 /// The small bodies: which, voxels across.
 const BODIES: [(PhantomKind, usize); 2] = [(PhantomKind::Block, 40), (PhantomKind::Head, 40)];
@@ -28,7 +20,7 @@ const SEEDS: u64 = 3;
 fn runs(kind: PhantomKind, size: usize, trouble: Trouble, severity: f64) -> Vec<StressRun> {
     let run = |seed| {
         let body = PhantomParams { seed, ..PhantomParams::new(kind).sized(size) };
-        field_run(&body, trouble, severity, &said).unwrap()
+        field_run(&body, trouble, severity).unwrap()
     };
     (1..=SEEDS).into_par_iter().map(run).collect()
 }
@@ -184,7 +176,7 @@ fn the_commands_write_their_files_and_results_do_not_depend_on_threads() {
 #[test]
 fn curves_come_in_order_and_bracket_the_break() {
     let effort = Effort::new(true);
-    let curves = field_curves(&effort, &[Trouble::NoOverlap], &said, &|_| {});
+    let curves = field_curves(&effort, &[Trouble::NoOverlap], &|_| {});
     let curve = &curves[0];
     assert!(curve.runs.windows(2).all(|w| w[0].severity <= w[1].severity));
     let (low, high) = (curve.holds_at.unwrap(), curve.breaks_at.unwrap());

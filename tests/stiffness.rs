@@ -762,6 +762,7 @@ fn a_match_is_read_as_the_mean_over_its_patch() {
         ncc: 0.9,
         covariance: [1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0],
         kept: true,
+        raw: None,
     };
     let observations = from_matches(&body, &field, &SparseField { matches: places.iter().map(one).collect() });
     assert_eq!(observations.len(), 7);

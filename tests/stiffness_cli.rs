@@ -197,6 +197,7 @@ fn a_sequence_is_read_by_the_matches_and_frames_of_its_own_track() {
         ncc: 1.0,
         covariance: [1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0],
         kept: true,
+        raw: None,
     };
     let inside = |offset: &usize| g.voxel(*offset).into_iter().all(|i| (3..13).contains(&i));
     let matches = SparseField { matches: (0..g.len()).filter(inside).step_by(3).map(one).collect() };

@@ -9,8 +9,8 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
 use palpate::types::params::{BodySource, Method, Preset};
-use palpate::types::{FieldParams, FieldSummary, Mask, names};
-use palpate::{io, pipeline};
+use palpate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, names};
+use palpate::{evaluate, io, pipeline};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -37,6 +37,9 @@ pub struct Options {
     /// One body: nothing slides
     #[arg(long, conflicts_with = "bodies")]
     bonded: bool,
+    /// Exact displacement on the initial volume's grid: the error after each stage is written too
+    #[arg(long, value_name = "FIELD")]
+    truth: Option<PathBuf>,
     /// Write the results even where the field folds, which tissue cannot do
     #[arg(long)]
     allow_folds: bool,
@@ -128,7 +131,8 @@ fn method(name: &str) -> Result<Method, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, bodies, rigid, bonded, allow_folds, dry_run, tuning } = options;
+    let Options { initial, deformed, target, mask, bodies, rigid, bonded, truth, allow_folds, .. } = options;
+    let Options { dry_run, tuning, .. } = options;
     let mut params = tuning.params()?;
     if *bonded {
         params.bodies = BodySource::Bonded;
@@ -139,7 +143,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
-    let given: Vec<&Path> = [initial, deformed].into_iter().chain(mask).chain(bodies).map(PathBuf::as_path).collect();
+    let given: Vec<&Path> =
+        [initial, deformed].into_iter().chain(mask).chain(bodies).chain(truth).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FIELD_FILES))?;
 
     field_fits(initial, deformed)?;
@@ -161,6 +166,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         inside = Some(bodies_of(path, labels, inside.as_ref(), rigid)?);
         (params.bodies, params.rigid) = (BodySource::Given, rigid.clone());
     }
+    let truth = truth.as_ref().map(|path| read_truth(path, fixed.grid(), initial)).transpose()?;
     if *dry_run {
         drop(progress);
         let plan = pipeline::plan::field(&fixed, &moving, inside.as_ref(), &params)?;
@@ -187,6 +193,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     result.summary.seconds.insert(0, ("read".into(), read));
     result.summary.warnings.splice(0..0, warnings);
 
+    let metrics = truth.as_ref().map(|truth| {
+        result.summary.stages = result.stages.iter().map(|stage| stage.scored(truth, inside.as_ref())).collect();
+        evaluate::metrics(&result.displacement, truth, inside.as_ref(), &[])
+    });
+    let metrics = metrics.transpose().with_context(|| format!("{} to {}", names[0], names[1]))?;
+
     progress.set("write", 1.0);
     let measured = Measured {
         command: "field",
@@ -195,7 +207,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         deformed: moving,
         mask: inside.as_ref(),
         params: &params,
-        truth: None,
+        truth: truth.as_ref().zip(metrics.as_ref()),
     };
     let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;
@@ -203,6 +215,19 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{summary}{}", target.look()))
+}
+
+/// The exact displacement of `path`, which must lie on the initial volume's grid.
+fn read_truth(path: &Path, grid: &Grid, initial: &Path) -> Result<DenseField> {
+    let truth = io::read_field(path)?;
+    if !truth.grid().same_as(grid) {
+        bail!(
+            "{}: lies on another grid than {}; give the exact displacement on the initial volume's grid",
+            name(path),
+            name(initial)
+        );
+    }
+    Ok(truth)
 }
 
 /// Bodies at most: each takes passes of its own.

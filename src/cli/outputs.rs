@@ -9,7 +9,7 @@ use palpate::io::{self, OutputFolder};
 use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
 use palpate::report::{FieldReport, html, json};
-use palpate::types::{DenseField, FieldParams, Grid, Mask, Mesh, Metrics, Volume};
+use palpate::types::{DenseField, FieldParams, Grid, Mask, Metrics, Volume};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -131,10 +131,8 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     folder.write("uncertainty.nii.gz", |p| uncertainty.write(p, "palpate: 1 sigma of u, mm", Some(bits)))?;
     folder.write("bodies.nii.gz", |p| io::write_labels(p, &result.bodies, "palpate: bodies, from 1"))?;
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
-    folder.write("mesh.vtu", |p| match &result.mesh {
-        Mesh::Tetrahedra(mesh) => io::write_tet_mesh(p, mesh, &result.node_displacement, &[]),
-        Mesh::Triangles(mesh) => io::write_tri_mesh(p, mesh, &result.node_displacement, &[]),
-    })?;
+    let at_nodes = result.at_nodes();
+    folder.write("mesh.vtu", |p| io::write_match_mesh(p, &result.mesh, &at_nodes))?;
     let mut writing = started.elapsed();
 
     let started = Instant::now();

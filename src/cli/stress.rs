@@ -7,12 +7,10 @@ use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
 use palpate::io;
-use palpate::pipeline::field::FieldResult;
 use palpate::pipeline::stress::{self, Effort, GraspAxis, StiffnessAxis};
 use palpate::report::stress as report;
-use palpate::report::verdict::{Trust, judge};
 use palpate::synth::Trouble;
-use palpate::types::{Part, Volume, names};
+use palpate::types::{Part, names};
 use std::time::Instant;
 
 #[derive(Debug, Args)]
@@ -84,13 +82,6 @@ fn check_axes(asked: &[String], wanted: impl Fn(Part) -> bool) -> Result<()> {
     Ok(())
 }
 
-/// What `palpate field` would say against its result: its warnings, and a verdict of low trust.
-fn said(initial: &Volume, result: &FieldResult) -> Vec<String> {
-    let verdict = judge(initial.grid(), None, &|at| result.uncertainty.at(at), &result.summary);
-    let low = (verdict.trust == Trust::Low).then(|| format!("trust is low: {}", verdict.reasons.join("; ")));
-    result.summary.warnings.iter().cloned().chain(low).collect()
-}
-
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { target, quick, part, axis } = options;
     let wanted = |p: Part| part.is_empty() || part.contains(&p);
@@ -102,7 +93,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut curves = Vec::new();
     let troubles = picked(axis, &field_axes());
     if wanted(Part::Field) && !troubles.is_empty() {
-        curves.extend(stress::field_curves(&effort, &troubles, &said, &|f| progress.set("field", f)));
+        curves.extend(stress::field_curves(&effort, &troubles, &|f| progress.set("field", f)));
     }
     let axes = picked(axis, &StiffnessAxis::ALL);
     if wanted(Part::Stiffness) && !axes.is_empty() {

@@ -276,22 +276,21 @@ pub struct Posterior {
 pub fn posterior(
     smoothness: &Smoothness,
     weights: &[f32],
-    blocks: &[[f32; 6]],
+    blocks: &Blocks,
     nodes: [usize; 3],
     draws: usize,
     seed: u64,
 ) -> Posterior {
     let n = blocks.len();
     let affine = Affine::new(nodes, blocks);
-    let planar = Blocks::from(blocks);
-    let matrix = Coupled::new(smoothness, weights, &planar, true);
+    let matrix = Coupled::new(smoothness, weights, blocks, true);
     let draw = |draw: usize| {
         let mut random = Random::new(seed, 1000 + draw as u64);
         let mut b: Vec<f32> = weights.chunks_exact(n).flat_map(|w| smoothness.sample(w, &mut random)).collect();
         let mut pulls = vec![[0.0f32; 3]; n];
         for (i, (a, pull)) in blocks.iter().zip(&mut pulls).enumerate() {
             let (e, f) = (random.normals(), random.normals());
-            *pull = cholesky_times(a, [e[0], e[1], f[0]]).map(|v| v as f32);
+            *pull = cholesky_times(&a, [e[0], e[1], f[0]]).map(|v| v as f32);
             (0..3).for_each(|c| b[c * n + i] += pull[c]);
         }
         // Of the rest an affine motion feels nothing.
@@ -310,7 +309,7 @@ pub fn posterior(
             for (i, (s, d)) in squares.iter_mut().zip(&mut determined).enumerate() {
                 *s += share * seen.iter().map(|c| x[c * n + i] * x[c * n + i]).sum::<f32>();
                 let at = std::array::from_fn(|c| f64::from(x[c * n + i]));
-                *d += quadratic(&blocks[i].map(f64::from), at) as f32 / draws as f32;
+                *d += quadratic(&blocks.at(i).map(f64::from), at) as f32 / draws as f32;
             }
         }
     }
@@ -326,9 +325,9 @@ struct Affine {
 }
 
 impl Affine {
-    fn new(nodes: [usize; 3], blocks: &[[f32; 6]]) -> Self {
+    fn new(nodes: [usize; 3], blocks: &Blocks) -> Self {
         let mut out = Self { nodes, normal: [[0.0; 12]; 12] };
-        for (i, &[xx, yy, zz, xy, xz, yz]) in blocks.iter().enumerate() {
+        for (i, [xx, yy, zz, xy, xz, yz]) in blocks.iter().enumerate() {
             let (shapes, block) = (out.shapes(i), [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]);
             for (r, row) in out.normal.iter_mut().enumerate() {
                 for (c, v) in row.iter_mut().enumerate() {

@@ -4,9 +4,9 @@ use crate::error::SpaceError;
 use crate::field::jacobian;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
-use crate::numerics::sampling::beside;
+use crate::numerics::sampling::{beside, nearest};
 use crate::numerics::simd::dispatch;
-use crate::types::{DenseField, Grid, Mask, Volume};
+use crate::types::{DenseField, Grid, Mask, Volume, VoxelPoint};
 use rayon::prelude::*;
 
 /// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at
@@ -111,6 +111,32 @@ impl FieldSpline {
             Some((grid, orientation)) => orientation.stored_field(field, grid),
             None => Ok(field),
         }
+    }
+
+    /// The displacement (mm along the axes) at a place of the canonical grid (voxels).
+    pub(crate) fn along_axes(&self, place: [f64; 3]) -> [f64; 3] {
+        let body = match self.labels.is_empty() {
+            true => 0,
+            false => nearest(self.grid.shape(), VoxelPoint(place)).map_or(0, |at| usize::from(self.labels[at])),
+        };
+        let (lattice, coefficients) = &self.bodies[body];
+        lattice.at(coefficients, place)
+    }
+
+    /// The displacement (mm, RAS) at a place of the canonical grid (voxels).
+    pub(crate) fn at_place(&self, place: [f64; 3]) -> [f64; 3] {
+        let (axes, v) = (axes(&self.grid), self.along_axes(place));
+        std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * v[a]).sum())
+    }
+
+    /// The displacement (mm, RAS) at a voxel offset (x fastest) of the grid it is asked for on, before
+    /// folds are opened.
+    pub fn at(&self, offset: usize) -> [f64; 3] {
+        let offset = match &self.stored {
+            Some((grid, orientation)) => orientation.offset(grid.shape(), grid.voxel(offset)),
+            None => offset,
+        };
+        self.at_place(self.grid.voxel(offset).map(|i| i as f64))
     }
 
     /// Voxels of `mask` beside another body, and how far that one moves from where the voxel's own

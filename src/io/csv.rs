@@ -5,13 +5,15 @@
 use super::atomic::write_atomic;
 use super::{format, markups, os};
 use crate::error::IoError;
-use crate::types::{Landmark, Match, SparseField, WorldPoint};
+use crate::types::{Landmark, Match, RawMatch, SparseField, WorldPoint};
 use csv::{ReaderBuilder, StringRecord, Trim, Writer};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
 const MATCH_COLUMNS: [&str; 9] = ["x", "y", "z", "dx", "dy", "dz", "ncc", "sigma", "kept"];
+/// What matching alone measured: displacement (mm, RAS) and its sigma (mm).
+const RAW_COLUMNS: [&str; 4] = ["raw_dx", "raw_dy", "raw_dz", "raw_sigma"];
 const LANDMARK_COLUMNS: [&str; 6] = ["fx", "fy", "fz", "mx", "my", "mz"];
 const POINT_COLUMNS: [&str; 3] = ["x", "y", "z"];
 
@@ -60,8 +62,8 @@ pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
     }
 }
 
-/// Writes x,y,z,dx,dy,dz (mm), ncc, sigma (mm) and kept (1 or 0), all matches in order, with six
-/// decimals.
+/// Writes x,y,z,dx,dy,dz (mm), ncc, sigma (mm), kept (1 or 0) and what matching alone measured
+/// (raw_dx, raw_dy, raw_dz, raw_sigma; mm), all matches in order, with six decimals.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -70,12 +72,15 @@ pub fn write_matches(path: impl AsRef<Path>, field: &SparseField) -> Result<(), 
         let numbers = [&m.initial.0[..], &m.displacement, &[f64::from(m.ncc), m.sigma()]].concat();
         let mut row: Vec<String> = numbers.into_iter().map(decimal).collect();
         row.push(u8::from(m.kept).to_string());
+        let raw = m.raw.unwrap_or(RawMatch { displacement: m.displacement, sigma: m.sigma() });
+        row.extend(raw.displacement.into_iter().chain([raw.sigma]).map(decimal));
         row
     });
-    write_table(path.as_ref(), &MATCH_COLUMNS, rows)
+    let columns = [&MATCH_COLUMNS[..], &RAW_COLUMNS].concat();
+    write_table(path.as_ref(), &columns, rows)
 }
 
-/// Reads what [`write_matches`] writes; the covariance becomes sigma squared along each axis.
+/// Reads the estimate that [`write_matches`] writes; the covariance becomes sigma squared along each axis.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number or kept neither 0 nor 1.
@@ -92,6 +97,7 @@ pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
         ncc: ncc as f32,
         covariance: [sigma * sigma, sigma * sigma, sigma * sigma, 0.0, 0.0, 0.0],
         kept: kept != 0.0,
+        raw: None,
     });
     Ok(SparseField { matches: matches.collect() })
 }
@@ -108,6 +114,7 @@ pub fn stored_matches(field: &SparseField) -> SparseField {
             ncc: kept(f64::from(m.ncc)) as f32,
             covariance: [sigma * sigma, sigma * sigma, sigma * sigma, 0.0, 0.0, 0.0],
             kept: m.kept,
+            raw: None,
         }
     };
     SparseField { matches: field.matches.iter().map(one).collect() }

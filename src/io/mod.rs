@@ -99,7 +99,7 @@ pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
 pub use trials::{write_stress, write_trials};
-pub use vtu::{write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
+pub use vtu::{write_match_mesh, write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;
 use std::path::Path;

@@ -61,6 +61,7 @@ pub fn read_trajectories(path: impl AsRef<Path>, reference: usize) -> Result<BTr
             ncc: 1.0,
             covariance: [sigma * sigma, sigma * sigma, sigma * sigma, 0.0, 0.0, 0.0],
             kept: true,
+            raw: None,
         });
     }
     Ok(out)

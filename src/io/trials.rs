@@ -70,6 +70,9 @@ pub fn write_stress(path: impl AsRef<Path>, curves: &[StressCurve]) -> Result<()
         "inside_band",
         "refused",
         "said",
+        "expected",
+        "silent",
+        "false_alarm",
     ];
     let rows = curves.iter().flat_map(|c| {
         c.runs.iter().map(move |r| {
@@ -87,6 +90,9 @@ pub fn write_stress(path: impl AsRef<Path>, curves: &[StressCurve]) -> Result<()
                 number(r.inside),
                 r.refused.clone().unwrap_or_default(),
                 r.said.join("; "),
+                number(r.expected),
+                u8::from(r.silent()).to_string(),
+                u8::from(r.false_alarm()).to_string(),
             ]
         })
     });

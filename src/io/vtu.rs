@@ -8,7 +8,7 @@
 use super::atomic::write_atomic;
 use super::{format, os};
 use crate::error::IoError;
-use crate::types::{QuadraticMesh, TetMesh, TriMesh, WorldPoint};
+use crate::types::{Match, Mesh, QuadraticMesh, TetMesh, TriMesh, WorldPoint};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use libdeflater::{CompressionLvl, Compressor};
 use std::fmt::Write as _;
@@ -33,7 +33,25 @@ pub fn write_tet_mesh(
     displacement: &[[f64; 3]],
     cell_data: &[(&str, &[f32])],
 ) -> Result<(), IoError> {
-    write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_TETRA, displacement, cell_data)
+    write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_TETRA, (displacement, None), cell_data)
+}
+
+/// Writes a mesh through matches (mm, RAS): at each node the displacement, its `magnitude`, its
+/// `sigma`, and the `raw_displacement` that matching alone measured.
+///
+/// # Errors
+/// As [`write_tet_mesh`].
+pub fn write_match_mesh(path: impl AsRef<Path>, mesh: &Mesh, matches: &[&Match]) -> Result<(), IoError> {
+    let displacement: Vec<[f64; 3]> = matches.iter().map(|m| m.displacement).collect();
+    let measured = AtNodes {
+        sigma: matches.iter().map(|m| m.sigma() as f32).collect(),
+        raw: matches.iter().map(|m| m.raw.map_or(m.displacement, |raw| raw.displacement)).collect(),
+    };
+    let (path, more) = (path.as_ref(), Some(&measured));
+    match mesh {
+        Mesh::Tetrahedra(m) => write(path, m.nodes(), m.tetrahedra(), VTK_TETRA, (&displacement, more), &[]),
+        Mesh::Triangles(m) => write(path, m.nodes(), m.triangles(), VTK_TRIANGLE, (&displacement, more), &[]),
+    }
 }
 
 /// Writes quadratic tetrahedra, as [`write_tet_mesh`] does linear ones.
@@ -46,7 +64,7 @@ pub fn write_quadratic_mesh(
     displacement: &[[f64; 3]],
     cell_data: &[(&str, &[f32])],
 ) -> Result<(), IoError> {
-    write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_QUADRATIC_TETRA, displacement, cell_data)
+    write(path.as_ref(), mesh.nodes(), mesh.tetrahedra(), VTK_QUADRATIC_TETRA, (displacement, None), cell_data)
 }
 
 /// Writes triangles, as [`write_tet_mesh`] does tetrahedra.
@@ -59,7 +77,13 @@ pub fn write_tri_mesh(
     displacement: &[[f64; 3]],
     cell_data: &[(&str, &[f32])],
 ) -> Result<(), IoError> {
-    write(path.as_ref(), mesh.nodes(), mesh.triangles(), VTK_TRIANGLE, displacement, cell_data)
+    write(path.as_ref(), mesh.nodes(), mesh.triangles(), VTK_TRIANGLE, (displacement, None), cell_data)
+}
+
+/// What is known of the displacement at the nodes (mm).
+struct AtNodes {
+    sigma: Vec<f32>,
+    raw: Vec<[f64; 3]>,
 }
 
 fn write<const N: usize>(
@@ -67,7 +91,7 @@ fn write<const N: usize>(
     nodes: &[WorldPoint],
     cells: &[[u32; N]],
     cell_type: u8,
-    displacement: &[[f64; 3]],
+    (displacement, more): (&[[f64; 3]], Option<&AtNodes>),
     cell_data: &[(&str, &[f32])],
 ) -> Result<(), IoError> {
     let fits = |name: &str, found: usize, needed: usize| match found == needed {
@@ -78,7 +102,7 @@ fn write<const N: usize>(
     cell_data.iter().try_for_each(|(name, values)| fits(name, values.len(), cells.len()))?;
 
     let mut file = Appended { xml: String::new(), data: String::new() };
-    let packed = file.describe(nodes, cells, cell_type, displacement, cell_data);
+    let packed = file.describe(nodes, cells, cell_type, (displacement, more), cell_data);
     packed.map_err(|e| os(path, "compress")(io::Error::other(e)))?;
     write_atomic(path, |w| {
         write!(
@@ -109,7 +133,7 @@ impl Appended {
         nodes: &[WorldPoint],
         cells: &[[u32; N]],
         cell_type: u8,
-        displacement: &[[f64; 3]],
+        (displacement, more): (&[[f64; 3]], Option<&AtNodes>),
         cell_data: &[(&str, &[f32])],
     ) -> Packed {
         let vectors = |v: &mut dyn Iterator<Item = [f64; 3]>| bytes(v.flatten().map(|x| (x as f32).to_le_bytes()));
@@ -118,6 +142,10 @@ impl Appended {
         self.xml += "<PointData Vectors=\"displacement\" Scalars=\"magnitude\">\n";
         self.array("displacement", "Float32", 3, &vectors(&mut displacement.iter().copied()))?;
         self.array("magnitude", "Float32", 1, &bytes(displacement.iter().map(|d| length(d).to_le_bytes())))?;
+        if let Some(AtNodes { sigma, raw }) = more {
+            self.array("sigma", "Float32", 1, &bytes(sigma.iter().map(|v| v.to_le_bytes())))?;
+            self.array("raw_displacement", "Float32", 3, &vectors(&mut raw.iter().copied()))?;
+        }
         self.xml += "</PointData>\n<CellData>\n";
         for (name, values) in cell_data {
             self.array(name, "Float32", 1, &bytes(values.iter().map(|v| v.to_le_bytes())))?;

@@ -5,7 +5,8 @@
 //! gets the information `A = sum_x B(x) rho(x) g g^T / sigma^2` and the right-hand side
 //! `sum_x B(x) rho(x) g r / sigma^2`. The sum of the basis functions is one, so the block diagonal
 //! `A` bounds the true Gauss-Newton matrix from above (each step cannot overshoot) and no pair of
-//! nodes needs to be stored. `rho` is Cauchy's weight, `sigma` the robust spread of `r`, to which
+//! nodes needs to be stored. Noise has a gradient too, which tells nothing of motion: less that, `A`
+//! is the information that the data give. `rho` is Cauchy's weight, `sigma` the robust spread of `r`, to which
 //! what interpolation leaves unsure adds in proportion to `g`: contrast beyond that tells no more.
 
 use crate::matching::gain::GainField;
@@ -13,8 +14,9 @@ use crate::matching::pair::{Pair, row_step};
 use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
+use crate::numerics::small::eigenvalues;
 use crate::numerics::statistics::median;
-use crate::numerics::{ablation, pyramid};
+use crate::numerics::{ablation, filters, pyramid};
 use rayon::prelude::*;
 
 /// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
@@ -25,15 +27,85 @@ pub const CAUCHY: f32 = 2.385;
 /// voxel off.
 const UNSURE: f64 = 0.02;
 
+/// Variance of the gradient that white noise leaves, along an axis (voxel^-2), over that of the residual.
+///
+/// Both volumes are smoothed by (1, 4, 1) / 6, whose correlation over two voxels is 1/18. A central
+/// difference then has half of 17/18 of a volume's variance, the mean of two half of that.
+const NOISE_SLOPE: f32 = 17.0 / 144.0;
+
+/// Variance of white noise that (1, 4, 1) / 6 leaves along an axis.
+const SMOOTHED: f32 = 0.5;
+
+/// Residual beyond which a voxel's misfit counts no more (robust standard deviations).
+const TRIMMED: f32 = 5.0;
+
+/// Mean square of the residual about each node of `lattice`, over the robust variance of the whole
+/// (1); [`TRIMMED`], and 1 where no tissue is near. `warped` is the deformed volume, warped.
+pub fn misfit_by_place(pair: &Pair<'_>, warped: &[f32], lattice: &Lattice) -> Vec<f32> {
+    let gain = GainField::sharpened(pair, warped);
+    let scale = 1.0 / residual_sigma(pair, warped, &gain).max(f32::MIN_POSITIVE);
+    let [nx, ny, _] = pair.shape;
+    let sums = lattice.accumulate::<2>(|j, k, [squares, counts]| {
+        let span = pair.spans.row(j, k);
+        let from = nx * (j + ny * k);
+        // The two rows hold gain and offset until they are overwritten.
+        gain.row(j, k, squares, counts);
+        for i in span.clone() {
+            let r = scale * (pair.fixed_smooth[from + i] - (squares[i] * warped[from + i] + counts[i]));
+            let good = pair.mask[from + i] != 0 && r.is_finite();
+            (squares[i], counts[i]) = if good { ((r * r).min(TRIMMED * TRIMMED), 1.0) } else { (0.0, 0.0) };
+        }
+        span
+    });
+    let width = lattice.nodes.map(|n| if n > 1 { 1.0 } else { 0.0 });
+    let about = |v: &[f32]| filters::gaussian(v, lattice.nodes, width);
+    let (squares, counts) = sums.split_at(lattice.len());
+    let one = |(s, c): (f32, f32)| if c > 1.0 { s / c } else { 1.0 };
+    about(squares).into_iter().zip(about(counts)).map(one).collect()
+}
+
 /// Normal equations of one pass.
 #[derive(Debug, Clone)]
 pub struct NormalEquations {
-    /// Information of each node (1/mm^2).
+    /// Bound of the Gauss-Newton matrix at each node (1/mm^2).
     pub blocks: Blocks,
     /// Right-hand side (1/mm), planar.
     pub rhs: Vec<f32>,
     /// Robust standard deviation of the residual (intensity).
     pub sigma: f32,
+    /// Sum of the weights at each node (intensity^-2), and what noise adds to a block for each of
+    /// them (intensity^2 / mm^2, by axis).
+    noise: (Vec<f32>, [f32; 3]),
+}
+
+impl NormalEquations {
+    /// Multiplies all information by `factor`.
+    pub fn scale(&mut self, factor: f32) {
+        let all = self.blocks.planar_mut().iter_mut().chain(&mut self.rhs).chain(&mut self.noise.0);
+        all.for_each(|v| *v *= factor);
+    }
+
+    /// Information of each node (1/mm^2): its block without what the gradient of the noise adds.
+    pub fn information(&self) -> Blocks {
+        let (weights, noise) = &self.noise;
+        let n = weights.len();
+        let mut planar = self.blocks.planar().to_vec();
+        for (i, weight) in weights.iter().enumerate() {
+            let mut block = self.blocks.at(i);
+            (0..3).for_each(|a| block[a] -= weight * noise[a]);
+            let least = if is_positive(&block) { 0.0 } else { eigenvalues(&block.map(f64::from))[2].min(0.0) as f32 };
+            // Across a slice there is neither motion nor information.
+            (0..3).filter(|&a| noise[a] > 0.0).for_each(|a| block[a] -= least);
+            block.into_iter().enumerate().for_each(|(q, v)| planar[q * n + i] = v);
+        }
+        Blocks::from_planar(planar)
+    }
+}
+
+/// Whether no eigenvalue of a symmetric block is negative, by its leading minors.
+fn is_positive(&[xx, yy, zz, xy, xz, yz]: &[f32; 6]) -> bool {
+    let determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz);
+    xx >= 0.0 && xx * yy >= xy * xy && determinant >= 0.0
 }
 
 /// Rows of a volume that are worth handing to another thread.
@@ -77,9 +149,17 @@ pub fn normal_equations(
         if ablation::is_on("gradient-floor") { UNSURE * pyramid::finest(pair.shape, pair.spacing) } else { 0.0 };
     let least = unsure.powi(2) as f32;
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
+    // Of the residual no more is noise than the volumes have.
+    let thick = pair.shape.iter().filter(|&&n| n > 1).count() as i32;
+    let white = variance.min(2.0 * SMOOTHED.powi(thick) * pair.noise * pair.noise);
+    let counts = ablation::is_on("noise-gradient");
+    let noise = std::array::from_fn(|a| match pair.shape[a] > 1 && counts {
+        true => NOISE_SLOPE * white / (pair.spacing[a] * pair.spacing[a]) as f32,
+        false => 0.0,
+    });
     // Differences over two voxels, over one at the border; none along a side of one voxel.
     let ends = |at: usize, n: usize| (at.saturating_sub(1), (at + 1).min(n - 1));
-    let mut sums = lattice.accumulate::<9>(|j, k, rows| {
+    let mut sums = lattice.accumulate::<10>(|j, k, rows| {
         let mut span = pair.spans.row(j, k);
         if nx > 1 {
             span = span.start.max(1)..span.end.min(nx - 1);
@@ -98,13 +178,14 @@ pub fn normal_equations(
             || {
                 // One by one: mapped arrays are functions of their own here, and took as long as
                 // the sums.
-                let [xx, yy, zz, xy, xz, yz, rx, ry, rz] = &mut *rows;
+                let [xx, yy, zz, xy, xz, yz, rx, ry, rz, weights] = &mut *rows;
                 // The first two rows hold gain and offset until they are overwritten.
                 gain.row(j, k, xx, yy);
                 let (from, to) = (span.start, span.end);
                 let (xx, yy, zz) = (&mut xx[from..to], &mut yy[from..to], &mut zz[from..to]);
                 let (xy, xz, yz) = (&mut xy[from..to], &mut xz[from..to], &mut yz[from..to]);
                 let (rx, ry, rz) = (&mut rx[from..to], &mut ry[from..to], &mut rz[from..to]);
+                let weights = &mut weights[from..to];
                 let f = &pair.fixed_smooth[here..][..n];
                 let w = &warped[here..][..n];
                 let mask = &pair.mask[here..][..n];
@@ -125,6 +206,7 @@ pub fn normal_equations(
                     let good = mask[i] != 0 && (r + gx + gy + gz).is_finite();
                     let (r, gx, gy, gz) = if good { (r, gx, gy, gz) } else { (0.0, 0.0, 0.0, 0.0) };
                     let weight = 1.0 / (variance + least * (gx * gx + gy * gy + gz * gz) + cut * r * r);
+                    weights[i] = if good { weight } else { 0.0 };
                     let (hx, hy, hz) = (weight * gx, weight * gy, weight * gz);
                     (xx[i], yy[i], zz[i]) = (hx * gx, hy * gy, hz * gz);
                     (xy[i], xz[i], yz[i]) = (hx * gy, hx * gz, hy * gz);
@@ -134,9 +216,10 @@ pub fn normal_equations(
         );
         span
     });
+    let weights = sums.split_off(9 * lattice.len());
     let rhs = sums.split_off(6 * lattice.len());
     sums.shrink_to_fit();
-    NormalEquations { blocks: Blocks::from_planar(sums), rhs, sigma }
+    NormalEquations { blocks: Blocks::from_planar(sums), rhs, sigma, noise: (weights, noise) }
 }
 
 /// A warp that others are judged against.

@@ -2,16 +2,19 @@
 //! where it stays at rest, and how sure it is.
 
 use crate::consistency::coupling::Posterior;
+use crate::consistency::energy::distance;
 use crate::consistency::models::{AffineMotion, Choice, Excess, choose, nearest_rigid};
 use crate::consistency::pruning::Measured;
 use crate::field::spline::Spline;
-use crate::matching::levels::to_level;
+use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
+use crate::matching::residual;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::{ablation, pyramid};
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::level::{self, LevelMatch, SplineField};
 use crate::pipeline::rest::{self, Places, Rest, Tried};
+use crate::pipeline::uncertainty::{AtNodes, Variances};
 use crate::types::{Grid, Mask, MotionModel};
 use rayon::prelude::*;
 
@@ -29,8 +32,8 @@ pub(super) fn labelled(mask: &Mask, labels: &[u8], name: impl Fn(usize) -> u8) -
 pub(super) struct Concluded {
     pub choice: Choice,
     pub rest: Option<Rest>,
-    /// On a lattice twice as coarse as the field's own.
-    posterior: (Lattice, Posterior),
+    /// At the nodes of its field.
+    posterior: Posterior,
 }
 
 impl Concluded {
@@ -49,7 +52,7 @@ impl Concluded {
         let windows = level::windows(&pair);
         let by_place = level::excess(&pair, field, &windows);
         let posterior = level::posterior(field, pair.spacing, seed);
-        let places_of = Places::new(&pair, &windows, &posterior);
+        let places_of = Places::new(&pair, &windows, &field.lattice, &posterior);
         let (mut choice, tried) = smallest(&measured, &pair, field, &by_place, &places_of, seed);
         if rigid {
             let motion = nearest_rigid(&rest::shown(&pair, field, |_| true));
@@ -82,67 +85,44 @@ impl Concluded {
     }
 
     /// The spline of each body over `grid`, and how sure they are together. The bodies' fields lie
-    /// on `pair`, a level of `factor`; `judged` maps its places to those of the level on which this
-    /// was concluded. With a seed the posterior is made again.
+    /// on `pair`, a level of `factor`; this was concluded on one of `judged`. With a seed the
+    /// posterior is made again.
     pub fn on_grid(
         all: Vec<Self>,
         bodies: &mut Bodies,
         (pair, factor): (&Pair<'_>, [usize; 3]),
-        (judged, again): (impl Fn([f64; 3]) -> [f64; 3] + Sync, Option<u64>),
+        (judged, again): ([usize; 3], Option<u64>),
         grid: &Grid,
-    ) -> (Vec<Spline>, Stated) {
-        let (mut splines, mut stated) = (Vec::new(), Vec::new());
+    ) -> (Vec<Spline>, Variances) {
+        let warped = bodies.warp(pair, &pair.spans);
+        let place = |p| to_level(from_level(p, factor), judged);
+        let (mut splines, mut variances) = (Vec::new(), Vec::new());
         for (b, Self { choice, rest, posterior }) in all.into_iter().enumerate() {
+            let part = bodies.part(pair, b);
             let field = &mut bodies.fields[b];
-            let (coarse, mut posterior) = match again {
-                Some(seed) => level::posterior(field, pair.spacing, seed),
-                None => posterior,
-            };
+            let posterior = again.map_or(posterior, |seed| level::posterior(field, pair.spacing, seed));
+            let misfit = residual::misfit_by_place(&part, &warped, &field.lattice);
+            let free = field.clone();
             let rest = rest.filter(Rest::is_taken);
             if let Some(rest) = &rest {
-                rest.bring(field, &judged);
+                rest.bring(field, place);
             }
-            splines.push(full_lattice(grid, field, factor, &choice));
-            let hidden = hidden(pair, field, &coarse);
-            if let Some(rest) = rest {
-                let seen = posterior.deviation.iter_mut().enumerate().filter(|&(m, _)| !hidden[m]);
-                seen.for_each(|(m, v)| *v *= rest.narrowed(judged(coarse.within(m))));
-            }
-            stated.push(Stated { coarse, deviation: posterior.deviation, hidden });
+            let lattice = free.lattice.clone();
+            let stated = full_lattice(grid, field, factor, (&choice, judged));
+            let apart = apart(&stated, &free, factor);
+            let narrowed = |m: usize| rest.as_ref().map_or(1.0, |rest| rest.narrowed(place(lattice.within(m))));
+            let narrowed: Vec<f32> = (0..lattice.len()).map(narrowed).collect();
+            let nodes = AtNodes {
+                deviation: &posterior.deviation,
+                misfit: &misfit,
+                apart: &apart,
+                narrowed: &narrowed,
+                hidden: &hidden(pair, field),
+            };
+            variances.push(Variances::of(lattice, pair.spacing, &nodes));
+            splines.push(stated);
         }
-        (splines, Stated::by_place(stated, bodies))
-    }
-}
-
-/// Standard deviations at the nodes of a lattice (mm), and which of these the deformed volume does
-/// not show.
-pub(super) struct Stated {
-    pub coarse: Lattice,
-    pub deviation: Vec<f32>,
-    pub hidden: Vec<bool>,
-}
-
-impl Stated {
-    /// On the closest lattice of all bodies, each node's from the body there.
-    fn by_place(mut all: Vec<Self>, bodies: &Bodies) -> Self {
-        let closest = (0..all.len()).max_by_key(|&b| all[b].coarse.len()).unwrap_or(0);
-        let lattice = all[closest].coarse.clone();
-        let at = |m: usize| {
-            let place = lattice.within(m);
-            let Self { coarse, deviation, hidden } = &all[bodies.label_near(place)];
-            if *coarse == lattice {
-                return (deviation[m], hidden[m]);
-            }
-            let stencil = coarse.stencil_near(place);
-            let mut nearest = (0.0, 0);
-            coarse.for_each_tap(place, |node, w| nearest = if w > nearest.0 { (w, node) } else { nearest });
-            (stencil.gather(deviation), hidden[nearest.1])
-        };
-        if all.len() == 1 {
-            return all.remove(0);
-        }
-        let (deviation, hidden) = (0..lattice.len()).map(at).unzip();
-        Self { deviation, hidden, coarse: lattice }
+        (splines, Variances::by_place(variances, bodies))
     }
 }
 
@@ -167,19 +147,20 @@ fn smallest(
     (choice, tried)
 }
 
-/// The chosen motion on a lattice over the full-resolution grid.
+/// The chosen motion on a lattice over the full-resolution grid; `field` lies on a level of
+/// `factor`, and the choice was made on one of `judged`.
 pub(super) fn full_lattice(
     grid: &Grid,
     field: &SplineField,
     factor: [usize; 3],
-    choice: &Choice,
-) -> (Lattice, Vec<f32>) {
+    (choice, judged): (&Choice, [usize; 3]),
+) -> Spline {
     let step = std::array::from_fn(|a| field.lattice.step[a] * factor[a]);
     let lattice = Lattice::new(grid.shape(), step);
     let spacing = grid.spacing();
     let coefficients = match &choice.motion {
         Some(motion) => lattice.fit(|p| {
-            motion.displacement(std::array::from_fn(|a| to_level(p, factor)[a] * spacing[a] * factor[a] as f64))
+            motion.displacement(std::array::from_fn(|a| to_level(p, judged)[a] * spacing[a] * judged[a] as f64))
         }),
         None if factor == [1; 3] => field.coefficients.clone(),
         None => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
@@ -187,12 +168,23 @@ pub(super) fn full_lattice(
     (lattice, coefficients)
 }
 
-/// Of each node of a lattice over the initial volume, whether the deformed volume does not show
-/// what is there.
-pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField, lattice: &Lattice) -> Vec<bool> {
+/// How far the motion that is stated over the full-resolution grid lies from a free field, at the
+/// nodes of that one (mm).
+pub(super) fn apart((full, stated): &Spline, free: &SplineField, factor: [usize; 3]) -> Vec<f32> {
+    let lattice = &free.lattice;
+    let at = |m: usize| {
+        let p = lattice.within(m);
+        distance(full.at(stated, from_level(p, factor)), lattice.at(&free.coefficients, p)) as f32
+    };
+    (0..lattice.len()).into_par_iter().map(at).collect()
+}
+
+/// Of each node of a field, whether the deformed volume does not show what is there.
+pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField) -> Vec<bool> {
+    let lattice = &field.lattice;
     let sees = |m: usize| {
         let p = lattice.within(m);
-        level::sees(pair, p, field.lattice.at(&field.coefficients, p))
+        level::sees(pair, p, lattice.at(&field.coefficients, p))
     };
     (0..lattice.len()).into_par_iter().map(|m| !sees(m)).collect()
 }

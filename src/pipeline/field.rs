@@ -10,12 +10,11 @@ use crate::numerics::ablation;
 use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
-use crate::numerics::pyramid;
-use crate::numerics::statistics::{median, quantile};
+use crate::numerics::statistics::quantile;
 use crate::pipeline::background;
 use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::check::{self, Checked};
-use crate::pipeline::conclusion::{Concluded, Stated, labelled};
+use crate::pipeline::conclusion::{Concluded, labelled};
 use crate::pipeline::finer::{self, Explained, finer, uneven, unlike};
 pub use crate::pipeline::hypotheses::Start;
 use crate::pipeline::hypotheses::{Begun, NEAR, Search};
@@ -24,6 +23,8 @@ use crate::pipeline::light::Light;
 use crate::pipeline::polish;
 use crate::pipeline::rest::Rest;
 use crate::pipeline::sparse;
+use crate::pipeline::stages::{self, Left, Stage};
+use crate::pipeline::uncertainty::{self, some_of};
 use crate::types::params::{BodySource, Interpolation, Method};
 use crate::types::*;
 use rayon::prelude::*;
@@ -56,11 +57,21 @@ pub struct FieldResult {
     pub mesh: Mesh,
     /// Displacement at the mesh's nodes (mm, RAS).
     pub node_displacement: Vec<[f64; 3]>,
+    /// The kept match of each node.
+    pub node_matches: Vec<u32>,
+    /// The field after each stage, in order; the last is the field itself.
+    pub stages: Vec<Stage>,
     /// The rest.
     pub summary: FieldSummary,
 }
 
 impl FieldResult {
+    /// The matches at the mesh's nodes.
+    pub fn at_nodes(&self) -> Vec<&Match> {
+        let kept: Vec<&Match> = self.matches.kept().collect();
+        self.node_matches.iter().map(|&i| kept[i as usize]).collect()
+    }
+
     /// The displacement once more, from what it is worked out from.
     pub(super) fn dense(&self, interpolation: Interpolation) -> Result<DenseField, FieldError> {
         interpolated(interpolation, self.coefficients.dense()?, (&self.mesh, &self.node_displacement))
@@ -193,6 +204,7 @@ fn stored(found: FieldResult, here: Orientation, grid: &Grid) -> Result<FieldRes
         coefficients: found.coefficients.stored_on(*grid, here),
         uncertainty: found.uncertainty.stored_on(*grid, here),
         bodies: here.stored(&found.bodies, grid),
+        stages: found.stages.into_iter().map(|s| Stage { field: s.field.stored_on(*grid, here), ..s }).collect(),
         ..found
     })
 }
@@ -256,6 +268,7 @@ fn canonical(
         gain,
         apart,
         asked,
+        stages,
     } = chain.run(search, tissue, &mut clock)?;
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
@@ -283,6 +296,7 @@ fn canonical(
 
     // What the average of voxels hides.
     let sparse = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
+    let sparse = thinned(sparse, points);
     let searched = factor;
     let any_free = concluded.iter().any(|c| c.choice.motion.is_none());
     let next = polish::next_finer(&grid, finest, params).filter(|&next| any_free && next != factor);
@@ -300,9 +314,8 @@ fn canonical(
         clock.book("residual");
     }
     let models: Vec<MotionModel> = concluded.iter().map(|c| c.choice.model).collect();
-    let judged = |p| to_level(from_level(p, factor), searched);
     let again = next.map(|_| params.seed);
-    let (splines, stated) = Concluded::on_grid(concluded, &mut bodies, (&pair, factor), (judged, again), &grid);
+    let (splines, variances) = Concluded::on_grid(concluded, &mut bodies, (&pair, factor), (searched, again), &grid);
     let labels = match &given {
         Some(given) => given.on(grid.shape(), [1; 3]),
         None => bodies.labels_on(grid.shape(), |p| to_level(p, factor)),
@@ -311,30 +324,38 @@ fn canonical(
     let reported = |(b, model): (usize, MotionModel)| {
         let label = name(b);
         let voxels = labelled.as_slice().iter().filter(|l| **l == label).count();
-        BodyReport { label, voxels, model, slides_mm: bodies.jump(&pair, b) }
+        BodyReport { label, voxels, model, slides_mm: bodies.jump(&pair, b), expected_error_mm: 0.0 }
     };
-    let body_reports: Vec<BodyReport> = models.into_iter().enumerate().map(reported).collect();
+    let mut body_reports: Vec<BodyReport> = models.into_iter().enumerate().map(reported).collect();
     // Where there is one body its field folds nowhere but between knots.
     let tissue = if labels.is_empty() { Vec::new() } else { dilate(mask.as_slice(), grid.shape(), BORDER) };
     let coefficients = FieldSpline::new(grid, splines, labels, tissue);
-    let spacing = pair.spacing;
+    let stages = stages::account(&grid, (&pair, factor), stages, &coefficients);
     drop(pair);
     drop(aligned);
+    clock.book("uncertainty");
+
+    // Given borders are not in doubt.
+    let jumps = if given.is_some() { Vec::new() } else { coefficients.jumps(&mask) };
+    let mut variances = variances.with_borders(jumps, factor);
+    let doubted = begun.doubted();
+    if let Some(seen) = doubted.filter(|_| unlike.is_some()) {
+        variances = variances.with_other_motions(seen.kept_share(), search);
+    }
+    let uncertainty = variances.deviation(&grid, factor);
+    let sparse = estimated(sparse, &grid, (&coefficients, &uncertainty));
     clock.book("uncertainty");
 
     // Mesh and dense field.
     progress("mesh", 0.92);
     let (mesh, source) = triangulate(&sparse, flat)?;
+    let at_nodes: Vec<&Match> = sparse.kept().collect();
+    let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
     let smooth = coefficients.dense()?;
-    // Given borders are not in doubt.
-    let jumps = if given.is_some() { Vec::new() } else { coefficients.jumps(&mask) };
-    let kept_matches: Vec<&Match> = sparse.kept().collect();
-    let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| kept_matches[i as usize].displacement).collect();
     let displacement = interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
-    let doubted = begun.doubted();
     if let Some(seen) = doubted.filter(|_| most_move(&displacement, &mask) > search) {
         no_measurement(kept, found, unlike.is_some().then_some(seen))?;
     }
@@ -343,8 +364,10 @@ fn canonical(
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
     progress("uncertainty", 0.95);
-    let uncertainty = uncertainty(&grid, spacing, stated, jumps);
-    let (uncertainty_median_mm, uncertainty_mean_mm) = average_inside(&uncertainty, &mask);
+    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), model);
+    for (body, found) in body_reports.iter_mut().zip(uncertainty::by_label(&uncertainty, &displacement, &labelled)) {
+        body.expected_error_mm = found.expected_error_mm;
+    }
     clock.book("uncertainty");
 
     let counts = with_mesh(&mut reports, &mesh);
@@ -354,20 +377,20 @@ fn canonical(
         evidence,
         bodies: body_reports,
         levels: reports,
+        stages: stages.iter().map(|s| s.report.clone()).collect(),
         folds,
         mask_voxels: length.2,
         mean_mm: length.0,
         max_mm: length.1,
-        uncertainty_median_mm,
+        uncertainty_median_mm: uncertainty::median_inside(&uncertainty, &mask),
+        expected,
         unseen,
-        in_doubt: doubted.is_some() && unlike.is_some(),
         seconds: clock.0,
         // A known field takes the search as far as it goes itself.
         warnings: warnings(counts, folds, not_finite, length.1, if starts.is_empty() { search } else { f64::INFINITY })
             .into_iter()
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
-            .chain(vague(model, uncertainty_mean_mm, length.0, &grid))
             .chain(doubted.map(in_doubt))
             .chain(unlike)
             .chain(uneven(gain))
@@ -376,9 +399,7 @@ fn canonical(
             .collect(),
     };
     progress("done", 1.0);
-    // What the data say at each node is as large again twice over, and no search starts from it.
-    bodies.fields.iter_mut().for_each(|f| f.blocks = Blocks::default());
-    let spline = Start { motion: bodies, factor, followed: Some(begun.followed) };
+    let spline = Start { motion: without_blocks(&bodies), factor, followed: Some(begun.followed) };
     Ok(FieldResult {
         displacement,
         coefficients,
@@ -388,8 +409,17 @@ fn canonical(
         matches: sparse,
         mesh,
         node_displacement,
+        node_matches: source,
+        stages,
         summary,
     })
+}
+
+/// A motion without what the data say at each node, which is as large again twice over.
+fn without_blocks(bodies: &Bodies) -> Bodies {
+    let mut out = bodies.clone();
+    out.fields.iter_mut().for_each(|f| f.blocks = Blocks::default());
+    out
 }
 
 /// Refuses a motion past all that was looked for where few matches survive, `kept` of `found`
@@ -446,6 +476,8 @@ struct Found<'a> {
     apart: usize,
     /// Questions that were asked on the way, with their answers.
     asked: Vec<String>,
+    /// The motion after each stage.
+    stages: Vec<Left>,
 }
 
 impl<'a> CoarseToFine<'a, '_> {
@@ -460,6 +492,7 @@ impl<'a> CoarseToFine<'a, '_> {
         let Self { aligned, params, progress, .. } = *self;
         let (mut reports, mut asked, mut light, mut range) = (Vec::new(), Vec::new(), Light::default(), range);
         let mut state: Option<(Bodies, [usize; 3], Begun)> = None;
+        let mut stages = Vec::new();
         for (l, &factor) in self.factors.iter().enumerate() {
             let (first, last) = (l == 0, l + 1 == self.factors.len());
             let mut pair = light.level(aligned, factor);
@@ -472,7 +505,7 @@ impl<'a> CoarseToFine<'a, '_> {
             let matching = || progress("matching", done(0.0));
             let search = Search { params, range, flat: self.flat, matching: &matching, tick: &tick };
             let mut matched = 0.0;
-            let (mut bodies, begun, sought) = match state.take() {
+            let (mut bodies, mut begun, sought) = match state.take() {
                 Some((coarse, from, begun)) if self.given.is_some() => {
                     (coarse.carried(&lattice, |p| to_level(from_level(p, factor), from)), begun, false)
                 }
@@ -512,6 +545,10 @@ impl<'a> CoarseToFine<'a, '_> {
                     pair.spacing.into_iter().zip(factor).map(|(s, f)| s / f as f64).fold(f64::INFINITY, f64::min);
                 asked.extend(bodies.divide(&pair, &begun.matches, (passes, edge), params.seed));
             }
+            if let Some(field) = begun.of_matches.take() {
+                let name = if first { "matches alone" } else { "matches about that field" };
+                stages.push(Left { name: name.into(), motion: field.into(), factor });
+            }
             // What a coarser level saw of the brightness serves the finest one.
             let open = first || !last || light.is_unknown();
             let more = open && light.look(&mut pair, (aligned, factor), &bodies);
@@ -521,6 +558,7 @@ impl<'a> CoarseToFine<'a, '_> {
             if !last {
                 clock.skip("matching", matched);
                 clock.book("residual");
+                stages.push(Left { name: "coarse level".into(), motion: without_blocks(&bodies), factor });
                 state = Some((bodies, factor, begun));
                 continue;
             }
@@ -538,9 +576,9 @@ impl<'a> CoarseToFine<'a, '_> {
             clock.skip("matching", matched);
             clock.book("residual");
             progress("matching", done(0.9));
-            let automatic = (pair.inside / params.voxels_per_point).max(200);
+            let automatic = (pair.inside / params.voxels_per_point).max(LEAST_POINTS);
             let points = if params.points > 0 { params.points } else { automatic };
-            let near = MatchParams::near(params, &pair, points, params.points > 0);
+            let near = MatchParams::near(params, &pair, points.max(LEAST_POINTS), params.points > 0);
             let (matches, report) = bodies.matches(&pair, near);
             if first {
                 reports.clear();
@@ -548,6 +586,7 @@ impl<'a> CoarseToFine<'a, '_> {
             reports.push(report);
             clock.book("matching");
             let (search, apart) = (range, closest);
+            stages.push(Left { name: "finest level".into(), motion: without_blocks(&bodies), factor });
             return Ok(Found {
                 bodies,
                 factor,
@@ -562,6 +601,7 @@ impl<'a> CoarseToFine<'a, '_> {
                 gain,
                 apart,
                 asked,
+                stages,
             });
         }
         Err(too_few(0, range))
@@ -637,6 +677,9 @@ fn why_farther(range: f64, own: &Begun, wide: &Begun, taken: bool) -> String {
         if taken { "taken" } else { "not taken" }
     )
 }
+
+/// Points that are matched at least, however few are asked for: a field is judged by them.
+const LEAST_POINTS: usize = 200;
 
 /// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and
 /// [`FEWEST`] must be left.
@@ -730,7 +773,30 @@ pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Ma
         ncc: m.ncc,
         covariance: [turned(0, 0), turned(1, 1), turned(2, 2), turned(0, 1), turned(0, 2), turned(1, 2)],
         kept: m.kept,
+        raw: None,
     }
+}
+
+/// Matches with what the final estimate says at their places.
+pub(super) fn estimated(
+    mut sparse: SparseField,
+    grid: &Grid,
+    (coefficients, deviation): (&FieldSpline, &ScalarSpline),
+) -> SparseField {
+    let of = |m: &mut Match| {
+        let VoxelPoint(place) = grid.affine().to_voxel(m.initial);
+        *m = m.with_estimate(coefficients.at_place(place), f64::from(deviation.at_place(place)));
+    };
+    sparse.matches.par_iter_mut().for_each(of);
+    sparse
+}
+
+/// At most `wanted` of the matches, evenly.
+fn thinned(sparse: SparseField, wanted: usize) -> SparseField {
+    let count = sparse.matches.len();
+    let every = |i: &usize| (i + 1) * wanted / count.max(1) > i * wanted / count.max(1);
+    let matches = sparse.matches.into_iter().enumerate().filter(|(i, _)| wanted >= count || every(i));
+    SparseField { matches: matches.map(|(_, m)| m).collect() }
 }
 
 /// The Delaunay mesh of the kept matches, and the kept match of each node.
@@ -790,75 +856,6 @@ fn barycentric(mesh: &Mesh, nodes: &[[f64; 3]], mut outside: DenseField) -> Resu
     Ok(outside)
 }
 
-/// What the posterior leaves out (how the lattice, the interpolation and a local gain fall short,
-/// and that one number stands for three axes) gives the errors longer tails than it says: of 27
-/// pairs made from scans of a head, legs and a spine 16 had 90 % of their errors inside the 95 %
-/// band at 1.25, 24 at this; in the median of them it then holds 94 %.
-const CALIBRATION: f32 = 1.6;
-
-/// Standard deviation along an axis that a voxel at a border between bodies adds, as a part of the
-/// jump there: one in ten such voxels goes with the wrong side (13 scenes).
-const SIDE: f32 = 0.18;
-
-/// What interpolation and a voxel's extent hide from any match, as a part of a voxel: motions that
-/// were affine to the last digit (blocks with sharp edges, legs shifted along thick slices) came
-/// out 0.005 to 0.03 of a voxel off along an axis where noise alone explained a fifth of it.
-const HIDDEN: f64 = 0.015;
-
-/// How much more uncertain tissue is that the deformed volume does not show than smoothness says:
-/// of a brain of which 11 to 75 % had moved out of view the 95 % bands held 0.86 to 0.49 of the
-/// errors there without it.
-const EXTRAPOLATED: f32 = 3.0;
-
-/// Posterior standard deviation of the coupled field (mm) times [`CALIBRATION`], with what no match
-/// shows ([`HIDDEN`]), what is not in view ([`hidden`]), and what is in doubt beside `jumps`
-/// (voxel, mm).
-pub(super) fn uncertainty(
-    grid: &Grid,
-    spacing: [f64; 3],
-    Stated { coarse, mut deviation, hidden }: Stated,
-    jumps: Vec<([usize; 3], f32)>,
-) -> ScalarSpline {
-    let thick = || (0..3).filter(|&a| coarse.shape[a] > 1);
-    let least = HIDDEN * (thick().map(|a| spacing[a].powi(2)).sum::<f64>() / thick().count().max(1) as f64).sqrt();
-    for (v, hidden) in deviation.iter_mut().zip(hidden) {
-        let part = if hidden { EXTRAPOLATED } else { 1.0 };
-        *v = part * (*v * CALIBRATION).hypot(least as f32);
-    }
-    let factor: [usize; 3] = std::array::from_fn(|a| (spacing[a] / grid.spacing()[a]).round() as usize);
-    let cell: usize = (0..3).filter(|&a| coarse.shape[a] > 1).map(|a| coarse.step[a] * factor[a]).product();
-    let mut squares = vec![0.0f32; deviation.len()];
-    for (voxel, jump) in jumps {
-        let square = (SIDE * jump).powi(2) / cell as f32;
-        coarse.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| squares[node] += w * square);
-    }
-    for (v, square) in deviation.iter_mut().zip(squares) {
-        *v = (*v * *v + square).sqrt();
-    }
-    let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));
-    if full.nodes == coarse.nodes {
-        return ScalarSpline::new(*grid, full, deviation);
-    }
-    let three: Vec<f32> = deviation.iter().chain(&deviation).chain(&deviation).copied().collect();
-    let values = full.fit(|p| coarse.at(&three, to_level(p, factor)));
-    let values = values[..full.len()].to_vec();
-    ScalarSpline::new(*grid, full, values)
-}
-
-/// Voxels of the mask, evenly, at most about 25,000.
-fn some_of(mask: &Mask) -> impl Iterator<Item = usize> {
-    let mask = mask.as_slice();
-    let inside = || (0..mask.len()).filter(|&at| mask[at] != 0);
-    inside().step_by((inside().count() / 25_000).max(1))
-}
-
-/// Median and mean over the mask, from at most about 25,000 of its voxels.
-pub(super) fn average_inside(values: &ScalarSpline, mask: &Mask) -> (f64, f64) {
-    let mut picked: Vec<f32> = some_of(mask).map(|at| values.at(at)).collect();
-    let mean = picked.iter().map(|&v| f64::from(v)).sum::<f64>() / picked.len().max(1) as f64;
-    (f64::from(median(&mut picked)), mean)
-}
-
 /// Length (mm) that all but a twentieth of the mask move at most, from at most about 25,000 of its
 /// voxels. A neck that shows in one volume alone goes anywhere; of the tissues that are not each
 /// other's (legs, heads, necks, upside down or noise) it was 1.1 to 2 times the search range, of
@@ -891,42 +888,6 @@ pub(super) fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
         .collect();
     let (sum, top, n) = rows.iter().fold((0.0, 0.0f32, 0), |a, r| (a.0 + r.0, a.1.max(r.1), a.2 + r.2));
     (sum / n.max(1) as f64, f64::from(top), n)
-}
-
-/// Mean length of an error in space over the stated deviation along an axis: 2 sqrt(2 / pi) for
-/// normal errors, less here, since that deviation allows for long tails (1.35 in the median of the
-/// same 27 pairs).
-const LENGTH: f64 = 1.35;
-
-/// Part of that limit from which it is said: the expected error is right to a tenth at best. Of 978
-/// stressed runs two that were of no use lay at 0.97 and 0.99 of it; of 984 with other seeds none
-/// under 1.
-const NEARLY: f64 = 0.95;
-
-/// Says so where the field is expected to be off by about half of the motion or a voxel, or more:
-/// beyond that it is of little use (docs/failures.md shows how often this is right). A free field's
-/// own length holds its errors, as squares; under a smaller model that much bending would not have
-/// shown, and where nothing is seen to move a voxel alone counts.
-pub(super) fn vague(model: MotionModel, sigma: f64, length: f64, grid: &Grid) -> Option<String> {
-    let edge = pyramid::finest(grid.shape(), grid.spacing());
-    let expected = LENGTH * sigma;
-    let motion = match model {
-        MotionModel::Free => (length * length - expected * expected).max(0.0).sqrt(),
-        MotionModel::Rigid | MotionModel::Affine => length,
-        MotionModel::Identity => f64::INFINITY,
-    };
-    (expected > NEARLY * (0.5 * motion).min(edge)).then(|| match model {
-        MotionModel::Free => format!(
-            "the mean error to expect, {expected:.2} mm, is about half of the mean motion ({length:.2} mm, this error in it) or a voxel \
-             ({edge:.2} mm), or more: there is too little texture or too much noise for it; use only places of small uncertainty"
-        ),
-        _ => format!(
-            "the smallest model that explains the volumes was taken ({}), but bending by {expected:.2} mm would not have shown: about half of the \
-             mean motion ({length:.2} mm) or a voxel ({edge:.2} mm), or more; do not read its strain as measured, and image with less noise or a \
-             larger motion",
-            model.name()
-        ),
-    })
 }
 
 /// Tissue without texture from which it is said: pairs made from scans of heads, legs and a spine

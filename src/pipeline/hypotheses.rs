@@ -107,6 +107,8 @@ const KEPT: f64 = 0.9;
 /// What the coarsest level found.
 pub(super) struct Begun {
     pub motion: Bodies,
+    /// The field of the matches alone, where there were enough.
+    pub of_matches: Option<SplineField>,
     /// Of the matches, where they were sought.
     pub report: Option<LevelReport>,
     pub matches: Vec<LevelMatch>,
@@ -220,6 +222,7 @@ impl Search<'_> {
         {
             return Begun {
                 motion: refined(motion.clone()),
+                of_matches: None,
                 report: None,
                 matches: Vec::new(),
                 followed: followed + 1,
@@ -228,12 +231,13 @@ impl Search<'_> {
         (self.matching)();
         let (found, report, matches) = timed(seconds, || self.matched(pair, lattice));
         let counts = report.counts;
+        let of_matches = found.clone();
         let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
         let own = refined(own.into());
         let in_doubt = counts.kept_share() < LOOSE || counts.kept < ENOUGH;
         let wins = |known: &Bodies| in_doubt && known.agree_better(pair, &own);
         let motion = course.filter(wins).map_or(own, refined);
-        Begun { motion, report: Some(report), matches, followed: 0 }
+        Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }
 
     /// The field of the matches of a whole volume; none where these are too few. Where few features
@@ -286,8 +290,10 @@ impl Search<'_> {
         let wide = self.wide(pair, CLOSER * self.range, most);
         (self.matching)();
         let (matches, found, report) = timed(seconds, || level::matches_again(pair, only, wide));
-        let motion = self.refined(pair, found.filter(|_| report.counts.kept >= FEWEST)?.into(), passes);
-        motion.agree_better(pair, own).then_some(Begun { motion, report: Some(report), matches, followed: 0 })
+        let of_matches = found.filter(|_| report.counts.kept >= FEWEST)?;
+        let motion = self.refined(pair, of_matches.clone().into(), passes);
+        let begun = |motion| Begun { motion, of_matches: Some(of_matches), report: Some(report), matches, followed: 0 };
+        motion.agree_better(pair, own).then(|| begun(motion))
     }
 }
 

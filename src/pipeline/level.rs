@@ -141,9 +141,8 @@ pub(super) fn refine_from(
         pair.warp_again(&field.lattice, &field.coefficients, &active, &mut warped);
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
-        for v in equations.blocks.planar_mut().iter_mut().chain(&mut equations.rhs) {
-            *v *= weight;
-        }
+        equations.scale(weight);
+        let information = equations.information();
         let weights: Vec<f32> = field.smoothness.iter().map(|s| s * cell as f32).collect();
         if large {
             warped = Vec::new();
@@ -155,7 +154,8 @@ pub(super) fn refine_from(
         let step = || coupling::step(&matrix, rhs, coefficients, 0.02, ITERATIONS);
         // From the last pass's solution a few iterations suffice, though the blocks and weights
         // have changed.
-        let mut determine = || settled.then(|| probe.determined(&matrix, limit));
+        let informed = || Coupled::new(&energy, &weights, &information, false);
+        let mut determine = || settled.then(|| probe.determined(&informed(), limit));
         // Neither needs the other, and the planes of a small lattice are not worth sharing out;
         // those of a large one are, and only one of the two then needs its vectors.
         let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
@@ -166,7 +166,7 @@ pub(super) fn refine_from(
         if ablation::is_on("unfold") {
             unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
         }
-        field.blocks = equations.blocks;
+        field.blocks = information;
         if let Some(determined) = determined {
             let n = field.lattice.len();
             let bent: Vec<f32> =
@@ -228,24 +228,15 @@ pub fn excess<'a>(
     }
 }
 
-/// What the data of the last pass leave open and what they determine, on a lattice twice as coarse
-/// as the field's own.
-pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> (Lattice, Posterior) {
-    let coarse = Lattice::new(field.lattice.shape, field.lattice.step.map(|s| 2 * s));
-    let mut blocks = vec![[0.0f32; 6]; coarse.len()];
-    for (m, block) in field.blocks.iter().enumerate() {
-        coarse.for_each_tap(field.lattice.place(m), |node, w| {
-            for q in 0..6 {
-                blocks[node][q] += w * block[q];
-            }
-        });
-    }
-    let energy = smoothness(&coarse, spacing);
-    let cell = cell_volume(&coarse, spacing) as f32;
-    let weights =
-        resampled(&field.lattice, &field.smoothness, &coarse, |p| p).iter().map(|s| s * cell).collect::<Vec<_>>();
-    let posterior = coupling::posterior(&energy, &weights, &blocks, coarse.nodes, 6, seed);
-    (coarse, posterior)
+/// Random vectors from which the posterior's deviation is estimated.
+const DRAWS: usize = 8;
+
+/// What the data of the last pass leave open and what they determine, at the field's own nodes.
+pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> Posterior {
+    let energy = smoothness(&field.lattice, spacing);
+    let cell = cell_volume(&field.lattice, spacing) as f32;
+    let weights: Vec<f32> = field.smoothness.iter().map(|s| s * cell).collect();
+    coupling::posterior(&energy, &weights, &field.blocks, field.lattice.nodes, DRAWS, seed)
 }
 
 /// By how much the misfit shrinks from one warp to another, with the information that correlated

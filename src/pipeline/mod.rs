@@ -9,6 +9,8 @@ pub mod level;
 
 pub mod check;
 
+pub mod stages;
+
 pub mod plan;
 
 pub mod grasp;
@@ -43,3 +45,4 @@ mod polish;
 mod rest;
 mod search;
 mod sparse;
+mod uncertainty;

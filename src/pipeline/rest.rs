@@ -18,18 +18,12 @@ use crate::pipeline::level::SplineField;
 use crate::types::{MotionModel, VoxelPoint};
 
 /// Excess misfit for each degree of freedom up to which tissue is at rest, and from which the free
-/// field stands. Over 31 pairs made from scans, most of them pressed, with 1 and 3 the mean error
-/// is 0.769 of what it was, its gradient's 0.549; with 1.5 and 4 0.754 and 0.500, with 2 and 5
-/// 0.751 and 0.471, but tissue that slides loses 16 % in place of 8; with 3 and 7 smooth motion
-/// under noise loses up to a sixth.
-const AT_REST: [f32; 2] = [1.5, 4.0];
+/// field stands (1). Calibrated: docs/lab/2026-11-expected-error.md.
+const AT_REST: [f32; 2] = [0.85, 2.2];
 
-/// The uncertainty of a place, as a part of the free field's, is its excess misfit for each degree
-/// of freedom over this, and no less than [`NARROWEST`]: over 23 presses errors were 0.01 to 0.15
-/// of the free field's deviation up to 1.5, 0.03 to 0.2 up to 3; of five pairs whose rest was not
-/// quite at rest (halves that slide in noise, slices five times as thick as wide) 0.3 to 0.9, but
-/// hardly any tissue was under 1.5.
-const NARROW: f32 = 3.0;
+/// Excess misfit for each degree of freedom from which tissue at rest is as uncertain as the free
+/// field (1); below it, in proportion. Calibrated with [`AT_REST`].
+const NARROW: f32 = 1.7;
 
 /// See [`NARROW`]: how well so little motion would have shown is not known better.
 const NARROWEST: f32 = 1.0 / 3.0;
@@ -72,7 +66,7 @@ pub(super) struct Places {
 
 impl Places {
     /// From the posterior of a field.
-    pub fn new(pair: &Pair<'_>, windows: &Lattice, (nodes, posterior): &(Lattice, Posterior)) -> Self {
+    pub fn new(pair: &Pair<'_>, windows: &Lattice, nodes: &Lattice, posterior: &Posterior) -> Self {
         let mut determined = vec![0.0f32; windows.len()];
         for (m, &part) in posterior.determined.iter().enumerate() {
             windows.stencil_near(nodes.place(m)).scatter(part, &mut determined);

@@ -17,6 +17,7 @@ use crate::field::jacobian;
 use crate::field::spline::FieldSpline;
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
+use crate::matching::residual;
 use crate::numerics::blocks::Blocks;
 use crate::numerics::pyramid;
 use crate::numerics::small::{inverse, quadratic};
@@ -28,6 +29,8 @@ use crate::pipeline::conclusion;
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
 use crate::pipeline::hypotheses::Search;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::stages::{self, Left};
+use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::*;
 use rayon::prelude::*;
 
@@ -130,7 +133,7 @@ pub(super) fn measure(
     let factors = field::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
 
     // Coarse to fine.
-    let mut reports = Vec::new();
+    let (mut reports, mut left) = (Vec::new(), Vec::new());
     let mut state: Option<(Found, Pair<'_>, [usize; 3])> = None;
     for (l, &factor) in factors.iter().enumerate() {
         let pair = aligned.level(factor);
@@ -143,6 +146,8 @@ pub(super) fn measure(
         };
         let found = on_level(&pair, begun, l + 1 == factors.len(), params);
         reports.push(found.report.clone());
+        let motion = SplineField { blocks: Blocks::default(), ..found.field.clone() }.into();
+        left.push(Left { name: "matches of a level".into(), motion, factor });
         state = Some((found, pair, factor));
         clock.book("matching");
     }
@@ -161,27 +166,36 @@ pub(super) fn measure(
     choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
     let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
     clock.book("model");
-    let (coarse, Posterior { deviation, .. }) = level::posterior(&field, pair.spacing, params.seed);
-    let hidden = conclusion::hidden(&pair, &field, &coarse);
+    let Posterior { deviation, .. } = level::posterior(&field, pair.spacing, params.seed);
+    let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
+    let misfit = residual::misfit_by_place(&pair, &warped, &field.lattice);
+    let hidden = conclusion::hidden(&pair, &field);
+    clock.book("uncertainty");
+
+    let full = conclusion::full_lattice(&grid, &field, factor, (&choice, factor));
+    let apart = conclusion::apart(&full, &field, factor);
+    let narrowed = vec![1.0; deviation.len()];
+    let nodes = AtNodes { deviation: &deviation, misfit: &misfit, apart: &apart, narrowed: &narrowed, hidden: &hidden };
+    let variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
+    let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
+    let uncertainty = variances.deviation(&grid, factor);
+    let stages = stages::account(&grid, (&pair, factor), left, &coefficients);
+    let measured = SparseField { matches: matches.iter().map(|m| field::world_match(&grid, m, factor)).collect() };
+    let sparse = field::estimated(measured, &grid, (&coefficients, &uncertainty));
     clock.book("uncertainty");
 
     progress("mesh", 0.92);
-    let sparse = SparseField { matches: matches.iter().map(|m| field::world_match(&grid, m, factor)).collect() };
     let (mesh, source) = field::triangulate(&sparse, flat)?;
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
-    let coefficients =
-        FieldSpline::new(grid, vec![conclusion::full_lattice(&grid, &field, factor, &choice)], Vec::new(), Vec::new());
     let smooth = coefficients.dense()?;
     let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
-    let uncertainty =
-        field::uncertainty(&grid, pair.spacing, conclusion::Stated { coarse, deviation, hidden }, Vec::new());
-    let (uncertainty_median_mm, uncertainty_mean_mm) = field::average_inside(&uncertainty, &mask);
+    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), choice.model);
     clock.book("uncertainty");
 
     let counts = field::with_mesh(&mut reports, &mesh);
@@ -189,21 +203,27 @@ pub(super) fn measure(
         counts,
         model: choice.model,
         evidence: choice.evidence,
-        bodies: vec![BodyReport { label: 1, voxels: mask_voxels, model: choice.model, slides_mm: 0.0 }],
+        bodies: vec![BodyReport {
+            label: 1,
+            voxels: mask_voxels,
+            model: choice.model,
+            slides_mm: 0.0,
+            expected_error_mm: expected.mean_mm,
+        }],
         levels: reports,
+        stages: stages.iter().map(|s| s.report.clone()).collect(),
         folds,
         mask_voxels,
         mean_mm,
         max_mm,
-        uncertainty_median_mm,
+        uncertainty_median_mm: uncertainty::median_inside(&uncertainty, &mask),
+        expected,
         unseen,
-        in_doubt: false,
         seconds: clock.0,
         warnings: field::warnings(counts, folds, not_finite, max_mm, search)
             .into_iter()
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
-            .chain(field::vague(choice.model, uncertainty_mean_mm, mean_mm, &grid))
             .chain(field::without_texture(pair.plain()))
             .chain(field::out_of_view(unseen))
             .collect(),
@@ -220,6 +240,8 @@ pub(super) fn measure(
         matches: sparse,
         mesh,
         node_displacement,
+        node_matches: source,
+        stages,
         summary,
     })
 }

@@ -4,24 +4,20 @@
 use crate::error::{StiffnessError, SynthError};
 use crate::evaluate;
 use crate::evaluate::breaking::{Breaking, Spread, breaking_point};
-use crate::evaluate::coverage::{BAND, coverage, textured};
+use crate::evaluate::coverage::{BAND, coverage};
 use crate::grasp::simulate::simulate;
 use crate::pipeline::field::{self, FieldResult};
 use crate::pipeline::pressed::Pressed;
 use crate::pipeline::trials::{exact, posture_error};
 use crate::synth::severity::{disturbed, shifted_labels};
-use crate::synth::{ElasticParams, Phantom, PhantomKind, PhantomParams, Trouble, troubled};
+use crate::synth::{ElasticParams, PhantomKind, PhantomParams, Trouble, troubled};
 use crate::types::scene::{Formulation, Method};
-use crate::types::{FieldParams, Mask, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Volume};
+use crate::types::{FieldParams, Mask, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Trust};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Called with the fraction that is done (0 to 1); may be called from any thread.
 pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
-
-/// What the program says against a field that it measured on this initial volume without a mask;
-/// nothing when it has nothing to say.
-pub type Judge<'a> = &'a (dyn Fn(&Volume, &FieldResult) -> Vec<String> + Sync);
 
 /// How thorough a search is.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,22 +49,17 @@ impl Effort {
     }
 }
 
-/// Mean error beyond which a field is of no use: this part of the motion, or the finest voxel edge
-/// where that is less.
-const USEFUL: f64 = 0.5;
+/// Mean error beyond which a field is of no use, as a part of the mean motion (1): there trust is
+/// low.
+const USEFUL: f64 = 1.0 / 3.0;
 
 /// The field on every body along every axis of `troubles`.
-pub fn field_curves(
-    effort: &Effort,
-    troubles: &[Trouble],
-    judge: Judge<'_>,
-    progress: Progress<'_>,
-) -> Vec<StressCurve> {
+pub fn field_curves(effort: &Effort, troubles: &[Trouble], progress: Progress<'_>) -> Vec<StressCurve> {
     let pairs: Vec<_> = effort.bodies.iter().flat_map(|b| troubles.iter().map(move |t| (*t, b))).collect();
     let done = AtomicUsize::new(0);
     let one = |&(trouble, body): &(Trouble, &PhantomParams)| {
         let at = |severity: f64| -> Option<Vec<StressRun>> {
-            let one = |&seed: &u64| field_run(&PhantomParams { seed, ..body.clone() }, trouble, severity, judge).ok();
+            let one = |&seed: &u64| field_run(&PhantomParams { seed, ..body.clone() }, trouble, severity).ok();
             effort.seeds.par_iter().map(one).collect()
         };
         let found =
@@ -109,42 +100,40 @@ fn curve(
 ///
 /// # Errors
 /// [`SynthError`] when there is no such phantom.
-pub fn field_run(
-    body: &PhantomParams,
-    trouble: Trouble,
-    severity: f64,
-    judge: Judge<'_>,
-) -> Result<StressRun, SynthError> {
+pub fn field_run(body: &PhantomParams, trouble: Trouble, severity: f64) -> Result<StressRun, SynthError> {
     let p = troubled(body, trouble, severity)?;
     let measured = field::run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {});
     Ok(match measured {
         Err(e) => StressRun {
             severity,
             error: f64::NAN,
-            limit: limit(&p, p.description.mean_mm),
+            limit: USEFUL * p.description.mean_mm,
             refused: Some(e.to_string()),
             said: Vec::new(),
             inside: None,
+            expected: None,
         },
         Ok(result) => {
             let scored = evaluate::metrics(&result.displacement, &p.truth, Some(&p.mask), &[]).ok();
-            let texture = textured(&p.initial, &p.mask);
             let sigma = |at: usize| result.uncertainty.at(at);
             StressRun {
                 severity,
                 error: scored.as_ref().map_or(f64::NAN, |m| m.mean_mm),
-                limit: limit(&p, scored.as_ref().map_or(0.0, |m| m.identity_mm)),
+                limit: USEFUL * scored.as_ref().map_or(0.0, |m| m.identity_mm),
                 refused: None,
-                said: judge(&p.initial, &result),
-                inside: coverage(&result.displacement, &p.truth, &sigma, &texture),
+                said: distrusted(&result).into_iter().collect(),
+                inside: coverage(&result.displacement, &p.truth, &sigma, &p.mask),
+                expected: Some(result.summary.expected.mean_mm),
             }
         }
     })
 }
 
-fn limit(phantom: &Phantom, motion: f64) -> f64 {
-    let edge = phantom.initial.grid().spacing().iter().fold(f64::INFINITY, |m: f64, &s| m.min(s));
-    (USEFUL * motion).min(edge)
+/// What is said against a field of low trust.
+fn distrusted(result: &FieldResult) -> Option<String> {
+    let expected = &result.summary.expected;
+    let low = expected.trust() == Trust::Low;
+    low.then(|| format!("trust is low: the expected error is {:.0} % of the motion", 100.0 * expected.share()))
 }
 
 /// Error of a modulus beyond which it is of no use (per cent).
@@ -238,7 +227,15 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
         Ok(result) => result,
         Err(e) => {
             let refused = Some(e.to_string());
-            return StressRun { severity, error: f64::NAN, limit: MODULUS, refused, said: Vec::new(), inside: None };
+            return StressRun {
+                severity,
+                error: f64::NAN,
+                limit: MODULUS,
+                refused,
+                said: Vec::new(),
+                inside: None,
+                expected: None,
+            };
         }
     };
     let errors = body.errors(&result);
@@ -258,6 +255,7 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
         limit: MODULUS,
         refused: None,
         inside: Some(inside.count() as f64 / result.regions.len() as f64),
+        expected: None,
         said,
     }
 }
@@ -375,5 +373,5 @@ fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
             }
         }
     }
-    StressRun { severity, error, limit, refused, said, inside: None }
+    StressRun { severity, error, limit, refused, said, inside: None, expected: None }
 }

@@ -89,6 +89,7 @@ pub fn matches(array: &PyReadonlyArray2<'_, f64>) -> PyResult<SparseField> {
         ncc: r[6] as f32,
         covariance: [r[7] * r[7], r[7] * r[7], r[7] * r[7], 0.0, 0.0, 0.0],
         kept: r[8] != 0.0,
+        raw: None,
     };
     Ok(SparseField { matches: rows.rows().into_iter().map(one).collect() })
 }

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 
 /// Columns of batch.csv.
-pub const COLUMNS: [&str; 18] = [
+pub const COLUMNS: [&str; 21] = [
     "name",
     "subject",
     "session",
@@ -30,6 +30,9 @@ pub const COLUMNS: [&str; 18] = [
     "fingertip_kpa",
     "grasp_completed",
     "flags",
+    "expected_error_mm",
+    "expected_error_p95_mm",
+    "trust",
 ];
 
 /// Columns of regions.csv over all pairs.
@@ -90,6 +93,7 @@ pub fn row(o: &PairOutcome) -> Vec<String> {
     out.push(text(&o.stiffness["verdict"]));
     out.push(o.fingertip_kpa.map_or_else(String::new, |e| e.to_string()));
     out.extend([text(&o.grasp["completed"]), flags(o).join("; ")]);
+    out.extend(["expected_error_mm", "expected_error_p95_mm", "trust"].map(|k| text(&f[k])));
     out
 }
 
@@ -266,13 +270,14 @@ pub fn page(outcomes: &[PairOutcome]) -> String {
         .map(|o| {
             let mm = |key: &str| o.field[key].as_f64().map_or_else(String::new, |v| format!("{v:.3}"));
             let mut row = vec![format!("<a href=\"{0}/field/report.html\">{0}</a>", escape(&o.name))];
-            row.extend(["displacement_mean_mm", "displacement_max_mm", "uncertainty_median_mm"].map(mm));
+            row.extend(["displacement_mean_mm", "displacement_max_mm", "expected_error_mm"].map(mm));
+            row.push(text(&o.field["trust"]));
             row.push(text(&o.field["counts"]["kept"]));
             row.push(flags(o).iter().map(|f| escape(f)).collect::<Vec<_>>().join("<br>"));
             row
         })
         .collect();
-    let head = ["Pair", "Mean, mm", "Largest, mm", "Uncertainty, mm", "Matches kept", "To look at"];
+    let head = ["Pair", "Mean, mm", "Largest, mm", "Expected error, mm", "Trust", "Matches kept", "To look at"];
     let rows = table(&head, &rows);
     let _ = write!(body, "<section><h2>Pairs</h2><article class=\"wide words\">{rows}</article></section>");
     document("Cohort", &body)
@@ -293,7 +298,7 @@ mod tests {
             stage: "",
             reason: String::new(),
             seconds: 1.0,
-            field: json!({ "folds": 2, "warnings": ["noisy"], "counts": { "kept": 7 } }),
+            field: json!({ "folds": 2, "warnings": ["noisy"], "counts": { "kept": 7 }, "trust": "low" }),
             stiffness: json!({ "absolute": true, "regions": [region], "warnings": [] }),
             fingertip_kpa: None,
             grasp: Value::Null,
@@ -317,5 +322,6 @@ mod tests {
         assert_eq!(row(&one).len(), COLUMNS.len());
         assert!(region_rows(&one).iter().all(|r| r.len() == REGION_COLUMNS.len()));
         assert_eq!(row(&one)[17], "2 voxels folded; field: noisy");
+        assert_eq!(row(&one)[20], "low");
     }
 }

@@ -139,6 +139,7 @@ mod tests {
             ncc: 0.9,
             covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
             kept,
+            raw: None,
         };
         let svg = matches(&section, &picture, &[at(0.0, true), at(0.4, false), at(3.0, true)], 0.5, &scale);
         assert_eq!(svg.matches("<circle").count(), 1);

@@ -49,7 +49,10 @@ pub struct FieldReport<'a> {
 pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
-    use crate::types::{Affine, BodyReport, Counts, LevelReport, Match, MotionModel, TetMesh, Volume, WorldPoint};
+    use crate::types::{
+        Affine, BodyReport, Counts, ErrorSource, ExpectedError, LevelReport, Match, MotionModel, StageReport, TetMesh,
+        Volume, WorldPoint,
+    };
 
     /// A made-up result with known numbers.
     pub(crate) struct Case {
@@ -80,6 +83,7 @@ pub(crate) mod tests {
                 ncc: 0.9,
                 covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
                 kept: true,
+                raw: None,
             };
             let counts = Counts {
                 features_initial: 20_000,
@@ -100,15 +104,35 @@ pub(crate) mod tests {
                 counts,
                 model: MotionModel::Free,
                 evidence: vec!["free: 12 % lower".into()],
-                bodies: vec![BodyReport { label: 1, voxels: grid.len(), model: MotionModel::Free, slides_mm: 0.0 }],
+                bodies: vec![BodyReport {
+                    label: 1,
+                    voxels: grid.len(),
+                    model: MotionModel::Free,
+                    slides_mm: 0.0,
+                    expected_error_mm: 0.2,
+                }],
                 levels: vec![level],
+                stages: vec![StageReport {
+                    name: "final".into(),
+                    spacing_mm: spacing,
+                    moved_mm: 1.5,
+                    unexplained: 0.1,
+                    error_mm: None,
+                }],
                 folds: 0,
                 mask_voxels: grid.len(),
                 mean_mm: 1.5,
                 max_mm: 2.2,
                 uncertainty_median_mm: 0.2,
+                expected: ExpectedError {
+                    mean_mm: 0.12,
+                    interval_mm: [0.06, 0.24],
+                    p95_mm: 0.5,
+                    against_mm: 1.5,
+                    sources: vec![(ErrorSource::Noise, 0.9), (ErrorSource::Misfit, 0.1)],
+                    labels: Vec::new(),
+                },
                 unseen: 0.0,
-                in_doubt: false,
                 seconds: vec![("features".into(), 1.0), ("matching".into(), 2.0)],
                 warnings: vec!["two of <three> slices are empty".into()],
             };

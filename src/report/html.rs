@@ -88,7 +88,8 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let evidence: String = report.summary.evidence.iter().map(|e| format!("<li>{}</li>", escape(e))).collect();
     let _ = write!(
         body,
-        "<article class=\"wide\"><h3>Coarse to fine</h3>{}</article><article><h3>Bodies</h3>{}</article><article><h3>Motion model</h3><ul>{evidence}</ul></article><article><h3>Time</h3>{}</article></div></section>",
+        "<article class=\"wide\"><h3>Stages</h3>{}</article><article class=\"wide\"><h3>Coarse to fine</h3>{}</article><article><h3>Bodies</h3>{}</article><article><h3>Motion model</h3><ul>{evidence}</ul></article><article><h3>Time</h3>{}</article></div></section>",
+        tables::stages(report),
         tables::levels(report),
         tables::bodies(report),
         chart::stage_times(&report.summary.seconds)
@@ -156,9 +157,9 @@ fn head(report: &FieldReport<'_>) -> String {
         env!("CARGO_PKG_VERSION"),
         escape(&v.headline),
         escape(&v.reasons.join("; ")),
+        tile(format!("{:.2}", s.expected.mean_mm), "mm", "expected error"),
         tile(format!("{:.2}", s.mean_mm), "mm", "mean motion"),
         tile(format!("{:.2}", s.max_mm), "mm", "largest motion"),
-        tile(format!("{:.2}", s.uncertainty_median_mm), "mm", "median uncertainty"),
         tile(thousands(s.counts.kept), "", "matches kept"),
         tile(thousands(s.folds), "", "voxels folded"),
         tile(format!("{seconds:.1}"), "s", "in all stages"),

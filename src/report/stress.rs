@@ -247,7 +247,7 @@ mod tests {
 
     fn run(severity: f64, error: f64, said: &str) -> StressRun {
         let said = if said.is_empty() { Vec::new() } else { vec![said.to_string()] };
-        StressRun { severity, error, limit: 1.0, refused: None, said, inside: Some(0.93) }
+        StressRun { severity, error, limit: 1.0, refused: None, said, inside: Some(0.93), expected: Some(0.9) }
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use crate::report::field::FieldReport;
 use crate::report::html::escape;
 use crate::report::scale::{short, thousands};
-use crate::types::{BodyReport, Metrics, MotionModel};
+use crate::types::{BodyReport, Metrics, MotionModel, StageReport};
 use std::fmt::Write;
 
 /// A table from a head (may be empty) and rows; the first column is text, the others are numbers.
@@ -60,10 +60,31 @@ pub fn bodies(report: &FieldReport<'_>) -> String {
             format!("{share:.1}"),
             model.into(),
             format!("{:.2}", b.slides_mm),
+            format!("{:.3}", b.expected_error_mm),
         ]
     };
     let rows: Vec<_> = report.summary.bodies.iter().map(row).collect();
-    table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm"], &rows)
+    table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm", "Expected error, mm"], &rows)
+}
+
+/// The field after each stage.
+pub fn stages(report: &FieldReport<'_>) -> String {
+    let row = |s: &StageReport| {
+        let mut row = vec![
+            s.name.clone(),
+            triple(s.spacing_mm),
+            format!("{:.3}", s.moved_mm),
+            format!("{:.1}", 100.0 * s.unexplained),
+        ];
+        row.extend(s.error_mm.map(|error| format!("{error:.3}")));
+        row
+    };
+    let rows: Vec<_> = report.summary.stages.iter().map(row).collect();
+    let mut head = vec!["Field after", "Voxel, mm", "Changed by, mm", "Variance unexplained, %"];
+    if report.summary.stages.iter().any(|s| s.error_mm.is_some()) {
+        head.push("Mean error, mm");
+    }
+    table(&head, &rows)
 }
 
 /// The levels, coarse to fine.

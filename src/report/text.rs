@@ -42,6 +42,9 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
         let bodies: Vec<String> = s.bodies.iter().map(of).collect();
         let _ = writeln!(out, "  bodies       {}", bodies.join(", "));
     }
+    if let Some((_, m)) = report.truth {
+        let _ = writeln!(out, "  true error   mean {:.3} mm, 95th percentile {:.3} mm", m.mean_mm, m.p95_mm);
+    }
     let _ = writeln!(out, "  mesh         {} nodes, {} elements", thousands(c.nodes), thousands(c.tetrahedra));
     let _ = writeln!(out, "  folds        {}", thousands(s.folds));
     let _ = writeln!(out, "  trust        {}: {}", v.trust.name(), v.reasons.join("; "));
@@ -82,7 +85,13 @@ mod tests {
     fn the_summary_is_short_and_holds_the_counts() {
         let text = field_summary(&Case::new([8, 8, 8], [1.0; 3]).report());
         assert!(text.lines().count() <= 9, "{text}");
-        for part in ["13,020 kept of 160,000", "900.0000 -> 300.0000", "mean 1.50 mm", "trust        moderate"] {
+        for part in [
+            "13,020 kept of 160,000",
+            "900.0000 -> 300.0000",
+            "expected error 0.12 mm (0.06 to 0.24)",
+            "mean 1.50 mm",
+            "trust        high: the expected error is 8 % of the motion",
+        ] {
             assert!(text.contains(part), "{part} is missing in\n{text}");
         }
     }

@@ -472,6 +472,8 @@ mod tests {
             max_mm: frame as f64,
             residual_mm: 0.1,
             uncertainty_median_mm: 0.1,
+            expected_error_mm: 0.1,
+            trust: Some(crate::types::Trust::Moderate),
             folds: 0,
             out_of_line: 0.0,
             seconds: 1.0,
@@ -556,9 +558,9 @@ mod tests {
         let tracked = sequence(1);
         assert!(
             told(&tracked, page)
-                .contains("<b>Trust is moderate</b> median uncertainty at most 0.1 mm in any frame; frame 2 is lost.")
+                .contains("<b>Trust is moderate</b> expected error at most 0.1 mm in any frame; frame 2 is lost")
         );
-        assert!(told(&tracked, text).contains("  trust        moderate: median"));
+        assert!(told(&tracked, text).contains("  trust        moderate: expected"));
     }
 
     #[test]

@@ -3,29 +3,8 @@
 use crate::report::field::FieldReport;
 use crate::report::scale::{short, thousands};
 use crate::report::statistics::sample;
-use crate::types::{FieldSummary, FrameSummary, Grid, Mask, MotionModel};
-
-/// How far to rely on a field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Trust {
-    /// Precise everywhere, nothing odd.
-    High,
-    /// Usable; look at the uncertainty first.
-    Moderate,
-    /// Do not build on it before looking at the reasons.
-    Low,
-}
-
-impl Trust {
-    /// In lower case.
-    pub fn name(self) -> &'static str {
-        match self {
-            Trust::High => "high",
-            Trust::Moderate => "moderate",
-            Trust::Low => "low",
-        }
-    }
-}
+pub use crate::types::Trust;
+use crate::types::{ErrorSource, FieldSummary, FrameSummary, Grid, Mask, MotionModel};
 
 /// A judgement with its reasons.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,18 +17,10 @@ pub struct Verdict {
     pub reasons: Vec<String>,
 }
 
-const MEDIAN: &str = "median uncertainty";
+/// A source of error is named from this share of the expected squared error on.
+const NAMED: f64 = 0.2;
 
-/// The part of the tissue outside the deformed volume from which trust is low: what is carried over
-/// so far is off by millimetres.
-const UNSEEN: f64 = 0.25;
-
-/// Judges a result. With the edge of a cube of a voxel's volume as measure, trust is low with under
-/// 100 matches, folds in more than one voxel of a thousand, a median uncertainty above that edge,
-/// or one above the mean motion of a free field, and where more than a quarter of the tissue moves
-/// out of the deformed volume or the field is in doubt; high when nothing folds, the median
-/// uncertainty is under half an edge, under a tenth of the voxels are uncertain by more than an
-/// edge, and nothing is warned of.
+/// Judges a result: trust follows from the expected error alone ([`Trust::of`]).
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     judge(report.initial.grid(), report.mask, report.uncertainty, report.summary)
 }
@@ -59,7 +30,9 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
 pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
     let edge = grid.spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
-        MotionModel::Identity => "Nothing moved beyond the noise".to_string(),
+        MotionModel::Identity => {
+            format!("Nothing moved by more than about {} mm", short2(s.expected.p95_mm))
+        }
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Affine => format!("One affine motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Free => {
@@ -70,48 +43,23 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
             format!("Tissue moved {} mm on average and {} mm at most{bodies}", short2(s.mean_mm), short2(s.max_mm))
         }
     };
-    let residual =
-        s.levels.last().map(|l| format!(", median residual {} mm", short2(l.residual_mm))).unwrap_or_default();
-    let headline = format!("{motion}: {} matches{residual}.", thousands(s.counts.kept));
-
-    let (share, side) = uncertain(grid, mask, uncertainty, edge);
-    let mut low = Vec::new();
-    if s.counts.kept < 100 {
-        low.push(format!("only {} matches carry the field", s.counts.kept));
-    }
-    if s.folds * 1000 > s.mask_voxels {
-        low.push(format!("the field folds in {} voxels, which tissue cannot do", thousands(s.folds)));
-    }
-    if s.uncertainty_median_mm > edge {
-        low.push(format!("half of the voxels are uncertain by more than {} mm", short2(s.uncertainty_median_mm)));
-    } else if s.model == MotionModel::Free && s.uncertainty_median_mm > s.mean_mm {
-        low.push("the motion is smaller than its uncertainty".into());
-    }
-    if s.unseen > UNSEEN {
-        low.push(format!("{:.0} % of the tissue is not in the deformed volume", 100.0 * s.unseen));
-    }
-    if s.in_doubt {
-        low.push(
-            "features do not bear each other out, and the volumes stay different: another tissue, or another motion"
-                .into(),
-        );
-    }
-    let weak = format!(
-        "{} % of the voxels are uncertain by more than a voxel ({} mm){side}",
-        short1(100.0 * share),
-        short2(edge)
-    );
-    let precise = s.uncertainty_median_mm <= edge / 2.0 && share < 0.1;
-    let median = format!("{MEDIAN} {} mm (1 sigma)", short2(s.uncertainty_median_mm));
-    let (trust, mut reasons) = match (low.is_empty(), precise && s.folds == 0 && s.warnings.is_empty()) {
-        (false, _) => (Trust::Low, low),
-        (true, true) => (Trust::High, vec![median, "no folds".into()]),
-        (true, false) => (Trust::Moderate, vec![median]),
+    let headline = format!("{motion}; expected error {}.", expected(s));
+    let trust = s.expected.trust();
+    let mut reasons = vec![format!("the expected error is {}", of_what(s))];
+    let named = |(source, share): &(ErrorSource, f64)| match *share {
+        share if share >= NAMED => Some(format!("{:.0} % of its square comes from {}", 100.0 * share, source.words())),
+        _ => None,
     };
+    reasons.extend(s.expected.sources.iter().filter_map(named));
+    let (share, side) = uncertain(grid, mask, uncertainty, edge);
     if share >= 0.01 {
-        reasons.push(weak);
+        reasons.push(format!(
+            "{} % of the voxels are uncertain by more than a voxel ({} mm){side}",
+            short1(100.0 * share),
+            short2(edge)
+        ));
     }
-    if trust == Trust::Moderate && s.folds > 0 {
+    if s.folds > 0 {
         reasons.push(format!("{} voxels fold", thousands(s.folds)));
     }
     match s.warnings.len() {
@@ -122,41 +70,58 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
     Verdict { headline, trust, reasons }
 }
 
+/// The expected error with its interval.
+pub(super) fn expected(s: &FieldSummary) -> String {
+    let e = &s.expected;
+    let [low, high] = e.interval_mm;
+    format!("{} mm ({} to {})", short2(e.mean_mm), short2(low), short2(high))
+}
+
+/// The expected error as a part of the motion, or of a voxel where nothing moves.
+pub(super) fn of_what(s: &FieldSummary) -> String {
+    let what = if s.model == MotionModel::Identity { "a voxel" } else { "the motion" };
+    format!("{} % of {what}", short1(100.0 * s.expected.share()))
+}
+
+const EXPECTED: &str = "expected error";
+
+/// Part of the tissue out of line with the frames beside it from which trust in a frame is low (1).
+const OUT_OF_LINE: f64 = 0.25;
+
 /// Judges a sequence by its worst frames, which the reasons name: `judged` has the number of each measured frame and what
 /// [`judge`] says of it. Trust in the sequence is low where more than
-/// half of the frames are lost or of low trust, high where each frame is of high trust, else moderate. A frame in which more than a quarter of the
-/// tissue is out of line with the frames beside it is of low trust.
+/// half of the frames are lost or of low trust, high where each frame is of high trust, else
+/// moderate. A frame in which more than a quarter of the tissue is out of line with the frames
+/// beside it is of low trust.
 pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
     let of = |f: &FrameSummary| judged.iter().find(|j| j.0 == f.frame).map(|j| &j.1);
-    let trust = |f: &FrameSummary| match (&f.lost, of(f).map_or(Trust::High, |v| v.trust)) {
-        (Some(_), _) => Trust::Low,
-        (None, _) if f.out_of_line > UNSEEN => Trust::Low,
-        (None, Trust::High) if !f.warnings.is_empty() => Trust::Moderate,
-        (None, trust) => trust,
+    let trust = |f: &FrameSummary| match f.trust {
+        Some(trust) if f.out_of_line <= OUT_OF_LINE => trust,
+        _ => Trust::Low,
     };
     let numbers = |pick: &dyn Fn(&FrameSummary) -> bool| frames.iter().filter(|f| pick(f)).map(|f| f.frame).collect();
     let lost: Vec<usize> = numbers(&|f| f.lost.is_some());
     let low: Vec<usize> = numbers(&|f| f.lost.is_none() && trust(f) == Trust::Low);
-    let warned: Vec<usize> = numbers(&|f| f.lost.is_none() && trust(f) != Trust::Low && !f.warnings.is_empty());
-    let vague: Vec<usize> = numbers(&|f| trust(f) == Trust::Moderate && f.warnings.is_empty());
+    let vague: Vec<usize> = numbers(&|f| trust(f) == Trust::Moderate);
+    let warned: Vec<usize> = numbers(&|f| f.lost.is_none() && !f.warnings.is_empty());
 
-    let median = frames.iter().map(|f| f.uncertainty_median_mm).fold(0.0, f64::max);
-    let mut reasons = vec![format!("{MEDIAN} at most {} mm in any frame", short2(median))];
-    for (which, what) in [(lost, "lost"), (low, "of low trust"), (warned, "warned of"), (vague, "of moderate trust")] {
+    let largest = frames.iter().map(|f| f.expected_error_mm).fold(0.0, f64::max);
+    let mut reasons = vec![format!("{EXPECTED} at most {} mm in any frame", short2(largest))];
+    for (which, what) in [(lost, "lost"), (low, "of low trust"), (vague, "of moderate trust"), (warned, "warned of")] {
         if let Some(names) = named(&which) {
             reasons.push(format!("{names} {} {what}", if which.len() == 1 { "is" } else { "are" }));
         }
     }
-    let share = |f: &FrameSummary| f.uncertainty_median_mm / f.mean_mm.max(1e-6);
+    let share = |f: &FrameSummary| f.expected_error_mm / f.mean_mm.max(1e-6);
     let worse = |a: &&FrameSummary, b: &&FrameSummary| trust(a).cmp(&trust(b)).then(share(a).total_cmp(&share(b)));
     let worst = frames.iter().filter(|f| f.lost.is_none() && trust(f) != Trust::High).max_by(worse);
     if let Some(f) = worst {
         let said = of(f).filter(|v| v.trust != Trust::High).map(|v| v.reasons.as_slice()).unwrap_or_default();
-        let why: String = said.iter().filter(|r| !r.starts_with(MEDIAN)).map(|r| format!(", {r}")).collect();
+        let why: String = said.iter().skip(1).map(|r| format!(", {r}")).collect();
         reasons.push(format!(
-            "the worst, frame {}, is uncertain by {} mm (median) where tissue moved {} mm on average{}",
+            "the worst, frame {}, has an {EXPECTED} of {} mm where tissue moved {} mm on average{}",
             f.frame,
-            short2(f.uncertainty_median_mm),
+            short2(f.expected_error_mm),
             short2(f.mean_mm),
             why
         ));
@@ -238,39 +203,39 @@ mod tests {
     use crate::report::field::tests::Case;
 
     #[test]
-    fn a_precise_field_is_trusted_and_a_vague_one_is_not() {
+    fn trust_follows_from_the_expected_error_alone() {
         let mut case = Case::new([20, 20, 20], [1.0; 3]);
-        let warned = verdict(&case.report());
-        assert_eq!((warned.trust, warned.reasons[1].as_str()), (Trust::Moderate, "there is a warning"));
-        case.summary.warnings.clear();
-        let good = verdict(&case.report());
-        assert_eq!(good.trust, Trust::High, "{:?}", good.reasons);
-        assert!(good.headline.contains("13,020 matches, median residual 0.12 mm"), "{}", good.headline);
-        case.summary.uncertainty_median_mm = 2.5;
-        let vague = verdict(&case.report());
-        assert_eq!(vague.trust, Trust::Low);
-        assert!(vague.reasons[0].contains("2.5 mm"));
-        case.summary.uncertainty_median_mm = 0.2;
-        case.summary.in_doubt = true;
-        assert_eq!(verdict(&case.report()).trust, Trust::Low);
-        case.summary.in_doubt = false;
-        case.summary.unseen = 0.4;
-        let gone = verdict(&case.report());
-        assert_eq!((gone.trust, gone.reasons[0].contains("40 %")), (Trust::Low, true));
+        let mut of = |error: f64| {
+            case.summary.expected.mean_mm = error;
+            verdict(&case.report())
+        };
+        // The tissue moves by 1.5 mm.
+        let [high, moderate, low] = [0.14, 0.16, 0.51].map(&mut of);
+        assert_eq!([high.trust, moderate.trust, low.trust], [Trust::High, Trust::Moderate, Trust::Low]);
+        assert!(low.headline.contains("expected error 0.51 mm"), "{}", low.headline);
+        assert_eq!(low.reasons[0], "the expected error is 34 % of the motion");
+        assert_eq!(low.reasons[1], "90 % of its square comes from noise where texture is weak");
+        case.summary.folds = 100;
+        case.summary.warnings.push("one more".into());
+        case.summary.expected.mean_mm = 0.14;
+        let folded = verdict(&case.report());
+        assert_eq!(folded.trust, Trust::High);
+        assert!(folded.reasons.iter().any(|r| r == "100 voxels fold"), "{:?}", folded.reasons);
     }
 
     #[test]
-    fn folds_and_few_matches_are_named() {
-        let mut case = Case::new([20, 20, 20], [1.0; 3]);
-        case.summary.folds = 100;
-        case.summary.counts.kept = 31;
-        let v = verdict(&case.report());
-        assert_eq!((v.trust, v.reasons.len()), (Trust::Low, 3));
+    fn where_nothing_moves_a_voxel_is_the_measure() {
+        let mut case = Case::new([20, 20, 20], [2.0; 3]);
+        case.summary.model = MotionModel::Identity;
+        (case.summary.mean_mm, case.summary.expected.against_mm) = (0.0, 2.0);
+        let still = verdict(&case.report());
+        assert_eq!((still.trust, still.reasons[0].as_str()), (Trust::High, "the expected error is 6 % of a voxel"));
+        assert!(still.headline.starts_with("Nothing moved by more than about 0.5 mm"), "{}", still.headline);
     }
 
-    /// Frames of a sequence with so much median uncertainty and mean motion (mm).
+    /// Frames of a sequence with so much expected error and mean motion (mm).
     fn frames(all: &[[f64; 2]]) -> Vec<FrameSummary> {
-        let frame = |(at, &[uncertainty_median_mm, mean_mm]): (usize, &[f64; 2])| FrameSummary {
+        let frame = |(at, &[expected_error_mm, mean_mm]): (usize, &[f64; 2])| FrameSummary {
             frame: at + 1,
             lost: None,
             searched: true,
@@ -279,7 +244,9 @@ mod tests {
             mean_mm,
             max_mm: 2.0 * mean_mm,
             residual_mm: 0.0,
-            uncertainty_median_mm,
+            uncertainty_median_mm: expected_error_mm,
+            expected_error_mm,
+            trust: Some(Trust::of(expected_error_mm / mean_mm)),
             folds: 0,
             out_of_line: 0.0,
             seconds: 0.0,
@@ -290,29 +257,29 @@ mod tests {
 
     #[test]
     fn a_sequence_is_judged_by_its_worst_frames() {
-        let mut all = frames(&[[0.05, 0.4], [0.13, 0.11], [0.2, 0.44], [0.3, 1.2]]);
+        let mut all = frames(&[[0.03, 0.4], [0.01, 0.11], [0.04, 0.44], [0.1, 1.2]]);
         let high =
             |frame| (frame, Verdict { headline: String::new(), trust: Trust::High, reasons: vec!["fine".into()] });
         let mut judged: Vec<(usize, Verdict)> = (1..=4).map(high).collect();
         let (trust, reasons) = judge_frames(&all, &judged);
         assert_eq!((trust, reasons.len()), (Trust::High, 1), "{reasons:?}");
-        // What is warned of is not of high trust, however small its uncertainty.
-        (1..3).for_each(|at| all[at].warnings.push("the mean error to expect is about half of the mean motion".into()));
+        // Warnings are named and change no trust.
+        (1..3).for_each(|at| all[at].warnings.push("out of view".into()));
         let (trust, reasons) = judge_frames(&all, &judged);
-        assert_eq!((trust, reasons[1].as_str()), (Trust::Moderate, "frames 2, 3 are warned of"));
-        assert!(reasons[2].starts_with("the worst, frame 2, is uncertain by 0.13 mm"), "{reasons:?}");
+        assert_eq!((trust, reasons[1].as_str()), (Trust::High, "frames 2, 3 are warned of"));
+        all[3].trust = Some(Trust::Low);
         judged[3].1.trust = Trust::Low;
-        judged[3].1.reasons = vec!["only 40 matches carry the field".into()];
-        all[0].lost = Some("no overlap".into());
+        judged[3].1.reasons = vec!["the expected error is 50 % of the motion".into(), "it is noisy".into()];
+        (all[0].lost, all[0].trust) = (Some("no overlap".into()), None);
         let (trust, reasons) = judge_frames(&all, &judged);
         assert_eq!(
             (trust, reasons[1].as_str(), reasons[2].as_str()),
             (Trust::Moderate, "frame 1 is lost", "frame 4 is of low trust")
         );
-        assert!(
-            reasons[4].starts_with("the worst, frame 4") && reasons[4].ends_with("only 40 matches carry the field")
-        );
-        judged[2].1.trust = Trust::Low;
+        let worst =
+            "the worst, frame 4, has an expected error of 0.1 mm where tissue moved 1.2 mm on average, it is noisy";
+        assert_eq!(reasons.last().map(String::as_str), Some(worst));
+        all[2].out_of_line = 0.3;
         assert_eq!(judge_frames(&all, &judged).0, Trust::Low);
     }
 
@@ -328,11 +295,7 @@ mod tests {
         let mut case = Case::new([20, 20, 20], [1.0; 3]);
         case.uncertainty = Box::new(|o| if o < 20 * 20 * 16 { 0.2 } else { 3.0 });
         let v = verdict(&case.report());
-        assert_eq!(v.trust, Trust::Moderate);
-        assert!(
-            v.reasons[1].starts_with("20 % of the voxels") && v.reasons[1].ends_with("upper side"),
-            "{:?}",
-            v.reasons
-        );
+        let named = |r: &&String| r.starts_with("20 % of the voxels") && r.ends_with("upper side");
+        assert_eq!(v.reasons.iter().filter(named).count(), 1, "{:?}", v.reasons);
     }
 }

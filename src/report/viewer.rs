@@ -404,6 +404,7 @@ mod tests {
             ncc: 1.0,
             covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
             kept: true,
+            raw: None,
         };
         let moment = Moment {
             name: None,

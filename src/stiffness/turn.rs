@@ -144,6 +144,7 @@ mod tests {
             ncc: 1.0,
             covariance: [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
             kept: true,
+            raw: None,
         };
         let [xx, yy, _, xy, ..] = turn.undone_matches(&SparseField { matches: vec![one] }).matches[0].covariance;
         for (found, exact) in [(xx, c * c), (yy, s * s), (xy, -c * s)] {

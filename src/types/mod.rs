@@ -19,6 +19,8 @@ pub mod params;
 
 pub mod metrics;
 
+pub mod expected;
+
 pub mod result;
 
 pub mod track;
@@ -39,13 +41,14 @@ pub mod trial;
 
 pub mod batch;
 
+pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};
 pub use field::{DenseField, Displacement};
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
 pub use metrics::Metrics;
 pub use params::FieldParams;
-pub use points::{Candidate, FeaturePoint, Landmark, Match, SparseField};
-pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel};
+pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
+pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel, StageReport};
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};

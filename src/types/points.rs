@@ -37,9 +37,29 @@ pub struct Match {
     pub covariance: [f64; 6],
     /// Whether the consistency stage kept it.
     pub kept: bool,
+    /// What least-squares matching alone measured there, where a field was fitted to it later.
+    pub raw: Option<RawMatch>,
+}
+
+/// A match before the field of all voxels was estimated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RawMatch {
+    /// Initial to deformed, world mm.
+    pub displacement: [f64; 3],
+    /// One number for the precision: the root of a third of the covariance's trace (mm).
+    pub sigma: f64,
 }
 
 impl Match {
+    /// The same with what the final estimate says there: displacement (mm, RAS) and standard
+    /// deviation along an axis (mm); what was measured stays as [`Match::raw`].
+    #[must_use]
+    pub fn with_estimate(self, displacement: [f64; 3], deviation: f64) -> Self {
+        let raw = self.raw.or(Some(RawMatch { displacement: self.displacement, sigma: self.sigma() }));
+        let variance = deviation * deviation;
+        Self { displacement, covariance: [variance, variance, variance, 0.0, 0.0, 0.0], raw, ..self }
+    }
+
     /// One number for the precision: the root of a third of the covariance's trace (mm).
     pub fn sigma(&self) -> f64 {
         ((self.covariance[0] + self.covariance[1] + self.covariance[2]) / 3.0).max(0.0).sqrt()

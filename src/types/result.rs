@@ -1,6 +1,6 @@
 //! What the field pipeline gives back.
 
-use crate::types::{TetMesh, TriMesh};
+use crate::types::{ExpectedError, TetMesh, TriMesh};
 use serde::Serialize;
 
 /// The mesh through the kept matches: tetrahedra, or triangles for one slice.
@@ -102,6 +102,21 @@ impl LevelReport {
     }
 }
 
+/// What one stage did to the field.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StageReport {
+    /// Which: the matches alone, a level's refinement iterations, or the final field.
+    pub name: String,
+    /// Voxel size of the level it worked on (mm).
+    pub spacing_mm: [f64; 3],
+    /// Mean length over the mask by which it changed the displacement (mm).
+    pub moved_mm: f64,
+    /// Part of the initial volume's variance that the warped deformed volume does not explain (1).
+    pub unexplained: f64,
+    /// Mean error over the mask (mm), where the truth is known.
+    pub error_mm: Option<f64>,
+}
+
 /// A body of the scene: tissue that slides along the rest, or all of it where nothing slides.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct BodyReport {
@@ -114,6 +129,8 @@ pub struct BodyReport {
     /// How far the tissue beside it moves from where its own motion leads (mm, median along its
     /// border); 0 where it borders on none.
     pub slides_mm: f64,
+    /// Expected mean error within it (mm).
+    pub expected_error_mm: f64,
 }
 
 /// Everything but the volumes.
@@ -129,6 +146,8 @@ pub struct FieldSummary {
     pub bodies: Vec<BodyReport>,
     /// Coarse to fine.
     pub levels: Vec<LevelReport>,
+    /// The field after each stage, in order.
+    pub stages: Vec<StageReport>,
     /// Voxels of the mask with a Jacobian determinant at or below zero.
     pub folds: usize,
     /// Voxels of the mask.
@@ -139,13 +158,11 @@ pub struct FieldSummary {
     pub max_mm: f64,
     /// Median of the uncertainty over the mask (mm, 1 sigma).
     pub uncertainty_median_mm: f64,
+    /// How far off the displacement is expected to be.
+    pub expected: ExpectedError,
     /// The part of the mask that lies outside the deformed volume after the motion, or where that
     /// is not finite (1).
     pub unseen: f64,
-    /// Whether fewer than half of the features agreed with their neighbours when the whole volume
-    /// was searched, and the volumes stay different by more than noise: another tissue, or another
-    /// motion.
-    pub in_doubt: bool,
     /// Stage names and wall seconds, in order.
     pub seconds: Vec<(String, f64)>,
     /// What the user should know before trusting the result.

@@ -1,7 +1,7 @@
 //! What a sequence of volumes gives.
 
 use crate::types::space::WorldPoint;
-use crate::types::{Counts, MotionModel};
+use crate::types::{Counts, MotionModel, Trust};
 use serde::Serialize;
 
 /// How a point's place in a frame is known.
@@ -102,6 +102,10 @@ pub struct FrameSummary {
     pub residual_mm: f64,
     /// Median uncertainty over the mask (mm, 1 sigma).
     pub uncertainty_median_mm: f64,
+    /// Expected mean error over the mask (mm); 0 where the frame is lost.
+    pub expected_error_mm: f64,
+    /// How far to rely on it; none where the frame is lost.
+    pub trust: Option<Trust>,
     /// Voxels of the mask that fold.
     pub folds: usize,
     /// Part of the tissue (1) that lies elsewhere than the frames before and after have it, without

@@ -93,9 +93,14 @@ pub struct StressRun {
     pub refused: Option<String>,
     /// What the program itself said about its result; empty when it saw nothing wrong.
     pub said: Vec<String>,
-    /// Share of the errors inside the stated 95 % band, where one is stated.
+    /// Share of the errors inside the stated 95 % region, where one is stated.
     pub inside: Option<f64>,
+    /// The error that the program expects, in the unit of the curve, where it states one.
+    pub expected: Option<f64>,
 }
+
+/// Part of the limit under which an error is small: warnings about it are false alarms (1).
+const SMALL: f64 = 0.3;
 
 impl StressRun {
     /// Whether there is no result, or one of no use.
@@ -111,6 +116,11 @@ impl StressRun {
     /// Broken without a word.
     pub fn silent(&self) -> bool {
         self.broken() && !self.told()
+    }
+
+    /// Refused or warned of although the error is under three tenths of the limit, or would be.
+    pub fn false_alarm(&self) -> bool {
+        self.told() && self.error < SMALL * self.limit
     }
 }
 

@@ -1,0 +1,244 @@
+//! How far off a field may be: the variance that each source of error leaves at the nodes of a
+//! lattice, and what they add up to over the mask.
+//!
+//! The posterior of the coupled field says what noise and smoothness leave open. It is widened
+//! where the volumes differ by more than noise, by half of the way from the free field to the
+//! motion that stands in its place, where tissue is out of view, at borders between bodies, and by
+//! motions that the search could not rule out. One calibration ([`BAND`], [`MEAN`], [`SPREAD`]) is
+//! fitted on half of the scenes: docs/lab/2026-11-expected-error.md.
+
+use crate::field::spline::ScalarSpline;
+use crate::matching::levels::to_level;
+use crate::numerics::bspline::Lattice;
+use crate::numerics::statistics::median;
+use crate::pipeline::bodies::Bodies;
+use crate::types::{DenseField, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel};
+
+/// Standard deviation over the posterior's such that 95 % of the errors lie in the 95 % region (1).
+const BAND: f32 = 1.05;
+
+/// Mean length of the error, over that of normal errors of the stated deviation (1): most places
+/// are better than the deviation says that holds 95 % of them.
+const MEAN: f64 = 0.70;
+
+/// Factor within which the true mean error lies of the expected one in nine of ten scenes (1).
+const SPREAD: f64 = 2.0;
+
+/// Place that interpolation and a voxel's extent hide from any match (voxels, one axis): affine
+/// motions without noise come out .005 to .03 of a voxel off.
+const HIDDEN: f64 = 0.015;
+
+/// How much more uncertain tissue out of view is than smoothness says (1): of a brain of which 11
+/// to 75 % had moved out of view the 95 % bands held .86 to .49 of the errors there without it.
+const EXTRAPOLATED: f32 = 3.0;
+
+/// Standard deviation along an axis that a voxel at a border between bodies adds, as a part of the
+/// jump there (1): one in ten such voxels goes with the wrong side (13 scenes).
+const SIDE: f32 = 0.18;
+
+/// Voxels of the mask from which means over it are taken, about.
+const SAMPLED: usize = 25_000;
+
+/// What one body's data say at the nodes of its lattice.
+pub(super) struct AtNodes<'a> {
+    /// Standard deviation of the free field (mm, one axis).
+    pub deviation: &'a [f32],
+    /// Mean square of the residual over the noise's (1).
+    pub misfit: &'a [f32],
+    /// From the free field to the motion that is stated (mm).
+    pub apart: &'a [f32],
+    /// Part of the deviation that is left where tissue is at rest (1).
+    pub narrowed: &'a [f32],
+    /// Whether the deformed volume does not show what is there.
+    pub hidden: &'a [bool],
+}
+
+/// Variance along an axis (mm^2) by source of the error, at the nodes of a lattice.
+pub(super) struct Variances {
+    lattice: Lattice,
+    /// In the order of [`ErrorSource::ALL`].
+    parts: [Vec<f32>; 6],
+}
+
+impl Variances {
+    /// Of one body.
+    pub fn of(lattice: Lattice, spacing: [f64; 3], nodes: &AtNodes<'_>) -> Self {
+        let thick = || (0..3).filter(|&a| lattice.shape[a] > 1);
+        let axes = thick().count().max(1) as f64;
+        let hidden = (HIDDEN * HIDDEN * thick().map(|a| spacing[a].powi(2)).sum::<f64>() / axes) as f32;
+        let mut parts: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; lattice.len()]);
+        for m in 0..lattice.len() {
+            let narrowed = (BAND * nodes.narrowed[m]).powi(2);
+            let free = narrowed * nodes.deviation[m].powi(2);
+            let model = narrowed * nodes.apart[m].powi(2) / axes as f32;
+            let noise = free + hidden;
+            let misfit = free * (nodes.misfit[m] - 1.0).max(0.0);
+            let more = if nodes.hidden[m] { EXTRAPOLATED * EXTRAPOLATED - 1.0 } else { 0.0 };
+            let all = [noise, misfit, model, more * (noise + misfit + model), 0.0, 0.0];
+            all.into_iter().zip(&mut parts).for_each(|(v, part)| part[m] = v);
+        }
+        Self { lattice, parts }
+    }
+
+    /// On the closest lattice of all bodies, each node's from the body there.
+    pub fn by_place(mut all: Vec<Self>, bodies: &Bodies) -> Self {
+        if all.len() == 1 {
+            return all.remove(0);
+        }
+        let closest = (0..all.len()).max_by_key(|&b| all[b].lattice.len()).unwrap_or(0);
+        let lattice = all[closest].lattice.clone();
+        let at = |part: usize, m: usize| {
+            let place = lattice.within(m);
+            let own = &all[bodies.label_near(place)];
+            if own.lattice == lattice {
+                own.parts[part][m]
+            } else {
+                own.lattice.stencil_near(place).gather(&own.parts[part])
+            }
+        };
+        let parts = std::array::from_fn(|part| (0..lattice.len()).map(|m| at(part, m)).collect());
+        Self { lattice, parts }
+    }
+
+    fn part(&mut self, source: ErrorSource) -> &mut Vec<f32> {
+        &mut self.parts[source as usize]
+    }
+
+    /// Adds what is in doubt beside borders between bodies: voxels of the grid of which the lattice's
+    /// level has `factor` each, with the jump there (mm).
+    pub fn with_borders(mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) -> Self {
+        let lattice = self.lattice.clone();
+        let cell: usize = (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] * factor[a]).product();
+        let borders = self.part(ErrorSource::Borders);
+        for (voxel, jump) in jumps {
+            let square = (SIDE * jump).powi(2) / cell as f32;
+            lattice.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| borders[node] += w * square);
+        }
+        self
+    }
+
+    /// Adds what other motions within the range of the search leave open (mm), where only this part
+    /// of the features agree on the one that was found: the rest may be anywhere in that ball.
+    pub fn with_other_motions(mut self, agreeing: f64, range: f64) -> Self {
+        let variance = ((1.0 - agreeing) * range * range / 5.0) as f32;
+        self.part(ErrorSource::OtherMotions).fill(variance);
+        self
+    }
+
+    /// The standard deviation along an axis (mm) over `grid`, of which the lattice's level has
+    /// `factor` voxels each.
+    pub fn deviation(&self, grid: &Grid, factor: [usize; 3]) -> ScalarSpline {
+        let coarse = &self.lattice;
+        let at = |m: usize| self.parts.iter().map(|part| part[m]).sum::<f32>().sqrt();
+        let deviation: Vec<f32> = (0..coarse.len()).map(at).collect();
+        let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));
+        if full.nodes == coarse.nodes {
+            return ScalarSpline::new(*grid, full, deviation);
+        }
+        let three: Vec<f32> = deviation.iter().chain(&deviation).chain(&deviation).copied().collect();
+        let values = full.fit(|p| coarse.at(&three, to_level(p, factor)));
+        let values = values[..full.len()].to_vec();
+        ScalarSpline::new(*grid, full, values)
+    }
+
+    /// Each source's share of the variance at these voxels, greatest first.
+    fn shares(&self, voxels: impl Iterator<Item = [usize; 3]>, factor: [usize; 3]) -> Vec<(ErrorSource, f64)> {
+        let mut sums = [0.0f64; 6];
+        for voxel in voxels {
+            let stencil = self.lattice.stencil_near(to_level(voxel.map(|v| v as f64), factor));
+            let parts = sums.iter_mut().zip(&self.parts);
+            parts.for_each(|(sum, part)| *sum += f64::from(stencil.gather(part).max(0.0)));
+        }
+        let all = sums.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+        let mut shares: Vec<_> = ErrorSource::ALL.into_iter().zip(sums.map(|s| s / all)).collect();
+        shares.sort_by(|a, b| b.1.total_cmp(&a.1));
+        shares
+    }
+
+    /// The error to expect over `mask` of a field of this `deviation`.
+    pub fn expected(
+        &self,
+        (deviation, factor): (&ScalarSpline, [usize; 3]),
+        (field, mask): (&DenseField, &Mask),
+        model: MotionModel,
+    ) -> ExpectedError {
+        let grid = *mask.grid();
+        let axes = if grid.is_single_slice() { 2 } else { 3 };
+        let picked: Vec<usize> = some_of(mask).collect();
+        let sigma: Vec<f32> = picked.iter().map(|&at| deviation.at(at)).collect();
+        let motion = picked.iter().map(|&at| length(field, at)).sum::<f64>() / picked.len().max(1) as f64;
+        let count = picked.len().max(1) as f64;
+        let mean_mm = MEAN * mean_length(axes) * sigma.iter().map(|&s| f64::from(s)).sum::<f64>() / count;
+        ExpectedError {
+            mean_mm,
+            interval_mm: [mean_mm / SPREAD, mean_mm * SPREAD],
+            p95_mm: longest(axes, sigma),
+            against_mm: if model == MotionModel::Identity { edge(&grid) } else { motion },
+            sources: self.shares(picked.iter().map(|&at| grid.voxel(at)), factor),
+            labels: Some(by_label(deviation, field, mask)).filter(|labels| labels.len() > 1).unwrap_or_default(),
+        }
+    }
+}
+
+/// Displacement magnitude at a voxel (mm).
+fn length(field: &DenseField, at: usize) -> f64 {
+    field.at(at).iter().map(|v| f64::from(v * v)).sum::<f64>().sqrt()
+}
+
+/// The error to expect within each label of `mask`, from the least label on.
+pub(super) fn by_label(deviation: &ScalarSpline, field: &DenseField, mask: &Mask) -> Vec<LabelError> {
+    let axes = if mask.grid().is_single_slice() { 2 } else { 3 };
+    // Voxels, their deviations and displacement magnitudes, by label.
+    let mut sums = [(0usize, 0.0f64, 0.0f64); 256];
+    for at in some_of(mask) {
+        let (count, sigma, moved) = &mut sums[usize::from(mask.as_slice()[at])];
+        *count += 1;
+        *sigma += f64::from(deviation.at(at));
+        *moved += length(field, at);
+    }
+    let of = |(label, &(count, sigma, moved)): (usize, &(usize, f64, f64))| LabelError {
+        label: label as u8,
+        expected_error_mm: MEAN * mean_length(axes) * sigma / count as f64,
+        displacement_mean_mm: moved / count as f64,
+    };
+    sums.iter().enumerate().filter(|(_, s)| s.0 > 0).map(of).collect()
+}
+
+/// Edge of a cube of a voxel's volume (mm).
+fn edge(grid: &Grid) -> f64 {
+    let shape = grid.shape();
+    let thick: Vec<f64> = (0..3).filter(|&a| shape[a] > 1).map(|a| grid.spacing()[a]).collect();
+    thick.iter().product::<f64>().powf(1.0 / thick.len().max(1) as f64)
+}
+
+/// Mean length of a normal error in two or three axes over its deviation along one.
+fn mean_length(axes: usize) -> f64 {
+    use std::f64::consts::PI;
+    if axes == 2 { (PI / 2.0).sqrt() } else { (8.0 / PI).sqrt() }
+}
+
+/// Quantiles of the length of a normal error over its deviation along an axis: at 5, 15, ... 95 %.
+const LENGTHS: [[f32; 10]; 2] = [
+    [0.3203, 0.5701, 0.7585, 0.9282, 1.0935, 1.2637, 1.4490, 1.6651, 1.9479, 2.4477],
+    [0.5932, 0.8932, 1.1012, 1.2812, 1.4524, 1.6257, 1.8119, 2.0269, 2.3059, 2.7955],
+];
+
+/// 95th percentile of the length of normal errors of these deviations along an axis.
+fn longest(axes: usize, sigma: Vec<f32>) -> f64 {
+    let quantiles = LENGTHS[usize::from(axes == 3)];
+    let mut all: Vec<f32> = sigma.iter().flat_map(|s| quantiles.map(|q| q * s)).collect();
+    f64::from(crate::numerics::statistics::quantile(&mut all, 0.95))
+}
+
+/// Voxels of the mask, evenly, at most about [`SAMPLED`].
+pub(super) fn some_of(mask: &Mask) -> impl Iterator<Item = usize> {
+    let mask = mask.as_slice();
+    let inside = || (0..mask.len()).filter(|&at| mask[at] != 0);
+    inside().step_by((inside().count() / SAMPLED).max(1))
+}
+
+/// Median over the mask, from at most about [`SAMPLED`] of its voxels.
+pub(super) fn median_inside(values: &ScalarSpline, mask: &Mask) -> f64 {
+    let mut picked: Vec<f32> = some_of(mask).map(|at| values.at(at)).collect();
+    f64::from(median(&mut picked))
+}
