@@ -229,7 +229,7 @@ pub fn excess<'a>(
 }
 
 /// Random vectors from which the posterior's deviation is estimated.
-const DRAWS: usize = 8;
+const DRAWS: usize = 6;
 
 /// What the data of the last pass leave open and what they determine, at the field's own nodes.
 pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> Posterior {

@@ -10,7 +10,7 @@ use crate::types::{DenseField, Grid, Mask, StageReport};
 use rayon::prelude::*;
 
 /// Places at which stages are compared, about.
-const PLACES: usize = 20_000;
+const PLACES: usize = 5000;
 
 /// A motion that a stage left, on a level of `factor`.
 pub(super) struct Left {
