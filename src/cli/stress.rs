@@ -6,6 +6,7 @@ use super::outputs::Target;
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
+use palpate::evaluate::stated::stated;
 use palpate::io;
 use palpate::pipeline::stress::{self, Effort, GraspAxis, StiffnessAxis};
 use palpate::report::stress as report;
@@ -103,14 +104,16 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if wanted(Part::Grasp) && !axes.is_empty() {
         curves.extend(stress::grasp_curves(&effort, &axes, &|f| progress.set("grasp", f)));
     }
+    let of_field = || curves.iter().filter(|c| c.part == Part::Field).flat_map(|c| &c.runs);
+    let field = of_field().next().map(|_| stated(of_field()));
     progress.set("write", 1.0);
     folder.write("stress.csv", |p| io::write_stress(p, &curves))?;
     folder.write("stress.svg", |p| io::write_text(p, &report::svg(&curves)))?;
     let seconds = started.elapsed().as_secs_f64();
-    folder.write("summary.json", |p| io::write_json(p, &report::summary(&curves, seconds)))?;
-    folder.write("stress.html", |p| io::write_text(p, &report::page(&curves)))?;
+    folder.write("summary.json", |p| io::write_json(p, &report::summary(&curves, field.as_ref(), seconds)))?;
+    folder.write("stress.html", |p| io::write_text(p, &report::page(&curves, field.as_ref())))?;
     folder.commit()?;
     drop(progress);
     let look = target.output.join("stress.html");
-    console.say(&format!("{}  results      {}", report::text(&curves), look.display()))
+    console.say(&format!("{}  results      {}", report::text(&curves, field.as_ref()), look.display()))
 }

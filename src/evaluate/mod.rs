@@ -11,6 +11,8 @@ pub mod coverage;
 
 pub mod frontier;
 
+pub mod stated;
+
 use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::sampling::{displacement, inside};

@@ -59,6 +59,21 @@ pub fn percentile(values: &mut [f64], q: f64) -> f64 {
     }
 }
 
+/// Spearman's rank correlation of two lists of one length (-1 to 1); equal values share their mean
+/// rank. None of fewer than two, or where a list holds one value.
+pub fn rank_correlation(a: &[f64], b: &[f64]) -> Option<f64> {
+    let ranks = |v: &[f64]| -> Vec<f64> {
+        let below = |x: f64| v.iter().filter(|w| **w < x).count() as f64;
+        let equal = |x: f64| v.iter().filter(|w| **w == x).count() as f64;
+        let middle = (v.len() as f64 - 1.0) / 2.0;
+        v.iter().map(|&x| below(x) + (equal(x) - 1.0) / 2.0 - middle).collect()
+    };
+    let (a, b) = (ranks(a), ranks(b));
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let size = (product(&a, &a) * product(&b, &b)).sqrt();
+    (size > 0.0).then(|| product(&a, &b) / size)
+}
+
 /// Standard deviation of white noise in a volume, from second differences along every thick axis at
 /// once.
 ///

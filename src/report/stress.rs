@@ -4,7 +4,7 @@ use crate::report::axes::{Axis, Panel, path, tiled};
 use crate::report::html::{document, escape};
 use crate::report::scale::significant;
 use crate::report::tables::table;
-use crate::types::{Part, StressCurve, StressRun};
+use crate::types::{Part, Stated, StressCurve, StressRun};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -105,7 +105,7 @@ fn hover(curve: &StressCurve, runs: &[StressRun]) -> String {
             if r.error.is_nan() { "no result".into() } else { format!("{} {}", digits(r.error), curve.error_unit) };
         let _ = write!(out, "\n{error}, limit {}", digits(r.limit));
         if let Some(inside) = r.inside {
-            let _ = write!(out, ", {:.0} % inside the band", 100.0 * inside);
+            let _ = write!(out, ", {:.0} % inside the region", 100.0 * inside);
         }
         for said in r.refused.iter().chain(&r.said) {
             let _ = write!(out, "; {said}");
@@ -179,19 +179,20 @@ fn rows(curves: &[StressCurve]) -> Vec<Vec<String>> {
 }
 
 const HEAD: [&str; 6] =
-    ["Axis", "Body or form", "Breaking point", "First says so", "Silent failures", "Inside 95 % band"];
+    ["Axis", "Body or form", "Breaking point", "First says so", "Silent failures", "Inside 95 % region"];
 
 /// The page.
-pub fn page(curves: &[StressCurve]) -> String {
+pub fn page(curves: &[StressCurve], stated: Option<&Stated>) -> String {
     let silent: usize = curves.iter().map(|c| c.silent().count()).sum();
     let broken: usize = curves.iter().flat_map(|c| &c.runs).filter(|r| r.broken()).count();
+    let stated = stated.map_or_else(String::new, |s| format!("<p>{}</p>", stated_in_words(s)));
     let body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>Where it breaks</h1><p class=\"verdict\">{broken} of {} runs have no result \
          or one of no use; {silent} of these without a word.</p></header><p class=\"lead\">Severity grows to the right. The dotted \
          line is the limit of use. On the axis, an upright stroke marks where at least half of the runs break, a dashed one where \
          at least half say that something is wrong. Hollow: refused. Red crosses: broken and silent. Errors below a thousandth of the limit are drawn at \
          that, runs without a result at the top.</p><article \
-         class=\"wide\">{}</article><section><h2>Table</h2><div class=\"four\">{}</div></section>",
+         class=\"wide\">{}</article><section><h2>Table</h2>{stated}<div class=\"four\">{}</div></section>",
         env!("CARGO_PKG_VERSION"),
         curves.iter().map(|c| c.runs.len()).sum::<usize>(),
         svg(curves),
@@ -201,7 +202,7 @@ pub fn page(curves: &[StressCurve]) -> String {
 }
 
 /// summary.json: each curve without its runs.
-pub fn summary(curves: &[StressCurve], seconds: f64) -> Value {
+pub fn summary(curves: &[StressCurve], stated: Option<&Stated>, seconds: f64) -> Value {
     let one = |c: &StressCurve| {
         let inside: Vec<f64> = c.runs.iter().filter(|r| !r.broken()).filter_map(|r| r.inside).collect();
         let mean = (!inside.is_empty()).then(|| inside.iter().sum::<f64>() / inside.len() as f64);
@@ -213,12 +214,28 @@ pub fn summary(curves: &[StressCurve], seconds: f64) -> Value {
     };
     json!({
         "version": env!("CARGO_PKG_VERSION"), "command": "stress", "curves": curves.iter().map(one).collect::<Vec<_>>(),
-        "field_bands_that_hold": bands_that_hold(curves, Part::Field, 0.9), "seconds": seconds,
+        "field_bands_that_hold": bands_that_hold(curves, Part::Field, 0.9), "field_stated": stated,
+        "seconds": seconds,
     })
 }
 
+/// What the field's runs state of their errors, in words.
+fn stated_in_words(s: &Stated) -> String {
+    let ranks = s.rank_correlation.map_or_else(|| "none".into(), |r| format!("{r:.2}"));
+    format!(
+        "Of {} field runs {} have no result or an error of a third of the motion or more, {} of them without low trust. Of {}          with an error under a tenth of it {} are refused or of low trust. Expected and true error: rank correlation {ranks},          within a factor of 1.5 in {:.0} %, of 2 in {:.0} %.",
+        s.runs,
+        s.broken,
+        s.silent,
+        s.small,
+        s.false_alarms,
+        100.0 * s.within[0],
+        100.0 * s.within[1]
+    )
+}
+
 /// A line a curve, for stdout.
-pub fn text(curves: &[StressCurve]) -> String {
+pub fn text(curves: &[StressCurve], stated: Option<&Stated>) -> String {
     let mut out = String::from("Breaking points (harmless to hopeless), and where the program first says so:\n");
     let row = |c: &StressCurve| {
         let silent = c.silent().count();
@@ -234,9 +251,12 @@ pub fn text(curves: &[StressCurve]) -> String {
     if let Some(share) = bands_that_hold(curves, Part::Field, 0.9) {
         let _ = writeln!(
             out,
-            "The 95 % band holds 90 % of the errors or more in {:.0} % of the field runs that are of use.",
+            "The 95 % region holds 90 % of the errors or more in {:.0} % of the field runs that are of use.",
             100.0 * share
         );
+    }
+    if let Some(stated) = stated {
+        let _ = writeln!(out, "{}", stated_in_words(stated));
     }
     out
 }
@@ -267,10 +287,12 @@ mod tests {
         };
         let curves = [curve];
         assert_eq!(svg(&curves).matches(r#"class="x""#).count(), 1);
-        assert!(page(&curves).contains("2 of 3 runs have no result or one of no use; 1 of these without a word"));
-        assert_eq!(summary(&curves, 1.0)["curves"][0]["silent"], 1);
-        assert!(text(&curves).contains("breaks at 10 % (holds at 0)") && text(&curves).contains("1 silent"));
-        assert!(text(&curves).contains("says so at 20 % (not at 10)"));
+        assert!(page(&curves, None).contains("2 of 3 runs have no result or one of no use; 1 of these without a word"));
+        assert_eq!(summary(&curves, None, 1.0)["curves"][0]["silent"], 1);
+        assert!(
+            text(&curves, None).contains("breaks at 10 % (holds at 0)") && text(&curves, None).contains("1 silent")
+        );
+        assert!(text(&curves, None).contains("says so at 20 % (not at 10)"));
         assert_eq!(bands_that_hold(&curves, Part::Field, 0.9), Some(1.0));
     }
     #[test]

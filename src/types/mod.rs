@@ -53,5 +53,5 @@ pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Together, Tracked, Trajectory};
-pub use trial::{Part, Standing, StressCurve, StressRun, Trial};
+pub use trial::{Part, Standing, Stated, StressCurve, StressRun, Trial};
 pub use volume::{Mask, Volume, Voxels};

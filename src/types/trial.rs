@@ -118,10 +118,34 @@ impl StressRun {
         self.broken() && !self.told()
     }
 
-    /// Refused or warned of although the error is under three tenths of the limit, or would be.
-    pub fn false_alarm(&self) -> bool {
-        self.told() && self.error < SMALL * self.limit
+    /// Whether the error is under three tenths of the limit: of a field, a tenth of the motion.
+    pub fn is_small(&self) -> bool {
+        self.error < SMALL * self.limit
     }
+
+    /// Warned of although the error is small.
+    pub fn false_alarm(&self) -> bool {
+        self.told() && self.is_small()
+    }
+}
+
+/// What a set of runs states of its errors, against the truth.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Stated {
+    /// Runs.
+    pub runs: usize,
+    /// Of these, with no result or one of no use.
+    pub broken: usize,
+    /// Of the broken ones, those that nothing was said against.
+    pub silent: usize,
+    /// Runs whose error is small ([`StressRun::false_alarm`]).
+    pub small: usize,
+    /// Of these, those that something was said against.
+    pub false_alarms: usize,
+    /// Rank correlation of expected and true error over the runs that state one.
+    pub rank_correlation: Option<f64>,
+    /// Share of these whose expected error lies within a factor of 1.5 and of 2 of the true one.
+    pub within: [f64; 2],
 }
 
 /// One part pushed along one axis until it breaks.
