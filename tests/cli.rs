@@ -362,6 +362,15 @@ fn a_phantom_scores_zero_against_its_own_truth() {
     assert!(score["identity_mm"].as_f64().unwrap() > 0.1);
     let (words, _) = run(folder.path(), &arguments, 0);
     assert!(words.starts_with("Mean error 0.000 mm"), "{words}");
+    run(folder.path(), &["invert", "truth.nii.gz", "-o", "back.nii.gz"], 0);
+    let arguments = ["evaluate", "truth.nii.gz", "--backward", "back.nii.gz", "--mask", "mask.nii.gz"];
+    let (words, _) = run(folder.path(), &arguments, 0);
+    assert!(words.starts_with("Inverse consistency: mean 0.0"), "{words}");
+    let (out, _) = run(folder.path(), &[&arguments[..], &["--json"]].concat(), 0);
+    let score: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert!(score["inverse_mean_mm"].as_f64().unwrap() < 0.05, "{score}");
+    let (_, err) = run(folder.path(), &["evaluate", "truth.nii.gz"], 2);
+    assert!(err.contains("--truth"), "{err}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Scores of small fields, worked out by hand.
 #![allow(clippy::unwrap_used)]
 
-use palpate::evaluate::{landmarks, metrics};
+use palpate::evaluate::{inverse_consistency, landmarks, metrics};
 use palpate::numerics::statistics::percentile;
 use palpate::types::{Affine, DenseField, Grid, Landmark, Mask, Volume, WorldPoint};
 
@@ -113,4 +113,23 @@ fn landmarks_outside_the_volume_are_found() {
     let marks =
         [mark([0.0; 3]), mark([-0.9, 0.0, 0.0]), mark([-1.1, 0.0, 0.0]), mark([4.0, 4.0, 8.9]), mark([4.0, 9.1, 4.0])];
     assert_eq!(palpate::evaluate::beyond(&g, &marks), [2, 4]);
+}
+
+/// A stretch and its inverse lead back; what leaves the second grid is counted apart.
+#[test]
+fn there_and_back_again_is_no_motion() {
+    let (here, there) = (grid([10, 4, 3], [1.0; 3]), grid([21, 5, 4], [1.0; 3]));
+    let forward = DenseField::from_fn(here, |p| [p.0[0], 0.0, 0.0]);
+    let back = |shift: f64| DenseField::from_fn(there, |p| [-0.5 * p.0[0] + shift, 0.0, 0.0]);
+    let exact = inverse_consistency(&forward, &back(0.0), None).unwrap();
+    assert_eq!((exact.voxels, exact.outside), (120, 0.0));
+    assert!(exact.inverse_max_mm < 1e-6, "{exact:?}");
+    let off = inverse_consistency(&forward, &back(0.25), None).unwrap();
+    close(off.inverse_mean_mm, 0.25);
+    close(off.inverse_p95_mm, 0.25);
+    // Of the first grid the outer half ends past one of 10 voxels.
+    let small = DenseField::from_fn(here, |p| [-0.5 * p.0[0], 0.0, 0.0]);
+    close(inverse_consistency(&forward, &small, None).unwrap().outside, 0.5);
+    let mask = Mask::from_voxels(here, |_, v| u8::from(v.0[0] > 6.0));
+    assert!(inverse_consistency(&forward, &small, Some(&mask)).unwrap_err().to_string().contains("backward"));
 }

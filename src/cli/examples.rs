@@ -87,11 +87,14 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
     ),
     (
         "evaluate",
-        &[(
-            "score a field",
-            "evaluate results/displacement.nii.gz --truth pair/truth.nii.gz --mask pair/mask.nii.gz --landmarks \
-             pair/landmarks.csv",
-        )],
+        &[
+            (
+                "score a field",
+                "evaluate results/displacement.nii.gz --truth pair/truth.nii.gz --mask pair/mask.nii.gz --landmarks \
+                 pair/landmarks.csv",
+            ),
+            ("inverse consistency", "evaluate results/displacement.nii.gz --backward back/displacement.nii.gz"),
+        ],
     ),
     ("demo", &[("everything on synthetic data", "demo")]),
     (

@@ -18,7 +18,7 @@ use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::sampling::{displacement, inside};
 use crate::numerics::statistics::percentile;
 use crate::types::space::{determinant, length};
-use crate::types::{DenseField, Grid, Landmark, Mask, Metrics};
+use crate::types::{DenseField, Grid, InverseConsistency, Landmark, Mask, Metrics};
 use rayon::prelude::*;
 
 /// Truth moves less than this in still tissue (mm).
@@ -75,6 +75,51 @@ pub fn metrics(
         grad_err_p95: percentile(&mut gradient, 95.0),
         folds: voxels.iter().filter(|v| v.folded).count() as f64 / voxels.len() as f64,
         landmarks_mm: (!at_landmarks.is_empty()).then(|| mean(&at_landmarks)),
+    })
+}
+
+/// Inverse consistency of `forward` and `backward` over `mask` on the first one's grid (everywhere
+/// when `None`): |u(x) + v(x + u(x))|, with `v` read off trilinearly on a grid of its own.
+///
+/// # Errors
+/// [`FieldError::GridMismatch`] when the mask lies on another grid, [`FieldError::Volume`] when a field is no number where
+/// it counts, or no voxel of the mask ends within the second grid.
+pub fn inverse_consistency(
+    forward: &DenseField,
+    backward: &DenseField,
+    mask: Option<&Mask>,
+) -> Result<InverseConsistency, FieldError> {
+    let grid = forward.grid();
+    if let Some(mask) = mask {
+        check("the mask", mask.grid(), grid)?;
+    }
+    check_numbers("forward", forward, mask)?;
+    check_numbers("backward", backward, None)?;
+    let used = |at: &usize| mask.is_none_or(|m| m.as_slice()[*at] != 0);
+    let there = backward.grid();
+    // None where the place lies outside the second grid.
+    let distance = |at: usize| {
+        let [i, j, k] = grid.voxel(at);
+        let u = forward.at(at).map(f64::from);
+        let end = grid.world(i, j, k).moved(u);
+        let v = inside(there.shape(), there.affine().to_voxel(end)).then(|| displacement(backward, end))?;
+        Some(length([u[0] + v[0], u[1] + v[1], u[2] + v[2]]))
+    };
+    let all: Vec<Option<f64>> = (0..grid.len()).into_par_iter().filter(used).map(distance).collect();
+    let mut distances: Vec<f64> = all.iter().flatten().copied().collect();
+    if distances.is_empty() {
+        return Err(FieldError::Volume {
+            volume: "backward",
+            what: "holds none of the places where the forward field ends".into(),
+            hint: "give the field of a run from the deformed to the initial volume".into(),
+        });
+    }
+    Ok(InverseConsistency {
+        voxels: distances.len(),
+        outside: 1.0 - distances.len() as f64 / all.len() as f64,
+        inverse_mean_mm: distances.iter().sum::<f64>() / distances.len() as f64,
+        inverse_p95_mm: percentile(&mut distances, 95.0),
+        inverse_max_mm: percentile(&mut distances, 100.0),
     })
 }
 

@@ -3,7 +3,7 @@
 use crate::report::field::FieldReport;
 use crate::report::scale::thousands;
 use crate::report::verdict::verdict;
-use crate::types::{BodyReport, Metrics};
+use crate::types::{BodyReport, InverseConsistency, Metrics};
 use std::fmt::Write;
 
 /// What a field run found, a few lines.
@@ -74,6 +74,21 @@ pub fn metrics(m: &Metrics) -> String {
     let _ = writeln!(out, "  gradient     median error {:.4}, 95th percentile {:.4}", m.grad_err, m.grad_err_p95);
     let _ = writeln!(out, "  folds        {:.2e} of the voxels", m.folds);
     out
+}
+
+/// How far points come back from where they started, in a line.
+pub fn inverse_consistency(c: &InverseConsistency) -> String {
+    let outside = match c.outside {
+        0.0 => String::new(),
+        share => format!("; {:.1} % of the voxels end outside the second field", 100.0 * share),
+    };
+    format!(
+        "Inverse consistency: mean {:.3} mm, 95th percentile {:.3} mm, largest {:.3} mm over {} voxels{outside}.\n",
+        c.inverse_mean_mm,
+        c.inverse_p95_mm,
+        c.inverse_max_mm,
+        thousands(c.voxels)
+    )
 }
 
 #[cfg(test)]

@@ -28,3 +28,19 @@ pub struct Metrics {
     /// Mean error at the landmarks, where there are any.
     pub landmarks_mm: Option<f64>,
 }
+
+/// How far a point comes back from where it started, by a field and one that leads back (mm unless
+/// said otherwise).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct InverseConsistency {
+    /// Voxels that lie within the second field's grid once they moved.
+    pub voxels: usize,
+    /// Share of the mask that does not (1).
+    pub outside: f64,
+    /// Mean distance from the start.
+    pub inverse_mean_mm: f64,
+    /// 95th percentile of the distance.
+    pub inverse_p95_mm: f64,
+    /// Largest distance.
+    pub inverse_max_mm: f64,
+}

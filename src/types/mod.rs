@@ -45,7 +45,7 @@ pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};
 pub use field::{DenseField, Displacement};
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
-pub use metrics::Metrics;
+pub use metrics::{InverseConsistency, Metrics};
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
 pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel, StageReport};
