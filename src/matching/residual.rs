@@ -40,7 +40,8 @@ const SMOOTHED: f32 = 0.5;
 const TRIMMED: f32 = 5.0;
 
 /// Mean square of the residual about each node of `lattice`, over the robust variance of the whole
-/// (1); [`TRIMMED`], and 1 where no tissue is near. `warped` is the deformed volume, warped.
+/// (1): squares of 5 deviations at most, and 1 where no tissue is near. `warped` is the deformed
+/// volume, warped.
 pub fn misfit_by_place(pair: &Pair<'_>, warped: &[f32], lattice: &Lattice) -> Vec<f32> {
     let gain = GainField::sharpened(pair, warped);
     let scale = 1.0 / residual_sigma(pair, warped, &gain).max(f32::MIN_POSITIVE);
