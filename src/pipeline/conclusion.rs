@@ -117,7 +117,7 @@ impl Concluded {
                 misfit: &misfit,
                 apart: &apart,
                 narrowed: &narrowed,
-                hidden: &hidden(pair, field),
+                hidden: &hidden(&part, field),
             };
             variances.push(Variances::of(lattice, pair.spacing, &nodes));
             splines.push(stated);
@@ -179,12 +179,14 @@ pub(super) fn apart((full, stated): &Spline, free: &SplineField, factor: [usize;
     (0..lattice.len()).into_par_iter().map(at).collect()
 }
 
-/// Of each node of a field, whether the deformed volume does not show what is there.
+/// Of each node of a field, whether the volumes show nothing of what is there: the deformed one does
+/// not reach it, or the initial one has no texture about it.
 pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField) -> Vec<bool> {
     let lattice = &field.lattice;
-    let sees = |m: usize| {
+    let is_plain = pair.is_plain();
+    let shows = |m: usize| {
         let p = lattice.within(m);
-        level::sees(pair, p, lattice.at(&field.coefficients, p))
+        level::sees(pair, p, lattice.at(&field.coefficients, p)) && !is_plain(p)
     };
-    (0..lattice.len()).into_par_iter().map(|m| !sees(m)).collect()
+    (0..lattice.len()).into_par_iter().map(|m| !shows(m)).collect()
 }

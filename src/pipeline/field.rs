@@ -339,8 +339,8 @@ fn canonical(
     let jumps = if given.is_some() { Vec::new() } else { coefficients.jumps(&mask) };
     let mut variances = variances.with_borders(jumps, factor);
     let doubted = begun.doubted();
-    if let Some(seen) = doubted.filter(|_| unlike.is_some()) {
-        variances = variances.with_other_motions(seen.kept_share(), search);
+    if begun.is_unsure() && unlike.is_some() {
+        variances = variances.with_other_motions(begun.share(), search);
     }
     let uncertainty = variances.deviation(&grid, factor);
     let sparse = estimated(sparse, &grid, (&coefficients, &uncertainty));

@@ -3,7 +3,7 @@
 //!
 //! The posterior of the coupled field says what noise and smoothness leave open. It is widened
 //! where the volumes differ by more than noise, by half of the way from the free field to the
-//! motion that stands in its place, where tissue is out of view, at borders between bodies, and by
+//! motion that stands in its place, where tissue is out of view or without texture, at borders between bodies, and by
 //! motions that the search could not rule out. One calibration ([`BAND`], [`MEAN`], [`SPREAD`]) is
 //! fitted on half of the scenes: docs/lab/2026-11-expected-error.md.
 
@@ -19,7 +19,7 @@ const BAND: f32 = 1.05;
 
 /// Mean length of the error, over that of normal errors of the stated deviation (1): most places
 /// are better than the deviation says that holds 95 % of them.
-const MEAN: f64 = 0.70;
+const MEAN: f64 = 0.63;
 
 /// Factor within which the true mean error lies of the expected one in nine of ten scenes (1).
 const SPREAD: f64 = 2.0;
@@ -28,7 +28,8 @@ const SPREAD: f64 = 2.0;
 /// motions without noise come out .005 to .03 of a voxel off.
 const HIDDEN: f64 = 0.015;
 
-/// How much more uncertain tissue out of view is than smoothness says (1): of a brain of which 11
+/// How much more uncertain tissue is that the volumes do not show (out of view, without texture)
+/// than smoothness says (1): of a brain of which 11
 /// to 75 % had moved out of view the 95 % bands held .86 to .49 of the errors there without it.
 const EXTRAPOLATED: f32 = 3.0;
 
@@ -49,7 +50,7 @@ pub(super) struct AtNodes<'a> {
     pub apart: &'a [f32],
     /// Part of the deviation that is left where tissue is at rest (1).
     pub narrowed: &'a [f32],
-    /// Whether the deformed volume does not show what is there.
+    /// Whether the volumes show nothing of what is there.
     pub hidden: &'a [bool],
 }
 

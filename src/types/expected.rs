@@ -12,7 +12,7 @@ pub enum ErrorSource {
     Misfit,
     /// A smaller motion model, or tissue held at rest, stands for the free field.
     Model,
-    /// The deformed volume does not show the tissue.
+    /// The volumes do not show the tissue: it is out of view, or has no texture.
     OutOfView,
     /// Voxels beside a border may belong to the other body.
     Borders,
@@ -31,7 +31,7 @@ impl ErrorSource {
             Self::Noise => "noise where texture is weak",
             Self::Misfit => "places where the volumes still differ",
             Self::Model => "the choice of the motion model",
-            Self::OutOfView => "tissue that the deformed volume does not show",
+            Self::OutOfView => "tissue out of view or without texture",
             Self::Borders => "borders between bodies",
             Self::OtherMotions => "other motions that the search could not rule out",
         }
