@@ -85,6 +85,7 @@ fn single_voxels_without_a_number_and_a_constant_half() {
         let inside: Vec<usize> = part.filter(|&at| p.mask.as_slice()[at] != 0).collect();
         inside.iter().map(|&at| f64::from(found.uncertainty.at(at))).sum::<f64>() / inside.len() as f64
     };
-    let (blind, seen) = (mean(0..n), mean(n..2 * n));
+    // Beside the half that shows texture its motion is carried over well.
+    let (blind, seen) = (mean(0..n / 2), mean(n..2 * n));
     assert!(blind > 2.0 * seen, "{blind:.3} mm blind, {seen:.3} mm seen");
 }

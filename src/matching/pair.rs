@@ -134,7 +134,7 @@ impl<'a> Pair<'a> {
             let firsts = corners(ny, 1).flat_map(|j| corners(nx, 0).map(move |i| [i, j, k]));
             let of = |first| {
                 let (variance, inside) = self.block(first, side);
-                (first, variance >= least, inside)
+                (first, variance > least, inside)
             };
             firsts.map(of).collect()
         };
@@ -157,7 +157,9 @@ impl<'a> Pair<'a> {
             }
         }
         let n = (xs.len() * ys.len() * zs.len()) as f64;
-        (sums[1] / n - (sums[0] / n).powi(2), inside)
+        // Of one value only rounding is left.
+        let (square, mean) = (sums[1] / n, sums[0] / n);
+        (if square - mean * mean > 1e-9 * square { square - mean * mean } else { 0.0 }, inside)
     }
 
     /// The deformed volume as a sampler.
