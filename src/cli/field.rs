@@ -131,8 +131,8 @@ fn method(name: &str) -> Result<Method, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, bodies, rigid, bonded, truth, allow_folds, .. } = options;
-    let Options { dry_run, tuning, .. } = options;
+    let Options { initial, deformed, target, mask, bodies, rigid, bonded, truth, allow_folds, dry_run, tuning } =
+        options;
     let mut params = tuning.params()?;
     if *bonded {
         params.bodies = BodySource::Bonded;
@@ -194,8 +194,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     result.summary.warnings.splice(0..0, warnings);
 
     let metrics = truth.as_ref().map(|truth| {
-        result.summary.stages = result.stages.iter().map(|stage| stage.scored(truth, inside.as_ref())).collect();
-        evaluate::metrics(&result.displacement, truth, inside.as_ref(), &[])
+        let measured = Some(&result.bodies);
+        result.summary.stages = result.stages.iter().map(|stage| stage.scored(truth, measured)).collect();
+        evaluate::metrics(&result.displacement, truth, measured, &[])
     });
     let metrics = metrics.transpose().with_context(|| format!("{} to {}", names[0], names[1]))?;
 

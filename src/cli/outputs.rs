@@ -154,7 +154,6 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     };
     let [jacobian, uncertainty, seen] =
         [&jacobian, &uncertainty, &warped].map(|layer| |offset: usize| layer.at(offset));
-    let bodies = result.bodies.as_slice();
     let mut report = FieldReport {
         command,
         names,
@@ -167,7 +166,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         displacement,
         jacobian: &jacobian,
         uncertainty: &uncertainty,
-        bodies: &|offset| f32::from(bodies[offset]),
+        bodies: &result.bodies,
         matches: &result.matches,
         mesh: &result.mesh,
         node_displacement: &result.node_displacement,

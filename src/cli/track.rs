@@ -218,7 +218,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         })?;
         let film = film.get_or_insert_with(|| start_film(&reference, field, shown, range));
         add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
-        judged.push((number, judge(&grid, inside.as_ref(), &|o| result.uncertainty.at(o), &result.summary)));
+        judged.push((number, judge(&result.bodies, &|o| result.uncertainty.at(o), &result.summary)));
         let mean = result.summary.mean_mm;
         if looks.wants(number, mean) {
             let there = on_grid(volume.view(), &grid);

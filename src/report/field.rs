@@ -31,8 +31,8 @@ pub struct FieldReport<'a> {
     pub jacobian: Values<'a>,
     /// One standard deviation of the displacement (mm).
     pub uncertainty: Values<'a>,
-    /// The body of each voxel, from 1; 0 outside the mask.
-    pub bodies: Values<'a>,
+    /// The body of each voxel that was measured, from 1; 0 elsewhere.
+    pub bodies: &'a Mask,
     /// All matches with covariance.
     pub matches: &'a SparseField,
     /// The mesh through the kept matches (initial positions).
@@ -60,6 +60,7 @@ pub(crate) mod tests {
         pub(crate) warped: Value,
         pub(crate) deformed: Value,
         pub(crate) uncertainty: Value,
+        pub(crate) bodies: Mask,
         pub(crate) displacement: DenseField,
         pub(crate) summary: FieldSummary,
         params: FieldParams,
@@ -141,6 +142,7 @@ pub(crate) mod tests {
                 warped: Box::new(move |o| same.as_slice()[o]),
                 deformed: Box::new(|o| (o % 97) as f32),
                 uncertainty: Box::new(|_| 0.2),
+                bodies: Mask::filled(grid, 1),
                 displacement,
                 summary,
                 params: FieldParams::default(),
@@ -164,7 +166,7 @@ pub(crate) mod tests {
                 displacement: &self.displacement,
                 jacobian: &*self.jacobian,
                 uncertainty: &*self.uncertainty,
-                bodies: &|_| 1.0,
+                bodies: &self.bodies,
                 matches: &self.matches,
                 mesh: &self.mesh,
                 node_displacement: &[[1.0, 0.0, 0.0]; 4],

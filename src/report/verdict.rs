@@ -4,7 +4,7 @@ use crate::report::field::FieldReport;
 use crate::report::scale::{short, thousands};
 use crate::report::statistics::sample;
 pub use crate::types::Trust;
-use crate::types::{ErrorSource, FieldSummary, FrameSummary, Grid, Mask, MotionModel};
+use crate::types::{ErrorSource, FieldSummary, FrameSummary, Mask, MotionModel};
 
 /// A judgement with its reasons.
 #[derive(Debug, Clone, PartialEq)]
@@ -22,17 +22,15 @@ const NAMED: f64 = 0.2;
 
 /// Judges a result: trust follows from the expected error alone ([`Trust::of`]).
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
-    judge(report.initial.grid(), report.mask, report.uncertainty, report.summary)
+    judge(report.bodies, report.uncertainty, report.summary)
 }
 
-/// As [`verdict`], from the initial volume's grid, the mask, the uncertainty by voxel (mm) and the
-/// summary alone.
-pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
-    let edge = grid.spacing().iter().product::<f64>().cbrt();
+/// As [`verdict`], from the bodies (0 where nothing was measured), the uncertainty by voxel (mm) and
+/// the summary alone.
+pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
+    let edge = bodies.grid().spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
-        MotionModel::Identity => {
-            format!("Nothing moved by more than about {} mm", short2(s.expected.p95_mm))
-        }
+        MotionModel::Identity => format!("Nothing moved by more than about {} mm", short2(s.expected.p95_mm)),
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Affine => format!("One affine motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Free => {
@@ -45,13 +43,15 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
     };
     let headline = format!("{motion}; expected error {}.", expected(s));
     let trust = s.expected.trust();
-    let mut reasons = vec![format!("the expected error is {}", of_what(s))];
+    let mut reasons = vec![format!("the expected error is {}", relative(s))];
     let named = |(source, share): &(ErrorSource, f64)| match *share {
-        share if share >= NAMED => Some(format!("{:.0} % of its square comes from {}", 100.0 * share, source.words())),
+        share if share >= NAMED => {
+            Some(format!("{:.0} % of the squared error comes from {}", 100.0 * share, source.words()))
+        }
         _ => None,
     };
     reasons.extend(s.expected.sources.iter().filter_map(named));
-    let (share, side) = uncertain(grid, mask, uncertainty, edge);
+    let (share, side) = uncertain(bodies, uncertainty, edge);
     if share >= 0.01 {
         reasons.push(format!(
             "{} % of the voxels are uncertain by more than a voxel ({} mm){side}",
@@ -71,28 +71,27 @@ pub fn judge(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f3
 }
 
 /// The expected error with its interval.
-pub(super) fn expected(s: &FieldSummary) -> String {
+fn expected(s: &FieldSummary) -> String {
     let e = &s.expected;
     let [low, high] = e.interval_mm;
     format!("{} mm ({} to {})", short2(e.mean_mm), short2(low), short2(high))
 }
 
 /// The expected error as a part of the motion, or of a voxel where nothing moves.
-pub(super) fn of_what(s: &FieldSummary) -> String {
+fn relative(s: &FieldSummary) -> String {
     let what = if s.model == MotionModel::Identity { "a voxel" } else { "the motion" };
     format!("{} % of {what}", short1(100.0 * s.expected.share()))
 }
 
-const EXPECTED: &str = "expected error";
-
 /// Part of the tissue out of line with the frames beside it from which trust in a frame is low (1).
 const OUT_OF_LINE: f64 = 0.25;
 
-/// Judges a sequence by its worst frames, which the reasons name: `judged` has the number of each measured frame and what
-/// [`judge`] says of it. Trust in the sequence is low where more than
-/// half of the frames are lost or of low trust, high where each frame is of high trust, else
-/// moderate. A frame in which more than a quarter of the tissue is out of line with the frames
-/// beside it is of low trust.
+/// Judges a sequence by its worst frames, which the reasons name: `judged` has the number of each
+/// measured frame and what [`judge`] says of it.
+///
+/// Trust in the sequence is low where more than half of the frames are lost or of low trust, high
+/// where each frame is of high trust, else moderate. A frame in which more than a quarter of the
+/// tissue is out of line with the frames beside it is of low trust.
 pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
     let of = |f: &FrameSummary| judged.iter().find(|j| j.0 == f.frame).map(|j| &j.1);
     let trust = |f: &FrameSummary| match f.trust {
@@ -106,7 +105,7 @@ pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Tr
     let warned: Vec<usize> = numbers(&|f| f.lost.is_none() && !f.warnings.is_empty());
 
     let largest = frames.iter().map(|f| f.expected_error_mm).fold(0.0, f64::max);
-    let mut reasons = vec![format!("{EXPECTED} at most {} mm in any frame", short2(largest))];
+    let mut reasons = vec![format!("expected error at most {} mm in any frame", short2(largest))];
     for (which, what) in [(lost, "lost"), (low, "of low trust"), (vague, "of moderate trust"), (warned, "warned of")] {
         if let Some(names) = named(&which) {
             reasons.push(format!("{names} {} {what}", if which.len() == 1 { "is" } else { "are" }));
@@ -119,7 +118,7 @@ pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Tr
         let said = of(f).filter(|v| v.trust != Trust::High).map(|v| v.reasons.as_slice()).unwrap_or_default();
         let why: String = said.iter().skip(1).map(|r| format!(", {r}")).collect();
         reasons.push(format!(
-            "the worst, frame {}, has an {EXPECTED} of {} mm where tissue moved {} mm on average{}",
+            "the worst, frame {}, has an expected error of {} mm where tissue moved {} mm on average{}",
             f.frame,
             short2(f.expected_error_mm),
             short2(f.mean_mm),
@@ -159,10 +158,11 @@ pub(super) fn named(which: &[usize]) -> Option<String> {
     (!which.is_empty()).then(|| format!("{noun} {}{more}", shown.join(", ")))
 }
 
-/// The share of voxels uncertain by more than `limit` mm, and in words where they lie, when they
+/// The share of the voxels measured that are uncertain by more than `limit` mm, and in words where they lie, when they
 /// lie to one side.
-fn uncertain(grid: &Grid, mask: Option<&Mask>, uncertainty: &dyn Fn(usize) -> f32, limit: f64) -> (f64, String) {
-    let picked = sample(grid.len(), mask);
+fn uncertain(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, limit: f64) -> (f64, String) {
+    let grid = bodies.grid();
+    let picked = sample(grid.len(), Some(bodies));
     let world = |&o: &usize| {
         let [i, j, k] = grid.voxel(o);
         grid.world(i, j, k).0
@@ -214,13 +214,22 @@ mod tests {
         assert_eq!([high.trust, moderate.trust, low.trust], [Trust::High, Trust::Moderate, Trust::Low]);
         assert!(low.headline.contains("expected error 0.51 mm"), "{}", low.headline);
         assert_eq!(low.reasons[0], "the expected error is 34 % of the motion");
-        assert_eq!(low.reasons[1], "90 % of its square comes from noise where texture is weak");
+        assert_eq!(low.reasons[1], "90 % of the squared error comes from noise where texture is weak");
         case.summary.folds = 100;
         case.summary.warnings.push("one more".into());
         case.summary.expected.mean_mm = 0.14;
         let folded = verdict(&case.report());
         assert_eq!(folded.trust, Trust::High);
         assert!(folded.reasons.iter().any(|r| r == "100 voxels fold"), "{:?}", folded.reasons);
+    }
+
+    #[test]
+    fn air_does_not_count_as_uncertain_tissue() {
+        let mut case = Case::new([20, 20, 20], [1.0; 3]);
+        case.uncertainty = Box::new(|o| if o < 4000 { 9.0 } else { 0.2 });
+        case.bodies.as_mut_slice()[..4000].fill(0);
+        let v = verdict(&case.report());
+        assert!(!v.reasons.iter().any(|r| r.contains("uncertain by more than")), "{:?}", v.reasons);
     }
 
     #[test]

@@ -50,8 +50,9 @@ fn bodies_of(
         return Ok(None);
     }
     let scale = Scale { low: 1.0, high: count as f64, unit: "", map: ColorMap::Viridis };
+    let labels = report.bodies.as_slice();
     // Outside the mask there is none.
-    let label = |o: usize| if (report.bodies)(o) > 0.0 { (report.bodies)(o) } else { f32::NAN };
+    let label = |o: usize| if labels[o] > 0 { f32::from(labels[o]) } else { f32::NAN };
     let panel = Panel::coloured("Bodies", sections, base, report.mask, scale, label)?;
     Ok(Some(panel.with_note(
         "Parts that slide along each other, each with a motion of its own, by their labels in bodies.nii.gz.",
@@ -98,8 +99,11 @@ impl Views {
                 let (u, t) = (displacement.at(o), truth.at(o));
                 (0..3).map(|c| (u[c] - t[c]).powi(2)).sum::<f32>().sqrt()
             };
-            let scale = Scale::from_zero(spread(0.99, &gap), "mm", ColorMap::Magma);
-            Panel::coloured("Error of the displacement", &sections, base, mask, scale, gap)
+            // Where nothing was measured the field is no result.
+            let measured = Some(report.bodies);
+            let most = quantile(sample(grid.len(), measured).into_iter().map(|o| gap(o).into()), 0.99);
+            let scale = Scale::from_zero(most, "mm", ColorMap::Magma);
+            Panel::coloured("Error of the displacement", &sections, base, measured, scale, gap)
         });
 
         let backgrounds =
