@@ -61,9 +61,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             .with_context(|| format!("{} and back by {}", name(field), name(path)))?;
         told += &text::inverse_consistency(&found);
         // Voxels are those compared with the truth, where there is one.
-        json_of(&found)?.into_iter().for_each(|(key, value)| {
+        for (key, value) in json_of(&found)? {
             values.entry(key).or_insert(value);
-        });
+        }
     }
     console.say(&if *json { serde_json::to_string_pretty(&values)? } else { told })
 }

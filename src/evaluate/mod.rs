@@ -82,8 +82,8 @@ pub fn metrics(
 /// when `None`): |u(x) + v(x + u(x))|, with `v` read off trilinearly on a grid of its own.
 ///
 /// # Errors
-/// [`FieldError::GridMismatch`] when the mask lies on another grid, [`FieldError::Volume`] when a field is no number where
-/// it counts, or no voxel of the mask ends within the second grid.
+/// [`FieldError::GridMismatch`] when the mask lies on another grid, [`FieldError::Volume`] when a
+/// field is no number where it counts, or no voxel of the mask ends within the second grid.
 pub fn inverse_consistency(
     forward: &DenseField,
     backward: &DenseField,

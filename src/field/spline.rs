@@ -62,6 +62,15 @@ pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
     std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
 }
 
+/// The place (voxels of `grid`) of a voxel offset of the grid that a spline is asked for on.
+fn place(grid: &Grid, stored: &Option<(Grid, Orientation)>, offset: usize) -> [f64; 3] {
+    let offset = match stored {
+        Some((asked, orientation)) => orientation.offset(asked.shape(), asked.voxel(offset)),
+        None => offset,
+    };
+    grid.voxel(offset).map(|i| i as f64)
+}
+
 /// A displacement field as its B-spline coefficients, one lattice a body that slides along others:
 /// all that a dense one is worked out from, and much smaller.
 #[derive(Debug, Clone, PartialEq)]
@@ -129,14 +138,10 @@ impl FieldSpline {
         std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * v[a]).sum())
     }
 
-    /// The displacement (mm, RAS) at a voxel offset (x fastest) of the grid it is asked for on, before
-    /// folds are opened.
+    /// The displacement (mm, RAS) at a voxel offset (x fastest) of the grid it is asked for on,
+    /// before folds are opened.
     pub fn at(&self, offset: usize) -> [f64; 3] {
-        let offset = match &self.stored {
-            Some((grid, orientation)) => orientation.offset(grid.shape(), grid.voxel(offset)),
-            None => offset,
-        };
-        self.at_place(self.grid.voxel(offset).map(|i| i as f64))
+        self.at_place(place(&self.grid, &self.stored, offset))
     }
 
     /// Voxels of `mask` beside another body, and how far that one moves from where the voxel's own
@@ -180,11 +185,7 @@ impl ScalarSpline {
 
     /// The value at a voxel offset (x fastest).
     pub fn at(&self, offset: usize) -> f32 {
-        let offset = match &self.stored {
-            Some((grid, orientation)) => orientation.offset(grid.shape(), grid.voxel(offset)),
-            None => offset,
-        };
-        self.at_place(self.grid.voxel(offset).map(|i| i as f64))
+        self.at_place(place(&self.grid, &self.stored, offset))
     }
 
     /// The value at a place of the canonical grid (voxels).

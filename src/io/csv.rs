@@ -80,7 +80,8 @@ pub fn write_matches(path: impl AsRef<Path>, field: &SparseField) -> Result<(), 
     write_table(path.as_ref(), &columns, rows)
 }
 
-/// Reads the estimate that [`write_matches`] writes; the covariance becomes sigma squared along each axis.
+/// Reads the estimate that [`write_matches`] writes; the covariance becomes sigma squared along
+/// each axis.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number or kept neither 0 nor 1.

@@ -3,10 +3,10 @@
 use crate::matching::brightness::Brightness;
 use crate::numerics::bspline::{Lattice, SmoothSampler};
 use crate::numerics::pyramid;
+use crate::numerics::sampling::beside;
 use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 use std::borrow::Cow;
-use std::collections::HashSet;
 use std::ops::Range;
 
 /// Side of the blocks in which texture is looked for (finest voxels).
@@ -97,46 +97,35 @@ impl<'a> Pair<'a> {
     }
 
     /// The part of the mask where nothing stands out of the noise: blocks of about seven of the
-    /// finest voxels along each axis in which the initial volume's standard deviation is hardly more
-    /// than the noise. How that moves only its surroundings tell.
+    /// finest voxels along each axis in which the initial volume's standard deviation is hardly
+    /// more than the noise. How that moves only its surroundings tell.
     pub fn plain(&self) -> f64 {
-        let inside = |textured: bool| self.blocks().iter().filter(|b| b.1 == textured).map(|b| b.2).sum::<usize>();
-        inside(false) as f64 / self.inside.max(1) as f64
+        let plain = self.blocks().into_iter().filter(|(textured, _)| !textured);
+        plain.map(|(_, inside)| inside).sum::<usize>() as f64 / self.inside.max(1) as f64
     }
 
     /// Whether a place (voxels) lies in such a block, with none that has texture beside it.
     pub fn is_plain(&self) -> impl Fn([f64; 3]) -> bool + Sync + use<> {
         let side = self.in_voxels(BLOCK);
-        let number = move |first: [usize; 3]| -> [usize; 3] { std::array::from_fn(|a| first[a] / side[a]) };
-        let blocks = self.blocks().into_iter();
-        let textured: HashSet<[usize; 3]> = blocks.filter(|b| b.1 && b.2 > 0).map(|b| number(b.0)).collect();
+        let [nx, ny, nz] = std::array::from_fn(|a| self.shape[a].div_ceil(side[a]));
+        let textured: Vec<bool> = self.blocks().into_iter().map(|(textured, inside)| textured && inside > 0).collect();
         move |p| {
-            let own = number(p.map(|v| v.round().max(0.0) as usize));
-            let mut beside = (0..3).flat_map(|a| {
-                [own[a].wrapping_sub(1), own[a], own[a] + 1].map(|at| {
-                    let mut block = own;
-                    block[a] = at;
-                    block
-                })
-            });
-            beside.all(|block| !textured.contains(&block))
+            let [i, j, k] = std::array::from_fn(|a| p[a].round().max(0.0) as usize / side[a]);
+            let own = i + nx * (j + ny * k);
+            !textured[own] && beside([nx, ny, nz], own).all(|block| !textured[block])
         }
     }
 
-    /// The blocks of [`Pair::plain`]: the voxel where each begins, whether it has texture, and its
-    /// voxels of the mask.
-    fn blocks(&self) -> Vec<([usize; 3], bool, usize)> {
+    /// Of each block of [`Pair::plain`] (x fastest), whether it has texture, and its voxels of the
+    /// mask.
+    fn blocks(&self) -> Vec<(bool, usize)> {
         let [nx, ny, nz] = self.shape;
         let side = self.in_voxels(BLOCK);
         let least = f64::from(STANDS_OUT * self.noise).powi(2);
         let corners = |n: usize, a: usize| (0..n).step_by(side[a]);
-        let in_slab = |k: usize| -> Vec<([usize; 3], bool, usize)> {
-            let firsts = corners(ny, 1).flat_map(|j| corners(nx, 0).map(move |i| [i, j, k]));
-            let of = |first| {
-                let (variance, inside) = self.block(first, side);
-                (first, variance > least, inside)
-            };
-            firsts.map(of).collect()
+        let in_slab = |k: usize| -> Vec<(bool, usize)> {
+            let blocks = corners(ny, 1).flat_map(|j| corners(nx, 0).map(move |i| self.block([i, j, k], side)));
+            blocks.map(|(variance, inside)| (variance > least, inside)).collect()
         };
         let slabs: Vec<usize> = corners(nz, 2).collect();
         slabs.into_par_iter().map(in_slab).collect::<Vec<_>>().concat()
@@ -159,7 +148,8 @@ impl<'a> Pair<'a> {
         let n = (xs.len() * ys.len() * zs.len()) as f64;
         // Of one value only rounding is left.
         let (square, mean) = (sums[1] / n, sums[0] / n);
-        (if square - mean * mean > 1e-9 * square { square - mean * mean } else { 0.0 }, inside)
+        let variance = square - mean * mean;
+        (if variance > 1e-9 * square { variance } else { 0.0 }, inside)
     }
 
     /// The deformed volume as a sampler.

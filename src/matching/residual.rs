@@ -5,9 +5,10 @@
 //! gets the information `A = sum_x B(x) rho(x) g g^T / sigma^2` and the right-hand side
 //! `sum_x B(x) rho(x) g r / sigma^2`. The sum of the basis functions is one, so the block diagonal
 //! `A` bounds the true Gauss-Newton matrix from above (each step cannot overshoot) and no pair of
-//! nodes needs to be stored. Noise has a gradient too, which tells nothing of motion: less that, `A`
-//! is the information that the data give. `rho` is Cauchy's weight, `sigma` the robust spread of `r`, to which
-//! what interpolation leaves unsure adds in proportion to `g`: contrast beyond that tells no more.
+//! nodes needs to be stored. Noise has a gradient too, which tells nothing of motion: less that,
+//! `A` is the information that the data give. `rho` is Cauchy's weight, `sigma` the robust spread
+//! of `r`, to which what interpolation leaves unsure adds in proportion to `g`: contrast beyond
+//! that tells no more.
 
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, row_step};
@@ -27,7 +28,8 @@ pub const CAUCHY: f32 = 2.385;
 /// voxel off.
 const UNSURE: f64 = 0.02;
 
-/// Variance of the gradient that white noise leaves, along an axis (voxel^-2), over that of the residual.
+/// Variance of the gradient that white noise leaves, along an axis (voxel^-2), over that of the
+/// residual.
 ///
 /// Both volumes are smoothed by (1, 4, 1) / 6, whose correlation over two voxels is 1/18. A central
 /// difference then has half of 17/18 of a volume's variance, the mean of two half of that.

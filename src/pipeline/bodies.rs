@@ -153,6 +153,12 @@ impl Bodies {
         self.labels = labels;
     }
 
+    /// The same without the information at the nodes, from which no search starts.
+    pub fn without_blocks(&self) -> Self {
+        let fields = self.fields.iter().map(SplineField::without_blocks).collect();
+        Self { labels: self.labels.clone(), fixed: self.fixed, fields }
+    }
+
     /// How many there are.
     pub fn count(&self) -> usize {
         self.fields.len()

@@ -109,13 +109,13 @@ impl Concluded {
             }
             let lattice = free.lattice.clone();
             let stated = full_lattice(grid, field, factor, (&choice, judged));
-            let apart = apart(&stated, &free, factor);
+            let departure = departure(&stated, &free, factor);
             let narrowed = |m: usize| rest.as_ref().map_or(1.0, |rest| rest.narrowed(place(lattice.within(m))));
             let narrowed: Vec<f32> = (0..lattice.len()).map(narrowed).collect();
             let nodes = AtNodes {
                 deviation: &posterior.deviation,
                 misfit: &misfit,
-                apart: &apart,
+                departure: &departure,
                 narrowed: &narrowed,
                 hidden: &hidden(&part, field),
             };
@@ -155,22 +155,31 @@ pub(super) fn full_lattice(
     factor: [usize; 3],
     (choice, judged): (&Choice, [usize; 3]),
 ) -> Spline {
-    let step = std::array::from_fn(|a| field.lattice.step[a] * factor[a]);
-    let lattice = Lattice::new(grid.shape(), step);
-    let spacing = grid.spacing();
-    let coefficients = match &choice.motion {
-        Some(motion) => lattice.fit(|p| {
-            motion.displacement(std::array::from_fn(|a| to_level(p, judged)[a] * spacing[a] * judged[a] as f64))
-        }),
-        None if factor == [1; 3] => field.coefficients.clone(),
-        None => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
+    let Some(motion) = &choice.motion else { return on_full_grid(grid, field, factor) };
+    let (lattice, spacing) = (over(grid, field, factor), grid.spacing());
+    let coefficients = lattice
+        .fit(|p| motion.displacement(std::array::from_fn(|a| to_level(p, judged)[a] * spacing[a] * judged[a] as f64)));
+    (lattice, coefficients)
+}
+
+/// A field of a level of `factor` over the full-resolution grid.
+pub(super) fn on_full_grid(grid: &Grid, field: &SplineField, factor: [usize; 3]) -> Spline {
+    let lattice = over(grid, field, factor);
+    let coefficients = match factor == [1; 3] {
+        true => field.coefficients.clone(),
+        false => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
     };
     (lattice, coefficients)
 }
 
-/// How far the motion that is stated over the full-resolution grid lies from a free field, at the
-/// nodes of that one (mm).
-pub(super) fn apart((full, stated): &Spline, free: &SplineField, factor: [usize; 3]) -> Vec<f32> {
+/// A lattice over the full-resolution grid with the nodes of a level's field.
+fn over(grid: &Grid, field: &SplineField, factor: [usize; 3]) -> Lattice {
+    Lattice::new(grid.shape(), std::array::from_fn(|a| field.lattice.step[a] * factor[a]))
+}
+
+/// How far the motion that is stated over the full-resolution grid departs from a free field, at
+/// the nodes of that one (mm).
+pub(super) fn departure((full, stated): &Spline, free: &SplineField, factor: [usize; 3]) -> Vec<f32> {
     let lattice = &free.lattice;
     let at = |m: usize| {
         let p = lattice.within(m);
@@ -179,8 +188,8 @@ pub(super) fn apart((full, stated): &Spline, free: &SplineField, factor: [usize;
     (0..lattice.len()).into_par_iter().map(at).collect()
 }
 
-/// Of each node of a field, whether the volumes show nothing of what is there: the deformed one does
-/// not reach it, or the initial one has no texture about it.
+/// Of each node of a field, whether the volumes show nothing of what is there: the deformed one
+/// does not reach it, or the initial one has no texture about it.
 pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField) -> Vec<bool> {
     let lattice = &field.lattice;
     let is_plain = pair.is_plain();

@@ -7,7 +7,6 @@ use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level
 use crate::matching::pair::{Pair, dilate};
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
 use crate::numerics::ablation;
-use crate::numerics::blocks::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::statistics::quantile;
@@ -365,9 +364,8 @@ fn canonical(
     clock.book("jacobian");
     progress("uncertainty", 0.95);
     let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), model);
-    for (body, found) in body_reports.iter_mut().zip(uncertainty::by_label(&uncertainty, &displacement, &labelled)) {
-        body.expected_error_mm = found.expected_error_mm;
-    }
+    let of_labels = uncertainty::by_label(&uncertainty, &displacement, &labelled);
+    uncertainty::tell_bodies(&mut body_reports, &of_labels, expected.mean_mm);
     clock.book("uncertainty");
 
     let counts = with_mesh(&mut reports, &mesh);
@@ -399,7 +397,7 @@ fn canonical(
             .collect(),
     };
     progress("done", 1.0);
-    let spline = Start { motion: without_blocks(&bodies), factor, followed: Some(begun.followed) };
+    let spline = Start { motion: bodies.without_blocks(), factor, followed: Some(begun.followed) };
     Ok(FieldResult {
         displacement,
         coefficients,
@@ -413,13 +411,6 @@ fn canonical(
         stages,
         summary,
     })
-}
-
-/// A motion without what the data say at each node, which is as large again twice over.
-fn without_blocks(bodies: &Bodies) -> Bodies {
-    let mut out = bodies.clone();
-    out.fields.iter_mut().for_each(|f| f.blocks = Blocks::default());
-    out
 }
 
 /// Refuses a motion past all that was looked for where few matches survive, `kept` of `found`
@@ -546,7 +537,7 @@ impl<'a> CoarseToFine<'a, '_> {
                 asked.extend(bodies.divide(&pair, &begun.matches, (passes, edge), params.seed));
             }
             if let Some(field) = begun.of_matches.take() {
-                let name = if first { "matches alone" } else { "matches about that field" };
+                let name = if first { "matches alone" } else { "matches of the next level" };
                 stages.push(Left { name: name.into(), motion: field.into(), factor });
             }
             // What a coarser level saw of the brightness serves the finest one.
@@ -558,7 +549,7 @@ impl<'a> CoarseToFine<'a, '_> {
             if !last {
                 clock.skip("matching", matched);
                 clock.book("residual");
-                stages.push(Left { name: "coarse level".into(), motion: without_blocks(&bodies), factor });
+                stages.push(Left { name: "coarse level".into(), motion: bodies.without_blocks(), factor });
                 state = Some((bodies, factor, begun));
                 continue;
             }
@@ -586,7 +577,7 @@ impl<'a> CoarseToFine<'a, '_> {
             reports.push(report);
             clock.book("matching");
             let (search, apart) = (range, closest);
-            stages.push(Left { name: "finest level".into(), motion: without_blocks(&bodies), factor });
+            stages.push(Left { name: "finest level".into(), motion: bodies.without_blocks(), factor });
             return Ok(Found {
                 bodies,
                 factor,
@@ -755,6 +746,9 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
         0 => format!("one for {} voxels of tissue", params.voxels_per_point),
         _ => "as asked".into(),
     };
+    if found > wanted {
+        return format!("points: {wanted} of the {found} that were matched are written, {source}");
+    }
     let limit = if found < wanted { "; no more corners stand out of the noise" } else { "" };
     format!("points: {found} of {wanted} wanted, {source}{limit}")
 }

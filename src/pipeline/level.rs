@@ -55,6 +55,17 @@ impl SplineField {
         Self { lattice, coefficients: vec![0.0; n], smoothness: vec![STIFFNESS; n], blocks: Blocks::default() }
     }
 
+    /// The same without the information at its nodes.
+    pub fn without_blocks(&self) -> Self {
+        let Self { lattice, coefficients, smoothness, .. } = self;
+        Self {
+            lattice: lattice.clone(),
+            coefficients: coefficients.clone(),
+            smoothness: smoothness.clone(),
+            blocks: Blocks::default(),
+        }
+    }
+
     /// Of matches alone, with a bending energy to start passes from.
     pub fn to_refine(mut self) -> Self {
         self.smoothness.iter_mut().for_each(|s| *s = (STIFFER * *s).min(STIFFNESS));

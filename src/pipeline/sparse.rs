@@ -146,7 +146,7 @@ pub(super) fn measure(
         };
         let found = on_level(&pair, begun, l + 1 == factors.len(), params);
         reports.push(found.report.clone());
-        let motion = SplineField { blocks: Blocks::default(), ..found.field.clone() }.into();
+        let motion = found.field.without_blocks().into();
         left.push(Left { name: "matches of a level".into(), motion, factor });
         state = Some((found, pair, factor));
         clock.book("matching");
@@ -173,9 +173,10 @@ pub(super) fn measure(
     clock.book("uncertainty");
 
     let full = conclusion::full_lattice(&grid, &field, factor, (&choice, factor));
-    let apart = conclusion::apart(&full, &field, factor);
+    let departure = conclusion::departure(&full, &field, factor);
     let narrowed = vec![1.0; deviation.len()];
-    let nodes = AtNodes { deviation: &deviation, misfit: &misfit, apart: &apart, narrowed: &narrowed, hidden: &hidden };
+    let nodes =
+        AtNodes { deviation: &deviation, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
     let variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
     let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
     let uncertainty = variances.deviation(&grid, factor);

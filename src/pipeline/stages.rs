@@ -1,11 +1,12 @@
 //! The stage account: the field as each stage left it.
 
-use crate::field::spline::{FieldSpline, Spline};
+use crate::field::spline::FieldSpline;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
-use crate::numerics::bspline::{Lattice, SmoothSampler};
+use crate::numerics::bspline::SmoothSampler;
 use crate::pipeline::bodies::Bodies;
-use crate::pipeline::level::SplineField;
+use crate::pipeline::conclusion::on_full_grid;
+use crate::pipeline::uncertainty::evenly;
 use crate::types::{DenseField, Grid, Mask, StageReport};
 use rayon::prelude::*;
 
@@ -31,9 +32,8 @@ pub struct Stage {
 impl Stage {
     /// The report with the mean error (mm) against `truth` over `mask`.
     pub fn scored(&self, truth: &DenseField, mask: Option<&Mask>) -> StageReport {
-        let n = truth.grid().len();
-        let inside: Vec<usize> = (0..n).filter(|&at| mask.is_none_or(|m| m.as_slice()[at] != 0)).collect();
-        let some: Vec<usize> = inside.iter().copied().step_by((inside.len() / PLACES).max(1)).collect();
+        let inside = |at: usize| mask.is_none_or(|m| m.as_slice()[at] != 0);
+        let some: Vec<usize> = evenly(truth.grid().len(), inside, PLACES).collect();
         let error = |&at: &usize| {
             let (u, t) = (self.field.at(at), truth.at(at));
             (0..3).map(|c| (u[c] - f64::from(t[c])).powi(2)).sum::<f64>().sqrt()
@@ -77,9 +77,8 @@ pub(super) fn account(
 /// Voxels of the tissue of a level, evenly.
 fn places(pair: &Pair<'_>) -> Vec<[f64; 3]> {
     let [nx, ny, _] = pair.shape;
-    let inside: Vec<usize> = (0..pair.mask.len()).filter(|&at| pair.mask[at] != 0).collect();
-    let of = |&at: &usize| [at % nx, at / nx % ny, at / (nx * ny)].map(|v| v as f64);
-    inside.iter().step_by((inside.len() / PLACES).max(1)).map(of).collect()
+    let of = |at: usize| [at % nx, at / nx % ny, at / (nx * ny)].map(|v| v as f64);
+    evenly(pair.mask.len(), |at| pair.mask[at] != 0, PLACES).map(of).collect()
 }
 
 /// The part of the initial volume's variance at these places that the deformed volume, sampled
@@ -102,15 +101,7 @@ fn unexplained(pair: &Pair<'_>, sampler: &SmoothSampler<'_>, places: &[[f64; 3]]
 
 /// A motion of a level over the full-resolution grid.
 fn on_grid(grid: &Grid, motion: &Bodies, factor: [usize; 3]) -> FieldSpline {
-    let spline = |field: &SplineField| -> Spline {
-        let step = std::array::from_fn(|a| field.lattice.step[a] * factor[a]);
-        let lattice = Lattice::new(grid.shape(), step);
-        let coefficients = match factor == [1; 3] {
-            true => field.coefficients.clone(),
-            false => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
-        };
-        (lattice, coefficients)
-    };
+    let splines = motion.fields.iter().map(|field| on_full_grid(grid, field, factor)).collect();
     let labels = motion.labels_on(grid.shape(), |p| to_level(p, factor));
-    FieldSpline::new(*grid, motion.fields.iter().map(spline).collect(), labels, Vec::new())
+    FieldSpline::new(*grid, splines, labels, Vec::new())
 }

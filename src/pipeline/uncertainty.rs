@@ -2,17 +2,17 @@
 //! lattice, and what they add up to over the mask.
 //!
 //! The posterior of the coupled field says what noise and smoothness leave open. It is widened
-//! where the volumes differ by more than noise, by half of the way from the free field to the
-//! motion that stands in its place, where tissue is out of view or without texture, at borders between bodies, and by
-//! motions that the search could not rule out. One calibration ([`BAND`], [`MEAN`], [`SPREAD`]) is
-//! fitted on half of the scenes: docs/lab/2026-11-expected-error.md.
+//! where the volumes differ by more than noise, by the departure of the stated motion from the free
+//! field, where tissue is out of view or without texture, at borders between bodies, and by motions
+//! that the search could not rule out. One calibration ([`BAND`], [`MEAN`], [`SPREAD`]) is fitted
+//! on half of the scenes: docs/lab/2026-11-expected-error.md.
 
 use crate::field::spline::ScalarSpline;
 use crate::matching::levels::to_level;
 use crate::numerics::bspline::Lattice;
-use crate::numerics::statistics::median;
+use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::bodies::Bodies;
-use crate::types::{DenseField, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel};
+use crate::types::{BodyReport, DenseField, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel};
 
 /// Standard deviation over the posterior's such that 95 % of the errors lie in the 95 % region (1).
 const BAND: f32 = 1.05;
@@ -26,11 +26,10 @@ const SPREAD: f64 = 2.0;
 
 /// Place that interpolation and a voxel's extent hide from any match (voxels, one axis): affine
 /// motions without noise come out .005 to .03 of a voxel off.
-const HIDDEN: f64 = 0.015;
+const INTERPOLATION: f64 = 0.015;
 
 /// How much more uncertain tissue is that the volumes do not show (out of view, without texture)
-/// than smoothness says (1): of a brain of which 11
-/// to 75 % had moved out of view the 95 % bands held .86 to .49 of the errors there without it.
+/// than smoothness says (1). Calibrated: docs/lab/2026-11-expected-error.md.
 const EXTRAPOLATED: f32 = 3.0;
 
 /// Standard deviation along an axis that a voxel at a border between bodies adds, as a part of the
@@ -46,8 +45,8 @@ pub(super) struct AtNodes<'a> {
     pub deviation: &'a [f32],
     /// Mean square of the residual over the noise's (1).
     pub misfit: &'a [f32],
-    /// From the free field to the motion that is stated (mm).
-    pub apart: &'a [f32],
+    /// Departure of the stated motion from the free field (mm).
+    pub departure: &'a [f32],
     /// Part of the deviation that is left where tissue is at rest (1).
     pub narrowed: &'a [f32],
     /// Whether the volumes show nothing of what is there.
@@ -66,13 +65,14 @@ impl Variances {
     pub fn of(lattice: Lattice, spacing: [f64; 3], nodes: &AtNodes<'_>) -> Self {
         let thick = || (0..3).filter(|&a| lattice.shape[a] > 1);
         let axes = thick().count().max(1) as f64;
-        let hidden = (HIDDEN * HIDDEN * thick().map(|a| spacing[a].powi(2)).sum::<f64>() / axes) as f32;
+        let edges = thick().map(|a| spacing[a].powi(2)).sum::<f64>();
+        let interpolation = (INTERPOLATION * INTERPOLATION * edges / axes) as f32;
         let mut parts: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; lattice.len()]);
         for m in 0..lattice.len() {
             let narrowed = (BAND * nodes.narrowed[m]).powi(2);
             let free = narrowed * nodes.deviation[m].powi(2);
-            let model = narrowed * nodes.apart[m].powi(2) / axes as f32;
-            let noise = free + hidden;
+            let model = narrowed * nodes.departure[m].powi(2) / axes as f32;
+            let noise = free + interpolation;
             let misfit = free * (nodes.misfit[m] - 1.0).max(0.0);
             let more = if nodes.hidden[m] { EXTRAPOLATED * EXTRAPOLATED - 1.0 } else { 0.0 };
             let all = [noise, misfit, model, more * (noise + misfit + model), 0.0, 0.0];
@@ -105,8 +105,8 @@ impl Variances {
         &mut self.parts[source as usize]
     }
 
-    /// Adds what is in doubt beside borders between bodies: voxels of the grid of which the lattice's
-    /// level has `factor` each, with the jump there (mm).
+    /// Adds what is in doubt beside borders between bodies: voxels of the full-resolution grid with
+    /// the jump there (mm). The lattice lies on a level of `factor`.
     pub fn with_borders(mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) -> Self {
         let lattice = self.lattice.clone();
         let cell: usize = (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] * factor[a]).product();
@@ -126,8 +126,8 @@ impl Variances {
         self
     }
 
-    /// The standard deviation along an axis (mm) over `grid`, of which the lattice's level has
-    /// `factor` voxels each.
+    /// The standard deviation along an axis (mm) over the full-resolution `grid`; the lattice lies
+    /// on a level of `factor`.
     pub fn deviation(&self, grid: &Grid, factor: [usize; 3]) -> ScalarSpline {
         let coarse = &self.lattice;
         let at = |m: usize| self.parts.iter().map(|part| part[m]).sum::<f32>().sqrt();
@@ -167,8 +167,8 @@ impl Variances {
         let axes = if grid.is_single_slice() { 2 } else { 3 };
         let picked: Vec<usize> = some_of(mask).collect();
         let sigma: Vec<f32> = picked.iter().map(|&at| deviation.at(at)).collect();
-        let motion = picked.iter().map(|&at| length(field, at)).sum::<f64>() / picked.len().max(1) as f64;
         let count = picked.len().max(1) as f64;
+        let motion = picked.iter().map(|&at| length(field, at)).sum::<f64>() / count;
         let mean_mm = MEAN * mean_length(axes) * sigma.iter().map(|&s| f64::from(s)).sum::<f64>() / count;
         ExpectedError {
             mean_mm,
@@ -205,6 +205,14 @@ pub(super) fn by_label(deviation: &ScalarSpline, field: &DenseField, mask: &Mask
     sums.iter().enumerate().filter(|(_, s)| s.0 > 0).map(of).collect()
 }
 
+/// Gives each body the error of its label; one too small to be sampled has that of the `whole` (mm).
+pub(super) fn tell_bodies(bodies: &mut [BodyReport], labels: &[LabelError], whole: f64) {
+    for body in bodies {
+        let own = labels.iter().find(|l| l.label == body.label);
+        body.expected_error_mm = own.map_or(whole, |l| l.expected_error_mm);
+    }
+}
+
 /// Edge of a cube of a voxel's volume (mm).
 fn edge(grid: &Grid) -> f64 {
     let shape = grid.shape();
@@ -228,18 +236,39 @@ const LENGTHS: [[f32; 10]; 2] = [
 fn longest(axes: usize, sigma: Vec<f32>) -> f64 {
     let quantiles = LENGTHS[usize::from(axes == 3)];
     let mut all: Vec<f32> = sigma.iter().flat_map(|s| quantiles.map(|q| q * s)).collect();
-    f64::from(crate::numerics::statistics::quantile(&mut all, 0.95))
+    f64::from(quantile(&mut all, 0.95))
 }
 
 /// Voxels of the mask, evenly, at most about [`SAMPLED`].
 pub(super) fn some_of(mask: &Mask) -> impl Iterator<Item = usize> {
     let mask = mask.as_slice();
-    let inside = || (0..mask.len()).filter(|&at| mask[at] != 0);
-    inside().step_by((inside().count() / SAMPLED).max(1))
+    evenly(mask.len(), |at| mask[at] != 0, SAMPLED)
+}
+
+/// Of `count` voxels those that are `inside`, evenly, at most about `most`.
+pub(super) fn evenly(count: usize, inside: impl Fn(usize) -> bool, most: usize) -> impl Iterator<Item = usize> {
+    let step = (0..count).filter(|&at| inside(at)).count() / most;
+    (0..count).filter(move |&at| inside(at)).step_by(step.max(1))
 }
 
 /// Median over the mask, from at most about [`SAMPLED`] of its voxels.
 pub(super) fn median_inside(values: &ScalarSpline, mask: &Mask) -> f64 {
     let mut picked: Vec<f32> = some_of(mask).map(|at| values.at(at)).collect();
     f64::from(median(&mut picked))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A body that no sampled voxel lies in takes the error of the whole, not that of the next body.
+    #[test]
+    fn a_body_has_the_error_of_its_own_label() {
+        let body =
+            |label| BodyReport { label, voxels: 1, model: MotionModel::Free, slides_mm: 0.0, expected_error_mm: 0.0 };
+        let error = |label, expected_error_mm| LabelError { label, expected_error_mm, displacement_mean_mm: 1.0 };
+        let mut bodies = [body(1), body(4), body(7)];
+        tell_bodies(&mut bodies, &[error(1, 0.1), error(7, 0.7)], 0.2);
+        assert_eq!(bodies.map(|b| b.expected_error_mm), [0.1, 0.2, 0.7]);
+    }
 }

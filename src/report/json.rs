@@ -41,8 +41,8 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
         "expected_error_interval_mm": s.expected.interval_mm,
         "expected_error_p95_mm": s.expected.p95_mm,
         "expected_error_share": s.expected.share(),
-        "expected_error_sources": s.expected.sources.iter().map(|(source, share)| (json!(source), share))
-            .filter_map(|(source, share)| Some((source.as_str()?.to_string(), json!(share))))
+        "expected_error_sources": s.expected.sources.iter()
+            .filter_map(|(source, share)| Some((json!(source).as_str()?.to_string(), json!(share))))
             .collect::<Map<String, Value>>(),
         "expected_error_labels": s.expected.labels,
         "unseen": s.unseen,

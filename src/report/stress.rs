@@ -223,7 +223,9 @@ pub fn summary(curves: &[StressCurve], stated: Option<&Stated>, seconds: f64) ->
 fn stated_in_words(s: &Stated) -> String {
     let ranks = s.rank_correlation.map_or_else(|| "none".into(), |r| format!("{r:.2}"));
     format!(
-        "Of {} field runs {} have no result or an error of a third of the motion or more, {} of them without low trust. Of {} with an error under a tenth of it {} are refused or of low trust. Expected and true error: rank correlation {ranks}, within a factor of 1.5 in {:.0} %, of 2 in {:.0} %.",
+        "Of {} field runs {} have no result or an error of a third of the motion or more, {} of them without low trust. Of {} \
+         with an error under a tenth of it {} are refused or of low trust. Expected and true error: rank correlation {ranks}, \
+         within a factor of 1.5 in {:.0} %, of 2 in {:.0} %.",
         s.runs,
         s.broken,
         s.silent,

@@ -7,11 +7,11 @@ use crate::error::SynthError;
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::synth::anatomy::body;
-use crate::synth::looks::{BRIGHTEST, PATTERN};
+use crate::synth::looks::{BRIGHTEST, PATTERN, unchanged};
 use crate::synth::noise::Texture;
 use crate::synth::params::PhantomParams;
 use crate::synth::phantom::{Phantom, painted, phantom, phantom_on, rician};
-use crate::types::{Affine, DenseField, Grid, Mask, Volume, WorldPoint};
+use crate::types::{Affine, DenseField, Grid, Mask, Volume};
 use std::collections::BTreeSet;
 
 /// Intensity of a hot voxel over the largest of its volume (1).
@@ -54,7 +54,6 @@ pub(super) fn hot_voxels(base: &PhantomParams, count: usize) -> Result<Phantom, 
 /// same in both volumes, without noise and bias of its own.
 pub(super) fn background(base: &PhantomParams, ratio: f64) -> Result<Phantom, SynthError> {
     let grid = base.grid()?;
-    let unchanged = |_: WorldPoint, seen: (f64, bool)| seen.0;
     let mut made = painted(base, [grid; 2], &unchanged, &unchanged)?;
     // The same motion of a body that shows how much of a voxel it fills.
     let body = body(base.kind, &grid, base.seed);

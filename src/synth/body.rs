@@ -24,6 +24,15 @@ pub struct Superellipsoid {
     pub power: i32,
 }
 
+/// Width of a border (logistic, voxels): 10 to 90 % in two.
+pub(super) const BORDER: f64 = 0.45;
+
+/// 1 well inside a surface, 0 well outside, from the depth under it and the border's width (one
+/// unit).
+pub(super) fn cover(depth: f64, edge: f64) -> f64 {
+    1.0 / (1.0 + (-depth / edge).exp())
+}
+
 /// A region and what it looks like.
 #[derive(Debug, Clone)]
 pub struct Region {
@@ -136,8 +145,6 @@ impl Body {
 
     /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1; exactly 0 far outside.
     fn cover(&self, shape: &Superellipsoid, q: [f64; 3]) -> f64 {
-        /// Width of the logistic edge, in voxels: 10 to 90 % in two.
-        const WIDTH: f64 = 0.45;
         /// Beyond so many voxels outside, the logistic is under 1e-9.
         const FAR: f64 = 9.5;
         let d: [f64; 3] = std::array::from_fn(|a| q[a] - shape.centre[a]);
@@ -152,7 +159,7 @@ impl Body {
         // changes the width.
         let rate = self.edges.iter().map(|e| (0..3).map(|w| e[w] * gradient[w]).sum::<f64>().powi(2)).sum::<f64>();
         let voxels = (1.0 - value) / rate.sqrt().max(1e-12);
-        if voxels < -FAR { 0.0 } else { 1.0 / (1.0 + (-voxels / WIDTH).exp()) }
+        if voxels < -FAR { 0.0 } else { cover(voxels, BORDER) }
     }
 }
 

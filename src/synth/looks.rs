@@ -7,7 +7,7 @@ use crate::error::SynthError;
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::synth::anatomy::body;
-use crate::synth::body::{centre, extent};
+use crate::synth::body::{BORDER, centre, cover, extent};
 use crate::synth::params::PhantomParams;
 use crate::synth::phantom::{Phantom, painted};
 use crate::types::space::length;
@@ -27,10 +27,8 @@ const DARK: f64 = 0.25;
 /// Width of the border between two contrasts (logistic, share of the field of view).
 const SMOOTH: f64 = 0.05;
 
-/// Width of a border (logistic, voxels): 10 to 90 % in two.
-pub(super) const BORDER: f64 = 0.45;
-
-fn unchanged(_: WorldPoint, seen: (f64, bool)) -> f64 {
+/// What the body shows by itself.
+pub(super) fn unchanged(_: WorldPoint, seen: (f64, bool)) -> f64 {
     seen.0
 }
 
@@ -117,11 +115,6 @@ pub(super) fn inverted_on_the_right(base: &PhantomParams, share: f64) -> Result<
     let grid = base.grid()?;
     let right = right_half(&grid, SMOOTH * extent(&grid)[0]);
     inverted(base, &|y| share * right(y))
-}
-
-/// 1 well inside a surface, 0 well outside, from the depth under it and the edge's width (both mm).
-pub(super) fn cover(depth: f64, edge: f64) -> f64 {
-    1.0 / (1.0 + (-depth / edge).exp())
 }
 
 /// Places and brightness of a body's tissue.

@@ -1,7 +1,7 @@
 //! The bodies that are pressed: what they are made of, where, and how they look.
 
 use crate::numerics::random::Random;
-use crate::synth::body::{centre, extent};
+use crate::synth::body::{BORDER, centre, cover, extent};
 use crate::synth::elastic::blocks::{Ball, block_with_balls, dome, layered_block};
 use crate::synth::elastic::hexahedra::{CURVED, HexMesh, Surfaces};
 use crate::synth::noise::Texture;
@@ -155,7 +155,7 @@ impl Tissue {
 
     /// How much of a voxel lies inside, at `depth` mm.
     fn cover(&self, depth: f64) -> f64 {
-        1.0 / (1.0 + (-depth / (0.45 * self.voxel)).exp())
+        cover(depth, BORDER * self.voxel)
     }
 
     /// Coarse hexahedra fitted to the regions.
