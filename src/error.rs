@@ -165,6 +165,54 @@ fn os_hint(error: &std::io::Error) -> &'static str {
     }
 }
 
+/// Strain from a displacement field.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum StrainError {
+    /// Two grids that had to be the same are not, or geometry.
+    #[error(transparent)]
+    Field(#[from] FieldError),
+    /// NaN or infinity where strain is wanted.
+    #[error("the field is no finite number in {voxels} voxels of the tissue; leave them out with --mask")]
+    NotFinite {
+        /// How many voxels.
+        voxels: usize,
+    },
+    /// The field folds.
+    #[error(
+        "the field folds in {voxels} voxels of the tissue, which has no strain there; measure it again, or leave them out \
+         with --mask"
+    )]
+    Folds {
+        /// How many voxels.
+        voxels: usize,
+    },
+    /// The gauge does not reach a voxel's neighbours.
+    #[error("a gauge of {asked} mm is under two voxels ({least:.3} mm); ask for that or more, or leave --gauge out")]
+    ShortGauge {
+        /// Asked for (mm).
+        asked: f64,
+        /// The shortest (mm).
+        least: f64,
+    },
+    /// The gauge is wider than the body.
+    #[error("a gauge of {asked} mm is wider than the tissue ({width:.3} mm); ask for less, or leave --gauge out")]
+    WideGauge {
+        /// Asked for (mm).
+        asked: f64,
+        /// Least extent of the tissue along an axis (mm).
+        width: f64,
+    },
+    /// Directions that are none.
+    #[error("{what}; {hint}")]
+    Directions {
+        /// What is wrong.
+        what: String,
+        /// What to try.
+        hint: String,
+    },
+}
+
 /// The field pipeline.
 #[derive(Debug, Error)]
 #[non_exhaustive]

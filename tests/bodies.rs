@@ -3,7 +3,6 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::evaluate;
-use palpate::field::strain::StrainField;
 use palpate::numerics::random::Random;
 use palpate::pipeline::field::{FieldResult, run};
 use palpate::pipeline::track::Tracker;
@@ -171,17 +170,6 @@ fn halves_that_slide_keep_their_jump_and_fold_nowhere() {
             assert!(scene.error(&found, label) < 0.15, "{}", scene.error(&found, label));
         }
     }
-}
-
-/// Differences across the wall passed for strain of 3 and more.
-#[test]
-fn no_strain_is_taken_across_a_wall_that_slides() {
-    let scene = Scene::halves(3.0, 3);
-    let cut = StrainField::of_bodies(&scene.truth, &scene.labels).unwrap();
-    let most = |s: &StrainField| (0..s.grid().len()).map(|at| s.principal(at)[0].abs()).fold(0.0, f64::max);
-    assert!(most(&cut) < 1e-6 && most(&StrainField::of(&scene.truth)) > 1.0);
-    let other = Grid::new([60, 56, 51], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
-    assert!(StrainField::of_bodies(&scene.truth, &Mask::filled(other, 1)).is_err());
 }
 
 /// Smooth motion, small and large, with noise, is one body: none of these is split.

@@ -454,7 +454,7 @@ fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
     assert!(out.contains("matches") && out.contains("one/report.html"), "{out}");
     assert!(err.is_empty(), "{err}");
     let volumes = ["displacement.nii.gz", "warped.nii.gz", "jacobian.nii.gz", "uncertainty.nii.gz"];
-    for name in volumes.into_iter().chain(["matches.csv", "mesh.vtu"]) {
+    for name in volumes.into_iter().chain(["posterior.nii.gz", "matches.csv", "mesh.vtu"]) {
         let read = |run: &str| fs::read(folder.path().join(run).join(name)).unwrap();
         assert!(read("one") == read("two"), "{name} depends on the number of threads");
     }
@@ -469,7 +469,7 @@ fn a_field_run_writes_everything_and_the_same_with_any_number_of_threads() {
     assert!(summary["seconds"]["read"].as_f64().unwrap() >= 0.0);
     let page = fs::read_to_string(folder.path().join("one/report.html")).unwrap();
     assert!(page.contains("Trust is") && !page.contains("://"));
-    assert_eq!(fs::read_dir(folder.path().join("one")).unwrap().count(), 9);
+    assert_eq!(fs::read_dir(folder.path().join("one")).unwrap().count(), 10);
 }
 
 #[test]

@@ -380,7 +380,7 @@ fn deviation_and_degrees_of_freedom_are_those_of_the_inverse() {
         let variance: Vec<f32> =
             (0..80).map(|i| ((0..3).map(|a| inverse[80 * a + i][80 * a + i]).sum::<f64>() / 3.0) as f32).collect();
         let exact = filters::gaussian(&variance, nodes, [1.0; 3]);
-        let coupling::Posterior { deviation: found, determined } =
+        let coupling::Posterior { deviation: found, determined, .. } =
             coupling::posterior(&smoothness, &even(lambda, 80), &Blocks::from(&blocks[..]), nodes, 200, 7);
         // The node's part of the trace of the inverse times the data.
         let part = |i: usize| -> f64 {

@@ -8,12 +8,13 @@ use std::path::{Path, PathBuf};
 const BASE: [&str; 3] = ["types", "error", "numerics"];
 
 /// The steps of the work; none knows another.
-const STAGES: [&str; 11] = [
+const STAGES: [&str; 12] = [
     "features",
     "matching",
     "consistency",
     "mesh",
     "field",
+    "strain",
     "stiffness",
     "fingertip",
     "grasp",

@@ -4,12 +4,15 @@
 use palpate::error::FieldError;
 use palpate::evaluate::metrics;
 use palpate::field::composition::compose;
-use palpate::field::strain::{StrainField, StrainStatistics, green_lagrange};
 use palpate::numerics::small::eigenvalues;
 use palpate::pipeline::field::run as pair;
 use palpate::pipeline::track::{Tracker, run};
+use palpate::strain::StrainField;
+use palpate::strain::gauge::Gauge;
+use palpate::strain::measure::green_lagrange;
+use palpate::strain::statistics::StrainStatistics;
 use palpate::synth::{Sequence, SequenceKind, SequenceParams};
-use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, PointState, Volume};
+use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, PointState, StrainMeasure, Volume};
 
 fn sequence(kind: SequenceKind, frames: usize) -> Sequence {
     Sequence::new(&SequenceParams { frames, ..SequenceParams::new(kind).sized(40) }).unwrap()
@@ -122,6 +125,10 @@ fn steady_frames_are_followed_and_a_jump_is_found() {
     assert!(error(&found.displacement, &truth, &s.mask) < 0.1);
 }
 
+fn strain_of(field: &DenseField) -> StrainField {
+    StrainField::of(field, &[], Gauge::shortest(field.grid()), StrainMeasure::GreenLagrange)
+}
+
 #[test]
 fn principal_strains_come_back() {
     for kind in [SequenceKind::Pinch, SequenceKind::Pen] {
@@ -131,7 +138,7 @@ fn principal_strains_come_back() {
         let mut tracker = Tracker::new(&reference, Some(&s.mask), &params);
         for t in 1..s.frames() {
             let found = tracker.next(&s.frame(t), &|_, _| {}).unwrap();
-            let (found, truth) = (StrainField::of(&found.displacement), StrainField::of(&s.truth(t)));
+            let (found, truth) = (strain_of(&found.displacement), strain_of(&s.truth(t)));
             let apart = |&at: &usize| -> f64 {
                 let (a, b) = (found.principal(at), truth.principal(at));
                 (0..3).map(|k| (a[k] - b[k]).abs()).sum::<f64>() / 3.0
@@ -277,7 +284,7 @@ fn statistics_of_a_uniform_strain() {
     let s = sequence(SequenceKind::Pinch, 2);
     let field = DenseField::from_fn(*s.mask.grid(), |p| [0.1 * p.0[0], -0.05 * p.0[1], 0.0]);
     let offsets = deep(&s.mask);
-    let found = StrainStatistics::over(&StrainField::of(&field), &offsets);
+    let found = StrainStatistics::over(&strain_of(&field), &offsets);
     let (e1, e3) = (0.5 * (1.1f64.powi(2) - 1.0), 0.5 * (0.95f64.powi(2) - 1.0));
     assert_eq!(found.voxels, offsets.len());
     for (value, truth) in [

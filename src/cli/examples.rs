@@ -33,6 +33,14 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         ],
     ),
     (
+        "strain",
+        &[
+            ("of a result, the gauge by its noise", "strain results -o strain"),
+            ("over 5 mm, by region", "strain results --gauge 5 --labels labels.nii.gz -o strain"),
+            ("along fibres that run up in label 2", "strain results --labels labels.nii.gz --fibres 2=0,0,1 -o strain"),
+        ],
+    ),
+    (
         "stiffness",
         &[
             (

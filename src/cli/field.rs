@@ -4,11 +4,13 @@ use super::console::Console;
 use super::dry_run;
 use super::inputs::{check_distinct, name, read_labels, read_mask, read_volume, same_file, warn_all};
 use super::limits::field_fits;
-use super::outputs::{FIELD_FILES, Measured, Target, write_field};
+use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use palpate::error::UnknownName;
-use palpate::types::params::{BodySource, Method, Preset};
+use palpate::error::{StrainError, UnknownName};
+use palpate::pipeline::field::{FieldResult, Progress};
+use palpate::pipeline::strain::{StrainInput, StrainParams, StrainResult};
+use palpate::types::params::{BodySource, Method, ModelSource, Preset};
 use palpate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, names};
 use palpate::{evaluate, io, pipeline};
 use std::collections::BTreeSet;
@@ -43,6 +45,9 @@ pub struct Options {
     /// Write the results even where the field folds, which tissue cannot do
     #[arg(long)]
     allow_folds: bool,
+    /// Write the strain too, as `palpate strain` does of the results
+    #[arg(long)]
+    strain: bool,
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     dry_run: bool,
@@ -60,6 +65,10 @@ pub struct Tuning {
     /// [default: full]
     #[arg(long, value_parser = method)]
     method: Option<Method>,
+    /// Motion model of each body: identity, rigid, affine, free, or auto, the smallest that explains
+    /// the volumes [default: auto]
+    #[arg(long, value_parser = model)]
+    model: Option<ModelSource>,
     /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
     #[arg(long, value_name = "N")]
     points: Option<usize>,
@@ -83,6 +92,7 @@ impl Tuning {
         out.extend(self.config.iter().flat_map(|c| ["--config".into(), c.display().to_string()]));
         out.extend(self.preset.iter().flat_map(|p| ["--preset".into(), preset_name(*p)]));
         out.extend(self.method.iter().flat_map(|m| ["--method".into(), method_name(*m)]));
+        out.extend(self.model.iter().flat_map(|m| ["--model".into(), model_name(*m)]));
         out.extend(self.seed.iter().flat_map(|s| ["--seed".into(), s.to_string()]));
         out.extend(self.points.iter().flat_map(|p| ["--points".into(), p.to_string()]));
         out.extend(self.search.iter().flat_map(|s| ["--search".into(), s.to_string()]));
@@ -101,6 +111,7 @@ impl Tuning {
             None => FieldParams::preset(self.preset.unwrap_or_default()),
         };
         params.method = self.method.unwrap_or(params.method);
+        params.model = self.model.unwrap_or(params.model);
         params.seed = self.seed.unwrap_or(params.seed);
         params.points = self.points.unwrap_or(params.points);
         params.search_mm = self.search.unwrap_or(params.search_mm);
@@ -130,8 +141,24 @@ fn method(name: &str) -> Result<Method, UnknownName> {
     names::choose("method", name, &METHODS)
 }
 
+const MODELS: [(&str, ModelSource); 5] = [
+    ("auto", ModelSource::Auto),
+    ("identity", ModelSource::Identity),
+    ("rigid", ModelSource::Rigid),
+    ("affine", ModelSource::Affine),
+    ("free", ModelSource::Free),
+];
+
+fn model_name(model: ModelSource) -> String {
+    MODELS.iter().find(|m| m.1 == model).map_or_else(String::new, |m| m.0.into())
+}
+
+fn model(name: &str) -> Result<ModelSource, UnknownName> {
+    names::choose("model", name, &MODELS)
+}
+
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, bodies, rigid, bonded, truth, allow_folds, dry_run, tuning } =
+    let Options { initial, deformed, target, mask, bodies, rigid, bonded, truth, allow_folds, strain, dry_run, tuning } =
         options;
     let mut params = tuning.params()?;
     if *bonded {
@@ -145,7 +172,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let given: Vec<&Path> =
         [initial, deformed].into_iter().chain(mask).chain(bodies).chain(truth).map(PathBuf::as_path).collect();
-    check_distinct(&given, &target.files(&FIELD_FILES))?;
+    let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
+    check_distinct(&given, &target.files(&files))?;
 
     field_fits(initial, deformed)?;
 
@@ -172,7 +200,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let plan = pipeline::plan::field(&fixed, &moving, inside.as_ref(), &params)?;
         warn_all(console, &warnings);
         let volumes = [(initial, fixed.grid()), (deformed, moving.grid())];
-        return console.say(&dry_run::field(&volumes, &plan, &params, target, &FIELD_FILES)?);
+        return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
     }
     let mut folder = target.create()?;
     let read = started.elapsed().as_secs_f64();
@@ -200,6 +228,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     });
     let metrics = metrics.transpose().with_context(|| format!("{} to {}", names[0], names[1]))?;
 
+    let strain = strain.then(|| strain_of(&result, inside.as_ref(), &set));
+    let strain = strain.transpose().with_context(|| format!("{} to {}", names[0], names[1]))?;
     progress.set("write", 1.0);
     let measured = Measured {
         command: "field",
@@ -209,6 +239,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         mask: inside.as_ref(),
         params: &params,
         truth: truth.as_ref().zip(metrics.as_ref()),
+        strain: strain.as_ref(),
     };
     let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;
@@ -216,6 +247,18 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{summary}{}", target.look()))
+}
+
+/// The strain of a field, by the labels of the mask.
+fn strain_of(result: &FieldResult, mask: Option<&Mask>, progress: Progress<'_>) -> Result<StrainResult, StrainError> {
+    let input = StrainInput {
+        field: &result.displacement,
+        bodies: &result.bodies,
+        labels: mask,
+        samples: Some(&result.samples),
+        trust: Some(result.summary.expected.trust()),
+    };
+    pipeline::strain::run(input, &StrainParams::default(), progress)
 }
 
 /// The exact displacement of `path`, which must lie on the initial volume's grid.

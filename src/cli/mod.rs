@@ -55,6 +55,8 @@ mod stiffness;
 
 mod stiffness_sequence;
 
+mod strain;
+
 mod stress;
 
 mod warp;
@@ -107,6 +109,8 @@ enum Command {
     Invert(invert::Options),
     /// Follow the tissue of one volume through a sequence of others
     Track(track::Options),
+    /// Strain from a displacement field, with its standard deviation
+    Strain(strain::Options),
     /// Young's modulus from a displacement field, region by region or without regions
     Stiffness(stiffness::Options),
     /// Reduce a stiffness map of a finger pad to a fingertip for grasps
@@ -190,6 +194,7 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Warp(options) => warp::run(options, console),
         Command::Invert(options) => invert::run(options, console),
         Command::Track(options) => track::run(options, console),
+        Command::Strain(options) => strain::run(options, console),
         Command::Stiffness(options) => stiffness::run(options, console),
         Command::Fingertip(options) => fingertip::run(options, console),
         Command::Batch(options) => batch::run(options, console),

@@ -8,22 +8,38 @@ use palpate::field::warp::{warp_rows, warped_at};
 use palpate::io::{self, OutputFolder};
 use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
+use palpate::pipeline::strain::StrainResult;
+use palpate::report::strain::StrainReport;
 use palpate::report::{FieldReport, html, json};
-use palpate::types::{DenseField, FieldParams, Grid, Mask, Metrics, Volume};
+use palpate::strain::{StrainField, measure};
+use palpate::types::{DenseField, FieldParams, Grid, Mask, Metrics, Volume, WorldPoint};
+use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Names of what [`write_field`] writes.
-pub const FIELD_FILES: [&str; 9] = [
+pub const FIELD_FILES: [&str; 10] = [
     "displacement.nii.gz",
     "warped.nii.gz",
     "jacobian.nii.gz",
     "uncertainty.nii.gz",
+    "posterior.nii.gz",
     "bodies.nii.gz",
     "matches.csv",
     "mesh.vtu",
     "summary.json",
     "report.html",
+];
+
+/// Names of the maps and tables that [`write_strain`] writes.
+pub const STRAIN_FILES: [&str; 7] = [
+    "strain.nii.gz",
+    "strain_sd.nii.gz",
+    "principal.nii.gz",
+    "directions.nii.gz",
+    "shear.nii.gz",
+    "volume_change.nii.gz",
+    "regions.csv",
 ];
 
 /// Where results go.
@@ -72,6 +88,7 @@ pub struct Measured<'a> {
     pub mask: Option<&'a Mask>,
     pub params: &'a FieldParams,
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
+    pub strain: Option<&'a StrainResult>,
 }
 
 /// Voxels of a grid up to which what is made for a file is kept for the report. Of a larger one,
@@ -117,7 +134,7 @@ impl<'a> Layer<'a> {
 /// Stages all files, adds the times of warping and writing to the summary, and gives the short
 /// summary for stdout back.
 pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &mut FieldResult) -> Result<String> {
-    let Measured { command, names, initial, deformed, mask, params, truth } = measured;
+    let Measured { command, names, initial, deformed, mask, params, truth, strain } = measured;
     let started = Instant::now();
     let displacement = &result.displacement;
     let grid = displacement.grid();
@@ -129,10 +146,15 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     let uncertainty = Layer::new(grid, |first, out| vague.rows(first, out), |offset| vague.at(offset));
     let bits = io::length_bits(grid);
     folder.write("uncertainty.nii.gz", |p| uncertainty.write(p, "palpate: 1 sigma of u, mm", Some(bits)))?;
+    folder.write("posterior.nii.gz", |p| io::write_samples(p, &result.samples))?;
     folder.write("bodies.nii.gz", |p| io::write_labels(p, &result.bodies, "palpate: bodies, from 1"))?;
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;
     let at_nodes = result.at_nodes();
-    folder.write("mesh.vtu", |p| io::write_match_mesh(p, &result.mesh, &at_nodes))?;
+    let strained = strain.map(|s| at_places(&s.strain, at_nodes.iter().map(|m| m.initial)));
+    folder.write("mesh.vtu", |p| io::write_match_mesh(p, &result.mesh, &at_nodes, strained.as_deref()))?;
+    if let Some(strain) = strain {
+        write_strain(folder, strain, &result.bodies)?;
+    }
     let mut writing = started.elapsed();
 
     let started = Instant::now();
@@ -154,6 +176,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     };
     let [jacobian, uncertainty, seen] =
         [&jacobian, &uncertainty, &warped].map(|layer| |offset: usize| layer.at(offset));
+    let maps = strain.map(StrainMaps::of);
     let mut report = FieldReport {
         command,
         names,
@@ -172,6 +195,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         node_displacement: &result.node_displacement,
         summary: &summary,
         truth,
+        strain: maps.as_ref().map(|maps| maps.report(names[0], (displacement, &result.bodies), Some(initial))),
     };
     let (written, page) = rayon::join(
         || folder.write("warped.nii.gz", |p| warped.write(p, "palpate: deformed at x + u(x)", None)),
@@ -188,4 +212,107 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     let text = palpate::report::text::field_summary(&report);
     result.summary = summary;
     Ok(text)
+}
+
+/// Stages the maps and the table of [`STRAIN_FILES`]; `bodies` are 0 outside the tissue, where the
+/// maps are 0.
+pub fn write_strain(folder: &mut OutputFolder, result: &StrainResult, bodies: &Mask) -> Result<(), IoError> {
+    let StrainResult { strain, deviation, summary } = result;
+    let grid = strain.grid();
+    let axes = format!("palpate: {} strain, LPS axes", summary.measure.name());
+    folder.write("strain.nii.gz", |p| io::write_tensors(p, grid, strain.tensors(), &axes))?;
+    let measured = |at: usize| bodies.as_slice()[at] != 0;
+    let each = |at: usize| match measured(at) {
+        true => deviation.at(place(grid, at)).map(|v| v as f32),
+        false => [0.0; 6],
+    };
+    let vague: Vec<[f32; 6]> = (0..grid.len()).into_par_iter().map(each).collect();
+    folder.write("strain_sd.nii.gz", |p| io::write_tensor_deviations(p, grid, &vague, "palpate: 1 sigma of strain"))?;
+    drop(vague);
+    let principal: Vec<[f32; 3]> =
+        (0..grid.len()).into_par_iter().map(|at| strain.principal(at).map(|v| v as f32)).collect();
+    folder.write("principal.nii.gz", |p| {
+        io::write_vectors(p, grid, &principal, "palpate: principal strains", io::STRAIN_BITS)
+    })?;
+    drop(principal);
+    let lps = |at: usize| -> [f32; 9] {
+        let rows = if measured(at) { measure::directions(&strain.at(at)) } else { [[0.0; 3]; 3] };
+        std::array::from_fn(|c| rows[c / 3][c % 3] as f32 * if c % 3 < 2 { -1.0 } else { 1.0 } + 0.0)
+    };
+    let directions: Vec<[f32; 9]> = (0..grid.len()).into_par_iter().map(lps).collect();
+    let said = "palpate: principal directions, largest first, LPS";
+    folder.write("directions.nii.gz", |p| io::write_vectors(p, grid, &directions, said, DIRECTION_BITS))?;
+    drop(directions);
+    let map = |of: &(dyn Fn(usize) -> f64 + Sync)| Volume::from_voxels(*grid, |at, _| of(at) as f32);
+    let shear = map(&|at| measure::largest_shear(&strain.at(at)));
+    folder.write("shear.nii.gz", |p| io::write_steps(p, &shear, "palpate: largest shear strain", io::STRAIN_BITS))?;
+    let change = map(&|at| measure::volume_change(summary.measure, &strain.at(at)));
+    folder.write("volume_change.nii.gz", |p| {
+        io::write_steps(p, &change, "palpate: relative change of volume", io::STRAIN_BITS)
+    })?;
+    folder.write("regions.csv", |p| io::write_region_strains(p, &summary.regions))
+}
+
+/// Unit vectors are kept to 2^-9, a tenth of a degree.
+const DIRECTION_BITS: i32 = 9;
+
+fn place(grid: &Grid, at: usize) -> WorldPoint {
+    let [i, j, k] = grid.voxel(at);
+    grid.world(i, j, k)
+}
+
+/// The strain in the voxels nearest to these places (mm); those outside have that of the border.
+pub fn at_places(strain: &StrainField, places: impl Iterator<Item = WorldPoint>) -> Vec<[f64; 6]> {
+    let grid = strain.grid();
+    let voxel = |p: WorldPoint| {
+        let at = grid.affine().to_voxel(p).0;
+        let [i, j, k] = std::array::from_fn(|a| (at[a].round().max(0.0) as usize).min(grid.shape()[a] - 1));
+        grid.index(i, j, k)
+    };
+    places.map(|p| strain.at(voxel(p))).collect()
+}
+
+/// What a report shows of a strain, worked out where it is asked for.
+pub struct StrainMaps<'a> {
+    result: &'a StrainResult,
+    maps: [Box<dyn Fn(usize) -> f32 + Sync + 'a>; 5],
+}
+
+impl<'a> StrainMaps<'a> {
+    pub fn of(result: &'a StrainResult) -> Self {
+        let StrainResult { strain, deviation, summary } = result;
+        let normal = move |at: usize| {
+            let d = deviation.at(place(strain.grid(), at));
+            ((d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / 3.0).sqrt() as f32
+        };
+        let maps: [Box<dyn Fn(usize) -> f32 + Sync + 'a>; 5] = [
+            Box::new(move |at| strain.principal(at)[0] as f32),
+            Box::new(move |at| strain.principal(at)[2] as f32),
+            Box::new(move |at| measure::largest_shear(&strain.at(at)) as f32),
+            Box::new(move |at| measure::volume_change(summary.measure, &strain.at(at)) as f32),
+            Box::new(normal),
+        ];
+        Self { result, maps }
+    }
+
+    pub fn report<'b>(
+        &'b self,
+        name: &'b str,
+        (displacement, bodies): (&'b DenseField, &'b Mask),
+        image: Option<&'b Volume>,
+    ) -> StrainReport<'b> {
+        let [largest, smallest, shear, volume, deviation] = &self.maps;
+        StrainReport {
+            name,
+            displacement,
+            image,
+            bodies,
+            largest,
+            smallest,
+            shear,
+            volume,
+            deviation,
+            summary: &self.result.summary,
+        }
+    }
 }

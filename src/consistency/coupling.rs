@@ -263,6 +263,8 @@ pub struct Posterior {
     /// Degrees of freedom that the data determine there, the node's part of `tr((A + L)^-1 A)` (see
     /// [`determined`]).
     pub determined: Vec<f32>,
+    /// Draws of the error, coefficients (mm, planar).
+    pub draws: Vec<Vec<f32>>,
 }
 
 /// Deviation and degrees of freedom of the coupled field at each node.
@@ -303,6 +305,7 @@ pub fn posterior(
     let share = 1.0 / (seen.len().max(1) * draws) as f32;
     let mut squares = vec![0.0f32; n];
     let mut determined = vec![0.0f32; n];
+    let mut drawn = Vec::with_capacity(draws);
     for first in (0..draws).step_by(SIDE_BY_SIDE) {
         let some: Vec<Vec<f32>> = (first..(first + SIDE_BY_SIDE).min(draws)).into_par_iter().map(draw).collect();
         for x in some {
@@ -311,10 +314,11 @@ pub fn posterior(
                 let at = std::array::from_fn(|c| f64::from(x[c * n + i]));
                 *d += quadratic(&blocks.at(i).map(f64::from), at) as f32 / draws as f32;
             }
+            drawn.push(x);
         }
     }
     let smooth = filters::gaussian(&squares, nodes, [1.0; 3]);
-    Posterior { deviation: smooth.iter().map(|v| v.sqrt()).collect(), determined }
+    Posterior { deviation: smooth.iter().map(|v| v.sqrt()).collect(), determined, draws: drawn }
 }
 
 /// The affine motions of a lattice, which no bending energy holds, under the data alone.

@@ -47,6 +47,15 @@ pub struct Choice {
     pub evidence: Vec<String>,
 }
 
+impl Choice {
+    /// The model that was asked for, whatever the evidence, through what was `measured`.
+    pub fn asked(self, model: MotionModel, measured: &[Measured]) -> Self {
+        let mut evidence = self.evidence;
+        evidence.push(format!("{}: as asked", model.name()));
+        Self { model, motion: nearest(model, measured), evidence }
+    }
+}
+
 /// Excess misfit per determined degree of freedom up to which a simpler model stands. Measured on
 /// 96 phantoms without motion (four kinds, three noise levels, two sizes, four seeds): median 0.49,
 /// nine in ten under 1.07, at most 1.39.
@@ -172,10 +181,24 @@ fn step<const N: usize>(
     cholesky_solve(h, b).unwrap_or([0.0; N])
 }
 
+fn weights(measured: &[Measured]) -> Vec<Symmetric3> {
+    measured.iter().map(|m| inverse(&m.covariance).unwrap_or([0.0; 6])).collect()
+}
+
 /// The rigid motion nearest to what was measured, robustly and weighed by the inverse covariances.
 pub fn nearest_rigid(measured: &[Measured]) -> AffineMotion {
-    let information: Vec<Symmetric3> = measured.iter().map(|m| inverse(&m.covariance).unwrap_or([0.0; 6])).collect();
-    fit_rigid(measured, &information)
+    fit_rigid(measured, &weights(measured))
+}
+
+/// The motion of a model nearest to what was measured, robustly and weighed by the inverse
+/// covariances; none for a free field.
+pub fn nearest(model: MotionModel, measured: &[Measured]) -> Option<AffineMotion> {
+    match model {
+        MotionModel::Identity => Some(AffineMotion::IDENTITY),
+        MotionModel::Rigid => Some(nearest_rigid(measured)),
+        MotionModel::Affine => Some(fit_affine(measured, &weights(measured), nearest_rigid(measured))),
+        MotionModel::Free => None,
+    }
 }
 
 /// Robust information-weighted rigid fit: twelve Gauss-Newton steps on (rotation vector, shift).

@@ -10,6 +10,4 @@ pub mod inverse;
 
 pub mod composition;
 
-pub mod strain;
-
 pub mod warp;

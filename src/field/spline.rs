@@ -6,7 +6,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{beside, nearest};
 use crate::numerics::simd::dispatch;
-use crate::types::{DenseField, Grid, Mask, Volume, VoxelPoint};
+use crate::types::{Affine, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at
@@ -60,6 +60,20 @@ fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
 pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
     let (spacing, linear) = (grid.spacing(), grid.affine().linear());
     std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
+}
+
+/// The nodes of a lattice over `grid` as a grid of their own.
+///
+/// # Errors
+/// [`SpaceError`] when they have no place.
+pub fn node_grid(grid: &Grid, lattice: &Lattice) -> Result<Grid, SpaceError> {
+    let linear = grid.affine().linear();
+    let WorldPoint(first) = grid.affine().to_world(VoxelPoint(lattice.place(0)));
+    let row = |r: usize| {
+        let [x, y, z] = std::array::from_fn(|a| linear[r][a] * lattice.step[a] as f64);
+        [x, y, z, first[r]]
+    };
+    Grid::new(lattice.nodes, Affine::new(std::array::from_fn(row))?)
 }
 
 /// The place (voxels of `grid`) of a voxel offset of the grid that a spline is asked for on.

@@ -15,7 +15,7 @@ use super::image::{Format, raw_field};
 use super::nifti;
 use crate::error::{IoError, UnknownName};
 use crate::types::names::choose;
-use crate::types::{DenseField, Grid, VoxelPoint, WorldPoint};
+use crate::types::{DenseField, ErrorSamples, Grid, VoxelPoint, WorldPoint};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -113,6 +113,22 @@ pub fn read_field_as(
         }
     }
     DenseField::from_vec(grid, values).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
+}
+
+/// Reads samples of a field's error as `write_samples` leaves them.
+///
+/// # Errors
+/// As [`read_field`].
+pub fn read_samples(path: impl AsRef<Path>) -> Result<ErrorSamples, IoError> {
+    let path = path.as_ref();
+    let (nodes, mut values) = nifti::read::samples(path)?;
+    for sample in &mut values {
+        sample[..2 * nodes.len()].iter_mut().for_each(|v| *v = -*v);
+    }
+    if values.iter().flatten().any(|v| !v.is_finite()) {
+        return Err(Flaw::new("holds a value that is not finite", "measure the field again").at(path));
+    }
+    ErrorSamples::new(nodes, values).map_err(|e| Flaw::new(e.to_string(), "measure the field again").at(path))
 }
 
 /// Replaces each voxel's three numbers by what `f` makes of its centre and of them.

@@ -45,6 +45,8 @@ pub mod skin;
 
 pub mod track;
 
+pub mod strain;
+
 pub mod stiffness;
 
 pub mod trials;
@@ -74,7 +76,7 @@ pub use csv::{
     PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches, table_kind,
     write_landmarks, write_matches, write_points,
 };
-pub use field::{FieldConvention, read_field, read_field_as};
+pub use field::{FieldConvention, read_field, read_field_as, read_samples};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
     stored_motion, stored_sample, write_energy, write_motions, write_pinch_map, write_posture_force, write_stability,
@@ -88,14 +90,16 @@ pub use live::abandon;
 pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
 pub use nifti::{
-    PackedField, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact, write_field,
-    write_field_series, write_integers, write_labels, write_series_field, write_steps, write_tensors, write_volume,
+    PackedField, STRAIN_BITS, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact,
+    write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field, write_steps,
+    write_tensor_deviations, write_tensors, write_vectors, write_volume,
 };
 pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
 pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
+pub use strain::write_region_strains;
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
 pub use trials::{write_stress, write_trials};

@@ -37,15 +37,22 @@ pub fn write_tet_mesh(
 }
 
 /// Writes a mesh through matches (mm, RAS): at each node the displacement, its `magnitude`, its
-/// `sigma`, and the `raw_displacement` that matching alone measured.
+/// `sigma`, the `raw_displacement` that matching alone measured, and the `strain` where it is known
+/// (xx, yy, zz, xy, xz, yz, RAS; VTK's order in the file).
 ///
 /// # Errors
 /// As [`write_tet_mesh`].
-pub fn write_match_mesh(path: impl AsRef<Path>, mesh: &Mesh, matches: &[&Match]) -> Result<(), IoError> {
+pub fn write_match_mesh(
+    path: impl AsRef<Path>,
+    mesh: &Mesh,
+    matches: &[&Match],
+    strain: Option<&[[f64; 6]]>,
+) -> Result<(), IoError> {
     let displacement: Vec<[f64; 3]> = matches.iter().map(|m| m.displacement).collect();
     let measured = AtNodes {
         sigma: matches.iter().map(|m| m.sigma() as f32).collect(),
         raw: matches.iter().map(|m| m.raw.map_or(m.displacement, |raw| raw.displacement)).collect(),
+        strain: strain.map(<[_]>::to_vec),
     };
     let (path, more) = (path.as_ref(), Some(&measured));
     match mesh {
@@ -84,6 +91,7 @@ pub fn write_tri_mesh(
 struct AtNodes {
     sigma: Vec<f32>,
     raw: Vec<[f64; 3]>,
+    strain: Option<Vec<[f64; 6]>>,
 }
 
 fn write<const N: usize>(
@@ -142,9 +150,13 @@ impl Appended {
         self.xml += "<PointData Vectors=\"displacement\" Scalars=\"magnitude\">\n";
         self.array("displacement", "Float32", 3, &vectors(&mut displacement.iter().copied()))?;
         self.array("magnitude", "Float32", 1, &bytes(displacement.iter().map(|d| length(d).to_le_bytes())))?;
-        if let Some(AtNodes { sigma, raw }) = more {
+        if let Some(AtNodes { sigma, raw, strain }) = more {
             self.array("sigma", "Float32", 1, &bytes(sigma.iter().map(|v| v.to_le_bytes())))?;
             self.array("raw_displacement", "Float32", 3, &vectors(&mut raw.iter().copied()))?;
+            if let Some(strain) = strain {
+                let in_vtk = strain.iter().flat_map(|&[xx, yy, zz, xy, xz, yz]| [xx, yy, zz, xy, yz, xz]);
+                self.array("strain", "Float32", 6, &bytes(in_vtk.map(|v| (v as f32).to_le_bytes())))?;
+            }
         }
         self.xml += "</PointData>\n<CellData>\n";
         for (name, values) in cell_data {

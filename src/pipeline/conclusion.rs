@@ -3,7 +3,7 @@
 
 use crate::consistency::coupling::Posterior;
 use crate::consistency::energy::distance;
-use crate::consistency::models::{AffineMotion, Choice, Excess, choose, nearest_rigid};
+use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
 use crate::consistency::pruning::Measured;
 use crate::field::spline::Spline;
 use crate::matching::levels::{from_level, to_level};
@@ -37,14 +37,14 @@ pub(super) struct Concluded {
 }
 
 impl Concluded {
-    /// The smallest motion that explains a body's matches, where it stays at rest, and what its
-    /// data leave open. `rigid` says that it moves rigidly, whatever the evidence.
+    /// The smallest motion that explains a body's matches, or that of the model that is `asked`
+    /// for, where it stays at rest, and what its data leave open.
     pub fn of(
         bodies: &Bodies,
         body: usize,
         pair: &Pair<'_>,
         matches: &[LevelMatch],
-        (rigid, seed): (bool, u64),
+        (asked, seed): (Option<MotionModel>, u64),
     ) -> Self {
         let (pair, field) = (bodies.part(pair, body), &bodies.fields[body]);
         let own = matches.iter().filter(|m| m.kept && bodies.label_near(m.voxel) == body);
@@ -54,12 +54,10 @@ impl Concluded {
         let posterior = level::posterior(field, pair.spacing, seed);
         let places_of = Places::new(&pair, &windows, &field.lattice, &posterior);
         let (mut choice, tried) = smallest(&measured, &pair, field, &by_place, &places_of, seed);
-        if rigid {
-            let motion = nearest_rigid(&rest::shown(&pair, field, |_| true));
-            choice.evidence.push("rigid: as asked".into());
-            choice = Choice { model: MotionModel::Rigid, motion: Some(motion), ..choice };
+        if let Some(model) = asked {
+            choice = choice.asked(model, &rest::shown(&pair, field, |_| true));
         }
-        let free = choice.motion.is_none() && ablation::is_on("rest");
+        let free = choice.motion.is_none() && asked.is_none() && ablation::is_on("rest");
         let rest = free.then(|| Rest::find((&pair, field), &windows, &places_of, &tried, &by_place)).flatten();
         drop(by_place);
         Self { choice, rest, posterior }
@@ -113,7 +111,7 @@ impl Concluded {
             let narrowed = |m: usize| rest.as_ref().map_or(1.0, |rest| rest.narrowed(place(lattice.within(m))));
             let narrowed: Vec<f32> = (0..lattice.len()).map(narrowed).collect();
             let nodes = AtNodes {
-                deviation: &posterior.deviation,
+                posterior: &posterior,
                 misfit: &misfit,
                 departure: &departure,
                 narrowed: &narrowed,

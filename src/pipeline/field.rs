@@ -48,6 +48,8 @@ pub struct FieldResult {
     pub spline: Start,
     /// One standard deviation of the displacement (mm).
     pub uncertainty: ScalarSpline,
+    /// Errors that the displacement may have, drawn at random.
+    pub samples: ErrorSamples,
     /// The body of each voxel of the mask, from 1; 0 outside it.
     pub bodies: Mask,
     /// All matches with covariance.
@@ -278,8 +280,9 @@ fn canonical(
     progress("model", 0.9);
     let flat = grid.is_single_slice();
     let is_rigid = |b: usize| given.as_ref().is_some_and(|g| params.rigid.contains(&g.names[b]));
+    let asked_of = |b: usize| if is_rigid(b) { Some(MotionModel::Rigid) } else { params.model.asked() };
     let concluded: Vec<Concluded> =
-        (0..bodies.count()).map(|b| Concluded::of(&bodies, b, &pair, &matches, (is_rigid(b), params.seed))).collect();
+        (0..bodies.count()).map(|b| Concluded::of(&bodies, b, &pair, &matches, (asked_of(b), params.seed))).collect();
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
     let name = |b: usize| given.as_ref().map_or(b as u8 + 1, |g| g.names[b]);
     let (model, mut evidence) = Concluded::together(&concluded, &bodies, &pair, name);
@@ -342,12 +345,13 @@ fn canonical(
         variances = variances.with_other_motions(begun.share(), search);
     }
     let uncertainty = variances.deviation(&grid, factor);
+    let samples = variances.samples(&grid, factor)?;
     let sparse = estimated(sparse, &grid, (&coefficients, &uncertainty));
     clock.book("uncertainty");
 
     // Mesh and dense field.
     progress("mesh", 0.92);
-    let (mesh, source) = triangulate(&sparse, flat)?;
+    let (mesh, source) = mesh_of(&sparse, flat)?;
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
@@ -403,6 +407,7 @@ fn canonical(
         coefficients,
         spline,
         uncertainty,
+        samples,
         bodies: labelled,
         matches: sparse,
         mesh,
@@ -794,7 +799,10 @@ fn thinned(sparse: SparseField, wanted: usize) -> SparseField {
 }
 
 /// The Delaunay mesh of the kept matches, and the kept match of each node.
-pub(super) fn triangulate(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
+///
+/// # Errors
+/// [`FieldError`] when they do not span the space, or the plane of a `flat` volume.
+pub fn mesh_of(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
     let places: Vec<WorldPoint> = sparse.kept().map(|m| m.initial).collect();
     if !flat {
         match delaunay3(&places) {

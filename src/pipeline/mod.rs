@@ -21,6 +21,8 @@ pub mod skin;
 
 pub mod track;
 
+pub mod strain;
+
 pub mod stiffness;
 
 pub mod stiffness_sequence;

@@ -8,7 +8,7 @@
 //! Where the motion varies within a patch or between matches, that detail is lost: the full method
 //! is better there.
 
-use crate::consistency::coupling::{Evidence, Posterior};
+use crate::consistency::coupling::Evidence;
 use crate::consistency::energy::distance;
 use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
 use crate::consistency::pruning::{GATE, Measured, prune};
@@ -29,6 +29,7 @@ use crate::pipeline::conclusion;
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
 use crate::pipeline::hypotheses::Search;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::rest;
 use crate::pipeline::stages::{self, Left};
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::*;
@@ -160,13 +161,16 @@ pub(super) fn measure(
     // The smallest motion that explains the matches, and what they leave open.
     progress("model", 0.9);
     let mut choice = smallest(&matches, &pair, &field, params.seed);
+    if let Some(model) = params.model.asked() {
+        choice = choice.asked(model, &rest::shown(&pair, &field, |_| true));
+    }
     choice.evidence.insert(0, MADE_BY.into());
     choice.evidence.extend(background::why_unseen(cut));
     let corners = reports.last().map_or(0, |r| r.counts.features_initial);
     choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
     let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
     clock.book("model");
-    let Posterior { deviation, .. } = level::posterior(&field, pair.spacing, params.seed);
+    let posterior = level::posterior(&field, pair.spacing, params.seed);
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
     let misfit = residual::misfit_by_place(&pair, &warped, &field.lattice);
     let hidden = conclusion::hidden(&pair, &field);
@@ -174,19 +178,20 @@ pub(super) fn measure(
 
     let full = conclusion::full_lattice(&grid, &field, factor, (&choice, factor));
     let departure = conclusion::departure(&full, &field, factor);
-    let narrowed = vec![1.0; deviation.len()];
+    let narrowed = vec![1.0; departure.len()];
     let nodes =
-        AtNodes { deviation: &deviation, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
+        AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
     let variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
     let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
     let uncertainty = variances.deviation(&grid, factor);
+    let samples = variances.samples(&grid, factor)?;
     let stages = stages::account(&grid, (&pair, factor), left, &coefficients);
     let measured = SparseField { matches: matches.iter().map(|m| field::world_match(&grid, m, factor)).collect() };
     let sparse = field::estimated(measured, &grid, (&coefficients, &uncertainty));
     clock.book("uncertainty");
 
     progress("mesh", 0.92);
-    let (mesh, source) = field::triangulate(&sparse, flat)?;
+    let (mesh, source) = field::mesh_of(&sparse, flat)?;
     let at_nodes: Vec<&Match> = sparse.kept().collect();
     let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
     clock.book("mesh");
@@ -237,6 +242,7 @@ pub(super) fn measure(
         coefficients,
         spline: Start { motion: field.into(), factor, followed: None },
         uncertainty,
+        samples,
         bodies: conclusion::labelled(&mask, &[], |_| 1),
         matches: sparse,
         mesh,

@@ -8,13 +8,15 @@
 //! coefficients.
 
 use crate::error::FieldError;
-use crate::field::strain::{StrainField, StrainStatistics};
 use crate::matching::levels::foreground;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{displacement, inside};
 use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
 use crate::pipeline::modes::{self, Modes};
+use crate::strain::StrainField;
+use crate::strain::gauge::Gauge;
+use crate::strain::statistics::StrainStatistics;
 use crate::types::params::Interpolation;
 use crate::types::*;
 use rayon::prelude::*;
@@ -144,10 +146,9 @@ pub fn run<'v, E: From<FieldError>>(
         } else {
             result.displacement = displacement;
         }
-        let strain = match result.summary.bodies.len() {
-            0 | 1 => StrainField::of(&result.displacement),
-            _ => StrainField::of_bodies(&result.displacement, &result.bodies)?,
-        };
+        let bodies = if result.summary.bodies.len() < 2 { &[] } else { result.bodies.as_slice() };
+        let gauge = Gauge::shortest(result.displacement.grid());
+        let strain = StrainField::of(&result.displacement, bodies, gauge, StrainMeasure::GreenLagrange);
         points.add(number, &result, volume.grid());
         for (label, offsets) in &regions {
             let StrainStatistics { voxels, mean, peak, shear, volume_change } =

@@ -7,12 +7,17 @@
 //! that the search could not rule out. One calibration ([`BAND`], [`MEAN`], [`SPREAD`]) is fitted
 //! on half of the scenes: docs/lab/2026-11-expected-error.md.
 
-use crate::field::spline::ScalarSpline;
+use crate::consistency::coupling::Posterior;
+use crate::error::SpaceError;
+use crate::field::spline::{self, ScalarSpline};
 use crate::matching::levels::to_level;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::bodies::Bodies;
-use crate::types::{BodyReport, DenseField, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel};
+use crate::types::{
+    BodyReport, DenseField, ErrorSamples, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel,
+};
+use rayon::prelude::*;
 
 /// Standard deviation over the posterior's such that 95 % of the errors lie in the 95 % region (1).
 const BAND: f32 = 1.05;
@@ -41,8 +46,8 @@ const SAMPLED: usize = 25_000;
 
 /// What one body's data say at the nodes of its lattice.
 pub(super) struct AtNodes<'a> {
-    /// Standard deviation of the free field (mm, one axis).
-    pub deviation: &'a [f32],
+    /// What the data leave open of the free field.
+    pub posterior: &'a Posterior,
     /// Mean square of the residual over the noise's (1).
     pub misfit: &'a [f32],
     /// Departure of the stated motion from the free field (mm).
@@ -58,6 +63,9 @@ pub(super) struct Variances {
     lattice: Lattice,
     /// In the order of [`ErrorSource::ALL`].
     parts: [Vec<f32>; 6],
+    /// Draws of the free field's error (coefficients, mm, planar), and their variance (mm^2).
+    free: Vec<f32>,
+    draws: Vec<Vec<f32>>,
 }
 
 impl Variances {
@@ -70,7 +78,7 @@ impl Variances {
         let mut parts: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; lattice.len()]);
         for m in 0..lattice.len() {
             let narrowed = (BAND * nodes.narrowed[m]).powi(2);
-            let free = narrowed * nodes.deviation[m].powi(2);
+            let free = narrowed * nodes.posterior.deviation[m].powi(2);
             let model = narrowed * nodes.departure[m].powi(2) / axes as f32;
             let noise = free + interpolation;
             let misfit = free * (nodes.misfit[m] - 1.0).max(0.0);
@@ -78,7 +86,8 @@ impl Variances {
             let all = [noise, misfit, model, more * (noise + misfit + model), 0.0, 0.0];
             all.into_iter().zip(&mut parts).for_each(|(v, part)| part[m] = v);
         }
-        Self { lattice, parts }
+        let draws = nodes.posterior.draws.clone();
+        Self { free: variance_of(&lattice, &draws), lattice, parts, draws }
     }
 
     /// On the closest lattice of all bodies, each node's from the body there.
@@ -88,17 +97,24 @@ impl Variances {
         }
         let closest = (0..all.len()).max_by_key(|&b| all[b].lattice.len()).unwrap_or(0);
         let lattice = all[closest].lattice.clone();
-        let at = |part: usize, m: usize| {
+        let n = lattice.len();
+        let at = |values: &dyn Fn(&Self) -> &[f32], m: usize| {
             let place = lattice.within(m);
             let own = &all[bodies.label_near(place)];
-            if own.lattice == lattice {
-                own.parts[part][m]
-            } else {
-                own.lattice.stencil_near(place).gather(&own.parts[part])
-            }
+            if own.lattice == lattice { values(own)[m] } else { own.lattice.stencil_near(place).gather(values(own)) }
         };
-        let parts = std::array::from_fn(|part| (0..lattice.len()).map(|m| at(part, m)).collect());
-        Self { lattice, parts }
+        let each = |values: &dyn Fn(&Self) -> &[f32]| (0..n).map(|m| at(values, m)).collect::<Vec<f32>>();
+        let parts = std::array::from_fn(|part| each(&|own| &own.parts[part]));
+        let free = each(&|own| &own.free);
+        let component = |d: usize, c: usize| {
+            each(&|own| {
+                let n = own.lattice.len();
+                &own.draws[d][c * n..(c + 1) * n]
+            })
+        };
+        let draw = |d: usize| (0..3).flat_map(|c| component(d, c)).collect();
+        let draws = (0..all[closest].draws.len()).map(draw).collect();
+        Self { lattice, parts, free, draws }
     }
 
     fn part(&mut self, source: ErrorSource) -> &mut Vec<f32> {
@@ -126,20 +142,53 @@ impl Variances {
         self
     }
 
+    /// The standard deviation along an axis (mm) at node `m`.
+    fn at_node(&self, m: usize) -> f32 {
+        self.parts.iter().map(|part| part[m]).sum::<f32>().sqrt()
+    }
+
+    /// The lattice over the full-resolution `grid`, of which this one has `factor` voxels each.
+    fn full(&self, grid: &Grid, factor: [usize; 3]) -> Lattice {
+        Lattice::new(grid.shape(), std::array::from_fn(|a| self.lattice.step[a] * factor[a]))
+    }
+
+    /// Coefficients (planar, three components) on the lattice over the full-resolution grid.
+    fn on_full(&self, full: &Lattice, coefficients: Vec<f32>, factor: [usize; 3]) -> Vec<f32> {
+        match full.nodes == self.lattice.nodes {
+            true => coefficients,
+            false => full.fit(|p| self.lattice.at(&coefficients, to_level(p, factor))),
+        }
+    }
+
     /// The standard deviation along an axis (mm) over the full-resolution `grid`; the lattice lies
     /// on a level of `factor`.
     pub fn deviation(&self, grid: &Grid, factor: [usize; 3]) -> ScalarSpline {
-        let coarse = &self.lattice;
-        let at = |m: usize| self.parts.iter().map(|part| part[m]).sum::<f32>().sqrt();
-        let deviation: Vec<f32> = (0..coarse.len()).map(at).collect();
-        let full = Lattice::new(grid.shape(), std::array::from_fn(|a| coarse.step[a] * factor[a]));
-        if full.nodes == coarse.nodes {
-            return ScalarSpline::new(*grid, full, deviation);
-        }
-        let three: Vec<f32> = deviation.iter().chain(&deviation).chain(&deviation).copied().collect();
-        let values = full.fit(|p| coarse.at(&three, to_level(p, factor)));
-        let values = values[..full.len()].to_vec();
+        let deviation: Vec<f32> = (0..self.lattice.len()).map(|m| self.at_node(m)).collect();
+        let full = self.full(grid, factor);
+        let mut values = self.on_full(&full, deviation.repeat(3), factor);
+        values.truncate(full.len());
         ScalarSpline::new(*grid, full, values)
+    }
+
+    /// Errors that the displacement may have (mm, RAS): draws of the free field's, each node's
+    /// widened to all that it is uncertain by.
+    ///
+    /// # Errors
+    /// [`SpaceError`] when the lattice's place cannot be told.
+    pub fn samples(&self, grid: &Grid, factor: [usize; 3]) -> Result<ErrorSamples, SpaceError> {
+        let n = self.lattice.len();
+        let wider: Vec<f32> =
+            (0..n).map(|m| self.at_node(m) / self.free[m].sqrt().max(f32::MIN_POSITIVE.sqrt())).collect();
+        let full = self.full(grid, factor);
+        let axes = spline::axes(grid);
+        let sample = |draw: &Vec<f32>| {
+            let widened = draw.iter().enumerate().map(|(at, v)| v * wider[at % n]).collect();
+            let along = self.on_full(&full, widened, factor);
+            let n = full.len();
+            let world = |r: usize, m: usize| (0..3).map(|a| axes[r][a] as f32 * along[a * n + m]).sum::<f32>();
+            (0..3).flat_map(|r| (0..n).map(move |m| (r, m))).map(|(r, m)| world(r, m)).collect()
+        };
+        ErrorSamples::new(spline::node_grid(grid, &full)?, self.draws.iter().map(sample).collect())
     }
 
     /// Each source's share of the variance at these voxels, greatest first.
@@ -179,6 +228,18 @@ impl Variances {
             labels: Some(by_label(deviation, field, mask)).filter(|labels| labels.len() > 1).unwrap_or_default(),
         }
     }
+}
+
+/// The variance along an axis (mm^2) of the fields of these coefficients, at the nodes. Neighbours are
+/// left out: beyond the tissue they are far more uncertain.
+fn variance_of(lattice: &Lattice, draws: &[Vec<f32>]) -> Vec<f32> {
+    let seen = (0..3).filter(|&a| lattice.shape[a] > 1).count().max(1);
+    let square = |m: usize| {
+        let stencil = lattice.stencil_near(lattice.within(m));
+        let one = |draw: &Vec<f32>| draw.chunks_exact(lattice.len()).map(|c| stencil.gather(c).powi(2)).sum::<f32>();
+        draws.iter().map(one).sum::<f32>() / (seen * draws.len().max(1)) as f32
+    };
+    (0..lattice.len()).into_par_iter().map(square).collect()
 }
 
 /// Displacement magnitude at a voxel (mm).

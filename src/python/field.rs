@@ -84,6 +84,7 @@ pub fn field<'py>(
             node_displacement: &result.node_displacement,
             summary: &result.summary,
             truth: None,
+            strain: None,
         };
         let summary = json::field_summary(&report);
         let warped = kept(warped, io::stored);

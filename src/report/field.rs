@@ -1,5 +1,6 @@
 //! What the report of `palpate field` is made from.
 
+use crate::report::strain::StrainReport;
 use crate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, Mesh, Metrics, SparseField, Voxels};
 
 /// A value for each voxel offset (x fastest): a volume, or what can be worked out where a picture
@@ -43,6 +44,8 @@ pub struct FieldReport<'a> {
     pub summary: &'a FieldSummary,
     /// The true displacement and the score against it, where the truth is known.
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
+    /// The strain, where it was asked for.
+    pub strain: Option<StrainReport<'a>>,
 }
 
 #[cfg(test)]
@@ -172,6 +175,7 @@ pub(crate) mod tests {
                 node_displacement: &[[1.0, 0.0, 0.0]; 4],
                 summary: &self.summary,
                 truth: None,
+                strain: None,
             }
         }
     }

@@ -12,7 +12,7 @@ use crate::report::statistics::{Histogram, sample};
 use crate::report::verdict::{short2, verdict};
 use crate::report::viewer::{Layer, Moment, Viewer, elements};
 use crate::report::views::Views;
-use crate::report::{chart, tables};
+use crate::report::{chart, strain, tables};
 use crate::types::Mesh;
 use std::fmt::Write;
 
@@ -66,7 +66,11 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     if let Some(bodies) = &views.bodies {
         body.push_str(&card(bodies));
     }
-    body.push_str("</div></section><section><h2>How far to trust it</h2><div class=\"grid\">");
+    body.push_str("</div></section>");
+    if let Some(strain) = &report.strain {
+        body.push_str(&strain::section(strain)?);
+    }
+    body.push_str("<section><h2>How far to trust it</h2><div class=\"grid\">");
     body.push_str(&card(&views.uncertainty));
     let (dots, slab, precision) = &views.matches;
     let note = format!(

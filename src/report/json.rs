@@ -1,6 +1,7 @@
 //! summary.json of `palpate field`.
 
 use crate::report::field::FieldReport;
+use crate::report::strain;
 use crate::report::verdict::verdict;
 use crate::types::Grid;
 use serde_json::{Map, Value, json};
@@ -54,6 +55,9 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
     });
     if let Some((_, metrics)) = report.truth {
         out["metrics"] = json!(metrics);
+    }
+    if let Some(strain) = &report.strain {
+        out["strain"] = strain::summary(strain);
     }
     out
 }

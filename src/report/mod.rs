@@ -63,6 +63,8 @@ pub mod grasp_surface;
 
 pub mod grasp_analysis;
 
+pub mod strain;
+
 pub mod stiffness;
 
 pub mod axes;

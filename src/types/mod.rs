@@ -23,6 +23,10 @@ pub mod expected;
 
 pub mod result;
 
+pub mod samples;
+
+pub mod strain;
+
 pub mod track;
 
 pub mod names;
@@ -49,9 +53,11 @@ pub use metrics::{InverseConsistency, Metrics};
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
 pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel, StageReport};
+pub use samples::ErrorSamples;
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
+pub use strain::{GaugeTrial, RegionStrain, StrainMeasure, StrainSummary};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Together, Tracked, Trajectory};
 pub use trial::{Part, Standing, Stated, StressCurve, StressRun, Trial};
 pub use volume::{Mask, Volume, Voxels};

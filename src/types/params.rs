@@ -1,6 +1,7 @@
 //! Parameters of the field pipeline: default, range, unit and source of each.
 
 use crate::error::ParamError;
+use crate::types::MotionModel;
 use serde::{Deserialize, Serialize};
 
 /// How much time to spend.
@@ -39,6 +40,36 @@ pub enum BodySource {
     Bonded,
     /// The labels of the mask.
     Given,
+}
+
+/// Which motion model stands for each body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Default)]
+#[serde(rename_all = "lowercase")]
+pub enum ModelSource {
+    /// The smallest that explains the volumes.
+    #[default]
+    Auto,
+    /// Nothing moves.
+    Identity,
+    /// One rotation and one translation.
+    Rigid,
+    /// One affine map.
+    Affine,
+    /// A free field, also where nothing seems to move.
+    Free,
+}
+
+impl ModelSource {
+    /// The model that was asked for; none where the volumes choose.
+    pub fn asked(self) -> Option<MotionModel> {
+        match self {
+            Self::Auto => None,
+            Self::Identity => Some(MotionModel::Identity),
+            Self::Rigid => Some(MotionModel::Rigid),
+            Self::Affine => Some(MotionModel::Affine),
+            Self::Free => Some(MotionModel::Free),
+        }
+    }
 }
 
 /// How the dense field is made from the measured places.
@@ -93,6 +124,8 @@ pub struct FieldParams {
     pub consistency: bool,
     /// Whether matches are refined to a fraction of a voxel. Only for comparisons.
     pub sub_voxel: bool,
+    /// Which motion model stands for each body.
+    pub model: ModelSource,
     /// Which bodies there are.
     pub bodies: BodySource,
     /// Labels of the given bodies that move rigidly.
@@ -109,7 +142,7 @@ impl Default for FieldParams {
 
 impl FieldParams {
     /// Names of all parameters, as files have them.
-    pub const KEYS: [&str; 17] = [
+    pub const KEYS: [&str; 18] = [
         "preset",
         "method",
         "points",
@@ -124,6 +157,7 @@ impl FieldParams {
         "candidates",
         "consistency",
         "sub_voxel",
+        "model",
         "bodies",
         "rigid",
         "seed",
@@ -146,6 +180,7 @@ impl FieldParams {
             candidates: 8,
             consistency: true,
             sub_voxel: true,
+            model: ModelSource::Auto,
             bodies: BodySource::Found,
             rigid: Vec::new(),
             seed: 1,

@@ -25,6 +25,15 @@ pub(in crate::io) fn field(path: &Path, flat: bool) -> Result<(Grid, Vec<f32>, I
     Ok((plan.grid, values, plan.intent))
 }
 
+/// The grid and the samples of a field's error (planar, three components each), LPS.
+pub(in crate::io) fn samples(path: &Path) -> Result<(Grid, Vec<Vec<f32>>), IoError> {
+    let (plan, values) = load(path, samples_layout)?;
+    let n = plan.grid.len();
+    let frames = values.len() / (3 * n);
+    let of = |frame: usize| (0..3).flat_map(|c| &values[(c * frames + frame) * n..][..n]).copied().collect();
+    Ok((plan.grid, (0..frames).map(of).collect()))
+}
+
 /// What the header says about the file, and its intent.
 pub(in crate::io) fn header(path: &Path) -> Result<(Stored, i64), IoError> {
     open(path)?.stored().map_err(|flaw| flaw.at(path))
@@ -75,6 +84,14 @@ fn field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
     match h.intent {
         1006 | 1007 => Ok(3),
         code => Err(Flaw::new(format!("is not a displacement field: intent {code} instead of 1007 (vector)"), hint)),
+    }
+}
+
+/// Samples of a field's error have it on the fourth axis, and three components.
+fn samples_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
+    match (axes[4..] == [3, 1, 1], h.intent) {
+        (true, 1007) => Ok(3 * axes[3]),
+        _ => Err(Flaw::new("does not hold samples of a field's error", "give posterior.nii.gz of palpate field")),
     }
 }
 

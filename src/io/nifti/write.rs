@@ -6,7 +6,7 @@ use crate::io::atomic::write_atomic;
 use crate::io::flaw::Flaw;
 use crate::io::gzip::{Chunk, Member, Run};
 use crate::numerics::simd::dispatch;
-use crate::types::{DenseField, Grid, Mask, Volume};
+use crate::types::{DenseField, ErrorSamples, Grid, Mask, Volume};
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::fs::File;
@@ -189,6 +189,11 @@ pub fn write_field_series(
     })
 }
 
+/// Strains are multiples of 2^-18, four microstrain.
+pub const STRAIN_BITS: i32 = 18;
+/// Component of ours, and its sign in LPS, for each one of a tensor on disk.
+const ON_DISK: [(usize, f32); 6] = [(0, 1.0), (3, 1.0), (1, 1.0), (4, -1.0), (5, -1.0), (2, 1.0)];
+
 /// Writes a symmetric tensor a voxel as NIfTI's intent 1005 has it: (nx, ny, nz, 1, 6), the lower
 /// triangle row by row, with axes in LPS. `tensors` are xx, yy, zz, xy, xz, yz in RAS, x fastest;
 /// rounded to multiples of 2^-18.
@@ -201,15 +206,60 @@ pub fn write_tensors(
     tensors: &[[f32; 6]],
     description: &str,
 ) -> Result<(), IoError> {
-    /// Component of ours, and its sign in LPS, for each one on disk.
-    const ON_DISK: [(usize, f32); 6] = [(0, 1.0), (3, 1.0), (1, 1.0), (4, -1.0), (5, -1.0), (2, 1.0)];
-    const STEPS: f32 = 262_144.0;
+    let step = stored_steps(STRAIN_BITS);
     let form = Form { components: 6, intent: SYMMETRIC, description, ..Form::FLOATS };
     write(path.as_ref(), grid, form, &[tensors; 6], |c, t: [f32; 6]| {
         let (component, sign) = ON_DISK[c];
-        ((sign * t[component] * STEPS).round_ties_even() / STEPS + 0.0).to_le_bytes()
+        step(sign * t[component]).to_le_bytes()
     })
     .map(drop)
+}
+
+/// Writes standard deviations of the six components of a tensor as [`write_tensors`] does the
+/// tensor; they have no sign.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_tensor_deviations(
+    path: impl AsRef<Path>,
+    grid: &Grid,
+    deviations: &[[f32; 6]],
+    description: &str,
+) -> Result<(), IoError> {
+    let form = Form { components: 6, intent: SYMMETRIC, description, ..Form::FLOATS };
+    let step = stored_steps(STRAIN_BITS);
+    let kept = |c: usize, d: [f32; 6]| step(d[ON_DISK[c].0]).to_le_bytes();
+    write(path.as_ref(), grid, form, &[deviations; 6], kept).map(drop)
+}
+
+/// Writes several numbers a voxel, (nx, ny, nz, 1, N), rounded to multiples of 2^-`bits`.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_vectors<const N: usize>(
+    path: impl AsRef<Path>,
+    grid: &Grid,
+    vectors: &[[f32; N]],
+    description: &str,
+    bits: i32,
+) -> Result<(), IoError> {
+    let form = Form { components: N as i16, intent: 1007, description, ..Form::FLOATS };
+    let step = stored_steps(bits);
+    write(path.as_ref(), grid, form, &vec![vectors; N], |c, v: [f32; N]| step(v[c]).to_le_bytes()).map(drop)
+}
+
+/// Writes samples of a field's error as B-spline coefficients (mm): (nodes along x, y, z, samples,
+/// 3), intent 1007, float32, LPS.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> Result<(), IoError> {
+    let (n, frames) = (samples.nodes().len(), samples.values().len());
+    let form = Form { frames, description: "samples of the error of u: cubic B-splines, LPS mm", ..Form::VECTORS };
+    let parts: Vec<&[f32]> =
+        (0..3).flat_map(|c| samples.values().iter().map(move |s| &s[c * n..(c + 1) * n])).collect();
+    let kept = |part: usize, v: f32| stored(if part < 2 * frames { -v } else { v } + 0.0).to_le_bytes();
+    write(path.as_ref(), samples.nodes(), form, &parts, kept).map(drop)
 }
 
 /// A length (mm) as [`write_field`] keeps it on `grid`: of 10 um voxels 2^-12 mm would be 2 %.

@@ -1,0 +1,249 @@
+//! report.html, summary.json and the short summary of `palpate strain`, and its part of a field's
+//! page.
+
+use crate::error::ReportError;
+use crate::report::colormap::ColorMap;
+use crate::report::field::Values;
+use crate::report::grasp::tile;
+use crate::report::html::{card, document, escape};
+use crate::report::json::{grid, seconds};
+use crate::report::panels::{Panel, centre_of_motion, gray_range};
+use crate::report::scale::{Scale, significant, thousands};
+use crate::report::section::Section;
+use crate::report::statistics::{quantile, sample};
+use crate::report::tables::table;
+use crate::types::{DenseField, Mask, RegionStrain, StrainSummary, Voxels};
+use serde_json::{Map, Value, json};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+/// Strain with what it was taken from, all on one grid.
+#[derive(Clone, Copy)]
+pub struct StrainReport<'a> {
+    /// The field, as it is called.
+    pub name: &'a str,
+    /// The displacement (mm, RAS).
+    pub displacement: &'a DenseField,
+    /// An image of the tissue, where there is one.
+    pub image: Option<&'a Voxels<'a>>,
+    /// The body of each voxel; 0 outside.
+    pub bodies: &'a Mask,
+    /// Largest principal strain (1).
+    pub largest: Values<'a>,
+    /// Smallest principal strain (1).
+    pub smallest: Values<'a>,
+    /// Largest shear (1).
+    pub shear: Values<'a>,
+    /// Relative change of volume (1).
+    pub volume: Values<'a>,
+    /// Standard deviation of a normal strain (1).
+    pub deviation: Values<'a>,
+    /// The rest.
+    pub summary: &'a StrainSummary,
+}
+
+/// A part as a percentage.
+fn percent(v: f64) -> String {
+    significant(100.0 * v)
+}
+
+fn measure(report: &StrainReport<'_>) -> &'static str {
+    match report.summary.measure.name() {
+        "green-lagrange" => "Green-Lagrange strain",
+        "small" => "small strain",
+        _ => "logarithmic strain",
+    }
+}
+
+/// The result in a sentence.
+fn headline(report: &StrainReport<'_>) -> String {
+    let s = report.summary;
+    format!(
+        "Strain over a gauge of {} mm is known to ± {} % (one standard deviation of a normal strain); its root mean square is {} %.",
+        significant(s.gauge_mm),
+        percent(s.noise),
+        percent(s.strain)
+    )
+}
+
+/// Where the gauge comes from.
+fn gauge(s: &StrainSummary) -> String {
+    let sides = s.gauge_axes_mm.map(significant).join(" x ");
+    let why = if s.gauge_asked { "as asked" } else { "the least error to expect" };
+    format!("{} mm ({sides} along the voxel axes), {why}", significant(s.gauge_mm))
+}
+
+/// The keys are those of docs/file-formats.md.
+pub fn summary(report: &StrainReport<'_>) -> Value {
+    let s = report.summary;
+    let mut regions: BTreeMap<String, Map<String, Value>> = BTreeMap::new();
+    for r in &s.regions {
+        let [mean, sd, p5, p95] = r.values;
+        let known = |v: f64| if v.is_finite() { json!(v) } else { Value::Null };
+        let [mean_sd, sd_sd, p5_sd, p95_sd] = r.errors.map(known);
+        let value = json!({
+            "mean": mean, "sd": sd, "p5": p5, "p95": p95,
+            "mean_sd": mean_sd, "sd_sd": sd_sd, "p5_sd": p5_sd, "p95_sd": p95_sd, "voxels": r.voxels,
+        });
+        regions.entry(r.label.to_string()).or_default().insert(r.component.into(), value);
+    }
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "strain",
+        "inputs": { "field": report.name },
+        "grid": grid(report.displacement.grid()),
+        "measure": s.measure,
+        "gauge_mm": s.gauge_mm,
+        "gauge_axes_mm": s.gauge_axes_mm,
+        "gauge_asked": s.gauge_asked,
+        "gauges": s.gauges,
+        "noise": s.noise,
+        "strain_rms": s.strain,
+        "deviation_from": s.deviation_from,
+        "regions": regions,
+        "trust": s.trust.name(),
+        "trust_reasons": s.trust_reasons,
+        "seconds": seconds(&s.seconds),
+        "warnings": s.warnings,
+    })
+}
+
+/// What is shown of a region on the console and in the table.
+const SHOWN: [&str; 9] = ["e1", "e2", "e3", "shear", "volume", "fibre", "radial", "circumferential", "axial"];
+
+/// The rows of the regions: label, component and the four numbers in percent.
+fn rows(regions: &[RegionStrain]) -> Vec<Vec<String>> {
+    let shown = regions.iter().filter(|r| SHOWN.contains(&r.component));
+    let with = |v: f64, error: f64| match error.is_finite() {
+        true => format!("{} ± {}", percent(v), percent(error)),
+        false => percent(v),
+    };
+    let row = |r: &RegionStrain| {
+        let numbers = (0..4).map(|k| with(r.values[k], r.errors[k]));
+        [r.label.to_string(), r.component.to_string()].into_iter().chain(numbers).collect()
+    };
+    shown.map(row).collect()
+}
+
+/// What was found, a few lines.
+pub fn text(report: &StrainReport<'_>) -> String {
+    let s = report.summary;
+    let mut out = format!("{}\n", headline(report));
+    let _ = writeln!(out, "  measure      {}", measure(report));
+    let _ = writeln!(out, "  gauge        {}", gauge(s));
+    let _ = writeln!(out, "  deviation    from {}", s.deviation_from);
+    let mut labels: Vec<u8> = s.regions.iter().map(|r| r.label).collect();
+    labels.dedup();
+    for label in labels.iter().take(8) {
+        let mean = |component: &str| {
+            let found = s.regions.iter().find(|r| r.label == *label && r.component == component)?;
+            let error =
+                if found.errors[0].is_finite() { format!(" ± {}", percent(found.errors[0])) } else { "".into() };
+            Some(format!("{component} {}{error} %", percent(found.values[0])))
+        };
+        let means: Vec<String> = SHOWN.iter().filter_map(|c| mean(c)).collect();
+        let _ = writeln!(out, "  {:<12} {}", format!("label {label}"), means.join(", "));
+    }
+    let _ = writeln!(out, "  trust        {}: {}", s.trust.name(), s.trust_reasons.join("; "));
+    out
+}
+
+/// Pictures, regions and gauges.
+///
+/// # Errors
+/// [`ReportError`] when a picture cannot be encoded.
+pub fn section(report: &StrainReport<'_>) -> Result<String, ReportError> {
+    let s = report.summary;
+    let grid = report.displacement.grid();
+    let centre = centre_of_motion(report.displacement, Some(report.bodies));
+    let sections = Section::through(grid, centre);
+    let blank = Voxels::filled(*grid, 0.0f32);
+    let image = report.image.unwrap_or(&blank);
+    let base = (image, gray_range(image));
+    let inside = sample(grid.len(), Some(report.bodies));
+    let most = |values: Values<'_>| quantile(inside.iter().map(|&o| 100.0 * f64::from(values(o)).abs()), 0.98);
+    let panel = |title: &str, values: Values<'_>, scale: Scale, note: &str| {
+        let shown = |o: usize| 100.0 * values(o);
+        Ok(card(&Panel::coloured(title, &sections, base, Some(report.bodies), scale, shown)?.with_note(note)))
+    };
+    let about = |values: Values<'_>| Scale::about(0.0, most(values), "%");
+    let from_zero = |values: Values<'_>, map| Scale::from_zero(most(values), "%", map);
+    let pictures = [
+        panel(
+            "Largest principal strain",
+            report.largest,
+            about(report.largest),
+            "Red: the tissue is stretched most this much.",
+        )?,
+        panel(
+            "Smallest principal strain",
+            report.smallest,
+            about(report.smallest),
+            "Blue: it is shortened most this much.",
+        )?,
+        panel("Largest shear", report.shear, from_zero(report.shear, ColorMap::Viridis), "")?,
+        panel(
+            "Change of volume",
+            report.volume,
+            about(report.volume),
+            "Muscle keeps its volume: what departs from 0 is error, or fluid.",
+        )?,
+        panel(
+            "Standard deviation",
+            report.deviation,
+            from_zero(report.deviation, ColorMap::Magma),
+            "Of a normal strain, in the same places.",
+        )?,
+    ];
+    let gauges: Vec<Vec<String>> =
+        s.gauges.iter().map(|g| vec![significant(g.gauge_mm), percent(g.noise), percent(g.error)]).collect();
+    let chosen = match gauges.is_empty() {
+        true => String::new(),
+        false => format!(
+            "<article><h3>Gauges that were tried</h3><p>The error holds what a longer gauge smooths away.</p>{}</article>",
+            table(&["Gauge, mm", "Noise, %", "Error to expect, %"], &gauges)
+        ),
+    };
+    Ok(format!(
+        "<section><h2>Strain</h2><p class=\"lead\">{} Gauge {}. Deviation from {}.</p><div class=\"grid\">{}{chosen}\
+         <article class=\"wide\"><h3>Regions</h3>{}</article></div></section>",
+        escape(&headline(report)),
+        escape(&gauge(s)),
+        escape(s.deviation_from),
+        pictures.concat(),
+        table(
+            &["Label", "Component", "Mean, %", "Spread, %", "5th percentile, %", "95th percentile, %"],
+            &rows(&s.regions)
+        )
+    ))
+}
+
+/// The page.
+///
+/// # Errors
+/// [`ReportError`] when a picture cannot be encoded.
+pub fn page(report: &StrainReport<'_>) -> Result<String, ReportError> {
+    let s = report.summary;
+    let voxels = report.bodies.as_slice().iter().filter(|l| **l != 0).count();
+    let mut body = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>strain</span></h1><p class=\"verdict\">{}</p>\
+         <p class=\"trust {trust}\"><b>Trust is {trust}</b> {}.</p></header><div class=\"tiles\">{}{}{}{}</div>",
+        env!("CARGO_PKG_VERSION"),
+        escape(report.name),
+        escape(&headline(report)),
+        escape(&s.trust_reasons.join("; ")),
+        tile(&percent(s.noise), "%", "deviation of a normal strain"),
+        tile(&percent(s.strain), "%", "root mean square strain"),
+        tile(&significant(s.gauge_mm), "mm", "gauge length"),
+        tile(&thousands(voxels), "", "voxels"),
+        trust = s.trust.name()
+    );
+    if !s.warnings.is_empty() {
+        let items: String = s.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
+    }
+    body += &section(report)?;
+    body += "<footer><p>Strain is on the initial volume, axes right, anterior, superior. A gauge is the side of the cube over which \
+             displacements give one strain: what is finer is smoothed away.</p></footer>";
+    Ok(document(&format!("Strain of {}", escape(report.name)), &body))
+}

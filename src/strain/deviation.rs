@@ -1,0 +1,206 @@
+//! How far off a strain may be, from random draws of the displacement's error.
+
+use super::gauge::{Gauge, map_gradients};
+use super::measure::{self, principal};
+use crate::error::SpaceError;
+use crate::numerics::bspline::weights;
+use crate::numerics::filters::gaussian;
+use crate::numerics::small::Symmetric3;
+use crate::types::space::Matrix3;
+use crate::types::{Affine, DenseField, ErrorSamples, Grid, StrainMeasure, WorldPoint};
+use rayon::prelude::*;
+
+/// The places of every so many voxels of a field, with random draws of its error there.
+#[derive(Debug, Clone)]
+pub struct Draws {
+    step: [usize; 3],
+    grid: Grid,
+    field: DenseField,
+    bodies: Vec<u8>,
+    errors: Vec<DenseField>,
+}
+
+/// The field of gradients by draw, the first without any error; each holds rows by components.
+pub type Gradients = Vec<Vec<Option<Matrix3>>>;
+
+impl Draws {
+    /// Places half as far apart as the nodes of the samples.
+    ///
+    /// # Errors
+    /// [`SpaceError`] when the places have no grid.
+    pub fn new(field: &DenseField, bodies: &[u8], samples: &ErrorSamples) -> Result<Self, SpaceError> {
+        let full = *field.grid();
+        let (shape, spacing) = (full.shape(), full.spacing());
+        // The nodes may run along other axes: the closest along any counts for all.
+        let nodes = samples.nodes();
+        let thick = (0..3).filter(|&a| nodes.shape()[a] > 1);
+        let apart = thick.map(|a| nodes.spacing()[a]).fold(f64::INFINITY, f64::min);
+        let step: [usize; 3] = std::array::from_fn(|a| ((apart / (2.0 * spacing[a])) as usize).clamp(1, shape[a]));
+        let (linear, WorldPoint(origin)) = (full.affine().linear(), full.affine().origin());
+        let row = |r: usize| {
+            let [x, y, z] = std::array::from_fn(|a| linear[r][a] * step[a] as f64);
+            [x, y, z, origin[r]]
+        };
+        let affine = Affine::new(std::array::from_fn(row))?;
+        let grid = Grid::new(std::array::from_fn(|a| (shape[a] - 1) / step[a] + 1), affine)?;
+        let at = |offset: usize| {
+            let v = grid.voxel(offset);
+            full.index(v[0] * step[0], v[1] * step[1], v[2] * step[2])
+        };
+        let thinned = DenseField::from_voxels(grid, |o, _| field.at(at(o)).map(f64::from));
+        let labels = if bodies.is_empty() { Vec::new() } else { (0..grid.len()).map(|o| bodies[at(o)]).collect() };
+        let errors =
+            drawn(&grid, samples).map(|values| DenseField::from_vec(grid, values)).collect::<Result<_, _>>()?;
+        Ok(Self { step, grid, field: thinned, bodies: labels, errors })
+    }
+
+    /// Where the places are.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// The offset of a place on the field's own grid.
+    pub fn offset(&self, full: &Grid, place: usize) -> usize {
+        let v = self.grid.voxel(place);
+        full.index(v[0] * self.step[0], v[1] * self.step[1], v[2] * self.step[2])
+    }
+
+    /// The gauge in places.
+    fn thinned(&self, gauge: Gauge) -> Gauge {
+        let half = |a: usize| match gauge.half[a] {
+            0 => 0,
+            h => ((h as f64 / self.step[a] as f64).round() as usize).max(1),
+        };
+        Gauge { half: std::array::from_fn(half) }
+    }
+
+    /// The displacement gradient at each place of a body: as measured, then with each draw of the
+    /// error, `most` of them.
+    pub fn gradients(&self, gauge: Gauge, most: usize) -> Gradients {
+        let gauge = self.thinned(gauge);
+        let of = |field: &DenseField| map_gradients(field, &self.bodies, gauge, |_, g| Some(*g));
+        let own = of(&self.field);
+        let with = |error: &DenseField| {
+            let plus = |(g, d): (&Option<Matrix3>, Option<Matrix3>)| {
+                let (g, d) = ((*g)?, d?);
+                Some(std::array::from_fn(|r| std::array::from_fn(|c| g[r][c] + d[r][c])))
+            };
+            own.iter().zip(of(error)).map(plus).collect()
+        };
+        let drawn: Vec<Vec<Option<Matrix3>>> = self.errors.iter().take(most).map(with).collect();
+        [own].into_iter().chain(drawn).collect()
+    }
+}
+
+/// Each sample at the places of a grid (mm, RAS, planar).
+fn drawn(grid: &Grid, samples: &ErrorSamples) -> impl Iterator<Item = Vec<f32>> {
+    let (n, nodes) = (grid.len(), samples.nodes().len());
+    let all: Vec<Vec<f32>> = (0..n)
+        .into_par_iter()
+        .map(|at| {
+            let [i, j, k] = grid.voxel(at);
+            let taps = taps(samples.nodes(), grid.world(i, j, k));
+            let of = |component: &[f32]| taps.iter().map(|&(node, w)| w * component[node]).sum::<f32>();
+            samples.values().iter().flat_map(|s| s.chunks_exact(nodes).map(of)).collect()
+        })
+        .collect();
+    (0..samples.values().len())
+        .map(move |s| (0..3).flat_map(|c| all.iter().map(move |values| values[3 * s + c])).collect())
+}
+
+/// The at most 64 nodes that act at a place (mm), with their weights.
+fn taps(nodes: &Grid, place: WorldPoint) -> Vec<(usize, f32)> {
+    let shape = nodes.shape();
+    let at = nodes.affine().to_voxel(place).0;
+    let axis = |a: usize| match shape[a] {
+        0..4 => (0, [1.0, 0.0, 0.0, 0.0], 1),
+        n => {
+            let first = (at[a].floor() - 1.0).clamp(0.0, (n - 4) as f64);
+            (first as usize, weights((at[a] - 1.0 - first).clamp(0.0, 1.0) as f32), 4)
+        }
+    };
+    let [x, y, z] = [0, 1, 2].map(axis);
+    let tap = |i: usize, j: usize, k: usize| {
+        (x.0 + i + shape[0] * (y.0 + j + shape[1] * (z.0 + k)), x.1[i] * y.1[j] * z.1[k])
+    };
+    (0..z.2)
+        .flat_map(|k| (0..y.2).flat_map(move |j| (0..x.2).map(move |i| (i, j, k))))
+        .map(|(i, j, k)| tap(i, j, k))
+        .collect()
+}
+
+/// Width over which variances of a few draws are averaged (places, one standard deviation of a
+/// Gaussian): about a node to either side.
+const AVERAGED: f64 = 1.5;
+
+/// Standard deviation of a strain by place.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StrainDeviation {
+    /// From draws of the error, on a grid of places: variances of the six components (planar).
+    Drawn(Box<Grid>, Vec<Vec<f32>>),
+    /// The same everywhere, from the noise of the displacement between neighbouring voxels alone.
+    White(f64),
+}
+
+impl StrainDeviation {
+    /// From the gradients of [`Draws::gradients`].
+    pub fn drawn(draws: &Draws, gradients: &Gradients, measure: StrainMeasure) -> Self {
+        let (shape, n) = (draws.grid.shape(), draws.grid.len());
+        let mut squares = vec![vec![0.0f32; n]; 6];
+        let mut counts = vec![0.0f32; n];
+        let [own, drawn @ ..] = &gradients[..] else { return Self::White(0.0) };
+        for at in 0..n {
+            let Some(g) = own[at] else { continue };
+            counts[at] = 1.0;
+            let e = measure::tensor(measure, &g);
+            for other in drawn.iter().filter_map(|d| d[at]) {
+                let apart = measure::tensor(measure, &other);
+                (0..6).for_each(|c| squares[c][at] += ((apart[c] - e[c]).powi(2) / drawn.len() as f64) as f32);
+            }
+        }
+        let smooth = |values: &[f32]| gaussian(values, shape, shape.map(|n| if n > 1 { AVERAGED } else { 0.0 }));
+        let share = smooth(&counts);
+        let averaged = |values: Vec<f32>| smooth(&values).iter().zip(&share).map(|(v, s)| v / s.max(1e-6)).collect();
+        Self::Drawn(Box::new(draws.grid), squares.into_iter().map(averaged).collect())
+    }
+
+    /// Of each component (xx, yy, zz, xy, xz, yz; 1) at a place (mm).
+    pub fn at(&self, place: WorldPoint) -> Symmetric3 {
+        match self {
+            Self::White(normal) => {
+                let shear = normal / 2f64.sqrt();
+                [*normal, *normal, *normal, shear, shear, shear]
+            }
+            Self::Drawn(grid, variances) => {
+                let stencil = crate::numerics::sampling::Stencil::new(grid.shape(), grid.affine().to_voxel(place));
+                std::array::from_fn(|c| stencil.of(&variances[c]).max(0.0).sqrt())
+            }
+        }
+    }
+}
+
+/// Mean square of the normal strains of `gradients` less those of `others`, over the places of a body
+/// (1).
+pub fn apart(gradients: &[Option<Matrix3>], others: &[Option<Matrix3>]) -> f64 {
+    let square = |(a, b): (&Option<Matrix3>, &Option<Matrix3>)| {
+        a.zip(*b).map(|(a, b)| (0..3).map(|c| (a[c][c] - b[c][c]).powi(2)).sum::<f64>())
+    };
+    let squares: Vec<f64> = gradients.iter().zip(others).filter_map(square).collect();
+    squares.iter().sum::<f64>() / (3 * squares.len().max(1)) as f64
+}
+
+/// Names of the components of a strain that every voxel has.
+pub const COMPONENTS: [&str; 11] = ["xx", "yy", "zz", "xy", "xz", "yz", "e1", "e2", "e3", "shear", "volume"];
+
+/// The [`COMPONENTS`] of a strain, then those along up to three directions (NaN without).
+pub fn components(measure: StrainMeasure, e: &Symmetric3, frame: Option<&Matrix3>) -> [f64; 14] {
+    let mut out = [f64::NAN; 14];
+    out[..6].copy_from_slice(e);
+    out[6..9].copy_from_slice(&principal(e));
+    out[9] = measure::largest_shear(e);
+    out[10] = measure::volume_change(measure, e);
+    if let Some(frame) = frame {
+        (0..3).for_each(|k| out[11 + k] = measure::along(e, frame[k]));
+    }
+    out
+}
