@@ -41,6 +41,14 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         ],
     ),
     (
+        "certify",
+        &[
+            ("one scan, its noise estimated", "certify before.nii.gz --mask tissue.nii.gz -o certificate"),
+            ("with a repeat scan at rest", "certify before.nii.gz again.nii.gz --mask tissue.nii.gz -o certificate"),
+            ("and a motion such as was measured", "certify before.nii.gz --like results -o certificate"),
+        ],
+    ),
+    (
         "stiffness",
         &[
             (

@@ -5,6 +5,8 @@
 
 mod batch;
 
+mod certify;
+
 mod chart;
 
 mod completions;
@@ -111,6 +113,8 @@ enum Command {
     Track(track::Options),
     /// Strain from a displacement field, with its standard deviation
     Strain(strain::Options),
+    /// What a scan can measure: known motions are imposed on it and measured
+    Certify(certify::Options),
     /// Young's modulus from a displacement field, region by region or without regions
     Stiffness(stiffness::Options),
     /// Reduce a stiffness map of a finger pad to a fingertip for grasps
@@ -195,6 +199,7 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Invert(options) => invert::run(options, console),
         Command::Track(options) => track::run(options, console),
         Command::Strain(options) => strain::run(options, console),
+        Command::Certify(options) => certify::run(options, console),
         Command::Stiffness(options) => stiffness::run(options, console),
         Command::Fingertip(options) => fingertip::run(options, console),
         Command::Batch(options) => batch::run(options, console),

@@ -13,6 +13,8 @@ pub mod frontier;
 
 pub mod stated;
 
+pub mod waves;
+
 use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::sampling::{displacement, inside};

@@ -23,6 +23,8 @@ pub mod track;
 
 pub mod strain;
 
+pub mod certify;
+
 pub mod stiffness;
 
 pub mod stiffness_sequence;

@@ -65,6 +65,8 @@ pub mod grasp_analysis;
 
 pub mod strain;
 
+pub mod certify;
+
 pub mod stiffness;
 
 pub mod axes;

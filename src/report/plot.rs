@@ -148,8 +148,9 @@ impl Plot<'_> {
         }
         let _ = write!(svg, r#"<path class="axis" d="M{LEFT} {base}H{:.0}"/>"#, WIDTH - RIGHT);
         for v in places_ticks(x0, x1, finite().map(|p| p[0])) {
-            let _ =
-                write!(svg, r#"<text x="{:.1}" y="{:.0}" text-anchor="middle">{}</text>"#, x(v), base + 15.0, short(v));
+            let name = short(v);
+            let at = x(v).min(WIDTH - width(&name) / 2.0);
+            let _ = write!(svg, r#"<text x="{at:.1}" y="{:.0}" text-anchor="middle">{name}</text>"#, base + 15.0);
         }
         let _ = write!(
             svg,

@@ -3,7 +3,7 @@
 //! A body is an intensity B(p) at every world position, a motion a displacement u(x) in closed form
 //! or, for the elastic ones, that of finite elements; so neither volume is interpolated. The same
 //! settings give the same bytes for any number of threads. Fails when a setting is out of range or
-//! the motion folds.
+//! the motion folds. Only [`imposed`] moves a real volume, which is interpolated once.
 
 mod anatomy;
 
@@ -12,6 +12,8 @@ mod artefacts;
 mod body;
 
 pub mod elastic;
+
+pub mod imposed;
 
 mod landmarks;
 

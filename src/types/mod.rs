@@ -19,6 +19,8 @@ pub mod params;
 
 pub mod metrics;
 
+pub mod certificate;
+
 pub mod expected;
 
 pub mod result;
@@ -45,6 +47,7 @@ pub mod trial;
 
 pub mod batch;
 
+pub use certificate::{Certificate, Gain, GaugeNoise, Imposed};
 pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};
 pub use field::{DenseField, Displacement};
 pub use fingertip::{Fingertip, FingertipModel};

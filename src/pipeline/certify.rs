@@ -1,0 +1,343 @@
+//! What a scan can measure: known motions are imposed on it, and the same settings as of a run
+//! measure them.
+
+use crate::error::{FieldError, StrainError};
+use crate::evaluate::metrics;
+use crate::evaluate::waves::{Row, cut_off, gains, rows};
+use crate::matching::levels::foreground;
+use crate::numerics::statistics::{noise_sigma, robust_deviation};
+use crate::pipeline::check;
+use crate::pipeline::field::{self, Clock, FieldResult, Progress};
+use crate::pipeline::strain::{StrainInput, StrainParams};
+use crate::strain::StrainField;
+use crate::strain::gauge::Gauge;
+use crate::synth::imposed::{Star, imposed, stretch, with_noise};
+use crate::types::params::ModelSource;
+use crate::types::{
+    Certificate, DenseField, FieldParams, Gain, GaugeNoise, Grid, Imposed, Mask, StrainMeasure, Volume, Voxels,
+};
+use rayon::prelude::*;
+
+/// What a certificate is made of.
+#[derive(Debug, Clone, Copy)]
+pub struct CertifyInput<'a> {
+    /// The scan.
+    pub initial: &'a Voxels<'a>,
+    /// A second scan at rest, on the same grid.
+    pub second: Option<&'a Voxels<'a>>,
+    /// Where there is tissue; what stands out of the background without.
+    pub mask: Option<&'a Mask>,
+    /// A measured motion to impose beside the others, on the scan's grid.
+    pub like: Option<&'a DenseField>,
+}
+
+/// A certificate, with the smallest displacement that is told from noise at each voxel (mm).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Certified {
+    /// The numbers.
+    pub certificate: Certificate,
+    /// Smallest displacement along an axis that is told from noise, 95 % of the time (mm).
+    pub detectable: Volume,
+    /// Where there is tissue.
+    pub tissue: Mask,
+}
+
+/// Amplitude of the waves (voxels of the finest axis): that of the DIC Challenge 2.0.
+const AMPLITUDE: f64 = 0.5;
+
+/// Uniform strain that is imposed (1).
+const STRETCH: f64 = 0.02;
+
+/// Normal deviations that 95 % of the errors lie within.
+const NORMAL_95: f64 = 1.96;
+
+/// Gauges whose noise is told, in units of the shortest.
+const GAUGES: [usize; 7] = [1, 2, 3, 4, 6, 8, 12];
+
+/// Of a wavelength, the gauge over which strain is told: a mean over a quarter of a wave keeps 90 %
+/// of its amplitude.
+const GAUGE_OF_WAVE: f64 = 0.25;
+
+/// Makes the pairs: a volume with a known motion, and a scan with noise of its own.
+struct Pairs<'a> {
+    input: CertifyInput<'a>,
+    noise: f64,
+    seed: u64,
+}
+
+impl Pairs<'_> {
+    /// A pair whose displacement is `motion`; `draw` (0 or 1) gives it other noise.
+    ///
+    /// Of two scans one shows the motion and the other none, and the other way round: their noise is
+    /// real. Of one scan both have noise added.
+    fn of(&self, motion: &DenseField, draw: u64) -> [Volume; 2] {
+        let initial = self.input.initial;
+        match self.input.second {
+            Some(second) => {
+                let (moved, still) = if draw == 0 { (initial, second) } else { (second, initial) };
+                [imposed(moved, motion), still.view().into_volume()]
+            }
+            None => {
+                let seed = 1 + 2 * draw + 1000 * self.seed;
+                [with_noise(&imposed(initial, motion), self.noise, seed), with_noise(initial, self.noise, seed + 1)]
+            }
+        }
+    }
+
+    /// What the difference of two draws is over their noise: with two scans the errors are each
+    /// other's opposite.
+    fn apart(&self) -> f64 {
+        if self.input.second.is_some() { 2.0 } else { 2f64.sqrt() }
+    }
+}
+
+/// Makes a certificate with the settings of a run; the motion model is always free, so that what the
+/// scan cannot tell is not hidden by a smaller one.
+///
+/// # Errors
+/// [`StrainError`] as [`field::run`] and [`crate::pipeline::strain::run`], or when grids differ.
+pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>) -> Result<Certified, StrainError> {
+    let CertifyInput { initial, second, mask, like } = input;
+    let grid = *initial.grid();
+    check::mask_grid(initial, mask)?;
+    for (what, other) in
+        [("the second scan", second.map(|s| s.grid())), ("the measured motion", like.map(|l| l.grid()))]
+    {
+        same_grid(&grid, what, other)?;
+    }
+    let mut clock = Clock::start();
+    let params = FieldParams { model: ModelSource::Free, ..params.clone() };
+    let tissue = mask.map_or_else(|| foreground(initial), |m| Mask::from_voxels(grid, |at, _| m.as_slice()[at].min(1)));
+    let noise = image_noise(initial, second, &tissue);
+    let pairs = Pairs { input, noise, seed: params.seed };
+    let stars = stars(&tissue);
+    let total = (2 * stars.len() + 2 + usize::from(like.is_some()) + usize::from(second.is_some())) as f64;
+    let mut runs = 0usize;
+    let mut measure = |[a, b]: [Volume; 2]| -> Result<FieldResult, FieldError> {
+        let before = runs as f64;
+        runs += 1;
+        field::run(&a, &b, mask, &params, &|stage, part| progress(stage, (before + part) / total))
+    };
+
+    // Waves of each length, along and across each axis; two draws of the noise.
+    let (mut waves, mut differences): (Vec<Row>, Vec<DenseField>) = (Vec::new(), Vec::new());
+    for star in &stars {
+        let truth = star.field(&grid);
+        let first = measure(pairs.of(&truth, 0))?.displacement;
+        let again = measure(pairs.of(&truth, 1))?.displacement;
+        waves.extend(rows(&[&first, &again], &truth, &tissue, star.axes, |row| star.wavelength(row)));
+        differences.push(scaled_difference(&first, &again, pairs.apart()));
+    }
+    clock.book("waves");
+    let by_wavelength = gains(&waves);
+    let [wavelength_90_mm, wavelength_50_mm] = [0.9, 0.5].map(|level| cut_off(&by_wavelength, level));
+    let displacement_noise_mm = axis_deviation(&differences, &tissue);
+    let by_gauge = noise_by_gauge(&differences, &tissue);
+    let longest = by_wavelength.last().map_or(0.0, |g| g[0]);
+    let wanted = GAUGE_OF_WAVE * wavelength_90_mm.unwrap_or(longest);
+    let fallback = GaugeNoise { gauge_mm: 0.0, noise: 0.0, detectable: 0.0 };
+    let chosen =
+        by_gauge.iter().find(|g| g.gauge_mm >= wanted * 0.999).or(by_gauge.last()).copied().unwrap_or(fallback);
+    clock.book("noise");
+
+    // Rest, a uniform strain, and a motion such as was measured.
+    let still = DenseField::zeros(grid);
+    let at_rest = measure(pairs.of(&still, 0))?;
+    let edge = grid.least_spacing();
+    let detectable = Volume::from_voxels(grid, |at, _| match tissue.as_slice()[at] {
+        0 => 0.0,
+        _ => (NORMAL_95 * f64::from(at_rest.uncertainty.at(at))) as f32,
+    });
+    let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
+    let blind = inside.iter().filter(|&&at| f64::from(detectable.as_slice()[at]) > AMPLITUDE * edge).count();
+    let thick = (0..3).filter(|&a| grid.shape()[a] > 1).max_by_key(|&a| grid.shape()[a]).unwrap_or(0);
+    let uniform = stretch(&grid, thick, STRETCH);
+    let mut known = vec![(format!("uniform strain of {:.0} %", 100.0 * STRETCH), uniform)];
+    known.extend(like.map(|like| ("the motion that was given".to_string(), like.clone())));
+    let mut imposed = vec![compared("none (at rest)".into(), &at_rest, &still, &tissue, chosen.gauge_mm)?];
+    for (motion, truth) in known {
+        let found = measure(pairs.of(&truth, 0))?;
+        imposed.push(compared(motion, &found, &truth, &tissue, chosen.gauge_mm)?);
+    }
+    // The two scans as they are: what moved between them is not noise alone.
+    let rest_mm = match second {
+        Some(second) => {
+            let found = measure([initial.view().into_volume(), second.view().into_volume()])?;
+            Some(found.summary.mean_mm)
+        }
+        None => None,
+    };
+    clock.book("motions");
+    let warnings = warnings(&by_wavelength, wavelength_90_mm, rest_mm.zip(Some(displacement_noise_mm)));
+    Ok(Certified {
+        certificate: Certificate {
+            image_noise: noise,
+            image_noise_from: if second.is_some() { "repeat" } else { "estimated" },
+            displacement_noise_mm,
+            rest_mm,
+            gauge_mm: chosen.gauge_mm,
+            strain_noise: chosen.noise,
+            strain_noise_by_gauge: by_gauge,
+            amplitude_mm: AMPLITUDE * edge,
+            gains: by_wavelength.iter().map(|&[wavelength_mm, gain]| Gain { wavelength_mm, gain }).collect(),
+            wavelength_90_mm,
+            wavelength_50_mm,
+            blind_share: blind as f64 / inside.len().max(1) as f64,
+            imposed,
+            runs,
+            seconds: clock.0,
+            warnings,
+        },
+        detectable,
+        tissue,
+    })
+}
+
+fn same_grid(grid: &Grid, what: &str, other: Option<&Grid>) -> Result<(), FieldError> {
+    match other.filter(|other| !other.same_as(grid)) {
+        Some(other) => Err(FieldError::GridMismatch {
+            what: what.into(),
+            found: other.shape(),
+            reference: "the scan".into(),
+            expected: grid.shape(),
+        }),
+        None => Ok(()),
+    }
+}
+
+/// Standard deviation of the noise in one scan: of two, that of their difference.
+fn image_noise(initial: &Voxels<'_>, second: Option<&Voxels<'_>>, tissue: &Mask) -> f64 {
+    let inside = |at: usize| tissue.as_slice()[at] != 0;
+    let Some(second) = second else {
+        return f64::from(noise_sigma(initial.as_slice(), initial.grid().shape(), inside));
+    };
+    let pairs = initial.as_slice().iter().zip(second.as_slice()).enumerate();
+    let apart = pairs.filter(|&(at, _)| inside(at)).map(|(_, (a, b))| f64::from(a - b));
+    robust_deviation(apart.filter(|d| d.is_finite())) / 2f64.sqrt()
+}
+
+/// Waves along one axis that grow along the next and move along the third, for each thick axis; in a
+/// slice they move along the axis that they grow along.
+fn stars(tissue: &Mask) -> Vec<Star> {
+    let grid = tissue.grid();
+    let amplitude = AMPLITUDE * grid.least_spacing();
+    let thick: Vec<usize> = (0..3).filter(|&a| grid.shape()[a] > 1).collect();
+    let n = thick.len();
+    (0..n).map(|i| Star::over(tissue, [thick[i], thick[(i + 1) % n], thick[(i + 2) % n]], amplitude)).collect()
+}
+
+/// The difference of two fields over `by`.
+fn scaled_difference(a: &DenseField, b: &DenseField, by: f64) -> DenseField {
+    DenseField::from_voxels(*a.grid(), |at, _| {
+        let (a, b) = (a.at(at), b.at(at));
+        std::array::from_fn(|c| f64::from(a[c] - b[c]) / by)
+    })
+}
+
+/// Root mean square of the fields along an axis over the tissue (mm).
+fn axis_deviation(fields: &[DenseField], tissue: &Mask) -> f64 {
+    let axes = (0..3).filter(|&a| tissue.grid().shape()[a] > 1).count().max(1) as f64;
+    let inside: Vec<usize> = (0..tissue.grid().len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
+    let square = |f: &DenseField| {
+        inside.par_iter().map(|&at| f.at(at).iter().map(|v| f64::from(v * v)).sum::<f64>()).sum::<f64>()
+    };
+    (fields.iter().map(square).sum::<f64>() / (axes * (fields.len() * inside.len()).max(1) as f64)).sqrt()
+}
+
+/// Root mean square normal strain over the tissue (1).
+fn normal_strain(strain: &StrainField, tissue: &Mask) -> f64 {
+    let axes = (0..3).filter(|&a| tissue.grid().shape()[a] > 1).count().max(1) as f64;
+    let (mut sum, mut count) = (0.0, 0usize);
+    for at in (0..tissue.grid().len()).filter(|&at| tissue.as_slice()[at] != 0) {
+        sum += strain.at(at)[..3].iter().map(|e| e * e).sum::<f64>();
+        count += 1;
+    }
+    (sum / (axes * count.max(1) as f64)).sqrt()
+}
+
+/// Noise of a normal strain by gauge, from fields of noise alone.
+fn noise_by_gauge(noise: &[DenseField], tissue: &Mask) -> Vec<GaugeNoise> {
+    let grid = tissue.grid();
+    let shortest = 2.0 * grid.least_spacing();
+    let widest = (0..3).filter(|&a| grid.shape()[a] > 1).map(|a| grid.shape()[a] as f64 * grid.spacing()[a]);
+    let widest = widest.fold(f64::INFINITY, f64::min) / 2.0;
+    let of = |times: usize| {
+        let gauge_mm = times as f64 * shortest;
+        let gauge = Gauge::of_length(grid, gauge_mm);
+        let square = |f: &DenseField| {
+            normal_strain(&StrainField::of(f, tissue.as_slice(), gauge, StrainMeasure::Small), tissue).powi(2)
+        };
+        let noise = (noise.iter().map(square).sum::<f64>() / noise.len().max(1) as f64).sqrt();
+        GaugeNoise { gauge_mm, noise, detectable: NORMAL_95 * noise }
+    };
+    GAUGES.into_iter().filter(|&t| t == 1 || t as f64 * shortest <= widest).map(of).collect()
+}
+
+/// How a known motion came back.
+fn compared(
+    motion: String,
+    found: &FieldResult,
+    truth: &DenseField,
+    tissue: &Mask,
+    gauge_mm: f64,
+) -> Result<Imposed, StrainError> {
+    let grid = *truth.grid();
+    let scored = metrics(&found.displacement, truth, Some(tissue), &[])?;
+    let input = StrainInput {
+        field: &found.displacement,
+        bodies: tissue,
+        labels: None,
+        samples: Some(&found.samples),
+        trust: None,
+    };
+    let params = StrainParams { gauge_mm: Some(gauge_mm), ..StrainParams::default() };
+    let own = crate::pipeline::strain::run(input, &params, &|_, _| {})?;
+    let gauge = Gauge::of_length(&grid, gauge_mm);
+    let exact = StrainField::of(truth, tissue.as_slice(), gauge, StrainMeasure::GreenLagrange);
+    let (mut square, mut held, mut count) = (0.0, 0usize, 0usize);
+    for at in (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0) {
+        let [i, j, k] = grid.voxel(at);
+        let sd = own.deviation.at(grid.world(i, j, k));
+        let (e, t) = (own.strain.at(at), exact.at(at));
+        for c in (0..3).filter(|&c| sd[c] > 0.0) {
+            square += (e[c] - t[c]).powi(2);
+            held += usize::from((e[c] - t[c]).abs() < NORMAL_95 * sd[c]);
+            count += 1;
+        }
+    }
+    let count = count.max(1) as f64;
+    Ok(Imposed {
+        motion,
+        motion_mm: scored.identity_mm,
+        error_mm: scored.mean_mm,
+        expected_mm: found.summary.expected.mean_mm,
+        strain_error: (square / count).sqrt(),
+        strain_held: held as f64 / count,
+    })
+}
+
+/// Mean displacement between two scans at rest over the noise from which it is said to be motion.
+const MOVED: f64 = 5.0;
+
+fn warnings(gains: &[[f64; 2]], cut: Option<f64>, rest: Option<(f64, f64)>) -> Vec<String> {
+    let mut out = Vec::new();
+    match (gains.first(), gains.last(), cut) {
+        (_, Some(longest), None) => out.push(format!(
+            "no wave came back to 90 %, up to {:.1} mm, the longest that fits into the tissue: small features cannot be measured",
+            longest[0]
+        )),
+        (Some(first), _, Some(cut)) if cut <= first[0] => out.push(format!(
+            "even the shortest wave, {cut:.1} mm, came back to 90 %: the true limit is shorter"
+        )),
+        (None, ..) => out.push("the tissue is too small for any wave: no resolution can be told".into()),
+        _ => {}
+    }
+    if let Some((moved, noise)) = rest.filter(|(moved, noise)| *moved > MOVED * noise) {
+        out.push(format!(
+            "between the two scans the tissue moved by {moved:.3} mm on average, {:.0} times the noise: they are not at rest, and \
+             imposed motions carry that motion as an error",
+            moved / noise.max(f64::MIN_POSITIVE)
+        ));
+    }
+    out
+}

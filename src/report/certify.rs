@@ -1,0 +1,206 @@
+//! report.html, certificate.json and the short summary of `palpate certify`.
+
+use crate::error::ReportError;
+use crate::report::colormap::ColorMap;
+use crate::report::field::Values;
+use crate::report::grasp::tile;
+use crate::report::html::{card, document, escape};
+use crate::report::json::{grid, seconds};
+use crate::report::panels::{Panel, gray_range};
+use crate::report::plot::{Line, Plot};
+use crate::report::scale::{Scale, significant};
+use crate::report::section::Section;
+use crate::report::statistics::{quantile, sample};
+use crate::report::tables::table;
+use crate::types::{Certificate, FieldParams, Mask, VoxelPoint, Voxels};
+use serde_json::{Value, json};
+use std::fmt::Write;
+
+/// A certificate with the scan that it is about.
+#[derive(Clone, Copy)]
+pub struct CertifyReport<'a> {
+    /// The scan and the second one (empty without), as they are called.
+    pub names: [&'a str; 2],
+    /// The scan.
+    pub initial: &'a Voxels<'a>,
+    /// Where there is tissue.
+    pub tissue: &'a Mask,
+    /// What was asked for.
+    pub params: &'a FieldParams,
+    /// Smallest displacement that is told from noise (mm).
+    pub detectable: Values<'a>,
+    /// The numbers.
+    pub certificate: &'a Certificate,
+}
+
+fn percent(v: f64) -> String {
+    significant(100.0 * v)
+}
+
+/// The result in a sentence.
+pub fn headline(c: &Certificate) -> String {
+    let smoothed = match c.wavelength_90_mm {
+        Some(w) => format!("features smaller than {} mm are smoothed away", significant(w)),
+        None => "no feature that fits into the tissue comes back whole".into(),
+    };
+    format!("Strain to ± {} % at a gauge of {} mm; {smoothed}.", percent(c.strain_noise), significant(c.gauge_mm))
+}
+
+/// The keys are those of docs/file-formats.md.
+pub fn summary(report: &CertifyReport<'_>) -> Value {
+    let c = report.certificate;
+    let mut out = json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "command": "certify",
+        "headline": headline(c),
+        "inputs": { "initial": report.names[0], "second": Some(report.names[1]).filter(|n| !n.is_empty()) },
+        "grid": grid(report.initial.grid()),
+        "params": report.params,
+    });
+    if let (Value::Object(out), Ok(Value::Object(numbers))) = (&mut out, serde_json::to_value(c)) {
+        out.extend(numbers);
+    }
+    out["seconds"] = json!(seconds(&c.seconds));
+    out
+}
+
+/// From which wavelength on so much comes back.
+fn comes_back(level: &str, from: Option<f64>) -> String {
+    match from {
+        Some(w) => format!("{level} come back from {} mm on", significant(w)),
+        None => format!("no wave comes back to {level}"),
+    }
+}
+
+/// What was found, a few lines.
+pub fn text(report: &CertifyReport<'_>) -> String {
+    let c = report.certificate;
+    let mut out = format!("{}\n", headline(c));
+    let from = match c.image_noise_from {
+        "repeat" => "from the repeat scan",
+        _ => "estimated from the scan alone",
+    };
+    let _ = writeln!(out, "  image noise  {} ({from})", significant(c.image_noise));
+    let _ = writeln!(out, "  displacement ± {} mm by noise along an axis", significant(c.displacement_noise_mm));
+    if let Some(moved) = c.rest_mm {
+        let _ = writeln!(out, "  at rest      {} mm between the two scans", significant(moved));
+    }
+    let _ = writeln!(
+        out,
+        "  waves        {}, {}",
+        comes_back("90 %", c.wavelength_90_mm),
+        comes_back("50 %", c.wavelength_50_mm)
+    );
+    let gauges: Vec<String> = c
+        .strain_noise_by_gauge
+        .iter()
+        .map(|g| format!("± {} % at {} mm", percent(g.noise), significant(g.gauge_mm)))
+        .collect();
+    let _ = writeln!(out, "  strain       {}", gauges.join(", "));
+    let _ = writeln!(
+        out,
+        "  blind        {:.1} % of the tissue: a motion of {} mm is not told from noise there",
+        100.0 * c.blind_share,
+        significant(c.amplitude_mm)
+    );
+    for i in &c.imposed {
+        let _ = writeln!(
+            out,
+            "  {:<12} error {} mm of {} mm, {} mm expected",
+            i.motion,
+            significant(i.error_mm),
+            significant(i.motion_mm),
+            significant(i.expected_mm)
+        );
+    }
+    let _ = writeln!(out, "  time         {:.1} s, {} runs", c.seconds.iter().map(|t| t.1).sum::<f64>(), c.runs);
+    out
+}
+
+/// The page.
+///
+/// # Errors
+/// [`ReportError`] when a picture cannot be encoded.
+pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
+    let c = report.certificate;
+    let mut body = format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>certificate</span></h1><p class=\"verdict\">{}</p></header>\
+         <div class=\"tiles\">{}{}{}{}{}</div>",
+        env!("CARGO_PKG_VERSION"),
+        escape(report.names[0]),
+        escape(&headline(c)),
+        tile(&significant(c.displacement_noise_mm), "mm", "noise of a displacement along an axis"),
+        tile(&percent(c.strain_noise), "%", &format!("noise of strain at {} mm", significant(c.gauge_mm))),
+        tile(&c.wavelength_90_mm.map_or("none".into(), significant), "mm", "wave that comes back to 90 %"),
+        tile(&c.wavelength_50_mm.map_or("none".into(), significant), "mm", "wave that comes back to 50 %"),
+        tile(&percent(c.blind_share), "%", "of the tissue is blind"),
+    );
+    if !c.warnings.is_empty() {
+        let items: String = c.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
+    }
+    let gains: Vec<[f64; 2]> = c.gains.iter().map(|g| [g.wavelength_mm, g.gain]).collect();
+    let noise: Vec<[f64; 2]> = c.strain_noise_by_gauge.iter().map(|g| [g.gauge_mm, 100.0 * g.noise]).collect();
+    let marks: Vec<(f64, bool)> =
+        [c.wavelength_50_mm, c.wavelength_90_mm].into_iter().flatten().map(|w| (w, false)).collect();
+    let whole = gains.iter().map(|g| [g[0], 1.0]).collect();
+    let gain = Plot { title: "Share of a wave's amplitude that comes back", across: "wavelength, mm", marks: &marks }
+        .draw(&[Line::new("measured", 0, false, gains), Line::new("whole", 1, true, whole)]);
+    let strain = Plot { title: "Noise of a normal strain, %", across: "gauge, mm", marks: &[(c.gauge_mm, false)] }
+        .draw(&[Line::new("one standard deviation", 0, false, noise)]);
+    let gauges: Vec<Vec<String>> = c
+        .strain_noise_by_gauge
+        .iter()
+        .map(|g| vec![significant(g.gauge_mm), percent(g.noise), percent(g.detectable)])
+        .collect();
+    let imposed: Vec<Vec<String>> = c
+        .imposed
+        .iter()
+        .map(|i| {
+            let numbers = [i.motion_mm, i.error_mm, i.expected_mm].map(significant);
+            let strain = [percent(i.strain_error), format!("{:.1}", 100.0 * i.strain_held)];
+            [escape(&i.motion)].into_iter().chain(numbers).chain(strain).collect()
+        })
+        .collect();
+    let _ = write!(
+        body,
+        "<section><h2>Resolution and noise</h2><p class=\"lead\">Waves of {} mm were imposed on the scan, noise was added, and the same \
+         settings as those of a run measured them.</p><div class=\"grid\"><article>{gain}</article><article>{strain}</article>\
+         <article><h3>Strain by gauge</h3>{}</article>{}<article class=\"wide\"><h3>Known motions</h3>{}</article></div></section>",
+        significant(c.amplitude_mm),
+        table(&["Gauge, mm", "Noise, %", "Told from noise from, %"], &gauges),
+        blind(report)?,
+        table(
+            &["Motion", "Mean, mm", "Error, mm", "Expected error, mm", "Error of strain, %", "In the 95 % band, %"],
+            &imposed
+        )
+    );
+    body += "<footer><p>A gauge is the side of the cube over which displacements give one strain. Waves are shears that keep the \
+             volume; a feature of half a wavelength is as wide as one crest. What moves during a scan, and what changes from scan \
+             to scan beside noise, is not in this certificate.</p></footer>";
+    Ok(document(&format!("Certificate of {}", escape(report.names[0])), &body))
+}
+
+/// The picture of what is told from noise where.
+fn blind(report: &CertifyReport<'_>) -> Result<String, ReportError> {
+    let grid = report.initial.grid();
+    let inside = sample(grid.len(), Some(report.tissue));
+    let mut middle = [0.0; 3];
+    for &at in &inside {
+        let v = grid.voxel(at);
+        (0..3).for_each(|a| middle[a] += v[a] as f64 / inside.len() as f64);
+    }
+    let sections = Section::through(grid, grid.affine().to_world(VoxelPoint(middle)));
+    let most = quantile(inside.iter().map(|&o| f64::from((report.detectable)(o))), 0.98);
+    let scale = Scale::from_zero(most, "mm", ColorMap::Magma);
+    let base = (report.initial, gray_range(report.initial));
+    let panel = Panel::coloured(
+        "Smallest displacement that is told from noise",
+        &sections,
+        base,
+        Some(report.tissue),
+        scale,
+        report.detectable,
+    )?;
+    Ok(card(&panel.with_note("Along an axis, 95 % of the time. Bright: the tissue has little texture of its own.")))
+}
