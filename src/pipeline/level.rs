@@ -94,9 +94,9 @@ pub(super) fn independent(pair: &Pair<'_>) -> f32 {
     (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
 }
 
-/// How much of the last step is carried into the next (heavy ball, Polyak 1964): the block diagonal
-/// is an upper bound, so plain steps are short. With .7 small motions leave 2 % less error, large
-/// ones up to 40 % more: steps run past what the matches say.
+/// How much of the last step is carried into the next where that goes on the same way (heavy ball,
+/// Polyak 1964; restart, O'Donoghue & Candes 2015): the block diagonal is an upper bound, so plain
+/// steps are short. With .8 twelve pairs left 1 % less error, two of them 4 and 5 % more.
 const MOMENTUM: f32 = 0.5;
 
 /// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
@@ -171,8 +171,9 @@ pub(super) fn refine_from(
         // those of a large one are, and only one of the two then needs its vectors.
         let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
         for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(begun) {
-            let last = std::mem::replace(before, *c);
-            *c = (*c + d + MOMENTUM * (*c - last)).clamp(begun - reach, begun + reach);
+            let last = *c - std::mem::replace(before, *c);
+            let carried = if d * last > 0.0 { MOMENTUM * last } else { 0.0 };
+            *c = (*c + d + carried).clamp(begun - reach, begun + reach);
         }
         if ablation::is_on("unfold") {
             unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
