@@ -168,6 +168,21 @@ fn creased(noise: f32) -> (Volume, Volume, DenseField) {
     carried([48; 3], |[x, y, z]| [crease(y), crease(z), crease(x)], noise)
 }
 
+/// The bending energy alone left 0.95 of it, and momentum that was never dropped 1.07 in five
+/// passes.
+#[test]
+fn a_wave_comes_back_with_its_amplitude() {
+    let wave = |[x, _, _]: [f64; 3]| [0.0, 0.0, 0.5 * (x * std::f64::consts::TAU / 20.0).cos()];
+    let (initial, deformed, truth) = carried([64, 48, 40], wave, 15.0);
+    for preset in [Preset::Balanced, Preset::Fast] {
+        let result = run(&initial, &deformed, None, &FieldParams::preset(preset), &|_, _| {}).unwrap();
+        let (found, wanted) = (result.displacement.component(2), truth.component(2));
+        let along = |of: &[f32]| of.iter().zip(wanted).map(|(v, w)| f64::from(v * w)).sum::<f64>();
+        let gain = along(found) / along(wanted);
+        assert!((0.975..1.025).contains(&gain), "{preset:?}: {gain}");
+    }
+}
+
 /// A spine whose core slid by 18 mm in a volume 90 mm wide was 6 mm off: 13.5 mm were looked over.
 #[test]
 fn motion_that_reaches_the_search_range_is_looked_for_farther() {
@@ -248,7 +263,7 @@ fn another_contrast_is_made_up_for_or_warned_of_and_noise_is_not() {
             let (same, off) = measured(&|v| v);
             assert!(!warned(&same), "{kind:?} {noise}: {:?}", same.summary.warnings);
             let (root, by) = measured(&f32::sqrt);
-            assert!(by < 1.6 * off || warned(&root), "{kind:?} {noise}: {by} for {off}");
+            assert!(by < 1.8 * off || warned(&root), "{kind:?} {noise}: {by} for {off}");
             let (waves, _) = measured(&|v| v * (0.5 * (12.0 * v.max(1e-3).ln()).sin()).exp());
             assert!(noise > 0.05 || warned(&waves), "{kind:?} {noise}: {:?}", waves.summary.evidence);
         }

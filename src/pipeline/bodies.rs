@@ -250,6 +250,13 @@ impl Bodies {
         }
     }
 
+    /// Brings back what the bending energy flattened of each body's field.
+    pub fn twice(&mut self, pair: &Pair<'_>, seed: u64) {
+        for b in 0..self.count() {
+            level::twice(&self.part(pair, b), &mut self.fields[b], seed);
+        }
+    }
+
     /// The matches of each body about its own field, with what the level reports of all.
     pub fn matches(&self, pair: &Pair<'_>, params: MatchParams) -> (Vec<LevelMatch>, LevelReport) {
         let of = |b: usize| {

@@ -301,6 +301,11 @@ fn canonical(
     let sparse = thinned(sparse, points);
     let searched = factor;
     let any_free = concluded.iter().any(|c| c.choice.motion.is_none());
+    // What is concluded rests on the smooth field: what comes back brings noise with it.
+    if any_free {
+        bodies.twice(&pair, params.seed);
+        clock.book("residual");
+    }
     let next = polish::next_finer(&grid, finest, params).filter(|&next| any_free && next != factor);
     if let Some(next) = next {
         pair = light.level(&aligned, next);

@@ -25,6 +25,7 @@ use crate::numerics::unfold::unfold;
 use crate::numerics::{ablation, filters, pyramid};
 use crate::types::{Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// A spline field on one level, with the state of its coupling.
 #[derive(Debug, Clone, PartialEq)]
@@ -133,6 +134,38 @@ pub(super) fn refine_from(
     seed: u64,
     tick: impl Fn(usize),
 ) {
+    advance(pair, field, (begun, Held::Whole), passes, seed, tick);
+}
+
+/// Passes of [`twice`]. With one, waves of 20 to 30 voxels stay 1 % lower and twelve pairs have 2 %
+/// more error.
+const TWICED: usize = 2;
+
+/// Passes from a settled field in which the bending energy holds the change alone (twicing; Tukey
+/// 1977): what it flattened of long waves comes back, and short ones stay out.
+pub fn twice(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
+    let begun = field.coefficients.clone();
+    advance(pair, field, (&begun, Held::Change), TWICED, seed, |_| ());
+}
+
+/// What the bending energy is counted of.
+#[derive(Clone, Copy, PartialEq)]
+enum Held {
+    /// The field, with weights that follow the evidence.
+    Whole,
+    /// What it has changed by since passes began, with the weights as they are.
+    Change,
+}
+
+/// The passes of [`refine`] and [`twice`].
+fn advance(
+    pair: &Pair<'_>,
+    field: &mut SplineField,
+    (begun, held): (&[f32], Held),
+    passes: usize,
+    seed: u64,
+    tick: impl Fn(usize),
+) {
     let energy = smoothness(&field.lattice, pair.spacing);
     let cell = cell_volume(&field.lattice, pair.spacing);
     let active = pair.spans.grown(1);
@@ -158,11 +191,15 @@ pub(super) fn refine_from(
         if large {
             warped = Vec::new();
         }
-        let settled = pass % 2 == 1 || pass + 1 == passes;
+        let settled = held == Held::Whole && (pass % 2 == 1 || pass + 1 == passes);
         let limit = if pass < 2 { 20 } else { 10 };
         let matrix = Coupled::new(&energy, &weights, &equations.blocks, false);
-        let (rhs, coefficients) = (equations.rhs, &field.coefficients);
-        let step = || coupling::step(&matrix, rhs, coefficients, 0.02, ITERATIONS);
+        let bent: Cow<'_, [f32]> = match held {
+            Held::Whole => field.coefficients[..].into(),
+            Held::Change => field.coefficients.iter().zip(begun).map(|(c, begun)| c - begun).collect(),
+        };
+        let rhs = equations.rhs;
+        let step = || coupling::step(&matrix, rhs, &bent, 0.02, ITERATIONS);
         // From the last pass's solution a few iterations suffice, though the blocks and weights
         // have changed.
         let informed = || Coupled::new(&energy, &weights, &information, false);
