@@ -86,6 +86,7 @@ fn of_summary(facts: &mut Facts, summary: &Value, path: &Path, folder: &Path) {
     match command(summary) {
         "field" | "demo" => {
             let field = folder.join("displacement.nii.gz");
+            facts.does(&format!("palpate strain {} -o STRAIN", folder.display()));
             facts.does(&format!("palpate stiffness --field {} --labels LABELS -o STIFFNESS", field.display()));
         }
         "stiffness" => facts.does(&format!("palpate fingertip {} -o FINGERTIP.toml", folder.display())),

@@ -9,7 +9,7 @@ use crate::report::picture::Picture;
 use crate::report::scale::{Scale, short};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
-use crate::types::{SparseField, Voxels, WorldPoint};
+use crate::types::{MotionModel, SparseField, Voxels, WorldPoint};
 
 /// Everything that is cut from the volumes, and the scales that go with it.
 #[derive(Debug, Clone, PartialEq)]
@@ -132,10 +132,7 @@ impl Views {
             jacobian: Panel::coloured("Jacobian determinant", &sections, base, mask, change, jacobian)?
                 .with_note("Blue: the tissue shrinks. Red: it grows. White: its volume stays."),
             uncertainty: Panel::coloured("Uncertainty of the displacement", &sections, base, mask, vague, uncertainty)?
-                .with_note(format!(
-                    "One standard deviation. Half of the voxels lie under {} mm.",
-                    short(spread(0.5, uncertainty))
-                )),
+                .with_note(unseen(report, spread(0.5, uncertainty))),
             error: error.transpose()?,
             gray: (range, [before, after]),
             arrows: (arrows, factor),
@@ -143,6 +140,22 @@ impl Views {
         })
     }
 }
+
+/// What the uncertainty says, where half of the voxels lie under `median` mm.
+fn unseen(report: &FieldReport<'_>, median: f64) -> String {
+    let said = format!("One standard deviation. Half of the voxels lie under {} mm.", short(median));
+    match report.summary.model {
+        MotionModel::Identity => {
+            format!(
+                "{said} Nothing seemed to move: a motion of {SEEN} times as much would have been seen, 95 % of the time."
+            )
+        }
+        _ => said,
+    }
+}
+
+/// Deviations along an axis within which 95 % of the lengths of normal errors lie, in three axes.
+const SEEN: f64 = 2.8;
 
 /// Range and colours of what is measured: the same in pictures, viewers and distributions.
 pub(super) struct Scales {
