@@ -187,8 +187,25 @@ pub enum StrainError {
         /// How many voxels.
         voxels: usize,
     },
+    /// The tissue spans no volume.
+    #[error(
+        "the tissue is {voxels} voxel thick along an axis of a volume, so strain along it cannot be told; give a mask of two \
+         voxels or more"
+    )]
+    Thin {
+        /// How many voxels.
+        voxels: usize,
+    },
+    /// Samples of the error do not lie over the field.
+    #[error(
+        "the samples of the error lie over another place than the field; take posterior.nii.gz of the same run, or none"
+    )]
+    Samples,
+    /// No label lies in the tissue.
+    #[error("no label lies in the tissue; check that labels and mask show the same place")]
+    NoLabel,
     /// The gauge does not reach a voxel's neighbours.
-    #[error("a gauge of {asked} mm is under two voxels ({least:.3} mm); ask for that or more, or leave --gauge out")]
+    #[error("a gauge of {asked:.5} mm is under two voxels ({least:.5} mm); ask for that or more, or leave --gauge out")]
     ShortGauge {
         /// Asked for (mm).
         asked: f64,
@@ -196,7 +213,7 @@ pub enum StrainError {
         least: f64,
     },
     /// The gauge is wider than the body.
-    #[error("a gauge of {asked} mm is wider than the tissue ({width:.3} mm); ask for less, or leave --gauge out")]
+    #[error("a gauge of {asked:.5} mm is wider than the tissue ({width:.3} mm); ask for less, or leave --gauge out")]
     WideGauge {
         /// Asked for (mm).
         asked: f64,

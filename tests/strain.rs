@@ -18,7 +18,7 @@ use palpate::strain::gauge::{Gauge, map_gradients};
 use palpate::synth::{PhantomKind, PhantomParams, Trouble, troubled};
 use palpate::types::params::ModelSource;
 use palpate::types::space::Matrix3;
-use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, StrainMeasure, WorldPoint};
+use palpate::types::{Affine, DenseField, ErrorSamples, FieldParams, Grid, Mask, StrainMeasure, Trust, WorldPoint};
 
 fn grid(shape: [usize; 3]) -> Grid {
     Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap()
@@ -151,6 +151,7 @@ fn the_deviation_holds_the_errors_of_phantoms() {
         (PhantomKind::Head, Trouble::Noise, 6.0),
         (PhantomKind::Calf, Trouble::Motion, 6.0),
         (PhantomKind::Head, Trouble::Motion, 5.0),
+        (PhantomKind::Slice, Trouble::Noise, 5.0),
     ];
     let mut all = Vec::new();
     for (kind, trouble, severity) in scenes {
@@ -230,6 +231,18 @@ fn what_has_no_strain_is_refused() {
     let with = |gauge| StrainParams { gauge_mm: Some(gauge), ..Default::default() };
     assert!(matches!(strain_of(&folding, &StrainParams::default()), Err(StrainError::Folds { voxels: 1.. })));
     assert!(matches!(strain_of(&broken, &StrainParams::default()), Err(StrainError::NotFinite { voxels: 1 })));
+    let sheet = Mask::from_voxels(grid, |at, _| u8::from(grid.voxel(at)[2] == 5));
+    let elsewhere = Mask::from_voxels(grid, |at, _| u8::from(grid.voxel(at)[2] == 9));
+    let inside = Mask::from_voxels(grid, |at, _| u8::from(grid.voxel(at)[2] < 6));
+    let nodes = Grid::new([5; 3], Affine::scaled([4.0; 3], [-40.0; 3]).unwrap()).unwrap();
+    let lost = ErrorSamples::new(nodes, vec![vec![0.0; 3 * nodes.len()]; 6]).unwrap();
+    let of = |bodies: &Mask, labels: Option<&Mask>, samples: Option<&ErrorSamples>| {
+        let input = StrainInput { field: &still, bodies, labels, samples, trust: None };
+        pipeline::strain::run(input, &StrainParams::default(), &|_, _| {})
+    };
+    assert!(matches!(of(&sheet, None, None), Err(StrainError::Thin { voxels: 1 })));
+    assert!(matches!(of(&inside, Some(&elsewhere), None), Err(StrainError::NoLabel)));
+    assert!(matches!(of(&inside, None, Some(&lost)), Err(StrainError::Samples)));
     assert!(matches!(strain_of(&still, &with(1.9)), Err(StrainError::ShortGauge { .. })));
     assert!(matches!(strain_of(&still, &with(12.5)), Err(StrainError::WideGauge { .. })));
     assert!(matches!(strain_of(&still, &with(f64::NAN)), Err(StrainError::ShortGauge { .. })));
@@ -257,6 +270,9 @@ fn strain_of_a_pair_and_of_its_folder_are_the_same() {
     for (arguments, code, message) in [
         (&["strain", "f", "-o", "g", "--gauge", "0.1"][..], 1, "under two voxels"),
         (&["strain", "f", "-o", "g", "--fibres", "1=0,0,0"], 2, "has no length"),
+        (&["strain", "f", "-o", "g", "--fibres", "9=1,0,0"], 1, "no voxel has label 9"),
+        (&["strain", "f", "-o", "g", "--fibres", "1=1,0,0", "--fibres", "1=0,1,0"], 2, "has a direction already"),
+        (&["strain", "f/principal.nii.gz", "-o", "g"], 1, "is not a displacement field"),
         (&["strain", "f", "-o", "f"], 2, "choose another --output"),
         (&["strain", "nowhere", "-o", "g"], 1, "nowhere"),
     ] {
@@ -291,4 +307,12 @@ fn error_bars_of_regions_hold_what_noise_adds() {
         let z = (r.values[0] - mean) / r.errors[0];
         assert!(z.abs() < 4.0, "{}: {} ± {} is not {mean}", r.component, r.values[0], r.errors[0]);
     }
+}
+
+/// Smooth errors of a field from elsewhere cannot be seen in it: it is never of high trust.
+#[test]
+fn a_field_without_draws_is_not_of_high_trust() {
+    let field = DenseField::from_fn(grid([30, 28, 26]), |p| [2.0 * (0.15 * p.0[1]).sin(), 0.0, 0.03 * p.0[2]]);
+    let found = strain_of(&field, &StrainParams::default()).unwrap().summary;
+    assert!(found.noise < 1e-3 * found.strain && found.trust == Trust::Moderate && !found.drawn, "{found:?}");
 }

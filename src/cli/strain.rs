@@ -23,7 +23,7 @@ pub struct Options {
     target: Target,
     /// Gauge length: the side of the cube over which one strain is taken, at least two voxels
     /// [default: the least error to expect, by the noise]
-    #[arg(long, value_name = "MM")]
+    #[arg(long, value_name = "MM", allow_negative_numbers = true)]
     gauge: Option<f64>,
     /// Which strain: green-lagrange, small or logarithmic
     #[arg(long, value_name = "NAME", value_parser = measure, default_value = "green-lagrange")]
@@ -35,8 +35,8 @@ pub struct Options {
     /// Regions whose strain is summed up: a label map on the field's grid [default: the bodies]
     #[arg(long, value_name = "L")]
     labels: Option<PathBuf>,
-    /// Fibres: vectors on the field's grid (5-D NIfTI, LPS), or LABEL=X,Y,Z (RAS) for each label
-    #[arg(long, value_name = "F", num_args = 1.., allow_hyphen_values = true)]
+    /// Fibres: vectors on the field's grid (5-D NIfTI, LPS), or LABEL=X,Y,Z (RAS), once for each label
+    #[arg(long, value_name = "F")]
     fibres: Vec<String>,
     /// A label that is a tube: its radial, circumferential and axial strain
     #[arg(long, value_name = "LABEL", conflicts_with = "fibres", requires = "labels")]
@@ -67,13 +67,22 @@ struct Source {
 
 impl Source {
     /// Of a folder of `palpate field`, or of a file alone.
-    fn read(path: &Path, convention: &Convention) -> Result<Self> {
+    fn read(path: &Path, convention: &Convention, warnings: &mut Vec<String>) -> Result<Self> {
         if !path.is_dir() {
             let field = convention.read(path)?;
             return Ok(Self { field, bodies: None, samples: None, trust: None, image: None, matches: None });
         }
         let file = |name: &str| path.join(name);
         let there = |name: &str| Some(file(name)).filter(|p| p.is_file());
+        for (part, lost) in [
+            ("posterior.nii.gz", "the deviation of strain is that of noise between neighbouring voxels alone"),
+            ("bodies.nii.gz", "strain is taken of the air too; give --mask"),
+            ("summary.json", "how far to trust the field is not known"),
+        ] {
+            if there(part).is_none() {
+                warnings.push(format!("{}: {part} is missing: {lost}", path.display()));
+            }
+        }
         let field = io::read_field(file("displacement.nii.gz"))?;
         let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path)).transpose()?;
         let summary = there("summary.json").map(io::read_json).transpose()?;
@@ -120,7 +129,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
     let progress = console.progress();
     progress.set("read", 0.0);
-    let source = Source::read(path, convention)?;
+    let mut warnings = Vec::new();
+    let source = Source::read(path, convention, &mut warnings)?;
     let grid = *source.field.grid();
     let tissue = source.tissue(mask.as_ref().map(|m| read_mask(m, &grid, path)).transpose()?);
     let labels = labels.as_ref().map(|l| read_labels(l, &grid, path)).transpose()?;
@@ -135,7 +145,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         trust: source.trust,
     };
     let set = |stage: &str, part| progress.set(stage, part);
-    let result = strain::run(input, &params, &set).with_context(|| name(path))?;
+    let mut result = strain::run(input, &params, &set).with_context(|| name(path))?;
+    result.summary.warnings.extend(warnings);
 
     progress.set("write", 1.0);
     write_strain(&mut folder, &result, &tissue)?;
@@ -174,7 +185,18 @@ fn directions(fibres: &[String], tubes: &[u8], labels: &Mask, grid: &Grid) -> Re
             same_grid(path, field.grid(), grid, Path::new("the field"))?;
             Ok(Directions::Fibres(field))
         }
-        each => Ok(Directions::ByLabel(each.iter().map(|text| of_label(text)).collect::<Result<_>>()?)),
+        each => {
+            let known: Vec<(u8, [f64; 3])> = each.iter().map(|text| of_label(text)).collect::<Result<_>>()?;
+            for (at, (label, _)) in known.iter().enumerate() {
+                if !labels.as_slice().contains(label) {
+                    bail!("--fibres {}: no voxel has label {label}; check --labels", each[at]);
+                }
+                if known[..at].iter().any(|k| k.0 == *label) {
+                    bail!(Usage(format!("--fibres {}: label {label} has a direction already", each[at])));
+                }
+            }
+            Ok(Directions::ByLabel(known))
+        }
     }
 }
 

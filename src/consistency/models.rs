@@ -45,14 +45,19 @@ pub struct Choice {
     pub motion: Option<AffineMotion>,
     /// One line a model.
     pub evidence: Vec<String>,
+    /// Whether the model was asked for and the evidence speaks against it.
+    pub rejected: bool,
 }
 
 impl Choice {
     /// The model that was asked for, whatever the evidence, through what was `measured`.
     pub fn asked(self, model: MotionModel, measured: &[Measured]) -> Self {
+        let rejected = model.parameters() < self.model.parameters();
         let mut evidence = self.evidence;
-        evidence.push(format!("{}: as asked", model.name()));
-        Self { model, motion: nearest(model, measured), evidence }
+        let but =
+            if rejected { format!(", against the evidence, which is for {}", self.model.name()) } else { "".into() };
+        evidence.push(format!("{}: as asked{but}", model.name()));
+        Self { model, motion: nearest(model, measured), evidence, rejected }
     }
 }
 
@@ -136,8 +141,8 @@ pub fn choose(
     }
     evidence.push(format!("free: {determined:.0} degrees of freedom determined by the data"));
     match chosen {
-        Some((model, motion)) => Choice { model, motion: Some(motion), evidence },
-        None => Choice { model: MotionModel::Free, motion: None, evidence },
+        Some((model, motion)) => Choice { model, motion: Some(motion), evidence, rejected: false },
+        None => Choice { model: MotionModel::Free, motion: None, evidence, rejected: false },
     }
 }
 

@@ -68,7 +68,10 @@ pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
 /// [`SpaceError`] when they have no place.
 pub fn node_grid(grid: &Grid, lattice: &Lattice) -> Result<Grid, SpaceError> {
     let linear = grid.affine().linear();
-    let WorldPoint(first) = grid.affine().to_world(VoxelPoint(lattice.place(0)));
+    // The only node of a flat axis lies in its plane.
+    let place = lattice.place(0);
+    let first = std::array::from_fn(|a| if lattice.shape[a] > 1 { place[a] } else { 0.0 });
+    let WorldPoint(first) = grid.affine().to_world(VoxelPoint(first));
     let row = |r: usize| {
         let [x, y, z] = std::array::from_fn(|a| linear[r][a] * lattice.step[a] as f64);
         [x, y, z, first[r]]

@@ -4,6 +4,7 @@
 use crate::error::{FieldError, StrainError};
 use crate::evaluate::metrics;
 use crate::evaluate::waves::{Row, cut_off, gains, rows};
+use crate::field::jacobian::count_folds;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::{noise_sigma, robust_deviation};
 use crate::pipeline::check;
@@ -14,7 +15,8 @@ use crate::strain::gauge::Gauge;
 use crate::synth::imposed::{Star, imposed, stretch, with_noise};
 use crate::types::params::ModelSource;
 use crate::types::{
-    Certificate, DenseField, FieldParams, Gain, GaugeNoise, Grid, Imposed, Mask, StrainMeasure, Volume, Voxels,
+    Certificate, DenseField, FieldParams, FieldSummary, Gain, GaugeNoise, Grid, Imposed, Mask, StrainMeasure, Volume,
+    Voxels,
 };
 use rayon::prelude::*;
 
@@ -109,6 +111,13 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
     let params = FieldParams { model: ModelSource::Free, ..params.clone() };
     let tissue = mask.map_or_else(|| foreground(initial), |m| Mask::from_voxels(grid, |at, _| m.as_slice()[at].min(1)));
     let noise = image_noise(initial, second, &tissue);
+    if second.is_some() && noise == 0.0 {
+        let (what, hint) = ("is the same as the first".into(), "give another scan at rest, or one alone".into());
+        return Err(FieldError::Volume { volume: "second", what, hint }.into());
+    }
+    if let Some(voxels) = like.map(|l| count_folds(l, Some(&tissue))).transpose()?.filter(|folds| *folds > 0) {
+        return Err(StrainError::Folds { voxels });
+    }
     let pairs = Pairs { input, noise, seed: params.seed };
     let stars = stars(&tissue);
     let total = (2 * stars.len() + 2 + usize::from(like.is_some()) + usize::from(second.is_some())) as f64;
@@ -121,10 +130,13 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
 
     // Waves of each length, along and across each axis; two draws of the noise.
     let (mut waves, mut differences): (Vec<Row>, Vec<DenseField>) = (Vec::new(), Vec::new());
+    let mut variances = Volume::filled(grid, 0.0f32);
     for star in &stars {
         let truth = star.field(&grid);
-        let first = measure(pairs.of(&truth, 0))?.displacement;
+        let FieldResult { displacement: first, uncertainty, .. } = measure(pairs.of(&truth, 0))?;
         let again = measure(pairs.of(&truth, 1))?.displacement;
+        let variance = |at: usize| uncertainty.at(at).powi(2) / stars.len() as f32;
+        variances.as_mut_slice().par_iter_mut().enumerate().for_each(|(at, v)| *v += variance(at));
         waves.extend(rows(&[&first, &again], &truth, &tissue, star.axes, |row| star.wavelength(row)));
         differences.push(scaled_difference(&first, &again, pairs.apart()));
     }
@@ -146,7 +158,8 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
     let edge = grid.least_spacing();
     let detectable = Volume::from_voxels(grid, |at, _| match tissue.as_slice()[at] {
         0 => 0.0,
-        _ => (NORMAL_95 * f64::from(at_rest.uncertainty.at(at))) as f32,
+        // In waves: a field at rest is held smooth, and is sure of what it would not see.
+        _ => NORMAL_95 as f32 * variances.as_slice()[at].sqrt(),
     });
     let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
     let blind = inside.iter().filter(|&&at| f64::from(detectable.as_slice()[at]) > AMPLITUDE * edge).count();
@@ -160,15 +173,12 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
         imposed.push(compared(motion, &found, &truth, &tissue, chosen.gauge_mm)?);
     }
     // The two scans as they are: what moved between them is not noise alone.
-    let rest_mm = match second {
-        Some(second) => {
-            let found = measure([initial.view().into_volume(), second.view().into_volume()])?;
-            Some(found.summary.mean_mm)
-        }
-        None => None,
-    };
+    let as_they_are = |second: &Voxels<'_>| measure([initial.view().into_volume(), second.view().into_volume()]);
+    let between = second.map(as_they_are).transpose()?.map(|found| found.summary);
+    let rest_mm = between.as_ref().map(|s| s.mean_mm);
+    let moved = between.filter(|s| s.mean_mm > s.expected.interval_mm[1]);
     clock.book("motions");
-    let warnings = warnings(&by_wavelength, wavelength_90_mm, rest_mm.zip(Some(displacement_noise_mm)));
+    let warnings = warnings(&by_wavelength, wavelength_90_mm, moved.as_ref());
     Ok(Certified {
         certificate: Certificate {
             image_noise: noise,
@@ -316,10 +326,8 @@ fn compared(
     })
 }
 
-/// Mean displacement between two scans at rest over the noise from which it is said to be motion.
-const MOVED: f64 = 5.0;
-
-fn warnings(gains: &[[f64; 2]], cut: Option<f64>, rest: Option<(f64, f64)>) -> Vec<String> {
+/// What the user should know; `moved` is what a run says of two scans that are not at rest.
+fn warnings(gains: &[[f64; 2]], cut: Option<f64>, moved: Option<&FieldSummary>) -> Vec<String> {
     let mut out = Vec::new();
     match (gains.first(), gains.last(), cut) {
         (_, Some(longest), None) => out.push(format!(
@@ -332,11 +340,11 @@ fn warnings(gains: &[[f64; 2]], cut: Option<f64>, rest: Option<(f64, f64)>) -> V
         (None, ..) => out.push("the tissue is too small for any wave: no resolution can be told".into()),
         _ => {}
     }
-    if let Some((moved, noise)) = rest.filter(|(moved, noise)| *moved > MOVED * noise) {
+    if let Some(moved) = moved {
         out.push(format!(
-            "between the two scans the tissue moved by {moved:.3} mm on average, {:.0} times the noise: they are not at rest, and \
-             imposed motions carry that motion as an error",
-            moved / noise.max(f64::MIN_POSITIVE)
+            "between the two scans the tissue moved by {:.3} mm on average, where {:.3} mm of error is expected: they are not at rest, and \
+             their difference passes for noise",
+            moved.mean_mm, moved.expected.mean_mm
         ));
     }
     out

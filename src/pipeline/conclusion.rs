@@ -14,7 +14,7 @@ use crate::numerics::{ablation, pyramid};
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::level::{self, LevelMatch, SplineField};
 use crate::pipeline::rest::{self, Places, Rest, Tried};
-use crate::pipeline::uncertainty::{AtNodes, Variances};
+use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::{Grid, Mask, MotionModel};
 use rayon::prelude::*;
 
@@ -107,7 +107,11 @@ impl Concluded {
             }
             let lattice = free.lattice.clone();
             let stated = full_lattice(grid, field, factor, (&choice, judged));
-            let departure = departure(&stated, &free, factor);
+            let mut departure = departure(&stated, &free, factor);
+            if choice.rejected {
+                let left_out = uncertainty::left_out(if grid.is_single_slice() { 2 } else { 3 });
+                departure.iter_mut().for_each(|d| *d *= left_out);
+            }
             let narrowed = |m: usize| rest.as_ref().map_or(1.0, |rest| rest.narrowed(place(lattice.within(m))));
             let narrowed: Vec<f32> = (0..lattice.len()).map(narrowed).collect();
             let nodes = AtNodes {

@@ -281,8 +281,13 @@ fn canonical(
     let flat = grid.is_single_slice();
     let is_rigid = |b: usize| given.as_ref().is_some_and(|g| params.rigid.contains(&g.names[b]));
     let asked_of = |b: usize| if is_rigid(b) { Some(MotionModel::Rigid) } else { params.model.asked() };
-    let concluded: Vec<Concluded> =
-        (0..bodies.count()).map(|b| Concluded::of(&bodies, b, &pair, &matches, (asked_of(b), params.seed))).collect();
+    let conclude = |b: usize| {
+        let mut concluded = Concluded::of(&bodies, b, &pair, &matches, (asked_of(b), params.seed));
+        // A bone is known to be rigid.
+        concluded.choice.rejected &= !is_rigid(b);
+        concluded
+    };
+    let concluded: Vec<Concluded> = (0..bodies.count()).map(conclude).collect();
     let found = reports.last().map_or(0, |r| r.counts.features_initial);
     let name = |b: usize| given.as_ref().map_or(b as u8 + 1, |g| g.names[b]);
     let (model, mut evidence) = Concluded::together(&concluded, &bodies, &pair, name);
@@ -320,6 +325,7 @@ fn canonical(
         evidence.push(polish::why(&pair, nodes, params));
         clock.book("residual");
     }
+    let rejected = concluded.iter().any(|c| c.choice.rejected);
     let models: Vec<MotionModel> = concluded.iter().map(|c| c.choice.model).collect();
     let again = next.map(|_| params.seed);
     let (splines, variances) = Concluded::on_grid(concluded, &mut bodies, (&pair, factor), (searched, again), &grid);
@@ -372,7 +378,7 @@ fn canonical(
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
     progress("uncertainty", 0.95);
-    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), model);
+    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), (model, rejected));
     let of_labels = uncertainty::by_label(&uncertainty, &displacement, &labelled);
     uncertainty::tell_bodies(&mut body_reports, &of_labels, expected.mean_mm);
     clock.book("uncertainty");
@@ -381,6 +387,7 @@ fn canonical(
     let summary = FieldSummary {
         counts,
         model,
+        rejected,
         evidence,
         bodies: body_reports,
         levels: reports,
@@ -396,6 +403,7 @@ fn canonical(
         // A known field takes the search as far as it goes itself.
         warnings: warnings(counts, folds, not_finite, length.1, if starts.is_empty() { search } else { f64::INFINITY })
             .into_iter()
+            .chain(said_of_model(rejected))
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
             .chain(doubted.map(in_doubt))
@@ -761,6 +769,15 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     }
     let limit = if found < wanted { "; no more corners stand out of the noise" } else { "" };
     format!("points: {found} of {wanted} wanted, {source}{limit}")
+}
+
+/// Says so where a model that was asked for is smaller than the motion.
+pub(super) fn said_of_model(rejected: bool) -> Option<String> {
+    rejected.then(|| {
+        "the motion model that was asked for does not explain the volumes (see the evidence): what it leaves out is an error; leave \
+         --model out, or take free"
+            .into()
+    })
 }
 
 /// A level's match in world mm (RAS).

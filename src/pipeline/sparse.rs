@@ -177,7 +177,11 @@ pub(super) fn measure(
     clock.book("uncertainty");
 
     let full = conclusion::full_lattice(&grid, &field, factor, (&choice, factor));
-    let departure = conclusion::departure(&full, &field, factor);
+    let mut departure = conclusion::departure(&full, &field, factor);
+    if choice.rejected {
+        let left_out = uncertainty::left_out(if flat { 2 } else { 3 });
+        departure.iter_mut().for_each(|d| *d *= left_out);
+    }
     let narrowed = vec![1.0; departure.len()];
     let nodes =
         AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
@@ -201,13 +205,14 @@ pub(super) fn measure(
     let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
     let folds = jacobian::count_folds(&displacement, Some(&mask))?;
     clock.book("jacobian");
-    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), choice.model);
+    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), (choice.model, choice.rejected));
     clock.book("uncertainty");
 
     let counts = field::with_mesh(&mut reports, &mesh);
     let summary = FieldSummary {
         counts,
         model: choice.model,
+        rejected: choice.rejected,
         evidence: choice.evidence,
         bodies: vec![BodyReport {
             label: 1,
@@ -228,6 +233,7 @@ pub(super) fn measure(
         seconds: clock.0,
         warnings: field::warnings(counts, folds, not_finite, max_mm, search)
             .into_iter()
+            .chain(field::said_of_model(choice.rejected))
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
             .chain(field::without_texture(pair.plain()))

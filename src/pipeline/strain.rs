@@ -106,14 +106,15 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
     clock.book("regions");
     progress("done", 1.0);
 
-    let own = Trust::of(noise / size.max(f64::MIN_POSITIVE));
+    // Of a field without draws only a part of the error is known.
+    let known_best = if samples.is_some() { Trust::High } else { Trust::Moderate };
+    let own = Trust::of(noise / size.max(f64::MIN_POSITIVE)).max(known_best);
     let told = trust.map(|t| format!("trust in the field is {}", t.name()));
-    let ratio = format!(
-        "the deviation of a normal strain, {:.2} %, is {:.0} % of the strain, {:.2} %",
-        100.0 * noise,
-        (100.0 * noise / size.max(f64::MIN_POSITIVE)).min(999.0),
-        100.0 * size
-    );
+    let ratio = match noise / size.max(f64::MIN_POSITIVE) {
+        share if share < 1.0 => format!("the deviation of a normal strain is {:.1} % of the strain", 100.0 * share),
+        _ => "the deviation of a normal strain is as large as the strain".into(),
+    };
+    let in_part = samples.is_none().then(|| "errors that run over several voxels are not known".to_string());
     let known = match samples {
         Some(_) => "draws of the field's error",
         None => "differences between neighbouring voxels: noise that runs over several voxels is not in it",
@@ -123,16 +124,17 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
         deviation,
         summary: StrainSummary {
             measure: params.measure,
-            gauge_mm: params.gauge_mm.unwrap_or_else(|| nominal(&grid, gauge)),
+            gauge_mm: nominal(&grid, gauge),
             gauge_axes_mm: gauge.length_mm(&grid),
             gauge_asked: params.gauge_mm.is_some(),
             gauges,
             noise,
             strain: size,
+            drawn: samples.is_some(),
             deviation_from: known,
             regions,
             trust: trust.map_or(own, |field| field.max(own)),
-            trust_reasons: told.into_iter().chain([ratio]).collect(),
+            trust_reasons: told.into_iter().chain([ratio]).chain(in_part).collect(),
             seconds: clock.0,
             warnings: Vec::new(),
         },
@@ -141,7 +143,7 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
 
 /// Refuses what has no strain.
 fn check(input: StrainInput<'_>, params: &StrainParams) -> Result<(), StrainError> {
-    let StrainInput { field, bodies, labels, .. } = input;
+    let StrainInput { field, bodies, labels, samples, .. } = input;
     let grid = field.grid();
     for (what, mask) in [Some(("the bodies", bodies)), labels.map(|l| ("the labels", l))].into_iter().flatten() {
         if !mask.grid().same_as(grid) {
@@ -162,6 +164,16 @@ fn check(input: StrainInput<'_>, params: &StrainParams) -> Result<(), StrainErro
     let bad = tissue.par_iter().filter(|&&at| field.at(at).iter().any(|v| !v.is_finite())).count();
     if bad > 0 {
         return Err(StrainError::NotFinite { voxels: bad });
+    }
+    if labels.is_some_and(|l| !tissue.iter().any(|&at| l.as_slice()[at] != 0)) {
+        return Err(StrainError::NoLabel);
+    }
+    if samples.is_some_and(|s| !lies_over(s.nodes(), grid)) {
+        return Err(StrainError::Samples);
+    }
+    let voxels = thinnest(grid, &tissue);
+    if voxels < 2 {
+        return Err(StrainError::Thin { voxels });
     }
     if let Some(asked) = params.gauge_mm {
         let least = nominal(grid, Gauge::shortest(grid));
@@ -194,6 +206,32 @@ fn check(input: StrainInput<'_>, params: &StrainParams) -> Result<(), StrainErro
 fn nominal(grid: &Grid, gauge: Gauge) -> f64 {
     let sides = gauge.length_mm(grid);
     (0..3).filter(|&a| gauge.half[a] > 0).map(|a| sides[a]).fold(f64::INFINITY, f64::min)
+}
+
+/// Whether the nodes of a spline reach over a grid, a node about it to each side and no more than
+/// two.
+fn lies_over(nodes: &Grid, grid: &Grid) -> bool {
+    let corners = (0..8).map(|c| {
+        let [i, j, k] = std::array::from_fn(|a| if c >> a & 1 == 1 { grid.shape()[a] - 1 } else { 0 });
+        nodes.affine().to_voxel(grid.world(i, j, k)).0
+    });
+    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    for p in corners {
+        (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(p[a]), high[a].max(p[a])));
+    }
+    (0..3).all(|a| match nodes.shape()[a] {
+        1 => low[a].abs().max(high[a].abs()) < 0.5,
+        n => (low[a] - 1.0).abs() < 1e-3 && (n as f64 - 4.0..n as f64 - 1.0).contains(&(high[a] + 1e-3)),
+    })
+}
+
+/// Least extent of the tissue along a thick axis (voxels).
+fn thinnest(grid: &Grid, tissue: &[usize]) -> usize {
+    let along = |a: usize| {
+        let places = || tissue.iter().map(|&at| grid.voxel(at)[a]);
+        places().max().zip(places().min()).map_or(0, |(high, low)| high + 1 - low)
+    };
+    (0..3).filter(|&a| grid.shape()[a] > 1).map(along).min().unwrap_or(0)
 }
 
 /// Least extent of the tissue along a thick axis (mm).

@@ -86,7 +86,12 @@ impl Variances {
             let all = [noise, misfit, model, more * (noise + misfit + model), 0.0, 0.0];
             all.into_iter().zip(&mut parts).for_each(|(v, part)| part[m] = v);
         }
-        let draws = nodes.posterior.draws.clone();
+        let mut draws = nodes.posterior.draws.clone();
+        // Across a slice there is no motion.
+        for flat in (0..3).filter(|&a| lattice.shape[a] == 1) {
+            let n = lattice.len();
+            draws.iter_mut().for_each(|draw| draw[flat * n..(flat + 1) * n].fill(0.0));
+        }
         Self { free: variance_of(&lattice, &draws), lattice, parts, draws }
     }
 
@@ -210,7 +215,7 @@ impl Variances {
         &self,
         (deviation, factor): (&ScalarSpline, [usize; 3]),
         (field, mask): (&DenseField, &Mask),
-        model: MotionModel,
+        (model, rejected): (MotionModel, bool),
     ) -> ExpectedError {
         let grid = *mask.grid();
         let axes = if grid.is_single_slice() { 2 } else { 3 };
@@ -223,7 +228,12 @@ impl Variances {
             mean_mm,
             interval_mm: [mean_mm / SPREAD, mean_mm * SPREAD],
             p95_mm: longest(axes, sigma),
-            against_mm: if model == MotionModel::Identity { edge(&grid) } else { motion },
+            against_mm: match (model, rejected) {
+                (MotionModel::Identity, false) => edge(&grid),
+                // The motion that was left out is the error.
+                (MotionModel::Identity, true) => mean_mm,
+                _ => motion,
+            },
             sources: self.shares(picked.iter().map(|&at| grid.voxel(at)), factor),
             labels: Some(by_label(deviation, field, mask)).filter(|labels| labels.len() > 1).unwrap_or_default(),
         }
@@ -240,6 +250,12 @@ fn variance_of(lattice: &Lattice, draws: &[Vec<f32>]) -> Vec<f32> {
         draws.iter().map(one).sum::<f32>() / (seen * draws.len().max(1)) as f32
     };
     (0..lattice.len()).into_par_iter().map(square).collect()
+}
+
+/// What the departure from the free field counts times where the evidence speaks against the stated
+/// motion: its mean is then the mean error, and not that of a random one.
+pub(super) fn left_out(axes: usize) -> f32 {
+    ((axes as f64).sqrt() / (MEAN * mean_length(axes) * f64::from(BAND))) as f32
 }
 
 /// Displacement magnitude at a voxel (mm).

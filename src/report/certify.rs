@@ -39,10 +39,18 @@ fn percent(v: f64) -> String {
 
 /// The result in a sentence.
 pub fn headline(c: &Certificate) -> String {
+    // A crest is half as wide as its wave is long.
     let smoothed = match c.wavelength_90_mm {
-        Some(w) => format!("features smaller than {} mm are smoothed away", significant(w)),
+        Some(w) => format!("features smaller than {} mm are smoothed away", significant(w / 2.0)),
         None => "no feature that fits into the tissue comes back whole".into(),
     };
+    let blind = format!("{} % of the tissue is blind", percent(c.blind_share));
+    if c.wavelength_50_mm.is_none() {
+        return format!("Strain cannot be measured: no wave comes back to half of its amplitude, and {blind}.");
+    }
+    if c.blind_share > 0.5 {
+        return format!("Strain cannot be measured: {blind} to a motion of {} mm.", significant(c.amplitude_mm));
+    }
     format!("Strain to ± {} % at a gauge of {} mm; {smoothed}.", percent(c.strain_noise), significant(c.gauge_mm))
 }
 
@@ -67,7 +75,7 @@ pub fn summary(report: &CertifyReport<'_>) -> Value {
 /// From which wavelength on so much comes back.
 fn comes_back(level: &str, from: Option<f64>) -> String {
     match from {
-        Some(w) => format!("{level} come back from {} mm on", significant(w)),
+        Some(w) => format!("{level} come back at a wavelength of {} mm", significant(w)),
         None => format!("no wave comes back to {level}"),
     }
 }
@@ -131,8 +139,8 @@ pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
         escape(&headline(c)),
         tile(&significant(c.displacement_noise_mm), "mm", "noise of a displacement along an axis"),
         tile(&percent(c.strain_noise), "%", &format!("noise of strain at {} mm", significant(c.gauge_mm))),
-        tile(&c.wavelength_90_mm.map_or("none".into(), significant), "mm", "wave that comes back to 90 %"),
-        tile(&c.wavelength_50_mm.map_or("none".into(), significant), "mm", "wave that comes back to 50 %"),
+        wave(c.wavelength_90_mm, "90 %"),
+        wave(c.wavelength_50_mm, "50 %"),
         tile(&percent(c.blind_share), "%", "of the tissue is blind"),
     );
     if !c.warnings.is_empty() {
@@ -166,10 +174,11 @@ pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
         body,
         "<section><h2>Resolution and noise</h2><p class=\"lead\">Waves of {} mm were imposed on the scan, noise was added, and the same \
          settings as those of a run measured them.</p><div class=\"grid\"><article>{gain}</article><article>{strain}</article>\
-         <article><h3>Strain by gauge</h3>{}</article>{}<article class=\"wide\"><h3>Known motions</h3>{}</article></div></section>",
+         <article><h3>Strain by gauge</h3>{}</article>{}<article><h3>Settings</h3>{}</article><article class=\"wide\"><h3>Known motions</h3>{}</article></div></section>",
         significant(c.amplitude_mm),
         table(&["Gauge, mm", "Noise, %", "Told from noise from, %"], &gauges),
         blind(report)?,
+        settings(report),
         table(
             &["Motion", "Mean, mm", "Error, mm", "Expected error, mm", "Error of strain, %", "In the 95 % band, %"],
             &imposed
@@ -179,6 +188,33 @@ pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
              volume; a feature of half a wavelength is as wide as one crest. What moves during a scan, and what changes from scan \
              to scan beside noise, is not in this certificate.</p></footer>";
     Ok(document(&format!("Certificate of {}", escape(report.names[0])), &body))
+}
+
+/// The tile of a cut-off.
+fn wave(length: Option<f64>, level: &str) -> String {
+    match length {
+        Some(w) => tile(&significant(w), "mm", &format!("wave that comes back to {level}")),
+        None => tile("none", "", &format!("wave that comes back to {level}")),
+    }
+}
+
+/// Where the noise comes from and what was asked for.
+fn settings(report: &CertifyReport<'_>) -> String {
+    let c = report.certificate;
+    let noise = match c.image_noise_from {
+        "repeat" => format!("{} (from {})", significant(c.image_noise), escape(report.names[1])),
+        _ => format!("{} (estimated from the scan alone, added to both volumes)", significant(c.image_noise)),
+    };
+    let at_rest =
+        c.rest_mm.map(|moved| vec!["Motion between the two scans".into(), format!("{} mm", significant(moved))]);
+    let rows = [
+        vec!["Noise of the image".into(), noise],
+        vec!["Amplitude of the waves".into(), format!("{} mm", significant(c.amplitude_mm))],
+        vec!["Preset".into(), format!("{:?}", report.params.preset).to_lowercase()],
+        vec!["Motion model".into(), "free".into()],
+        vec!["Runs of field".into(), c.runs.to_string()],
+    ];
+    table(&[], &rows.into_iter().chain(at_rest).collect::<Vec<_>>())
 }
 
 /// The picture of what is told from noise where.

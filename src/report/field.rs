@@ -107,6 +107,7 @@ pub(crate) mod tests {
             let summary = FieldSummary {
                 counts,
                 model: MotionModel::Free,
+                rejected: false,
                 evidence: vec!["free: 12 % lower".into()],
                 bodies: vec![BodyReport {
                     label: 1,

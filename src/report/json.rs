@@ -29,6 +29,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
         "deformed_grid": grid(report.deformed_grid),
         "counts": s.counts,
         "model": s.model,
+        "model_rejected": s.rejected,
         "evidence": s.evidence,
         "bodies": s.bodies,
         "levels": s.levels,

@@ -56,8 +56,16 @@ fn measure(report: &StrainReport<'_>) -> &'static str {
 }
 
 /// The result in a sentence.
-fn headline(report: &StrainReport<'_>) -> String {
+pub fn headline(report: &StrainReport<'_>) -> String {
     let s = report.summary;
+    if !s.drawn {
+        return format!(
+            "Strain over a gauge of {} mm, {} % on root mean square; noise between neighbouring voxels alone leaves ± {} %.",
+            significant(s.gauge_mm),
+            percent(s.strain),
+            percent(s.noise)
+        );
+    }
     format!(
         "Strain over a gauge of {} mm is known to ± {} % (one standard deviation of a normal strain); its root mean square is {} %.",
         significant(s.gauge_mm),
@@ -120,7 +128,7 @@ fn rows(regions: &[RegionStrain]) -> Vec<Vec<String>> {
     };
     let row = |r: &RegionStrain| {
         let numbers = (0..4).map(|k| with(r.values[k], r.errors[k]));
-        [r.label.to_string(), r.component.to_string()].into_iter().chain(numbers).collect()
+        [r.label.to_string(), r.component.to_string()].into_iter().chain(numbers).chain([thousands(r.voxels)]).collect()
     };
     shown.map(row).collect()
 }
@@ -148,11 +156,16 @@ pub fn text(report: &StrainReport<'_>) -> String {
     out
 }
 
-/// Pictures, regions and gauges.
+/// Pictures, regions and gauges, with the result in a sentence.
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
 pub fn section(report: &StrainReport<'_>) -> Result<String, ReportError> {
+    pictures(report, &format!("{} ", headline(report)))
+}
+
+/// The same after other words.
+fn pictures(report: &StrainReport<'_>, lead: &str) -> Result<String, ReportError> {
     let s = report.summary;
     let grid = report.displacement.grid();
     let centre = centre_of_motion(report.displacement, Some(report.bodies));
@@ -173,13 +186,13 @@ pub fn section(report: &StrainReport<'_>) -> Result<String, ReportError> {
             "Largest principal strain",
             report.largest,
             about(report.largest),
-            "Red: the tissue is stretched most this much.",
+            "Red: how much the tissue is stretched, the way it is stretched most.",
         )?,
         panel(
             "Smallest principal strain",
             report.smallest,
             about(report.smallest),
-            "Blue: it is shortened most this much.",
+            "Blue: how much it is shortened, the way it is shortened most.",
         )?,
         panel("Largest shear", report.shear, from_zero(report.shear, ColorMap::Viridis), "")?,
         panel(
@@ -205,14 +218,14 @@ pub fn section(report: &StrainReport<'_>) -> Result<String, ReportError> {
         ),
     };
     Ok(format!(
-        "<section><h2>Strain</h2><p class=\"lead\">{} Gauge {}. Deviation from {}.</p><div class=\"grid\">{}{chosen}\
+        "<section><h2>Strain</h2><p class=\"lead\">{}Gauge {}. Deviation from {}.</p><div class=\"grid\">{}{chosen}\
          <article class=\"wide\"><h3>Regions</h3>{}</article></div></section>",
-        escape(&headline(report)),
+        escape(lead),
         escape(&gauge(s)),
         escape(s.deviation_from),
         pictures.concat(),
         table(
-            &["Label", "Component", "Mean, %", "Spread, %", "5th percentile, %", "95th percentile, %"],
+            &["Label", "Component", "Mean, %", "Spread, %", "5th percentile, %", "95th percentile, %", "Voxels"],
             &rows(&s.regions)
         )
     ))
@@ -242,7 +255,7 @@ pub fn page(report: &StrainReport<'_>) -> Result<String, ReportError> {
         let items: String = s.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
         let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
     }
-    body += &section(report)?;
+    body += &pictures(report, "")?;
     body += "<footer><p>Strain is on the initial volume, axes right, anterior, superior. A gauge is the side of the cube over which \
              displacements give one strain: what is finer is smoothed away.</p></footer>";
     Ok(document(&format!("Strain of {}", escape(report.name)), &body))

@@ -2,6 +2,7 @@
 
 use crate::report::field::FieldReport;
 use crate::report::scale::thousands;
+use crate::report::strain;
 use crate::report::verdict::verdict;
 use crate::types::{BodyReport, InverseConsistency, Metrics};
 use std::fmt::Write;
@@ -44,6 +45,9 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
     }
     if let Some((_, m)) = report.truth {
         let _ = writeln!(out, "  true error   mean {:.3} mm, 95th percentile {:.3} mm", m.mean_mm, m.p95_mm);
+    }
+    if let Some(strain) = &report.strain {
+        let _ = writeln!(out, "  strain       {}", strain::headline(strain));
     }
     let _ = writeln!(out, "  mesh         {} nodes, {} elements", thousands(c.nodes), thousands(c.tetrahedra));
     let _ = writeln!(out, "  folds        {}", thousands(s.folds));

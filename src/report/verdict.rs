@@ -30,6 +30,7 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
 pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
     let edge = bodies.grid().spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
+        MotionModel::Identity if s.rejected => "Held still, as asked, though the volumes show motion".into(),
         MotionModel::Identity => format!("Nothing moved by more than about {} mm", short2(s.expected.p95_mm)),
         MotionModel::Rigid => format!("One rigid motion, {} mm on average", short2(s.mean_mm)),
         MotionModel::Affine => format!("One affine motion, {} mm on average", short2(s.mean_mm)),
@@ -79,7 +80,7 @@ fn expected(s: &FieldSummary) -> String {
 
 /// The expected error as a part of the motion, or of a voxel where nothing moves.
 fn relative(s: &FieldSummary) -> String {
-    let what = if s.model == MotionModel::Identity { "a voxel" } else { "the motion" };
+    let what = if s.model == MotionModel::Identity && !s.rejected { "a voxel" } else { "the motion" };
     format!("{} % of {what}", short1(100.0 * s.expected.share()))
 }
 

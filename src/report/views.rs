@@ -145,7 +145,7 @@ impl Views {
 fn unseen(report: &FieldReport<'_>, median: f64) -> String {
     let said = format!("One standard deviation. Half of the voxels lie under {} mm.", short(median));
     match report.summary.model {
-        MotionModel::Identity => {
+        MotionModel::Identity if !report.summary.rejected => {
             format!(
                 "{said} Nothing seemed to move: a motion of {SEEN} times as much would have been seen, 95 % of the time."
             )

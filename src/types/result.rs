@@ -27,6 +27,16 @@ pub enum MotionModel {
 }
 
 impl MotionModel {
+    /// How many numbers it has, all for a free field.
+    pub fn parameters(self) -> usize {
+        match self {
+            Self::Identity => 0,
+            Self::Rigid => 6,
+            Self::Affine => 12,
+            Self::Free => usize::MAX,
+        }
+    }
+
     /// Its name in files and messages.
     pub fn name(self) -> &'static str {
         match self {
@@ -140,6 +150,8 @@ pub struct FieldSummary {
     pub counts: Counts,
     /// The model that was chosen.
     pub model: MotionModel,
+    /// Whether it was asked for and the evidence speaks against it.
+    pub rejected: bool,
     /// Why: the evidence for each model tried, in words with numbers.
     pub evidence: Vec<String>,
     /// The bodies that were found: one where nothing slides.

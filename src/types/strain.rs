@@ -70,6 +70,8 @@ pub struct StrainSummary {
     pub noise: f64,
     /// Root mean square normal strain over the tissue (1).
     pub strain: f64,
+    /// Whether the deviation holds all errors of the field, by draws of them.
+    pub drawn: bool,
     /// Where the deviation comes from.
     pub deviation_from: &'static str,
     /// Regions, component by component.

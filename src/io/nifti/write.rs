@@ -14,6 +14,8 @@ use std::io::Write;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+/// NIfTI's code of numbers without a unit.
+const DIMENSIONLESS: i16 = 1011;
 /// NIfTI's code of a symmetric matrix a voxel.
 const SYMMETRIC: i16 = 1005;
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
@@ -243,7 +245,7 @@ pub fn write_vectors<const N: usize>(
     description: &str,
     bits: i32,
 ) -> Result<(), IoError> {
-    let form = Form { components: N as i16, intent: 1007, description, ..Form::FLOATS };
+    let form = Form { components: N as i16, intent: DIMENSIONLESS, description, ..Form::FLOATS };
     let step = stored_steps(bits);
     write(path.as_ref(), grid, form, &vec![vectors; N], |c, v: [f32; N]| step(v[c]).to_le_bytes()).map(drop)
 }
