@@ -6,6 +6,7 @@ use palpate::evaluate;
 use palpate::evaluate::coverage::coverage;
 use palpate::pipeline::field::{FieldResult, run};
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, Trouble, phantom, troubled};
+use palpate::types::params::ModelSource;
 use palpate::types::{FieldParams, Mask, MotionModel, Trust};
 use rayon::prelude::*;
 
@@ -135,4 +136,34 @@ fn each_label_has_its_expected_error() {
     assert!((mean / expected.mean_mm - 1.0).abs() < 0.1, "{expected:?}");
     let sum: f64 = expected.sources.iter().map(|s| s.1).sum();
     assert!((sum - 1.0).abs() < 1e-9);
+}
+
+/// A model that was asked for and does not explain the volumes warns, and what it leaves out is its
+/// error; one that does not contradict them is taken as it is. Two scans at rest give noise.
+#[test]
+fn a_model_that_was_asked_for_knows_what_it_leaves_out() {
+    let p = troubled(&PhantomParams::new(PhantomKind::Head).sized(44), Trouble::Motion, 5.0).unwrap();
+    for (model, named) in [
+        (ModelSource::Identity, MotionModel::Identity),
+        (ModelSource::Rigid, MotionModel::Rigid),
+        (ModelSource::Affine, MotionModel::Affine),
+        (ModelSource::Free, MotionModel::Free),
+    ] {
+        let found = measured(&p, None, &FieldParams { model, ..FieldParams::default() });
+        let m = evaluate::metrics(&found.displacement, &p.truth, Some(&p.mask), &[]).unwrap();
+        let (s, expected) = (&found.summary, &found.summary.expected);
+        assert_eq!(s.model, named);
+        assert_eq!(s.rejected, model != ModelSource::Free, "{:?}", s.evidence);
+        assert_eq!(s.rejected, s.warnings.iter().any(|w| w.contains("asked for")), "{:?}", s.warnings);
+        if s.rejected {
+            let ratio = expected.mean_mm / m.mean_mm;
+            assert!((0.7..1.5).contains(&ratio), "{named:?}: {:.2} mm for {:.2}", expected.mean_mm, m.mean_mm);
+            assert!(m.mean_mm < 0.5 * m.identity_mm || expected.trust() == Trust::Low, "{named:?}: {expected:?}");
+        }
+    }
+    let still = PhantomParams { motion: MotionKind::None, ..PhantomParams::new(PhantomKind::Head).sized(44) };
+    let rest = phantom(&still).unwrap();
+    let free = measured(&rest, None, &FieldParams { model: ModelSource::Free, ..FieldParams::default() });
+    let m = evaluate::metrics(&free.displacement, &rest.truth, Some(&rest.mask), &[]).unwrap();
+    assert!(m.mean_mm > 0.0 && free.summary.expected.interval_mm[1] > m.mean_mm, "{} mm", m.mean_mm);
 }
