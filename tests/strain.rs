@@ -275,6 +275,7 @@ fn strain_of_a_pair_and_of_its_folder_are_the_same() {
         (&["strain", "f", "-o", "g", "--fibres", "9=1,0,0"], 1, "no voxel has label 9"),
         (&["strain", "f", "-o", "g", "--fibres", "1=1,0,0", "--fibres", "1=0,1,0"], 2, "has a direction already"),
         (&["strain", "f/principal.nii.gz", "-o", "g"], 1, "is not a displacement field"),
+        (&["strain", "f", "-o", "g", "--field-convention", "ras"], 2, "--field-convention"),
         (&["strain", "f", "-o", "f"], 2, "choose another --output"),
         (&["strain", "nowhere", "-o", "g"], 1, "nowhere"),
     ] {

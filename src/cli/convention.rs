@@ -18,6 +18,11 @@ pub struct Convention {
 }
 
 impl Convention {
+    /// Whether fields are taken as palpate writes them.
+    pub fn is_ours(&self) -> bool {
+        self.field_convention == FieldConvention::Lps
+    }
+
     /// The field in this convention.
     pub fn read(&self, path: &Path) -> Result<DenseField> {
         let deformed = self.field_deformed.as_ref().map(io::read_header).transpose()?;

@@ -72,6 +72,11 @@ impl Source {
             let field = convention.read(path)?;
             return Ok(Self { field, bodies: None, samples: None, trust: None, image: None, matches: None });
         }
+        if !convention.is_ours() {
+            bail!(Usage(
+                "--field-convention: a folder of palpate field holds LPS; leave it out, or name a file".into()
+            ));
+        }
         let file = |name: &str| path.join(name);
         let there = |name: &str| Some(file(name)).filter(|p| p.is_file());
         for (part, lost) in [
