@@ -157,21 +157,13 @@ fn the_deviation_holds_the_errors_of_phantoms() {
     for (kind, trouble, severity) in scenes {
         let p = troubled(&PhantomParams::new(kind).sized(44), trouble, severity).unwrap();
         let found = pipeline::field::run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {}).unwrap();
-        let input = StrainInput {
-            field: &found.displacement,
-            bodies: &found.bodies,
-            labels: None,
-            samples: Some(&found.samples),
-            trust: Some(found.summary.expected.trust()),
-        };
-        let strain = pipeline::strain::run(input, &StrainParams::default(), &|_, _| {}).unwrap();
+        let strain = pipeline::strain::run(StrainInput::of(&found), &StrainParams::default(), &|_, _| {}).unwrap();
         let grid = *found.displacement.grid();
         let gauge = Gauge::of_length(&grid, strain.summary.gauge_mm);
         let truth = StrainField::of(&p.truth, found.bodies.as_slice(), gauge, StrainMeasure::GreenLagrange);
         let (mut held, mut count) = (0, 0);
         for at in (0..grid.len()).filter(|&at| found.bodies.as_slice()[at] != 0 && p.mask.as_slice()[at] != 0) {
-            let [i, j, k] = grid.voxel(at);
-            let sd = strain.deviation.at(grid.world(i, j, k));
+            let sd = strain.deviation.at(grid.centre(at));
             let (e, t) = (strain.strain.at(at), truth.at(at));
             // Across a slice there is neither strain nor deviation.
             let known = || (0..6).filter(|&c| sd[c] > 0.0 || t[c] != 0.0);
@@ -292,14 +284,7 @@ fn error_bars_of_regions_hold_what_noise_adds() {
     let p = troubled(&PhantomParams::new(PhantomKind::Head).sized(44), Trouble::Noise, 10.0).unwrap();
     let params = FieldParams { model: ModelSource::Free, ..FieldParams::default() };
     let found = pipeline::field::run(&p.initial, &p.deformed, None, &params, &|_, _| {}).unwrap();
-    let input = StrainInput {
-        field: &found.displacement,
-        bodies: &found.bodies,
-        labels: None,
-        samples: Some(&found.samples),
-        trust: None,
-    };
-    let strain = pipeline::strain::run(input, &StrainParams::default(), &|_, _| {}).unwrap();
+    let strain = pipeline::strain::run(StrainInput::of(&found), &StrainParams::default(), &|_, _| {}).unwrap();
     let gauge = Gauge::of_length(found.displacement.grid(), strain.summary.gauge_mm);
     let truth = StrainField::of(&p.truth, found.bodies.as_slice(), gauge, StrainMeasure::GreenLagrange);
     let inside: Vec<usize> = (0..truth.grid().len()).filter(|&at| found.bodies.as_slice()[at] != 0).collect();

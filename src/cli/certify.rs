@@ -54,9 +54,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let like = like
         .as_ref()
         .map(|path| {
-            let file = if path.is_dir() { path.join("displacement.nii.gz") } else { path.clone() };
-            let field = convention.read(&file)?;
-            same_grid(&file, field.grid(), &grid, initial)?;
+            let field = convention.read_result(path)?;
+            same_grid(path, field.grid(), &grid, initial)?;
             Ok::<_, anyhow::Error>(field)
         })
         .transpose()?;

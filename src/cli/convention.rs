@@ -1,6 +1,7 @@
 //! `--field-convention`: fields of other programs.
 
-use anyhow::Result;
+use super::Usage;
+use anyhow::{Result, bail};
 use clap::Args;
 use palpate::io::{self, FieldConvention};
 use palpate::types::DenseField;
@@ -18,15 +19,23 @@ pub struct Convention {
 }
 
 impl Convention {
-    /// Whether fields are taken as palpate writes them.
-    pub fn is_ours(&self) -> bool {
-        self.field_convention == FieldConvention::Lps
-    }
-
     /// The field in this convention.
     pub fn read(&self, path: &Path) -> Result<DenseField> {
         let deformed = self.field_deformed.as_ref().map(io::read_header).transpose()?;
         let grid = deformed.as_ref().map(|(stored, _)| &stored.grid);
         Ok(io::read_field_as(path, self.field_convention, grid)?)
+    }
+
+    /// The field of a results folder, which is palpate's own, or that of a file in this convention.
+    pub fn read_result(&self, path: &Path) -> Result<DenseField> {
+        if !path.is_dir() {
+            return self.read(path);
+        }
+        if self.field_convention != FieldConvention::Lps {
+            bail!(Usage(
+                "--field-convention: a folder of palpate field holds LPS; leave it out, or name a file".into()
+            ));
+        }
+        Ok(io::read_field(path.join("displacement.nii.gz"))?)
     }
 }

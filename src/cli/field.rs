@@ -251,13 +251,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
 /// The strain of a field, by the labels of the mask.
 fn strain_of(result: &FieldResult, mask: Option<&Mask>, progress: Progress<'_>) -> Result<StrainResult, StrainError> {
-    let input = StrainInput {
-        field: &result.displacement,
-        bodies: &result.bodies,
-        labels: mask,
-        samples: Some(&result.samples),
-        trust: Some(result.summary.expected.trust()),
-    };
+    let input = StrainInput { labels: mask, ..StrainInput::of(result) };
     pipeline::strain::run(input, &StrainParams::default(), progress)
 }
 

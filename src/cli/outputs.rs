@@ -223,7 +223,7 @@ pub fn write_strain(folder: &mut OutputFolder, result: &StrainResult, bodies: &M
     folder.write("strain.nii.gz", |p| io::write_tensors(p, grid, strain.tensors(), &axes))?;
     let measured = |at: usize| bodies.as_slice()[at] != 0;
     let each = |at: usize| match measured(at) {
-        true => deviation.at(place(grid, at)).map(|v| v as f32),
+        true => deviation.at(grid.centre(at)).map(|v| v as f32),
         false => [0.0; 6],
     };
     let vague: Vec<[f32; 6]> = (0..grid.len()).into_par_iter().map(each).collect();
@@ -256,11 +256,6 @@ pub fn write_strain(folder: &mut OutputFolder, result: &StrainResult, bodies: &M
 /// Unit vectors are kept to 2^-9, a tenth of a degree.
 const DIRECTION_BITS: i32 = 9;
 
-fn place(grid: &Grid, at: usize) -> WorldPoint {
-    let [i, j, k] = grid.voxel(at);
-    grid.world(i, j, k)
-}
-
 /// The strain in the voxels nearest to these places (mm); those outside have that of the border.
 pub fn at_places(strain: &StrainField, places: impl Iterator<Item = WorldPoint>) -> Vec<[f64; 6]> {
     let grid = strain.grid();
@@ -282,7 +277,7 @@ impl<'a> StrainMaps<'a> {
     pub fn of(result: &'a StrainResult) -> Self {
         let StrainResult { strain, deviation, summary } = result;
         let normal = move |at: usize| {
-            let d = deviation.at(place(strain.grid(), at));
+            let d = deviation.at(strain.grid().centre(at));
             ((d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / 3.0).sqrt() as f32
         };
         let maps: [Box<dyn Fn(usize) -> f32 + Sync + 'a>; 5] = [

@@ -9,9 +9,10 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
 use palpate::io;
+use palpate::pipeline::field::mesh_of;
 use palpate::pipeline::strain::{self, StrainInput, StrainParams};
 use palpate::report::strain::{page, summary, text};
-use palpate::strain::directions::{Directions, Tube};
+use palpate::strain::directions::{Directions, Tube, unit};
 use palpate::types::{DenseField, ErrorSamples, Grid, Mask, SparseField, StrainMeasure, Trust, Volume, names};
 use std::path::{Path, PathBuf};
 
@@ -72,11 +73,6 @@ impl Source {
             let field = convention.read(path)?;
             return Ok(Self { field, bodies: None, samples: None, trust: None, image: None, matches: None });
         }
-        if !convention.is_ours() {
-            bail!(Usage(
-                "--field-convention: a folder of palpate field holds LPS; leave it out, or name a file".into()
-            ));
-        }
         let file = |name: &str| path.join(name);
         let there = |name: &str| Some(file(name)).filter(|p| p.is_file());
         for (part, lost) in [
@@ -88,15 +84,10 @@ impl Source {
                 warnings.push(format!("{}: {part} is missing: {lost}", path.display()));
             }
         }
-        let field = io::read_field(file("displacement.nii.gz"))?;
+        let field = convention.read_result(path)?;
         let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path)).transpose()?;
         let summary = there("summary.json").map(io::read_json).transpose()?;
-        let trust = summary.as_ref().and_then(|s| match s.get("trust")?.as_str()? {
-            "high" => Some(Trust::High),
-            "moderate" => Some(Trust::Moderate),
-            "low" => Some(Trust::Low),
-            _ => None,
-        });
+        let trust = summary.and_then(|mut s| serde_json::from_value(s.get_mut("trust")?.take()).ok());
         let image = there("warped.nii.gz").map(io::read_volume).transpose()?;
         Ok(Self {
             samples: there("posterior.nii.gz").map(io::read_samples).transpose()?,
@@ -125,7 +116,8 @@ impl Source {
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { field: path, target, gauge, measure, mask, labels, fibres, tube, convention } = options;
     let files: Vec<&str> = STRAIN_FILES.iter().copied().chain(["mesh.vtu", "summary.json", "report.html"]).collect();
-    let given: Vec<&Path> = [path].into_iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
+    let vectors = fibres.iter().map(Path::new);
+    let given: Vec<&Path> = [path].into_iter().chain(mask).chain(labels).map(PathBuf::as_path).chain(vectors).collect();
     check_distinct(&given, &target.files(&files))?;
     if path.is_dir() && path.canonicalize().ok() == target.output.canonicalize().ok() {
         bail!(Usage(format!("{}: its summary would be overwritten; choose another --output", path.display())));
@@ -156,7 +148,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     progress.set("write", 1.0);
     write_strain(&mut folder, &result, &tissue)?;
     if let Some(matches) = &source.matches {
-        let (mesh, nodes) = palpate::pipeline::field::mesh_of(matches, grid.is_single_slice())?;
+        let (mesh, nodes) = mesh_of(matches, grid.is_single_slice())?;
         let kept: Vec<_> = matches.kept().collect();
         let nodes: Vec<_> = nodes.iter().map(|&n| kept[n as usize]).collect();
         let strained = at_places(&result.strain, nodes.iter().map(|m| m.initial));
@@ -213,7 +205,7 @@ fn of_label(text: &str) -> Result<(u8, [f64; 3])> {
     let numbers: Vec<f64> =
         vector.split(',').map(|v| v.trim().parse()).collect::<Result<_, _>>().map_err(|_| wrong())?;
     let vector: [f64; 3] = numbers.try_into().map_err(|_| wrong())?;
-    if palpate::strain::directions::unit(vector).is_none() {
+    if unit(vector).is_none() {
         bail!(Usage(format!("--fibres {text}: that direction has no length; give another")));
     }
     Ok((label, vector))

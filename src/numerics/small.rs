@@ -97,7 +97,7 @@ pub fn eigenvalues(m: &Symmetric3) -> [f64; 3] {
 }
 
 /// All nine entries, row by row.
-fn full(m: &Symmetric3) -> [[f64; 3]; 3] {
+pub fn full(m: &Symmetric3) -> [[f64; 3]; 3] {
     [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]]
 }
 

@@ -9,7 +9,7 @@ use crate::matching::levels::foreground;
 use crate::numerics::statistics::{noise_sigma, robust_deviation};
 use crate::pipeline::check;
 use crate::pipeline::field::{self, Clock, FieldResult, Progress};
-use crate::pipeline::strain::{StrainInput, StrainParams};
+use crate::pipeline::strain::{self, StrainInput, StrainParams};
 use crate::strain::StrainField;
 use crate::strain::gauge::Gauge;
 use crate::synth::imposed::{Star, imposed, stretch, with_noise};
@@ -268,7 +268,7 @@ fn normal_strain(strain: &StrainField, tissue: &Mask) -> f64 {
 /// Noise of a normal strain by gauge, from fields of noise alone.
 fn noise_by_gauge(noise: &[DenseField], tissue: &Mask) -> Vec<GaugeNoise> {
     let grid = tissue.grid();
-    let shortest = 2.0 * grid.least_spacing();
+    let shortest = Gauge::shortest(grid).finest_mm(grid);
     let widest = (0..3).filter(|&a| grid.shape()[a] > 1).map(|a| grid.shape()[a] as f64 * grid.spacing()[a]);
     let widest = widest.fold(f64::INFINITY, f64::min) / 2.0;
     let of = |times: usize| {
@@ -293,21 +293,14 @@ fn compared(
 ) -> Result<Imposed, StrainError> {
     let grid = *truth.grid();
     let scored = metrics(&found.displacement, truth, Some(tissue), &[])?;
-    let input = StrainInput {
-        field: &found.displacement,
-        bodies: tissue,
-        labels: None,
-        samples: Some(&found.samples),
-        trust: None,
-    };
+    let input = StrainInput { bodies: tissue, ..StrainInput::of(found) };
     let params = StrainParams { gauge_mm: Some(gauge_mm), ..StrainParams::default() };
-    let own = crate::pipeline::strain::run(input, &params, &|_, _| {})?;
+    let own = strain::run(input, &params, &|_, _| {})?;
     let gauge = Gauge::of_length(&grid, gauge_mm);
     let exact = StrainField::of(truth, tissue.as_slice(), gauge, StrainMeasure::GreenLagrange);
     let (mut square, mut held, mut count) = (0.0, 0usize, 0usize);
     for at in (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0) {
-        let [i, j, k] = grid.voxel(at);
-        let sd = own.deviation.at(grid.world(i, j, k));
+        let sd = own.deviation.at(grid.centre(at));
         let (e, t) = (own.strain.at(at), exact.at(at));
         for c in (0..3).filter(|&c| sd[c] > 0.0) {
             square += (e[c] - t[c]).powi(2);

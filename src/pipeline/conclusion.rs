@@ -107,11 +107,7 @@ impl Concluded {
             }
             let lattice = free.lattice.clone();
             let stated = full_lattice(grid, field, factor, (&choice, judged));
-            let mut departure = departure(&stated, &free, factor);
-            if choice.rejected {
-                let left_out = uncertainty::left_out(if grid.is_single_slice() { 2 } else { 3 });
-                departure.iter_mut().for_each(|d| *d *= left_out);
-            }
+            let departure = departure(&stated, &free, factor, choice.rejected);
             let narrowed = |m: usize| rest.as_ref().map_or(1.0, |rest| rest.narrowed(place(lattice.within(m))));
             let narrowed: Vec<f32> = (0..lattice.len()).map(narrowed).collect();
             let nodes = AtNodes {
@@ -180,12 +176,14 @@ fn over(grid: &Grid, field: &SplineField, factor: [usize; 3]) -> Lattice {
 }
 
 /// How far the motion that is stated over the full-resolution grid departs from a free field, at
-/// the nodes of that one (mm).
-pub(super) fn departure((full, stated): &Spline, free: &SplineField, factor: [usize; 3]) -> Vec<f32> {
+/// the nodes of that one (mm); of a motion that the evidence rejects as [`uncertainty::left_out`].
+pub(super) fn departure((full, stated): &Spline, free: &SplineField, factor: [usize; 3], rejected: bool) -> Vec<f32> {
     let lattice = &free.lattice;
+    let axes = (0..3).filter(|&a| lattice.shape[a] > 1).count();
+    let times = if rejected { uncertainty::left_out(axes) } else { 1.0 };
     let at = |m: usize| {
         let p = lattice.within(m);
-        distance(full.at(stated, from_level(p, factor)), lattice.at(&free.coefficients, p)) as f32
+        times * distance(full.at(stated, from_level(p, factor)), lattice.at(&free.coefficients, p)) as f32
     };
     (0..lattice.len()).into_par_iter().map(at).collect()
 }

@@ -177,11 +177,7 @@ pub(super) fn measure(
     clock.book("uncertainty");
 
     let full = conclusion::full_lattice(&grid, &field, factor, (&choice, factor));
-    let mut departure = conclusion::departure(&full, &field, factor);
-    if choice.rejected {
-        let left_out = uncertainty::left_out(if flat { 2 } else { 3 });
-        departure.iter_mut().for_each(|d| *d *= left_out);
-    }
+    let departure = conclusion::departure(&full, &field, factor, choice.rejected);
     let narrowed = vec![1.0; departure.len()];
     let nodes =
         AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };

@@ -3,7 +3,7 @@
 use crate::error::{FieldError, StrainError};
 use crate::field::jacobian;
 use crate::numerics::statistics::{median, noise_sigma};
-use crate::pipeline::field::{Clock, Progress};
+use crate::pipeline::field::{Clock, FieldResult, Progress};
 use crate::pipeline::uncertainty::evenly;
 use crate::strain::StrainField;
 use crate::strain::deviation::{COMPONENTS, Draws, Gradients, StrainDeviation, apart, components};
@@ -12,8 +12,7 @@ use crate::strain::gauge::{Gauge, map_gradients};
 use crate::strain::measure;
 use crate::strain::statistics::moments;
 use crate::types::{
-    DenseField, ErrorSamples, GaugeTrial, Grid, Mask, RegionStrain, StrainMeasure, StrainSummary, Trust, VoxelPoint,
-    WorldPoint,
+    DenseField, ErrorSamples, GaugeTrial, Grid, Mask, RegionStrain, StrainMeasure, StrainSummary, Trust, WorldPoint,
 };
 use rayon::prelude::*;
 
@@ -31,6 +30,19 @@ pub struct StrainInput<'a> {
     pub samples: Option<&'a ErrorSamples>,
     /// How far the field is to be relied on, where that is known.
     pub trust: Option<Trust>,
+}
+
+impl<'a> StrainInput<'a> {
+    /// A measured field with all that is known of it, its bodies as regions.
+    pub fn of(result: &'a FieldResult) -> Self {
+        Self {
+            field: &result.displacement,
+            bodies: &result.bodies,
+            labels: None,
+            samples: Some(&result.samples),
+            trust: Some(result.summary.expected.trust()),
+        }
+    }
 }
 
 /// What is asked for.
@@ -81,11 +93,11 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
     let (gauge, mut gauges) = match (params.gauge_mm, &draws) {
         (Some(asked), _) => (Gauge::of_length(&grid, asked), Vec::new()),
         (None, Some(_)) => (Gauge::shortest(&grid), Vec::new()),
-        (None, None) => choose_white(field, inside, noise_mm),
+        (None, None) => choose_white(field, bodies, noise_mm),
     };
     let gradients = draws.as_ref().map(|draws| draws.gradients(gauge, usize::MAX));
     if let Some((draws, gradients)) = draws.as_ref().zip(gradients.as_ref()).filter(|_| params.gauge_mm.is_none()) {
-        gauges = by_draws(&grid, inside, draws, gradients);
+        gauges = by_draws(bodies, draws, gradients);
     }
     clock.book("gauge");
 
@@ -124,7 +136,7 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
         deviation,
         summary: StrainSummary {
             measure: params.measure,
-            gauge_mm: nominal(&grid, gauge),
+            gauge_mm: gauge.finest_mm(&grid),
             gauge_axes_mm: gauge.length_mm(&grid),
             gauge_asked: params.gauge_mm.is_some(),
             gauges,
@@ -171,16 +183,17 @@ fn check(input: StrainInput<'_>, params: &StrainParams) -> Result<(), StrainErro
     if samples.is_some_and(|s| !lies_over(s.nodes(), grid)) {
         return Err(StrainError::Samples);
     }
-    let voxels = thinnest(grid, &tissue);
+    let extent = extent(bodies);
+    let voxels = (0..3).filter(|&a| grid.shape()[a] > 1).map(|a| extent[a]).min().unwrap_or(0);
     if voxels < 2 {
         return Err(StrainError::Thin { voxels });
     }
     if let Some(asked) = params.gauge_mm {
-        let least = nominal(grid, Gauge::shortest(grid));
+        let least = Gauge::shortest(grid).finest_mm(grid);
         if asked.is_nan() || asked < least * (1.0 - 1e-6) {
             return Err(StrainError::ShortGauge { asked, least });
         }
-        let width = width(grid, &tissue);
+        let width = width(bodies);
         if asked > width {
             return Err(StrainError::WideGauge { asked, width });
         }
@@ -202,12 +215,6 @@ fn check(input: StrainInput<'_>, params: &StrainParams) -> Result<(), StrainErro
     Ok(())
 }
 
-/// The side of a gauge along the finest axis (mm).
-fn nominal(grid: &Grid, gauge: Gauge) -> f64 {
-    let sides = gauge.length_mm(grid);
-    (0..3).filter(|&a| gauge.half[a] > 0).map(|a| sides[a]).fold(f64::INFINITY, f64::min)
-}
-
 /// Whether the nodes of a spline reach over a grid, a node about it to each side and no more than
 /// two.
 fn lies_over(nodes: &Grid, grid: &Grid) -> bool {
@@ -225,32 +232,22 @@ fn lies_over(nodes: &Grid, grid: &Grid) -> bool {
     })
 }
 
-/// Least extent of the tissue along a thick axis (voxels).
-fn thinnest(grid: &Grid, tissue: &[usize]) -> usize {
-    let along = |a: usize| {
-        let places = || tissue.iter().map(|&at| grid.voxel(at)[a]);
-        places().max().zip(places().min()).map_or(0, |(high, low)| high + 1 - low)
-    };
-    (0..3).filter(|&a| grid.shape()[a] > 1).map(along).min().unwrap_or(0)
+/// Voxels of the tissue along each axis.
+fn extent(tissue: &Mask) -> [usize; 3] {
+    tissue.bounds().map_or([0; 3], |[low, high]| std::array::from_fn(|a| high[a] + 1 - low[a]))
 }
 
 /// Least extent of the tissue along a thick axis (mm).
-fn width(grid: &Grid, tissue: &[usize]) -> f64 {
-    let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
-    for &at in tissue {
-        let v = grid.voxel(at);
-        for a in 0..3 {
-            (low[a], high[a]) = (low[a].min(v[a]), high[a].max(v[a]));
-        }
-    }
-    let extent = |a: usize| (high[a] + 1 - low[a]) as f64 * grid.spacing()[a];
-    (0..3).filter(|&a| grid.shape()[a] > 1).map(extent).fold(f64::INFINITY, f64::min)
+fn width(tissue: &Mask) -> f64 {
+    let (grid, extent) = (tissue.grid(), extent(tissue));
+    let along = |a: usize| extent[a] as f64 * grid.spacing()[a];
+    (0..3).filter(|&a| grid.shape()[a] > 1).map(along).fold(f64::INFINITY, f64::min)
 }
 
 /// Gauges to try: those of [`TRIED`] that are shorter than half of the tissue.
-fn tried(grid: &Grid, bodies: &[u8]) -> Vec<Gauge> {
-    let tissue: Vec<usize> = (0..bodies.len()).filter(|&at| bodies[at] != 0).collect();
-    let (least, width) = (nominal(grid, Gauge::shortest(grid)), width(grid, &tissue));
+fn tried(tissue: &Mask) -> Vec<Gauge> {
+    let grid = tissue.grid();
+    let (least, width) = (Gauge::shortest(grid).finest_mm(grid), width(tissue));
     let lengths = TRIED.into_iter().map(|times| times as f64 * least);
     lengths.filter(|&l| l == least || l < width / 2.0).map(|l| Gauge::of_length(grid, l)).collect()
 }
@@ -261,7 +258,8 @@ const FEW: usize = 2;
 /// What each gauge would give, by draws of the field's error; `shortest` are the gradients of the
 /// first. The shortest has the least error to expect: the field is the mean of its posterior
 /// distribution, so a longer gauge adds what it smooths away, though its own noise falls.
-fn by_draws(grid: &Grid, bodies: &[u8], draws: &Draws, shortest: &Gradients) -> Vec<GaugeTrial> {
+fn by_draws(tissue: &Mask, draws: &Draws, shortest: &Gradients) -> Vec<GaugeTrial> {
+    let grid = tissue.grid();
     let noise = |all: &Gradients| {
         let drawn = all[1..].iter().map(|drawn| apart(drawn, &all[0])).sum::<f64>();
         drawn / (all.len() - 1).max(1) as f64
@@ -270,17 +268,17 @@ fn by_draws(grid: &Grid, bodies: &[u8], draws: &Draws, shortest: &Gradients) -> 
     let longer = |&gauge: &Gauge| {
         let own = draws.gradients(gauge, FEW);
         let error = (apart(&own[0], &shortest[0]) + least).sqrt();
-        GaugeTrial { gauge_mm: nominal(grid, gauge), noise: noise(&own).sqrt(), error }
+        GaugeTrial { gauge_mm: gauge.finest_mm(grid), noise: noise(&own).sqrt(), error }
     };
-    let gauges = tried(grid, bodies);
-    let first = GaugeTrial { gauge_mm: nominal(grid, gauges[0]), noise: least.sqrt(), error: least.sqrt() };
+    let gauges = tried(tissue);
+    let first = GaugeTrial { gauge_mm: gauges[0].finest_mm(grid), noise: least.sqrt(), error: least.sqrt() };
     [first].into_iter().chain(gauges[1..].iter().map(longer)).collect()
 }
 
 /// The same where only white noise of the displacement is known (mm).
-fn choose_white(field: &DenseField, bodies: &[u8], noise_mm: f64) -> (Gauge, Vec<GaugeTrial>) {
-    let grid = field.grid();
-    let gauges = tried(grid, bodies);
+fn choose_white(field: &DenseField, tissue: &Mask, noise_mm: f64) -> (Gauge, Vec<GaugeTrial>) {
+    let (grid, bodies) = (field.grid(), tissue.as_slice());
+    let gauges = tried(tissue);
     let normal = |gauge| map_gradients(field, bodies, gauge, |_, g| [g[0][0], g[1][1], g[2][2]].map(|v| v as f32));
     let shortest = normal(gauges[0]);
     let first = (noise_mm * gauges[0].slope_noise(grid)).powi(2);
@@ -291,7 +289,7 @@ fn choose_white(field: &DenseField, bodies: &[u8], noise_mm: f64) -> (Gauge, Vec
         let lost = normal(gauge).iter().zip(&shortest).map(apart).sum::<f64>() / (3.0 * inside);
         // A slope over a longer gauge holds all that the shorter one shares with it.
         let error = (lost - (first - own) + own).max(0.0).sqrt();
-        GaugeTrial { gauge_mm: nominal(grid, gauge), noise: own.sqrt(), error }
+        GaugeTrial { gauge_mm: gauge.finest_mm(grid), noise: own.sqrt(), error }
     };
     best(&gauges, gauges.iter().map(trial).collect())
 }
@@ -315,14 +313,10 @@ fn sizes(strain: &StrainField, deviation: &StrainDeviation, bodies: &Mask) -> [f
     let picked: Vec<usize> = evenly(grid.len(), |at| inside[at] != 0, SAMPLED).collect();
     let thick = (0..3).filter(|&a| grid.shape()[a] > 1).count().max(1) as f64;
     let normal = |e: [f64; 6]| (e[..3].iter().map(|v| v * v).sum::<f64>() / thick).sqrt();
-    let mut noise: Vec<f32> = picked.iter().map(|&at| normal(deviation.at(place(grid, at))) as f32).collect();
+    let mut noise: Vec<f32> = picked.iter().map(|&at| normal(deviation.at(grid.centre(at))) as f32).collect();
     let square = picked.iter().map(|&at| normal(strain.at(at)).powi(2)).sum::<f64>() / picked.len().max(1) as f64;
     let noise = if noise.is_empty() { 0.0 } else { f64::from(median(&mut noise)) };
     [noise, square.sqrt()]
-}
-
-fn place(grid: &Grid, at: usize) -> WorldPoint {
-    grid.affine().to_world(VoxelPoint(grid.voxel(at).map(|v| v as f64)))
 }
 
 /// Every component in every region, with what the draws say of it.
@@ -336,7 +330,7 @@ fn regions(
     let grid = strain.grid();
     let names: Vec<&'static str> = COMPONENTS.iter().chain(params.directions.names()).copied().collect();
     let inside = |at: usize| bodies.as_slice()[at] != 0;
-    let frame = |at: usize| params.directions.at(at, labels.as_slice()[at], place(grid, at));
+    let frame = |at: usize| params.directions.at(at, labels.as_slice()[at], grid.centre(at));
     let mut by_label: Vec<(u8, Vec<usize>)> = (1..=255).map(|l| (l, Vec::new())).collect();
     for at in (0..grid.len()).filter(|&at| inside(at) && labels.as_slice()[at] != 0) {
         by_label[usize::from(labels.as_slice()[at]) - 1].1.push(at);

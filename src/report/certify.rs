@@ -4,11 +4,11 @@ use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
 use crate::report::grasp::tile;
-use crate::report::html::{card, document, escape};
+use crate::report::html::{card, document, escape, warned};
 use crate::report::json::{grid, seconds};
 use crate::report::panels::{Panel, gray_range};
 use crate::report::plot::{Line, Plot};
-use crate::report::scale::{Scale, significant};
+use crate::report::scale::{Scale, percent, significant};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
@@ -31,10 +31,6 @@ pub struct CertifyReport<'a> {
     pub detectable: Values<'a>,
     /// The numbers.
     pub certificate: &'a Certificate,
-}
-
-fn percent(v: f64) -> String {
-    significant(100.0 * v)
 }
 
 /// The result in a sentence.
@@ -143,10 +139,7 @@ pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
         wave(c.wavelength_50_mm, "50 %"),
         tile(&percent(c.blind_share), "%", "of the tissue is blind"),
     );
-    if !c.warnings.is_empty() {
-        let items: String = c.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
-    }
+    body += &warned(&c.warnings);
     let gains: Vec<[f64; 2]> = c.gains.iter().map(|g| [g.wavelength_mm, g.gain]).collect();
     let noise: Vec<[f64; 2]> = c.strain_noise_by_gauge.iter().map(|g| [g.gauge_mm, 100.0 * g.noise]).collect();
     let marks: Vec<(f64, bool)> =

@@ -147,6 +147,15 @@ fn look(report: &FieldReport<'_>, views: &Views) -> String {
 const LOOK: &str = "<p class=\"lead\">Click or drag in a picture to move the planes, scroll to go through the slices. Numbers \
                     are those at the cross.</p>";
 
+/// The warnings, where there are any.
+pub(super) fn warned(warnings: &[String]) -> String {
+    if warnings.is_empty() {
+        return String::new();
+    }
+    let items: String = warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
+    format!("<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>")
+}
+
 /// Verdict, key numbers, warnings.
 fn head(report: &FieldReport<'_>) -> String {
     let (s, v) = (report.summary, verdict(report));
@@ -169,10 +178,7 @@ fn head(report: &FieldReport<'_>) -> String {
         tile(format!("{seconds:.1}"), "s", "in all stages"),
         trust = v.trust.name()
     );
-    if !s.warnings.is_empty() {
-        let items: String = s.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(out, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
-    }
+    out.push_str(&warned(&s.warnings));
     out
 }
 

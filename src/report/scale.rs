@@ -79,6 +79,11 @@ pub fn significant(v: f64) -> String {
     }
 }
 
+/// A part as a percentage, as [`significant`] has it.
+pub fn percent(v: f64) -> String {
+    significant(100.0 * v)
+}
+
 /// 1234567 as 1,234,567.
 pub fn thousands(n: usize) -> String {
     let digits = n.to_string();

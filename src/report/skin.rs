@@ -1,7 +1,7 @@
 //! report.html, summary.json and the short summary of `palpate skin`.
 
 use crate::report::grasp::tile;
-use crate::report::html::{document, escape, legend};
+use crate::report::html::{document, escape, legend, warned};
 use crate::report::json::seconds;
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, short};
@@ -113,10 +113,7 @@ pub fn page(report: &SkinReport<'_>) -> String {
         tile(&short(1e3 * left), "mm", "left at the end"),
         tile(&short(100.0 * left / scene.load.displacement), "%", "of the indentation"),
     );
-    if !report.warnings.is_empty() {
-        let items: String = report.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
-    }
+    body.push_str(&warned(report.warnings));
     let _ = write!(
         body,
         "<section><h2>Over time</h2><p class=\"lead\">The column is exact; the block has a punch and free skin beside it. One layer has \

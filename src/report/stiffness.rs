@@ -3,7 +3,7 @@
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::html::{card, document, escape};
+use crate::report::html::{card, document, escape, warned};
 use crate::report::panels::{Panel, gray_range, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, short, thousands};
@@ -316,10 +316,7 @@ fn page_with(
         tile(thousands(result.mesh.nodes().len()), "", "mesh nodes"),
         tile(format!("{total:.1}"), "s", "in all stages"),
     );
-    if !result.warnings.is_empty() {
-        let items: String = result.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(out, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
-    }
+    out.push_str(&warned(&result.warnings));
     let _ = write!(
         out,
         "<section><h2>Regions</h2><div class=\"grid\"><article class=\"wide\"><h3>Moduli</h3>{}</article></div></section>",

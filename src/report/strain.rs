@@ -5,10 +5,10 @@ use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
 use crate::report::grasp::tile;
-use crate::report::html::{card, document, escape};
+use crate::report::html::{card, document, escape, warned};
 use crate::report::json::{grid, seconds};
 use crate::report::panels::{Panel, centre_of_motion, gray_range};
-use crate::report::scale::{Scale, significant, thousands};
+use crate::report::scale::{Scale, percent, significant, thousands};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
@@ -40,11 +40,6 @@ pub struct StrainReport<'a> {
     pub deviation: Values<'a>,
     /// The rest.
     pub summary: &'a StrainSummary,
-}
-
-/// A part as a percentage.
-fn percent(v: f64) -> String {
-    significant(100.0 * v)
 }
 
 fn measure(report: &StrainReport<'_>) -> &'static str {
@@ -251,10 +246,7 @@ pub fn page(report: &StrainReport<'_>) -> Result<String, ReportError> {
         tile(&thousands(voxels), "", "voxels"),
         trust = s.trust.name()
     );
-    if !s.warnings.is_empty() {
-        let items: String = s.warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
-    }
+    body += &warned(&s.warnings);
     body += &pictures(report, "")?;
     body += "<footer><p>Strain is on the initial volume, axes right, anterior, superior. A gauge is the side of the cube over which \
              displacements give one strain: what is finer is smoothed away.</p></footer>";

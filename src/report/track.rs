@@ -5,7 +5,7 @@ use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
 use crate::report::film::Film;
 use crate::report::grasp::tile;
-use crate::report::html::{document, escape};
+use crate::report::html::{document, escape, warned};
 use crate::report::json::{grid, seconds};
 use crate::report::panels::{centre_of_motion, gray_range, length};
 use crate::report::plot::{Line, Plot};
@@ -310,10 +310,7 @@ pub fn page(report: &TrackReport<'_>) -> String {
         trust = trust.name(),
     );
     let warnings = warnings(report);
-    if !warnings.is_empty() {
-        let items: String = warnings.iter().map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(body, "<article class=\"warnings\"><h3>Warnings</h3><ul>{items}</ul></article>");
-    }
+    body.push_str(&warned(&warnings));
     let clock: Vec<String> = (0..=all).map(|f| report.clock(f)).collect();
     let _ = write!(
         body,

@@ -159,8 +159,8 @@ pub(super) fn named(which: &[usize]) -> Option<String> {
     (!which.is_empty()).then(|| format!("{noun} {}{more}", shown.join(", ")))
 }
 
-/// The share of the voxels measured that are uncertain by more than `limit` mm, and in words where they lie, when they
-/// lie to one side.
+/// The share of the voxels measured that are uncertain by more than `limit` mm, and in words where
+/// they lie, when they lie to one side.
 fn uncertain(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, limit: f64) -> (f64, String) {
     let grid = bodies.grid();
     let picked = sample(grid.len(), Some(bodies));

@@ -1,11 +1,12 @@
 //! How far off a strain may be, from random draws of the displacement's error.
 
 use super::gauge::{Gauge, map_gradients};
-use super::measure::{self, principal};
+use super::measure;
 use crate::error::SpaceError;
 use crate::numerics::bspline::weights;
 use crate::numerics::filters::gaussian;
-use crate::numerics::small::Symmetric3;
+use crate::numerics::sampling::Stencil;
+use crate::numerics::small::{Symmetric3, eigenvalues, quadratic};
 use crate::types::space::Matrix3;
 use crate::types::{Affine, DenseField, ErrorSamples, Grid, StrainMeasure, WorldPoint};
 use rayon::prelude::*;
@@ -20,7 +21,8 @@ pub struct Draws {
     errors: Vec<DenseField>,
 }
 
-/// The field of gradients by draw, the first without any error; each holds rows by components.
+/// Displacement gradients by place: as measured, then with each draw of the error; none outside the
+/// bodies.
 pub type Gradients = Vec<Vec<Option<Matrix3>>>;
 
 impl Draws {
@@ -43,10 +45,7 @@ impl Draws {
         };
         let affine = Affine::new(std::array::from_fn(row))?;
         let grid = Grid::new(std::array::from_fn(|a| (shape[a] - 1) / step[a] + 1), affine)?;
-        let at = |offset: usize| {
-            let v = grid.voxel(offset);
-            full.index(v[0] * step[0], v[1] * step[1], v[2] * step[2])
-        };
+        let at = |place: usize| offset(&grid, step, &full, place);
         let thinned = DenseField::from_voxels(grid, |o, _| field.at(at(o)).map(f64::from));
         let labels = if bodies.is_empty() { Vec::new() } else { (0..grid.len()).map(|o| bodies[at(o)]).collect() };
         let errors =
@@ -61,8 +60,7 @@ impl Draws {
 
     /// The offset of a place on the field's own grid.
     pub fn offset(&self, full: &Grid, place: usize) -> usize {
-        let v = self.grid.voxel(place);
-        full.index(v[0] * self.step[0], v[1] * self.step[1], v[2] * self.step[2])
+        offset(&self.grid, self.step, full, place)
     }
 
     /// The gauge in places.
@@ -92,14 +90,19 @@ impl Draws {
     }
 }
 
+/// The offset on the `full` grid of a place of `grid`, which has every `step`-th voxel of it.
+fn offset(grid: &Grid, step: [usize; 3], full: &Grid, place: usize) -> usize {
+    let v = grid.voxel(place);
+    full.index(v[0] * step[0], v[1] * step[1], v[2] * step[2])
+}
+
 /// Each sample at the places of a grid (mm, RAS, planar).
 fn drawn(grid: &Grid, samples: &ErrorSamples) -> impl Iterator<Item = Vec<f32>> {
     let (n, nodes) = (grid.len(), samples.nodes().len());
     let all: Vec<Vec<f32>> = (0..n)
         .into_par_iter()
         .map(|at| {
-            let [i, j, k] = grid.voxel(at);
-            let taps = taps(samples.nodes(), grid.world(i, j, k));
+            let taps = taps(samples.nodes(), grid.centre(at));
             let of = |component: &[f32]| taps.iter().map(|&(node, w)| w * component[node]).sum::<f32>();
             samples.values().iter().flat_map(|s| s.chunks_exact(nodes).map(of)).collect()
         })
@@ -172,7 +175,7 @@ impl StrainDeviation {
                 [*normal, *normal, *normal, shear, shear, shear]
             }
             Self::Drawn(grid, variances) => {
-                let stencil = crate::numerics::sampling::Stencil::new(grid.shape(), grid.affine().to_voxel(place));
+                let stencil = Stencil::new(grid.shape(), grid.affine().to_voxel(place));
                 std::array::from_fn(|c| stencil.of(&variances[c]).max(0.0).sqrt())
             }
         }
@@ -196,11 +199,11 @@ pub const COMPONENTS: [&str; 11] = ["xx", "yy", "zz", "xy", "xz", "yz", "e1", "e
 pub fn components(measure: StrainMeasure, e: &Symmetric3, frame: Option<&Matrix3>) -> [f64; 14] {
     let mut out = [f64::NAN; 14];
     out[..6].copy_from_slice(e);
-    out[6..9].copy_from_slice(&principal(e));
+    out[6..9].copy_from_slice(&eigenvalues(e));
     out[9] = measure::largest_shear(e);
     out[10] = measure::volume_change(measure, e);
     if let Some(frame) = frame {
-        (0..3).for_each(|k| out[11 + k] = measure::along(e, frame[k]));
+        (0..3).for_each(|k| out[11 + k] = quadratic(e, frame[k]));
     }
     out
 }

@@ -2,7 +2,7 @@
 
 use crate::numerics::dense::symmetric_eigen;
 use crate::types::space::{Matrix3, cross, dot, length};
-use crate::types::{DenseField, Mask, VoxelPoint, WorldPoint};
+use crate::types::{DenseField, Mask, WorldPoint};
 
 /// Directions of the tissue.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -34,10 +34,8 @@ impl Tube {
     /// most. None when it has no voxels or extends nowhere.
     pub fn of(label: u8, labels: &Mask) -> Option<Self> {
         let grid = labels.grid();
-        let own: Vec<[f64; 3]> = (0..grid.len())
-            .filter(|&at| labels.as_slice()[at] == label)
-            .map(|at| grid.affine().to_world(VoxelPoint(grid.voxel(at).map(|v| v as f64))).0)
-            .collect();
+        let own: Vec<[f64; 3]> =
+            (0..grid.len()).filter(|&at| labels.as_slice()[at] == label).map(|at| grid.centre(at).0).collect();
         let n = own.len().max(1) as f64;
         let centre: [f64; 3] = std::array::from_fn(|a| own.iter().map(|p| p[a]).sum::<f64>() / n);
         let spread: Matrix3 = std::array::from_fn(|r| {

@@ -38,6 +38,12 @@ impl Gauge {
         std::array::from_fn(|a| 2.0 * self.half[a] as f64 * spacing[a])
     }
 
+    /// Its side along the finest thick axis (mm).
+    pub fn finest_mm(&self, grid: &Grid) -> f64 {
+        let sides = self.length_mm(grid);
+        (0..3).filter(|&a| self.half[a] > 0).map(|a| sides[a]).fold(f64::INFINITY, f64::min)
+    }
+
     /// Voxels in the cube.
     pub fn voxels(&self) -> usize {
         self.half.iter().map(|h| 2 * h + 1).product()
@@ -75,10 +81,9 @@ pub fn map_gradients<T: Clone + Default + Send + Sync>(
     let grid = *field.grid();
     let [nx, ny, _] = grid.shape();
     let plane = nx * ny;
-    let mut labels: Vec<u8> = bodies.to_vec();
-    labels.sort_unstable();
-    labels.dedup();
-    labels.retain(|&l| l != 0);
+    let mut seen = [false; 256];
+    bodies.iter().for_each(|&l| seen[usize::from(l)] = true);
+    let labels: Vec<u8> = (1..=255).filter(|&l| seen[usize::from(l)]).collect();
     let one = bodies.is_empty().then_some(1);
     let mut out = vec![T::default(); grid.len()];
     out.par_chunks_mut(PLANES * plane).enumerate().for_each(|(slab, out)| {

@@ -1,7 +1,7 @@
 //! Strain measures of a displacement gradient.
 
 use crate::numerics::dense::symmetric_eigen;
-use crate::numerics::small::{Symmetric3, eigenvalues, quadratic};
+use crate::numerics::small::{Symmetric3, eigenvalues, full};
 use crate::types::StrainMeasure;
 use crate::types::space::{Matrix3, cross};
 
@@ -35,15 +35,6 @@ fn logarithm(e: &Symmetric3) -> Symmetric3 {
     [h(0, 0), h(1, 1), h(2, 2), h(0, 1), h(0, 2), h(1, 2)]
 }
 
-fn full(m: &Symmetric3) -> Matrix3 {
-    [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]]
-}
-
-/// Principal strains, largest first (1).
-pub fn principal(strain: &Symmetric3) -> [f64; 3] {
-    eigenvalues(strain)
-}
-
 /// Unit vectors along the principal strains, largest first; their signs are arbitrary, the third
 /// completes a right-handed frame.
 pub fn directions(strain: &Symmetric3) -> Matrix3 {
@@ -70,11 +61,6 @@ pub fn volume_change(measure: StrainMeasure, strain: &Symmetric3) -> f64 {
         StrainMeasure::Small => trace,
         StrainMeasure::Logarithmic => trace.exp_m1(),
     }
-}
-
-/// The normal strain along a unit vector (1).
-pub fn along(strain: &Symmetric3, direction: [f64; 3]) -> f64 {
-    quadratic(strain, direction)
 }
 
 #[cfg(test)]

@@ -15,9 +15,9 @@ pub mod measure;
 
 pub mod statistics;
 
+use crate::numerics::small::eigenvalues;
 use crate::types::space::{Grid, Matrix3};
 use crate::types::{DenseField, StrainMeasure};
-use measure::principal;
 
 /// Strain at every voxel, axes in RAS.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,6 +58,6 @@ impl StrainField {
 
     /// Principal strains at a voxel offset, largest first (1).
     pub fn principal(&self, offset: usize) -> [f64; 3] {
-        principal(&self.at(offset))
+        eigenvalues(&self.at(offset))
     }
 }

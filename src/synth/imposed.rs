@@ -19,31 +19,26 @@ pub struct Star {
     pub amplitude: f64,
     /// Wavelengths at the first and the last row (mm).
     pub wavelengths: [f64; 2],
-    /// The first and the last row, and the middle along the waves (voxels).
+    /// The first and the last row (voxels).
     pub rows: [f64; 2],
     /// Where along the waves they are all in phase (voxels).
     pub middle: f64,
 }
 
 impl Star {
-    /// Over the box of a mask, from four of the coarser voxel edges to two thirds of the box along
-    /// the waves.
+    /// Over the box of a mask, from four voxel edges along the waves to two thirds of the box.
     pub fn over(mask: &Mask, axes: [usize; 3], amplitude: f64) -> Self {
         let grid = mask.grid();
-        let (mut low, mut high) = ([usize::MAX; 3], [0usize; 3]);
-        for at in (0..grid.len()).filter(|&at| mask.as_slice()[at] != 0) {
-            let v = grid.voxel(at);
-            (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(v[a]), high[a].max(v[a])));
-        }
+        let [low, high] = mask.bounds().unwrap_or([[0; 3]; 2]);
         let [wave, grow, _] = axes;
-        let extent = (high[wave] + 1 - low[wave].min(high[wave])) as f64 * grid.spacing()[wave];
+        let extent = (high[wave] + 1 - low[wave]) as f64 * grid.spacing()[wave];
         let shortest = 4.0 * grid.spacing()[wave];
         Self {
             axes,
             amplitude,
             wavelengths: [shortest, (extent / 1.5).max(2.0 * shortest)],
-            rows: [low[grow].min(high[grow]) as f64, high[grow] as f64],
-            middle: (low[wave].min(high[wave]) + high[wave]) as f64 / 2.0,
+            rows: [low[grow] as f64, high[grow] as f64],
+            middle: (low[wave] + high[wave]) as f64 / 2.0,
         }
     }
 

@@ -1,6 +1,6 @@
 //! How far off a field is expected to be, and how far to rely on it.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Where the error of a field comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -39,7 +39,7 @@ impl ErrorSource {
 }
 
 /// How far to rely on a field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Trust {
     /// The expected error is under a tenth of the motion.

@@ -228,6 +228,13 @@ impl Grid {
         self.affine.to_world(VoxelPoint([i as f64, j as f64, k as f64]))
     }
 
+    /// The centre of the voxel at an offset (x fastest), in world mm.
+    #[inline]
+    pub fn centre(&self, offset: usize) -> WorldPoint {
+        let [i, j, k] = self.voxel(offset);
+        self.world(i, j, k)
+    }
+
     /// Whether the two grids have the same shape and their corners coincide to 1e-3 of a voxel
     /// (NIfTI stores float32).
     pub fn same_as(&self, other: &Grid) -> bool {

@@ -127,3 +127,15 @@ impl<'a, T: Clone> Voxels<'a, T> {
         Voxels { grid: self.grid, values: self.values.into_owned().into() }
     }
 }
+
+impl Voxels<'_, u8> {
+    /// The first and the last voxel along each axis of those that are not 0; none of an empty mask.
+    pub fn bounds(&self) -> Option<[[usize; 3]; 2]> {
+        let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
+        for (at, _) in self.as_slice().iter().enumerate().filter(|(_, v)| **v != 0) {
+            let v = self.grid.voxel(at);
+            (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(v[a]), high[a].max(v[a])));
+        }
+        (low[0] != usize::MAX).then_some([low, high])
+    }
+}
