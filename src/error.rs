@@ -271,6 +271,26 @@ pub enum FieldError {
         /// What to try.
         hint: String,
     },
+    /// A start that no search can begin from.
+    #[error("the start {what}; {hint}")]
+    Start {
+        /// What is wrong.
+        what: String,
+        /// What to try.
+        hint: String,
+    },
+    /// The displacement makes the volumes less alike.
+    #[error(
+        "no motion was found: under the displacement one volume explains {found:.3} of the other's variance, at rest          {at_rest:.3}; {hint}"
+    )]
+    Worse {
+        /// Part of the variance at rest.
+        at_rest: f64,
+        /// Part of the variance under the displacement.
+        found: f64,
+        /// What to try.
+        hint: String,
+    },
     /// Two grids that had to be the same are not.
     #[error(
         "{what} is on another grid ({found:?}) than {reference} ({expected:?}{}); if both lie in the same \

@@ -2,7 +2,8 @@
 
 use super::console::Console;
 use super::dry_run;
-use super::inputs::{check_distinct, name, read_labels, read_mask, read_volume, same_file, warn_all};
+use super::inputs::{check_distinct, name, read_labels, read_volume, same_file, warn_all};
+use super::known::{Knowledge, mask_on};
 use super::limits::field_fits;
 use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
 use anyhow::{Context, Result, bail};
@@ -26,7 +27,7 @@ pub struct Options {
     deformed: PathBuf,
     #[command(flatten)]
     target: Target,
-    /// Where to measure: a mask on the initial volume's grid, 0 outside
+    /// Where to measure: a mask of the initial volume, 0 outside
     #[arg(long, value_name = "M")]
     mask: Option<PathBuf>,
     /// Bodies that slide along each other: labels on the initial volume's grid, 0 outside
@@ -51,6 +52,8 @@ pub struct Options {
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     dry_run: bool,
+    #[command(flatten)]
+    knowledge: Knowledge,
     #[command(flatten)]
     tuning: Tuning,
 }
@@ -158,8 +161,21 @@ fn model(name: &str) -> Result<ModelSource, UnknownName> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { initial, deformed, target, mask, bodies, rigid, bonded, truth, allow_folds, strain, dry_run, tuning } =
-        options;
+    let Options {
+        initial,
+        deformed,
+        target,
+        mask,
+        bodies,
+        rigid,
+        bonded,
+        truth,
+        allow_folds,
+        strain,
+        dry_run,
+        knowledge,
+        tuning,
+    } = options;
     let mut params = tuning.params()?;
     if *bonded {
         params.bodies = BodySource::Bonded;
@@ -170,8 +186,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
-    let given: Vec<&Path> =
-        [initial, deformed].into_iter().chain(mask).chain(bodies).chain(truth).map(PathBuf::as_path).collect();
+    let given: Vec<&Path> = [initial, deformed]
+        .into_iter()
+        .chain(mask)
+        .chain(bodies)
+        .chain(truth)
+        .chain(knowledge.files())
+        .map(PathBuf::as_path)
+        .collect();
     let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
     check_distinct(&given, &target.files(&files))?;
 
@@ -188,16 +210,17 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (fixed, moving) = rayon::join(|| read_volume(initial, &mut first), || read_volume(deformed, &mut second));
     let (fixed, moving) = (fixed?, moving?);
     warnings.extend(first.into_iter().chain(second));
-    let mut inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
+    let mut inside = mask.as_ref().map(|m| mask_on(m, fixed.grid(), initial, &mut warnings)).transpose()?;
     if let Some(path) = bodies {
         let labels = read_labels(path, fixed.grid(), initial)?;
         inside = Some(bodies_of(path, labels, inside.as_ref(), rigid)?);
         (params.bodies, params.rigid) = (BodySource::Given, rigid.clone());
     }
     let truth = truth.as_ref().map(|path| read_truth(path, fixed.grid(), initial)).transpose()?;
+    let known = knowledge.read((&fixed, &moving), [initial, deformed], inside, &mut warnings)?;
     if *dry_run {
         drop(progress);
-        let plan = pipeline::plan::field(&fixed, &moving, inside.as_ref(), &params)?;
+        let plan = pipeline::plan::field(&fixed, &moving, known.mask(), &params)?;
         warn_all(console, &warnings);
         let volumes = [(initial, fixed.grid()), (deformed, moving.grid())];
         return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
@@ -207,7 +230,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
     let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
     let set = |stage: &str, part| progress.set(stage, part);
-    let (mut result, [fixed, moving]) = pipeline::field::run_lent(fixed, moving, inside.as_ref(), &params, &set)
+    let (mut result, [fixed, moving]) = pipeline::field::run_lent(fixed, moving, &known.known(), &params, &set)
         .with_context(|| format!("{} to {}", names[0], names[1]))?;
     if result.summary.folds > 0 && !allow_folds {
         bail!(
@@ -228,7 +251,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     });
     let metrics = metrics.transpose().with_context(|| format!("{} to {}", names[0], names[1]))?;
 
-    let strain = strain.then(|| strain_of(&result, inside.as_ref(), &set));
+    let strain = strain.then(|| strain_of(&result, known.mask(), &set));
     let strain = strain.transpose().with_context(|| format!("{} to {}", names[0], names[1]))?;
     progress.set("write", 1.0);
     let measured = Measured {
@@ -236,7 +259,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         names: [&names[0], &names[1], &names[2]],
         initial: &fixed,
         deformed: moving,
-        mask: inside.as_ref(),
+        mask: known.mask(),
         params: &params,
         truth: truth.as_ref().zip(metrics.as_ref()),
         strain: strain.as_ref(),

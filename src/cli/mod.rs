@@ -37,6 +37,8 @@ mod inputs;
 
 mod invert;
 
+mod known;
+
 mod limits;
 
 mod markups;

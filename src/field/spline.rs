@@ -114,6 +114,28 @@ impl FieldSpline {
         Self { stored: Some((stored, orientation)), ..self }
     }
 
+    /// The same field, followed by an affine map of the world (mm, RAS).
+    #[must_use]
+    pub(crate) fn followed_by(mut self, map: &Affine) -> Self {
+        let (grid, axes) = (self.grid, axes(&self.grid));
+        let spacing = grid.spacing();
+        for (lattice, coefficients) in &mut self.bodies {
+            let n = lattice.len();
+            // Cubic B-splines through the values of a linear field are that field.
+            for m in 0..n {
+                let place = lattice.place(m);
+                let place = std::array::from_fn(|a| if lattice.shape[a] > 1 { place[a] } else { 0.0 });
+                let here = grid.affine().to_world(VoxelPoint(place));
+                let along = [0, 1, 2].map(|c| f64::from(coefficients[c * n + m]));
+                let world = std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * along[a]).sum());
+                let moved = map.to_world(VoxelPoint(here.moved(world).0)).minus(here);
+                let moved = grid.affine().vector_to_voxel(moved);
+                (0..3).for_each(|c| coefficients[c * n + m] = (spacing[c] * moved[c]) as f32);
+            }
+        }
+        self
+    }
+
     /// The spline of all voxels, where there is one body.
     pub(crate) fn only(&self) -> Option<&Spline> {
         self.bodies.first().filter(|_| self.bodies.len() == 1)
@@ -198,6 +220,13 @@ impl ScalarSpline {
     /// The same, to be asked for on the grid `stored` of the same voxels.
     pub fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
         Self { stored: Some((stored, orientation)), ..self }
+    }
+
+    /// The same, so many times as large.
+    #[must_use]
+    pub(crate) fn scaled(mut self, factor: f32) -> Self {
+        self.values.iter_mut().for_each(|v| *v *= factor);
+        self
     }
 
     /// The value at a voxel offset (x fastest).

@@ -2,7 +2,7 @@
 
 use crate::error::{FieldError, SpaceError};
 use crate::matching::gain::weigh;
-use crate::matching::pair::{Pair, Spans, about_mean};
+use crate::matching::pair::{Anchor, Pair, Spans, about_mean};
 use crate::numerics::sampling::Sampler;
 use crate::numerics::statistics::{noise_sigma, quantile};
 use crate::numerics::{ablation, filters, pyramid};
@@ -20,6 +20,7 @@ pub struct Aligned<'a> {
     moving_shape: [usize; 3],
     moving_origin: [f64; 3],
     moving: Cow<'a, [f32]>,
+    anchors: Vec<Anchor>,
 }
 
 impl<'a> Aligned<'a> {
@@ -49,6 +50,7 @@ impl<'a> Aligned<'a> {
             moving_shape: m.shape(),
             moving_origin: g.affine().to_voxel(m.affine().origin()).0,
             moving: Cow::Borrowed(&[]),
+            anchors: Vec::new(),
         };
         if same_axes {
             return Ok(Self { moving: deformed.as_slice().into(), ..base });
@@ -57,6 +59,12 @@ impl<'a> Aligned<'a> {
         let shape = std::array::from_fn(|a| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1);
         let moving = resample(deformed, g, origin, shape)?;
         Ok(Self { moving_shape: shape, moving_origin: origin, moving: moving.into(), ..base })
+    }
+
+    /// With landmarks, in voxels of the initial grid.
+    #[must_use]
+    pub fn with_anchors(self, anchors: Vec<Anchor>) -> Self {
+        Self { anchors, ..self }
     }
 
     /// The same, with its own copy of the volumes.
@@ -107,6 +115,7 @@ impl<'a> Aligned<'a> {
             moving_shape: pyramid::reduced_shape(self.moving_shape, factor),
             moving_origin: std::array::from_fn(|a| self.moving_origin[a] / factor[a] as f64),
             moving,
+            anchors: self.anchors.iter().map(|a| Anchor { at: to_level(a.at, factor), ..*a }).collect(),
         }
     }
 }

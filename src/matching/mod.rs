@@ -21,6 +21,8 @@ pub mod lsm;
 
 pub mod brightness;
 
+pub mod contrast;
+
 pub mod gain;
 
 pub mod residual;

@@ -16,6 +16,17 @@ const BLOCK: usize = 7;
 /// scatters by 4 % (343 voxels).
 const STANDS_OUT: f32 = 1.25;
 
+/// A place that is known in both volumes, with how well.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Anchor {
+    /// Place (voxels of the initial lattice).
+    pub at: [f64; 3],
+    /// Displacement (mm along the lattice's axes).
+    pub displacement: [f64; 3],
+    /// Standard deviation along an axis (mm).
+    pub sd: f64,
+}
+
 /// An initial and a deformed volume whose voxels have the same axes and size; the second may start
 /// elsewhere.
 #[derive(Debug, Clone)]
@@ -45,6 +56,8 @@ pub struct Pair<'a> {
     pub moving_origin: [f64; 3],
     /// Deformed intensities.
     pub moving: Cow<'a, [f32]>,
+    /// Landmarks.
+    pub anchors: Cow<'a, [Anchor]>,
 }
 
 impl<'a> Pair<'a> {
@@ -55,6 +68,7 @@ impl<'a> Pair<'a> {
             fixed_smooth: self.fixed_smooth.into_owned().into(),
             mask: self.mask.into_owned().into(),
             moving: self.moving.into_owned().into(),
+            anchors: self.anchors.into_owned().into(),
             ..self
         }
     }
@@ -66,6 +80,7 @@ impl<'a> Pair<'a> {
             fixed_smooth: Cow::Borrowed(&self.fixed_smooth),
             mask: Cow::Borrowed(&self.mask),
             moving: Cow::Borrowed(&self.moving),
+            anchors: Cow::Borrowed(&self.anchors),
             spans,
             ..*self
         }

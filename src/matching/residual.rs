@@ -88,6 +88,19 @@ impl NormalEquations {
         all.for_each(|v| *v *= factor);
     }
 
+    /// Adds a place that pulls with `pull` (1/mm) under the information `weight` (1/mm^2, the same
+    /// along every axis), as it acts on the nodes of `lattice`.
+    pub fn add(&mut self, lattice: &Lattice, at: [f64; 3], weight: f32, pull: [f32; 3]) {
+        let n = lattice.len();
+        let thick: [bool; 3] = lattice.shape.map(|s| s > 1);
+        lattice.for_each_tap(at, |node, b| {
+            for c in (0..3).filter(|&c| thick[c]) {
+                self.blocks.planar_mut()[c * n + node] += b * weight;
+                self.rhs[c * n + node] += b * pull[c];
+            }
+        });
+    }
+
     /// Information of each node (1/mm^2): its block without what the gradient of the noise adds.
     pub fn information(&self) -> Blocks {
         let (weights, noise) = &self.noise;

@@ -217,7 +217,8 @@ impl Bodies {
         let mask: Vec<u8> = pair.mask.iter().zip(&self.labels).map(own).collect();
         let inside = mask.iter().filter(|m| **m != 0).count();
         let spans = Spans::new(&mask, pair.shape);
-        Pair { mask: mask.into(), inside, ..pair.within(spans) }
+        let anchors = pair.anchors.iter().filter(|a| self.label_near(a.at) == body).copied().collect();
+        Pair { mask: mask.into(), inside, anchors, ..pair.within(spans) }
     }
 
     /// The deformed volume as all bodies together bring it back.

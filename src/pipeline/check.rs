@@ -7,7 +7,9 @@ use crate::numerics::filters::mean_beside;
 use crate::numerics::statistics::{quantile, sampled, stands_for_all};
 use crate::pipeline::background::{self, Cut, hidden};
 use crate::pipeline::field::FEWEST;
-use crate::types::{DenseField, Grid, Mask, Volume, Voxels};
+use crate::pipeline::known::Known;
+use crate::types::params::{BodySource, Method};
+use crate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
@@ -394,6 +396,41 @@ fn in_range<'a>(mut volume: Voxels<'a>, like: Option<f64>) -> (Voxels<'a>, f64) 
         *v = ((f64::from(*v) - low) * scale) as f32;
     }
     (volume, spread * scale)
+}
+
+/// What is known must fit the volumes and the parameters.
+///
+/// # Errors
+/// [`FieldError`] that names what does not.
+pub fn known(
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
+    known: &Known<'_>,
+    params: &FieldParams,
+) -> Result<(), FieldError> {
+    params.check()?;
+    mask_grid(initial, known.mask)?;
+    mask_grid(initial, known.initial_counts)?;
+    match known.deformed_counts {
+        Some(m) if !m.grid().same_as(deformed.grid()) => {
+            return Err(FieldError::GridMismatch {
+                what: "the deformed mask".into(),
+                found: m.grid().shape(),
+                reference: "the deformed volume".into(),
+                expected: deformed.grid().shape(),
+            });
+        }
+        _ => {}
+    }
+    let refuse = |volume, what: &str, hint: &str| FieldError::Volume { volume, what: what.into(), hint: hint.into() };
+    if params.method == Method::Full && params.bodies == BodySource::Given && known.mask.is_none() {
+        return Err(refuse("mask", "is missing", "give the label map of the bodies as mask"));
+    }
+    if params.method == Method::Sparse && !known.landmarks.is_empty() {
+        let (what, hint) = ("fits matches alone and takes no landmarks".into(), "leave --method sparse out".into());
+        return Err(FieldError::Start { what, hint });
+    }
+    Ok(())
 }
 
 /// The mask must lie on the initial volume's grid.

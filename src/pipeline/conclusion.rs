@@ -12,6 +12,7 @@ use crate::matching::residual;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::{ablation, pyramid};
 use crate::pipeline::bodies::Bodies;
+use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, SplineField};
 use crate::pipeline::rest::{self, Places, Rest, Tried};
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
@@ -48,7 +49,7 @@ impl Concluded {
     ) -> Self {
         let (pair, field) = (bodies.part(pair, body), &bodies.fields[body]);
         let own = matches.iter().filter(|m| m.kept && bodies.label_near(m.voxel) == body);
-        let measured: Vec<Measured> = own.map(|m| m.measured).collect();
+        let measured: Vec<Measured> = own.map(|m| m.measured).chain(landmarks::measured(&pair, field)).collect();
         let windows = level::windows(&pair);
         let by_place = level::excess(&pair, field, &windows);
         let posterior = level::posterior(field, pair.spacing, seed);

@@ -14,15 +14,19 @@ use crate::pipeline::background;
 use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::conclusion::{Concluded, labelled};
+use crate::pipeline::contrast::{self, Common};
 use crate::pipeline::finer::{self, Explained, finer, uneven, unlike};
 pub use crate::pipeline::hypotheses::Start;
 use crate::pipeline::hypotheses::{Begun, NEAR, Search};
+use crate::pipeline::known::{Known, StartMap, Turned};
+use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::light::Light;
 use crate::pipeline::polish;
 use crate::pipeline::rest::Rest;
 use crate::pipeline::sparse;
 use crate::pipeline::stages::{self, Left, Stage};
+use crate::pipeline::start::{self, Begin};
 use crate::pipeline::uncertainty::{self, some_of};
 use crate::types::params::{BodySource, Interpolation, Method};
 use crate::types::*;
@@ -140,29 +144,31 @@ pub fn run(
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    run_from(initial, deformed, mask, params, &[], progress)
+    run_from(initial, deformed, &Known::mask(mask), params, &[], progress)
 }
 
-/// As [`run`], with fields from which the search may start beside the ones it finds itself; the
-/// agreement of the volumes decides.
+/// As [`run`], with all that is known of the pair, and with fields from which the search may start
+/// beside the ones it finds itself; the agreement of the volumes decides.
 ///
 /// # Errors
-/// As [`run`].
+/// As [`run`], and where a start or a mask does not fit the volumes.
 pub fn run_from(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
-    mask: Option<&Mask>,
+    known: &Known<'_>,
     params: &FieldParams,
     starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    let [here, there] = [initial, deformed].map(|v| Orientation::of(v.grid()));
-    let (first, second) = (here.turned(initial), there.turned(deformed));
-    check::mask_grid(initial, mask)?;
-    let turned = turned_mask(mask, here);
-    let found = canonical(&first, &second, turned.as_ref().or(mask), params, starts, progress)?;
+    check::known(initial, deformed, known, params)?;
+    let begun = Begin::of(initial.grid(), known)?;
+    let moved = deformed.view().placed(begun.grid(deformed.grid())?)?;
+    let orientations = [initial, &moved].map(|v| Orientation::of(v.grid()));
+    let (first, second) = (orientations[0].turned(initial), orientations[1].turned(&moved));
+    let turned = Turned::of(known, orientations);
+    let found = canonical(&first, &second, &begun.known(&turned.known(known)), params, starts, progress)?;
     drop((first, second));
-    stored(found, here, initial.grid())
+    Ok(begun.end(stored(found, orientations[0], initial.grid())?))
 }
 
 /// As [`run`], of volumes that are lent and come back: where their axes run otherwise they are
@@ -173,26 +179,25 @@ pub fn run_from(
 pub fn run_lent(
     initial: Volume,
     deformed: Volume,
-    mask: Option<&Mask>,
+    known: &Known<'_>,
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<(FieldResult, [Volume; 2]), FieldError> {
+    check::known(&initial, &deformed, known, params)?;
+    let begun = Begin::of(initial.grid(), known)?;
+    let placed = *deformed.grid();
+    let deformed = deformed.placed(begun.grid(&placed)?)?;
     let grids = [*initial.grid(), *deformed.grid()];
     let turns = grids.map(|g| Orientation::of(&g));
-    check::mask_grid(&initial, mask)?;
     let [initial, deformed] = [turns[0].turn(initial), turns[1].turn(deformed)];
-    let turned = turned_mask(mask, turns[0]);
-    let found = canonical(&initial, &deformed, turned.as_ref().or(mask), params, &[], progress)?;
+    let turned = Turned::of(known, turns);
+    let found = canonical(&initial, &deformed, &begun.known(&turned.known(known)), params, &[], progress)?;
     drop(turned);
-    let found = stored(found, turns[0], &grids[0])?;
+    let found = begun.end(stored(found, turns[0], &grids[0])?);
     let back =
         |turn: Orientation, volume: Volume, grid| if turn.is_canonical() { volume } else { turn.stored(&volume, grid) };
-    Ok((found, [back(turns[0], initial, &grids[0]), back(turns[1], deformed, &grids[1])]))
-}
-
-/// The mask as the initial volume is turned; none where it is right as it lies.
-fn turned_mask(mask: Option<&Mask>, here: Orientation) -> Option<Mask> {
-    mask.filter(|_| !here.is_canonical()).map(|m| here.turned(m).into_volume())
+    let deformed = back(turns[1], deformed, &grids[1]).placed(placed)?;
+    Ok((found, [back(turns[0], initial, &grids[0]), deformed]))
 }
 
 /// A result on the grid that the initial volume is stored on.
@@ -215,34 +220,57 @@ fn stored(found: FieldResult, here: Orientation, grid: &Grid) -> Result<FieldRes
 fn canonical(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
-    mask: Option<&Mask>,
+    known: &Known<'_>,
     params: &FieldParams,
     starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    params.check()?;
+    let (initial, deformed) = (counting(initial, known.initial_counts), counting(deformed, known.deformed_counts));
     if params.method == Method::Sparse {
-        return sparse::measure(initial, deformed, mask, params, progress);
-    }
-    if params.bodies == BodySource::Given && mask.is_none() {
-        let (what, hint) = ("is missing".into(), "give the label map of the bodies as mask".into());
-        return Err(FieldError::Volume { volume: "mask", what, hint });
+        let bends = known.start.is_some_and(|start| start::bends(start::rest(start), initial.grid(), known.mask));
+        if bends {
+            let what = "bends, and --method sparse begins at an affine map".into();
+            let hint = "leave --method out, or give an affine transform".into();
+            return Err(FieldError::Start { what, hint });
+        }
+        return sparse::measure(&initial, &deformed, known, params, progress);
     }
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
-    let masked = mask.is_some();
+    let masked = known.mask.is_some();
     let [initial, deformed] = match ablation::is_on("robust-range") {
-        true => [initial, deformed].map(check::tamed),
-        false => [initial, deformed].map(Voxels::view),
+        true => [&initial, &deformed].map(check::tamed),
+        false => [&initial, &deformed].map(Voxels::view),
     };
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
-        check::inputs(&initial, &deformed, mask)?;
+        check::inputs(&initial, &deformed, known.mask)?;
+    let not_finite = told(not_finite, [&initial, &deformed], known);
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
-    let aligned = Aligned::new(&clean, &seen, &mask, TWICE * search)?;
+    let anchors = landmarks::anchors(known, &grid);
+    let reach = TWICE * search;
+    let aligned = Aligned::new(&clean, &seen, &mask, reach)?.with_anchors(anchors.clone());
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
+    let scene = contrast::Scene {
+        initial: &clean,
+        deformed: &seen,
+        mask: &mask,
+        anchors: &anchors,
+        factors: &factors,
+        range: search,
+        reach,
+        nodes: COARSE,
+        params,
+    };
+    let common = scene.common(&aligned)?;
+    let aligned = match &common {
+        Some(c) => Aligned::new(&c.initial, &c.deformed, &mask, reach)?.with_anchors(anchors.clone()),
+        None => aligned,
+    };
     clock.book("pyramid");
+    let bent = begun_from(known, &aligned, factors[0], &grid, Some(&mask));
+    let starts: Vec<Start> = starts.iter().cloned().chain(bent).collect();
     // Without a mask all tissue is searched from the start.
     let tissue = || masked.then(|| around(&mask, &clean));
     let given = (params.bodies == BodySource::Given).then(|| Given::new(mask.as_slice(), grid.shape()));
@@ -252,7 +280,7 @@ fn canonical(
         factors: &factors,
         flat: grid.is_single_slice(),
         params,
-        starts,
+        starts: &starts,
         progress,
     };
     let Found {
@@ -293,6 +321,7 @@ fn canonical(
     let (model, mut evidence) = Concluded::together(&concluded, &bodies, &pair, name);
     evidence.extend(background::why_unseen(cut));
     evidence.extend(light.why());
+    evidence.extend(common.as_ref().map(Common::why));
     evidence.extend(asked);
     evidence.push(why_so_many(params, points, found));
     let unlike = unlike(&pair, left);
@@ -344,6 +373,7 @@ fn canonical(
     let tissue = if labels.is_empty() { Vec::new() } else { dilate(mask.as_slice(), grid.shape(), BORDER) };
     let coefficients = FieldSpline::new(grid, splines, labels, tissue);
     let stages = stages::account(&grid, (&pair, factor), stages, &coefficients);
+    let agreement = agreement(&pair, &bodies, model)?;
     drop(pair);
     drop(aligned);
     clock.book("uncertainty");
@@ -355,9 +385,13 @@ fn canonical(
     if begun.is_unsure() && unlike.is_some() {
         variances = variances.with_other_motions(begun.share(), search);
     }
+    if let Some(common) = &common {
+        variances = variances.with_contrast(1.0 - common.explained());
+    }
     let uncertainty = variances.deviation(&grid, factor);
     let samples = variances.samples(&grid, factor)?;
     let sparse = estimated(sparse, &grid, (&coefficients, &uncertainty));
+    let landmarks = landmarks::report(&anchors, |p| coefficients.along_axes(p), |p| uncertainty.at_place(p).into());
     clock.book("uncertainty");
 
     // Mesh and dense field.
@@ -384,6 +418,7 @@ fn canonical(
     clock.book("uncertainty");
 
     let counts = with_mesh(&mut reports, &mesh);
+    let said_of_landmarks = landmarks::said_of(landmarks.as_ref());
     let summary = FieldSummary {
         counts,
         model,
@@ -399,10 +434,16 @@ fn canonical(
         uncertainty_median_mm: uncertainty::median_inside(&uncertainty, &mask),
         expected,
         unseen,
+        agreement,
+        recast: common.as_ref().map(Common::recast),
+        landmarks,
+        start: None,
         seconds: clock.0,
         // A known field takes the search as far as it goes itself.
         warnings: warnings(counts, folds, not_finite, length.1, if starts.is_empty() { search } else { f64::INFINITY })
             .into_iter()
+            .chain(common.as_ref().map(Common::said))
+            .chain(said_of_landmarks)
             .chain(said_of_model(rejected))
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
@@ -447,6 +488,72 @@ fn no_measurement(kept: usize, found: usize, seen: Option<Counts>) -> Result<(),
             Err(FieldError::TooFew { found, what, needed, hint })
         }
     }
+}
+
+/// Part of the variance by which a displacement may leave the volumes less alike than at rest.
+const NO_WORSE: f64 = 0.01;
+
+/// How well the volumes agree at rest and under the bodies' fields.
+///
+/// # Errors
+/// [`FieldError::Worse`] where they agree less under the fields.
+pub(super) fn agreement(pair: &Pair<'_>, bodies: &Bodies, model: MotionModel) -> Result<Agreement, FieldError> {
+    let found = contrast::agreement(pair, bodies);
+    let Agreement { at_rest, found: now } = found;
+    if model != MotionModel::Identity && now < at_rest - NO_WORSE {
+        let hint = "check that both volumes show the same tissue, or say more: --initial, --landmarks, --mask".into();
+        return Err(FieldError::Worse { at_rest, found: now, hint });
+    }
+    Ok(found)
+}
+
+/// The volume without the voxels that do not count.
+fn counting<'a>(volume: &'a Voxels<'_>, counts: Option<&Mask>) -> Voxels<'a> {
+    let mut out = volume.view();
+    if let Some(counts) = counts {
+        let left_out = out.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0);
+        left_out.for_each(|(v, _)| *v = f32::NAN);
+    }
+    out
+}
+
+/// Voxels that are not finite, less those that do not count.
+pub(super) fn told(not_finite: [usize; 2], volumes: [&Voxels<'_>; 2], known: &Known<'_>) -> [usize; 2] {
+    let counts = [known.initial_counts, known.deformed_counts];
+    std::array::from_fn(|v| match counts[v] {
+        Some(counts) => {
+            let values = volumes[v].as_slice().iter().zip(counts.as_slice());
+            values.filter(|(v, c)| **c != 0 && !v.is_finite()).count()
+        }
+        None => not_finite[v],
+    })
+}
+
+/// The fields that what is known suggests on the coarsest level: what is left of a start, and one
+/// through the landmarks.
+fn begun_from(
+    known: &Known<'_>,
+    aligned: &Aligned<'_>,
+    factor: [usize; 3],
+    grid: &Grid,
+    mask: Option<&Mask>,
+) -> Vec<Start> {
+    if known.start.is_none() && known.landmarks.is_empty() {
+        return Vec::new();
+    }
+    let pair = aligned.level(factor);
+    let axes = spline::axes(grid);
+    let of = |start: &StartMap<'_>| {
+        let rest = start::rest(start);
+        let along = |p: [f64; 3]| {
+            let d = rest(grid.affine().to_world(VoxelPoint(from_level(p, factor))));
+            std::array::from_fn(|a| (0..3).map(|r| axes[r][a] * d[r]).sum())
+        };
+        let field = SplineField::still(level::lattice(&pair, COARSE));
+        let motion = SplineField { coefficients: field.lattice.fit(along), ..field };
+        start::bends(rest, grid, mask).then(|| Start { motion: Bodies::from(motion), factor, followed: None })
+    };
+    known.start.and_then(of).into_iter().chain(landmarks::start(&pair, factor)).collect()
 }
 
 /// The levels of the pyramid, from the coarsest one, and how they are worked on.

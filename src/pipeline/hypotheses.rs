@@ -17,7 +17,7 @@ pub struct Start {
     pub(super) motion: Bodies,
     /// Voxels that a voxel of its level stands for.
     pub(super) factor: [usize; 3],
-    /// Frames since the whole volume was searched; none where it never was.
+    /// Frames since the whole volume was searched; none where it never was: a start that was given.
     pub(super) followed: Option<usize>,
 }
 
@@ -235,7 +235,8 @@ impl Search<'_> {
         let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
         let own = refined(own.into());
         let in_doubt = counts.kept_share() < LOOSE || counts.kept < ENOUGH;
-        let wins = |known: &Bodies| in_doubt && known.agree_better(pair, &own);
+        let given = known.iter().any(|s| s.followed.is_none());
+        let wins = |known: &Bodies| (in_doubt || given) && known.agree_better(pair, &own);
         let motion = course.filter(wins).map_or(own, refined);
         Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }

@@ -23,6 +23,7 @@ use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
 use crate::numerics::unfold::unfold;
 use crate::numerics::{ablation, filters, pyramid};
+use crate::pipeline::landmarks;
 use crate::types::{Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -186,6 +187,7 @@ fn advance(
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
         equations.scale(weight);
+        landmarks::pull(pair, field, &mut equations);
         let information = equations.information();
         let weights: Vec<f32> = field.smoothness.iter().map(|s| s * cell as f32).collect();
         if large {
@@ -272,8 +274,10 @@ pub fn excess<'a>(
     move |motion| {
         let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * some.spacing[a])));
         let warped = some.warp_sparsely(&field.lattice, &map);
-        let by_place = residual::excess_by_place(&some, &warped, &free, windows);
-        by_place.into_iter().map(|v| weight * v).collect()
+        let mut by_place = residual::excess_by_place(&some, &warped, &free, windows);
+        by_place.iter_mut().for_each(|v| *v *= weight);
+        landmarks::add_excess(pair, field, motion, windows, &mut by_place);
+        by_place
     }
 }
 

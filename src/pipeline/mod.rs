@@ -9,6 +9,10 @@ pub mod level;
 
 pub mod check;
 
+pub mod known;
+
+pub mod start;
+
 pub mod stages;
 
 pub mod plan;
@@ -40,9 +44,11 @@ pub mod stress;
 mod background;
 mod bodies;
 mod conclusion;
+mod contrast;
 mod course;
 mod finer;
 mod hypotheses;
+mod landmarks;
 mod light;
 mod modes;
 mod polish;

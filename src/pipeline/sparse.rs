@@ -28,6 +28,7 @@ use crate::pipeline::check::{self, Checked};
 use crate::pipeline::conclusion;
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
 use crate::pipeline::hypotheses::Search;
+use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::rest;
 use crate::pipeline::stages::{self, Left};
@@ -118,7 +119,7 @@ struct Found {
 pub(super) fn measure(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
-    mask: Option<&Mask>,
+    known: &Known<'_>,
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
@@ -126,7 +127,8 @@ pub(super) fn measure(
     let mut clock = Clock::start();
     let [initial, deformed] = [initial, deformed].map(check::tamed);
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
-        check::inputs(&initial, &deformed, mask)?;
+        check::inputs(&initial, &deformed, known.mask)?;
+    let not_finite = field::told(not_finite, [&initial, &deformed], known);
     let grid = *initial.grid();
     let flat = grid.is_single_slice();
     let search = field::search_mm(&grid, params.search_mm);
@@ -185,6 +187,7 @@ pub(super) fn measure(
     let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
     let uncertainty = variances.deviation(&grid, factor);
     let samples = variances.samples(&grid, factor)?;
+    let agreement = field::agreement(&pair, &field.without_blocks().into(), choice.model)?;
     let stages = stages::account(&grid, (&pair, factor), left, &coefficients);
     let measured = SparseField { matches: matches.iter().map(|m| field::world_match(&grid, m, factor)).collect() };
     let sparse = field::estimated(measured, &grid, (&coefficients, &uncertainty));
@@ -226,6 +229,10 @@ pub(super) fn measure(
         uncertainty_median_mm: uncertainty::median_inside(&uncertainty, &mask),
         expected,
         unseen,
+        agreement,
+        recast: None,
+        landmarks: None,
+        start: None,
         seconds: clock.0,
         warnings: field::warnings(counts, folds, not_finite, max_mm, search)
             .into_iter()

@@ -13,6 +13,7 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{displacement, inside};
 use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
+use crate::pipeline::known::Known;
 use crate::pipeline::modes::{self, Modes};
 use crate::strain::StrainField;
 use crate::strain::gauge::Gauge;
@@ -53,7 +54,7 @@ impl<'a> Tracker<'a> {
         let [last, before] = &self.past;
         let steady = last.as_ref().zip(before.as_ref()).map(|(l, b)| l.extrapolated(b));
         let starts: Vec<Start> = last.iter().cloned().chain(steady).collect();
-        let result = run_from(self.reference, frame, self.mask, self.params, &starts, progress)?;
+        let result = run_from(self.reference, frame, &Known::mask(self.mask), self.params, &starts, progress)?;
         self.past.swap(0, 1);
         self.past[0] = Some(result.spline.clone());
         Ok(result)

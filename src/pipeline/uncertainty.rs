@@ -41,6 +41,10 @@ const EXTRAPOLATED: f32 = 3.0;
 /// jump there (1): one in ten such voxels goes with the wrong side (13 scenes).
 const SIDE: f32 = 0.18;
 
+/// Relative widening of the deviation for each part of the variance that the relation of two
+/// contrasts leaves (1): calibrated on 16 scenes, docs/lab/2026-11-inputs.md.
+const CONTRAST: f64 = 5.0;
+
 /// Voxels of the mask from which means over it are taken, about.
 const SAMPLED: usize = 25_000;
 
@@ -144,6 +148,17 @@ impl Variances {
     pub fn with_other_motions(mut self, agreeing: f64, range: f64) -> Self {
         let variance = ((1.0 - agreeing) * range * range / 5.0) as f32;
         self.part(ErrorSource::OtherMotions).fill(variance);
+        self
+    }
+
+    /// Widens all where the volumes have different contrasts, of whose variance their relation leaves
+    /// this part.
+    pub fn with_contrast(mut self, left: f64) -> Self {
+        let more = ((1.0 + CONTRAST * left).powi(2) - 1.0) as f32;
+        for m in 0..self.lattice.len() {
+            let all: f32 = self.parts.iter().map(|part| part[m]).sum();
+            self.part(ErrorSource::Misfit)[m] += more * all;
+        }
         self
     }
 

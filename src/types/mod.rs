@@ -55,7 +55,9 @@ pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
 pub use metrics::{InverseConsistency, Metrics};
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
-pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel, StageReport};
+pub use result::{
+    Agreement, BodyReport, Counts, FieldSummary, LandmarkReport, LevelReport, Mesh, MotionModel, StageReport,
+};
 pub use samples::ErrorSamples;
 pub use scene::Scene;
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};

@@ -1,6 +1,6 @@
 //! Feature points, matches and sparse displacement fields.
 
-use crate::types::space::{VoxelPoint, WorldPoint};
+use crate::types::space::{Affine, VoxelPoint, WorldPoint};
 
 /// A corner-like place of a volume (3D Harris).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,6 +58,20 @@ impl Match {
         let raw = self.raw.or(Some(RawMatch { displacement: self.displacement, sigma: self.sigma() }));
         let variance = deviation * deviation;
         Self { displacement, covariance: [variance, variance, variance, 0.0, 0.0, 0.0], raw, ..self }
+    }
+
+    /// The same, followed by an affine map of the world (mm, RAS).
+    #[must_use]
+    pub fn followed_by(&self, map: &Affine) -> Self {
+        let moved = |d: [f64; 3]| map.to_world(VoxelPoint(self.initial.moved(d).0)).minus(self.initial);
+        let [xx, yy, zz, xy, xz, yz] = self.covariance;
+        let (c, l) = ([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], map.linear());
+        let turned = |r: usize, s: usize| -> f64 {
+            (0..3).map(|a| (0..3).map(|b| l[r][a] * c[a][b] * l[s][b]).sum::<f64>()).sum()
+        };
+        let covariance = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|(r, s)| turned(r, s));
+        let raw = self.raw.map(|raw| RawMatch { displacement: moved(raw.displacement), ..raw });
+        Self { displacement: moved(self.displacement), covariance, raw, ..*self }
     }
 
     /// One number for the precision: the root of a third of the covariance's trace (mm).

@@ -48,6 +48,31 @@ impl MotionModel {
     }
 }
 
+/// How well two volumes agree, whatever their contrast: the part of one's variance that the other's
+/// intensity explains (correlation ratio, 0 to 1).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Agreement {
+    /// Where nothing moves; from the start, where one was given.
+    pub at_rest: f64,
+    /// Under the displacement.
+    pub found: f64,
+}
+
+/// What became of the landmarks in the fit.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LandmarkReport {
+    /// How many there are.
+    pub count: usize,
+    /// Standard deviation of each along an axis (mm).
+    pub sd_mm: f64,
+    /// Mean distance of their deformed places from where the field takes them (mm).
+    pub mean_mm: f64,
+    /// Numbers, from 1, of those that the field contradicts.
+    pub wrong: Vec<usize>,
+    /// Each one's distance (mm), in the order of the file.
+    pub distances_mm: Vec<f64>,
+}
+
 /// How many of what (at full resolution).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
@@ -175,6 +200,15 @@ pub struct FieldSummary {
     /// The part of the mask that lies outside the deformed volume after the motion, or where that
     /// is not finite (1).
     pub unseen: f64,
+    /// How well the volumes agree, at rest and under the displacement.
+    pub agreement: Agreement,
+    /// The volume ("initial" or "deformed") that was brought to the other's contrast, where they
+    /// have different ones.
+    pub recast: Option<&'static str>,
+    /// What became of the landmarks, where there are any.
+    pub landmarks: Option<LandmarkReport>,
+    /// The affine part of the start (world mm, RAS, rows), where one was given.
+    pub start: Option<[[f64; 4]; 3]>,
     /// Stage names and wall seconds, in order.
     pub seconds: Vec<(String, f64)>,
     /// What the user should know before trusting the result.

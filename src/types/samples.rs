@@ -1,7 +1,7 @@
 //! Errors that a displacement field may have.
 
 use crate::error::SpaceError;
-use crate::types::space::Grid;
+use crate::types::space::{Grid, Matrix3};
 
 /// Errors that a displacement field may have, drawn at random from its posterior distribution:
 /// cubic B-splines through their coefficients at nodes.
@@ -25,6 +25,19 @@ impl ErrorSamples {
             Some(found) => Err(SpaceError::Length { expected, found }),
             None => Ok(Self { nodes, values }),
         }
+    }
+
+    /// The same errors after a linear map of the world.
+    #[must_use]
+    pub fn turned(mut self, linear: &Matrix3) -> Self {
+        let n = self.nodes.len();
+        for sample in &mut self.values {
+            for at in 0..n {
+                let v = [0, 1, 2].map(|c| f64::from(sample[c * n + at]));
+                (0..3).for_each(|r| sample[r * n + at] = (0..3).map(|c| linear[r][c] * v[c]).sum::<f64>() as f32);
+            }
+        }
+        self
     }
 
     /// Where the nodes are.

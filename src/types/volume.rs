@@ -122,6 +122,14 @@ impl<'a, T: Clone> Voxels<'a, T> {
         self.values.into_owned()
     }
 
+    /// The same values on another grid of the same shape.
+    ///
+    /// # Errors
+    /// [`SpaceError::Length`] when it has another number of voxels.
+    pub fn placed(self, grid: Grid) -> Result<Self, SpaceError> {
+        Self::of(grid, self.values)
+    }
+
     /// With values of its own (a copy, when they are lent).
     pub fn into_volume(self) -> Volume<T> {
         Voxels { grid: self.grid, values: self.values.into_owned().into() }

@@ -1,0 +1,203 @@
+//! What a user knows of a pair: starts, masks and landmarks.
+
+use super::inputs::{name, read_landmarks};
+use anyhow::{Result, bail};
+use clap::Args;
+use palpate::field::warp::warp_labels;
+use palpate::io;
+use palpate::pipeline::known::{Known, StartMap};
+use palpate::pipeline::start::{Alignment, agreement, aligned};
+use palpate::types::{DenseField, Grid, Landmark, Mask, Voxels, WorldPoint};
+use std::path::{Path, PathBuf};
+
+/// What `field`, `track` and `batch` share.
+#[derive(Debug, Args)]
+pub struct Knowledge {
+    /// Where the search begins: centre, moments or principal (the volumes brought onto each other),
+    /// or transforms from the initial to the deformed volume, in the order that a point takes
+    #[arg(long, value_name = "T", num_args = 1..)]
+    initial: Vec<PathBuf>,
+    /// What counts of the deformed volume: a mask on its grid, 0 elsewhere
+    #[arg(long, value_name = "M")]
+    deformed_mask: Option<PathBuf>,
+    /// What does not count (implants, artefacts): a mask on the initial or the deformed volume's
+    /// grid, 0 elsewhere; may be given several times
+    #[arg(long, value_name = "M")]
+    ignore: Vec<PathBuf>,
+    /// Places known in both volumes: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed),
+    /// world mm, RAS; or two files of points (.csv, .fcsv, .mrk.json), initial and deformed
+    #[arg(long, value_name = "L", num_args = 1..=2)]
+    landmarks: Vec<PathBuf>,
+    /// Standard deviation of a landmark along an axis [default: one voxel]
+    #[arg(long, value_name = "MM", requires = "landmarks")]
+    landmark_sd: Option<f64>,
+}
+
+/// What was read.
+#[derive(Default)]
+pub struct Read {
+    mask: Option<Mask>,
+    initial_counts: Option<Mask>,
+    deformed_counts: Option<Mask>,
+    start: Option<Box<StartMap<'static>>>,
+    landmarks: Vec<Landmark>,
+    landmark_sd_mm: f64,
+}
+
+impl Knowledge {
+    /// The files among them.
+    pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
+        let transforms = self.initial.iter().filter(|t| alignment(t).is_none());
+        transforms.chain(&self.deformed_mask).chain(&self.ignore).chain(&self.landmarks)
+    }
+
+    /// The same as command-line arguments.
+    pub fn arguments(&self) -> Vec<String> {
+        let mut out = Vec::new();
+        let mut add = |flag: &str, values: &[PathBuf]| {
+            if !values.is_empty() {
+                out.push(flag.to_string());
+                out.extend(values.iter().map(|v| v.display().to_string()));
+            }
+        };
+        add("--initial", &self.initial);
+        self.deformed_mask.iter().for_each(|m| add("--deformed-mask", std::slice::from_ref(m)));
+        self.ignore.iter().for_each(|m| add("--ignore", std::slice::from_ref(m)));
+        add("--landmarks", &self.landmarks);
+        out.extend(self.landmark_sd.iter().flat_map(|sd| ["--landmark-sd".into(), sd.to_string()]));
+        out
+    }
+
+    /// Reads what there is for a pair of volumes called `names`. `mask` is where to measure.
+    pub fn read(
+        &self,
+        (initial, deformed): (&Voxels<'_>, &Voxels<'_>),
+        names: [&Path; 2],
+        mask: Option<Mask>,
+        warnings: &mut Vec<String>,
+    ) -> Result<Read> {
+        if self.landmark_sd.is_some_and(|sd| !(sd.is_finite() && sd > 0.0)) {
+            bail!("--landmark-sd takes a standard deviation above 0, in mm");
+        }
+        let grids = [initial.grid(), deformed.grid()];
+        let deformed_mask = self.deformed_mask.as_ref();
+        let mut deformed_counts = deformed_mask.map(|m| mask_on(m, grids[1], names[1], warnings)).transpose()?;
+        let mut initial_counts = None;
+        for path in &self.ignore {
+            let ignored = io::read_mask(path)?;
+            let of_deformed = ignored.grid().same_as(grids[1]) && !grids[0].same_as(grids[1]);
+            let side = usize::from(of_deformed);
+            let ignored = resampled(path, ignored, grids[side], names[side], warnings)?;
+            let counts = if of_deformed { &mut deformed_counts } else { &mut initial_counts };
+            let counts = counts.get_or_insert_with(|| Mask::filled(*grids[side], 1));
+            let left_out = counts.as_mut_slice().iter_mut().zip(ignored.as_slice()).filter(|(_, i)| **i != 0);
+            left_out.for_each(|(c, _)| *c = 0);
+            if counts.as_slice().iter().all(|c| *c == 0) {
+                bail!("{}: nothing is left that counts; give a mask that is 0 in the tissue", path.display());
+            }
+        }
+        Ok(Read {
+            mask,
+            initial_counts,
+            deformed_counts,
+            start: self.start(initial, deformed, warnings)?,
+            landmarks: read_landmarks(&self.landmarks, grids[0], warnings)?,
+            landmark_sd_mm: self.landmark_sd.unwrap_or(0.0),
+        })
+    }
+
+    /// The start, with a warning where the volumes agree less there than where they lie.
+    fn start(
+        &self,
+        initial: &Voxels<'_>,
+        deformed: &Voxels<'_>,
+        warnings: &mut Vec<String>,
+    ) -> Result<Option<Box<StartMap<'static>>>> {
+        let start: Box<StartMap<'static>> = match &self.initial[..] {
+            [] => return Ok(None),
+            [one] if alignment(one).is_some() => {
+                let how = alignment(one).unwrap_or(Alignment::Centre);
+                let map = aligned(initial, deformed, how)?;
+                return Ok(Some(Box::new(move |p: WorldPoint| Some(map.to_world(palpate::types::VoxelPoint(p.0))))));
+            }
+            several if several.iter().any(|t| alignment(t).is_some()) => {
+                bail!("--initial: centre, moments and principal stand alone; give one of them, or transforms")
+            }
+            transforms => transforms_of(transforms)?,
+        };
+        let at = |p: WorldPoint| start(p).unwrap_or(p);
+        let [there, here] = [agreement(initial, deformed, at), agreement(initial, deformed, |p| p)];
+        if there < here {
+            warnings.push(format!(
+                "--initial: the volumes agree less at this start ({there:.2}) than where they lie ({here:.2}); check its direction: it leads \
+                 from the initial to the deformed volume, and ,-1 after a name turns it round"
+            ));
+        }
+        Ok(Some(start))
+    }
+}
+
+/// The way to bring two volumes onto each other that an argument names.
+fn alignment(argument: &Path) -> Option<Alignment> {
+    match argument.to_str()? {
+        "centre" | "center" => Some(Alignment::Centre),
+        "moments" => Some(Alignment::Moments),
+        "principal" => Some(Alignment::Principal),
+        _ => None,
+    }
+}
+
+fn transforms_of(_transforms: &[PathBuf]) -> Result<Box<StartMap<'static>>> {
+    let field = io::read_field(&_transforms[0])?;
+    Ok(Box::new(move |p| palpate::field::warp::warp_points(&[p], &field)[0]))
+}
+
+impl Read {
+    /// What a run takes.
+    pub fn known(&self) -> Known<'_> {
+        Known {
+            mask: self.mask.as_ref(),
+            initial_counts: self.initial_counts.as_ref(),
+            deformed_counts: self.deformed_counts.as_ref(),
+            start: self.start.as_deref().map(|s| s as &StartMap<'_>),
+            landmarks: &self.landmarks,
+            landmark_sd_mm: self.landmark_sd_mm,
+        }
+    }
+
+    /// Where to measure.
+    pub fn mask(&self) -> Option<&Mask> {
+        self.mask.as_ref()
+    }
+}
+
+/// A mask on `grid`, which is that of `reference`: resampled by nearest neighbour, with a note,
+/// where it lies on another one.
+pub fn mask_on(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
+    let mask = io::read_mask(path)?;
+    if mask.as_slice().iter().all(|v| *v == 0) {
+        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
+    }
+    resampled(path, mask, grid, reference, warnings)
+}
+
+/// The same of a label map or a mask that was read.
+pub fn resampled(path: &Path, labels: Mask, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
+    if grid.same_as(labels.grid()) {
+        return Ok(labels);
+    }
+    let placed = warp_labels(&labels, &DenseField::zeros(*grid), None, 0);
+    if placed.as_slice().iter().all(|v| *v == 0) {
+        bail!(
+            "{}: does not overlap {} in world space; check both headers (palpate info)",
+            path.display(),
+            reference.display()
+        );
+    }
+    warnings.push(format!(
+        "{}: lies on another grid than {}; it was resampled onto that by nearest neighbour",
+        name(path),
+        name(reference)
+    ));
+    Ok(placed)
+}

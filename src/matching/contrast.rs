@@ -1,0 +1,201 @@
+//! How the intensities of two volumes go together, whatever their contrast.
+//!
+//! From the joint histogram of voxels that show the same tissue: the mean of one volume's intensity
+//! where the other has a given one explains a part of its variance, the correlation ratio (Roche et
+//! al. 1998). Of two volumes in one contrast that mean rises with the intensity, however the gain
+//! differs by place. Where it does not, the mean itself brings one volume to the other's contrast.
+
+use crate::numerics::filters;
+use crate::numerics::statistics::quantile;
+
+/// Intensities that are told apart.
+const BINS: usize = 48;
+
+/// Quantiles between which they lie.
+const RANGE: [f64; 2] = [0.005, 0.995];
+
+/// Voxels for each intensity at least.
+const VOXELS: usize = 8;
+
+/// The joint histogram of two volumes.
+#[derive(Debug, Clone)]
+pub struct Relation {
+    /// Share of the voxels with each pair of intensities, those of the first volume fastest.
+    joint: Vec<f64>,
+    /// Lowest and highest intensity of the two.
+    ranges: [[f32; 2]; 2],
+}
+
+/// Which volume is brought to the other's contrast.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// The initial one.
+    Initial,
+    /// The deformed one.
+    Deformed,
+}
+
+impl Relation {
+    /// From the intensities of the two volumes at the same tissue; those that are not finite are
+    /// left out. None where there are too few, or all alike.
+    pub fn of(pairs: impl Iterator<Item = [f32; 2]>) -> Option<Self> {
+        let pairs: Vec<[f32; 2]> = pairs.filter(|p| p[0].is_finite() && p[1].is_finite()).collect();
+        if pairs.len() < VOXELS * BINS {
+            return None;
+        }
+        let range = |c: usize| {
+            let mut values: Vec<f32> = pairs.iter().map(|p| p[c]).collect();
+            RANGE.map(|q| quantile(&mut values, q))
+        };
+        let ranges = [range(0), range(1)];
+        if ranges.iter().any(|[low, high]| high.partial_cmp(low) != Some(std::cmp::Ordering::Greater)) {
+            return None;
+        }
+        let mut counts = vec![0.0f32; BINS * BINS];
+        for pair in &pairs {
+            let [a, b] = std::array::from_fn(|c| bin(ranges[c], pair[c]).round() as usize);
+            counts[a + BINS * b] += 1.0;
+        }
+        let smooth = filters::gaussian(&counts, [BINS, BINS, 1], [1.0, 1.0, 0.0]);
+        let all: f64 = smooth.iter().map(|v| f64::from(*v)).sum();
+        Some(Self { joint: smooth.iter().map(|v| f64::from(*v) / all).collect(), ranges })
+    }
+
+    /// The share of the voxels with each of the intensities of the volume that tells, and the mean
+    /// of the other one there.
+    fn means(&self, explained: Side) -> ([f64; BINS], [f64; BINS]) {
+        let (mut share, mut mean) = ([0.0; BINS], [0.0; BINS]);
+        for (at, p) in self.joint.iter().enumerate() {
+            let (first, second) = (at % BINS, at / BINS);
+            let (from, to) = if explained == Side::Initial { (second, first) } else { (first, second) };
+            share[from] += p;
+            mean[from] += p * to as f64;
+        }
+        for (m, s) in mean.iter_mut().zip(share) {
+            *m /= s.max(f64::MIN_POSITIVE);
+        }
+        (share, mean)
+    }
+
+    /// The part of the variance of the volume `explained` that `values` (bins, one an intensity of
+    /// the other volume) explain.
+    fn part(&self, explained: Side, share: &[f64; BINS], values: &[f64; BINS]) -> f64 {
+        let (own, _) = self.means(if explained == Side::Initial { Side::Deformed } else { Side::Initial });
+        let moment = |w: &[f64; BINS], v: &dyn Fn(usize) -> f64, power: i32| -> f64 {
+            w.iter().enumerate().map(|(i, w)| w * v(i).powi(power)).sum()
+        };
+        let bins = |i: usize| i as f64;
+        let variance = moment(&own, &bins, 2) - moment(&own, &bins, 1).powi(2);
+        let of = |i: usize| values[i];
+        (moment(share, &of, 2) - moment(share, &of, 1).powi(2)) / variance.max(f64::MIN_POSITIVE)
+    }
+
+    /// The part of the initial volume's variance that the deformed one explains, and the other way
+    /// round (0 to 1).
+    pub fn explained(&self) -> [f64; 2] {
+        [Side::Initial, Side::Deformed].map(|side| {
+            let (share, mean) = self.means(side);
+            self.part(side, &share, &mean)
+        })
+    }
+
+    /// The same by a relation that does not fall: one contrast.
+    pub fn explained_by_rising(&self) -> [f64; 2] {
+        [Side::Initial, Side::Deformed].map(|side| {
+            let (share, mean) = self.means(side);
+            self.part(side, &share, &rising(&share, &mean))
+        })
+    }
+
+    /// The side that the other explains more of.
+    pub fn side(&self) -> Side {
+        let [initial, deformed] = self.explained();
+        // What tells more of the other is brought to its contrast.
+        if initial > deformed { Side::Deformed } else { Side::Initial }
+    }
+
+    /// Intensities of the volume `side` as the other one has them.
+    pub fn recast(&self, side: Side, values: &mut [f32]) {
+        let explained = if side == Side::Deformed { Side::Initial } else { Side::Deformed };
+        let (own, other) = match side {
+            Side::Initial => (self.ranges[0], self.ranges[1]),
+            Side::Deformed => (self.ranges[1], self.ranges[0]),
+        };
+        let (_, mean) = self.means(explained);
+        let scale = f64::from(other[1] - other[0]) / (BINS - 1) as f64;
+        for v in values.iter_mut().filter(|v| v.is_finite()) {
+            let at = bin(own, *v);
+            let low = (at as usize).min(BINS - 2);
+            let part = f64::from(at) - low as f64;
+            let there = (1.0 - part) * mean[low] + part * mean[low + 1];
+            *v = (f64::from(other[0]) + scale * there) as f32;
+        }
+    }
+}
+
+/// Which bin an intensity falls into.
+fn bin([low, high]: [f32; 2], v: f32) -> f32 {
+    ((v - low) / (high - low) * (BINS - 1) as f32).clamp(0.0, (BINS - 1) as f32)
+}
+
+/// The values nearest to `mean` under these weights that do not fall (pool adjacent violators; Ayer
+/// et al. 1955).
+fn rising(share: &[f64; BINS], mean: &[f64; BINS]) -> [f64; BINS] {
+    let mut pools: Vec<(f64, f64, usize)> = Vec::with_capacity(BINS);
+    for (&weight, &value) in share.iter().zip(mean) {
+        let (mut weight, mut value, mut count) = (weight.max(f64::MIN_POSITIVE), value, 1);
+        while let Some(&(before, w, n)) = pools.last().filter(|p| p.0 > value) {
+            value = (value * weight + before * w) / (weight + w);
+            (weight, count) = (weight + w, count + n);
+            pools.pop();
+        }
+        pools.push((value, weight, count));
+    }
+    let mut all = pools.into_iter().flat_map(|(value, _, count)| std::iter::repeat_n(value, count));
+    std::array::from_fn(|_| all.next().unwrap_or_default())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::numerics::random::Random;
+
+    fn pairs(of: impl Fn(f32) -> f32) -> Vec<[f32; 2]> {
+        let mut random = Random::new(1, 1);
+        let value = |_| {
+            let [a, b, _] = random.normals();
+            let v = 500.0 + 150.0 * a as f32;
+            [v, of(v) + 5.0 * b as f32]
+        };
+        (0..20_000).map(value).collect()
+    }
+
+    #[test]
+    fn a_rising_relation_is_one_contrast_and_a_falling_one_is_another() {
+        let square = Relation::of(pairs(|v| v * v / 500.0).into_iter()).unwrap();
+        let [free, held] = [square.explained(), square.explained_by_rising()];
+        assert!((0..2).all(|c| free[c] > 0.98 && free[c] - held[c] < 1e-3), "{free:?} {held:?}");
+        let falling = Relation::of(pairs(|v| 2000.0 - v).into_iter()).unwrap();
+        let [free, held] = [falling.explained(), falling.explained_by_rising()];
+        assert!((0..2).all(|c| free[c] > 0.98 && held[c] < 1e-3), "{free:?} {held:?}");
+    }
+
+    /// Where two intensities of one volume are one of the other, the first tells the second.
+    #[test]
+    fn the_volume_that_tells_the_other_is_recast() {
+        let folded = Relation::of(pairs(|v| (v - 500.0).abs()).into_iter()).unwrap();
+        assert_eq!(folded.side(), Side::Initial);
+        let mut values = [350.0, 500.0, 700.0, f32::NAN];
+        folded.recast(Side::Initial, &mut values);
+        for (found, wanted) in values.into_iter().zip([150.0, 0.0, 200.0]) {
+            assert!((found - wanted).abs() < 15.0, "{values:?}");
+        }
+        assert!(values[3].is_nan());
+    }
+
+    #[test]
+    fn too_few_or_equal_voxels_have_no_relation() {
+        assert!(Relation::of(pairs(|v| v).into_iter().take(300)).is_none());
+        assert!(Relation::of(pairs(|_| 3.0).into_iter().map(|[a, _]| [a, 7.0])).is_none());
+    }
+}

@@ -1,0 +1,153 @@
+//! Landmarks: matches of known deviation in the same fit as the voxels.
+//!
+//! Each pulls the field by its distance from it over its variance, with Geman and McClure's weight,
+//! so that one that most others and the volumes speak against does not pull.
+
+use crate::consistency::energy::distance;
+use crate::consistency::models::AffineMotion;
+use crate::consistency::pruning::Measured;
+use crate::field::spline;
+use crate::matching::pair::{Anchor, Pair};
+use crate::matching::residual::NormalEquations;
+use crate::numerics::bspline::Lattice;
+use crate::numerics::statistics::median;
+use crate::pipeline::bodies::Bodies;
+use crate::pipeline::hypotheses::Start;
+use crate::pipeline::known::Known;
+use crate::pipeline::level::{self, SplineField};
+use crate::types::{Grid, Landmark, LandmarkReport};
+
+/// Squared distance, over the variance, at which a landmark's weight is a quarter once most are
+/// where the field has them: three standard deviations, as for matches.
+const SCALE: f64 = 9.0;
+
+/// The same distance beyond which a landmark is called wrong: one right one in a thousand is (chi
+/// square, three axes).
+const WRONG: f64 = 16.27;
+
+/// Landmarks from which a field of their own may start the search: an affine map takes four.
+const FEWEST: usize = 4;
+
+/// The landmarks on the initial volume's grid.
+pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
+    let sd = if known.landmark_sd_mm > 0.0 { known.landmark_sd_mm } else { voxel(grid) };
+    let axes = spline::axes(grid);
+    let of = |l: &Landmark| {
+        let d = l.deformed.minus(l.initial);
+        let along = |a: usize| (0..3).map(|r| axes[r][a] * d[r]).sum();
+        Anchor { at: grid.affine().to_voxel(l.initial).0, displacement: std::array::from_fn(along), sd }
+    };
+    known.landmarks.iter().map(of).collect()
+}
+
+/// Edge of a cube of a voxel's volume (mm): the deviation of a landmark that is not told.
+fn voxel(grid: &Grid) -> f64 {
+    grid.spacing().iter().product::<f64>().cbrt()
+}
+
+/// Each landmark's squared distance from a motion `at` a place, over its variance.
+fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
+    anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
+}
+
+/// The scale of the weights: while most landmarks are far from the field, so far.
+fn scale(squares: &[f64]) -> f64 {
+    let mut all: Vec<f32> = squares.iter().map(|q| *q as f32).collect();
+    if all.is_empty() { SCALE } else { SCALE.max(2.0 * f64::from(median(&mut all))) }
+}
+
+/// Adds what the landmarks pull with to a pass.
+pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalEquations) {
+    let at = |p| field.lattice.at(&field.coefficients, p);
+    let squares = squares(&pair.anchors, at);
+    let scale = scale(&squares);
+    for (anchor, q) in pair.anchors.iter().zip(squares) {
+        let weight = (scale / (scale + q)).powi(2) / (anchor.sd * anchor.sd);
+        let u = at(anchor.at);
+        let pull = std::array::from_fn(|c| (weight * (anchor.displacement[c] - u[c])) as f32);
+        equations.add(&field.lattice, anchor.at, weight as f32, pull);
+    }
+}
+
+/// Adds how much worse a map agrees with the landmarks than `field` does, about each of the
+/// windows.
+pub(super) fn add_excess(
+    pair: &Pair<'_>,
+    field: &SplineField,
+    motion: &AffineMotion,
+    windows: &Lattice,
+    excess: &mut [f32],
+) {
+    let free = squares(&pair.anchors, |p| field.lattice.at(&field.coefficients, p));
+    let map = squares(&pair.anchors, |p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
+    let cost = |q: f64| SCALE * q / (SCALE + q);
+    for ((anchor, free), map) in pair.anchors.iter().zip(free).zip(map) {
+        windows.stencil_near(anchor.at).scatter((cost(map) - cost(free)) as f32, excess);
+    }
+}
+
+/// The landmarks as matches beside those of the features.
+pub(super) fn measured(pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
+    let of = |a: &Anchor| {
+        let variance = a.sd * a.sd;
+        Measured {
+            place: std::array::from_fn(|c| a.at[c] * pair.spacing[c]),
+            displacement: a.displacement,
+            covariance: [variance, variance, variance, 0.0, 0.0, 0.0],
+            field: field.lattice.at(&field.coefficients, a.at),
+        }
+    };
+    pair.anchors.iter().map(of).collect()
+}
+
+/// The field through the landmarks alone on a level of `factor`, from which a search may start.
+pub(super) fn start(pair: &Pair<'_>, factor: [usize; 3]) -> Option<Start> {
+    let thick: Vec<usize> = (0..3).filter(|&a| pair.shape[a] > 1).collect();
+    if pair.anchors.len() < FEWEST {
+        return None;
+    }
+    let of = |a: &Anchor| {
+        let variance = |c: usize| if thick.contains(&c) { a.sd * a.sd } else { 0.0 };
+        (a.at, a.displacement, [variance(0), variance(1), variance(2), 0.0, 0.0, 0.0])
+    };
+    let (field, _) = level::couple(pair, pair.anchors.iter().map(of), (&[0; 3], 0.3), None);
+    Some(Start { motion: Bodies::from(field.to_refine()), factor, followed: None })
+}
+
+/// What became of the landmarks under a motion `at` a place of the full-resolution grid (voxels, mm
+/// along the axes) of such a deviation along an axis (mm).
+pub(super) fn report(
+    anchors: &[Anchor],
+    at: impl Fn([f64; 3]) -> [f64; 3],
+    deviation: impl Fn([f64; 3]) -> f64,
+) -> Option<LandmarkReport> {
+    let first = anchors.first()?;
+    let off: Vec<f64> = anchors.iter().map(|a| distance(at(a.at), a.displacement)).collect();
+    let is_wrong = |i: &usize| {
+        let variance = anchors[*i].sd.powi(2) + deviation(anchors[*i].at).powi(2);
+        off[*i].powi(2) / variance > WRONG
+    };
+    let wrong: Vec<usize> = (0..anchors.len()).filter(is_wrong).collect();
+    Some(LandmarkReport {
+        count: anchors.len(),
+        sd_mm: first.sd,
+        mean_mm: off.iter().sum::<f64>() / off.len() as f64,
+        wrong: wrong.iter().map(|i| i + 1).collect(),
+        distances_mm: off,
+    })
+}
+
+/// Names the landmarks that the field does not go through.
+pub(super) fn said_of(report: Option<&LandmarkReport>) -> Option<String> {
+    let LandmarkReport { count, wrong, distances_mm, .. } = report?;
+    let far = |n: &usize| format!("number {n} by {:.1} mm", distances_mm[n - 1]);
+    let named: Vec<String> = wrong.iter().take(5).map(far).collect();
+    let more = if wrong.len() > 5 { ", and more (see summary.json)" } else { "" };
+    (!wrong.is_empty()).then(|| {
+        format!(
+            "{} of {count} landmarks disagree with the field: {}{more}. They hardly pulled it; check that each shows the same tissue",
+            wrong.len(),
+            named.join(", ")
+        )
+    })
+}

@@ -1,0 +1,334 @@
+//! Where a search begins: a map that is known, or one that brings the two volumes onto each other.
+//!
+//! The affine part of a start is taken into the deformed volume's place, which costs no
+//! interpolation; what is left of it is a field from which the search may begin. The result is then
+//! followed by the affine part.
+
+use crate::error::FieldError;
+use crate::matching::contrast::Relation;
+use crate::matching::levels::foreground;
+use crate::numerics::dense::symmetric_eigen;
+use crate::numerics::sampling::nearest;
+use crate::numerics::small::{full, inverse};
+use crate::pipeline::field::{FieldResult, lengths};
+use crate::pipeline::known::{Known, StartMap};
+use crate::pipeline::stages::Stage;
+use crate::types::space::{Matrix3, determinant, length};
+use crate::types::{
+    Affine, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, VoxelPoint, Voxels, WorldPoint,
+};
+use rayon::prelude::*;
+
+/// How two volumes are brought onto each other where nothing is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Alignment {
+    /// The centres of both grids.
+    Centre,
+    /// The centres of brightness of both foregrounds.
+    Moments,
+    /// The same, and their principal axes, whichever way round agrees best.
+    Principal,
+}
+
+/// Places at which a start is looked at, about.
+const PLACES: usize = 4000;
+
+/// Every so many voxels of `grid` at which `mask` is not 0, in world mm.
+fn places(grid: &Grid, mask: Option<&Mask>) -> Vec<WorldPoint> {
+    let inside: Vec<usize> = (0..grid.len()).filter(|&at| mask.is_none_or(|m| m.as_slice()[at] != 0)).collect();
+    inside.iter().step_by(inside.len().div_ceil(PLACES).max(1)).map(|&at| grid.centre(at)).collect()
+}
+
+/// The mean of some places.
+fn mean(places: impl Iterator<Item = WorldPoint>) -> [f64; 3] {
+    let (sum, n) = places.fold(([0.0; 3], 0.0f64), |(s, n), p| (std::array::from_fn(|a| s[a] + p.0[a]), n + 1.0));
+    sum.map(|v| v / n.max(1.0))
+}
+
+/// The affine map nearest to a start over the tissue (least squares): exactly the start where that
+/// is affine.
+///
+/// # Errors
+/// [`FieldError::Start`] where the start has no value in the tissue, or turns it inside out.
+pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Result<Affine, FieldError> {
+    let refuse = |what: &str, hint: &str| FieldError::Start { what: what.into(), hint: hint.into() };
+    let pairs: Vec<(WorldPoint, WorldPoint)> =
+        places(grid, mask).into_iter().filter_map(|x| Some((x, start(x)?))).collect();
+    if pairs.is_empty() {
+        return Err(refuse("has no value anywhere in the tissue", "check that it is a map from the initial volume"));
+    }
+    let [from, to] = [mean(pairs.iter().map(|p| p.0)), mean(pairs.iter().map(|p| p.1))];
+    let (mut spread, mut cross) = ([0.0; 6], [[0.0; 3]; 3]);
+    for (x, y) in &pairs {
+        let (d, e): ([f64; 3], [f64; 3]) = (x.minus(WorldPoint(from)), y.minus(WorldPoint(to)));
+        for (q, (a, b)) in [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
+            spread[q] += d[a] * d[b];
+        }
+        (0..3).for_each(|r| (0..3).for_each(|c| cross[r][c] += e[r] * d[c]));
+    }
+    // Across a slice, where there is nothing to go by, nothing is stretched or turned.
+    let little = 1e-9 * (spread[0] + spread[1] + spread[2]).max(f64::MIN_POSITIVE);
+    for a in 0..3 {
+        spread[a] += little;
+        cross[a][a] += little;
+    }
+    let [xx, yy, zz, xy, xz, yz] = inverse(&spread).unwrap_or([0.0; 6]);
+    let inverse = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+    let linear: Matrix3 =
+        std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| cross[r][k] * inverse[k][c]).sum()));
+    if determinant(&linear) <= 0.0 {
+        return Err(refuse(
+            "turns the tissue inside out",
+            "check its convention: a mirrored axis most often is a wrong one",
+        ));
+    }
+    about(linear, from, to).map_err(|_| refuse("flattens the tissue", "check the file"))
+}
+
+/// `x -> linear (x - from) + to`.
+fn about(linear: Matrix3, from: [f64; 3], to: [f64; 3]) -> Result<Affine, crate::error::SpaceError> {
+    let row = |r: usize| {
+        let [a, b, c] = linear[r];
+        [a, b, c, to[r] - (a * from[0] + b * from[1] + c * from[2])]
+    };
+    Affine::new([row(0), row(1), row(2)])
+}
+
+/// A point after an affine map of the world.
+pub(super) fn mapped(map: &Affine, p: WorldPoint) -> WorldPoint {
+    map.to_world(VoxelPoint(p.0))
+}
+
+/// A point before an affine map of the world.
+pub(super) fn unmapped(map: &Affine, p: WorldPoint) -> WorldPoint {
+    WorldPoint(map.to_voxel(p).0)
+}
+
+/// The grid on which a volume lies once the world is taken back by `map`.
+pub(super) fn before(map: &Affine, grid: &Grid) -> Result<Grid, FieldError> {
+    let at = |v: [f64; 3]| unmapped(map, grid.affine().to_world(VoxelPoint(v))).0;
+    let origin = at([0.0; 3]);
+    let columns: [[f64; 3]; 3] = std::array::from_fn(|c| at(std::array::from_fn(|a| f64::from(u8::from(a == c)))));
+    let row = |r: usize| [columns[0][r] - origin[r], columns[1][r] - origin[r], columns[2][r] - origin[r], origin[r]];
+    Ok(Grid::new(grid.shape(), Affine::new([row(0), row(1), row(2)])?)?)
+}
+
+/// Landmarks with the deformed places taken back by `map`.
+pub(super) fn landmarks_before(map: &Affine, landmarks: &[Landmark]) -> Vec<Landmark> {
+    landmarks.iter().map(|l| Landmark { deformed: unmapped(map, l.deformed), ..*l }).collect()
+}
+
+/// The map that brings the initial volume's tissue onto the deformed volume's.
+///
+/// # Errors
+/// [`FieldError`] when a volume is of one value, so that it has no centre of brightness.
+pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> Result<Affine, FieldError> {
+    let identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+    let volumes = [initial, deformed];
+    if how == Alignment::Centre {
+        let [from, to] = volumes.map(|v| middle(v.grid()));
+        return Ok(about(identity, from, to)?);
+    }
+    let [first, second] = [Moments::of(initial, "initial")?, Moments::of(deformed, "deformed")?];
+    if how == Alignment::Moments {
+        return Ok(about(identity, first.centre, second.centre)?);
+    }
+    let flips = [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]];
+    let turned = flips.map(|flip| {
+        let product = |r: usize, c: usize| (0..3).map(|k| second.axes[k][r] * flip[k] * first.axes[k][c]).sum();
+        std::array::from_fn(|r| std::array::from_fn(|c| product(r, c)))
+    });
+    // Of a round body the axes say nothing.
+    let turns = turned.into_iter().chain([identity]);
+    let maps: Result<Vec<Affine>, _> = turns.map(|turn| about(turn, first.centre, second.centre)).collect();
+    let agreement = |map: &Affine| agreement(initial, deformed, |p| mapped(map, p));
+    let best = maps?.into_iter().map(|m| (agreement(&m), m)).max_by(|a, b| a.0.total_cmp(&b.0));
+    best.map(|b| b.1).ok_or(FieldError::NoOverlap { hint: "check both volumes".into() })
+}
+
+/// The middle of a grid (world mm).
+fn middle(grid: &Grid) -> [f64; 3] {
+    grid.affine().to_world(VoxelPoint(grid.shape().map(|n| (n - 1) as f64 / 2.0))).0
+}
+
+/// Centre of brightness of a volume's foreground and its principal axes (world mm).
+struct Moments {
+    centre: [f64; 3],
+    axes: Matrix3,
+}
+
+impl Moments {
+    fn of(volume: &Voxels<'_>, name: &'static str) -> Result<Self, FieldError> {
+        let tissue = foreground(volume);
+        let (grid, values) = (volume.grid(), volume.as_slice());
+        let inside: Vec<usize> =
+            (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0 && values[at].is_finite()).collect();
+        let low = inside.iter().map(|&at| values[at]).fold(f32::INFINITY, f32::min);
+        let weight = |at: usize| f64::from(values[at] - low);
+        let all: f64 = inside.iter().map(|&at| weight(at)).sum();
+        if all <= 0.0 {
+            let (what, hint) = ("is constant, so it has no centre".into(), "check that it is the right file".into());
+            return Err(FieldError::Volume { volume: name, what, hint });
+        }
+        let mut centre = [0.0; 3];
+        for &at in &inside {
+            let p = grid.centre(at).0;
+            (0..3).for_each(|a| centre[a] += weight(at) / all * p[a]);
+        }
+        let mut spread = [0.0; 6];
+        for &at in &inside {
+            let d = grid.centre(at).minus(WorldPoint(centre));
+            for (q, (a, b)) in [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
+                spread[q] += weight(at) / all * d[a] * d[b];
+            }
+        }
+        let mut axes = symmetric_eigen(&full(&spread)).map(|e| e.1);
+        if determinant(&axes) < 0.0 {
+            axes[2] = axes[2].map(|v| -v);
+        }
+        Ok(Self { centre, axes })
+    }
+}
+
+/// How well two volumes agree under a map, whatever their contrast (0 to 1): the part of one's
+/// variance that the other explains, less where less of the tissue is seen.
+pub fn agreement(initial: &Voxels<'_>, deformed: &Voxels<'_>, map: impl Fn(WorldPoint) -> WorldPoint) -> f64 {
+    let grid = initial.grid();
+    let tissue = foreground(initial);
+    let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
+    let some: Vec<usize> = inside.iter().copied().step_by(inside.len().div_ceil(10 * PLACES).max(1)).collect();
+    let seen = |at: usize| {
+        let there = deformed.grid().affine().to_voxel(map(grid.centre(at)));
+        nearest(deformed.grid().shape(), there).map_or(f32::NAN, |o| deformed.as_slice()[o])
+    };
+    let pairs: Vec<[f32; 2]> = some.iter().map(|&at| [initial.as_slice()[at], seen(at)]).collect();
+    let finite = pairs.iter().filter(|p| p[0].is_finite() && p[1].is_finite()).count();
+    let share = finite as f64 / some.len().max(1) as f64;
+    share * Relation::of(pairs.into_iter()).map_or(0.0, |r| r.explained().into_iter().fold(0.0, f64::max))
+}
+
+/// A start as a run takes it: its affine part apart, and what is known with that taken out.
+pub(super) struct Begin<'a> {
+    affine: Option<Affine>,
+    rest: Option<Box<StartMap<'a>>>,
+    landmarks: Vec<Landmark>,
+}
+
+impl<'a> Begin<'a> {
+    /// # Errors
+    /// As [`affine_part`].
+    pub fn of(grid: &Grid, known: &Known<'a>) -> Result<Self, FieldError> {
+        let Some(start) = known.start else {
+            return Ok(Self { affine: None, rest: None, landmarks: Vec::new() });
+        };
+        let affine = affine_part(start, grid, known.mask)?;
+        let rest = move |x: WorldPoint| start(x).map(|y| unmapped(&affine, y));
+        let landmarks = landmarks_before(&affine, known.landmarks);
+        Ok(Self { affine: Some(affine), rest: Some(Box::new(rest)), landmarks })
+    }
+
+    /// The deformed volume's grid with the affine part taken out.
+    ///
+    /// # Errors
+    /// As [`before`].
+    pub fn grid(&self, deformed: &Grid) -> Result<Grid, FieldError> {
+        self.affine.as_ref().map_or(Ok(*deformed), |map| before(map, deformed))
+    }
+
+    /// What is known, with the affine part taken out.
+    pub fn known<'b>(&'b self, known: &Known<'b>) -> Known<'b> {
+        match &self.rest {
+            Some(rest) => Known { start: Some(&**rest), landmarks: &self.landmarks, ..*known },
+            None => *known,
+        }
+    }
+
+    /// The result with the affine part.
+    pub fn end(&self, found: FieldResult) -> FieldResult {
+        match &self.affine {
+            Some(map) => found.followed_by(map),
+            None => found,
+        }
+    }
+}
+
+/// Rest of a start, as a part of a voxel, up to which it is affine.
+const AFFINE: f64 = 0.02;
+
+/// The displacement (mm, RAS) of a start at a place of the initial volume's world; 0 where it has
+/// none.
+pub(super) fn rest<'a>(start: &'a StartMap<'a>) -> impl Fn(WorldPoint) -> [f64; 3] + Sync + 'a {
+    move |x| start(x).map_or([0.0; 3], |y| y.minus(x))
+}
+
+/// Whether a start whose affine part was taken out is more than that.
+pub(super) fn bends(rest: impl Fn(WorldPoint) -> [f64; 3], grid: &Grid, mask: Option<&Mask>) -> bool {
+    places(grid, mask).into_iter().any(|x| length(rest(x)) > AFFINE * grid.least_spacing())
+}
+
+impl FieldResult {
+    /// The same, followed by an affine map of the world: what was measured from a start that had
+    /// that map taken out.
+    pub(super) fn followed_by(mut self, map: &Affine) -> Self {
+        let linear = map.linear();
+        let scale = determinant(linear).cbrt();
+        follow(&mut self.displacement, map);
+        (self.summary.mean_mm, self.summary.max_mm, _) = lengths(&self.displacement, &self.bodies);
+        self.summary.start = Some(map.rows());
+        self.summary.evidence.push(said_of(map));
+        self.coefficients = self.coefficients.followed_by(map);
+        self.uncertainty = self.uncertainty.scaled(scale as f32);
+        self.samples = self.samples.turned(linear);
+        self.matches = SparseField { matches: self.matches.matches.iter().map(|m| m.followed_by(map)).collect() };
+        let nodes: Vec<[f64; 3]> = self.at_nodes().iter().map(|m| m.displacement).collect();
+        self.node_displacement = nodes;
+        let stage = |s: Stage| Stage { field: s.field.followed_by(map), ..s };
+        self.stages = self.stages.into_iter().map(stage).collect();
+        let own = model_of(map);
+        let larger = |m: MotionModel| if m.parameters() < own.parameters() { own } else { m };
+        self.summary.model = larger(self.summary.model);
+        self.summary.bodies.iter_mut().for_each(|b| b.model = larger(b.model));
+        self
+    }
+}
+
+/// What was taken of a start, in words.
+fn said_of(map: &Affine) -> String {
+    let rows: Vec<String> =
+        map.rows().iter().map(|r| format!("[{:.4} {:.4} {:.4} {:.3}]", r[0], r[1], r[2], r[3])).collect();
+    format!(
+        "start: the search began at the affine map {} (world mm, RAS); models, ranges and the expected error are of the motion beyond it",
+        rows.join(" ")
+    )
+}
+
+/// Puts `x -> map(x + u)` in the place of `x -> x + u`.
+fn follow(field: &mut DenseField, map: &Affine) {
+    let grid = *field.grid();
+    let n = grid.len();
+    let (x, rest) = field.as_mut_slice().split_at_mut(n);
+    let (y, z) = rest.split_at_mut(n);
+    x.par_iter_mut().zip(y).zip(z).enumerate().for_each(|(at, ((x, y), z))| {
+        let here = grid.centre(at);
+        let moved = mapped(map, here.moved([*x, *y, *z].map(f64::from))).minus(here);
+        [*x, *y, *z] = moved.map(|v| v as f32);
+    });
+}
+
+/// Departure of a linear map from a rotation, and of a map from rest (mm over a metre), up to which
+/// it is one: what single precision leaves of a transform file.
+const NOTHING: f64 = 1e-6;
+
+/// The smallest model that holds an affine map.
+fn model_of(map: &Affine) -> MotionModel {
+    let linear = map.linear();
+    let gram = |r: usize, c: usize| (0..3).map(|k| linear[k][r] * linear[k][c]).sum::<f64>();
+    let unit = |r: usize, c: usize| f64::from(u8::from(r == c));
+    let all =
+        |of: &dyn Fn(usize, usize) -> f64| (0..3).all(|r| (0..3).all(|c| (of(r, c) - unit(r, c)).abs() < NOTHING));
+    match () {
+        _ if !all(&gram) => MotionModel::Affine,
+        _ if all(&|r, c| linear[r][c]) && map.origin().0.iter().all(|v| v.abs() < NOTHING) => MotionModel::Identity,
+        _ => MotionModel::Rigid,
+    }
+}
