@@ -32,6 +32,12 @@ pub enum SpaceError {
         /// Voxels along each axis.
         shape: [usize; 3],
     },
+    /// An affine map of world points that cannot be used.
+    #[error("the affine transform {what}")]
+    Transform {
+        /// What is wrong.
+        what: String,
+    },
     /// As many values as the grid has voxels were expected.
     #[error("{found} values for a grid of {expected}")]
     Length {

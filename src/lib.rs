@@ -21,6 +21,8 @@ pub mod mesh;
 
 pub mod field;
 
+pub mod transforms;
+
 pub mod strain;
 
 pub mod stiffness;

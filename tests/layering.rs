@@ -8,12 +8,13 @@ use std::path::{Path, PathBuf};
 const BASE: [&str; 3] = ["types", "error", "numerics"];
 
 /// The steps of the work; none knows another.
-const STAGES: [&str; 12] = [
+const STAGES: [&str; 13] = [
     "features",
     "matching",
     "consistency",
     "mesh",
     "field",
+    "transforms",
     "strain",
     "stiffness",
     "fingertip",

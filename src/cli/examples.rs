@@ -18,13 +18,34 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         &[
             ("an image", "warp after.nii.gz --field results/displacement.nii.gz -o back.nii.gz"),
             (
-                "labels",
-                "warp labels.nii.gz --field results/displacement.nii.gz --interpolation nearest -o labels_back.nii.gz",
+                "labels, which are recognised",
+                "warp labels.nii.gz --field results/displacement.nii.gz -o labels_back.nii.gz",
+            ),
+            (
+                "along a registration of ANTs",
+                "warp after.nii.gz --transform 1Warp.nii.gz 0GenericAffine.mat --reference before.nii.gz -o back.nii.gz",
             ),
             ("points", "warp --points points.csv --field results/displacement.nii.gz -o moved.csv"),
         ],
     ),
     ("invert", &[("deformed to initial", "invert results/displacement.nii.gz -o inverse.nii.gz")]),
+    (
+        "compose",
+        &[
+            ("a warp and an affine as one field", "compose 1Warp.nii.gz 0GenericAffine.mat -o one.nii.gz"),
+            ("the way back of two affine transforms", "compose a.tfm greedy:b.mat --inverse -o back.tfm"),
+        ],
+    ),
+    (
+        "convert",
+        &[
+            (
+                "FLIRT's matrix for ITK",
+                "convert fsl:a.mat --initial before.nii.gz --deformed after.nii.gz --to itk -o a.tfm",
+            ),
+            ("a field for FSL", "convert results --to fsl --deformed after.nii.gz -o warp.nii.gz"),
+        ],
+    ),
     (
         "track",
         &[

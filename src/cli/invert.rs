@@ -1,9 +1,10 @@
 //! `palpate invert`: the field from the deformed to the initial place.
 
+use super::compose::FIELDS;
 use super::console::Console;
 use super::convention::Convention;
 use super::inputs::{check_distinct, check_output_file};
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use palpate::field::inverse::invert;
 use palpate::io;
@@ -16,7 +17,7 @@ const RESIDUAL_MM: f64 = 0.1;
 pub struct Options {
     /// Displacement field (5-D NIfTI, LPS mm)
     field: PathBuf,
-    /// File to write (.nii, .nii.gz)
+    /// File to write (.nii, .nii.gz, .nrrd, .mha)
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
@@ -26,8 +27,16 @@ pub struct Options {
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { field, output, convention } = options;
     check_distinct(&[field], std::slice::from_ref(output))?;
-    check_output_file(output, &[".nii", ".nii.gz"])?;
+    check_output_file(output, &FIELDS)?;
     let inverse = invert(&convention.read(field)?, None);
+    if inverse.outside == inverse.field.grid().len() {
+        bail!(
+            "{}: the field leads away from its own grid, so its inverse there would be empty; compose it with what brings it \
+             back, and name a grid: palpate compose {},-1 --reference IMAGE",
+            field.display(),
+            field.display()
+        );
+    }
     io::write_field(output, &inverse.field)?;
     if inverse.folds > 0 {
         console.warn(&format!(

@@ -11,9 +11,13 @@ mod chart;
 
 mod completions;
 
+mod compose;
+
 mod console;
 
 mod convention;
+
+mod convert;
 
 mod demo;
 
@@ -54,6 +58,8 @@ mod sequence;
 mod skin;
 
 mod track;
+
+mod transform;
 
 mod stiffness;
 
@@ -107,10 +113,14 @@ struct Common {
 enum Command {
     /// Measure the displacement from an initial to a deformed volume
     Field(field::Options),
-    /// Carry an image, a label map or points along a displacement field
+    /// Carry an image, a label map or points along displacement fields and affine transforms
     Warp(warp::Options),
     /// Turn a displacement field around: deformed to initial
     Invert(invert::Options),
+    /// Join transforms into one field, or one affine transform
+    Compose(compose::Options),
+    /// Write a transform for another program
+    Convert(convert::Options),
     /// Follow the tissue of one volume through a sequence of others
     Track(track::Options),
     /// Strain from a displacement field, with its standard deviation
@@ -199,6 +209,8 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Field(options) => field::run(options, console),
         Command::Warp(options) => warp::run(options, console),
         Command::Invert(options) => invert::run(options, console),
+        Command::Compose(options) => compose::run(options, console),
+        Command::Convert(options) => convert::run(options, console),
         Command::Track(options) => track::run(options, console),
         Command::Strain(options) => strain::run(options, console),
         Command::Certify(options) => certify::run(options, console),

@@ -1,16 +1,19 @@
-//! `palpate warp`: images, labels and points carried along a field.
+//! `palpate warp`: images, labels and points carried along transforms.
 
 use super::Usage;
+use super::compose::FIELDS;
 use super::console::Console;
 use super::convention::Convention;
 use super::inputs::{check_distinct, check_output_file};
+use super::transform::{Given, Volumes, percent, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
-use palpate::error::IoError;
-use palpate::field::warp::{warp_image, warp_labels, warp_points};
 use palpate::io;
+use palpate::numerics::labels::is_label_map;
 use palpate::numerics::sampling::Interpolation;
-use palpate::types::{DenseField, Grid, WorldPoint};
+use palpate::transforms::Chain;
+use palpate::transforms::resample::{Resampled, resample};
+use palpate::types::{Grid, Transform, Volume, WorldPoint};
 use std::path::{Path, PathBuf};
 
 /// The largest whole number up to which single precision has all.
@@ -19,8 +22,10 @@ const WHOLE: f32 = 16_777_216.0;
 #[derive(Debug, Args)]
 #[command(
     after_help = "An image is read at x + u(x), so the deformed volume comes to look like the initial one. A point \
-                        moves to p + u(p), from its initial to its deformed place. Use --interpolation nearest for \
-                        labels and masks. With --reference and no --field nothing moves: the image comes onto that grid."
+                        moves to p + u(p), from its initial to its deformed place. Of several transforms the first listed \
+                        comes first, as with antsApplyTransforms and greedy -r, and all are one interpolation. Write fsl:, \
+                        niftyreg:, greedy: or ras: before a file that is theirs, and ,-1 after one to turn it round. With \
+                        --reference and no transform nothing moves: the image comes onto that grid."
 )]
 pub struct Options {
     /// Image, label map or mask (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
@@ -31,68 +36,126 @@ pub struct Options {
     #[arg(long, value_name = "P", conflicts_with_all = ["image", "reference", "interpolation"])]
     points: Option<PathBuf>,
     /// Displacement field (5-D NIfTI, .nrrd or .mha; LPS mm, as `palpate field` writes it)
-    #[arg(long, value_name = "F", required_unless_present = "reference")]
+    #[arg(long, value_name = "F", required_unless_present_any = ["reference", "transform"])]
     field: Option<PathBuf>,
-    /// File to write
+    /// Transforms, the first listed first: .tfm, .txt, .mat, a displacement field, or a folder of
+    /// `palpate field`
+    #[arg(short, long, value_name = "T", num_args = 1.., conflicts_with_all = ["field", "field_convention", "field_deformed"])]
+    transform: Vec<Given>,
+    /// The way back along all transforms: deformed to initial
+    #[arg(long, conflicts_with = "field")]
+    inverse: bool,
+    /// File to write (.nii, .nii.gz, .nrrd, .mha; .csv or .mrk.json of points)
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Take the grid of this image or field instead of the field's
+    /// Take the grid of this image or field instead of the first field's
     #[arg(long, value_name = "R")]
     reference: Option<PathBuf>,
-    /// nearest, linear or cubic
-    #[arg(long, default_value = "linear")]
-    interpolation: Interpolation,
+    /// nearest, linear, cubic or label (the label with most weight) [default: nearest for what looks
+    /// like a label map, else linear]
+    #[arg(long)]
+    interpolation: Option<Interpolation>,
     #[command(flatten)]
     convention: Convention,
+    #[command(flatten)]
+    volumes: Volumes,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { image, points, field, output, reference, interpolation, convention } = options;
-    let given = [image, points, reference].into_iter().flatten().chain(field).map(PathBuf::as_path);
+    let Options { image, points, field, transform, output, reference, volumes, .. } = options;
+    let given = [image, points, reference, field].into_iter().flatten().map(PathBuf::as_path);
+    let given = given.chain(transform.iter().map(|t| t.path.as_path())).chain(volumes.paths());
     check_distinct(&given.collect::<Vec<_>>(), std::slice::from_ref(output))?;
     match (image, points) {
         (_, Some(points)) => {
             check_output_file(output, &[".csv", ".mrk.json"])?;
-            let Some(field) = field else { bail!(Usage("--points needs --field".into())) };
-            move_points(points, &convention.read(field)?, output, console)
+            let chain = chain(options, &volumes.grids()?, console)?;
+            if chain.0.is_empty() {
+                bail!(Usage("--points needs --field or --transform".into()));
+            }
+            move_points(points, &chain, output, console)
         }
         (Some(image), None) => {
-            check_output_file(output, &[".nii", ".nii.gz"])?;
-            let grid = reference.as_deref().map(|path| grid_of(path, convention)).transpose()?;
-            let field = match (field, grid) {
-                (Some(field), _) => convention.read(field)?,
-                (None, Some(grid)) => DenseField::zeros(grid),
-                (None, None) => bail!(Usage("give --field, --reference or both".into())),
-            };
-            let integers = (*interpolation == Interpolation::Nearest).then(|| io::read_labels(image));
-            match integers {
-                Some(Ok(labels)) => {
-                    io::write_labels(
-                        output,
-                        &warp_labels(&labels, &field, grid.as_ref(), 0),
-                        "palpate: labels, warped",
-                    )?;
-                }
-                Some(Err(error @ IoError::Os { .. })) => return Err(error.into()),
-                _ => {
-                    let volume = io::read_volume(image)?;
-                    let exact = *interpolation == Interpolation::Nearest;
-                    if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > WHOLE) {
-                        bail!(
-                            "{}: holds {v}, and numbers beyond {WHOLE} cannot be told apart in single precision; give labels smaller numbers",
-                            image.display()
-                        );
-                    }
-                    let warped = warp_image(&volume, &field, grid.as_ref(), *interpolation, 0.0);
-                    // No value appears that was not there.
-                    let write = if exact { io::write_exact } else { io::write_volume };
-                    write(output, &warped, "palpate: warped")?;
-                }
-            }
-            console.say(&format!("Wrote {}.", output.display()))
+            check_output_file(output, &FIELDS)?;
+            move_image(image, options, console)
         }
         (None, None) => Ok(()),
     }
+}
+
+/// The transforms of the command line; none where there are none.
+fn chain(options: &Options, grids: &[Option<Grid>; 2], console: &Console) -> Result<Chain> {
+    let Options { field, transform, inverse, convention, .. } = options;
+    let chain = match field {
+        Some(field) => Chain(vec![Transform::Field(convention.read(field)?)]),
+        None => read_chain(transform, grids, console)?,
+    };
+    Ok(if *inverse { chain.inverse() } else { chain })
+}
+
+fn move_image(path: &Path, options: &Options, console: &Console) -> Result<()> {
+    let Options { output, reference, interpolation, convention, volumes, .. } = options;
+    let (stored, _) = io::read_header(path)?;
+    let reference = reference.as_deref().map(|path| grid_of(path, convention)).transpose()?;
+    // A transform of FSL leads between the volumes of this command, if no others are named.
+    let [initial, deformed] = volumes.grids()?;
+    let chain = chain(options, &[initial.or(reference), deformed.or(Some(stored.grid))], console)?;
+    let Some(grid) = reference.or(chain.grid().copied()) else {
+        bail!(Usage("all transforms are affine, so none brings a grid: give the initial volume as --reference".into()));
+    };
+    let volume = io::read_volume(path)?;
+    let labels = stored.labels || is_label_map(&volume);
+    let chosen = interpolation.unwrap_or(if labels { Interpolation::Nearest } else { Interpolation::Linear });
+    let exact = matches!(chosen, Interpolation::Nearest | Interpolation::Label);
+    check_labels(path, &volume, chosen)?;
+    match interpolation {
+        None if labels => console.say(&format!(
+            "{} is a label map: each voxel takes the nearest one's label (--interpolation chooses).",
+            path.display()
+        ))?,
+        Some(_) if labels && !exact => console.warn(&format!(
+            "{} looks like a label map, and between two labels there is none; leave --interpolation out, or take label",
+            path.display()
+        )),
+        _ => {}
+    }
+    let Resampled { image: warped, outside } = resample(&volume, &chain, &grid, chosen, 0.0);
+    if outside == grid.len() {
+        bail!(
+            "{}: no voxel of the output would come from inside it; check the order of the transforms, that each is the right \
+             way round (,-1 turns one, --inverse all), and whose they are (fsl:, niftyreg:)",
+            path.display()
+        );
+    }
+    match io::labels_of(&warped, output).ok().filter(|_| exact) {
+        Some(labels) => io::write_labels(output, &labels, "palpate: labels, warped")?,
+        // No value appears that was not there.
+        None if exact => io::write_exact(output, &warped, "palpate: warped")?,
+        None => io::write_volume(output, &warped, "palpate: warped")?,
+    }
+    if outside > 0 {
+        let share = percent(outside, grid.len());
+        console.say(&format!("{share} of the voxels come from outside {} and are 0.", path.display()))?;
+    }
+    console.say(&format!("Wrote {}.", output.display()))
+}
+
+/// Refuses numbers that cannot be told apart where no new one may appear, and fractions as labels.
+fn check_labels(path: &Path, volume: &Volume, interpolation: Interpolation) -> Result<()> {
+    let exact = matches!(interpolation, Interpolation::Nearest | Interpolation::Label);
+    if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > WHOLE) {
+        bail!(
+            "{}: holds {v}, and numbers beyond {WHOLE} cannot be told apart in single precision; give labels smaller numbers",
+            path.display()
+        );
+    }
+    if let Some(v) = volume.as_slice().iter().find(|v| interpolation == Interpolation::Label && v.fract() != 0.0) {
+        bail!(
+            "{}: holds {v}, and labels are whole numbers; take --interpolation linear or cubic for an image",
+            path.display()
+        );
+    }
+    Ok(())
 }
 
 /// The grid of an image or a field.
@@ -103,11 +166,11 @@ fn grid_of(path: &Path, convention: &Convention) -> Result<Grid> {
     }
 }
 
-/// Points outside the field's grid keep their line in a table, with NaN for a place; a point list
-/// of Slicer has none of those.
-fn move_points(points: &Path, field: &DenseField, output: &Path, console: &Console) -> Result<()> {
+/// Points for which a field says nothing keep their line in a table, with NaN for a place; a point
+/// list of Slicer has none of those.
+fn move_points(points: &Path, chain: &Chain, output: &Path, console: &Console) -> Result<()> {
     let mut table = io::read_points(points)?;
-    let moved = warp_points(&table.points, field);
+    let moved: Vec<Option<WorldPoint>> = table.points.iter().map(|&p| chain.at(p)).collect();
     let listed = io::is_slicer(output);
     let lost = moved.iter().filter(|p| p.is_none()).count();
     if lost > 0 {

@@ -184,6 +184,7 @@ pub(super) fn series(path: &Path, values: bool) -> Result<(Stored, Vec<f32>), Io
         axes: shape.to_vec(),
         placed: "ImagePositionPatient and ImageOrientationPatient",
         apart_mm: None,
+        labels: false,
         grid,
         bytes,
     };

@@ -143,7 +143,7 @@ fn each(grid: &Grid, values: &mut [f32], f: impl Fn(WorldPoint, [f64; 3]) -> [f6
 
 /// FSL's coordinates of a grid: voxels times their size, x from the far end where the determinant
 /// is positive.
-struct Scaled {
+pub(super) struct Scaled {
     grid: Grid,
     size: [f64; 3],
     /// The place of voxel 0 along x, where x is turned round.
@@ -151,13 +151,13 @@ struct Scaled {
 }
 
 impl Scaled {
-    fn of(grid: &Grid) -> Self {
+    pub(super) fn of(grid: &Grid) -> Self {
         let size = grid.spacing();
         let turned = crate::types::space::determinant(grid.affine().linear()) > 0.0;
         Self { grid: *grid, size, turned: turned.then(|| (grid.shape()[0] - 1) as f64 * size[0]) }
     }
 
-    fn place(&self, x: WorldPoint) -> [f64; 3] {
+    pub(super) fn place(&self, x: WorldPoint) -> [f64; 3] {
         let v = self.grid.affine().to_voxel(x).0;
         let mut out: [f64; 3] = std::array::from_fn(|a| v[a] * self.size[a]);
         if let Some(far) = self.turned {
@@ -166,7 +166,7 @@ impl Scaled {
         out
     }
 
-    fn world(&self, mut place: [f64; 3]) -> WorldPoint {
+    pub(super) fn world(&self, mut place: [f64; 3]) -> WorldPoint {
         if let Some(far) = self.turned {
             place[0] = far - place[0];
         }

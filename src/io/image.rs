@@ -61,6 +61,8 @@ pub struct Stored {
     pub apart_mm: Option<f64>,
     /// The first three axes.
     pub grid: Grid,
+    /// Whether the header says that it is a label map (NIfTI's intent 1002).
+    pub labels: bool,
     /// Size of the file with the voxels.
     pub bytes: u64,
 }

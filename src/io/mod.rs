@@ -23,6 +23,8 @@ mod elements;
 
 mod raw;
 
+mod raw_write;
+
 mod voxels;
 
 mod flaw;
@@ -44,6 +46,8 @@ pub mod fingertip;
 pub mod skin;
 
 pub mod track;
+
+pub mod transform;
 
 pub mod strain;
 
@@ -102,6 +106,9 @@ pub use stiffness::{write_feb, write_frames, write_inp, write_regions};
 pub use strain::write_region_strains;
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
+pub use transform::{
+    AffineFormat, FieldFormat, StoredTransforms, TransformSource, read_transform, write_affine, write_field_as,
+};
 pub use trials::{write_stress, write_trials};
 pub use vtu::{write_match_mesh, write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 

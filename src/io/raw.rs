@@ -97,6 +97,7 @@ impl RawImage {
             axes,
             placed: self.placed,
             apart_mm: None,
+            labels: false,
             grid: self.grid,
             bytes: self.file.metadata().map_or(0, |m| m.len()),
         }

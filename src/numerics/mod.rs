@@ -52,5 +52,7 @@ mod tail;
 pub mod cholesky;
 
 pub mod exponential;
+pub mod inversion;
+pub mod labels;
 pub mod trig;
 pub mod unfold;

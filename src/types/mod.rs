@@ -31,6 +31,8 @@ pub mod strain;
 
 pub mod track;
 
+pub mod transform;
+
 pub mod names;
 
 pub mod stiffness;
@@ -64,5 +66,6 @@ pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use strain::{GaugeTrial, RegionStrain, StrainMeasure, StrainSummary};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Together, Tracked, Trajectory};
+pub use transform::{AffineMap, Transform};
 pub use trial::{Part, Standing, Stated, StressCurve, StressRun, Trial};
 pub use volume::{Mask, Volume, Voxels};

@@ -68,6 +68,14 @@ fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])
 }
 
+/// The identity.
+const UNIT: Matrix3 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+
+/// `a b`.
+fn matmul(a: &Matrix3, b: &Matrix3) -> Matrix3 {
+    std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| a[r][k] * b[k][c]).sum()))
+}
+
 impl Affine {
     /// From the upper three rows of the homogeneous 4 x 4 matrix (mm a voxel, mm).
     ///
@@ -92,6 +100,21 @@ impl Affine {
             })
         });
         Ok(Self { linear: m, origin: std::array::from_fn(|r| rows[r][3]), inverse })
+    }
+
+    /// The same numbers in both frames.
+    pub(super) const IDENTITY: Self = Self { linear: UNIT, origin: [0.0; 3], inverse: UNIT };
+
+    /// The affine that undoes this one. (Its frames are the same two, the other way round.)
+    pub(super) fn inverted(&self) -> Self {
+        let origin = matvec(&self.inverse, self.origin).map(|v| 0.0 - v);
+        Self { linear: self.inverse, origin, inverse: self.linear }
+    }
+
+    /// This affine, then `next`.
+    pub(super) fn then(&self, next: &Self) -> Self {
+        let origin = WorldPoint(matvec(&next.linear, self.origin)).moved(next.origin).0;
+        Self { linear: matmul(&next.linear, &self.linear), origin, inverse: matmul(&self.inverse, &next.inverse) }
     }
 
     /// Axis-aligned: `spacing` mm a voxel, the first voxel's centre at `origin` (mm).

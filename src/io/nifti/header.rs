@@ -7,7 +7,7 @@ use nifti::{Endianness, NiftiHeader};
 pub(super) const LONGEST: usize = 540;
 
 /// What NiftyReg writes as `intent_name` of a transformation.
-const NIFTYREG: &[u8] = b"NREG_TRANS";
+pub(super) const NIFTYREG: &[u8] = b"NREG_TRANS";
 
 const CONVERT: &str = "convert it to a .nii.gz (for example with dcm2niix, nibabel or ITK-SNAP)";
 

@@ -48,6 +48,8 @@ pub(in crate::io) fn volume_header(path: &Path) -> Result<Stored, IoError> {
 }
 
 const EXPORT: &str = "export it again";
+/// NIfTI's code of a label map.
+const LABEL: i64 = 1002;
 
 /// Who wrote a field, and what its numbers are.
 #[derive(Debug, Clone, PartialEq)]
@@ -144,7 +146,8 @@ impl Opened {
         let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
         let apart_mm = disagreement(&header, shape);
         let axes = axes[..used].to_vec();
-        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, bytes: self.size }, header.intent))
+        let labels = header.intent == LABEL;
+        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, labels, bytes: self.size }, header.intent))
     }
 }
 

@@ -1,10 +1,13 @@
 //! Writing volumes, label maps and displacement fields.
 
 use super::affine::quaternion;
+use super::header::NIFTYREG;
 use crate::error::IoError;
 use crate::io::atomic::write_atomic;
 use crate::io::flaw::Flaw;
 use crate::io::gzip::{Chunk, Member, Run};
+use crate::io::raw_write::{TextFormat, TextImage};
+use crate::io::voxels::Kind;
 use crate::numerics::simd::dispatch;
 use crate::types::{DenseField, ErrorSamples, Grid, Mask, Volume};
 use rayon::prelude::*;
@@ -18,6 +21,8 @@ use std::path::{Path, PathBuf};
 const DIMENSIONLESS: i16 = 1011;
 /// NIfTI's code of a symmetric matrix a voxel.
 const SYMMETRIC: i16 = 1005;
+/// FSL's code of a displacement field.
+const FNIRT: i16 = 2006;
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
 const CHUNK: usize = 1 << 18;
 /// Chunks that are held packed at a time: of few threads six for each, of many two.
@@ -35,8 +40,8 @@ const COARSE: f64 = 0.25;
 /// 65,536 are exact), so that they pack.
 ///
 /// # Errors
-/// [`IoError`] when the name ends in neither `.nii` nor `.nii.gz`, an axis has more than 32,767 voxels or the file
-/// cannot be written.
+/// [`IoError`] when the name ends in none of `.nii`, `.nii.gz`, `.nrrd` and `.mha`, an axis of NIfTI has more than
+/// 32,767 voxels or the file cannot be written.
 pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) -> Result<(), IoError> {
     let form = Form { description, ..Form::FLOATS };
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| stored(v).to_le_bytes()).map(drop)
@@ -144,6 +149,32 @@ pub fn write_series_field(path: impl AsRef<Path>, field: &DenseField) -> Result<
         stored(lps).to_le_bytes()
     })?;
     Ok(PackedField { path: path.as_ref().into(), runs })
+}
+
+/// Fields whose numbers are not LPS mm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::io) enum ForeignField {
+    /// FSL's relative warp: (nx, ny, nz, 3), FNIRT's intent, scaled-voxel mm.
+    Fsl,
+    /// NiftyReg's displacement, RAS mm.
+    Niftyreg,
+    /// Voxels of the field's grid along its axes.
+    Voxels,
+}
+
+/// Writes a field whose numbers are those of another convention already, as float32, bit for bit.
+pub(in crate::io) fn write_foreign_field(path: &Path, field: &DenseField, whose: ForeignField) -> Result<(), IoError> {
+    let form = match whose {
+        ForeignField::Fsl => {
+            Form { flat: true, intent: FNIRT, description: "FSL relative warp, scaled-voxel mm", ..Form::VECTORS }
+        }
+        ForeignField::Niftyreg => {
+            Form { niftyreg: true, description: "NiftyReg displacement, RAS mm", ..Form::VECTORS }
+        }
+        ForeignField::Voxels => Form { description: "displacement in voxels of this grid", ..Form::VECTORS },
+    };
+    let components = [field.component(0), field.component(1), field.component(2)];
+    write(path, field.grid(), form, &components, |_, v: f32| v.to_le_bytes()).map(drop)
 }
 
 /// What the header of a field says.
@@ -308,11 +339,24 @@ struct Form<'a> {
     /// From frame to frame (s), 0 when not known.
     step_s: f64,
     description: &'a str,
+    /// Whether components are on the fourth axis, as FSL has them.
+    flat: bool,
+    /// Whether NiftyReg is to take it for a displacement of its own.
+    niftyreg: bool,
 }
 
 impl Form<'_> {
-    const FLOATS: Self =
-        Self { datatype: 16, bits: 32, components: 1, intent: 0, frames: 1, step_s: 0.0, description: "" };
+    const FLOATS: Self = Self {
+        datatype: 16,
+        bits: 32,
+        components: 1,
+        intent: 0,
+        frames: 1,
+        step_s: 0.0,
+        description: "",
+        flat: false,
+        niftyreg: false,
+    };
     const VECTORS: Self = Self { components: 3, intent: 1007, ..Self::FLOATS };
 }
 
@@ -340,8 +384,21 @@ fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
 ) -> Result<Vec<Run>, IoError> {
     let name = path.to_string_lossy().to_lowercase();
     let pack = name.ends_with(".nii.gz");
+    if let Some(format) = TextFormat::of(&name).filter(|_| form.frames == 1 && matches!(parts, 1 | 3)) {
+        let Form { datatype, description, .. } = form;
+        let number = match datatype {
+            2 => Kind::U8,
+            4 => Kind::I16,
+            _ => Kind::F32,
+        };
+        let image = TextImage { format, grid, kind: number, components: parts, description };
+        let bytes = |part: usize, range: Range<usize>| -> Vec<u8> {
+            made(part, range).iter().flat_map(|&v| stored(part, v)).collect()
+        };
+        return image.write(path, bytes).map(|()| Vec::new());
+    }
     if !pack && !name.ends_with(".nii") {
-        return Err(Flaw::new("only NIfTI can be written", "end the name in .nii or .nii.gz").at(path));
+        return Err(Flaw::new("only NIfTI can hold it", "end the name in .nii or .nii.gz").at(path));
     }
     let header = header(grid, &form).map_err(|flaw| flaw.at(path))?;
     let all = grid.len();
@@ -399,6 +456,9 @@ fn header(grid: &Grid, form: &Form<'_>) -> Result<[u8; 352], Flaw> {
     let mut dim = [if form.components > 1 { 5i16 } else { 3 }, 1, 1, 1, 1, form.components, 1, 1];
     dim[4] = i16::try_from(form.frames)
         .map_err(|_| Flaw::new(format!("{} frames: NIfTI-1 ends at 32767", form.frames), "cut the series"))?;
+    if form.flat {
+        (dim[0], dim[4], dim[5]) = (4, form.components, 1);
+    }
     for a in 0..3 {
         dim[a + 1] = i16::try_from(shape[a]).map_err(|_| {
             Flaw::new(format!("{shape:?} voxels: NIfTI-1 ends at 32767 an axis"), "crop or resample it")
@@ -408,6 +468,10 @@ fn header(grid: &Grid, form: &Form<'_>) -> Result<[u8; 352], Flaw> {
     put(&mut h, 40, &dim.map(i16::to_le_bytes).concat());
     if form.intent == SYMMETRIC {
         put_floats(&mut h, 56, &[3.0]); // intent_p1: the matrix has so many rows
+    }
+    if form.niftyreg {
+        put_floats(&mut h, 56, &[1.0]); // intent_p1: a displacement (_reg_maths.h)
+        put(&mut h, 328, NIFTYREG);
     }
     put(&mut h, 68, &form.intent.to_le_bytes());
     put(&mut h, 70, &form.datatype.to_le_bytes());
