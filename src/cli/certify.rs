@@ -3,7 +3,7 @@
 use super::console::Console;
 use super::convention::Convention;
 use super::field::Tuning;
-use super::inputs::{check_distinct, name, read_mask, read_volume, same_grid, warn_all};
+use super::inputs::{Part, check_distinct, name, read_mask, read_volume, same_grid, standing_for, warn_all};
 use super::outputs::Target;
 use anyhow::{Context, Result};
 use clap::Args;
@@ -17,14 +17,16 @@ const FILES: [&str; 3] = ["certificate.json", "detectable.nii.gz", "report.html"
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// The scan (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a DICOM series)
+    /// The scan (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a DICOM series or of
+    /// palpate phantom)
+    #[arg(value_parser = standing_for(Part::Initial))]
     initial: PathBuf,
     /// A second scan at rest on the same grid: its noise is real [default: noise is estimated]
     second: Option<PathBuf>,
     #[command(flatten)]
     target: Target,
     /// Where there is tissue: a mask on the scan's grid, 0 outside
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// A measured field, or a folder of `palpate field`: its motion is imposed too
     #[arg(long, value_name = "FIELD")]
@@ -54,7 +56,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let like = like
         .as_ref()
         .map(|path| {
-            let field = convention.read_result(path)?;
+            let field = convention.read(path)?;
             same_grid(path, field.grid(), &grid, initial)?;
             Ok::<_, anyhow::Error>(field)
         })

@@ -2,7 +2,9 @@
 
 use super::console::Console;
 use super::dry_run;
-use super::inputs::{check_distinct, name, read_labels, read_mask, read_volume, same_file, warn_all};
+use super::inputs::{
+    Part, check_distinct, name, read_labels, read_mask, read_volume, same_file, standing_for, warn_all,
+};
 use super::limits::field_fits;
 use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
 use anyhow::{Context, Result, bail};
@@ -20,18 +22,20 @@ use std::time::Instant;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Volume before the deformation (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a
-    /// DICOM series)
+    /// DICOM series or of palpate phantom)
+    #[arg(value_parser = standing_for(Part::Initial))]
     initial: PathBuf,
     /// Volume after it, on any grid
+    #[arg(value_parser = standing_for(Part::Deformed))]
     deformed: PathBuf,
     #[command(flatten)]
     target: Target,
     /// Where to measure: a mask on the initial volume's grid, 0 outside
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Bodies that slide along each other: labels on the initial volume's grid, 0 outside
     /// [default: found from the volumes]
-    #[arg(long, value_name = "LABELS")]
+    #[arg(long, value_name = "LABELS", value_parser = standing_for(Part::Labels))]
     bodies: Option<PathBuf>,
     /// A body of --bodies that moves rigidly (a bone), by its label; may be given several times
     #[arg(long, value_name = "LABEL", requires = "bodies")]
@@ -40,7 +44,7 @@ pub struct Options {
     #[arg(long, conflicts_with = "bodies")]
     bonded: bool,
     /// Exact displacement on the initial volume's grid: the error after each stage is written too
-    #[arg(long, value_name = "FIELD")]
+    #[arg(long, value_name = "FIELD", value_parser = standing_for(Part::Truth))]
     truth: Option<PathBuf>,
     /// Write the results even where the field folds, which tissue cannot do
     #[arg(long)]

@@ -4,7 +4,7 @@ use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
 use super::dry_run;
-use super::inputs::{check_distinct, name, on_grid, read_labels, read_mask, warn_all};
+use super::inputs::{Part, check_distinct, file_of, name, on_grid, read_labels, read_mask, standing_for, warn_all};
 use super::limits::mesh_fits;
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -50,13 +50,19 @@ pub struct Options {
     /// Matches to use inside the body, with their precision, in place of the field, which
     /// smoothness flattens; none for the field itself
     /// [default: matches.csv of the same results of palpate field, if any]
-    #[arg(long, value_name = "M.csv|none")]
+    #[arg(long, value_name = "M.csv|none", value_parser = standing_for(Part::Matches))]
     matches: Option<PathBuf>,
     /// The body: a mask on the field's grid; regions are then looked for
-    #[arg(long, value_name = "M", conflicts_with = "labels", required_unless_present_any = ["labels", "sequence"])]
+    #[arg(
+        long,
+        value_name = "M",
+        conflicts_with = "labels",
+        required_unless_present_any = ["labels", "sequence"],
+        value_parser = standing_for(Part::Mask)
+    )]
     mask: Option<PathBuf>,
     /// Regions: a label map on the field's grid, 0 outside
-    #[arg(long, value_name = "L")]
+    #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     pub(super) labels: Option<PathBuf>,
     /// Names of the labels, as 1=skin,2=fat (or with ; between, as a table of pairs has them)
     #[arg(long, value_name = "NAMES", requires = "labels")]
@@ -178,7 +184,7 @@ pub(super) fn plan(
 }
 
 fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
-    let mut source = Source::of(field, options.matches.as_deref());
+    let mut source = Source::of(field, options.matches.as_deref())?;
     let patches = patch_files(options);
     let given: Vec<&Path> = [Some(source.field.as_path()), Some(body), source.matches.as_deref()]
         .into_iter()
@@ -250,10 +256,9 @@ struct Source {
 impl Source {
     /// The matches of the same results are taken where none are named: the field between them is
     /// smoothed, which flattens strain and with it a contrast.
-    fn of(given: &Path, matches: Option<&Path>) -> Self {
-        let folder = given.is_dir();
-        let field = if folder { given.join("displacement.nii.gz") } else { given.to_path_buf() };
-        let ours = folder || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
+    fn of(given: &Path, matches: Option<&Path>) -> Result<Self> {
+        let field = file_of(given, Part::Field)?;
+        let ours = given.is_dir() || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
         let ours = ours && field.with_file_name("summary.json").is_file();
         let beside = |file: &str| Some(field.with_file_name(file)).filter(|f| ours && f.is_file());
         let matches = match matches {
@@ -261,7 +266,7 @@ impl Source {
             Some(path) => Some(path.to_path_buf()),
             None => beside("matches.csv"),
         };
-        Self { image: beside("warped.nii.gz"), matches, field }
+        Ok(Self { image: beside("warped.nii.gz"), matches, field })
     }
 }
 
@@ -332,6 +337,7 @@ fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place>
             if !path.exists() {
                 bail!("{flag} {text}: is neither a side (x-, x+, y-, y+, z-, z+) nor a file; check the spelling");
             }
+            let path = &file_of(path, Part::Mask).with_context(|| format!("{flag} {text}"))?;
             let mask = read_mask(path, grid, reference).with_context(|| format!("{flag} {text}"))?;
             Ok(Place::Mask(Box::new(mask), name(path)))
         }

@@ -3,7 +3,7 @@
 use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
-use super::inputs::{check_distinct, name, read_labels, read_mask, same_grid, warn_all};
+use super::inputs::{Part, check_distinct, name, read_labels, read_mask, same_grid, standing_for, warn_all};
 use super::outputs::{STRAIN_FILES, StrainMaps, Target, at_places, write_strain};
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -31,10 +31,10 @@ pub struct Options {
     measure: StrainMeasure,
     /// Where there is tissue, on the field's grid, 0 outside [default: what the folder measured,
     /// everywhere of a file]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Regions whose strain is summed up: a label map on the field's grid [default: the bodies]
-    #[arg(long, value_name = "L")]
+    #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     labels: Option<PathBuf>,
     /// Fibres: vectors on the field's grid (5-D NIfTI, LPS), or LABEL=X,Y,Z (RAS), once for each label
     #[arg(long, value_name = "F")]
@@ -84,7 +84,7 @@ impl Source {
                 warnings.push(format!("{}: {part} is missing: {lost}", path.display()));
             }
         }
-        let field = convention.read_result(path)?;
+        let field = convention.read(path)?;
         let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path)).transpose()?;
         let summary = there("summary.json").map(io::read_json).transpose()?;
         let trust = summary.and_then(|mut s| serde_json::from_value(s.get_mut("trust")?.take()).ok());

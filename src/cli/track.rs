@@ -5,8 +5,8 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{
-    check_distinct, name, on_grid, read_labels, read_mask, usable, warn_all, warn_of_non_finite, warn_of_places,
-    warn_of_two_places,
+    Part, check_distinct, name, on_grid, read_labels, read_mask, standing_for, usable, warn_all, warn_of_non_finite,
+    warn_of_places, warn_of_two_places,
 };
 use super::limits::grids_fit;
 use super::outputs::Target;
@@ -41,10 +41,10 @@ pub struct Options {
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
     reference: usize,
     /// Where to measure: a mask on the reference's grid, 0 outside
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Regions whose strain is written to strain.csv: a label map on the reference's grid
-    #[arg(long, value_name = "L")]
+    #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     labels: Option<PathBuf>,
     /// Leave each frame's field as its own volume has it, without what all frames say together
     #[arg(long)]
