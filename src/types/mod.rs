@@ -52,7 +52,9 @@ pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};
 pub use field::{DenseField, Displacement};
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
-pub use metrics::{InverseConsistency, Metrics};
+pub use metrics::{
+    Distances, InverseConsistency, LabelScore, LabelScores, LandmarkError, Metrics, Overlap, TargetError,
+};
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
 pub use result::{BodyReport, Counts, FieldSummary, LevelReport, Mesh, MotionModel, StageReport};
