@@ -3,13 +3,15 @@
 use super::console::Console;
 use super::convention::Convention;
 use super::field::Tuning;
-use super::inputs::{Part, check_distinct, name, read_mask, read_volume, same_grid, standing_for, warn_all};
+use super::inputs::{Part, check_distinct, file_of, name, read_mask, read_volume, same_grid, standing_for, warn_all};
 use super::outputs::Target;
+use super::record::{self, Recording};
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::io;
 use palpate::pipeline::certify::{self, CertifyInput};
 use palpate::report::certify::{CertifyReport, page, summary, text};
+use palpate::report::record::{in_summary, on_page};
 use std::path::{Path, PathBuf};
 
 /// What is written.
@@ -43,9 +45,13 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let given: Vec<&Path> = [initial].into_iter().chain(second).chain(mask).chain(like).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FILES))?;
     target.check()?;
+    let mut inputs =
+        record::inputs(&[("initial", Some(initial)), ("second", second.as_ref()), ("mask", mask.as_ref())]);
+    inputs.extend(like.as_ref().map(|p| Ok::<_, anyhow::Error>(("like", file_of(p, Part::Field)?))).transpose()?);
+    inputs.extend(record::inputs(&[("field_deformed", convention.deformed()), ("config", tuning.config())]));
     let progress = console.progress();
     progress.set("read", 0.0);
-    let mut warnings = Vec::new();
+    let mut warnings = tuning.mask_left_out(mask.is_some());
     let volume = read_volume(initial, &mut warnings)?;
     let grid = *volume.grid();
     let again = second.as_ref().map(|p| read_volume(p, &mut warnings)).transpose()?;
@@ -62,6 +68,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         })
         .transpose()?;
     let mut folder = target.create()?;
+    let record = Recording::start(console, inputs);
     let input = CertifyInput { initial: &volume, second: again.as_ref(), mask: inside.as_ref(), like: like.as_ref() };
     let set = |stage: &str, part| progress.set(stage, part);
     let mut found = certify::run(input, &params, &set).with_context(|| name(initial))?;
@@ -77,11 +84,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         detectable: &|at| found.detectable.as_slice()[at],
         certificate: &found.certificate,
     };
-    folder.write("certificate.json", |p| io::write_json(p, &summary(&report)))?;
+    let record = record.finish()?;
+    folder.write("certificate.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     let said = "palpate: smallest displacement told from noise, mm";
     folder.write("detectable.nii.gz", |p| io::write_volume(p, &found.detectable, said))?;
     let html = page(&report)?;
-    folder.write("report.html", |p| io::write_text(p, &html))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(html, &record)))?;
     folder.commit()?;
     drop(progress);
     warn_all(console, &found.certificate.warnings);

@@ -20,6 +20,11 @@ pub struct Convention {
 }
 
 impl Convention {
+    /// The volume that `--field-deformed` names.
+    pub fn deformed(&self) -> Option<&PathBuf> {
+        self.field_deformed.as_ref()
+    }
+
     /// The field in this convention: of a file, or of a results folder, which is palpate's own.
     ///
     /// # Errors

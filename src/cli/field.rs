@@ -7,6 +7,7 @@ use super::inputs::{
 };
 use super::limits::field_fits;
 use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
+use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::{StrainError, UnknownName};
@@ -84,7 +85,7 @@ pub struct Tuning {
     #[arg(long, value_name = "S")]
     seed: Option<u64>,
     /// Parameters from a file: summary.json of an earlier run, or its keys as JSON or TOML; flags
-    /// go before it
+    /// go before it. A summary without inputs beside it repeats its run
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
 }
@@ -106,6 +107,17 @@ impl Tuning {
     /// The file of parameters, where one is given.
     pub fn config(&self) -> Option<&PathBuf> {
         self.config.as_ref()
+    }
+
+    /// Says so where the run that --config names had a mask and this one has none.
+    pub fn mask_left_out(&self, masked: bool) -> Vec<String> {
+        let Some(file) = self.config.as_ref().filter(|_| !masked) else { return Vec::new() };
+        let summary = io::read_json(file).unwrap_or_default();
+        let files = summary["files"].as_array().into_iter().flatten();
+        let full = files.filter(|f| f["role"] == "mask").find_map(|f| f["path"].as_str());
+        let mask = full.or(summary["inputs"]["mask"].as_str()).filter(|m| !m.is_empty());
+        let said = |mask| format!("{}: its run had the mask {mask}, this one has none; add --mask", file.display());
+        mask.map(said).into_iter().collect()
     }
 
     /// Parameters in range.
@@ -176,13 +188,21 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let given: Vec<&Path> =
         [initial, deformed].into_iter().chain(mask).chain(bodies).chain(truth).map(PathBuf::as_path).collect();
+    let inputs = record::inputs(&[
+        ("initial", Some(initial)),
+        ("deformed", Some(deformed)),
+        ("mask", mask.as_ref()),
+        ("bodies", bodies.as_ref()),
+        ("truth", truth.as_ref()),
+        ("config", tuning.config()),
+    ]);
     let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
     check_distinct(&given, &target.files(&files))?;
 
     field_fits(initial, deformed)?;
 
     let started = Instant::now();
-    let mut warnings = Vec::new();
+    let mut warnings = tuning.mask_left_out(mask.is_some());
     if same_file(initial, deformed) {
         warnings.push("the initial and the deformed volume are the same file".into());
     }
@@ -207,6 +227,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
     }
     let mut folder = target.create()?;
+    let record = Recording::start(console, inputs);
     let read = started.elapsed().as_secs_f64();
 
     let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
@@ -244,6 +265,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params: &params,
         truth: truth.as_ref().zip(metrics.as_ref()),
         strain: strain.as_ref(),
+        record,
     };
     let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;

@@ -6,12 +6,14 @@ use super::convention::Convention;
 use super::dry_run;
 use super::inputs::{Part, check_distinct, file_of, name, on_grid, read_labels, read_mask, standing_for, warn_all};
 use super::limits::mesh_fits;
+use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline;
 use palpate::pipeline::stiffness::{ENOUGH, Inputs, inside};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
@@ -138,6 +140,20 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
     named.map(PathBuf::from).collect()
 }
 
+/// What is read of a single field as of a sequence.
+pub(super) fn common_inputs(options: &Options) -> Read {
+    let mut inputs = record::inputs(&[
+        ("labels", options.labels.as_ref()),
+        ("mask", options.mask.as_ref()),
+        ("field_deformed", options.convention.deformed()),
+    ]);
+    let patches = [("held", &options.held), ("load", &options.load)];
+    let files = patches.into_iter().filter(|(_, text)| Side::parse(text).is_none());
+    inputs.extend(files.filter_map(|(role, text)| Some((role, file_of(Path::new(text), Part::Mask).ok()?))));
+    inputs.extend(options.images.iter().map(|p| ("image", p.clone())));
+    inputs
+}
+
 /// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field; that
 /// is left out where it cannot be shown.
 pub(super) fn images(options: &Options, beside: Option<&Path>, grid: &Grid) -> Result<Vec<(String, Volume)>> {
@@ -211,6 +227,12 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         return plan(options, params, &source.field, &setting, &[], console);
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
+    let mut inputs = record::inputs(&[("field", Some(&source.field)), ("matches", source.matches.as_ref())]);
+    inputs.extend(common_inputs(options));
+    if options.images.is_empty() {
+        inputs.extend(source.image.iter().map(|p| ("image", p.clone())));
+    }
+    let record = Recording::start(console, inputs);
     // Of a sequence.
     folder.supersede(|file| file == "frames.csv" || file == FOUND)?;
     let read = started.elapsed().as_secs_f64();
@@ -227,9 +249,11 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         load: options.load.clone(),
     };
     write(&mut folder, &mut result)?;
-    folder.write("summary.json", |p| io::write_json(p, &report::summary(&result, &names)))?;
+    let record = record.finish()?;
+    let told = in_summary(report::summary(&result, &names), &record);
+    folder.write("summary.json", |p| io::write_json(p, &told))?;
     let page = report::page(&result, &names, &report::Shown { field: Some(&field), images: &images })?;
-    folder.write("report.html", |p| io::write_text(p, &page))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page, &record)))?;
     folder.commit()?;
     drop(progress);
     result.evidence.iter().for_each(|e| console.detail(&report::evidence_line(e)));

@@ -10,6 +10,7 @@ use super::inputs::{
 };
 use super::limits::grids_fit;
 use super::outputs::Target;
+use super::record::{self, Read, Recording};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::FieldError;
@@ -24,6 +25,7 @@ use palpate::pipeline::{
 };
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as all_warnings};
 use palpate::report::verdict::judge;
 use palpate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
@@ -152,6 +154,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let given: Vec<&Path> = volumes.iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&files(frames, origin)))?;
+    let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
+    inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
 
     // The largest of the others is what has to fit.
     let others = order(frames, origin).map(|t| (source.path(t), source.grid(t)));
@@ -162,7 +166,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let started = Instant::now();
     let progress = console.progress();
     progress.set("read", 0.0);
-    let mut warnings = Vec::new();
+    let mut warnings = tuning.mask_left_out(mask.is_some());
     if let Source::Series(file, _) = &source {
         warn_of_two_places(file, &mut warnings);
     }
@@ -181,6 +185,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&plan);
     }
     let mut folder = target.create()?;
+    let record = Recording::start(console, inputs);
     folder.supersede(of_a_frame)?;
     let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
     let mut film = None;
@@ -283,8 +288,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         warnings: &warnings,
         seconds: &seconds,
     };
-    folder.write("report.html", |p| io::write_text(p, &page(&report)))?;
-    folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
+    let record = record.finish()?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page(&report), &record)))?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     folder.commit()?;
     drop(progress);
     warn_all(console, &all_warnings(&report));

@@ -23,6 +23,8 @@ pub mod certificate;
 
 pub mod expected;
 
+pub mod record;
+
 pub mod result;
 
 pub mod samples;
