@@ -4,6 +4,7 @@ use super::console::Console;
 use super::convention::Convention;
 use super::field::Tuning;
 use super::inputs::{Part, check_distinct, file_of, name, read_mask, read_volume, same_grid, standing_for, warn_all};
+use super::limits::cap_search;
 use super::outputs::Target;
 use super::record::{self, Recording};
 use anyhow::{Context, Result};
@@ -41,7 +42,7 @@ pub struct Options {
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { initial, second, target, mask, like, convention, tuning } = options;
-    let params = tuning.params()?;
+    let mut params = tuning.params()?;
     let given: Vec<&Path> = [initial].into_iter().chain(second).chain(mask).chain(like).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FILES))?;
     target.check()?;
@@ -54,6 +55,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut warnings = tuning.mask_left_out(mask.is_some());
     let volume = read_volume(initial, &mut warnings)?;
     let grid = *volume.grid();
+    warnings.extend(cap_search(&mut params, &grid, initial));
     let again = second.as_ref().map(|p| read_volume(p, &mut warnings)).transpose()?;
     if let (Some(path), Some(again)) = (second, &again) {
         same_grid(path, again.grid(), &grid, initial)?;

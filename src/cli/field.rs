@@ -5,7 +5,7 @@ use super::dry_run;
 use super::inputs::{
     Part, check_distinct, name, read_labels, read_mask, read_volume, same_file, standing_for, warn_all,
 };
-use super::limits::field_fits;
+use super::limits::{cap_search, field_fits};
 use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
 use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
@@ -211,7 +211,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (mut first, mut second) = (Vec::new(), Vec::new());
     let (fixed, moving) = rayon::join(|| read_volume(initial, &mut first), || read_volume(deformed, &mut second));
     let (fixed, moving) = (fixed?, moving?);
-    warnings.extend(first.into_iter().chain(second));
+    warnings.extend(first.into_iter().chain(second).chain(cap_search(&mut params, fixed.grid(), initial)));
     let mut inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial)).transpose()?;
     if let Some(path) = bodies {
         let labels = read_labels(path, fixed.grid(), initial)?;

@@ -8,7 +8,7 @@ use super::inputs::{
     Part, check_distinct, name, on_grid, read_labels, read_mask, standing_for, usable, warn_all, warn_of_non_finite,
     warn_of_places, warn_of_two_places,
 };
-use super::limits::grids_fit;
+use super::limits::{cap_search, grids_fit, same_unit};
 use super::outputs::Target;
 use super::record::{self, Read, Recording};
 use anyhow::{Result, bail};
@@ -146,7 +146,7 @@ impl<'a> Source<'a> {
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { volumes, target, reference: origin, mask, labels, frame_by_frame, dry_run, tuning } = options;
-    let (params, origin) = (tuning.params()?, *origin);
+    let (mut params, origin) = (tuning.params()?, *origin);
     let mut source = Source::open(volumes)?;
     let frames = source.frames();
     if origin >= frames {
@@ -157,6 +157,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
     inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
 
+    for t in order(frames, origin) {
+        same_unit((source.path(origin), source.grid(origin)), (source.path(t), source.grid(t)))?;
+    }
     // The largest of the others is what has to fit.
     let others = order(frames, origin).map(|t| (source.path(t), source.grid(t)));
     if let Some(largest) = others.max_by_key(|o| o.1.len()) {
@@ -173,6 +176,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let reference = source.read_usable(origin, &mut warnings)?;
     let grid = *reference.grid();
     let first = source.path(origin);
+    warnings.extend(cap_search(&mut params, &grid, first));
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_labels(l, &grid, first)).transpose()?;
     warnings.extend(out_of_order(volumes));
