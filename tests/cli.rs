@@ -537,3 +537,47 @@ fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     let (_, err) = run(folder.path(), &command, 1);
     assert!(err.contains("palpate-demo") && err.contains("--force"), "{err}");
 }
+
+#[test]
+fn volumes_in_unlike_units_are_refused_before_any_work() {
+    let folder = small_pair();
+    let put = |name: &str, size: f32, dims: [i16; 3]| {
+        let mut file = Nifti::ramp(dims);
+        (0..3).for_each(|a| file.sform[a][a] = size);
+        fs::write(folder.path().join(name), file.bytes()).unwrap();
+    };
+    put("mm.nii", 2.0, [20, 22, 18]);
+    put("m.nii", 0.002, [20, 22, 18]);
+    put("cm.nii", 0.2, [20, 20, 20]);
+    put("fine.nii", 0.1, [20, 20, 20]);
+    put("lost.nii", 1.0, [20, 20, 20]);
+    put("crop.nii", 2.0, [4, 4, 4]);
+    let cases = [
+        ("mm.nii", "m.nii", "44 mm, about 1000 times as long; one of them is likely in metres or micrometres"),
+        ("cm.nii", "mm.nii", "about 10 times as long; one of them is likely in centimetres"),
+        ("fine.nii", "lost.nii", "lost.nii has voxels of 1 mm on every side, as where a header was lost"),
+    ];
+    for (initial, deformed, message) in cases {
+        let (_, err) = run(folder.path(), &["field", initial, deformed, "-o", "out"], 1);
+        assert!(err.contains(message) && err.contains(initial) && err.contains(deformed), "{message}: {err}");
+        let (_, err) = run(folder.path(), &["track", initial, deformed, "-o", "out"], 1);
+        assert!(err.contains(message), "{message}: {err}");
+    }
+    // A part of the other volume has as large voxels, but fewer.
+    let (_, err) = run(folder.path(), &["field", "mm.nii", "crop.nii", "-o", "out", "--dry-run"], 1);
+    assert!(!err.contains("times as long"), "{err}");
+    assert!(!folder.path().join("out").exists());
+}
+
+#[test]
+fn a_search_beyond_the_volume_is_capped_and_said() {
+    let folder = small_pair();
+    let volume = palpate::io::read_volume(folder.path().join("initial.nii.gz")).unwrap();
+    let side = (0..3).map(|a| volume.grid().shape()[a] as f64 * volume.grid().spacing()[a]).fold(0.0, f64::max);
+    let pair = ["field", "initial.nii.gz", "deformed.nii.gz", "-o", "out", "--dry-run", "--search"];
+    let (out, err) = run(folder.path(), &[&pair[..], &["180"]].concat(), 0);
+    assert!(err.contains("--search 180 mm is more than the longest side of initial.nii.gz"), "{err}");
+    assert!(out.contains(&format!("search       {side} mm")), "{out}");
+    let (_, err) = run(folder.path(), &[&pair[..], &["7"]].concat(), 0);
+    assert!(!err.contains("longest side"), "{err}");
+}

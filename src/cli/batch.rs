@@ -10,12 +10,15 @@ use super::console::Console;
 use super::field::Tuning;
 use super::inputs::name;
 use super::limits::ATTENDED;
+use super::record::{self, Recording};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::io::{self, read_header};
 use palpate::pipeline::plan;
 use palpate::report::batch as report;
+use palpate::report::record::{in_summary, on_page};
 use palpate::types::batch::{Pair, PairOutcome, Status};
+use palpate::types::record::RunRecord;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -79,6 +82,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         bail!("{}: holds something that is not a batch; choose another --output, or add --force", output.display());
     }
     io::make_folder(output)?;
+    // What each stage has read is in its own summary.
+    let record = Recording::start(console, record::inputs(&[("table", Some(table)), ("config", tuning.config())]));
     let outcomes: Vec<PairOutcome> = match collect {
         true => pairs.iter().map(|pair| collected(pair, output, tuning)).collect(),
         false => {
@@ -90,7 +95,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             batch.run(jobs.min(pairs.len()))?
         }
     };
-    write(output, &outcomes)?;
+    write(output, &outcomes, &record.finish()?)?;
     for o in outcomes.iter().filter(|o| o.status == Status::Failed) {
         console.warn(&format!("{} failed at {}: {}", o.name, o.stage, o.reason));
     }
@@ -113,14 +118,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 }
 
 /// The tables and the report.
-fn write(output: &Path, outcomes: &[PairOutcome]) -> Result<()> {
+fn write(output: &Path, outcomes: &[PairOutcome], record: &RunRecord) -> Result<()> {
     io::write_rows(
         output.join("regions.csv"),
         &report::REGION_COLUMNS,
         outcomes.iter().flat_map(report::region_rows).collect(),
     )?;
-    io::write_json(output.join("summary.json"), &report::summary(outcomes))?;
-    io::write_text(output.join("report.html"), &report::page(outcomes))?;
+    io::write_json(output.join("summary.json"), &in_summary(report::summary(outcomes), record))?;
+    io::write_text(output.join("report.html"), &on_page(report::page(outcomes), record))?;
     Ok(io::write_rows(output.join(TABLE), &report::COLUMNS, outcomes.iter().map(report::row).collect())?)
 }
 

@@ -5,6 +5,7 @@ use super::console::Console;
 use super::inputs::{read_landmarks, read_mask, same_grid, warn_all};
 use super::outputs::Target;
 use super::peers::Peers;
+use super::record::Recording;
 use super::stress::part;
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -15,6 +16,7 @@ use palpate::io;
 use palpate::pipeline::pressed;
 use palpate::pipeline::trials::{self, Case, Variant};
 use palpate::report::frontier::{self as report, Group};
+use palpate::report::record::{in_summary, on_page};
 use palpate::types::{DenseField, Part, Scene, Trial};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -140,6 +142,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     warn_all(console, &warnings);
     let mut folder = target.create()?;
+    let record = Recording::start(console, case.iter().map(|c| ("case", c.clone())).collect());
     let started = Instant::now();
     let between = io::Scratch::new()?;
     let found = if *peers { find_peers(between.path(), &wanted, console) } else { None };
@@ -205,8 +208,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("chart.csv", |p| io::write_trials(p, &trials))?;
     folder.write("chart.svg", |p| io::write_text(p, &report::svg(&groups, &trials)))?;
     let seconds = started.elapsed().as_secs_f64();
-    folder.write("summary.json", |p| io::write_json(p, &report::summary(&groups, seconds)))?;
-    folder.write("chart.html", |p| io::write_text(p, &report::page(&groups, &trials)))?;
+    let record = record.finish()?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(report::summary(&groups, seconds), &record)))?;
+    folder.write("chart.html", |p| io::write_text(p, &on_page(report::page(&groups, &trials), &record)))?;
     folder.commit()?;
     drop(progress);
     let look = target.output.join("chart.html");

@@ -2,17 +2,30 @@
 
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::{ErrorKind, Write, stderr, stdout};
+use std::sync::Arc;
 
-/// How much to say.
+/// What was typed, and how much to say.
 #[derive(Debug, Clone)]
 pub struct Console {
     quiet: bool,
     verbose: bool,
+    arguments: Arc<[String]>,
 }
 
 impl Console {
-    pub fn new(quiet: bool, verbose: bool) -> Self {
-        Self { quiet, verbose }
+    /// `arguments` are those of the program, the command first.
+    pub fn new(quiet: bool, verbose: bool, arguments: &[String]) -> Self {
+        Self { quiet, verbose, arguments: arguments.into() }
+    }
+
+    /// The same for a command that this one runs.
+    pub fn for_command(&self, arguments: &[&str]) -> Self {
+        Self { arguments: arguments.iter().map(|a| a.to_string()).collect(), ..self.clone() }
+    }
+
+    /// The arguments of the program, the command first.
+    pub fn arguments(&self) -> &[String] {
+        &self.arguments
     }
 
     /// Results, on stdout.

@@ -1,6 +1,7 @@
 //! `--field-convention`: fields of other programs.
 
 use super::Usage;
+use super::inputs::{Part, file_of};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::io::{self, FieldConvention};
@@ -19,23 +20,21 @@ pub struct Convention {
 }
 
 impl Convention {
-    /// The field in this convention.
-    pub fn read(&self, path: &Path) -> Result<DenseField> {
-        let deformed = self.field_deformed.as_ref().map(io::read_header).transpose()?;
-        let grid = deformed.as_ref().map(|(stored, _)| &stored.grid);
-        Ok(io::read_field_as(path, self.field_convention, grid)?)
+    /// The volume that `--field-deformed` names.
+    pub fn deformed(&self) -> Option<&PathBuf> {
+        self.field_deformed.as_ref()
     }
 
-    /// The field of a results folder, which is palpate's own, or that of a file in this convention.
-    pub fn read_result(&self, path: &Path) -> Result<DenseField> {
-        if !path.is_dir() {
-            return self.read(path);
+    /// The field in this convention: of a file, or of a results folder, which is palpate's own.
+    ///
+    /// # Errors
+    /// When it cannot be read, or a folder comes with another convention than LPS.
+    pub fn read(&self, path: &Path) -> Result<DenseField> {
+        if path.is_dir() && self.field_convention != FieldConvention::Lps {
+            bail!(Usage("--field-convention: a folder of palpate holds LPS; leave it out, or name a file".into()));
         }
-        if self.field_convention != FieldConvention::Lps {
-            bail!(Usage(
-                "--field-convention: a folder of palpate field holds LPS; leave it out, or name a file".into()
-            ));
-        }
-        Ok(io::read_field(path.join("displacement.nii.gz"))?)
+        let deformed = self.field_deformed.as_ref().map(io::read_header).transpose()?;
+        let grid = deformed.as_ref().map(|(stored, _)| &stored.grid);
+        Ok(io::read_field_as(file_of(path, Part::Field)?, self.field_convention, grid)?)
     }
 }

@@ -5,6 +5,7 @@ use super::Cli;
 use super::console::Console;
 use super::field::Tuning;
 use super::inputs::name;
+use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser};
 use palpate::evaluate;
@@ -12,6 +13,7 @@ use palpate::grasp::simulate::simulate;
 use palpate::io::{self, OutputFolder, SceneOverrides};
 use palpate::pipeline::fingertip;
 use palpate::report::chain::{Part, Row, page, text};
+use palpate::report::record::{in_summary, on_page};
 use palpate::types::Volume;
 use palpate::types::fingertip::{StiffnessFolder, StiffnessRegion};
 use serde_json::{Value, json};
@@ -62,10 +64,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         bail!("{}: is not empty; choose another folder, or write into it with --force", output.display());
     }
     let at = |part: &str| output.join(part).display().to_string();
-    let step = |command: &[&str]| -> Result<()> {
-        console.say(&format!("\n$ palpate {}", command.join(" ")))?;
-        let Cli { command, .. } = Cli::try_parse_from([&["palpate"], command].concat())?;
-        super::dispatch(&command, console)
+    let record = Recording::start(console, record::inputs(&[("config", tuning.config())]));
+    let step = |words: &[&str]| -> Result<()> {
+        console.say(&format!("\n$ palpate {}", words.join(" ")))?;
+        let Cli { command, .. } = Cli::try_parse_from([&["palpate"], words].concat())?;
+        super::dispatch(&command, &console.for_command(words))
     };
     let (seed, cells, nodes) = (params.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
     let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--force", "-o"];
@@ -135,9 +138,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let summary = json!({
         "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": FILES,
     });
+    let record = record.finish()?;
     folder.write("chain.csv", |p| io::write_chain(p, &rows))?;
-    folder.write("summary.json", |p| io::write_json(p, &summary))?;
-    folder.write("report.html", |p| io::write_text(p, &page(&rows, &parts)))?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page(&rows, &parts), &record)))?;
     folder.commit()?;
     console.say(&format!("\n{}\nLook at {}", text(&rows), output.join("report.html").display()))
 }

@@ -130,7 +130,9 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
                 "evaluate results/displacement.nii.gz --truth pair/truth.nii.gz --mask pair/mask.nii.gz --landmarks \
                  pair/landmarks.csv",
             ),
-            ("inverse consistency", "evaluate results/displacement.nii.gz --backward back/displacement.nii.gz"),
+            ("by landmarks alone", "evaluate results --landmarks landmarks.csv"),
+            ("by label maps alone", "evaluate results --labels before_labels.nii.gz after_labels.nii.gz"),
+            ("inverse consistency", "evaluate results --inverse back"),
         ],
     ),
     ("demo", &[("everything on synthetic data", "demo")]),

@@ -2,10 +2,11 @@
 
 use super::console::Console;
 use super::dry_run;
-use super::inputs::{check_distinct, name, read_labels, read_volume, same_file, warn_all};
+use super::inputs::{Part, check_distinct, name, read_labels, read_volume, same_file, standing_for, warn_all};
 use super::known::{Knowledge, mask_on};
-use super::limits::field_fits;
+use super::limits::{cap_search, field_fits};
 use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
+use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::{StrainError, UnknownName};
@@ -21,18 +22,20 @@ use std::time::Instant;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Volume before the deformation (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or a folder with a
-    /// DICOM series)
+    /// DICOM series or of palpate phantom)
+    #[arg(value_parser = standing_for(Part::Initial))]
     initial: PathBuf,
     /// Volume after it, on any grid
+    #[arg(value_parser = standing_for(Part::Deformed))]
     deformed: PathBuf,
     #[command(flatten)]
     target: Target,
     /// Where to measure: a mask of the initial volume, 0 outside
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Bodies that slide along each other: labels on the initial volume's grid, 0 outside
     /// [default: found from the volumes]
-    #[arg(long, value_name = "LABELS")]
+    #[arg(long, value_name = "LABELS", value_parser = standing_for(Part::Labels))]
     bodies: Option<PathBuf>,
     /// A body of --bodies that moves rigidly (a bone), by its label; may be given several times
     #[arg(long, value_name = "LABEL", requires = "bodies")]
@@ -41,7 +44,7 @@ pub struct Options {
     #[arg(long, conflicts_with = "bodies")]
     bonded: bool,
     /// Exact displacement on the initial volume's grid: the error after each stage is written too
-    #[arg(long, value_name = "FIELD")]
+    #[arg(long, value_name = "FIELD", value_parser = standing_for(Part::Truth))]
     truth: Option<PathBuf>,
     /// Write the results even where the field folds, which tissue cannot do
     #[arg(long)]
@@ -83,7 +86,7 @@ pub struct Tuning {
     #[arg(long, value_name = "S")]
     seed: Option<u64>,
     /// Parameters from a file: summary.json of an earlier run, or its keys as JSON or TOML; flags
-    /// go before it
+    /// go before it. A summary without inputs beside it repeats its run
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
 }
@@ -105,6 +108,17 @@ impl Tuning {
     /// The file of parameters, where one is given.
     pub fn config(&self) -> Option<&PathBuf> {
         self.config.as_ref()
+    }
+
+    /// Says so where the run that --config names had a mask and this one has none.
+    pub fn mask_left_out(&self, masked: bool) -> Vec<String> {
+        let Some(file) = self.config.as_ref().filter(|_| !masked) else { return Vec::new() };
+        let summary = io::read_json(file).unwrap_or_default();
+        let files = summary["files"].as_array().into_iter().flatten();
+        let full = files.filter(|f| f["role"] == "mask").find_map(|f| f["path"].as_str());
+        let mask = full.or(summary["inputs"]["mask"].as_str()).filter(|m| !m.is_empty());
+        let said = |mask| format!("{}: its run had the mask {mask}, this one has none; add --mask", file.display());
+        mask.map(said).into_iter().collect()
     }
 
     /// Parameters in range.
@@ -186,21 +200,23 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
-    let given: Vec<&Path> = [initial, deformed]
-        .into_iter()
-        .chain(mask)
-        .chain(bodies)
-        .chain(truth)
-        .chain(knowledge.files())
-        .map(PathBuf::as_path)
-        .collect();
+    let mut inputs = record::inputs(&[
+        ("initial", Some(initial)),
+        ("deformed", Some(deformed)),
+        ("mask", mask.as_ref()),
+        ("bodies", bodies.as_ref()),
+        ("truth", truth.as_ref()),
+        ("config", tuning.config()),
+    ]);
+    inputs.extend(knowledge.inputs());
+    let given: Vec<&Path> = inputs.iter().map(|(_, path)| path.as_path()).collect();
     let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
     check_distinct(&given, &target.files(&files))?;
 
     field_fits(initial, deformed)?;
 
     let started = Instant::now();
-    let mut warnings = Vec::new();
+    let mut warnings = tuning.mask_left_out(mask.is_some());
     if same_file(initial, deformed) {
         warnings.push("the initial and the deformed volume are the same file".into());
     }
@@ -209,7 +225,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (mut first, mut second) = (Vec::new(), Vec::new());
     let (fixed, moving) = rayon::join(|| read_volume(initial, &mut first), || read_volume(deformed, &mut second));
     let (fixed, moving) = (fixed?, moving?);
-    warnings.extend(first.into_iter().chain(second));
+    warnings.extend(first.into_iter().chain(second).chain(cap_search(&mut params, fixed.grid(), initial)));
     let mut inside = mask.as_ref().map(|m| mask_on(m, fixed.grid(), initial, &mut warnings)).transpose()?;
     if let Some(path) = bodies {
         let labels = read_labels(path, fixed.grid(), initial)?;
@@ -217,7 +233,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         (params.bodies, params.rigid) = (BodySource::Given, rigid.clone());
     }
     let truth = truth.as_ref().map(|path| read_truth(path, fixed.grid(), initial)).transpose()?;
-    let known = knowledge.read((&fixed, &moving), [initial, deformed], inside, &mut warnings)?;
+    let known = knowledge.read((&fixed, &moving), [initial, deformed], inside, console, &mut warnings)?;
     if *dry_run {
         drop(progress);
         let plan = pipeline::plan::field(&fixed, &moving, known.mask(), &params)?;
@@ -226,6 +242,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
     }
     let mut folder = target.create()?;
+    let record = Recording::start(console, inputs);
     let read = started.elapsed().as_secs_f64();
 
     let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
@@ -263,6 +280,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params: &params,
         truth: truth.as_ref().zip(metrics.as_ref()),
         strain: strain.as_ref(),
+        record,
     };
     let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;

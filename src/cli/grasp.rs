@@ -4,10 +4,12 @@ use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
 use super::outputs::Target;
+use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::io::{self, SceneFile, SceneOverrides};
 use palpate::pipeline;
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::{GraspReport, grasp};
 use palpate::types::FingertipModel;
 use palpate::types::scene::Formulation;
@@ -61,6 +63,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let names = ["trajectory.csv", "motions.csv", "sweep.csv", "summary.json", "report.html"];
     check_inputs(path, &file, target, &names)?;
     let mut folder = target.create()?;
+    let inputs = record::inputs(&[("scene", Some(path)), ("fingertip", file.fingertip_file.as_ref())]);
+    let record = Recording::start(console, inputs);
 
     let progress = console.progress();
     let name = name(path);
@@ -97,8 +101,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         seconds: &seconds,
         warnings: &notes,
     };
-    folder.write("summary.json", |p| io::write_json(p, &grasp::summary(&report)))?;
-    folder.write("report.html", |p| io::write_text(p, &grasp::page(&report)))?;
+    let record = record.finish()?;
+    let told = in_summary(grasp::summary(&report), &record);
+    folder.write("summary.json", |p| io::write_json(p, &told))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(grasp::page(&report), &record)))?;
     folder.commit()?;
     drop(progress);
     seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.3} s")));

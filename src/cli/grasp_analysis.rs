@@ -5,11 +5,13 @@ use super::console::Console;
 use super::grasp::{Choices, check_inputs};
 use super::inputs::{name, warn_all};
 use super::outputs::Target;
+use super::record::{self, Recording};
 use anyhow::{Context, Result};
 use clap::Args;
 use palpate::io;
 use palpate::pipeline;
 use palpate::report::grasp_analysis::{self, AnalysisReport};
+use palpate::report::record::{in_summary, on_page};
 use palpate::types::FingertipModel;
 use std::path::PathBuf;
 
@@ -29,6 +31,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let file = Choices::default().read(path)?;
     check_inputs(path, &file, target, &FILES)?;
     let mut folder = target.create()?;
+    let inputs = record::inputs(&[("scene", Some(path)), ("fingertip", file.fingertip_file.as_ref())]);
+    let record = Recording::start(console, inputs);
     let progress = console.progress();
     let name = name(path);
     let (analysis, seconds) =
@@ -42,9 +46,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let pushed = pipeline::grasp::pushed(&file.scene);
     let report =
         AnalysisReport { name: &name, scene: &file.scene, pushed: &pushed, analysis: &analysis, seconds: &seconds };
-    folder.write("summary.json", |p| io::write_json(p, &grasp_analysis::summary(&report)))?;
+    let record = record.finish()?;
+    let told = in_summary(grasp_analysis::summary(&report), &record);
+    folder.write("summary.json", |p| io::write_json(p, &told))?;
     let page = grasp_analysis::page(&report)?;
-    folder.write("report.html", |p| io::write_text(p, &page))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page, &record)))?;
     folder.commit()?;
     drop(progress);
     let mut warnings: Vec<String> =

@@ -2,11 +2,12 @@
 
 use super::Usage;
 use super::console::Console;
-use anyhow::{Result, bail};
+use anyhow::{Result, anyhow, bail};
+use clap::builder::{PathBufValueParser, TypedValueParser};
 use palpate::error::FieldError;
 use palpate::evaluate;
 use palpate::field::warp::warp_image;
-use palpate::io::{self, Stored};
+use palpate::io::{self, ImageKind, Stored};
 use palpate::numerics::sampling::Interpolation;
 use palpate::types::{DenseField, Grid, Landmark, Mask, Volume, Voxels};
 use std::path::{Path, PathBuf};
@@ -21,10 +22,99 @@ pub fn same_file(a: &Path, b: &Path) -> bool {
     matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 
+/// What is asked for where a folder may stand for one of its files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    Initial,
+    Deformed,
+    Field,
+    Truth,
+    Labels,
+    Mask,
+    Matches,
+    Landmarks,
+}
+
+impl Part {
+    /// What it is called, and the files of palpate that hold it, the first that is there.
+    fn files(self) -> (&'static str, &'static [&'static str]) {
+        match self {
+            Self::Initial => ("initial volume", &["initial.nii.gz"]),
+            Self::Deformed => ("deformed volume", &["deformed.nii.gz"]),
+            Self::Field => ("displacement field", &["displacement.nii.gz", "truth.nii.gz"]),
+            Self::Truth => ("exact displacement", &["truth.nii.gz", "displacement.nii.gz"]),
+            Self::Labels => ("label map", &["labels.nii.gz", "regions.nii.gz", "bodies.nii.gz"]),
+            Self::Mask => ("mask", &["mask.nii.gz", "bodies.nii.gz", "regions.nii.gz", "labels.nii.gz"]),
+            Self::Matches => ("table of matches", &["matches.csv"]),
+            Self::Landmarks => ("table of landmarks", &["landmarks.csv"]),
+        }
+    }
+
+    /// Whether a folder with a DICOM series can be it.
+    fn can_be_dicom(self) -> bool {
+        matches!(self, Self::Initial | Self::Deformed | Self::Labels | Self::Mask)
+    }
+
+    /// The file that `path` stands for: itself, or the one of a folder that holds this part.
+    ///
+    /// # Errors
+    /// When the folder has no such file; says what it has. The path is not named.
+    fn of(self, path: &Path) -> Result<PathBuf, String> {
+        if !path.is_dir() {
+            return Ok(path.into());
+        }
+        let (what, names) = self.files();
+        if let Some(found) = names.iter().map(|name| path.join(name)).find(|file| file.is_file()) {
+            return match io::read_header(&found) {
+                Ok((_, ImageKind::Fields)) => Err(format!(
+                    "holds the fields of a sequence in {}; name that of one frame, such as displacement_001.nii.gz",
+                    name(&found)
+                )),
+                _ => Ok(found),
+            };
+        }
+        let volume = matches!(self, Self::Initial | Self::Deformed);
+        if volume || (self.can_be_dicom() && io::read_header(path).is_ok()) {
+            return Ok(path.into());
+        }
+        let all = io::list(path).map_err(|e| e.to_string())?;
+        let shown: Vec<String> = all.iter().take(SHOWN).map(|file| name(file)).collect();
+        let holds = match all.len() {
+            0 => "it is empty".into(),
+            n if n > SHOWN => format!("it has {}, and {} more", shown.join(", "), n - SHOWN),
+            _ => format!("it has {}", shown.join(", ")),
+        };
+        Err(format!("is a folder without a {what} ({}); {holds}; name the file", names.join(" or ")))
+    }
+}
+
+/// Files of a folder that a message lists at most.
+const SHOWN: usize = 12;
+
+/// The file that `path` stands for where `part` is asked for: itself, or that of a folder which
+/// palpate wrote. A folder with a DICOM series stands for itself.
+///
+/// # Errors
+/// When the folder has no such file; says what it has.
+pub fn file_of(path: &Path, part: Part) -> Result<PathBuf> {
+    part.of(path).map_err(|why| anyhow!("{}: {why}", path.display()))
+}
+
+/// The same for an argument of the command line.
+pub fn standing_for(part: Part) -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(move |path| part.of(&path))
+}
+
+/// Whether writing `output` would replace `input`, or a file of the folder `input`.
+fn replaces(output: &Path, input: &Path) -> bool {
+    let beside = || output.is_file() && output.parent().is_some_and(|folder| same_file(input, folder));
+    same_file(input, output) || (input.is_dir() && beside())
+}
+
 /// An output must not replace an input.
 pub fn check_distinct(inputs: &[&Path], outputs: &[PathBuf]) -> Result<()> {
     for output in outputs {
-        if let Some(input) = inputs.iter().find(|input| same_file(input, output)) {
+        if let Some(input) = inputs.iter().find(|input| replaces(output, input)) {
             bail!(Usage(format!("{} is an input and would be overwritten; choose another --output", input.display())));
         }
     }

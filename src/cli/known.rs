@@ -1,8 +1,11 @@
 //! What a user knows of a pair: starts, masks and landmarks.
 
-use super::inputs::{name, read_landmarks};
+use super::console::Console;
+use super::inputs::{Part, name, read_landmarks, standing_for};
+use super::transform::{Given, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::UnknownName;
 use palpate::field::warp::warp_labels;
 use palpate::io;
 use palpate::pipeline::known::{Known, StartMap};
@@ -15,18 +18,18 @@ use std::path::{Path, PathBuf};
 pub struct Knowledge {
     /// Where the search begins: centre, moments or principal (the volumes brought onto each other),
     /// or transforms from the initial to the deformed volume, in the order that a point takes
-    #[arg(long, value_name = "T", num_args = 1..)]
-    initial: Vec<PathBuf>,
+    #[arg(long, value_name = "T", num_args = 1.., value_parser = transform)]
+    initial: Vec<String>,
     /// What counts of the deformed volume: a mask on its grid, 0 elsewhere
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     deformed_mask: Option<PathBuf>,
     /// What does not count (implants, artefacts): a mask on the initial or the deformed volume's
     /// grid, 0 elsewhere; may be given several times
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     ignore: Vec<PathBuf>,
     /// Places known in both volumes: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed),
     /// world mm, RAS; or two files of points (.csv, .fcsv, .mrk.json), initial and deformed
-    #[arg(long, value_name = "L", num_args = 1..=2)]
+    #[arg(long, value_name = "L", num_args = 1..=2, value_parser = standing_for(Part::Landmarks))]
     landmarks: Vec<PathBuf>,
     /// Standard deviation of a landmark along an axis [default: one voxel]
     #[arg(long, value_name = "MM", requires = "landmarks")]
@@ -45,22 +48,34 @@ pub struct Read {
 }
 
 impl Knowledge {
-    /// The files among them.
-    pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
-        let transforms = self.initial.iter().filter(|t| alignment(t).is_none());
-        transforms.chain(&self.deformed_mask).chain(&self.ignore).chain(&self.landmarks)
+    /// The files among them, with what each is to the run.
+    pub fn inputs(&self) -> Vec<(&'static str, PathBuf)> {
+        let transforms = self.transforms().into_iter().map(|t| ("initial transform", t.path));
+        let masks = self.deformed_mask.iter().map(|m| ("deformed mask", m.clone()));
+        let ignored = self.ignore.iter().map(|m| ("ignored", m.clone()));
+        let landmarks = self.landmarks.iter().map(|l| ("landmarks", l.clone()));
+        transforms.chain(masks).chain(ignored).chain(landmarks).collect()
+    }
+
+    /// The transforms of --initial; none where volumes are brought onto each other.
+    fn transforms(&self) -> Vec<Given> {
+        let names = self.initial.iter().filter(|t| alignment(t).is_none());
+        names.filter_map(|t| t.parse().ok()).collect()
     }
 
     /// The same as command-line arguments.
     pub fn arguments(&self) -> Vec<String> {
         let mut out = Vec::new();
+        if !self.initial.is_empty() {
+            out.push("--initial".to_string());
+            out.extend(self.initial.iter().cloned());
+        }
         let mut add = |flag: &str, values: &[PathBuf]| {
             if !values.is_empty() {
                 out.push(flag.to_string());
                 out.extend(values.iter().map(|v| v.display().to_string()));
             }
         };
-        add("--initial", &self.initial);
         self.deformed_mask.iter().for_each(|m| add("--deformed-mask", std::slice::from_ref(m)));
         self.ignore.iter().for_each(|m| add("--ignore", std::slice::from_ref(m)));
         add("--landmarks", &self.landmarks);
@@ -74,6 +89,7 @@ impl Knowledge {
         (initial, deformed): (&Voxels<'_>, &Voxels<'_>),
         names: [&Path; 2],
         mask: Option<Mask>,
+        console: &Console,
         warnings: &mut Vec<String>,
     ) -> Result<Read> {
         if self.landmark_sd.is_some_and(|sd| !(sd.is_finite() && sd > 0.0)) {
@@ -100,7 +116,7 @@ impl Knowledge {
             mask,
             initial_counts,
             deformed_counts,
-            start: self.start(initial, deformed, warnings)?,
+            start: self.start(initial, deformed, console, warnings)?,
             landmarks: read_landmarks(&self.landmarks, grids[0], warnings)?,
             landmark_sd_mm: self.landmark_sd.unwrap_or(0.0),
         })
@@ -111,6 +127,7 @@ impl Knowledge {
         &self,
         initial: &Voxels<'_>,
         deformed: &Voxels<'_>,
+        console: &Console,
         warnings: &mut Vec<String>,
     ) -> Result<Option<Box<StartMap<'static>>>> {
         let start: Box<StartMap<'static>> = match &self.initial[..] {
@@ -118,12 +135,16 @@ impl Knowledge {
             [one] if alignment(one).is_some() => {
                 let how = alignment(one).unwrap_or(Alignment::Centre);
                 let map = aligned(initial, deformed, how)?;
-                return Ok(Some(Box::new(move |p: WorldPoint| Some(map.to_world(palpate::types::VoxelPoint(p.0))))));
+                return Ok(Some(Box::new(move |p| Some(map.at(p)))));
             }
             several if several.iter().any(|t| alignment(t).is_some()) => {
                 bail!("--initial: centre, moments and principal stand alone; give one of them, or transforms")
             }
-            transforms => transforms_of(transforms)?,
+            _ => {
+                let grids = [Some(*initial.grid()), Some(*deformed.grid())];
+                let chain = read_chain(&self.transforms(), &grids, console)?;
+                Box::new(move |p| chain.at(p))
+            }
         };
         let at = |p: WorldPoint| start(p).unwrap_or(p);
         let [there, here] = [agreement(initial, deformed, at), agreement(initial, deformed, |p| p)];
@@ -138,8 +159,8 @@ impl Knowledge {
 }
 
 /// The way to bring two volumes onto each other that an argument names.
-fn alignment(argument: &Path) -> Option<Alignment> {
-    match argument.to_str()? {
+fn alignment(argument: &str) -> Option<Alignment> {
+    match argument {
         "centre" | "center" => Some(Alignment::Centre),
         "moments" => Some(Alignment::Moments),
         "principal" => Some(Alignment::Principal),
@@ -147,9 +168,12 @@ fn alignment(argument: &Path) -> Option<Alignment> {
     }
 }
 
-fn transforms_of(_transforms: &[PathBuf]) -> Result<Box<StartMap<'static>>> {
-    let field = io::read_field(&_transforms[0])?;
-    Ok(Box::new(move |p| palpate::field::warp::warp_points(&[p], &field)[0]))
+/// An argument of --initial.
+fn transform(argument: &str) -> Result<String, UnknownName> {
+    if alignment(argument).is_none() {
+        argument.parse::<Given>()?;
+    }
+    Ok(argument.into())
 }
 
 impl Read {

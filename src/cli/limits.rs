@@ -2,10 +2,12 @@
 //! that it is a part of.
 
 use super::console::Console;
+use super::inputs::name;
 use anyhow::{Result, bail};
 use palpate::io;
 use palpate::pipeline::plan::{memory, stiffness_memory};
-use palpate::types::Grid;
+use palpate::report::scale::significant;
+use palpate::types::{FieldParams, Grid};
 use std::path::Path;
 use std::process::exit;
 use std::time::Duration;
@@ -18,12 +20,72 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
-/// Refuses a field run on two volumes that needs more memory than is left, before their voxels are
-/// read.
+/// Refuses, before their voxels are read, two volumes of which one is likely in another unit, or that
+/// need more memory for a field run than is left.
 pub fn field_fits(initial: &Path, deformed: &Path) -> Result<()> {
     // A header that cannot be read is reported by who reads the whole.
     let (Ok((a, _)), Ok((b, _))) = (io::read_header(initial), io::read_header(deformed)) else { return Ok(()) };
+    same_unit((initial, &a.grid), (deformed, &b.grid))?;
     grids_fit((initial, &a.grid), (deformed, &b.grid))
+}
+
+/// The longest side of a grid (mm).
+fn longest(grid: &Grid) -> f64 {
+    let size = grid.spacing();
+    (0..3).map(|a| size[a] * grid.shape()[a] as f64).fold(0.0, f64::max)
+}
+
+/// How far the logarithm (to base 10) of a ratio of sides may be off one of a factor of ten.
+const ABOUT: f64 = 0.1;
+/// Ratio of the numbers of voxels along a side up to which two volumes may show the same part.
+const ALIKE: f64 = 2.5;
+
+/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10, 100
+/// or 1000: their units differ, or one has lost its header.
+pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
+    let (small, large) =
+        if longest(a) < longest(b) { ((initial, a), (deformed, b)) } else { ((deformed, b), (initial, a)) };
+    let log = (longest(large.1) / longest(small.1)).log10();
+    let voxels = |g: &Grid| g.shape().into_iter().max().unwrap_or(1) as f64;
+    let alike = (voxels(a) / voxels(b)).max(voxels(b) / voxels(a)) <= ALIKE;
+    let unit = match log.round() {
+        1.0 => "centimetres",
+        2.0 => "another unit than mm",
+        3.0 => "metres or micrometres",
+        _ => return Ok(()),
+    };
+    if !alike || (log - log.round()).abs() > ABOUT {
+        return Ok(());
+    }
+    let lost = |g: &Grid| g.spacing().iter().all(|s| (s - 1.0).abs() < 1e-6);
+    let cause = match [small, large].into_iter().find(|v| lost(v.1)) {
+        Some((path, _)) => format!("{} has voxels of 1 mm on every side, as where a header was lost", path.display()),
+        None => format!("one of them is likely in {unit}"),
+    };
+    bail!(
+        "{}: its longest side is {} mm, that of {} is {} mm, about {} times as long; {cause}; correct the voxel size in that header, or \
+         crop the larger volume if both are right",
+        small.0.display(),
+        significant(longest(small.1)),
+        large.0.display(),
+        significant(longest(large.1)),
+        10f64.powf(log.round())
+    );
+}
+
+/// Caps the search at the longest side of the volume at `path`, on `grid`: tissue that moves farther is
+/// nowhere in it. Says so where that is less than was asked for.
+pub fn cap_search(params: &mut FieldParams, grid: &Grid, path: &Path) -> Option<String> {
+    let (asked, most) = (params.search_mm, longest(grid));
+    (asked > most).then(|| {
+        params.search_mm = most;
+        format!(
+            "--search {} mm is more than the longest side of {}; {} mm is taken",
+            significant(asked),
+            name(path),
+            significant(most)
+        )
+    })
 }
 
 /// The same of two volumes whose grids are known.

@@ -53,6 +53,10 @@ mod peers;
 
 mod phantom;
 
+mod record;
+
+mod repeat;
+
 mod sequence;
 
 mod skin;
@@ -71,8 +75,10 @@ mod stress;
 
 mod warp;
 
+use clap::error::ErrorKind;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use console::Console;
+use std::ffi::OsString;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -107,6 +113,17 @@ struct Common {
     /// More on stderr: stages, levels, reasons
     #[arg(short, long, global = true, conflicts_with = "quiet")]
     verbose: bool,
+}
+
+impl Common {
+    /// The same as command-line arguments.
+    fn arguments(&self) -> Vec<String> {
+        let flags = [("--quiet", self.quiet), ("--verbose", self.verbose)];
+        let mut out: Vec<String> = flags.iter().filter(|f| f.1).map(|f| f.0.into()).collect();
+        out.extend(self.threads.map(|n| format!("--threads={n}")));
+        out.extend(self.timeout.map(|t| format!("--timeout={}", t.as_secs_f64())));
+        out
+    }
 }
 
 #[derive(Debug, Subcommand)]
@@ -173,6 +190,9 @@ fn seconds(text: &str) -> Result<Duration, String> {
 #[error("{0}")]
 struct Usage(String);
 
+/// What is wrong with a command line that names a summary in place of inputs.
+const MISSING: [ErrorKind; 2] = [ErrorKind::MissingRequiredArgument, ErrorKind::UnknownArgument];
+
 /// The command line with an example after each help.
 fn whole() -> clap::Command {
     examples::with_examples(Cli::command())
@@ -180,9 +200,20 @@ fn whole() -> clap::Command {
 
 /// The whole program.
 pub fn run() -> ExitCode {
-    let Cli { common, command } =
-        Cli::from_arg_matches(&whole().get_matches()).unwrap_or_else(|e| e.format(&mut whole()).exit());
-    let console = Console::new(common.quiet, common.verbose);
+    let typed: Vec<OsString> = std::env::args_os().collect();
+    let words: Vec<String> = typed.iter().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
+    let (matches, words, warning) = match whole().try_get_matches_from(&typed) {
+        Ok(matches) => (matches, words, None),
+        Err(error) if MISSING.contains(&error.kind()) => match repeat::repeated(&typed) {
+            Ok(Some(again)) => (again.matches, again.arguments, again.warning),
+            Ok(None) => error.exit(),
+            Err(error) => return failed(&Console::new(false, false, &words), &error),
+        },
+        Err(error) => error.exit(),
+    };
+    let Cli { common, command } = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.format(&mut whole()).exit());
+    let console = Console::new(common.quiet, common.verbose, &words);
+    warning.iter().for_each(|text| console.warn(text));
     limits::watch(console.clone(), common.timeout);
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool
     // for each small step.
@@ -195,12 +226,15 @@ pub fn run() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) if console::is_closed_pipe(&error) => ExitCode::SUCCESS,
-        Err(error) => {
-            console.error(&error);
-            let usage = error.is::<Usage>() || error.is::<palpate::error::ParamError>();
-            ExitCode::from(if usage { 2 } else { 1 })
-        }
+        Err(error) => failed(&console, &error),
     }
+}
+
+/// Says why, and with which code the program ends.
+fn failed(console: &Console, error: &anyhow::Error) -> ExitCode {
+    console.error(error);
+    let usage = error.is::<Usage>() || error.is::<palpate::error::ParamError>();
+    ExitCode::from(if usage { 2 } else { 1 })
 }
 
 /// Runs one command.

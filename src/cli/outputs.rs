@@ -1,5 +1,6 @@
 //! The files of a field run.
 
+use super::record::Recording;
 use anyhow::Result;
 use clap::Args;
 use palpate::error::IoError;
@@ -9,6 +10,7 @@ use palpate::io::{self, OutputFolder};
 use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
 use palpate::pipeline::strain::StrainResult;
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::strain::StrainReport;
 use palpate::report::{FieldReport, html, json};
 use palpate::strain::{StrainField, measure};
@@ -89,6 +91,7 @@ pub struct Measured<'a> {
     pub params: &'a FieldParams,
     pub truth: Option<(&'a DenseField, &'a Metrics)>,
     pub strain: Option<&'a StrainResult>,
+    pub record: Recording,
 }
 
 /// Voxels of a grid up to which what is made for a file is kept for the report. Of a larger one,
@@ -134,7 +137,7 @@ impl<'a> Layer<'a> {
 /// Stages all files, adds the times of warping and writing to the summary, and gives the short
 /// summary for stdout back.
 pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &mut FieldResult) -> Result<String> {
-    let Measured { command, names, initial, deformed, mask, params, truth, strain } = measured;
+    let Measured { command, names, initial, deformed, mask, params, truth, strain, record } = measured;
     let started = Instant::now();
     let displacement = &result.displacement;
     let grid = displacement.grid();
@@ -202,13 +205,14 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         || html::page(&report),
     );
     written?;
-    let page = page?;
+    let record = record.finish()?;
+    let page = on_page(page?, &record);
     folder.write("report.html", |p| io::write_text(p, &page))?;
     writing += started.elapsed();
     let mut summary = summary.clone();
     summary.seconds.push(("write".into(), writing.as_secs_f64()));
     report.summary = &summary;
-    folder.write("summary.json", |p| io::write_json(p, &json::field_summary(&report)))?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(json::field_summary(&report), &record)))?;
     let text = palpate::report::text::field_summary(&report);
     result.summary = summary;
     Ok(text)

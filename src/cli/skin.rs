@@ -3,10 +3,12 @@
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
 use super::outputs::Target;
+use super::record::{self, Recording};
 use anyhow::Result;
 use clap::Args;
 use palpate::io;
 use palpate::pipeline;
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::skin::{SkinReport, page, summary, text};
 use std::path::PathBuf;
 
@@ -23,6 +25,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let scene = io::read_skin_scene(path)?;
     check_distinct(&[path], &target.files(&["response.csv", "summary.json", "report.html"]))?;
     let mut folder = target.create()?;
+    let record = Recording::start(console, record::inputs(&[("scene", Some(path))]));
     let progress = console.progress();
     progress.set("skin", 0.0);
     let outcome = pipeline::skin::run(&scene);
@@ -41,8 +44,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         warnings: &warnings,
     };
     folder.write("response.csv", |p| io::write_response(p, &scene, &outcome.column))?;
-    folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
-    folder.write("report.html", |p| io::write_text(p, &page(&report)))?;
+    let record = record.finish()?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page(&report), &record)))?;
     folder.commit()?;
     drop(progress);
     warn_all(console, &warnings);

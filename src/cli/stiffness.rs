@@ -4,14 +4,16 @@ use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
 use super::dry_run;
-use super::inputs::{check_distinct, name, on_grid, read_labels, read_mask, warn_all};
+use super::inputs::{Part, check_distinct, file_of, name, on_grid, read_labels, read_mask, standing_for, warn_all};
 use super::limits::mesh_fits;
+use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline;
 use palpate::pipeline::stiffness::{ENOUGH, Inputs, inside};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
@@ -50,13 +52,19 @@ pub struct Options {
     /// Matches to use inside the body, with their precision, in place of the field, which
     /// smoothness flattens; none for the field itself
     /// [default: matches.csv of the same results of palpate field, if any]
-    #[arg(long, value_name = "M.csv|none")]
+    #[arg(long, value_name = "M.csv|none", value_parser = standing_for(Part::Matches))]
     matches: Option<PathBuf>,
     /// The body: a mask on the field's grid; regions are then looked for
-    #[arg(long, value_name = "M", conflicts_with = "labels", required_unless_present_any = ["labels", "sequence"])]
+    #[arg(
+        long,
+        value_name = "M",
+        conflicts_with = "labels",
+        required_unless_present_any = ["labels", "sequence"],
+        value_parser = standing_for(Part::Mask)
+    )]
     mask: Option<PathBuf>,
     /// Regions: a label map on the field's grid, 0 outside
-    #[arg(long, value_name = "L")]
+    #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     pub(super) labels: Option<PathBuf>,
     /// Names of the labels, as 1=skin,2=fat (or with ; between, as a table of pairs has them)
     #[arg(long, value_name = "NAMES", requires = "labels")]
@@ -132,6 +140,20 @@ pub(super) fn patch_files(options: &Options) -> Vec<PathBuf> {
     named.map(PathBuf::from).collect()
 }
 
+/// What is read of a single field as of a sequence.
+pub(super) fn common_inputs(options: &Options) -> Read {
+    let mut inputs = record::inputs(&[
+        ("labels", options.labels.as_ref()),
+        ("mask", options.mask.as_ref()),
+        ("field_deformed", options.convention.deformed()),
+    ]);
+    let patches = [("held", &options.held), ("load", &options.load)];
+    let files = patches.into_iter().filter(|(_, text)| Side::parse(text).is_none());
+    inputs.extend(files.filter_map(|(role, text)| Some((role, file_of(Path::new(text), Part::Mask).ok()?))));
+    inputs.extend(options.images.iter().map(|p| ("image", p.clone())));
+    inputs
+}
+
 /// Volumes for the report, on `grid`: those asked for, or what was found `beside` the field; that
 /// is left out where it cannot be shown.
 pub(super) fn images(options: &Options, beside: Option<&Path>, grid: &Grid) -> Result<Vec<(String, Volume)>> {
@@ -178,7 +200,7 @@ pub(super) fn plan(
 }
 
 fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
-    let mut source = Source::of(field, options.matches.as_deref());
+    let mut source = Source::of(field, options.matches.as_deref())?;
     let patches = patch_files(options);
     let given: Vec<&Path> = [Some(source.field.as_path()), Some(body), source.matches.as_deref()]
         .into_iter()
@@ -205,6 +227,12 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         return plan(options, params, &source.field, &setting, &[], console);
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
+    let mut inputs = record::inputs(&[("field", Some(&source.field)), ("matches", source.matches.as_ref())]);
+    inputs.extend(common_inputs(options));
+    if options.images.is_empty() {
+        inputs.extend(source.image.iter().map(|p| ("image", p.clone())));
+    }
+    let record = Recording::start(console, inputs);
     // Of a sequence.
     folder.supersede(|file| file == "frames.csv" || file == FOUND)?;
     let read = started.elapsed().as_secs_f64();
@@ -221,9 +249,11 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         load: options.load.clone(),
     };
     write(&mut folder, &mut result)?;
-    folder.write("summary.json", |p| io::write_json(p, &report::summary(&result, &names)))?;
+    let record = record.finish()?;
+    let told = in_summary(report::summary(&result, &names), &record);
+    folder.write("summary.json", |p| io::write_json(p, &told))?;
     let page = report::page(&result, &names, &report::Shown { field: Some(&field), images: &images })?;
-    folder.write("report.html", |p| io::write_text(p, &page))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page, &record)))?;
     folder.commit()?;
     drop(progress);
     result.evidence.iter().for_each(|e| console.detail(&report::evidence_line(e)));
@@ -250,10 +280,9 @@ struct Source {
 impl Source {
     /// The matches of the same results are taken where none are named: the field between them is
     /// smoothed, which flattens strain and with it a contrast.
-    fn of(given: &Path, matches: Option<&Path>) -> Self {
-        let folder = given.is_dir();
-        let field = if folder { given.join("displacement.nii.gz") } else { given.to_path_buf() };
-        let ours = folder || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
+    fn of(given: &Path, matches: Option<&Path>) -> Result<Self> {
+        let field = file_of(given, Part::Field)?;
+        let ours = given.is_dir() || field.file_name().is_some_and(|n| n == "displacement.nii.gz");
         let ours = ours && field.with_file_name("summary.json").is_file();
         let beside = |file: &str| Some(field.with_file_name(file)).filter(|f| ours && f.is_file());
         let matches = match matches {
@@ -261,7 +290,7 @@ impl Source {
             Some(path) => Some(path.to_path_buf()),
             None => beside("matches.csv"),
         };
-        Self { image: beside("warped.nii.gz"), matches, field }
+        Ok(Self { image: beside("warped.nii.gz"), matches, field })
     }
 }
 
@@ -332,6 +361,7 @@ fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place>
             if !path.exists() {
                 bail!("{flag} {text}: is neither a side (x-, x+, y-, y+, z-, z+) nor a file; check the spelling");
             }
+            let path = &file_of(path, Part::Mask).with_context(|| format!("{flag} {text}"))?;
             let mask = read_mask(path, grid, reference).with_context(|| format!("{flag} {text}"))?;
             Ok(Place::Mask(Box::new(mask), name(path)))
         }

@@ -3,11 +3,13 @@
 use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
-use super::stiffness::{FILES, FOUND, Options, Setting, images, patch_files, plan, write};
+use super::record::{Read, Recording};
+use super::stiffness::{FILES, FOUND, Options, Setting, common_inputs, images, patch_files, plan, write};
 use anyhow::{Context, Result, bail};
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
 use palpate::types::{SparseField, StiffnessParams};
 use std::path::{Path, PathBuf};
@@ -58,6 +60,13 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let rank = |m: f64| if m.is_finite() { m } else { -1.0 };
     order.sort_by(|a, b| rank(b.1).total_cmp(&rank(a.1)).then(a.0.cmp(&b.0)));
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
+    let mut inputs: Read = vec![("sequence", from.join("summary.json"))];
+    for (_, path, _) in &frames {
+        inputs.push(("field", path.clone()));
+        inputs.extend(matches_of(path).map(|p| ("matches", p)));
+    }
+    inputs.extend(common_inputs(options));
+    let record = Recording::start(console, inputs);
     // Of a mask.
     folder.supersede(|file| file == FOUND)?;
 
@@ -95,9 +104,10 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     };
     let mut summary = report::summary(&shared.result, &names);
     summary["sequence"] = report::sequence_summary(&shared);
-    folder.write("summary.json", |p| io::write_json(p, &summary))?;
+    let record = record.finish()?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
     let page = report::sequence_page(&shared, &names, &report::Shown { field: None, images: &images })?;
-    folder.write("report.html", |p| io::write_text(p, &page))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page, &record)))?;
     folder.commit()?;
     drop(progress);
     warn_all(console, &shared.result.warnings);
@@ -141,8 +151,12 @@ fn number(field: &Path) -> Option<&str> {
 
 /// The matches beside a frame's field, if any.
 fn matches_beside(field: &Path) -> Result<Option<SparseField>> {
-    let path = number(field).map(|n| field.with_file_name(format!("matches_{n}.csv"))).filter(|p| p.is_file());
-    Ok(path.map(io::read_matches).transpose()?)
+    Ok(matches_of(field).map(io::read_matches).transpose()?)
+}
+
+/// Where they are.
+fn matches_of(field: &Path) -> Option<PathBuf> {
+    number(field).map(|n| field.with_file_name(format!("matches_{n}.csv"))).filter(|p| p.is_file())
 }
 
 /// The fields of all measured frames but the reference, by frame.

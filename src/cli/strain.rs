@@ -3,14 +3,16 @@
 use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
-use super::inputs::{check_distinct, name, read_labels, read_mask, same_grid, warn_all};
+use super::inputs::{Part, check_distinct, file_of, name, read_labels, read_mask, same_grid, standing_for, warn_all};
 use super::outputs::{STRAIN_FILES, StrainMaps, Target, at_places, write_strain};
+use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
 use palpate::io;
 use palpate::pipeline::field::mesh_of;
 use palpate::pipeline::strain::{self, StrainInput, StrainParams};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::strain::{page, summary, text};
 use palpate::strain::directions::{Directions, Tube, unit};
 use palpate::types::{DenseField, ErrorSamples, Grid, Mask, SparseField, StrainMeasure, Trust, Volume, names};
@@ -31,10 +33,10 @@ pub struct Options {
     measure: StrainMeasure,
     /// Where there is tissue, on the field's grid, 0 outside [default: what the folder measured,
     /// everywhere of a file]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Regions whose strain is summed up: a label map on the field's grid [default: the bodies]
-    #[arg(long, value_name = "L")]
+    #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     labels: Option<PathBuf>,
     /// Fibres: vectors on the field's grid (5-D NIfTI, LPS), or LABEL=X,Y,Z (RAS), once for each label
     #[arg(long, value_name = "F")]
@@ -84,7 +86,7 @@ impl Source {
                 warnings.push(format!("{}: {part} is missing: {lost}", path.display()));
             }
         }
-        let field = convention.read_result(path)?;
+        let field = convention.read(path)?;
         let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path)).transpose()?;
         let summary = there("summary.json").map(io::read_json).transpose()?;
         let trust = summary.and_then(|mut s| serde_json::from_value(s.get_mut("trust")?.take()).ok());
@@ -123,6 +125,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         bail!(Usage(format!("{}: its summary would be overwritten; choose another --output", path.display())));
     }
     target.check()?;
+    let mut inputs: Read = parts(path).into_iter().map(|p| ("field", p)).collect();
+    inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref())]));
+    inputs.extend(fibres.iter().filter(|f| !f.contains('=')).map(|f| ("fibres", PathBuf::from(f))));
+    inputs.extend(convention.deformed().map(|p| ("field_deformed", p.clone())));
 
     let progress = console.progress();
     progress.set("read", 0.0);
@@ -133,6 +139,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let labels = labels.as_ref().map(|l| read_labels(l, &grid, path)).transpose()?;
     let directions = directions(fibres, tube, labels.as_ref().unwrap_or(&tissue), &grid)?;
     let mut folder = target.create()?;
+    let record = Recording::start(console, inputs);
     let params = StrainParams { gauge_mm: *gauge, measure: *measure, directions };
     let input = StrainInput {
         field: &source.field,
@@ -158,12 +165,21 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let called = name(path);
     let report = maps.report(&called, (&source.field, &tissue), source.image.as_ref());
     let html = page(&report)?;
-    folder.write("report.html", |p| io::write_text(p, &html))?;
-    folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
+    let record = record.finish()?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(html, &record)))?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     folder.commit()?;
     drop(progress);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{}{}", text(&report), target.look()))
+}
+
+/// The files of a results folder that are read, or the one file.
+fn parts(path: &Path) -> Vec<PathBuf> {
+    let beside =
+        ["posterior.nii.gz", "bodies.nii.gz", "warped.nii.gz", "matches.csv", "summary.json"].map(|f| path.join(f));
+    let field = file_of(path, Part::Field).unwrap_or_else(|_| path.into());
+    std::iter::once(field).chain(beside.into_iter().filter(|f| f.is_file())).collect()
 }
 
 /// The directions that `--fibres` or `--tube` name.

@@ -3,12 +3,14 @@
 use super::Usage;
 use super::console::Console;
 use super::outputs::Target;
+use super::record::Recording;
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::UnknownName;
 use palpate::evaluate::stated::stated;
 use palpate::io;
 use palpate::pipeline::stress::{self, Effort, GraspAxis, StiffnessAxis};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::stress as report;
 use palpate::synth::Trouble;
 use palpate::types::{Part, names};
@@ -88,6 +90,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let wanted = |p: Part| part.is_empty() || part.contains(&p);
     check_axes(axis, wanted)?;
     let mut folder = target.create()?;
+    let record = Recording::start(console, Vec::new());
     let started = Instant::now();
     let progress = console.progress();
     let effort = Effort::new(*quick);
@@ -110,8 +113,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("stress.csv", |p| io::write_stress(p, &curves))?;
     folder.write("stress.svg", |p| io::write_text(p, &report::svg(&curves)))?;
     let seconds = started.elapsed().as_secs_f64();
-    folder.write("summary.json", |p| io::write_json(p, &report::summary(&curves, field.as_ref(), seconds)))?;
-    folder.write("stress.html", |p| io::write_text(p, &report::page(&curves, field.as_ref())))?;
+    let record = record.finish()?;
+    let told = in_summary(report::summary(&curves, field.as_ref(), seconds), &record);
+    folder.write("summary.json", |p| io::write_json(p, &told))?;
+    let page = on_page(report::page(&curves, field.as_ref()), &record);
+    folder.write("stress.html", |p| io::write_text(p, &page))?;
     folder.commit()?;
     drop(progress);
     let look = target.output.join("stress.html");

@@ -5,11 +5,12 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{
-    check_distinct, name, on_grid, read_labels, read_mask, usable, warn_all, warn_of_non_finite, warn_of_places,
-    warn_of_two_places,
+    Part, check_distinct, name, on_grid, read_labels, read_mask, standing_for, usable, warn_all, warn_of_non_finite,
+    warn_of_places, warn_of_two_places,
 };
-use super::limits::grids_fit;
+use super::limits::{cap_search, grids_fit, same_unit};
 use super::outputs::Target;
+use super::record::{self, Read, Recording};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::FieldError;
@@ -24,6 +25,7 @@ use palpate::pipeline::{
 };
 use palpate::report::film::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
+use palpate::report::record::{in_summary, on_page};
 use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as all_warnings};
 use palpate::report::verdict::judge;
 use palpate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
@@ -41,10 +43,10 @@ pub struct Options {
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
     reference: usize,
     /// Where to measure: a mask on the reference's grid, 0 outside
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Regions whose strain is written to strain.csv: a label map on the reference's grid
-    #[arg(long, value_name = "L")]
+    #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     labels: Option<PathBuf>,
     /// Leave each frame's field as its own volume has it, without what all frames say together
     #[arg(long)]
@@ -144,7 +146,7 @@ impl<'a> Source<'a> {
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { volumes, target, reference: origin, mask, labels, frame_by_frame, dry_run, tuning } = options;
-    let (params, origin) = (tuning.params()?, *origin);
+    let (mut params, origin) = (tuning.params()?, *origin);
     let mut source = Source::open(volumes)?;
     let frames = source.frames();
     if origin >= frames {
@@ -152,7 +154,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let given: Vec<&Path> = volumes.iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&files(frames, origin)))?;
+    let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
+    inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
 
+    for t in order(frames, origin) {
+        same_unit((source.path(origin), source.grid(origin)), (source.path(t), source.grid(t)))?;
+    }
     // The largest of the others is what has to fit.
     let others = order(frames, origin).map(|t| (source.path(t), source.grid(t)));
     if let Some(largest) = others.max_by_key(|o| o.1.len()) {
@@ -162,13 +169,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let started = Instant::now();
     let progress = console.progress();
     progress.set("read", 0.0);
-    let mut warnings = Vec::new();
+    let mut warnings = tuning.mask_left_out(mask.is_some());
     if let Source::Series(file, _) = &source {
         warn_of_two_places(file, &mut warnings);
     }
     let reference = source.read_usable(origin, &mut warnings)?;
     let grid = *reference.grid();
     let first = source.path(origin);
+    warnings.extend(cap_search(&mut params, &grid, first));
     let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
     let regions = labels.as_ref().map(|l| read_labels(l, &grid, first)).transpose()?;
     warnings.extend(out_of_order(volumes));
@@ -181,6 +189,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&plan);
     }
     let mut folder = target.create()?;
+    let record = Recording::start(console, inputs);
     folder.supersede(of_a_frame)?;
     let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
     let mut film = None;
@@ -283,8 +292,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         warnings: &warnings,
         seconds: &seconds,
     };
-    folder.write("report.html", |p| io::write_text(p, &page(&report)))?;
-    folder.write("summary.json", |p| io::write_json(p, &summary(&report)))?;
+    let record = record.finish()?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page(&report), &record)))?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     folder.commit()?;
     drop(progress);
     warn_all(console, &all_warnings(&report));

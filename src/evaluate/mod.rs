@@ -1,6 +1,6 @@
-//! A displacement field against exact truth.
+//! A displacement field against exact truth, landmarks, label maps or a field that leads back.
 //!
-//! Both fields lie on one grid; gradients are those of [`crate::numerics::differences`],
+//! Field and truth lie on one grid; gradients are those of [`crate::numerics::differences`],
 //! percentiles interpolate linearly, landmarks are read off trilinearly with the edge value beyond
 //! the grid. Nothing is compared where the mask is zero. Fails when grids differ or the mask is
 //! empty.
@@ -11,6 +11,8 @@ pub mod coverage;
 
 pub mod frontier;
 
+pub mod labels;
+
 pub mod stated;
 
 pub mod waves;
@@ -20,7 +22,9 @@ use crate::numerics::differences::{deformation_gradient, displacement_gradient};
 use crate::numerics::sampling::{displacement, inside};
 use crate::numerics::statistics::percentile;
 use crate::types::space::{determinant, length};
-use crate::types::{DenseField, Grid, InverseConsistency, Landmark, Mask, Metrics};
+use crate::types::{
+    DenseField, Distances, Grid, InverseConsistency, Landmark, LandmarkError, Mask, Metrics, TargetError,
+};
 use rayon::prelude::*;
 
 /// Truth moves less than this in still tissue (mm).
@@ -129,6 +133,47 @@ pub fn inverse_consistency(
 pub fn landmarks(field: &DenseField, landmarks: &[Landmark]) -> Vec<f64> {
     let error = |l: &Landmark| length(l.initial.moved(displacement(field, l.initial)).minus(l.deformed));
     landmarks.iter().map(error).collect()
+}
+
+/// Mean, median, 95th percentile and largest of `values` (mm), which are reordered.
+pub fn distances(values: &mut [f64]) -> Distances {
+    Distances {
+        mean_mm: mean(values),
+        median_mm: percentile(values, 50.0),
+        p95_mm: percentile(values, 95.0),
+        max_mm: percentile(values, 100.0),
+    }
+}
+
+/// Target registration error of `field` (on any grid) at `marks` (world mm, RAS), and the same without
+/// registration. Beyond its grid the field's edge value counts.
+///
+/// # Errors
+/// [`FieldError::TooFew`] without a landmark, [`FieldError::Volume`] when the field is no number at one.
+pub fn target_error(field: &DenseField, marks: &[Landmark]) -> Result<TargetError, FieldError> {
+    if marks.is_empty() {
+        return Err(FieldError::TooFew { found: 0, what: "landmarks", needed: 1, hint: "give one at least".into() });
+    }
+    let mut errors = landmarks(field, marks);
+    if let Some(at) = errors.iter().position(|e| !e.is_finite()) {
+        return Err(FieldError::Volume {
+            volume: "measured",
+            what: format!("is NaN or infinite at landmark {}", at + 1),
+            hint: "leave that landmark out".into(),
+        });
+    }
+    let each: Vec<LandmarkError> = marks
+        .iter()
+        .zip(&errors)
+        .map(|(l, &error_mm)| LandmarkError {
+            initial: l.initial.0,
+            deformed: l.deformed.0,
+            error_mm,
+            before_mm: length(l.initial.minus(l.deformed)),
+        })
+        .collect();
+    let mut before: Vec<f64> = each.iter().map(|e| e.before_mm).collect();
+    Ok(TargetError { count: marks.len(), after: distances(&mut errors), before: distances(&mut before), each })
 }
 
 /// Numbers of the landmarks whose initial place lies more than half a voxel outside `grid`, where

@@ -6,7 +6,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{beside, nearest};
 use crate::numerics::simd::dispatch;
-use crate::types::{Affine, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
+use crate::types::{Affine, AffineMap, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at
@@ -116,7 +116,7 @@ impl FieldSpline {
 
     /// The same field, followed by an affine map of the world (mm, RAS).
     #[must_use]
-    pub(crate) fn followed_by(mut self, map: &Affine) -> Self {
+    pub(crate) fn followed_by(mut self, map: &AffineMap) -> Self {
         let (grid, axes) = (self.grid, axes(&self.grid));
         let spacing = grid.spacing();
         for (lattice, coefficients) in &mut self.bodies {
@@ -128,7 +128,7 @@ impl FieldSpline {
                 let here = grid.affine().to_world(VoxelPoint(place));
                 let along = [0, 1, 2].map(|c| f64::from(coefficients[c * n + m]));
                 let world = std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * along[a]).sum());
-                let moved = map.to_world(VoxelPoint(here.moved(world).0)).minus(here);
+                let moved = map.at(here.moved(world)).minus(here);
                 let moved = grid.affine().vector_to_voxel(moved);
                 (0..3).for_each(|c| coefficients[c * n + m] = (spacing[c] * moved[c]) as f32);
             }

@@ -71,6 +71,8 @@ mod atomic;
 
 mod deflate;
 
+mod digest;
+
 mod gzip;
 
 pub use batch::{make_folder, read_pairs, stamp, write_rows};
@@ -80,6 +82,7 @@ pub use csv::{
     PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches, table_kind,
     write_landmarks, write_matches, write_points,
 };
+pub use digest::{digest, files_of};
 pub use field::{FieldConvention, read_field, read_field_as, read_samples};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{

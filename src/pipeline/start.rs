@@ -4,7 +4,7 @@
 //! interpolation; what is left of it is a field from which the search may begin. The result is then
 //! followed by the affine part.
 
-use crate::error::FieldError;
+use crate::error::{FieldError, SpaceError};
 use crate::matching::contrast::Relation;
 use crate::matching::levels::foreground;
 use crate::numerics::dense::symmetric_eigen;
@@ -15,7 +15,7 @@ use crate::pipeline::known::{Known, StartMap};
 use crate::pipeline::stages::Stage;
 use crate::types::space::{Matrix3, determinant, length};
 use crate::types::{
-    Affine, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, VoxelPoint, Voxels, WorldPoint,
+    Affine, AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, VoxelPoint, Voxels, WorldPoint,
 };
 use rayon::prelude::*;
 
@@ -50,7 +50,7 @@ fn mean(places: impl Iterator<Item = WorldPoint>) -> [f64; 3] {
 ///
 /// # Errors
 /// [`FieldError::Start`] where the start has no value in the tissue, or turns it inside out.
-pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Result<Affine, FieldError> {
+pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Result<AffineMap, FieldError> {
     let refuse = |what: &str, hint: &str| FieldError::Start { what: what.into(), hint: hint.into() };
     let pairs: Vec<(WorldPoint, WorldPoint)> =
         places(grid, mask).into_iter().filter_map(|x| Some((x, start(x)?))).collect();
@@ -86,27 +86,18 @@ pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Re
 }
 
 /// `x -> linear (x - from) + to`.
-fn about(linear: Matrix3, from: [f64; 3], to: [f64; 3]) -> Result<Affine, crate::error::SpaceError> {
+fn about(linear: Matrix3, from: [f64; 3], to: [f64; 3]) -> Result<AffineMap, SpaceError> {
     let row = |r: usize| {
         let [a, b, c] = linear[r];
         [a, b, c, to[r] - (a * from[0] + b * from[1] + c * from[2])]
     };
-    Affine::new([row(0), row(1), row(2)])
-}
-
-/// A point after an affine map of the world.
-pub(super) fn mapped(map: &Affine, p: WorldPoint) -> WorldPoint {
-    map.to_world(VoxelPoint(p.0))
-}
-
-/// A point before an affine map of the world.
-pub(super) fn unmapped(map: &Affine, p: WorldPoint) -> WorldPoint {
-    WorldPoint(map.to_voxel(p).0)
+    AffineMap::new([row(0), row(1), row(2)])
 }
 
 /// The grid on which a volume lies once the world is taken back by `map`.
-pub(super) fn before(map: &Affine, grid: &Grid) -> Result<Grid, FieldError> {
-    let at = |v: [f64; 3]| unmapped(map, grid.affine().to_world(VoxelPoint(v))).0;
+pub(super) fn before(map: &AffineMap, grid: &Grid) -> Result<Grid, FieldError> {
+    let back = map.inverse();
+    let at = |v: [f64; 3]| back.at(grid.affine().to_world(VoxelPoint(v))).0;
     let origin = at([0.0; 3]);
     let columns: [[f64; 3]; 3] = std::array::from_fn(|c| at(std::array::from_fn(|a| f64::from(u8::from(a == c)))));
     let row = |r: usize| [columns[0][r] - origin[r], columns[1][r] - origin[r], columns[2][r] - origin[r], origin[r]];
@@ -114,15 +105,15 @@ pub(super) fn before(map: &Affine, grid: &Grid) -> Result<Grid, FieldError> {
 }
 
 /// Landmarks with the deformed places taken back by `map`.
-pub(super) fn landmarks_before(map: &Affine, landmarks: &[Landmark]) -> Vec<Landmark> {
-    landmarks.iter().map(|l| Landmark { deformed: unmapped(map, l.deformed), ..*l }).collect()
+pub(super) fn landmarks_before(map: &AffineMap, landmarks: &[Landmark]) -> Vec<Landmark> {
+    landmarks.iter().map(|l| Landmark { deformed: map.inverse().at(l.deformed), ..*l }).collect()
 }
 
 /// The map that brings the initial volume's tissue onto the deformed volume's.
 ///
 /// # Errors
 /// [`FieldError`] when a volume is of one value, so that it has no centre of brightness.
-pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> Result<Affine, FieldError> {
+pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> Result<AffineMap, FieldError> {
     let identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     let volumes = [initial, deformed];
     if how == Alignment::Centre {
@@ -140,8 +131,8 @@ pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> R
     });
     // Of a round body the axes say nothing.
     let turns = turned.into_iter().chain([identity]);
-    let maps: Result<Vec<Affine>, _> = turns.map(|turn| about(turn, first.centre, second.centre)).collect();
-    let agreement = |map: &Affine| agreement(initial, deformed, |p| mapped(map, p));
+    let maps: Result<Vec<AffineMap>, _> = turns.map(|turn| about(turn, first.centre, second.centre)).collect();
+    let agreement = |map: &AffineMap| agreement(initial, deformed, |p| map.at(p));
     let best = maps?.into_iter().map(|m| (agreement(&m), m)).max_by(|a, b| a.0.total_cmp(&b.0));
     best.map(|b| b.1).ok_or(FieldError::NoOverlap { hint: "check both volumes".into() })
 }
@@ -209,7 +200,7 @@ pub fn agreement(initial: &Voxels<'_>, deformed: &Voxels<'_>, map: impl Fn(World
 
 /// A start as a run takes it: its affine part apart, and what is known with that taken out.
 pub(super) struct Begin<'a> {
-    affine: Option<Affine>,
+    affine: Option<AffineMap>,
     rest: Option<Box<StartMap<'a>>>,
     landmarks: Vec<Landmark>,
 }
@@ -222,7 +213,8 @@ impl<'a> Begin<'a> {
             return Ok(Self { affine: None, rest: None, landmarks: Vec::new() });
         };
         let affine = affine_part(start, grid, known.mask)?;
-        let rest = move |x: WorldPoint| start(x).map(|y| unmapped(&affine, y));
+        let back = affine.inverse();
+        let rest = move |x: WorldPoint| start(x).map(|y| back.at(y));
         let landmarks = landmarks_before(&affine, known.landmarks);
         Ok(Self { affine: Some(affine), rest: Some(Box::new(rest)), landmarks })
     }
@@ -269,16 +261,16 @@ pub(super) fn bends(rest: impl Fn(WorldPoint) -> [f64; 3], grid: &Grid, mask: Op
 impl FieldResult {
     /// The same, followed by an affine map of the world: what was measured from a start that had
     /// that map taken out.
-    pub(super) fn followed_by(mut self, map: &Affine) -> Self {
-        let linear = map.linear();
-        let scale = determinant(linear).cbrt();
+    pub(super) fn followed_by(mut self, map: &AffineMap) -> Self {
+        let linear = map.rows().map(|[a, b, c, _]| [a, b, c]);
+        let scale = determinant(&linear).cbrt();
         follow(&mut self.displacement, map);
         (self.summary.mean_mm, self.summary.max_mm, _) = lengths(&self.displacement, &self.bodies);
         self.summary.start = Some(map.rows());
         self.summary.evidence.push(said_of(map));
         self.coefficients = self.coefficients.followed_by(map);
         self.uncertainty = self.uncertainty.scaled(scale as f32);
-        self.samples = self.samples.turned(linear);
+        self.samples = self.samples.turned(&linear);
         self.matches = SparseField { matches: self.matches.matches.iter().map(|m| m.followed_by(map)).collect() };
         let nodes: Vec<[f64; 3]> = self.at_nodes().iter().map(|m| m.displacement).collect();
         self.node_displacement = nodes;
@@ -293,7 +285,7 @@ impl FieldResult {
 }
 
 /// What was taken of a start, in words.
-fn said_of(map: &Affine) -> String {
+fn said_of(map: &AffineMap) -> String {
     let rows: Vec<String> =
         map.rows().iter().map(|r| format!("[{:.4} {:.4} {:.4} {:.3}]", r[0], r[1], r[2], r[3])).collect();
     format!(
@@ -303,14 +295,14 @@ fn said_of(map: &Affine) -> String {
 }
 
 /// Puts `x -> map(x + u)` in the place of `x -> x + u`.
-fn follow(field: &mut DenseField, map: &Affine) {
+fn follow(field: &mut DenseField, map: &AffineMap) {
     let grid = *field.grid();
     let n = grid.len();
     let (x, rest) = field.as_mut_slice().split_at_mut(n);
     let (y, z) = rest.split_at_mut(n);
     x.par_iter_mut().zip(y).zip(z).enumerate().for_each(|(at, ((x, y), z))| {
         let here = grid.centre(at);
-        let moved = mapped(map, here.moved([*x, *y, *z].map(f64::from))).minus(here);
+        let moved = map.at(here.moved([*x, *y, *z].map(f64::from))).minus(here);
         [*x, *y, *z] = moved.map(|v| v as f32);
     });
 }
@@ -320,15 +312,15 @@ fn follow(field: &mut DenseField, map: &Affine) {
 const NOTHING: f64 = 1e-6;
 
 /// The smallest model that holds an affine map.
-fn model_of(map: &Affine) -> MotionModel {
-    let linear = map.linear();
-    let gram = |r: usize, c: usize| (0..3).map(|k| linear[k][r] * linear[k][c]).sum::<f64>();
+fn model_of(map: &AffineMap) -> MotionModel {
+    let rows = map.rows();
+    let gram = |r: usize, c: usize| (0..3).map(|k| rows[k][r] * rows[k][c]).sum::<f64>();
     let unit = |r: usize, c: usize| f64::from(u8::from(r == c));
     let all =
         |of: &dyn Fn(usize, usize) -> f64| (0..3).all(|r| (0..3).all(|c| (of(r, c) - unit(r, c)).abs() < NOTHING));
     match () {
         _ if !all(&gram) => MotionModel::Affine,
-        _ if all(&|r, c| linear[r][c]) && map.origin().0.iter().all(|v| v.abs() < NOTHING) => MotionModel::Identity,
+        _ if all(&|r, c| rows[r][c]) && rows.iter().all(|row| row[3].abs() < NOTHING) => MotionModel::Identity,
         _ => MotionModel::Rigid,
     }
 }

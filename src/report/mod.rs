@@ -41,6 +41,8 @@ pub mod tables;
 
 pub mod html;
 
+pub mod record;
+
 pub mod text;
 
 pub mod json;

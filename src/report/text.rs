@@ -1,10 +1,10 @@
-//! The short summary for a terminal.
+//! The short summaries for a terminal.
 
 use crate::report::field::FieldReport;
 use crate::report::scale::thousands;
 use crate::report::strain;
 use crate::report::verdict::verdict;
-use crate::types::{BodyReport, InverseConsistency, Metrics};
+use crate::types::{BodyReport, Distances, InverseConsistency, LabelScore, LabelScores, Metrics, Overlap, TargetError};
 use std::fmt::Write;
 
 /// What a field run found, a few lines.
@@ -93,6 +93,51 @@ pub fn inverse_consistency(c: &InverseConsistency) -> String {
         c.inverse_max_mm,
         thousands(c.voxels)
     )
+}
+
+/// Target registration error, a few lines.
+pub fn target_error(t: &TargetError) -> String {
+    let mut out = format!(
+        "Target registration error: mean {:.3} mm over {} landmarks, {:.3} mm before registration.\n",
+        t.after.mean_mm,
+        thousands(t.count),
+        t.before.mean_mm
+    );
+    let row = |d: &Distances| {
+        format!("median {:.3} mm, 95th percentile {:.3} mm, largest {:.3} mm", d.median_mm, d.p95_mm, d.max_mm)
+    };
+    let _ = writeln!(out, "  after        {}", row(&t.after));
+    let _ = writeln!(out, "  before       {}", row(&t.before));
+    out
+}
+
+/// Overlap and surface distances of labels, a line a label; in brackets, before registration.
+pub fn label_scores(s: &LabelScores) -> String {
+    let mut out = format!(
+        "Labels: mean Dice {:.3} over {} labels, {:.3} before registration.\n",
+        s.dice_mean,
+        s.each.len(),
+        s.dice_mean_before
+    );
+    let mm = |v: Option<f64>| v.map_or_else(|| "none".into(), |v| format!("{v:.3}"));
+    let pair = |of: &dyn Fn(&Overlap) -> String, l: &LabelScore| format!("{} ({})", of(&l.after), of(&l.before));
+    for l in &s.each {
+        let _ = writeln!(
+            out,
+            "  label {:<6} Dice {}, surface distance mean {} mm, 95th percentile Hausdorff {} mm",
+            l.label,
+            pair(&|o| format!("{:.3}", o.dice), l),
+            pair(&|o| mm(o.surface_mean_mm), l),
+            pair(&|o| mm(o.hausdorff95_mm), l)
+        );
+    }
+    for (labels, map) in [(&s.only_initial, "initial"), (&s.only_deformed, "deformed")] {
+        if !labels.is_empty() {
+            let named: Vec<String> = labels.iter().map(u8::to_string).collect();
+            let _ = writeln!(out, "  not compared {}: in the {map} map alone", named.join(", "));
+        }
+    }
+    out
 }
 
 #[cfg(test)]

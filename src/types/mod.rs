@@ -23,6 +23,8 @@ pub mod certificate;
 
 pub mod expected;
 
+pub mod record;
+
 pub mod result;
 
 pub mod samples;
@@ -54,7 +56,9 @@ pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};
 pub use field::{DenseField, Displacement};
 pub use fingertip::{Fingertip, FingertipModel};
 pub use mesh::{QuadraticMesh, TetMesh, TriMesh};
-pub use metrics::{InverseConsistency, Metrics};
+pub use metrics::{
+    Distances, InverseConsistency, LabelScore, LabelScores, LandmarkError, Metrics, Overlap, TargetError,
+};
 pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
 pub use result::{

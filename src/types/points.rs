@@ -1,6 +1,7 @@
 //! Feature points, matches and sparse displacement fields.
 
-use crate::types::space::{Affine, VoxelPoint, WorldPoint};
+use crate::types::space::{VoxelPoint, WorldPoint};
+use crate::types::transform::AffineMap;
 
 /// A corner-like place of a volume (3D Harris).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,10 +63,10 @@ impl Match {
 
     /// The same, followed by an affine map of the world (mm, RAS).
     #[must_use]
-    pub fn followed_by(&self, map: &Affine) -> Self {
-        let moved = |d: [f64; 3]| map.to_world(VoxelPoint(self.initial.moved(d).0)).minus(self.initial);
+    pub fn followed_by(&self, map: &AffineMap) -> Self {
+        let moved = |d: [f64; 3]| map.at(self.initial.moved(d)).minus(self.initial);
         let [xx, yy, zz, xy, xz, yz] = self.covariance;
-        let (c, l) = ([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], map.linear());
+        let (c, l) = ([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], map.rows());
         let turned = |r: usize, s: usize| -> f64 {
             (0..3).map(|a| (0..3).map(|b| l[r][a] * c[a][b] * l[s][b]).sum::<f64>()).sum()
         };
