@@ -34,7 +34,8 @@ const RECORD: &str = "pair.json";
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Table of pairs (CSV): initial, deformed, and as wanted mask, labels, names, held, load,
+    /// Table of pairs (CSV): initial, deformed, and as wanted mask,
+    /// start, deformed_mask, ignore, landmarks, labels, names, held, load,
     /// force_n, scene, name, subject, session; paths count from the table's folder
     table: PathBuf,
     /// Folder for the results; those that are there already are not made again
@@ -170,12 +171,31 @@ fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stag
     let owned = |words: &[&str]| words.iter().map(|w| w.to_string()).collect::<Vec<_>>();
 
     let mut field = owned(&["field", &text(&pair.initial), &text(&pair.deformed), "--force", "-o", &at("field")]);
-    field.extend(flag("mask", pair.mask.as_deref().map(text)));
+    for (key, path) in [
+        ("mask", &pair.mask),
+        ("deformed-mask", &pair.deformed_mask),
+        ("ignore", &pair.ignore),
+        ("landmarks", &pair.landmarks),
+    ] {
+        field.extend(flag(key, path.as_deref().map(text)));
+    }
+    if !pair.start.is_empty() {
+        field.push("--initial".into());
+        field.extend(pair.start.iter().cloned());
+    }
     field.extend(tuning.arguments());
     let mut out = vec![Stage {
         name: "field",
         arguments: field,
-        inputs: files(&[Some(&pair.initial), Some(&pair.deformed), pair.mask.as_ref(), tuning.config()]),
+        inputs: files(&[
+            Some(&pair.initial),
+            Some(&pair.deformed),
+            pair.mask.as_ref(),
+            pair.deformed_mask.as_ref(),
+            pair.ignore.as_ref(),
+            pair.landmarks.as_ref(),
+            tuning.config(),
+        ]),
         marker: folder.join("field/summary.json"),
     }];
     let Some(labels) = &pair.labels else { return out };

@@ -5,7 +5,7 @@ use super::dry_run;
 use super::inputs::{Part, check_distinct, name, read_labels, read_volume, same_file, standing_for, warn_all};
 use super::known::{Knowledge, mask_on};
 use super::limits::{cap_search, field_fits};
-use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
+use super::outputs::{AFFINE_FILE, FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
 use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -242,6 +242,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
     }
     let mut folder = target.create()?;
+    folder.supersede(|file| file == AFFINE_FILE)?;
     let record = Recording::start(console, inputs);
     let read = started.elapsed().as_secs_f64();
 

@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 pub struct Knowledge {
     /// Where the search begins: centre, moments or principal (the volumes brought onto each other),
     /// or transforms from the initial to the deformed volume, in the order that a point takes
-    #[arg(long, value_name = "T", num_args = 1.., value_parser = transform)]
-    initial: Vec<String>,
+    #[arg(id = "start", long = "initial", value_name = "T", num_args = 1.., value_parser = transform)]
+    start: Vec<String>,
     /// What counts of the deformed volume: a mask on its grid, 0 elsewhere
     #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     deformed_mask: Option<PathBuf>,
@@ -38,7 +38,7 @@ pub struct Knowledge {
 
 /// What was read.
 #[derive(Default)]
-pub struct Read {
+pub struct KnownInputs {
     mask: Option<Mask>,
     initial_counts: Option<Mask>,
     deformed_counts: Option<Mask>,
@@ -48,6 +48,16 @@ pub struct Read {
 }
 
 impl Knowledge {
+    /// Whether nothing is known.
+    pub fn is_empty(&self) -> bool {
+        self.start.is_empty() && self.deformed_mask.is_none() && self.ignore.is_empty() && self.landmarks.is_empty()
+    }
+
+    /// Whether there are landmarks.
+    pub fn has_landmarks(&self) -> bool {
+        !self.landmarks.is_empty()
+    }
+
     /// The files among them, with what each is to the run.
     pub fn inputs(&self) -> Vec<(&'static str, PathBuf)> {
         let transforms = self.transforms().into_iter().map(|t| ("initial transform", t.path));
@@ -59,28 +69,8 @@ impl Knowledge {
 
     /// The transforms of --initial; none where volumes are brought onto each other.
     fn transforms(&self) -> Vec<Given> {
-        let names = self.initial.iter().filter(|t| alignment(t).is_none());
+        let names = self.start.iter().filter(|t| alignment(t).is_none());
         names.filter_map(|t| t.parse().ok()).collect()
-    }
-
-    /// The same as command-line arguments.
-    pub fn arguments(&self) -> Vec<String> {
-        let mut out = Vec::new();
-        if !self.initial.is_empty() {
-            out.push("--initial".to_string());
-            out.extend(self.initial.iter().cloned());
-        }
-        let mut add = |flag: &str, values: &[PathBuf]| {
-            if !values.is_empty() {
-                out.push(flag.to_string());
-                out.extend(values.iter().map(|v| v.display().to_string()));
-            }
-        };
-        self.deformed_mask.iter().for_each(|m| add("--deformed-mask", std::slice::from_ref(m)));
-        self.ignore.iter().for_each(|m| add("--ignore", std::slice::from_ref(m)));
-        add("--landmarks", &self.landmarks);
-        out.extend(self.landmark_sd.iter().flat_map(|sd| ["--landmark-sd".into(), sd.to_string()]));
-        out
     }
 
     /// Reads what there is for a pair of volumes called `names`. `mask` is where to measure.
@@ -91,7 +81,7 @@ impl Knowledge {
         mask: Option<Mask>,
         console: &Console,
         warnings: &mut Vec<String>,
-    ) -> Result<Read> {
+    ) -> Result<KnownInputs> {
         if self.landmark_sd.is_some_and(|sd| !(sd.is_finite() && sd > 0.0)) {
             bail!("--landmark-sd takes a standard deviation above 0, in mm");
         }
@@ -112,25 +102,25 @@ impl Knowledge {
                 bail!("{}: nothing is left that counts; give a mask that is 0 in the tissue", path.display());
             }
         }
-        Ok(Read {
+        Ok(KnownInputs {
             mask,
             initial_counts,
             deformed_counts,
-            start: self.start(initial, deformed, console, warnings)?,
+            start: self.begin(initial, deformed, console, warnings)?,
             landmarks: read_landmarks(&self.landmarks, grids[0], warnings)?,
             landmark_sd_mm: self.landmark_sd.unwrap_or(0.0),
         })
     }
 
     /// The start, with a warning where the volumes agree less there than where they lie.
-    fn start(
+    fn begin(
         &self,
         initial: &Voxels<'_>,
         deformed: &Voxels<'_>,
         console: &Console,
         warnings: &mut Vec<String>,
     ) -> Result<Option<Box<StartMap<'static>>>> {
-        let start: Box<StartMap<'static>> = match &self.initial[..] {
+        let start: Box<StartMap<'static>> = match &self.start[..] {
             [] => return Ok(None),
             [one] if alignment(one).is_some() => {
                 let how = alignment(one).unwrap_or(Alignment::Centre);
@@ -176,7 +166,12 @@ fn transform(argument: &str) -> Result<String, UnknownName> {
     Ok(argument.into())
 }
 
-impl Read {
+impl KnownInputs {
+    /// Only where to measure.
+    pub fn of_mask(mask: Option<Mask>) -> Self {
+        Self { mask, ..Self::default() }
+    }
+
     /// What a run takes.
     pub fn known(&self) -> Known<'_> {
         Known {

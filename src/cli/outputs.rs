@@ -9,12 +9,13 @@ use palpate::field::warp::{warp_rows, warped_at};
 use palpate::io::{self, OutputFolder};
 use palpate::numerics::sampling::Sampler;
 use palpate::pipeline::field::FieldResult;
+use palpate::pipeline::start::affine_of;
 use palpate::pipeline::strain::StrainResult;
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::strain::StrainReport;
 use palpate::report::{FieldReport, html, json};
 use palpate::strain::{StrainField, measure};
-use palpate::types::{DenseField, FieldParams, Grid, Mask, Metrics, Volume, WorldPoint};
+use palpate::types::{AffineMap, DenseField, FieldParams, Grid, Mask, Metrics, MotionModel, Volume, WorldPoint};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -32,6 +33,15 @@ pub const FIELD_FILES: [&str; 10] = [
     "summary.json",
     "report.html",
 ];
+
+/// Written beside them where one affine map is the motion.
+pub const AFFINE_FILE: &str = "affine.txt";
+
+/// The motion, where it is one affine map.
+fn affine(result: &FieldResult) -> Option<AffineMap> {
+    let one = result.summary.model != MotionModel::Free && result.summary.bodies.len() < 2;
+    one.then(|| affine_of(&result.displacement).ok()).flatten()
+}
 
 /// Names of the maps and tables that [`write_strain`] writes.
 pub const STRAIN_FILES: [&str; 7] = [
@@ -149,6 +159,9 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     let uncertainty = Layer::new(grid, |first, out| vague.rows(first, out), |offset| vague.at(offset));
     let bits = io::length_bits(grid);
     folder.write("uncertainty.nii.gz", |p| uncertainty.write(p, "palpate: 1 sigma of u, mm", Some(bits)))?;
+    if let Some(map) = affine(result) {
+        folder.write(AFFINE_FILE, |p| io::write_affine(p, &map, io::AffineFormat::Itk))?;
+    }
     folder.write("posterior.nii.gz", |p| io::write_samples(p, &result.samples))?;
     folder.write("bodies.nii.gz", |p| io::write_labels(p, &result.bodies, "palpate: bodies, from 1"))?;
     folder.write("matches.csv", |p| io::write_matches(p, &result.matches))?;

@@ -5,9 +5,10 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{
-    Part, check_distinct, name, on_grid, read_labels, read_mask, standing_for, usable, warn_all, warn_of_non_finite,
+    Part, check_distinct, name, on_grid, read_labels, standing_for, usable, warn_all, warn_of_non_finite,
     warn_of_places, warn_of_two_places,
 };
+use super::known::{Knowledge, KnownInputs, mask_on};
 use super::limits::{cap_search, grids_fit, same_unit};
 use super::outputs::Target;
 use super::record::{self, Read, Recording};
@@ -54,6 +55,8 @@ pub struct Options {
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     dry_run: bool,
+    #[command(flatten)]
+    knowledge: Knowledge,
     #[command(flatten)]
     tuning: Tuning,
 }
@@ -145,17 +148,22 @@ impl<'a> Source<'a> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { volumes, target, reference: origin, mask, labels, frame_by_frame, dry_run, tuning } = options;
+    let Options { volumes, target, reference: origin, mask, labels, frame_by_frame, dry_run, knowledge, tuning } =
+        options;
     let (mut params, origin) = (tuning.params()?, *origin);
     let mut source = Source::open(volumes)?;
     let frames = source.frames();
     if origin >= frames {
         bail!(Usage(format!("--reference is {origin}, but there are {frames} volumes (counted from 0)")));
     }
-    let given: Vec<&Path> = volumes.iter().chain(mask).chain(labels).map(PathBuf::as_path).collect();
-    check_distinct(&given, &target.files(&files(frames, origin)))?;
+    if knowledge.has_landmarks() && frames > 2 {
+        bail!(Usage("--landmarks belong to one pair; give palpate track two volumes, or take palpate field".into()));
+    }
     let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
     inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
+    inputs.extend(knowledge.inputs());
+    let given: Vec<&Path> = inputs.iter().map(|(_, path)| path.as_path()).collect();
+    check_distinct(&given, &target.files(&files(frames, origin)))?;
 
     for t in order(frames, origin) {
         same_unit((source.path(origin), source.grid(origin)), (source.path(t), source.grid(t)))?;
@@ -177,13 +185,22 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let grid = *reference.grid();
     let first = source.path(origin);
     warnings.extend(cap_search(&mut params, &grid, first));
-    let inside = mask.as_ref().map(|m| read_mask(m, &grid, first)).transpose()?;
+    let inside = mask.as_ref().map(|m| mask_on(m, &grid, first, &mut warnings)).transpose()?;
     let regions = labels.as_ref().map(|l| read_labels(l, &grid, first)).transpose()?;
+    let known = match knowledge.is_empty() {
+        true => KnownInputs::of_mask(inside),
+        false => {
+            let next = order(frames, origin).next().unwrap_or(origin);
+            let frame = source.read_usable(next, &mut Vec::new())?;
+            knowledge.read((&reference, &frame), [first, source.path(next)], inside, console, &mut warnings)?
+        }
+    };
+    let inside = known.mask();
     warnings.extend(out_of_order(volumes));
-    warnings.extend(inside.as_ref().zip(regions.as_ref()).and_then(|(mask, labels)| outside_the_mask(mask, labels)));
+    warnings.extend(inside.zip(regions.as_ref()).and_then(|(mask, labels)| outside_the_mask(mask, labels)));
     if *dry_run {
         drop(progress);
-        let plan = plan(&mut source, (origin, &reference), inside.as_ref(), &params, &mut warnings)?;
+        let plan = plan(&mut source, (origin, &reference), inside, &params, &mut warnings)?;
         warn_all(console, &warnings);
         let plan = dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files(frames, origin))?;
         return console.say(&plan);
@@ -199,7 +216,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (mut reading, mut writing) = (started.elapsed(), std::time::Duration::ZERO);
 
     let range = gray_range(&reference);
-    let shown = inside.as_ref().or(regions.as_ref());
+    let shown = inside.or(regions.as_ref());
     let mut seen = vec![false; frames];
     let read = |frame: usize| -> Result<Volume> {
         let started = Instant::now();
@@ -252,7 +269,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let tracked = track::run(
         (frames, origin),
         &reference,
-        (inside.as_ref(), regions.as_ref()),
+        (&known.known(), regions.as_ref()),
         (&params, !frame_by_frame),
         read,
         keep,

@@ -15,8 +15,23 @@ use std::time::UNIX_EPOCH;
 const RESERVED: [&str; 4] = ["batch.csv", "regions.csv", "summary.json", "report.html"];
 
 /// Columns of a table of pairs; the first two are needed.
-pub const PAIR_COLUMNS: [&str; 12] = [
-    "initial", "deformed", "mask", "labels", "names", "held", "load", "force_n", "scene", "name", "subject", "session",
+pub const PAIR_COLUMNS: [&str; 16] = [
+    "initial",
+    "deformed",
+    "mask",
+    "start",
+    "deformed_mask",
+    "ignore",
+    "landmarks",
+    "labels",
+    "names",
+    "held",
+    "load",
+    "force_n",
+    "scene",
+    "name",
+    "subject",
+    "session",
 ];
 
 /// Reads a table of pairs: comma-separated, one header line with some of [`PAIR_COLUMNS`] in any
@@ -80,6 +95,12 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
             initial: needed("initial")?,
             deformed: needed("deformed")?,
             mask: file("mask"),
+            start: text("start")
+                .map(|t| t.split(';').map(|one| start(folder, one.trim())).collect())
+                .unwrap_or_default(),
+            deformed_mask: file("deformed_mask"),
+            ignore: file("ignore"),
+            landmarks: file("landmarks"),
             labels: file("labels"),
             names: text("names").map(|n| n.replace(';', ",")),
             held: side("held"),
@@ -94,6 +115,17 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     match pairs.is_empty() {
         true => Err(format(path, "there is no pair after the header line", "give at least one")),
         false => Ok(pairs),
+    }
+}
+
+/// A start of a pair: the name of an alignment stays as it is, a file counts from the table, whatever
+/// stands before its name.
+fn start(folder: &Path, text: &str) -> String {
+    let (source, path) = text.split_once(':').map_or(("", text), |(source, path)| (source, path));
+    match (source, path) {
+        ("", "centre" | "center" | "moments" | "principal") => text.to_string(),
+        ("", path) => folder.join(path).display().to_string(),
+        (source, path) => format!("{source}:{}", folder.join(path).display()),
     }
 }
 

@@ -163,7 +163,7 @@ mod tests {
     fn pairs(of: impl Fn(f32) -> f32) -> Vec<[f32; 2]> {
         let mut random = Random::new(1, 1);
         let value = |_| {
-            let [a, b, _] = random.normals();
+            let [a, b] = random.normals();
             let v = 500.0 + 150.0 * a as f32;
             [v, of(v) + 5.0 * b as f32]
         };

@@ -301,7 +301,7 @@ fn canonical(
     } = chain.run(search, tissue, &mut clock)?;
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
-        return Err(too_few(kept, search));
+        return Err(too_few(kept, &pair, (search, params)));
     }
 
     // The smallest motion that explains the matches, body by body.
@@ -484,7 +484,8 @@ fn no_measurement(kept: usize, found: usize, seen: Option<Counts>) -> Result<(),
     match [Some(survived), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
         None => Ok(()),
         Some((found, what, needed)) => {
-            let hint = "check that both volumes show the same tissue with the same contrast, or widen --search".into();
+            let hint =
+                "check that both volumes show the same tissue; where they lie far apart, begin with --initial".into();
             Err(FieldError::TooFew { found, what, needed, hint })
         }
     }
@@ -720,7 +721,7 @@ impl<'a> CoarseToFine<'a, '_> {
                 stages,
             });
         }
-        Err(too_few(0, range))
+        Err(no_match(0, "check the mask".into()))
     }
 
     /// Each given body's motion on the coarsest level: by a search of its own or that of the whole,
@@ -860,8 +861,37 @@ fn in_doubt(counts: Counts) -> String {
     )
 }
 
-pub(super) fn too_few(found: usize, search: f64) -> FieldError {
-    let hint = format!("widen --search (now {search:.0} mm), check the mask, or check that both show the same tissue");
+/// Part of the tissue without texture from which that is why few matches survive.
+const MOSTLY: f64 = 0.5;
+
+/// Part of the variance that the volumes explain of each other at rest under which they show nothing
+/// of the same.
+const STRANGERS: f64 = 0.1;
+
+/// Refuses a run with too few matches, with what was measured of the volumes and the one thing to
+/// try. Nothing is advised that was asked for already.
+pub(super) fn too_few(found: usize, pair: &Pair<'_>, (search, params): (f64, &FieldParams)) -> FieldError {
+    let still = Bodies::from(SplineField::still(level::lattice(pair, COARSE)));
+    let (plain, agreement) = (pair.plain(), contrast::agreement(pair, &still).at_rest);
+    let hint = match () {
+        _ if plain > MOSTLY => format!(
+            "{:.0} % of the tissue shows no texture that stands out of the noise: image finer or with less noise, or give --landmarks",
+            100.0 * plain
+        ),
+        _ if agreement < STRANGERS => format!(
+            "at rest one volume explains {:.0} % of the other's variance: check that both show the same tissue; where they lie apart, \
+             begin with --initial centre",
+            100.0 * agreement
+        ),
+        _ if params.search_mm == 0.0 => {
+            format!("{search:.0} mm were looked over: if the tissue moved further, widen --search")
+        }
+        _ => format!("{search:.0} mm were looked over: give --landmarks, or a start with --initial"),
+    };
+    no_match(found, hint)
+}
+
+pub(super) fn no_match(found: usize, hint: String) -> FieldError {
     FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
 }
 
@@ -1064,7 +1094,7 @@ pub(super) fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max
     if max_mm > NEAR * search {
         let at = if max_mm > search { "past" } else { "near" };
         out.push(format!(
-            "the motion reaches {max_mm:.1} mm, {at} the search range of {search:.1} mm; try a wider --search"
+            "the motion reaches {max_mm:.1} mm, {at} the search range of {search:.1} mm: where it goes further, it was not found; try a wider --search"
         ));
     }
     if counts.features_initial > 0 && counts.kept * 4 < counts.features_initial {

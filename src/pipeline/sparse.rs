@@ -154,10 +154,12 @@ pub(super) fn measure(
         state = Some((found, pair, factor));
         clock.book("matching");
     }
-    let Some((Found { mut field, matches, .. }, pair, factor)) = state else { return Err(field::too_few(0, search)) };
+    let Some((Found { mut field, matches, .. }, pair, factor)) = state else {
+        return Err(field::no_match(0, "check the mask".into()));
+    };
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
-        return Err(field::too_few(kept, search));
+        return Err(field::too_few(kept, &pair, (search, params)));
     }
 
     // The smallest motion that explains the matches, and what they leave open.

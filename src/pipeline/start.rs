@@ -15,7 +15,8 @@ use crate::pipeline::known::{Known, StartMap};
 use crate::pipeline::stages::Stage;
 use crate::types::space::{Matrix3, determinant, length};
 use crate::types::{
-    Affine, AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, VoxelPoint, Voxels, WorldPoint,
+    Affine, AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, StartReport, VoxelPoint, Voxels,
+    WorldPoint,
 };
 use rayon::prelude::*;
 
@@ -266,7 +267,7 @@ impl FieldResult {
         let scale = determinant(&linear).cbrt();
         follow(&mut self.displacement, map);
         (self.summary.mean_mm, self.summary.max_mm, _) = lengths(&self.displacement, &self.bodies);
-        self.summary.start = Some(map.rows());
+        self.summary.start = Some(StartReport { affine_ras: map.rows(), model_beyond: self.summary.model });
         self.summary.evidence.push(said_of(map));
         self.coefficients = self.coefficients.followed_by(map);
         self.uncertainty = self.uncertainty.scaled(scale as f32);
@@ -292,6 +293,19 @@ fn said_of(map: &AffineMap) -> String {
         "start: the search began at the affine map {} (world mm, RAS); models, ranges and the expected error are of the motion beyond it",
         rows.join(" ")
     )
+}
+
+/// The affine map that a field is (least squares over its grid).
+///
+/// # Errors
+/// As [`affine_part`].
+pub fn affine_of(field: &DenseField) -> Result<AffineMap, FieldError> {
+    let grid = field.grid();
+    let moved = |p: WorldPoint| {
+        let at = nearest(grid.shape(), grid.affine().to_voxel(p))?;
+        Some(p.moved(field.at(at).map(f64::from)))
+    };
+    affine_part(&moved, grid, None)
 }
 
 /// Puts `x -> map(x + u)` in the place of `x -> x + u`.

@@ -26,10 +26,10 @@ use std::collections::HashMap;
 use std::time::Instant;
 
 /// Follows the tissue of one volume through others that were taken one after the other.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Tracker<'a> {
     reference: &'a Voxels<'a>,
-    mask: Option<&'a Mask>,
+    known: Known<'a>,
     params: &'a FieldParams,
     /// Of the frame before, and of the one before that.
     past: [Option<Start>; 2],
@@ -38,7 +38,12 @@ pub struct Tracker<'a> {
 impl<'a> Tracker<'a> {
     /// `mask` lies on the reference's grid.
     pub fn new(reference: &'a Voxels<'a>, mask: Option<&'a Mask>, params: &'a FieldParams) -> Self {
-        Self { reference, mask, params, past: [None, None] }
+        Self::knowing(reference, Known::mask(mask), params)
+    }
+
+    /// With more that is known of the reference and of each frame.
+    pub fn knowing(reference: &'a Voxels<'a>, known: Known<'a>, params: &'a FieldParams) -> Self {
+        Self { reference, known, params, past: [None, None] }
     }
 
     /// Forgets the frames so far: the next one again comes right after (or before) the reference.
@@ -54,7 +59,7 @@ impl<'a> Tracker<'a> {
         let [last, before] = &self.past;
         let steady = last.as_ref().zip(before.as_ref()).map(|(l, b)| l.extrapolated(b));
         let starts: Vec<Start> = last.iter().cloned().chain(steady).collect();
-        let result = run_from(self.reference, frame, &Known::mask(self.mask), self.params, &starts, progress)?;
+        let result = run_from(self.reference, frame, &self.known, self.params, &starts, progress)?;
         self.past.swap(0, 1);
         self.past[0] = Some(result.spline.clone());
         Ok(result)
@@ -78,7 +83,7 @@ pub struct Frame<'a> {
 /// backward to the first.
 ///
 /// `read` gives a volume by its number, twice each; `keep` gets each result once all are measured.
-/// Where `together` holds, each field is what all frames say of it. `labels` (on the reference's
+/// Where `together` holds, each field is what all frames say of it, unless a start is `known`. `labels` (on the reference's
 /// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them,
 /// and what stands out of the background without either. A frame that cannot be measured is
 /// reported as lost, and the next one starts from the frames before it.
@@ -88,16 +93,17 @@ pub struct Frame<'a> {
 pub fn run<'v, E: From<FieldError>>(
     (frames, origin): (usize, usize),
     reference: &Voxels<'_>,
-    (mask, labels): (Option<&Mask>, Option<&Mask>),
+    (known, labels): (&Known<'_>, Option<&Mask>),
     (params, together): (&FieldParams, bool),
     mut read: impl FnMut(usize) -> Result<Voxels<'v>, E>,
     mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
     progress: Progress<'_>,
 ) -> Result<Tracked, E> {
+    let mask = known.mask;
     // Without a mask it is tissue that counts, not air.
     let tissue = mask.map_or_else(|| Cow::Owned(foreground(reference)), Cow::Borrowed);
     let regions = regions(reference, if labels.is_some() { mask } else { Some(&*tissue) }, labels);
-    let mut tracker = Tracker::new(reference, mask, params);
+    let mut tracker = Tracker::knowing(reference, *known, params);
     let mut tracked = Tracked::default();
     let mut refused = None;
     let mut course = Course::new(reference, &tissue, origin);
@@ -135,7 +141,8 @@ pub fn run<'v, E: From<FieldError>>(
     drop((course, tracker));
 
     progress("together", 1.0);
-    if together && params.interpolation == Interpolation::Spline && frames > 2 {
+    // A start that all frames share would pass for the reference's noise.
+    if together && known.start.is_none() && params.interpolation == Interpolation::Spline && frames > 2 {
         tracked.together = Some(take_together(&mut held, origin, &tissue));
     }
     let mut points = Points::new(frames);

@@ -53,8 +53,8 @@ pub(crate) mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::types::{
-        Affine, BodyReport, Counts, ErrorSource, ExpectedError, LevelReport, Match, MotionModel, StageReport, TetMesh,
-        Volume, WorldPoint,
+        Affine, Agreement, BodyReport, Counts, ErrorSource, ExpectedError, LevelReport, Match, MotionModel,
+        StageReport, TetMesh, Volume, WorldPoint,
     };
 
     /// A made-up result with known numbers.
@@ -138,6 +138,10 @@ pub(crate) mod tests {
                     labels: Vec::new(),
                 },
                 unseen: 0.0,
+                agreement: Agreement { at_rest: 0.5, found: 0.9 },
+                recast: None,
+                landmarks: None,
+                start: None,
                 seconds: vec![("features".into(), 1.0), ("matching".into(), 2.0)],
                 warnings: vec!["two of <three> slices are empty".into()],
             };

@@ -43,6 +43,17 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
         let bodies: Vec<String> = s.bodies.iter().map(of).collect();
         let _ = writeln!(out, "  bodies       {}", bodies.join(", "));
     }
+    if let Some(l) = &s.landmarks {
+        let wrong = match l.wrong.len() {
+            0 => String::new(),
+            n => format!("; {n} disagree"),
+        };
+        let _ = writeln!(
+            out,
+            "  landmarks    {}, on average {:.2} mm from where the field takes them{wrong}",
+            l.count, l.mean_mm
+        );
+    }
     if let Some((_, m)) = report.truth {
         let _ = writeln!(out, "  true error   mean {:.3} mm, 95th percentile {:.3} mm", m.mean_mm, m.p95_mm);
     }

@@ -18,6 +18,14 @@ pub struct Pair {
     pub deformed: PathBuf,
     /// Where to measure, on the initial grid.
     pub mask: Option<PathBuf>,
+    /// Where the search begins: the name of an alignment, or transforms in the order a point takes.
+    pub start: Vec<String>,
+    /// What counts of the deformed volume.
+    pub deformed_mask: Option<PathBuf>,
+    /// What does not count.
+    pub ignore: Option<PathBuf>,
+    /// Places known in both volumes.
+    pub landmarks: Option<PathBuf>,
     /// Regions on the initial grid; with them moduli are looked for.
     pub labels: Option<PathBuf>,
     /// Names of the labels, as `1=skin,2=fat`.

@@ -63,6 +63,7 @@ pub use params::FieldParams;
 pub use points::{Candidate, FeaturePoint, Landmark, Match, RawMatch, SparseField};
 pub use result::{
     Agreement, BodyReport, Counts, FieldSummary, LandmarkReport, LevelReport, Mesh, MotionModel, StageReport,
+    StartReport,
 };
 pub use samples::ErrorSamples;
 pub use scene::Scene;

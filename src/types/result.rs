@@ -58,6 +58,15 @@ pub struct Agreement {
     pub found: f64,
 }
 
+/// Where a search began.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StartReport {
+    /// Rows of the affine part (world mm, RAS, initial to deformed).
+    pub affine_ras: [[f64; 4]; 3],
+    /// The model of the motion beyond it, which the expected error is held against.
+    pub model_beyond: MotionModel,
+}
+
 /// What became of the landmarks in the fit.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LandmarkReport {
@@ -207,8 +216,8 @@ pub struct FieldSummary {
     pub recast: Option<&'static str>,
     /// What became of the landmarks, where there are any.
     pub landmarks: Option<LandmarkReport>,
-    /// The affine part of the start (world mm, RAS, rows), where one was given.
-    pub start: Option<[[f64; 4]; 3]>,
+    /// Where the search began, where a start was given.
+    pub start: Option<StartReport>,
     /// Stage names and wall seconds, in order.
     pub seconds: Vec<(String, f64)>,
     /// What the user should know before trusting the result.
