@@ -314,6 +314,6 @@ fn composition_applies_the_first_then_the_second() {
 #[test]
 fn an_unknown_interpolation_is_answered_with_the_nearest_name() {
     let error = "linaer".parse::<Interpolation>().unwrap_err().to_string();
-    assert_eq!(error, "unknown interpolation 'linaer', did you mean 'linear'?; known: nearest, linear, cubic");
+    assert_eq!(error, "unknown interpolation 'linaer', did you mean 'linear'?; known: nearest, linear, cubic, label");
     assert!(!"zzz".parse::<Interpolation>().unwrap_err().to_string().contains("did you mean"));
 }

@@ -14,11 +14,11 @@ use flate2::{Compression, write::GzEncoder, write::ZlibEncoder};
 use palpate::io::{self, SceneOverrides};
 use palpate::numerics::random::Random;
 
-use palpate::types::{Affine, DenseField, FieldParams, Grid, Volume};
+use palpate::types::{Affine, DenseField, FieldParams, Grid, Transform, Volume};
 use peak_alloc::PeakAlloc;
 use std::fs;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
@@ -50,6 +50,15 @@ fn volume(path: &Path) -> Option<Vec<f32>> {
 fn nothing<T>(found: Result<T, impl std::fmt::Display>) -> Option<Vec<f32>> {
     // A message must come without a panic too.
     found.map_err(|e| e.to_string()).ok().map(|_| Vec::new())
+}
+
+fn transform(path: &Path) -> Option<Vec<f32>> {
+    nothing(io::read_transform(path, None, None, None))
+}
+
+fn write(path: &Path, bytes: &[u8]) -> PathBuf {
+    fs::write(path, bytes).unwrap();
+    path.into()
 }
 
 fn gzip(bytes: &[u8]) -> Vec<u8> {
@@ -107,6 +116,15 @@ fn kinds() -> Vec<Kind> {
         "patches":{"held":{"translation":[0,0,0]},"loaded":{"translation":[0,0,1],"travel_mm":1}}}"#;
     let fingertip = b"youngs_modulus = 1e4\n[pad]\ncalibration = 1.02\nfinite_element_nodes = 2500\n";
     let slices = [0, 1, 2].map(|n| slices::Slice::new(n).bytes());
+    let itk = "#Insight Transform File V1.0\n#Transform 0\nTransform: CompositeTransform_double_3_3\n#Transform 1\n\
+        Transform: Euler3DTransform_double_3_3\nParameters: 0.1 0.2 0.3 4 5 6\nFixedParameters: 1 2 3 0\n#Transform 2\n\
+        Transform: DisplacementFieldTransform_double_3_3\nParameters: 1 2 3 4 5 6\n\
+        FixedParameters: 2 1 1 0 0 0 1 1 1 1 0 0 0 1 0 0 0 1\n";
+    let matrix = "1.1 0.1 -0.2 4\n0.3 0.9 0.1 5\n0.05 -0.1 1.2 6\n0 0 0 1\n";
+    let map = io::read_transform(write(&at("m.mat"), matrix.as_bytes()), None, None, None).unwrap().transforms;
+    let [Transform::Affine(map)] = map[..] else { panic!("no affine map") };
+    io::write_affine(at("ants.mat"), &map, io::AffineFormat::Itk).unwrap();
+    let ants = fs::read(at("ants.mat")).unwrap();
     let kind = |name, good, read, ratio, checked| Kind { name, good, read, ratio, checked, beside: Vec::new() };
     vec![
         kind("v.nii", nifti.clone(), volume as fn(&Path) -> Option<Vec<f32>>, 2, false),
@@ -129,6 +147,9 @@ fn kinds() -> Vec<Kind> {
         kind("pairs.csv", table.into(), |p| nothing(io::read_pairs(p)), 64, false),
         kind("trajectories.csv", paths.into(), |p| nothing(io::read_trajectories(p, 0)), 64, false),
         kind("fingertip.toml", fingertip.to_vec(), |p| nothing(io::read_fingertip_press(p)), 64, false),
+        kind("chain.tfm", itk.into(), transform, 64, false),
+        kind("matrix.mat", matrix.into(), transform, 64, false),
+        kind("0GenericAffine.mat", ants, transform, 64, false),
         Kind {
             beside: vec![("stiffness.nii.gz", gzip(&nifti))],
             ..kind("summary.json", told.to_vec(), |p| nothing(io::read_stiffness(p.parent()?)), 64, false)

@@ -320,8 +320,8 @@ fn trap_names_with_dots_are_taken_as_they_are() {
     }
     assert_eq!(std::fs::read(other).unwrap(), b"precious");
     assert_eq!(std::fs::read_dir(files.0.path()).unwrap().count(), 5);
-    let error = write_volume(files.path("a.mha"), &volume, "").unwrap_err().to_string();
-    assert!(error.contains("a.mha") && error.contains(".nii.gz"), "{error}");
+    let error = write_volume(files.path("a.mhd"), &volume, "").unwrap_err().to_string();
+    assert!(error.contains("a.mhd") && error.contains(".nii.gz") && error.contains(".mha"), "{error}");
 }
 
 #[test]

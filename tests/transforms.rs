@@ -4,13 +4,16 @@
 
 mod fixtures;
 
+use fixtures::{palpate, run, small_pair, text};
 use palpate::field::warp::warp_points;
 use palpate::io::{self, AffineFormat, FieldFormat, TransformSource};
+use palpate::numerics::labels::is_label_map;
 use palpate::numerics::random::Random;
-use palpate::numerics::sampling::displacement;
+use palpate::numerics::sampling::{Interpolation, displacement};
 use palpate::transforms::Chain;
+use palpate::transforms::resample::resample;
 use palpate::types::space::length;
-use palpate::types::{Affine, AffineMap, DenseField, Grid, Transform, VoxelPoint, WorldPoint};
+use palpate::types::{Affine, AffineMap, DenseField, Grid, Mask, Transform, Volume, VoxelPoint, WorldPoint};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
@@ -418,4 +421,275 @@ fn files_with_flaws_are_named_with_what_is_wrong() {
     let matrix = put(&folder, "ok.mat", RAS);
     let error = io::read_transform(&matrix, Some(TransformSource::Itk), None, None).unwrap_err().to_string();
     assert!(error.contains("ok.mat") && error.contains("fsl:"), "{error}");
+}
+
+// Label maps.
+
+fn cube(n: usize) -> Grid {
+    Grid::new([n; 3], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap()
+}
+
+#[test]
+fn label_maps_are_told_from_images() {
+    let mut random = Random::new(60, 0);
+    // Blocks of n voxels a side, a label of its own for each of some hundred.
+    let blocks = |n: usize, labels: usize| {
+        Volume::from_voxels(cube(24), |_, p| {
+            let b = p.0.map(|v| v as usize / n);
+            let hash = (b[0] * 73 + b[1] * 179 + b[2] * 283) % labels;
+            if p.0.iter().any(|v| !(4.0..20.0).contains(v)) { 0.0 } else { (1000 + 7 * hash) as f32 }
+        })
+    };
+    for (n, labels) in [(4, 5), (4, 60), (8, 3)] {
+        assert!(is_label_map(&blocks(n, labels)), "{n} {labels}");
+    }
+    let map = |f: &dyn Fn([f64; 3]) -> f64| {
+        Volume::from_vec(
+            cube(24),
+            (0..24 * 24 * 24)
+                .map(|at| {
+                    let [i, j, k] = cube(24).voxel(at);
+                    f([i, j, k].map(|v| v as f64)) as f32
+                })
+                .collect(),
+        )
+        .unwrap()
+    };
+    let sheet = map(&|p| f64::from(u8::from(p[0] == 11.0)));
+    assert!(is_label_map(&sheet), "a mask one voxel thin");
+    // An image: smooth, with noise of two gray levels, whole numbers, a background of 0.
+    let noise: Vec<f64> = (0..24 * 24 * 24).map(|_| 2.0 * random.normals()[0]).collect();
+    let image = map(&|p| {
+        let at = (p[0] + 24.0 * (p[1] + 24.0 * p[2])) as usize;
+        let tissue = p.iter().all(|v| (4.0..20.0).contains(v));
+        if tissue { (100.0 + 20.0 * (0.2 * p[0]).sin() + noise[at]).round() } else { 0.0 }
+    });
+    assert!(!is_label_map(&image));
+    assert!(!is_label_map(&map(&|p| (0.3 * p[0]).sin())), "no whole numbers");
+    assert!(!is_label_map(&map(&|_| 3.0)), "one value");
+    assert!(!is_label_map(&map(&|p| p[0] + 24.0 * (p[1] + 24.0 * p[2]))), "each its own");
+    let folder = small_pair();
+    for (name, expected) in [("initial", false), ("deformed", false), ("mask", true)] {
+        let volume = io::read_volume(folder.path().join(format!("{name}.nii.gz"))).unwrap();
+        assert_eq!(is_label_map(&volume), expected, "{name}");
+    }
+}
+
+#[test]
+fn the_label_with_most_weight_wins() {
+    // Along x: 3 3 9 9 9 9, shifted by less than half a voxel in x and y.
+    let labels = Volume::from_voxels(cube(6), |_, p| if p.0[0] < 1.5 { 3.0 } else { 9.0 });
+    let shift = |x: f64, y: f64| {
+        let rows = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, y], [0.0, 0.0, 1.0, 0.0]];
+        Chain(vec![Transform::Affine(AffineMap::new(rows).unwrap())])
+    };
+    let row = |x, y| {
+        let found = resample(&labels, &shift(x, y), &cube(6), Interpolation::Label, 0.0);
+        (found.image.as_slice()[36 * 2 + 6 * 2..][..6].to_vec(), found.outside)
+    };
+    assert_eq!(row(0.4, 0.3), (vec![3.0, 3.0, 9.0, 9.0, 9.0, 9.0], 0));
+    assert_eq!(row(0.6, 0.3), (vec![3.0, 9.0, 9.0, 9.0, 9.0, 0.0], 36));
+    // A corner of 3 in a plane of 7 and 9: by weight 9, though the nearest voxel is 3.
+    let grid = Grid::new([2, 2, 1], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+    let corner = Volume::from_vec(grid, vec![3.0, 9.0, 9.0, 7.0]).unwrap();
+    let one = Grid::new([1; 3], Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+    let at = |how| resample(&corner, &shift(0.45, 0.45), &one, how, 0.0).image.as_slice()[0];
+    assert_eq!(at(Interpolation::Nearest), 3.0);
+    assert_eq!(at(Interpolation::Label), 9.0);
+}
+
+// The program.
+
+/// A folder with an image, labels, a field and affine files on oblique grids; the fixed grid is
+/// `initial.nii.gz`'s.
+fn workplace() -> (TempDir, Grid, DenseField) {
+    let folder = TempDir::new().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (fixed, moving) = (placed([16, 14, 12], 1.0, 0.0), placed([14, 16, 14], -1.0, 0.0));
+    // The flipped one lies over the other but for three voxels along x.
+    let mut rows = moving.affine().rows();
+    (0..3).for_each(|r| rows[r][3] = fixed.affine().rows()[r][3] - 16.0 * rows[r][0]);
+    let moving = Grid::new([14, 16, 14], Affine::new(rows).unwrap()).unwrap();
+    let wave = |p: WorldPoint| 500.0 + 200.0 * (0.2 * p.0[0]).sin() + 100.0 * (0.15 * p.0[1] + 0.2 * p.0[2]).cos();
+    io::write_exact(at("initial.nii.gz"), &Volume::from_voxels(fixed, |_, p| wave(p) as f32), "").unwrap();
+    io::write_exact(at("image.nii.gz"), &Volume::from_voxels(moving, |_, p| wave(p) as f32), "").unwrap();
+    let label = |p: WorldPoint| 1 + u8::from(p.0[0] > 20.0) + 2 * u8::from(p.0[1] > 10.0);
+    io::write_labels(at("labels.nii.gz"), &Mask::from_voxels(moving, |_, p| label(p)), "").unwrap();
+    let field = DenseField::from_fn(fixed, |p| [1.0 + 0.05 * p.0[1], -0.5, 0.04 * p.0[0]]);
+    io::write_field(at("field.nii.gz"), &field).unwrap();
+    std::fs::write(at("a.mat"), "1.02 0.03 0 1\n-0.03 1 0.01 -0.8\n0 -0.01 0.98 0.5\n0 0 0 1\n").unwrap();
+    std::fs::write(at("far.mat"), "1 0 0 900\n0 1 0 0\n0 0 1 0\n0 0 0 1\n").unwrap();
+    (folder, fixed, field)
+}
+
+#[test]
+fn warp_takes_a_chain_of_files_in_one_interpolation() {
+    let (folder, fixed, _) = workplace();
+    let image = io::read_volume(folder.path().join("image.nii.gz")).unwrap();
+    let field = io::read_field(folder.path().join("field.nii.gz")).unwrap();
+    let map = read(&folder.path().join("a.mat")).affine().unwrap();
+    let arguments = ["warp", "image.nii.gz", "--transform", "field.nii.gz", "greedy:a.mat,-1", "-o", "out.nii.gz"];
+    let (out, err) = run(folder.path(), &arguments, 0);
+    assert!(out.contains("% of the voxels come from outside image.nii.gz") && err.is_empty(), "{out}{err}");
+    let warped = io::read_volume(folder.path().join("out.nii.gz")).unwrap();
+    assert!(warped.grid().same_as(&fixed));
+    let chain = Chain(vec![Transform::Field(field), Transform::Affine(map.inverse())]);
+    let expected = resample(&image, &chain, &fixed, Interpolation::Linear, 0.0);
+    let apart =
+        |v: &Volume| v.as_slice().iter().zip(expected.image.as_slice()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(apart(&warped) < 0.05, "{}", apart(&warped));
+    // The way back of the way back.
+    let back = ["warp", "image.nii.gz", "--transform", "a.mat", "field.nii.gz,-1", "--inverse", "-o", "back.nii.gz"];
+    let (_, err) = run(folder.path(), &back, 0);
+    assert!(err.contains("a.mat") && err.contains("taken as greedy's") && err.contains("fsl:"), "{err}");
+    assert!(apart(&io::read_volume(folder.path().join("back.nii.gz")).unwrap()) < 0.05);
+    // Points.
+    std::fs::write(folder.path().join("p.csv"), "x,y,z\n20,12,9\n9000,0,0\n").unwrap();
+    let points = ["warp", "--points", "p.csv", "--transform", "field.nii.gz", "greedy:a.mat,-1", "-o", "q.csv"];
+    let (_, err) = run(folder.path(), &points, 0);
+    assert!(err.contains("1 of 2 points"), "{err}");
+    let moved = io::read_points(folder.path().join("q.csv")).unwrap_err().to_string();
+    assert!(moved.contains("NaN") || moved.contains("finite"), "{moved}");
+    let line = std::fs::read_to_string(folder.path().join("q.csv")).unwrap();
+    let first: Vec<f64> = line.lines().nth(1).unwrap().split(',').map(|v| v.parse().unwrap()).collect();
+    let truth = chain.at(WorldPoint([20.0, 12.0, 9.0])).unwrap();
+    assert!((0..3).all(|c| (first[c] - truth.0[c]).abs() < 1e-5), "{first:?} {truth:?}");
+}
+
+#[test]
+fn label_maps_are_warped_by_nearest_neighbour_unless_asked() {
+    let (folder, ..) = workplace();
+    let warp = |extra: &[&str]| {
+        let arguments = [&["warp", "labels.nii.gz", "--transform", "field.nii.gz", "-o", "l.nii.gz"], extra].concat();
+        let (out, err) = run(folder.path(), &arguments, 0);
+        let volume = io::read_volume(folder.path().join("l.nii.gz")).unwrap();
+        let whole = volume.as_slice().iter().all(|v| v.fract() == 0.0 && *v <= 4.0);
+        (out, err, whole, io::read_header(folder.path().join("l.nii.gz")).unwrap().0.datatype)
+    };
+    let (out, err, whole, datatype) = warp(&[]);
+    assert!(out.contains("labels.nii.gz is a label map") && err.is_empty() && whole, "{out}{err}");
+    assert_eq!(datatype, "uint8");
+    let (out, err, whole, datatype) = warp(&["--interpolation", "label"]);
+    assert!(!out.contains("is a label map") && err.is_empty() && whole && datatype == "uint8", "{out}{err}");
+    let (_, err, whole, datatype) = warp(&["--interpolation", "linear"]);
+    assert!(err.contains("looks like a label map") && !whole && datatype == "float32", "{err}");
+    let arguments =
+        ["warp", "image.nii.gz", "--transform", "field.nii.gz", "--interpolation", "label", "-o", "x.nii.gz"];
+    let (_, err) = run(folder.path(), &arguments, 1);
+    assert!(err.contains("image.nii.gz") && err.contains("whole numbers"), "{err}");
+    // NIfTI's intent alone, of what does not look like one.
+    let path = folder.path().join("said.nii");
+    io::write_exact(&path, &Volume::from_voxels(cube(6), |at, _| at as f32), "").unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    bytes[68..70].copy_from_slice(&1002i16.to_le_bytes());
+    std::fs::write(&path, bytes).unwrap();
+    let (out, _) = run(folder.path(), &["warp", "said.nii", "--reference", "said.nii", "-o", "again.nii"], 0);
+    assert!(out.contains("said.nii is a label map"), "{out}");
+}
+
+#[test]
+fn what_would_be_empty_is_an_error_and_nothing_is_written() {
+    let (folder, ..) = workplace();
+    let far = "greedy:far.mat";
+    let cases: [(&[&str], &str); 5] = [
+        (
+            &["warp", "image.nii.gz", "--transform", far, "--reference", "initial.nii.gz", "-o", "x.nii.gz"],
+            "image.nii.gz: no voxel",
+        ),
+        (&["warp", "image.nii.gz", "--transform", far, "field.nii.gz", "-o", "x.nii.gz"], "image.nii.gz: no voxel"),
+        (&["compose", far, "field.nii.gz", "-o", "x.nii.gz"], "lead nowhere"),
+        (&["compose", "none.tfm", "-o", "x.tfm"], "none.tfm: cannot read"),
+        (&["warp", "image.nii.gz", "--transform", "fsl:a.mat", "-o", "x.nii.gz"], "--initial"),
+    ];
+    for (arguments, message) in cases {
+        let (_, err) = run(folder.path(), arguments, 1);
+        assert!(err.contains(message), "{arguments:?}: {err}");
+        assert!(!folder.path().join("x.nii.gz").exists());
+    }
+    let grid = cube(8);
+    io::write_field(folder.path().join("away.nii"), &DenseField::from_fn(grid, |_| [90.0, 0.0, 0.0])).unwrap();
+    let (_, err) = run(folder.path(), &["invert", "away.nii", "-o", "x.nii.gz"], 1);
+    assert!(err.contains("away.nii") && err.contains("empty"), "{err}");
+    assert!(!folder.path().join("x.nii.gz").exists());
+}
+
+#[test]
+fn wrong_usage_of_transforms_is_answered_with_what_to_do() {
+    let (folder, ..) = workplace();
+    let cases: [(&[&str], &str); 9] = [
+        (&["warp", "image.nii.gz", "--transform", "greedy:a.mat", "-o", "x.nii.gz"], "--reference"),
+        (
+            &["warp", "image.nii.gz", "--transform", "flirt:a.mat", "-o", "x.nii.gz"],
+            "unknown kind of transform 'flirt'",
+        ),
+        (
+            &["warp", "image.nii.gz", "--transform", "a.mat", "--field", "field.nii.gz", "-o", "x.nii.gz"],
+            "cannot be used",
+        ),
+        (&["compose", "field.nii.gz", "-o", "x.mat"], "no affine"),
+        (&["compose", "greedy:a.mat", "-o", "x.nii.gz"], "--reference"),
+        (&["convert", "greedy:a.mat", "--to", "fsl", "-o", "x.mat"], "--initial"),
+        (&["convert", "greedy:a.mat", "--to", "voxels", "-o", "x.mat"], "takes a field"),
+        (&["convert", "field.nii.gz", "--to", "fsl", "-o", "x.nii"], "--deformed"),
+        (&["convert", "field.nii.gz", "--to", "slicer", "-o", "x.nii"], "known: itk, fsl"),
+    ];
+    for (arguments, message) in cases {
+        let (_, err) = run(folder.path(), arguments, 2);
+        assert!(err.contains(message), "{arguments:?}: {err}");
+    }
+    let over = palpate(folder.path()).args(["compose", "greedy:a.mat", "-o", "a.mat"]).output().unwrap();
+    assert!(text(&over.stderr).contains("would be overwritten"));
+}
+
+#[test]
+fn compose_and_convert_write_what_was_read() {
+    let (folder, fixed, field) = workplace();
+    let at = |name: &str| folder.path().join(name);
+    let map = read(&at("a.mat")).affine().unwrap();
+    run(folder.path(), &["compose", "greedy:a.mat", "greedy:a.mat", "-o", "twice.tfm"], 0);
+    let near = |a: &AffineMap, b: &AffineMap| {
+        a.rows().iter().flatten().zip(b.rows().iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-9)
+    };
+    assert!(near(&read(&at("twice.tfm")).affine().unwrap(), &map.then(&map)));
+    // FLIRT's matrix there and back, and turned round, which swaps its volumes.
+    let volumes = ["--initial", "initial.nii.gz", "--deformed", "image.nii.gz"];
+    run(folder.path(), &[&["convert", "greedy:a.mat", "--to", "fsl", "-o", "f.mat"][..], &volumes].concat(), 0);
+    run(folder.path(), &[&["convert", "fsl:f.mat", "--to", "itk", "-o", "b.txt"][..], &volumes].concat(), 0);
+    assert!(near(&read(&at("b.txt")).affine().unwrap(), &map));
+    run(folder.path(), &[&["convert", "fsl:f.mat,-1", "--to", "fsl", "-o", "g.mat"][..], &volumes].concat(), 0);
+    let number = |name: &str| read(&at(name)).affine().unwrap();
+    assert!(near(&number("g.mat"), &number("f.mat").inverse()), "FSL's own inverse is that of the numbers");
+    // A FLIRT matrix in a warp leads between the volumes of the command.
+    let warp = ["--reference", "initial.nii.gz", "-o"];
+    run(
+        folder.path(),
+        &[&["warp", "image.nii.gz", "--transform", "fsl:f.mat"][..], &warp, &["one.nii.gz"]].concat(),
+        0,
+    );
+    run(folder.path(), &[&["warp", "image.nii.gz", "--transform", "b.txt"][..], &warp, &["two.nii.gz"]].concat(), 0);
+    let [one, two] = ["one.nii.gz", "two.nii.gz"].map(|n| io::read_volume(at(n)).unwrap());
+    assert!(one.as_slice().iter().zip(two.as_slice()).all(|(a, b)| (a - b).abs() < 0.05));
+    // Of several it is not known between which.
+    let several = ["warp", "image.nii.gz", "--transform", "field.nii.gz", "fsl:f.mat", "-o", "x.nii"];
+    let (_, err) = run(folder.path(), &several, 1);
+    assert!(err.contains("f.mat") && err.contains("--deformed"), "{err}");
+    let (out, _) = run(folder.path(), &["info", "twice.tfm", "a.mat"], 0);
+    assert!(out.contains("initial to deformed") && out.contains("fsl:"), "{out}");
+    // A field, and the folder of a run.
+    std::fs::create_dir(at("results")).unwrap();
+    std::fs::copy(at("field.nii.gz"), at("results/displacement.nii.gz")).unwrap();
+    for (to, name, options) in [
+        ("itk", "u.nrrd", &[][..]),
+        ("greedy", "u.mha", &[]),
+        ("niftyreg", "niftyreg:u.nii.gz", &[]),
+        ("fsl", "fsl:w.nii.gz", &["--deformed", "image.nii.gz"]),
+    ] {
+        let file = name.rsplit(':').next().unwrap();
+        run(folder.path(), &[&["convert", "results", "--to", to, "-o", file][..], options].concat(), 0);
+        run(folder.path(), &[&["compose", name, "-o", "again.nii"][..], options].concat(), 0);
+        let again = io::read_field(at("again.nii")).unwrap();
+        assert!(again.grid().same_as(&fixed), "{name}");
+        let apart = again.as_slice().iter().zip(field.as_slice()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(apart < 1e-3, "{name}: {apart}");
+    }
 }

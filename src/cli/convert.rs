@@ -18,7 +18,7 @@ use std::str::FromStr;
 #[command(
     after_help = "Write fsl:, niftyreg:, greedy: or ras: before a file that is theirs, and ,-1 after it to turn it round. \
                         A matrix of FSL refers to the grids of two volumes: give --initial and --deformed. A field of FSL \
-                        refers to its own grid and to that of --deformed, the field's own without."
+                        refers to its own grid and to that of --deformed."
 )]
 pub struct Options {
     /// Transform: .tfm, .txt, .mat, a displacement field, or a folder of `palpate field`
@@ -105,11 +105,16 @@ fn field(output: &Path, field: &DenseField, to: Target, grids: &[Option<Grid>; 2
         let endings = FIELDS.join(" or ");
         bail!(Usage(format!("{}: the transform is a field: end the name in {endings}", output.display())));
     }
-    let format = match to {
-        Target::Itk | Target::Greedy => FieldFormat::Itk,
-        Target::Niftyreg => FieldFormat::Niftyreg,
-        Target::Fsl => FieldFormat::Fsl { deformed: grids[1].as_ref().unwrap_or(field.grid()) },
-        Target::Voxels => FieldFormat::Voxels,
+    let format = match (to, &grids[1]) {
+        (Target::Itk | Target::Greedy, _) => FieldFormat::Itk,
+        (Target::Niftyreg, _) => FieldFormat::Niftyreg,
+        (Target::Fsl, Some(deformed)) => FieldFormat::Fsl { deformed },
+        (Target::Fsl, None) => bail!(Usage(
+            "a field of FSL refers to the grid of the volume that it leads to: give --deformed (--initial where the field is \
+             turned round)"
+                .into()
+        )),
+        (Target::Voxels, _) => FieldFormat::Voxels,
     };
     Ok(io::write_field_as(output, field, format)?)
 }

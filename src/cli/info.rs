@@ -9,13 +9,14 @@ use palpate::io::{self, ImageKind, SceneOverrides, Series, TableKind};
 use palpate::pipeline::plan::memory;
 use palpate::report::info::{self, Facts};
 use palpate::report::scale::thousands;
+use palpate::transforms::Chain;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Volumes, fields, label maps, tables of points, scenes, summary.json, or a folder of palpate
-    /// or of a DICOM series
+    /// Volumes, fields, label maps, transforms, tables of points, scenes, summary.json, or a folder
+    /// of palpate or of a DICOM series
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// JSON instead of text
@@ -66,6 +67,8 @@ fn facts(path: &Path) -> Result<Facts> {
         of_summary(&mut facts, &summary, path, path.parent().unwrap_or(Path::new("")));
     } else if [".csv", ".fcsv", ".mrk.json"].iter().any(|e| lower.ends_with(e)) {
         return of_table(facts, path);
+    } else if [".tfm", ".mat", ".txt", ".h5"].iter().any(|e| lower.ends_with(e)) {
+        of_transform(&mut facts, path)?;
     } else {
         return of_image(facts, path);
     }
@@ -124,6 +127,25 @@ fn of_toml(facts: &mut Facts, path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Affine transforms, and chains of them and of fields.
+fn of_transform(facts: &mut Facts, path: &Path) -> Result<()> {
+    let found = io::read_transform(path, None, None, None)?;
+    let (shown, count, chain) = (path.display(), found.transforms.len(), Chain(found.transforms));
+    facts.is(if count > 1 { "transforms in a row" } else { "transform" });
+    facts.add("transforms", count.to_string(), count.into());
+    if let Some(map) = chain.affine() {
+        let rows = map.rows().map(|row| row.map(|v| format!("{v:.5}")).join(" ")).join("; ");
+        facts.add("affine", format!("{rows} (world mm, RAS, initial to deformed)"), serde_json::to_value(map.rows())?);
+    }
+    if found.guessed {
+        let note = "4 x 4 numbers do not say whose they are: read as greedy's or NiftyReg's; write fsl: before FLIRT's";
+        facts.add("note", note.into(), note.into());
+    }
+    facts.does(&format!("palpate warp DEFORMED --transform {shown} --reference INITIAL -o BACK.nii.gz"));
+    facts.does(&format!("palpate convert {shown} --to greedy -o FOR_GREEDY.mat"));
+    Ok(())
+}
+
 fn of_table(mut facts: Facts, path: &Path) -> Result<Facts> {
     let shown = path.display();
     match io::table_kind(path)? {
@@ -174,7 +196,7 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
             if info::looks_like_labels(&volume) {
                 facts.does(&format!("palpate field INITIAL DEFORMED --mask {shown} -o DIR"));
                 facts.does(&format!("palpate stiffness --field FIELD --labels {shown} -o STIFFNESS"));
-                facts.does(&format!("palpate warp {shown} --field FIELD --interpolation nearest -o BACK.nii.gz"));
+                facts.does(&format!("palpate warp {shown} --field FIELD -o BACK.nii.gz"));
             } else {
                 let memory = memory(&stored.grid, &stored.grid) / 1_000_000;
                 facts.does(&format!(

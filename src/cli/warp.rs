@@ -51,8 +51,8 @@ pub struct Options {
     /// Take the grid of this image or field instead of the first field's
     #[arg(long, value_name = "R")]
     reference: Option<PathBuf>,
-    /// nearest, linear, cubic or label (the label with most weight) [default: nearest for what looks
-    /// like a label map, else linear]
+    /// nearest, linear, cubic or label (the label with most weight) [default: nearest for what
+    /// looks like a label map, else linear]
     #[arg(long)]
     interpolation: Option<Interpolation>,
     #[command(flatten)]
@@ -94,12 +94,14 @@ fn chain(options: &Options, grids: &[Option<Grid>; 2], console: &Console) -> Res
 }
 
 fn move_image(path: &Path, options: &Options, console: &Console) -> Result<()> {
-    let Options { output, reference, interpolation, convention, volumes, .. } = options;
+    let Options { transform, output, reference, interpolation, convention, volumes, .. } = options;
     let (stored, _) = io::read_header(path)?;
     let reference = reference.as_deref().map(|path| grid_of(path, convention)).transpose()?;
-    // A transform of FSL leads between the volumes of this command, if no others are named.
-    let [initial, deformed] = volumes.grids()?;
-    let chain = chain(options, &[initial.or(reference), deformed.or(Some(stored.grid))], console)?;
+    // A transform of FSL leads between the volumes of this command, if it is alone and no others
+    // are named.
+    let ([initial, deformed], alone) = (volumes.grids()?, transform.len() == 1);
+    let grids = [initial.or(reference.filter(|_| alone)), deformed.or(alone.then_some(stored.grid))];
+    let chain = chain(options, &grids, console)?;
     let Some(grid) = reference.or(chain.grid().copied()) else {
         bail!(Usage("all transforms are affine, so none brings a grid: give the initial volume as --reference".into()));
     };

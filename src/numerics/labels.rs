@@ -2,14 +2,12 @@
 
 use crate::numerics::sampling::beside;
 use crate::types::Voxels;
-use std::collections::{BTreeMap, btree_map::Entry};
+use rayon::prelude::*;
 
-/// Whole numbers beyond this cannot all be told apart in single precision.
-const WHOLE: f32 = 16_777_216.0;
+/// Labels beyond this are not looked for.
+const LARGEST: f32 = 1_048_576.0;
 /// A region three voxels across, the smallest that counts, has so many voxels.
 const REGION: usize = 27;
-/// Most different values of a label map; brain atlases have some thousand.
-const MOST: usize = 1 << 16;
 
 /// Whether the values are those of a label map: whole numbers that form plateaus.
 ///
@@ -20,41 +18,41 @@ const MOST: usize = 1 << 16;
 /// levels are equal with probability 0.28 / s: an image passes only where its noise is under about
 /// half a gray level.
 pub fn is_label_map(volume: &Voxels<'_>) -> bool {
-    let Some(counts) = whole_values(volume.as_slice()) else { return false };
-    if counts.len() <= 2 {
-        return counts.len() == 2;
-    }
-    let background = counts.iter().max_by_key(|(_, n)| **n).map_or(0, |(v, _)| *v) as f32;
     let (values, shape) = (volume.as_slice(), volume.grid().shape());
-    let tissue = values.iter().filter(|v| **v != background).count();
-    if counts.len() > 1 + tissue / REGION {
+    let Some((different, background, common)) = whole_values(values) else { return false };
+    if different <= 2 {
+        return different == 2;
+    }
+    if different > 1 + (values.len() - common) / REGION {
         return false;
     }
-    let (mut equal, mut pairs) = (0usize, 0usize);
-    for (at, &v) in values.iter().enumerate() {
-        for next in beside(shape, at).filter(|next| *next > at) {
-            let both = v == background && values[next] == background;
-            pairs += usize::from(!both);
-            equal += usize::from(!both && v == values[next]);
+    let plane = shape[0] * shape[1];
+    let of_plane = |k: usize| {
+        let (mut equal, mut pairs) = (0usize, 0usize);
+        for at in k * plane..(k + 1) * plane {
+            for next in beside(shape, at).filter(|next| *next > at) {
+                let both = values[at] == background && values[next] == background;
+                pairs += usize::from(!both);
+                equal += usize::from(!both && values[at] == values[next]);
+            }
         }
-    }
+        (equal, pairs)
+    };
+    let sum = |a: (usize, usize), b: (usize, usize)| (a.0 + b.0, a.1 + b.1);
+    let (equal, pairs) = (0..shape[2]).into_par_iter().map(of_plane).reduce(|| (0, 0), sum);
     2 * equal >= pairs
 }
 
-/// How often each value occurs; none when one is no whole number, or there are too many.
-fn whole_values(values: &[f32]) -> Option<BTreeMap<i32, usize>> {
-    let mut counts = BTreeMap::new();
-    for line in values.chunk_by(|a, b| a == b) {
-        let v = line[0];
-        if !(v.abs() <= WHOLE && v.fract() == 0.0) {
-            return None;
-        }
-        let many = counts.len() >= MOST;
-        match counts.entry(v as i32) {
-            Entry::Occupied(mut count) => *count.get_mut() += line.len(),
-            Entry::Vacant(_) if many => return None,
-            Entry::Vacant(place) => drop(place.insert(line.len())),
-        }
+/// How many values there are, the commonest one and how often it occurs; none when one is no whole
+/// number up to the largest label.
+fn whole_values(values: &[f32]) -> Option<(usize, f32, usize)> {
+    if !values.iter().all(|v| v.abs() <= LARGEST && v.fract() == 0.0) {
+        return None;
     }
-    Some(counts)
+    let (low, high) = values.iter().fold((LARGEST, -LARGEST), |(l, h), &v| (l.min(v), h.max(v)));
+    let mut counts = vec![0usize; (high - low).max(0.0) as usize + 1];
+    values.iter().for_each(|v| counts[(v - low) as usize] += 1);
+    let different = counts.iter().filter(|n| **n > 0).count();
+    let (at, common) = counts.iter().enumerate().max_by_key(|(_, n)| **n)?;
+    Some((different, low + at as f32, *common))
 }

@@ -7,7 +7,7 @@ use crate::types::{AffineMap, DenseField, Grid, Transform, WorldPoint};
 
 /// How near the inverse of a field comes to the place that it looks for (mm).
 const TOLERANCE_MM: f64 = 1e-8;
-/// Further off than this (mm) there is no inverse: the field folds, or ends.
+/// Further off than this (mm) there is no inverse: the field ends, or folds.
 const LOST_MM: f64 = 1e-3;
 
 /// Transforms in the order in which a point travels: the first one comes first. An empty chain
@@ -18,15 +18,15 @@ pub struct Chain(pub Vec<Transform>);
 impl Chain {
     /// Where the point `p` of the initial volume lies in the deformed one (world mm).
     ///
-    /// A field says nothing outside its grid or where it is not finite, and its inverse nothing where no point of its grid
-    /// leads: there it is `None`. (ITK leaves such points where they are.)
+    /// A field says nothing outside its grid or where it is not finite, its inverse nothing where no
+    /// point of the grid leads: there it is `None`. (ITK leaves such points where they are.)
     pub fn at(&self, p: WorldPoint) -> Option<WorldPoint> {
         self.0.iter().try_fold(p, step)
     }
 
     /// [`Chain::at`] of the centre of a voxel of `grid`, by its offset (x fastest): a field on that
     /// grid is read there as it is.
-    pub(super) fn from_voxel(&self, grid: &Grid, offset: usize) -> Option<WorldPoint> {
+    pub(super) fn at_voxel(&self, grid: &Grid, offset: usize) -> Option<WorldPoint> {
         let x = grid.centre(offset);
         match &self.0[..] {
             [Transform::Field(field), rest @ ..] if field.grid() == grid => {
@@ -54,7 +54,7 @@ impl Chain {
     /// The displacement (mm) of the whole chain at each voxel centre of `grid`; NaN where
     /// [`Chain::at`] gives nothing.
     pub fn to_field(&self, grid: &Grid) -> DenseField {
-        DenseField::from_voxels(*grid, |at, x| self.from_voxel(grid, at).map_or([f64::NAN; 3], |y| y.minus(x)))
+        DenseField::from_voxels(*grid, |at, x| self.at_voxel(grid, at).map_or([f64::NAN; 3], |y| y.minus(x)))
     }
 
     /// The chain as one affine map, when all its transforms are affine.

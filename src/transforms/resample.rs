@@ -34,7 +34,7 @@ pub fn resample(
             let mut places = [[f64::NAN; LANES]; 3];
             for lane in 0..out.len() {
                 let offset = row * nx + block * LANES + lane;
-                match chain.from_voxel(grid, offset).map(|y| affine.to_voxel(y)).filter(|p| inside(shape, *p)) {
+                match chain.at_voxel(grid, offset).map(|y| affine.to_voxel(y)).filter(|p| inside(shape, *p)) {
                     Some(p) => (0..3).for_each(|a| places[a][lane] = p.0[a]),
                     None => lost += 1,
                 }

@@ -15,7 +15,7 @@ impl AffineMap {
     /// Nothing moves.
     pub const IDENTITY: Self = Self(Affine::IDENTITY);
 
-    /// From the upper three rows of the homogeneous 4 x 4 matrix (the last column is the shift, mm).
+    /// From the upper three rows of the homogeneous matrix (the last column is the shift, mm).
     ///
     /// # Errors
     /// [`SpaceError::Transform`] when an entry is not finite or absurdly large, or the linear part

@@ -384,7 +384,8 @@ fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
 ) -> Result<Vec<Run>, IoError> {
     let name = path.to_string_lossy().to_lowercase();
     let pack = name.ends_with(".nii.gz");
-    if let Some(format) = TextFormat::of(&name).filter(|_| form.frames == 1 && matches!(parts, 1 | 3)) {
+    let text = TextFormat::of(&name);
+    if let Some(format) = text.filter(|_| form.frames == 1 && matches!(parts, 1 | 3)) {
         let Form { datatype, description, .. } = form;
         let number = match datatype {
             2 => Kind::U8,
@@ -398,7 +399,11 @@ fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
         return image.write(path, bytes).map(|()| Vec::new());
     }
     if !pack && !name.ends_with(".nii") {
-        return Err(Flaw::new("only NIfTI can hold it", "end the name in .nii or .nii.gz").at(path));
+        let flaw = match text {
+            Some(_) => Flaw::new("only NIfTI can hold it", "end the name in .nii or .nii.gz"),
+            None => Flaw::new("no format is known by this ending", "end the name in .nii, .nii.gz, .nrrd or .mha"),
+        };
+        return Err(flaw.at(path));
     }
     let header = header(grid, &form).map_err(|flaw| flaw.at(path))?;
     let all = grid.len();

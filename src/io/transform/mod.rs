@@ -102,8 +102,8 @@ const ITK_MAGIC: &[u8] = b"#Insight Transform File";
 /// world points (mm, RAS), initial to deformed.
 ///
 /// `source` says whose it is; without, the file itself must say so, and a text of 4 x 4 numbers is
-/// taken as greedy's. FSL's numbers refer to the grids of the volumes that it led between:
-/// `initial`, needed for its matrices, and `deformed`, for a field the field's own without.
+/// taken as greedy's. FSL's numbers refer to the grids of the volumes that it led between: its
+/// matrices need `initial` and `deformed`, its fields `deformed`.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read, is damaged, 2-D, singular, of a kind that is not read,
@@ -140,6 +140,14 @@ pub fn read_transform(
         }
         Content::Image => {
             let convention = source.map_or(FieldConvention::Lps, TransformSource::convention);
+            if matches!(source, Some(TransformSource::Fsl | TransformSource::FslAbsolute)) && deformed.is_none() {
+                let what = "is a field of FSL, whose numbers refer to the grid of the volume that it leads to";
+                return Err(format(
+                    path,
+                    what,
+                    "name that volume: --deformed (the field's own where both are the same)",
+                ));
+            }
             read_field_as(path, convention, deformed).map(|field| one(Transform::Field(field)))
         }
     }
