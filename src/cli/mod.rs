@@ -37,6 +37,8 @@ mod inputs;
 
 mod invert;
 
+mod kinds;
+
 mod limits;
 
 mod markups;

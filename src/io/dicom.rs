@@ -186,6 +186,7 @@ pub(super) fn series(path: &Path, values: bool) -> Result<(Stored, Vec<f32>), Io
         apart_mm: None,
         grid,
         bytes,
+        description: String::new(),
     };
     Ok((stored, all))
 }

@@ -63,6 +63,8 @@ pub struct Stored {
     pub grid: Grid,
     /// Size of the file with the voxels.
     pub bytes: u64,
+    /// What the header says the image is; empty where it says nothing.
+    pub description: String,
 }
 
 /// What an image file holds, by its header alone.

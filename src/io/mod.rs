@@ -61,6 +61,8 @@ pub mod scratch;
 
 mod live;
 
+mod look;
+
 pub mod memory;
 
 mod atomic;
@@ -90,6 +92,7 @@ pub use image::{
     read_volume_header,
 };
 pub use live::abandon;
+pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
 pub use nifti::{

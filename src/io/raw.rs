@@ -99,6 +99,7 @@ impl RawImage {
             apart_mm: None,
             grid: self.grid,
             bytes: self.file.metadata().map_or(0, |m| m.len()),
+            description: String::new(),
         }
     }
 

@@ -144,7 +144,9 @@ impl Opened {
         let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
         let apart_mm = disagreement(&header, shape);
         let axes = axes[..used].to_vec();
-        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, bytes: self.size }, header.intent))
+        let description = header.description;
+        let stored = Stored { format, datatype, axes, placed, apart_mm, grid, bytes: self.size, description };
+        Ok((stored, header.intent))
     }
 }
 
