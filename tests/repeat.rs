@@ -109,6 +109,8 @@ fn a_field_is_repeated_from_its_summary_alone_from_any_folder() {
     let (_, err) = run(folder.path(), &[&twice[..], &["three"]].concat(), 1);
     assert!(err.contains("not empty"), "{err}");
     run(folder.path(), &[&twice[..], &["three", "--force"]].concat(), 0);
+    let (out, _) = run(folder.path(), &[&twice[..], &["four", "--dry-run"]].concat(), 0);
+    assert!(out.contains("fast, seed 5") && !folder.path().join("four").exists(), "{out}");
 }
 
 #[test]
@@ -124,6 +126,7 @@ fn a_changed_or_missing_input_is_named_and_nothing_is_run() {
     let (_, err) = run(folder.path(), &repeat, 1);
     assert!(err.contains("mask.nii.gz (mask) has changed"), "{err}");
     assert!(err.contains("deformed.nii.gz (deformed) is missing"), "{err}");
+    run(folder.path(), &["field", "--config", "one/summary.json", "-o", "two", "--dry-run"], 1);
     assert!(!err.contains("initial.nii.gz") && !folder.path().join("two").exists(), "{err}");
 }
 

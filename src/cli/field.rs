@@ -7,7 +7,7 @@ use super::inputs::{
 };
 use super::limits::{cap_search, field_fits};
 use super::outputs::{FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
-use super::record::{self, Recording};
+use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::{StrainError, UnknownName};
@@ -181,21 +181,14 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params.bodies = BodySource::Bonded;
     }
     if bodies.is_none() && params.bodies == BodySource::Given {
-        bail!("--config: the run was made with --bodies; give the label map again");
+        let config = tuning.config().map(|c| c.display().to_string()).unwrap_or_default();
+        bail!("{config}: its run was made with --bodies; give the label map again");
     }
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
     let given: Vec<&Path> =
         [initial, deformed].into_iter().chain(mask).chain(bodies).chain(truth).map(PathBuf::as_path).collect();
-    let inputs = record::inputs(&[
-        ("initial", Some(initial)),
-        ("deformed", Some(deformed)),
-        ("mask", mask.as_ref()),
-        ("bodies", bodies.as_ref()),
-        ("truth", truth.as_ref()),
-        ("config", tuning.config()),
-    ]);
     let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
     check_distinct(&given, &target.files(&files))?;
 
@@ -227,7 +220,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
     }
     let mut folder = target.create()?;
-    let record = Recording::start(console, inputs);
+    let record = Recording::start(console, inputs(options));
     let read = started.elapsed().as_secs_f64();
 
     let names = [name(initial), name(deformed), mask.as_deref().map(name).unwrap_or_default()];
@@ -273,6 +266,18 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{summary}{}", target.look()))
+}
+
+/// Everything that is read, for the summary.
+fn inputs(options: &Options) -> Read {
+    record::inputs(&[
+        ("initial", Some(&options.initial)),
+        ("deformed", Some(&options.deformed)),
+        ("mask", options.mask.as_ref()),
+        ("bodies", options.bodies.as_ref()),
+        ("truth", options.truth.as_ref()),
+        ("config", options.tuning.config()),
+    ])
 }
 
 /// The strain of a field, by the labels of the mask.

@@ -21,6 +21,8 @@ struct Again {
     output: PathBuf,
     #[arg(long, alias = "overwrite")]
     force: bool,
+    #[arg(long)]
+    dry_run: bool,
     #[command(flatten)]
     common: Common,
 }
@@ -61,6 +63,9 @@ pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
     arguments.push(format!("--output={}", output.display()));
     if again.force {
         arguments.push(if again.command == "stiffness" { "--overwrite" } else { "--force" }.into());
+    }
+    if again.dry_run {
+        arguments.push("--dry-run".into());
     }
     arguments.extend(again.common.arguments());
     let folder = Path::new(&record.working_folder);
