@@ -284,14 +284,11 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
     if let Some(note) = two_places(&stored) {
         facts.add("note", note.clone(), note.into());
     }
-    if let Some(known) = kinds::image(&stored.description).filter(|_| kind != ImageKind::Scalar) {
-        facts.is(known);
-        return Ok(facts);
-    }
+    let known = kinds::image(&stored.description);
+    let frames = stored.axes.get(3).copied().unwrap_or(1);
     match kind {
         ImageKind::Scalar => {
             let volume = io::read_volume(path)?;
-            let known = kinds::image(&stored.description);
             facts.is(known.unwrap_or(if info::looks_like_labels(&volume) { "label map or mask" } else { "volume" }));
             facts.values(&volume);
             if info::looks_like_labels(&volume) {
@@ -306,6 +303,7 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
                 facts.does(&format!("palpate warp {shown} --field FIELD -o BACK.nii.gz"));
             }
         }
+        ImageKind::Field if known.is_some() => facts.is(known.unwrap_or_default()),
         ImageKind::Field => {
             facts.is("displacement field");
             match io::read_field(path) {
@@ -327,18 +325,23 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
             facts.values(&series.read(0)?);
             facts.does(&format!("palpate track {shown} -o TRACKED"));
         }
+        ImageKind::Fields if known.is_some() => {
+            facts.is(known.unwrap_or_default());
+            facts.add("frames", frames.to_string(), frames.into());
+        }
         ImageKind::Fields => {
             facts.is("series of displacement fields");
-            let frames = stored.axes.get(3).copied().unwrap_or(1);
             facts.add("frames", frames.to_string(), frames.into());
             facts.does(
                 "palpate stiffness --sequence TRACKED -o STIFFNESS    # with the folder that palpate track wrote",
             );
         }
         ImageKind::Tensors => {
-            facts.is("symmetric tensors, such as strain");
-            facts.add("components", "xx xy yy xz yz zz, axes LPS".into(), 6.into());
+            facts.is(known.unwrap_or("symmetric tensors, such as strain"));
+            let words = "xx xy yy xz yz zz of symmetric tensors, axes LPS";
+            facts.add("components", words.into(), 6.into());
         }
+        ImageKind::Other if known.is_some() => facts.is(known.unwrap_or_default()),
         ImageKind::Other => {
             facts.is("image of another kind");
             let shape = times(stored.grid.shape());
