@@ -564,8 +564,7 @@ fn volumes_in_unlike_units_are_refused_before_any_work() {
         assert!(err.contains(message), "{message}: {err}");
     }
     // A part of the other volume has as large voxels, but fewer.
-    let (_, err) = run(folder.path(), &["field", "mm.nii", "crop.nii", "-o", "out", "--dry-run"], 1);
-    assert!(!err.contains("times as long"), "{err}");
+    run(folder.path(), &["field", "mm.nii", "crop.nii", "-o", "out", "--dry-run"], 0);
     assert!(!folder.path().join("out").exists());
 }
 

@@ -409,6 +409,7 @@ fn a_field_run_takes_nrrd_and_gives_the_same_as_nifti() {
     }
     let read = |run: &str| io::read_field(folder.path().join(run).join("displacement.nii.gz")).unwrap();
     close(&read("one"), &read("two"), 1e-6);
-    let folder_as_volume = palpate(folder.path()).args(["info", "."]).output().unwrap();
+    fs::create_dir(folder.path().join("empty")).unwrap();
+    let folder_as_volume = palpate(folder.path()).args(["info", "empty"]).output().unwrap();
     assert_eq!(folder_as_volume.status.code(), Some(1));
 }

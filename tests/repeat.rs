@@ -109,6 +109,8 @@ fn a_field_is_repeated_from_its_summary_alone_from_any_folder() {
     let (_, err) = run(folder.path(), &[&twice[..], &["three"]].concat(), 1);
     assert!(err.contains("not empty"), "{err}");
     run(folder.path(), &[&twice[..], &["three", "--force"]].concat(), 0);
+    let (out, _) = run(folder.path(), &[&twice[..], &["four", "--dry-run"]].concat(), 0);
+    assert!(out.contains("fast, seed 5") && !folder.path().join("four").exists(), "{out}");
 }
 
 #[test]
@@ -124,6 +126,7 @@ fn a_changed_or_missing_input_is_named_and_nothing_is_run() {
     let (_, err) = run(folder.path(), &repeat, 1);
     assert!(err.contains("mask.nii.gz (mask) has changed"), "{err}");
     assert!(err.contains("deformed.nii.gz (deformed) is missing"), "{err}");
+    run(folder.path(), &["field", "--config", "one/summary.json", "-o", "two", "--dry-run"], 1);
     assert!(!err.contains("initial.nii.gz") && !folder.path().join("two").exists(), "{err}");
 }
 
@@ -131,7 +134,10 @@ fn a_changed_or_missing_input_is_named_and_nothing_is_run() {
 fn other_commands_are_repeated_in_the_same_way() {
     let folder = data();
     run(folder.path(), &FIELD, 0);
-    let commands: [&[&str]; 2] = [
+    run(folder.path(), &["phantom", "fingertip", "--size", "28", "--seed", "2", "--amplitude", "1.5", "-o", "pad"], 0);
+    let commands: [&[&str]; 3] = [
+        // --force has a value here.
+        &["stiffness", "--field", "pad", "--labels", "pad", "--nodes", "1500", "--force", "1.5"],
         &["strain", "one", "--labels", "one", "--gauge", "9"],
         &["track", "data/initial.nii.gz", "data/deformed.nii.gz", "--mask", "data", "--preset", "fast"],
     ];
@@ -159,6 +165,8 @@ fn a_summary_that_does_not_say_how_is_refused_in_words() {
     fs::write(folder.path().join("old.json"), r#"{"version": "0.1.0", "command": "field", "params": {}}"#).unwrap();
     let (_, err) = run(folder.path(), &["field", "--config", "old.json", "-o", "x"], 1);
     assert!(err.contains("old.json: does not tell the command line"), "{err}");
+    let (_, err) = run(folder.path(), &["strain", "--config", "gone.json", "-o", "x"], 1);
+    assert!(err.contains("gone.json: cannot read"), "{err}");
     // Parameters alone are no run.
     fs::write(folder.path().join("fast.toml"), "preset = \"fast\"\n").unwrap();
     let (_, err) = run(folder.path(), &["field", "--config", "fast.toml", "-o", "x"], 2);

@@ -96,7 +96,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             batch.run(jobs.min(pairs.len()))?
         }
     };
-    write(output, &outcomes, &record.finish()?)?;
+    write(output, &outcomes, &record.finish())?;
     for o in outcomes.iter().filter(|o| o.status == Status::Failed) {
         console.warn(&format!("{} failed at {}: {}", o.name, o.stage, o.reason));
     }

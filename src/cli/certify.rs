@@ -86,7 +86,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         detectable: &|at| found.detectable.as_slice()[at],
         certificate: &found.certificate,
     };
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("certificate.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     let said = "palpate: smallest displacement told from noise, mm";
     folder.write("detectable.nii.gz", |p| io::write_volume(p, &found.detectable, said))?;

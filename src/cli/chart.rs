@@ -208,7 +208,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("chart.csv", |p| io::write_trials(p, &trials))?;
     folder.write("chart.svg", |p| io::write_text(p, &report::svg(&groups, &trials)))?;
     let seconds = started.elapsed().as_secs_f64();
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("summary.json", |p| io::write_json(p, &in_summary(report::summary(&groups, seconds), &record)))?;
     folder.write("chart.html", |p| io::write_text(p, &on_page(report::page(&groups, &trials), &record)))?;
     folder.commit()?;

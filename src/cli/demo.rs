@@ -138,7 +138,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let summary = json!({
         "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": FILES,
     });
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("chain.csv", |p| io::write_chain(p, &rows))?;
     folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
     folder.write("report.html", |p| io::write_text(p, &on_page(page(&rows, &parts), &record)))?;

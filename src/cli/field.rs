@@ -6,7 +6,7 @@ use super::inputs::{Part, check_distinct, name, read_labels, read_volume, same_f
 use super::known::{Knowledge, mask_on};
 use super::limits::{cap_search, field_fits};
 use super::outputs::{AFFINE_FILE, FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
-use super::record::{self, Recording};
+use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::{StrainError, UnknownName};
@@ -195,20 +195,13 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params.bodies = BodySource::Bonded;
     }
     if bodies.is_none() && params.bodies == BodySource::Given {
-        bail!("--config: the run was made with --bodies; give the label map again");
+        let config = tuning.config().map(|c| c.display().to_string()).unwrap_or_default();
+        bail!("{config}: its run was made with --bodies; give the label map again");
     }
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
-    let mut inputs = record::inputs(&[
-        ("initial", Some(initial)),
-        ("deformed", Some(deformed)),
-        ("mask", mask.as_ref()),
-        ("bodies", bodies.as_ref()),
-        ("truth", truth.as_ref()),
-        ("config", tuning.config()),
-    ]);
-    inputs.extend(knowledge.inputs());
+    let inputs = inputs(options);
     let given: Vec<&Path> = inputs.iter().map(|(_, path)| path.as_path()).collect();
     let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
     check_distinct(&given, &target.files(&files))?;
@@ -289,6 +282,20 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{summary}{}", target.look()))
+}
+
+/// Everything that is read, for the summary.
+fn inputs(options: &Options) -> Read {
+    let mut all = record::inputs(&[
+        ("initial", Some(&options.initial)),
+        ("deformed", Some(&options.deformed)),
+        ("mask", options.mask.as_ref()),
+        ("bodies", options.bodies.as_ref()),
+        ("truth", options.truth.as_ref()),
+        ("config", options.tuning.config()),
+    ]);
+    all.extend(options.knowledge.inputs());
+    all
 }
 
 /// The strain of a field, by the labels of the mask.

@@ -101,7 +101,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         seconds: &seconds,
         warnings: &notes,
     };
-    let record = record.finish()?;
+    let record = record.finish();
     let told = in_summary(grasp::summary(&report), &record);
     folder.write("summary.json", |p| io::write_json(p, &told))?;
     folder.write("report.html", |p| io::write_text(p, &on_page(grasp::page(&report), &record)))?;

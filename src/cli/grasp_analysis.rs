@@ -46,7 +46,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let pushed = pipeline::grasp::pushed(&file.scene);
     let report =
         AnalysisReport { name: &name, scene: &file.scene, pushed: &pushed, analysis: &analysis, seconds: &seconds };
-    let record = record.finish()?;
+    let record = record.finish();
     let told = in_summary(grasp_analysis::summary(&report), &record);
     folder.write("summary.json", |p| io::write_json(p, &told))?;
     let page = grasp_analysis::page(&report)?;

@@ -3,20 +3,23 @@
 use super::console::Console;
 use super::dry_run::times;
 use super::inputs::{name, two_places};
+use super::kinds;
 use anyhow::{Result, bail};
 use clap::Args;
-use palpate::io::{self, ImageKind, SceneOverrides, Series, TableKind};
+use palpate::io::{self, Form, ImageKind, SceneOverrides, Series, TableKind};
 use palpate::pipeline::plan::memory;
 use palpate::report::info::{self, Facts};
-use palpate::report::scale::thousands;
+use palpate::report::record::command_line;
+use palpate::report::scale::{significant, thousands};
 use palpate::transforms::Chain;
+use palpate::types::record::RunRecord;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Volumes, fields, label maps, transforms, tables of points, scenes, summary.json, or a folder
-    /// of palpate or of a DICOM series
+    /// Whatever palpate reads or writes: volumes, fields, label maps, transforms, tables, meshes,
+    /// scenes, summary.json, or a folder of palpate or of a DICOM series
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// JSON instead of text
@@ -46,31 +49,24 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 }
 
 fn facts(path: &Path) -> Result<Facts> {
-    let (called, shown) = (name(path), path.display());
+    let called = name(path);
     let lower = called.to_lowercase();
     let mut facts = Facts::new(&called);
-    if path.is_dir() && path.join("summary.json").is_file() {
-        let summary = io::read_json(path.join("summary.json"))?;
-        facts.is(&format!("results of palpate {}", command(&summary)));
-        of_summary(&mut facts, &summary, &path.join("summary.json"), path);
-    } else if lower.ends_with(".toml") {
+    if path.is_dir() {
+        return of_folder(facts, path);
+    }
+    if lower.ends_with(".toml") {
         of_toml(&mut facts, path)?;
     } else if lower.ends_with(".json") && !lower.ends_with(".mrk.json") {
-        let summary = io::read_json(path)?;
-        if summary.get("markups").is_some() {
-            return of_table(facts, path);
-        }
-        if summary.get("version").is_none() || summary.get("command").is_none() {
-            bail!("{shown}: is JSON, but no summary of palpate; nothing can be done with it");
-        }
-        facts.is(&format!("summary of palpate {}", command(&summary)));
-        of_summary(&mut facts, &summary, path, path.parent().unwrap_or(Path::new("")));
+        return of_json(facts, path);
     } else if [".csv", ".fcsv", ".mrk.json"].iter().any(|e| lower.ends_with(e)) {
         return of_table(facts, path);
-    } else if [".tfm", ".mat", ".txt", ".h5"].iter().any(|e| lower.ends_with(e)) {
+    } else if lower.ends_with(".log") {
+        facts.is("log of a stage of palpate batch");
+    } else if [".tfm", ".mat", ".txt", ".h5"].iter().any(|e| lower.ends_with(e)) && !of_elastix(path) {
         of_transform(&mut facts, path)?;
     } else {
-        return of_image(facts, path);
+        return of_form(facts, path);
     }
     Ok(facts)
 }
@@ -79,26 +75,94 @@ fn command(summary: &Value) -> &str {
     summary.get("command").and_then(Value::as_str).unwrap_or("stiffness")
 }
 
+/// A folder: results by their summary, a phantom, a pair of a batch, or a DICOM series.
+fn of_folder(mut facts: Facts, path: &Path) -> Result<Facts> {
+    let told = ["summary.json", "certificate.json"].map(|file| path.join(file)).into_iter().find(|f| f.is_file());
+    if let Some(told) = told {
+        let summary = io::read_json(&told)?;
+        facts.is(&format!("results of palpate {}", command(&summary)));
+        of_summary(&mut facts, &summary, &told, path);
+    } else if path.join("phantom.json").is_file() {
+        facts.is("phantom of palpate");
+        of_phantom(&mut facts, &io::read_json(path.join("phantom.json"))?);
+        let folder = path.display();
+        if path.join("initial.nii.gz").is_file() {
+            facts.does(&format!("palpate field {folder} {folder} --mask {folder} --truth {folder} -o FIELD"));
+            facts.does(&format!("palpate evaluate FIELD --truth {folder} --mask {folder}"));
+        } else {
+            facts.does(&format!("palpate track {folder}/frame_*.nii.gz -o TRACKED"));
+        }
+    } else if path.join("pair.json").is_file() {
+        facts.is("pair of palpate batch");
+    } else {
+        return of_image(facts, path);
+    }
+    Ok(facts)
+}
+
+fn of_json(mut facts: Facts, path: &Path) -> Result<Facts> {
+    let told = io::read_json(path)?;
+    if told.get("markups").is_some() {
+        return of_table(facts, path);
+    }
+    if told.get("version").is_some() && told.get("command").is_some() {
+        facts.is(&format!("summary of palpate {}", command(&told)));
+        of_summary(&mut facts, &told, path, path.parent().unwrap_or(Path::new("")));
+    } else if told.get("noise_sigma").is_some() && told.get("mean_mm").is_some() {
+        facts.is("description of a phantom");
+        of_phantom(&mut facts, &told);
+    } else if told["stages"].is_array() {
+        facts.is("record of a pair of palpate batch");
+    } else {
+        bail!("{}: is JSON, but no summary of palpate; nothing can be done with it", path.display());
+    }
+    Ok(facts)
+}
+
+fn of_phantom(facts: &mut Facts, told: &Value) {
+    // Those of a sequence stand under `params`.
+    let of = |key: &str| if told[key].is_null() { told["params"][key].clone() } else { told[key].clone() };
+    for key in ["kind", "motion", "amplitude", "seed"] {
+        let value = of(key);
+        if !value.is_null() {
+            facts.add(if key == "kind" { "body" } else { key }, value.to_string().trim_matches('"').into(), value);
+        }
+    }
+}
+
 fn of_summary(facts: &mut Facts, summary: &Value, path: &Path, folder: &Path) {
     if let Some(inputs) = summary.get("inputs") {
         facts.add("inputs", inputs.to_string(), inputs.clone());
     }
+    for (key, words) in [("version", "version"), ("date", "date"), ("trust", "trust"), ("headline", "headline")] {
+        if let Some(text) = summary[key].as_str() {
+            facts.add(words, text.into(), text.into());
+        }
+    }
+    let command = command(summary);
+    if let Ok(record) = serde_json::from_value::<RunRecord>(summary.clone()) {
+        facts.add("command line", command_line(&record), record.command_line.into());
+        facts.does(&format!("palpate {command} --config {} -o AGAIN    # the same run", path.display()));
+    }
     if summary.get("params").is_some() {
         facts.does(&format!("palpate field INITIAL DEFORMED -o AGAIN --config {}", path.display()));
     }
-    match command(summary) {
+    let folder = folder.display();
+    match command {
         "field" | "demo" => {
-            let field = folder.join("displacement.nii.gz");
-            facts.does(&format!("palpate strain {} -o STRAIN", folder.display()));
-            facts.does(&format!("palpate stiffness --field {} --labels LABELS -o STIFFNESS", field.display()));
+            facts.does(&format!("palpate strain {folder} -o STRAIN"));
+            facts.does(&format!("palpate stiffness --field {folder} --labels LABELS -o STIFFNESS"));
+            facts.does(&format!("palpate evaluate {folder} --landmarks LANDMARKS"));
         }
-        "stiffness" => facts.does(&format!("palpate fingertip {} -o FINGERTIP.toml", folder.display())),
+        "track" => facts.does(&format!("palpate stiffness --sequence {folder} --labels LABELS -o STIFFNESS")),
+        "stiffness" => facts.does(&format!("palpate fingertip {folder} -o FINGERTIP.toml")),
         _ => {}
     }
 }
 
 fn of_toml(facts: &mut Facts, path: &Path) -> Result<()> {
     let (grasp, skin) = (io::read_scene(path, &SceneOverrides::default()), io::read_skin_scene(path));
+    let tip = io::read_fingertip_press(path);
     match (grasp, skin, io::read_config(path)) {
         (Ok(scene), ..) => {
             facts.is("grasp scene");
@@ -111,6 +175,15 @@ fn of_toml(facts: &mut Facts, path: &Path) -> Result<()> {
             facts.is("skin scene");
             facts.add("layers", scene.layers.len().to_string(), scene.layers.len().into());
             facts.does(&format!("palpate skin {} -o SKIN", path.display()));
+        }
+        _ if tip.is_ok() => {
+            facts.is("fingertip for a grasp scene");
+            let kpa = 1e-3 * io::read_fingertip_modulus(path)?;
+            facts.add("modulus", format!("{} kPa", significant(kpa)), kpa.into());
+            facts.does(&format!(
+                "palpate grasp SCENE.toml -o GRASP    # with [fingertip] file = \"{}\"",
+                path.display()
+            ));
         }
         (.., Ok(params)) => {
             facts.is("parameters of a field run");
@@ -125,6 +198,11 @@ fn of_toml(facts: &mut Facts, path: &Path) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Whether a file is a transform of elastix, which is known but not read.
+fn of_elastix(path: &Path) -> bool {
+    matches!(io::form_of(path), Ok(Form::Transform("elastix")))
 }
 
 /// Affine transforms, and chains of them and of fields.
@@ -148,6 +226,23 @@ fn of_transform(facts: &mut Facts, path: &Path) -> Result<()> {
 
 fn of_table(mut facts: Facts, path: &Path) -> Result<Facts> {
     let shown = path.display();
+    let slicer = io::is_slicer(path);
+    if slicer {
+        facts.add("format", "point list of 3D Slicer".into(), "Slicer".into());
+    } else {
+        let (columns, rows) = io::columns_of(path)?;
+        let known = kinds::table(&columns);
+        if known.is_some() || io::table_kind(path).is_err() {
+            let (kind, command) = known.unwrap_or(("table", ""));
+            facts.is(kind);
+            facts.add("lines", thousands(rows), rows.into());
+            facts.add("columns", columns.join(", "), columns.into());
+            if !command.is_empty() {
+                facts.does(&command.replace("FILE", &shown.to_string()));
+            }
+            return Ok(facts);
+        }
+    }
     match io::table_kind(path)? {
         TableKind::Matches => {
             facts.is("matches");
@@ -163,7 +258,7 @@ fn of_table(mut facts: Facts, path: &Path) -> Result<Facts> {
             facts.is("landmarks");
             let initial: Vec<_> = io::read_landmarks(path)?.iter().map(|l| l.initial).collect();
             facts.bounds(&initial);
-            facts.does(&format!("palpate evaluate FIELD --truth TRUTH --landmarks {shown}"));
+            facts.does(&format!("palpate evaluate FIELD --landmarks {shown}"));
             facts.does(&format!("palpate markups {shown} -o LANDMARKS.mrk.json"));
         }
         TableKind::Points => {
@@ -175,9 +270,36 @@ fn of_table(mut facts: Facts, path: &Path) -> Result<Facts> {
     Ok(facts)
 }
 
+/// Files that are known by their first bytes; what is left is an image.
+fn of_form(mut facts: Facts, path: &Path) -> Result<Facts> {
+    match io::form_of(path)? {
+        Form::Page => facts.is("page, for a browser"),
+        Form::Drawing => facts.is("drawing, for a browser"),
+        Form::Mesh { points, cells, data } => {
+            let modulus = data.iter().any(|name| name == "youngs_modulus");
+            let matches = data.iter().any(|name| name == "raw_displacement");
+            facts.is(match (modulus, matches) {
+                (true, _) => "mesh of a stiffness map",
+                (_, true) => "mesh of a field's matches",
+                _ => "mesh of VTK",
+            });
+            facts.add("points", thousands(points), points.into());
+            facts.add("cells", thousands(cells), cells.into());
+            facts.add("data", data.join(", "), data.into());
+        }
+        Form::Model(program) => facts.is(&format!("finite element model for {program}")),
+        Form::Transform(program) => facts.is(&format!("transform of {program}")),
+        Form::Other => return of_image(facts, path),
+    }
+    Ok(facts)
+}
+
 fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
     let (stored, kind) = io::read_header(path)?;
     let shown = path.display();
+    if !stored.description.is_empty() {
+        facts.add("description", stored.description.clone(), stored.description.clone().into());
+    }
     facts.add("format", format!("{}, {}", stored.format, stored.datatype), stored.format.into());
     facts.add("datatype", String::new(), stored.datatype.into());
     let axes: Vec<String> = stored.axes.iter().map(ToString::to_string).collect();
@@ -188,16 +310,18 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
     if let Some(note) = two_places(&stored) {
         facts.add("note", note.clone(), note.into());
     }
+    let known = kinds::image(&stored.description);
+    let frames = stored.axes.get(3).copied().unwrap_or(1);
     match kind {
         ImageKind::Scalar => {
             let volume = io::read_volume(path)?;
-            facts.is(if info::looks_like_labels(&volume) { "label map or mask" } else { "volume" });
+            facts.is(known.unwrap_or(if info::looks_like_labels(&volume) { "label map or mask" } else { "volume" }));
             facts.values(&volume);
             if info::looks_like_labels(&volume) {
                 facts.does(&format!("palpate field INITIAL DEFORMED --mask {shown} -o DIR"));
                 facts.does(&format!("palpate stiffness --field FIELD --labels {shown} -o STIFFNESS"));
                 facts.does(&format!("palpate warp {shown} --field FIELD -o BACK.nii.gz"));
-            } else {
+            } else if known.is_none() {
                 let memory = memory(&stored.grid, &stored.grid) / 1_000_000;
                 facts.does(&format!(
                     "palpate field {shown} DEFORMED -o DIR    # about {memory} MB for two of this size"
@@ -205,6 +329,7 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
                 facts.does(&format!("palpate warp {shown} --field FIELD -o BACK.nii.gz"));
             }
         }
+        ImageKind::Field if known.is_some() => facts.is(known.unwrap_or_default()),
         ImageKind::Field => {
             facts.is("displacement field");
             match io::read_field(path) {
@@ -226,18 +351,23 @@ fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
             facts.values(&series.read(0)?);
             facts.does(&format!("palpate track {shown} -o TRACKED"));
         }
+        ImageKind::Fields if known.is_some() => {
+            facts.is(known.unwrap_or_default());
+            facts.add("frames", frames.to_string(), frames.into());
+        }
         ImageKind::Fields => {
             facts.is("series of displacement fields");
-            let frames = stored.axes.get(3).copied().unwrap_or(1);
             facts.add("frames", frames.to_string(), frames.into());
             facts.does(
                 "palpate stiffness --sequence TRACKED -o STIFFNESS    # with the folder that palpate track wrote",
             );
         }
         ImageKind::Tensors => {
-            facts.is("symmetric tensors, such as strain");
-            facts.add("components", "xx xy yy xz yz zz, axes LPS".into(), 6.into());
+            facts.is(known.unwrap_or("symmetric tensors, such as strain"));
+            let words = "xx xy yy xz yz zz of symmetric tensors, axes LPS";
+            facts.add("components", words.into(), 6.into());
         }
+        ImageKind::Other if known.is_some() => facts.is(known.unwrap_or_default()),
         ImageKind::Other => {
             facts.is("image of another kind");
             let shape = times(stored.grid.shape());

@@ -6,7 +6,7 @@ use super::inputs::name;
 use anyhow::{Result, bail};
 use palpate::io;
 use palpate::pipeline::plan::{memory, stiffness_memory};
-use palpate::report::scale::significant;
+use palpate::report::scale::short;
 use palpate::types::{FieldParams, Grid};
 use std::path::Path;
 use std::process::exit;
@@ -20,8 +20,8 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
-/// Refuses, before their voxels are read, two volumes of which one is likely in another unit, or that
-/// need more memory for a field run than is left.
+/// Refuses, before their voxels are read, two volumes of which one is likely in another unit, or
+/// that need more memory for a field run than is left.
 pub fn field_fits(initial: &Path, deformed: &Path) -> Result<()> {
     // A header that cannot be read is reported by who reads the whole.
     let (Ok((a, _)), Ok((b, _))) = (io::read_header(initial), io::read_header(deformed)) else { return Ok(()) };
@@ -40,8 +40,8 @@ const ABOUT: f64 = 0.1;
 /// Ratio of the numbers of voxels along a side up to which two volumes may show the same part.
 const ALIKE: f64 = 2.5;
 
-/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10, 100
-/// or 1000: their units differ, or one has lost its header.
+/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10,
+/// 100 or 1000: their units differ, or one has lost its header.
 pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
     let (small, large) =
         if longest(a) < longest(b) { ((initial, a), (deformed, b)) } else { ((deformed, b), (initial, a)) };
@@ -63,27 +63,27 @@ pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) ->
         None => format!("one of them is likely in {unit}"),
     };
     bail!(
-        "{}: its longest side is {} mm, that of {} is {} mm, about {} times as long; {cause}; correct the voxel size in that header, or \
-         crop the larger volume if both are right",
+        "{}: its longest side is {} mm, and that of {} is {} mm, about {} times as long; {cause}; correct the voxel size \
+         in its header, or crop the larger volume",
         small.0.display(),
-        significant(longest(small.1)),
+        short(longest(small.1)),
         large.0.display(),
-        significant(longest(large.1)),
+        short(longest(large.1)),
         10f64.powf(log.round())
     );
 }
 
-/// Caps the search at the longest side of the volume at `path`, on `grid`: tissue that moves farther is
-/// nowhere in it. Says so where that is less than was asked for.
+/// Caps the search at the longest side of the volume at `path`, on `grid`: tissue that moves farther
+/// is nowhere in it. Says so where that is less than was asked for.
 pub fn cap_search(params: &mut FieldParams, grid: &Grid, path: &Path) -> Option<String> {
     let (asked, most) = (params.search_mm, longest(grid));
     (asked > most).then(|| {
         params.search_mm = most;
         format!(
             "--search {} mm is more than the longest side of {}; {} mm is taken",
-            significant(asked),
+            short(asked),
             name(path),
-            significant(most)
+            short(most)
         )
     })
 }

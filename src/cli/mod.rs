@@ -41,6 +41,8 @@ mod inputs;
 
 mod invert;
 
+mod kinds;
+
 mod known;
 
 mod limits;

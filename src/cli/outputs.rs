@@ -218,7 +218,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         || html::page(&report),
     );
     written?;
-    let record = record.finish()?;
+    let record = record.finish();
     let page = on_page(page?, &record);
     folder.write("report.html", |p| io::write_text(p, &page))?;
     writing += started.elapsed();

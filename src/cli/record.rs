@@ -1,8 +1,6 @@
 //! What a run was asked for and has read, for its summary and its page.
 
 use super::console::Console;
-use anyhow::Result;
-use palpate::error::IoError;
 use palpate::io;
 use palpate::types::record::{InputFile, RunRecord, rfc3339};
 use std::path::{PathBuf, absolute};
@@ -21,7 +19,7 @@ pub fn inputs(known: &[(&'static str, Option<&PathBuf>)]) -> Read {
 pub struct Recording {
     record: RunRecord,
     inputs: Read,
-    hashing: Option<JoinHandle<Result<Vec<InputFile>, IoError>>>,
+    hashing: Option<JoinHandle<Vec<InputFile>>>,
 }
 
 impl Recording {
@@ -42,24 +40,22 @@ impl Recording {
     }
 
     /// The whole record.
-    ///
-    /// # Errors
-    /// When an input can no longer be read.
-    pub fn finish(self) -> Result<RunRecord> {
+    pub fn finish(self) -> RunRecord {
         let done = self.hashing.and_then(|thread| thread.join().ok());
-        let files = done.unwrap_or_else(|| hashed(&self.inputs))?;
-        Ok(RunRecord { files, ..self.record })
+        let files = done.unwrap_or_else(|| hashed(&self.inputs));
+        RunRecord { files, ..self.record }
     }
 }
 
-fn hashed(inputs: &Read) -> Result<Vec<InputFile>, IoError> {
-    let mut out = Vec::new();
-    for (role, path) in inputs {
-        for file in io::files_of(path) {
-            let (bytes, sha256) = io::digest(&file)?;
+/// The files of `inputs`. One that is gone by now has no hash: results are not lost for that.
+fn hashed(inputs: &Read) -> Vec<InputFile> {
+    let of = |(role, path): &(&'static str, PathBuf)| {
+        let one = |file: PathBuf| {
+            let (bytes, sha256) = io::digest(&file).unwrap_or_default();
             let path = absolute(&file).unwrap_or(file).display().to_string();
-            out.push(InputFile { role: (*role).into(), path, bytes, sha256 });
-        }
-    }
-    Ok(out)
+            InputFile { role: (*role).into(), path, bytes, sha256 }
+        };
+        io::files_of(path).into_iter().map(one).collect::<Vec<_>>()
+    };
+    inputs.iter().flat_map(of).collect()
 }

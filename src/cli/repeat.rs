@@ -21,12 +21,20 @@ struct Again {
     output: PathBuf,
     #[arg(long, alias = "overwrite")]
     force: bool,
+    #[arg(long)]
+    dry_run: bool,
     #[command(flatten)]
     common: Common,
 }
 
-/// Flags that are not those of the run: where results go, and what is said.
-const OWN: [&str; 6] = ["--force", "--overwrite", "--quiet", "--verbose", "-v", "--dry-run"];
+/// Flags that are not those of the run: what is said.
+const SAID: [&str; 4] = ["--quiet", "--verbose", "-v", "--dry-run"];
+
+/// The flag with which a command writes into a folder that is not empty.
+fn overwrites(command: &str) -> &'static str {
+    // --force is a force there.
+    if command == "stiffness" { "--overwrite" } else { "--force" }
+}
 
 /// A run to be made again.
 pub struct Repeated {
@@ -44,7 +52,11 @@ pub struct Repeated {
 pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
     let Ok(again) = Again::try_parse_from(arguments) else { return Ok(None) };
     let (config, shown) = (&again.config, again.config.display());
-    let Some(summary) = io::read_json(config).ok().filter(|s| s["command"].is_string()) else { return Ok(None) };
+    let summary = match io::read_json(config) {
+        Ok(summary) if summary["command"].is_string() => summary,
+        Err(error) if config.extension().is_some_and(|e| e == "json") => return Err(error.into()),
+        _ => return Ok(None),
+    };
     if summary["command"] != again.command.as_str() {
         let command = summary["command"].as_str().unwrap_or_default();
         bail!(Usage(format!(
@@ -56,11 +68,15 @@ pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
     check(&record.files).with_context(|| format!("{shown}: its run cannot be repeated"))?;
 
     let output = absolute(&again.output).unwrap_or(again.output);
-    let mut arguments: Vec<String> =
-        record.command_line.iter().filter(|a| !OWN.contains(&a.as_str())).cloned().collect();
+    let overwrite = overwrites(&again.command);
+    let mut arguments = record.command_line.clone();
+    arguments.retain(|a| a != overwrite && !SAID.contains(&a.as_str()));
     arguments.push(format!("--output={}", output.display()));
     if again.force {
-        arguments.push(if again.command == "stiffness" { "--overwrite" } else { "--force" }.into());
+        arguments.push(overwrite.into());
+    }
+    if again.dry_run {
+        arguments.push("--dry-run".into());
     }
     arguments.extend(again.common.arguments());
     let folder = Path::new(&record.working_folder);

@@ -44,7 +44,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         warnings: &warnings,
     };
     folder.write("response.csv", |p| io::write_response(p, &scene, &outcome.column))?;
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     folder.write("report.html", |p| io::write_text(p, &on_page(page(&report), &record)))?;
     folder.commit()?;

@@ -249,7 +249,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         load: options.load.clone(),
     };
     write(&mut folder, &mut result)?;
-    let record = record.finish()?;
+    let record = record.finish();
     let told = in_summary(report::summary(&result, &names), &record);
     folder.write("summary.json", |p| io::write_json(p, &told))?;
     let page = report::page(&result, &names, &report::Shown { field: Some(&field), images: &images })?;

@@ -104,7 +104,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     };
     let mut summary = report::summary(&shared.result, &names);
     summary["sequence"] = report::sequence_summary(&shared);
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
     let page = report::sequence_page(&shared, &names, &report::Shown { field: None, images: &images })?;
     folder.write("report.html", |p| io::write_text(p, &on_page(page, &record)))?;

@@ -165,7 +165,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let called = name(path);
     let report = maps.report(&called, (&source.field, &tissue), source.image.as_ref());
     let html = page(&report)?;
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("report.html", |p| io::write_text(p, &on_page(html, &record)))?;
     folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     folder.commit()?;

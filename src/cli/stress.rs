@@ -113,7 +113,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("stress.csv", |p| io::write_stress(p, &curves))?;
     folder.write("stress.svg", |p| io::write_text(p, &report::svg(&curves)))?;
     let seconds = started.elapsed().as_secs_f64();
-    let record = record.finish()?;
+    let record = record.finish();
     let told = in_summary(report::summary(&curves, field.as_ref(), seconds), &record);
     folder.write("summary.json", |p| io::write_json(p, &told))?;
     let page = on_page(report::page(&curves, field.as_ref()), &record);

@@ -309,7 +309,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         warnings: &warnings,
         seconds: &seconds,
     };
-    let record = record.finish()?;
+    let record = record.finish();
     folder.write("report.html", |p| io::write_text(p, &on_page(page(&report), &record)))?;
     folder.write("summary.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
     folder.commit()?;

@@ -19,8 +19,8 @@ use rayon::prelude::*;
 /// grid the field's edge value counts.
 ///
 /// # Errors
-/// [`FieldError::Volume`] when the maps share no label, or the field is no number where the initial map
-/// lies.
+/// [`FieldError::Volume`] when the maps share no label, or the field is no number where the initial
+/// map lies.
 pub fn label_scores(field: &DenseField, initial: &Mask, deformed: &Mask) -> Result<LabelScores, FieldError> {
     let grid = initial.grid();
     let place = |at: usize| {

@@ -145,11 +145,12 @@ pub fn distances(values: &mut [f64]) -> Distances {
     }
 }
 
-/// Target registration error of `field` (on any grid) at `marks` (world mm, RAS), and the same without
-/// registration. Beyond its grid the field's edge value counts.
+/// Target registration error of `field` (on any grid) at `marks` (world mm, RAS), and the same
+/// without registration. Beyond its grid the field's edge value counts.
 ///
 /// # Errors
-/// [`FieldError::TooFew`] without a landmark, [`FieldError::Volume`] when the field is no number at one.
+/// [`FieldError::TooFew`] without a landmark, [`FieldError::Volume`] when the field is no number at
+/// one.
 pub fn target_error(field: &DenseField, marks: &[Landmark]) -> Result<TargetError, FieldError> {
     if marks.is_empty() {
         return Err(FieldError::TooFew { found: 0, what: "landmarks", needed: 1, hint: "give one at least".into() });

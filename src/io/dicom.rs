@@ -187,6 +187,7 @@ pub(super) fn series(path: &Path, values: bool) -> Result<(Stored, Vec<f32>), Io
         labels: false,
         grid,
         bytes,
+        description: String::new(),
     };
     Ok((stored, all))
 }

@@ -65,6 +65,8 @@ pub struct Stored {
     pub labels: bool,
     /// Size of the file with the voxels.
     pub bytes: u64,
+    /// What the header says the image is; empty where it says nothing.
+    pub description: String,
 }
 
 /// What an image file holds, by its header alone.

@@ -65,6 +65,8 @@ pub mod scratch;
 
 mod live;
 
+mod look;
+
 pub mod memory;
 
 mod atomic;
@@ -94,6 +96,7 @@ pub use image::{
     read_volume_header,
 };
 pub use live::abandon;
+pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
 pub use nifti::{

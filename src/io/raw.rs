@@ -100,6 +100,7 @@ impl RawImage {
             labels: false,
             grid: self.grid,
             bytes: self.file.metadata().map_or(0, |m| m.len()),
+            description: String::new(),
         }
     }
 

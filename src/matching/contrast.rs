@@ -157,6 +157,7 @@ fn rising(share: &[f64; BINS], mean: &[f64; BINS]) -> [f64; BINS] {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::numerics::random::Random;
 

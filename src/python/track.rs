@@ -3,6 +3,7 @@
 use super::arrays::{self, Callback, Image, told};
 use super::field::{kept_field, params};
 use crate::error::FieldError;
+use crate::pipeline::known::Known;
 use crate::pipeline::track::{Frame, run};
 use crate::report::film::Film;
 use crate::report::track::{TrackReport, summary};
@@ -55,7 +56,7 @@ pub fn track<'py>(
         run(
             (frames, reference),
             &all[reference],
-            (mask.as_ref(), labels.as_ref()),
+            (&Known::mask(mask.as_ref()), labels.as_ref()),
             (&params, together),
             read,
             keep,

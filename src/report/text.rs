@@ -125,9 +125,10 @@ pub fn target_error(t: &TargetError) -> String {
 /// Overlap and surface distances of labels, a line a label; in brackets, before registration.
 pub fn label_scores(s: &LabelScores) -> String {
     let mut out = format!(
-        "Labels: mean Dice {:.3} over {} labels, {:.3} before registration.\n",
+        "Labels: mean Dice {:.3} over {} {}, {:.3} before registration.\n",
         s.dice_mean,
         s.each.len(),
+        if s.each.len() == 1 { "label" } else { "labels" },
         s.dice_mean_before
     );
     let mm = |v: Option<f64>| v.map_or_else(|| "none".into(), |v| format!("{v:.3}"));

@@ -12,7 +12,7 @@ pub struct InputFile {
     /// Its size; of a folder, that of its files together.
     pub bytes: u64,
     /// SHA-256 of its content in hexadecimal digits; of a folder, of its files one after the other
-    /// by name.
+    /// by name. Empty where it was gone before it could be read again.
     pub sha256: String,
 }
 

@@ -34,6 +34,14 @@ pub(super) struct Header {
     pub srow: [[f64; 4]; 3],
     /// Where the voxels may begin at the earliest.
     pub first_offset: i64,
+    /// Up to its first NUL, without characters that would disturb a terminal.
+    pub description: String,
+}
+
+/// Text that ends at its first NUL, as it may be shown.
+fn shown(bytes: &[u8]) -> String {
+    let text = bytes.split(|b| *b == 0).next().unwrap_or_default();
+    String::from_utf8_lossy(text).chars().filter(|c| !c.is_control()).collect::<String>().trim().into()
 }
 
 impl Header {
@@ -80,6 +88,7 @@ impl Header {
             quatern: [h.quatern_b, h.quatern_c, h.quatern_d, h.quatern_x, h.quatern_y, h.quatern_z].map(f64::from),
             srow: [h.srow_x, h.srow_y, h.srow_z].map(|row| row.map(f64::from)),
             first_offset: 352,
+            description: shown(&head[148..228]),
         })
     }
 
@@ -116,6 +125,7 @@ impl Header {
             quatern: std::array::from_fn(|i| float(352 + 8 * i)),
             srow: std::array::from_fn(|r| std::array::from_fn(|c| float(400 + 32 * r + 8 * c))),
             first_offset: 544,
+            description: shown(&head[240..320]),
         })
     }
 

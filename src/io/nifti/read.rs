@@ -146,8 +146,9 @@ impl Opened {
         let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
         let apart_mm = disagreement(&header, shape);
         let axes = axes[..used].to_vec();
-        let labels = header.intent == LABEL;
-        Ok((Stored { format, datatype, axes, placed, apart_mm, grid, labels, bytes: self.size }, header.intent))
+        let (labels, description) = (header.intent == LABEL, header.description);
+        let stored = Stored { format, datatype, axes, placed, apart_mm, grid, labels, bytes: self.size, description };
+        Ok((stored, header.intent))
     }
 }
 
