@@ -7,6 +7,7 @@ use palpate::error::FieldError;
 use palpate::evaluate::metrics;
 use palpate::field::composition::compose;
 use palpate::pipeline::field::run;
+use palpate::pipeline::known::Known;
 use palpate::pipeline::track::{self, Frame};
 use palpate::synth::{Sequence, SequenceKind, SequenceParams};
 use palpate::types::{DenseField, FieldParams};
@@ -33,7 +34,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         };
         let read = |t: usize| Ok(sequence.frame(t));
         let order = (sequence.frames(), 0);
-        let found = track::run(order, &reference, (mask, None), (&field, together), read, keep, &|_, _| {})?;
+        let found =
+            track::run(order, &reference, (&Known::mask(mask), None), (&field, together), read, keep, &|_, _| {})?;
         Ok::<_, FieldError>((fields, found.together))
     };
     let ((followed, _), (all, together)) = (measured(false)?, measured(true)?);

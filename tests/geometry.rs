@@ -3,6 +3,7 @@
 
 use palpate::numerics::sampling::displacement;
 use palpate::pipeline::field::{FieldResult, run, run_lent};
+use palpate::pipeline::known::Known;
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom};
 use palpate::types::{Affine, FieldParams, Grid, Mask, Volume, VoxelPoint};
 
@@ -94,7 +95,8 @@ fn lent_volumes_give_the_same_field_and_come_back() {
         let mask = stored(&p.mask, here.0, flips(here.1));
         let wanted = measure(&initial, &deformed, &mask);
         let (found, back) =
-            run_lent(initial.clone(), deformed.clone(), Some(&mask), &FieldParams::default(), &|_, _| {}).unwrap();
+            run_lent(initial.clone(), deformed.clone(), &Known::mask(Some(&mask)), &FieldParams::default(), &|_, _| {})
+                .unwrap();
         assert_eq!(back, [initial, deformed]);
         assert_eq!(found.displacement, wanted.displacement);
         assert_eq!(found.uncertainty.volume(), wanted.uncertainty.volume());

@@ -6,6 +6,7 @@ use palpate::evaluate::metrics;
 use palpate::field::composition::compose;
 use palpate::numerics::small::eigenvalues;
 use palpate::pipeline::field::run as pair;
+use palpate::pipeline::known::Known;
 use palpate::pipeline::track::{Tracker, run};
 use palpate::strain::StrainField;
 use palpate::strain::gauge::Gauge;
@@ -162,8 +163,16 @@ fn a_lost_frame_does_not_stop_the_others() {
         seen.push(f.number);
         Ok(())
     };
-    let found =
-        run((6, 2), &reference, (Some(&s.mask), Some(&s.labels)), (&params, true), read, keep, &|_, _| {}).unwrap();
+    let found = run(
+        (6, 2),
+        &reference,
+        (&Known::mask(Some(&s.mask)), Some(&s.labels)),
+        (&params, true),
+        read,
+        keep,
+        &|_, _| {},
+    )
+    .unwrap();
     assert_eq!(seen, [3, 5, 1, 0]);
     assert_eq!(found.frames.iter().map(|f| f.frame).collect::<Vec<_>>(), [0, 1, 3, 4, 5]);
     assert!(found.frames[3].lost.as_ref().unwrap().contains("constant"), "{:?}", found.frames[3].lost);
@@ -174,7 +183,9 @@ fn a_lost_frame_does_not_stop_the_others() {
     }
 
     let nothing = |_: usize| -> Result<Volume, FieldError> { Ok(Volume::filled(*reference.grid(), 0.0)) };
-    assert!(run((6, 2), &reference, (None, None), (&params, true), nothing, |_| Ok(()), &|_, _| {}).is_err());
+    assert!(
+        run((6, 2), &reference, (&Known::default(), None), (&params, true), nothing, |_| Ok(()), &|_, _| {}).is_err()
+    );
 }
 
 /// Without a mask the mean strain was that of all voxels, air with them.
@@ -183,7 +194,8 @@ fn without_a_mask_strain_is_that_of_tissue() {
     let s = sequence(SequenceKind::Pinch, 3);
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
-    let found = run((3, 0), &reference, (None, None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
+    let found =
+        run((3, 0), &reference, (&Known::default(), None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
     // The mask that is made reaches a voxel into the air; all of the volume is three times the
     // tissue.
     let tissue = s.mask.as_slice().iter().filter(|m| **m != 0).count() as f64;
@@ -206,7 +218,8 @@ fn a_jerk_is_not_out_of_line() {
     for order in [[0, 4, 4, 20, 4, 4], [0, 12, 14, 16, 18, 20]] {
         let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(order[t])) };
         let found =
-            run((6, 0), &reference, (Some(&s.mask), None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
+            run((6, 0), &reference, (&Known::mask(Some(&s.mask)), None), (&params, true), read, |_| Ok(()), &|_, _| {})
+                .unwrap();
         assert!(found.frames.iter().all(|f| f.out_of_line == 0.0), "{order:?}: {:?}", found.frames);
     }
 }
@@ -225,8 +238,16 @@ fn a_label_out_of_a_frames_view_is_named() {
         Ok(if t == 2 { Volume::from_vec(cut, whole.as_slice()[..cut.len()].to_vec()).unwrap() } else { whole })
     };
     let params = FieldParams::default();
-    let tracked =
-        run((3, 0), &reference, (Some(&s.mask), Some(&labels)), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
+    let tracked = run(
+        (3, 0),
+        &reference,
+        (&Known::mask(Some(&s.mask)), Some(&labels)),
+        (&params, true),
+        read,
+        |_| Ok(()),
+        &|_, _| {},
+    )
+    .unwrap();
     let said = |t: usize| tracked.frames.iter().find(|f| f.frame == t).unwrap().warnings.join(" ");
     assert!(said(2).contains("label 7 (100 %)") && !said(2).contains("label 1"), "{}", said(2));
     assert!(!said(1).contains("label"), "{}", said(1));
@@ -237,7 +258,9 @@ fn trajectories_follow_the_true_motion() {
     let s = sequence(SequenceKind::Pen, 5);
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
-    let found = run((5, 0), &reference, (Some(&s.mask), None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
+    let found =
+        run((5, 0), &reference, (&Known::mask(Some(&s.mask)), None), (&params, true), read, |_| Ok(()), &|_, _| {})
+            .unwrap();
     assert!(found.trajectories.len() > 50, "{}", found.trajectories.len());
     for t in 1..5 {
         let places: Vec<_> = found.trajectories.iter().filter_map(|p| Some((p.initial, p.places[t]?))).collect();
@@ -343,8 +366,15 @@ fn frames_together_are_nearer_to_the_truth_than_alone() {
                 fields[f.number] = Some(f.result.displacement.clone());
                 Ok(())
             };
-            let found =
-                run((12, origin), &reference, (Some(&s.mask), None), (&params, together), read, keep, &|_, _| {});
+            let found = run(
+                (12, origin),
+                &reference,
+                (&Known::mask(Some(&s.mask)), None),
+                (&params, together),
+                read,
+                keep,
+                &|_, _| {},
+            );
             (found.unwrap(), fields)
         };
         let ((alone, own), (found, all)) = (measured(false), measured(true));
@@ -387,7 +417,8 @@ fn a_frame_that_keeps_its_own_field_is_summed_up_as_a_pair() {
         assert!(f.number != 1 || f.result.displacement == alone.displacement);
         Ok(())
     };
-    let found = run((3, 0), &reference, (Some(&s.mask), None), (&params, true), read, keep, &|_, _| {}).unwrap();
+    let found =
+        run((3, 0), &reference, (&Known::mask(Some(&s.mask)), None), (&params, true), read, keep, &|_, _| {}).unwrap();
     let (first, own) = (&found.frames[0], &alone.summary);
     assert_eq!((first.mean_mm, first.max_mm, first.folds), (own.mean_mm, own.max_mm, own.folds));
     assert_eq!(found.together.unwrap().modes, None);

@@ -2,8 +2,8 @@
 //!
 //! From the joint histogram of voxels that show the same tissue: the mean of one volume's intensity
 //! where the other has a given one explains a part of its variance, the correlation ratio (Roche et
-//! al. 1998). Of two volumes in one contrast that mean rises with the intensity, however the gain
-//! differs by place. Where it does not, the mean itself brings one volume to the other's contrast.
+//! al. 1998). Of two volumes in one contrast that mean is a rising line, whatever gain and offset.
+//! Where it is not, the mean itself brings one volume to the other's contrast.
 
 use crate::numerics::filters;
 use crate::numerics::statistics::quantile;
@@ -99,12 +99,15 @@ impl Relation {
         })
     }
 
-    /// The same by a relation that does not fall: one contrast.
-    pub fn explained_by_rising(&self) -> [f64; 2] {
-        [Side::Initial, Side::Deformed].map(|side| {
-            let (share, mean) = self.means(side);
-            self.part(side, &share, &rising(&share, &mean))
-        })
+    /// The part that a straight rising line explains, either way round: one contrast, whatever its
+    /// gain and offset. Negative where the line falls (-1 to 1).
+    pub fn explained_by_gain(&self) -> f64 {
+        let mean = |v: &dyn Fn(usize) -> f64| self.joint.iter().enumerate().map(|(at, p)| p * v(at)).sum::<f64>();
+        let (first, second) = (|at: usize| (at % BINS) as f64, |at: usize| (at / BINS) as f64);
+        let (a, b) = (mean(&first), mean(&second));
+        let covariance = mean(&|at| (first(at) - a) * (second(at) - b));
+        let variances = [mean(&|at| (first(at) - a).powi(2)), mean(&|at| (second(at) - b).powi(2))];
+        covariance * covariance.abs() / (variances[0] * variances[1]).max(f64::MIN_POSITIVE)
     }
 
     /// The side that the other explains more of.
@@ -138,23 +141,6 @@ fn bin([low, high]: [f32; 2], v: f32) -> f32 {
     ((v - low) / (high - low) * (BINS - 1) as f32).clamp(0.0, (BINS - 1) as f32)
 }
 
-/// The values nearest to `mean` under these weights that do not fall (pool adjacent violators; Ayer
-/// et al. 1955).
-fn rising(share: &[f64; BINS], mean: &[f64; BINS]) -> [f64; BINS] {
-    let mut pools: Vec<(f64, f64, usize)> = Vec::with_capacity(BINS);
-    for (&weight, &value) in share.iter().zip(mean) {
-        let (mut weight, mut value, mut count) = (weight.max(f64::MIN_POSITIVE), value, 1);
-        while let Some(&(before, w, n)) = pools.last().filter(|p| p.0 > value) {
-            value = (value * weight + before * w) / (weight + w);
-            (weight, count) = (weight + w, count + n);
-            pools.pop();
-        }
-        pools.push((value, weight, count));
-    }
-    let mut all = pools.into_iter().flat_map(|(value, _, count)| std::iter::repeat_n(value, count));
-    std::array::from_fn(|_| all.next().unwrap_or_default())
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -172,13 +158,13 @@ mod tests {
     }
 
     #[test]
-    fn a_rising_relation_is_one_contrast_and_a_falling_one_is_another() {
-        let square = Relation::of(pairs(|v| v * v / 500.0).into_iter()).unwrap();
-        let [free, held] = [square.explained(), square.explained_by_rising()];
-        assert!((0..2).all(|c| free[c] > 0.98 && free[c] - held[c] < 1e-3), "{free:?} {held:?}");
+    fn a_gain_is_one_contrast_and_all_else_is_another() {
+        let gain = Relation::of(pairs(|v| 3.0 * v - 200.0).into_iter()).unwrap();
+        assert!(gain.explained().into_iter().all(|v| v > 0.98 && v - gain.explained_by_gain() < 5e-3));
         let falling = Relation::of(pairs(|v| 2000.0 - v).into_iter()).unwrap();
-        let [free, held] = [falling.explained(), falling.explained_by_rising()];
-        assert!((0..2).all(|c| free[c] > 0.98 && held[c] < 1e-3), "{free:?} {held:?}");
+        assert!(falling.explained()[0] > 0.98 && falling.explained_by_gain() < -0.98);
+        let steep = Relation::of(pairs(|v| v.max(0.0).powi(4) * 1e-8).into_iter()).unwrap();
+        assert!(steep.explained()[1] > 0.98 && steep.explained_by_gain() < 0.9);
     }
 
     /// Where two intensities of one volume are one of the other, the first tells the second.

@@ -1,7 +1,7 @@
 //! Two volumes in different contrasts brought to one, where the volumes show that they differ.
 //!
-//! In one contrast the mean of one volume's intensity rises with the other's, however little the two
-//! agree at rest. Where it does not rise, that mean itself serves as the volume in the other's
+//! In one contrast the mean of one volume's intensity is a rising line over the other's, however little
+//! the two agree at rest. Where it is not, that mean itself serves as the volume in the other's
 //! contrast: it is taken at rest, then under the motion that it leads to, coarse to fine.
 
 use crate::error::FieldError;
@@ -14,9 +14,9 @@ use crate::pipeline::hypotheses::Search;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Agreement, FieldParams, Mask, Voxels};
 
-/// Part of what a rising relation leaves of the variance that any relation must explain for the
-/// contrasts to differ. Calibrated: docs/lab/2026-11-inputs.md.
-const DIFFER: f64 = 0.05;
+/// Part of what a gain and an offset leave of the variance that any relation must explain for the
+/// contrasts to differ (1). Calibrated: docs/lab/2026-11-inputs.md.
+const DIFFER: f64 = 0.36;
 
 /// Times that the relation is taken on each level.
 const ROUNDS: usize = 3;
@@ -27,8 +27,8 @@ pub(super) struct Common<'a> {
     pub deformed: Voxels<'a>,
     relation: Relation,
     side: Side,
-    /// Part of the variance that a rising relation explains at rest.
-    rising: f64,
+    /// Part of the variance that a gain and an offset explain at rest.
+    by_gain: f64,
 }
 
 /// What the search for a common contrast needs to know.
@@ -91,8 +91,8 @@ impl<'a> Scene<'a> {
             }
         }
         let (initial, deformed) = self.recast(&found);
-        let (side, rising) = (found.side(), most(at_rest.explained_by_rising()));
-        Ok(Some(Common { initial, deformed, side, relation: found, rising }))
+        let (side, by_gain) = (found.side(), at_rest.explained_by_gain().max(0.0));
+        Ok(Some(Common { initial, deformed, side, relation: found, by_gain }))
     }
 
     /// Both volumes on one lattice.
@@ -136,8 +136,8 @@ impl<'a> Scene<'a> {
 
 /// Whether the intensities go together otherwise than in one contrast.
 fn differs(relation: &Relation) -> bool {
-    let (any, rising) = (most(relation.explained()), most(relation.explained_by_rising()));
-    any - rising > DIFFER * (1.0 - rising)
+    let (any, by_gain) = (most(relation.explained()), relation.explained_by_gain());
+    any - by_gain.max(0.0) > DIFFER * (1.0 - by_gain.max(0.0))
 }
 
 impl Common<'_> {
@@ -155,9 +155,9 @@ impl Common<'_> {
     pub fn why(&self) -> String {
         let [own, other] = if self.side == Side::Initial { ["initial", "deformed"] } else { ["deformed", "initial"] };
         format!(
-            "contrast: the volumes have different ones (a rising relation of their intensities explains {:.0} % of the variance, any \
-             relation {:.0} %); the {own} volume was brought to the {other} one's",
-            100.0 * self.rising,
+            "contrast: the volumes have different ones (at rest a gain explains {:.0} % of the variance, under the motion any relation {:.0} %); \
+             the {own} volume was brought to the {other} one's",
+            100.0 * self.by_gain,
             100.0 * self.explained()
         )
     }

@@ -404,8 +404,9 @@ fn canonical(
     let displacement = interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
     clock.book("interpolation");
     let length = lengths(&displacement, &mask);
-    if let Some(seen) = doubted.filter(|_| most_move(&displacement, &mask) > search) {
-        no_measurement(kept, found, unlike.is_some().then_some(seen))?;
+    // Landmarks bear out what features do not.
+    if let Some(seen) = doubted.filter(|_| anchors.is_empty()) {
+        no_measurement((kept, found), seen, (most_move(&displacement, &mask) > search, unlike.is_some()))?;
     }
 
     progress("jacobian", 0.94);
@@ -472,23 +473,25 @@ fn canonical(
     })
 }
 
-/// Refuses a motion past all that was looked for where few matches survive, `kept` of `found`
-/// features, or where the volumes stay different and few of the features `seen` agreed in the
-/// search of the whole.
-fn no_measurement(kept: usize, found: usize, seen: Option<Counts>) -> Result<(), FieldError> {
+/// Refuses what few features bear out: where few of the features `seen` agreed in the search of the
+/// whole and few of the matches survive, `kept` of `found`; past the range of the search (`far`)
+/// either will do, the first one where the volumes stay `unlike`.
+fn no_measurement((kept, found): (usize, usize), seen: Counts, (far, unlike): (bool, bool)) -> Result<(), FieldError> {
     let survived = (kept, "matches survive", found.div_ceil(5));
-    let agreed = seen.map(|seen| {
-        let what = "features agree with their neighbours in the search of the whole volume";
-        (seen.kept, what, seen.features_initial.div_ceil(3))
-    });
-    match [Some(survived), agreed].into_iter().flatten().find(|f| f.0 < f.2) {
-        None => Ok(()),
-        Some((found, what, needed)) => {
-            let hint =
-                "check that both volumes show the same tissue; where they lie far apart, begin with --initial".into();
-            Err(FieldError::TooFew { found, what, needed, hint })
-        }
-    }
+    let agreed = (
+        seen.kept,
+        "features agree with their neighbours in the search of the whole volume",
+        seen.features_initial.div_ceil(3),
+    );
+    let [few_survived, few_agreed] = [survived, agreed].map(|f| f.0 < f.2);
+    let refused = match () {
+        _ if few_survived && (few_agreed || far) => survived,
+        _ if few_agreed && far && unlike => agreed,
+        _ => return Ok(()),
+    };
+    let (found, what, needed) = refused;
+    let hint = "check that both volumes show the same tissue; where its motion is known in part, give --initial or --landmarks".into();
+    Err(FieldError::TooFew { found, what, needed, hint })
 }
 
 /// Part of the variance by which a displacement may leave the volumes less alike than at rest.
