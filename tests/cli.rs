@@ -245,7 +245,9 @@ fn mask_refused(mask: &Nifti, message: &str) {
 
 #[test]
 fn a_mask_on_another_grid() {
-    mask_refused(&Nifti::filled([9, 9, 9], 1.0), "another grid");
+    let mut mask = Nifti::filled([9, 9, 9], 1.0);
+    mask.sform[0][3] = 900.0;
+    mask_refused(&mask, "does not overlap initial.nii.gz");
 }
 
 #[test]

@@ -157,7 +157,7 @@ fn each_file_of_the_other_commands_is_named() {
     fs::write(folder.join("table.csv"), "initial,deformed\npair/initial.nii.gz,pair/deformed.nii.gz\n").unwrap();
     run(folder, &["batch", "table.csv", "--preset", "fast", "-o", "batch", "--quiet"], 0);
     fs::write(folder.join("other.csv"), "a,b\n1,2\n3,4\n").unwrap();
-    fs::write(folder.join("itk.tfm"), "#Insight Transform File V1.0\n#Transform 0\n").unwrap();
+    fs::write(folder.join("itk.tfm"), "#Insight Transform File V1.0\n#Transform 0\nTransform: TranslationTransform_double_3_3\nParameters: 1 2 3\nFixedParameters:\n").unwrap();
     fs::write(folder.join("points.fcsv"), "# CoordinateSystem = LPS\n# columns = id,x,y,z\n1,2,3,4\n").unwrap();
     let expected = [
         ("skin", "results of palpate skin"),
@@ -195,7 +195,7 @@ fn each_file_of_the_other_commands_is_named() {
         ("batch/pair-2/field.log", "log of a stage of palpate batch"),
         ("table.csv", "table of pairs"),
         ("other.csv", "table"),
-        ("itk.tfm", "transform of ITK"),
+        ("itk.tfm", "transform"),
         ("points.fcsv", "points"),
     ];
     check(folder, &expected);

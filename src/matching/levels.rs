@@ -239,7 +239,7 @@ pub fn overlap(initial: &Grid, deformed: &Grid, reach_mm: f64) -> Result<[[f64; 
         hi[a] = corners.iter().map(|c| c[a]).fold(f64::NEG_INFINITY, f64::max).min((shape[a] - 1) as f64 + reach);
     }
     if (0..3).any(|a| lo[a] > hi[a]) {
-        let hint = "if they show the same tissue, begin with --initial centre (or moments, principal); else check both headers (palpate info)".into();
+        let hint = "if they show the same tissue, begin with --initial centre (or moments, principal); else check sform and qform of both files (palpate info)".into();
         return Err(FieldError::NoOverlap { hint });
     }
     Ok([lo, hi])
