@@ -277,8 +277,8 @@ pub enum FieldError {
         /// What to try.
         hint: String,
     },
-    /// A start that no search can begin from.
-    #[error("the start {what}; {hint}")]
+    /// A start that no search can begin from, or something known that a method does not take.
+    #[error("{what}; {hint}")]
     Start {
         /// What is wrong.
         what: String,
@@ -287,12 +287,12 @@ pub enum FieldError {
     },
     /// The displacement makes the volumes less alike.
     #[error(
-        "no motion was found: under the displacement one volume explains {found:.3} of the other's variance, at rest          {at_rest:.3}; {hint}"
+        "the volumes agree less under the displacement that was found ({found:.2}) than at rest ({at_rest:.2}; 1 is best), so nothing was measured; {hint}"
     )]
     Worse {
-        /// Part of the variance at rest.
+        /// Part of the variance that one volume explains of the other at rest.
         at_rest: f64,
-        /// Part of the variance under the displacement.
+        /// The same under the displacement.
         found: f64,
         /// What to try.
         hint: String,

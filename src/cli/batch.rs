@@ -171,13 +171,12 @@ fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stag
     let owned = |words: &[&str]| words.iter().map(|w| w.to_string()).collect::<Vec<_>>();
 
     let mut field = owned(&["field", &text(&pair.initial), &text(&pair.deformed), "--force", "-o", &at("field")]);
-    for (key, path) in [
-        ("mask", &pair.mask),
-        ("deformed-mask", &pair.deformed_mask),
-        ("ignore", &pair.ignore),
-        ("landmarks", &pair.landmarks),
-    ] {
-        field.extend(flag(key, path.as_deref().map(text)));
+    field.extend(flag("mask", pair.mask.as_deref().map(text)));
+    field.extend(flag("deformed-mask", pair.deformed_mask.as_deref().map(text)));
+    field.extend(pair.ignore.iter().filter_map(|m| flag("ignore", Some(text(m)))));
+    if !pair.landmarks.is_empty() {
+        field.push("--landmarks".into());
+        field.extend(pair.landmarks.iter().map(|l| text(l)));
     }
     if !pair.start.is_empty() {
         field.push("--initial".into());
@@ -192,10 +191,11 @@ fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stag
             Some(&pair.deformed),
             pair.mask.as_ref(),
             pair.deformed_mask.as_ref(),
-            pair.ignore.as_ref(),
-            pair.landmarks.as_ref(),
             tuning.config(),
-        ]),
+        ])
+        .into_iter()
+        .chain(pair.ignore.iter().chain(&pair.landmarks).cloned())
+        .collect(),
         marker: folder.join("field/summary.json"),
     }];
     let Some(labels) = &pair.labels else { return out };

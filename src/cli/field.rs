@@ -121,6 +121,19 @@ impl Tuning {
         mask.map(said).into_iter().collect()
     }
 
+    /// Says so where the run that --config names had one of these and this one, with `known`, has not.
+    pub fn known_left_out(&self, known: &Knowledge) -> Option<String> {
+        let file = self.config.as_ref()?;
+        let summary = io::read_json(file).unwrap_or_default();
+        let earlier: Vec<&str> = summary["command_line"].as_array()?.iter().filter_map(|a| a.as_str()).collect();
+        let had =
+            |flag: &str| earlier.iter().any(|a| *a == flag || a.strip_prefix(flag).is_some_and(|r| r.starts_with('=')));
+        let missing: Vec<&str> = known.left_out().into_iter().filter(|flag| had(flag)).collect();
+        (!missing.is_empty()).then(|| {
+            format!("{}: its run had {}, this one has not; give that again", file.display(), missing.join(" and "))
+        })
+    }
+
     /// Parameters in range.
     pub fn params(&self) -> Result<FieldParams> {
         let mut params = match &self.config {
@@ -210,6 +223,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
 
     let started = Instant::now();
     let mut warnings = tuning.mask_left_out(mask.is_some());
+    warnings.extend(tuning.known_left_out(knowledge));
     if same_file(initial, deformed) {
         warnings.push("the initial and the deformed volume are the same file".into());
     }

@@ -23,8 +23,8 @@ pub struct Knowledge {
     /// What counts of the deformed volume: a mask on its grid, 0 elsewhere
     #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     deformed_mask: Option<PathBuf>,
-    /// What does not count (implants, artefacts): a mask on the initial or the deformed volume's
-    /// grid, 0 elsewhere; may be given several times
+    /// What does not count of the initial volume (implants, artefacts): a mask, 0 elsewhere; of the
+    /// deformed one where the mask lies on that one's grid alone; may be given several times
     #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     ignore: Vec<PathBuf>,
     /// Places known in both volumes: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed),
@@ -51,6 +51,17 @@ impl Knowledge {
     /// Whether nothing is known.
     pub fn is_empty(&self) -> bool {
         self.start.is_empty() && self.deformed_mask.is_none() && self.ignore.is_empty() && self.landmarks.is_empty()
+    }
+
+    /// The options that are not given.
+    pub fn left_out(&self) -> Vec<&'static str> {
+        let given = [
+            ("--initial", self.start.is_empty()),
+            ("--deformed-mask", self.deformed_mask.is_none()),
+            ("--ignore", self.ignore.is_empty()),
+            ("--landmarks", self.landmarks.is_empty()),
+        ];
+        given.into_iter().filter(|g| g.1).map(|g| g.0).collect()
     }
 
     /// Whether there are landmarks.
@@ -82,8 +93,8 @@ impl Knowledge {
         console: &Console,
         warnings: &mut Vec<String>,
     ) -> Result<KnownInputs> {
-        if self.landmark_sd.is_some_and(|sd| !(sd.is_finite() && sd > 0.0)) {
-            bail!("--landmark-sd takes a standard deviation above 0, in mm");
+        if self.landmark_sd.is_some_and(|sd| !(0.001..=100.0).contains(&sd)) {
+            bail!("--landmark-sd takes a standard deviation of 0.001 to 100 mm");
         }
         let grids = [initial.grid(), deformed.grid()];
         let deformed_mask = self.deformed_mask.as_ref();
@@ -150,7 +161,7 @@ impl Knowledge {
 
 /// The way to bring two volumes onto each other that an argument names.
 fn alignment(argument: &str) -> Option<Alignment> {
-    match argument {
+    match argument.to_lowercase().as_str() {
         "centre" | "center" => Some(Alignment::Centre),
         "moments" => Some(Alignment::Moments),
         "principal" => Some(Alignment::Principal),

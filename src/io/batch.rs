@@ -59,6 +59,9 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
             Some(record[at].to_string()).filter(|v| !v.is_empty())
         };
         let file = |column: &str| text(column).map(|v| folder.join(v));
+        let files = |column: &str| -> Vec<PathBuf> {
+            text(column).map(|v| v.split(';').map(|one| folder.join(one.trim())).collect()).unwrap_or_default()
+        };
         let needed = |column: &str| {
             file(column).ok_or_else(|| flaw(format!("there is no {column} volume"), "fill in that column"))
         };
@@ -99,8 +102,8 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
                 .map(|t| t.split(';').map(|one| start(folder, one.trim())).collect())
                 .unwrap_or_default(),
             deformed_mask: file("deformed_mask"),
-            ignore: file("ignore"),
-            landmarks: file("landmarks"),
+            ignore: files("ignore"),
+            landmarks: files("landmarks"),
             labels: file("labels"),
             names: text("names").map(|n| n.replace(';', ",")),
             held: side("held"),

@@ -55,8 +55,11 @@ impl<'a> Aligned<'a> {
         if same_axes {
             return Ok(Self { moving: deformed.as_slice().into(), ..base });
         }
-        let origin = lo.map(f64::floor);
-        let shape = std::array::from_fn(|a| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1);
+        // A slice stays one, whatever rounding has made of its place.
+        let flat = |a: usize| g.shape()[a] == 1;
+        let origin = std::array::from_fn(|a| if flat(a) { 0.0 } else { lo[a].floor() });
+        let extent = |a: usize| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1;
+        let shape = std::array::from_fn(|a| if flat(a) { 1 } else { extent(a) });
         let moving = resample(deformed, g, origin, shape)?;
         Ok(Self { moving_shape: shape, moving_origin: origin, moving: moving.into(), ..base })
     }

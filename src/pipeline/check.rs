@@ -91,10 +91,13 @@ pub fn inputs<'a>(
     let mut first = fill(hide(bridged(initial, &lost[0]), empty[0]), not_finite[0] > 0 || empty[0].is_some());
     let bad = not_finite[1] > 0 || !lost[1].is_empty() || empty[1].is_some();
     let second = fill(without(hide(deformed.view(), empty[1]), &lost[1]), bad);
-    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
-    if not_finite[0] > 0 || empty[0].is_some() {
-        let nothing = empty[0].unwrap_or(0.0);
+    let unknown = not_finite[0] > 0 || empty[0].is_some();
+    if unknown {
+        let nothing = empty[0].unwrap_or(ranges[0].low);
         first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = nothing);
+    }
+    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
+    if unknown {
         for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
             if !v.is_finite() || Some(*v) == empty[0] {
                 *m = 0;
@@ -293,7 +296,7 @@ const AROUND: usize = 13;
 const DRAWN_ON: usize = 2;
 
 /// The volume with what shows drawn on a little into what does not.
-fn drawn_on(mut volume: Voxels<'_>) -> Voxels<'_> {
+pub(super) fn drawn_on(mut volume: Voxels<'_>) -> Voxels<'_> {
     for _ in 0..DRAWN_ON {
         volume = filled(&volume, 1);
     }
@@ -427,7 +430,8 @@ pub fn known(
         return Err(refuse("mask", "is missing", "give the label map of the bodies as mask"));
     }
     if params.method == Method::Sparse && !known.landmarks.is_empty() {
-        let (what, hint) = ("fits matches alone and takes no landmarks".into(), "leave --method sparse out".into());
+        let (what, hint) =
+            ("--method sparse fits matches alone and takes no landmarks".into(), "leave --method out".into());
         return Err(FieldError::Start { what, hint });
     }
     Ok(())

@@ -161,7 +161,7 @@ pub fn run_from(
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
     check::known(initial, deformed, known, params)?;
-    let begun = Begin::of(initial.grid(), known)?;
+    let begun = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
     let moved = deformed.view().placed(begun.grid(deformed.grid())?)?;
     let orientations = [initial, &moved].map(|v| Orientation::of(v.grid()));
     let (first, second) = (orientations[0].turned(initial), orientations[1].turned(&moved));
@@ -184,7 +184,7 @@ pub fn run_lent(
     progress: Progress<'_>,
 ) -> Result<(FieldResult, [Volume; 2]), FieldError> {
     check::known(&initial, &deformed, known, params)?;
-    let begun = Begin::of(initial.grid(), known)?;
+    let begun = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
     let placed = *deformed.grid();
     let deformed = deformed.placed(begun.grid(&placed)?)?;
     let grids = [*initial.grid(), *deformed.grid()];
@@ -229,7 +229,7 @@ fn canonical(
     if params.method == Method::Sparse {
         let bends = known.start.is_some_and(|start| start::bends(start::rest(start), initial.grid(), known.mask));
         if bends {
-            let what = "bends, and --method sparse begins at an affine map".into();
+            let what = "the start bends, and --method sparse begins at an affine map".into();
             let hint = "leave --method out, or give an affine transform".into();
             return Err(FieldError::Start { what, hint });
         }
@@ -245,6 +245,7 @@ fn canonical(
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
         check::inputs(&initial, &deformed, known.mask)?;
     let not_finite = told(not_finite, [&initial, &deformed], known);
+    let mask = counted(mask, known.initial_counts);
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     let anchors = landmarks::anchors(known, &grid);
@@ -301,7 +302,7 @@ fn canonical(
     } = chain.run(search, tissue, &mut clock)?;
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
-        return Err(too_few(kept, &pair, (search, params)));
+        return Err(too_few(kept, &pair, (search, params), known.start.is_some()));
     }
 
     // The smallest motion that explains the matches, body by body.
@@ -388,10 +389,17 @@ fn canonical(
     if let Some(common) = &common {
         variances = variances.with_contrast(1.0 - common.explained());
     }
-    let uncertainty = variances.deviation(&grid, factor);
+    let mut uncertainty = variances.deviation(&grid, factor);
+    let told = |vague: &ScalarSpline| {
+        landmarks::report(&anchors, |p| coefficients.along_axes(p), |p| vague.at_place(p).into())
+    };
+    let landmarks = told(&uncertainty);
+    if let Some(variance) = landmarks.as_ref().and_then(landmarks::against) {
+        variances = variances.with_landmarks(variance);
+        uncertainty = variances.deviation(&grid, factor);
+    }
     let samples = variances.samples(&grid, factor)?;
     let sparse = estimated(sparse, &grid, (&coefficients, &uncertainty));
-    let landmarks = landmarks::report(&anchors, |p| coefficients.along_axes(p), |p| uncertainty.at_place(p).into());
     clock.book("uncertainty");
 
     // Mesh and dense field.
@@ -511,14 +519,22 @@ pub(super) fn agreement(pair: &Pair<'_>, bodies: &Bodies, model: MotionModel) ->
     Ok(found)
 }
 
-/// The volume without the voxels that do not count.
+/// The volume without the voxels that do not count; what does is drawn on a little past them, so
+/// that patches beside them can be matched.
 fn counting<'a>(volume: &'a Voxels<'_>, counts: Option<&Mask>) -> Voxels<'a> {
     let mut out = volume.view();
+    let Some(counts) = counts else { return out };
+    let left_out = out.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0);
+    left_out.for_each(|(v, _)| *v = f32::NAN);
+    check::drawn_on(out)
+}
+
+/// The mask without the voxels that do not count.
+pub(super) fn counted(mut mask: Mask, counts: Option<&Mask>) -> Mask {
     if let Some(counts) = counts {
-        let left_out = out.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0);
-        left_out.for_each(|(v, _)| *v = f32::NAN);
+        mask.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0).for_each(|(m, _)| *m = 0);
     }
-    out
+    mask
 }
 
 /// Voxels that are not finite, less those that do not count.
@@ -873,13 +889,23 @@ const STRANGERS: f64 = 0.1;
 
 /// Refuses a run with too few matches, with what was measured of the volumes and the one thing to
 /// try. Nothing is advised that was asked for already.
-pub(super) fn too_few(found: usize, pair: &Pair<'_>, (search, params): (f64, &FieldParams)) -> FieldError {
+pub(super) fn too_few(
+    found: usize,
+    pair: &Pair<'_>,
+    (search, params): (f64, &FieldParams),
+    started: bool,
+) -> FieldError {
     let still = Bodies::from(SplineField::still(level::lattice(pair, COARSE)));
     let (plain, agreement) = (pair.plain(), contrast::agreement(pair, &still).at_rest);
     let hint = match () {
         _ if plain > MOSTLY => format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: image finer or with less noise, or give --landmarks",
             100.0 * plain
+        ),
+        _ if agreement < STRANGERS && started => format!(
+            "at the start one volume explains {:.0} % of the other's variance: check its direction (,-1 after a name turns it round), or \
+             try --initial principal",
+            100.0 * agreement
         ),
         _ if agreement < STRANGERS => format!(
             "at rest one volume explains {:.0} % of the other's variance: check that both show the same tissue; where they lie apart, \

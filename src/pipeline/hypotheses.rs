@@ -71,7 +71,7 @@ const FEWEST: usize = 8;
 /// Where fewer of the features than this agree with each other, more is sought: about a rigid
 /// motion and outside the mask. Heads, pads and small motions keep nine tenths, legs in thick
 /// slices that moved by 16 mm four tenths.
-const AGREED: f64 = 0.75;
+pub(super) const AGREED: f64 = 0.75;
 
 /// The same for a search of the next level. Slides and legs that move far keep 0.4 to 0.81.
 const LOOSE: f64 = 0.85;

@@ -17,13 +17,20 @@ use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Grid, Landmark, LandmarkReport};
 
-/// Squared distance, over the variance, at which a landmark's weight is a quarter once most are
-/// where the field has them: three standard deviations, as for matches.
+/// Squared distance, over the variance, at which a landmark's weight is a quarter in the end: three
+/// standard deviations, as for matches.
 const SCALE: f64 = 9.0;
+
+/// Factor by which that falls from pass to pass, and the passes at the end in which it holds.
+const FALLS: f64 = 4.0;
+const SETTLING: usize = 3;
 
 /// The same distance beyond which a landmark is called wrong: one right one in a thousand is (chi
 /// square, three axes).
 const WRONG: f64 = 16.27;
+
+/// Least standard deviation of a landmark (voxels): what interpolation leaves unsure of any place.
+const SURE: f64 = 0.02;
 
 /// Landmarks from which a field of their own may start the search: an affine map takes four.
 const FEWEST: usize = 4;
@@ -31,6 +38,7 @@ const FEWEST: usize = 4;
 /// The landmarks on the initial volume's grid.
 pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
     let sd = if known.landmark_sd_mm > 0.0 { known.landmark_sd_mm } else { voxel(grid) };
+    let sd = sd.max(SURE * voxel(grid));
     let axes = spline::axes(grid);
     let of = |l: &Landmark| {
         let d = l.deformed.minus(l.initial);
@@ -50,18 +58,30 @@ fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
 }
 
-/// The scale of the weights: while most landmarks are far from the field, so far.
-fn scale(squares: &[f64]) -> f64 {
-    let mut all: Vec<f32> = squares.iter().map(|q| *q as f32).collect();
-    if all.is_empty() { SCALE } else { SCALE.max(2.0 * f64::from(median(&mut all))) }
+/// The scale of the weights with so many passes to come after this one: it falls by [`FALLS`] from
+/// pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and Zisserman
+/// 1987), and holds in the last [`SETTLING`].
+fn scale(to_come: usize) -> f64 {
+    SCALE * FALLS.powi(to_come.saturating_sub(SETTLING - 1).min(20) as i32)
 }
 
-/// Adds what the landmarks pull with to a pass.
-pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalEquations) {
+/// How far the field is from most landmarks (mm, twice the median).
+pub(super) fn reach(pair: &Pair<'_>, field: &SplineField) -> f64 {
+    let far = |a: &Anchor| distance(field.lattice.at(&field.coefficients, a.at), a.displacement) as f32;
+    let mut all: Vec<f32> = pair.anchors.iter().map(far).collect();
+    if all.is_empty() { 0.0 } else { 2.0 * f64::from(median(&mut all)) }
+}
+
+/// Whether the passes may end with so many to come: the weights are final.
+pub(super) fn are_settled(pair: &Pair<'_>, to_come: usize) -> bool {
+    pair.anchors.is_empty() || to_come < SETTLING
+}
+
+/// Adds what the landmarks pull with to a pass with so many to come after it.
+pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalEquations, to_come: usize) {
     let at = |p| field.lattice.at(&field.coefficients, p);
-    let squares = squares(&pair.anchors, at);
-    let scale = scale(&squares);
-    for (anchor, q) in pair.anchors.iter().zip(squares) {
+    let scale = scale(to_come);
+    for (anchor, q) in pair.anchors.iter().zip(squares(&pair.anchors, at)) {
         let weight = (scale / (scale + q)).powi(2) / (anchor.sd * anchor.sd);
         let u = at(anchor.at);
         let pull = std::array::from_fn(|c| (weight * (anchor.displacement[c] - u[c])) as f32);
@@ -137,6 +157,14 @@ pub(super) fn report(
     })
 }
 
+/// The variance along an axis (mm^2) of the field's error that landmarks show, where at least half of
+/// them contradict it.
+pub(super) fn against(report: &LandmarkReport) -> Option<f64> {
+    let squares = report.wrong.iter().map(|n| report.distances_mm[n - 1].powi(2)).sum::<f64>();
+    let most = 2 * report.wrong.len() >= report.count && !report.wrong.is_empty();
+    most.then(|| squares / (3.0 * report.wrong.len() as f64))
+}
+
 /// Names the landmarks that the field does not go through.
 pub(super) fn said_of(report: Option<&LandmarkReport>) -> Option<String> {
     let LandmarkReport { count, wrong, distances_mm, .. } = report?;
@@ -145,8 +173,9 @@ pub(super) fn said_of(report: Option<&LandmarkReport>) -> Option<String> {
     let more = if wrong.len() > 5 { ", and more (see summary.json)" } else { "" };
     (!wrong.is_empty()).then(|| {
         format!(
-            "{} of {count} landmarks disagree with the field: {}{more}. They hardly pulled it; check that each shows the same tissue",
+            "{} of {count} landmarks {} with the field: {}{more}; check that each shows the same tissue in both volumes",
             wrong.len(),
+            if wrong.len() == 1 { "disagrees" } else { "disagree" },
             named.join(", ")
         )
     })

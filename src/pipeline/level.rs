@@ -172,7 +172,8 @@ fn advance(
     let active = pair.spans.grown(1);
     let weight = independent(pair);
     let finest = pyramid::finest(pair.shape, pair.spacing);
-    let reach = (REACH * finest) as f32;
+    // Landmarks hold what texture does not.
+    let reach = (REACH * finest).max(landmarks::reach(pair, field)) as f32;
     let mut before = field.coefficients.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
     let large = field.lattice.len() >= LARGE;
@@ -187,7 +188,8 @@ fn advance(
         let gain = GainField::sharpened(pair, &warped);
         let mut equations = normal_equations(pair, &warped, &gain, &field.lattice, 1e-3 * pair.noise);
         equations.scale(weight);
-        landmarks::pull(pair, field, &mut equations);
+        let to_come = passes - 1 - pass;
+        landmarks::pull(pair, field, &mut equations, to_come);
         let information = equations.information();
         let weights: Vec<f32> = field.smoothness.iter().map(|s| s * cell as f32).collect();
         if large {
@@ -229,7 +231,7 @@ fn advance(
             }
         }
         tick(pass);
-        if f64::from(length) < SETTLED * finest && pass >= 3 {
+        if f64::from(length) < SETTLED * finest && pass >= 3 && landmarks::are_settled(pair, to_come) {
             break;
         }
     }

@@ -27,6 +27,8 @@ use crate::pipeline::background;
 use crate::pipeline::check::{self, Checked};
 use crate::pipeline::conclusion;
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
+use crate::pipeline::finer;
+use crate::pipeline::hypotheses::AGREED;
 use crate::pipeline::hypotheses::Search;
 use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
@@ -129,6 +131,7 @@ pub(super) fn measure(
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
         check::inputs(&initial, &deformed, known.mask)?;
     let not_finite = field::told(not_finite, [&initial, &deformed], known);
+    let mask = field::counted(mask, known.initial_counts);
     let grid = *initial.grid();
     let flat = grid.is_single_slice();
     let search = field::search_mm(&grid, params.search_mm);
@@ -159,7 +162,7 @@ pub(super) fn measure(
     };
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
-        return Err(field::too_few(kept, &pair, (search, params)));
+        return Err(field::too_few(kept, &pair, (search, params), known.start.is_some()));
     }
 
     // The smallest motion that explains the matches, and what they leave open.
@@ -185,7 +188,12 @@ pub(super) fn measure(
     let narrowed = vec![1.0; departure.len()];
     let nodes =
         AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
-    let variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
+    let mut variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
+    let searched = reports.first().map_or(1.0, |r| r.counts.kept_share());
+    let unlike = finer::unlike(&pair, level::misfit(&pair, &warped)[0]);
+    if searched < AGREED && unlike.is_some() {
+        variances = variances.with_other_motions(searched, search);
+    }
     let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
     let uncertainty = variances.deviation(&grid, factor);
     let samples = variances.samples(&grid, factor)?;
@@ -241,6 +249,7 @@ pub(super) fn measure(
             .chain(field::said_of_model(choice.rejected))
             .chain(check::said_of(&lost))
             .chain(check::squeezed(&displacement, &mask))
+            .chain(unlike)
             .chain(field::without_texture(pair.plain()))
             .chain(field::out_of_view(unseen))
             .collect(),

@@ -4,16 +4,19 @@
 //! interpolation; what is left of it is a field from which the search may begin. The result is then
 //! followed by the affine part.
 
+use crate::consistency::models::nearest_rigid;
+use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, SpaceError};
 use crate::matching::contrast::Relation;
 use crate::matching::levels::foreground;
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::sampling::nearest;
 use crate::numerics::small::{full, inverse};
+use crate::numerics::statistics::median;
 use crate::pipeline::field::{FieldResult, lengths};
 use crate::pipeline::known::{Known, StartMap};
 use crate::pipeline::stages::Stage;
-use crate::types::space::{Matrix3, determinant, length};
+use crate::types::space::{Matrix3, determinant, dot, length};
 use crate::types::{
     Affine, AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, StartReport, VoxelPoint, Voxels,
     WorldPoint,
@@ -52,7 +55,7 @@ fn mean(places: impl Iterator<Item = WorldPoint>) -> [f64; 3] {
 /// # Errors
 /// [`FieldError::Start`] where the start has no value in the tissue, or turns it inside out.
 pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Result<AffineMap, FieldError> {
-    let refuse = |what: &str, hint: &str| FieldError::Start { what: what.into(), hint: hint.into() };
+    let refuse = |what: &str, hint: &str| FieldError::Start { what: format!("the start {what}"), hint: hint.into() };
     let pairs: Vec<(WorldPoint, WorldPoint)> =
         places(grid, mask).into_iter().filter_map(|x| Some((x, start(x)?))).collect();
     if pairs.is_empty() {
@@ -130,12 +133,24 @@ pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> R
         let product = |r: usize, c: usize| (0..3).map(|k| second.axes[k][r] * flip[k] * first.axes[k][c]).sum();
         std::array::from_fn(|r| std::array::from_fn(|c| product(r, c)))
     });
-    // Of a round body the axes say nothing.
-    let turns = turned.into_iter().chain([identity]);
+    // Of a round body the axes say nothing, and a slice is not turned over.
+    let [own, other] = volumes.map(|v| normal(v.grid()));
+    let over = |turn: &Matrix3| {
+        let normal: [f64; 3] = std::array::from_fn(|r| dot(turn[r], own.unwrap_or([0.0; 3])));
+        other.is_some_and(|other| dot(normal, other) < 0.0)
+    };
+    let turns = turned.into_iter().filter(|turn| !over(turn)).chain([identity]);
     let maps: Result<Vec<AffineMap>, _> = turns.map(|turn| about(turn, first.centre, second.centre)).collect();
     let agreement = |map: &AffineMap| agreement(initial, deformed, |p| map.at(p));
     let best = maps?.into_iter().map(|m| (agreement(&m), m)).max_by(|a, b| a.0.total_cmp(&b.0));
     best.map(|b| b.1).ok_or(FieldError::NoOverlap { hint: "check both volumes".into() })
+}
+
+/// The unit normal of a slice; none of a volume.
+fn normal(grid: &Grid) -> Option<[f64; 3]> {
+    let flat = (0..3).find(|&a| grid.shape()[a] == 1)?;
+    let axis: [f64; 3] = std::array::from_fn(|r| grid.affine().linear()[r][flat]);
+    Some(axis.map(|v| v / length(axis)))
 }
 
 /// The middle of a grid (world mm).
@@ -207,11 +222,16 @@ pub(super) struct Begin<'a> {
 }
 
 impl<'a> Begin<'a> {
+    /// Where no start is given and landmarks lie further apart than the `range` of the search (mm),
+    /// it is the rigid motion nearest to them.
+    ///
     /// # Errors
     /// As [`affine_part`].
-    pub fn of(grid: &Grid, known: &Known<'a>) -> Result<Self, FieldError> {
+    pub fn of(grid: &Grid, known: &Known<'a>, range: f64) -> Result<Self, FieldError> {
         let Some(start) = known.start else {
-            return Ok(Self { affine: None, rest: None, landmarks: Vec::new() });
+            let affine = far_apart(known.landmarks, range);
+            let landmarks = affine.map_or_else(Vec::new, |map| landmarks_before(&map, known.landmarks));
+            return Ok(Self { affine, rest: None, landmarks });
         };
         let affine = affine_part(start, grid, known.mask)?;
         let back = affine.inverse();
@@ -232,6 +252,7 @@ impl<'a> Begin<'a> {
     pub fn known<'b>(&'b self, known: &Known<'b>) -> Known<'b> {
         match &self.rest {
             Some(rest) => Known { start: Some(&**rest), landmarks: &self.landmarks, ..*known },
+            None if self.affine.is_some() => Known { landmarks: &self.landmarks, ..*known },
             None => *known,
         }
     }
@@ -283,6 +304,26 @@ impl FieldResult {
         self.summary.bodies.iter_mut().for_each(|b| b.model = larger(b.model));
         self
     }
+}
+
+/// Landmarks that a rigid motion takes.
+const RIGID: usize = 4;
+
+/// The rigid motion nearest to landmarks most of which move further than `range` (mm).
+fn far_apart(landmarks: &[Landmark], range: f64) -> Option<AffineMap> {
+    let mut lengths: Vec<f32> = landmarks.iter().map(|l| length(l.deformed.minus(l.initial)) as f32).collect();
+    if landmarks.len() < RIGID || f64::from(median(&mut lengths)) <= range {
+        return None;
+    }
+    let middle = mean(landmarks.iter().map(|l| l.initial));
+    let measured = |l: &Landmark| Measured {
+        place: l.initial.minus(WorldPoint(middle)),
+        displacement: l.deformed.minus(l.initial),
+        covariance: [1.0, 1.0, 1.0, 0.0, 0.0, 0.0],
+        field: [0.0; 3],
+    };
+    let rigid = nearest_rigid(&landmarks.iter().map(measured).collect::<Vec<_>>());
+    about(rigid.linear, middle, std::array::from_fn(|a| middle[a] + rigid.shift[a])).ok()
 }
 
 /// What was taken of a start, in words.

@@ -151,6 +151,12 @@ impl Variances {
         self
     }
 
+    /// Adds the variance along an axis (mm^2) that landmarks show where most contradict the field.
+    pub fn with_landmarks(mut self, variance: f64) -> Self {
+        self.part(ErrorSource::OtherMotions).iter_mut().for_each(|v| *v += variance as f32);
+        self
+    }
+
     /// Widens all where the volumes have different contrasts, of whose variance their relation leaves
     /// this part.
     pub fn with_contrast(mut self, left: f64) -> Self {

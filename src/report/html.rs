@@ -89,6 +89,9 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
         tables::counts(report),
         tables::inputs(report)
     );
+    if let Some(landmarks) = tables::landmarks(report) {
+        let _ = write!(body, "<article><h3>Landmarks</h3>{landmarks}</article>");
+    }
     let evidence: String = report.summary.evidence.iter().map(|e| format!("<li>{}</li>", escape(e))).collect();
     let _ = write!(
         body,

@@ -35,6 +35,8 @@ pub fn counts(report: &FieldReport<'_>) -> String {
         MotionModel::Affine => "affine",
         MotionModel::Free => "free",
     };
+    let agreement = [s.agreement.at_rest, s.agreement.found].map(|part| format!("{:.1} %", 100.0 * part));
+    let [at_rest, found] = agreement;
     let rows = [
         ("Features in the initial volume", thousands(c.features_initial)),
         ("Features in the deformed volume", thousands(c.features_deformed)),
@@ -45,6 +47,8 @@ pub fn counts(report: &FieldReport<'_>) -> String {
         ("Voxels measured", thousands(s.mask_voxels)),
         ("Voxels folded", thousands(s.folds)),
         ("Motion model", model.into()),
+        (if s.start.is_some() { "Variance explained at the start" } else { "Variance explained at rest" }, at_rest),
+        ("Variance explained under the field", found),
     ];
     table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
 }
@@ -65,6 +69,32 @@ pub fn bodies(report: &FieldReport<'_>) -> String {
     };
     let rows: Vec<_> = report.summary.bodies.iter().map(row).collect();
     table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm", "Expected error, mm"], &rows)
+}
+
+/// Landmarks drawn at most, the furthest first.
+const LANDMARKS: usize = 20;
+
+/// How far the deformed place of each landmark is from where the field leads, as bars; red where the
+/// field contradicts it.
+pub fn landmarks(report: &FieldReport<'_>) -> Option<String> {
+    let l = report.summary.landmarks.as_ref()?;
+    let mut order: Vec<usize> = (0..l.distances_mm.len()).collect();
+    order.sort_by(|&a, &b| l.distances_mm[b].total_cmp(&l.distances_mm[a]));
+    let most = order.first().map_or(0.0, |&i| l.distances_mm[i]).max(f64::MIN_POSITIVE);
+    let row = |&i: &usize| {
+        let (mm, colour) = (l.distances_mm[i], if l.wrong.contains(&(i + 1)) { "#d1495b" } else { "#2e86ab" });
+        let width = 100.0 * mm / most;
+        let bar = format!("<div style=\"width:{width:.1}%;min-width:2px;height:.7em;background:{colour}\"></div>");
+        vec![format!("number {}", i + 1), format!("{mm:.2} mm"), bar]
+    };
+    let rows: Vec<_> = order.iter().take(LANDMARKS).map(row).collect();
+    let note = format!(
+        "Distance of {} landmarks from where the field leads: {:.2} mm on average, for a deviation of {} mm along each axis.",
+        l.count,
+        l.mean_mm,
+        short(l.sd_mm)
+    );
+    Some(format!("<p>{note}</p>{}", table(&[], &rows)))
 }
 
 /// The field after each stage.

@@ -46,11 +46,13 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
     if let Some(l) = &s.landmarks {
         let wrong = match l.wrong.len() {
             0 => String::new(),
+            1 => "; one disagrees".into(),
             n => format!("; {n} disagree"),
         };
+        let most = l.distances_mm.iter().copied().fold(0.0, f64::max);
         let _ = writeln!(
             out,
-            "  landmarks    {}, on average {:.2} mm from where the field takes them{wrong}",
+            "  landmarks    {}, on average {:.2} mm from where the field takes them, at most {most:.2} mm{wrong}",
             l.count, l.mean_mm
         );
     }

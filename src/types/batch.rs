@@ -23,9 +23,9 @@ pub struct Pair {
     /// What counts of the deformed volume.
     pub deformed_mask: Option<PathBuf>,
     /// What does not count.
-    pub ignore: Option<PathBuf>,
-    /// Places known in both volumes.
-    pub landmarks: Option<PathBuf>,
+    pub ignore: Vec<PathBuf>,
+    /// Places known in both volumes: one table, or two lists.
+    pub landmarks: Vec<PathBuf>,
     /// Regions on the initial grid; with them moduli are looked for.
     pub labels: Option<PathBuf>,
     /// Names of the labels, as `1=skin,2=fat`.
