@@ -15,6 +15,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::sampling::beside;
 use crate::numerics::statistics::median;
 use crate::numerics::{ablation, filters, pyramid};
+use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::types::LevelReport;
 use rayon::prelude::*;
@@ -349,7 +350,8 @@ impl Bodies {
 
     /// Whether the two volumes agree better under these than under `other`.
     pub fn agree_better(&self, pair: &Pair<'_>, other: &Self) -> bool {
-        level::gained(pair, &other.warp(pair, &pair.spans), self.warp(pair, &pair.spans)) > 0.0
+        let gained = level::gained(pair, &other.warp(pair, &pair.spans), self.warp(pair, &pair.spans));
+        gained + landmarks::gained(pair, other, self) > 0.0
     }
 
     /// Those of two under which the volumes agree better.

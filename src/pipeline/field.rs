@@ -743,6 +743,11 @@ impl<'a> CoarseToFine<'a, '_> {
         Err(no_match(0, "check the mask".into()))
     }
 
+    /// The starts that a user gave.
+    fn starts_given(&self) -> &[Start] {
+        if self.starts.iter().all(Start::is_given) { self.starts } else { &[] }
+    }
+
     /// Each given body's motion on the coarsest level: by a search of its own or that of the whole,
     /// whichever agrees better in it.
     fn each(
@@ -783,12 +788,12 @@ impl<'a> CoarseToFine<'a, '_> {
     ) -> Begun {
         let mut found = search.begin((pair, factor), lattice, self.starts, passes, matched);
         if let Some(tissue) = found.is_unsure().then(around).flatten() {
-            let wider = search.begin((&tissue, factor), lattice, &[], passes, matched);
+            let wider = search.begin((&tissue, factor), lattice, self.starts_given(), passes, matched);
             found = Begun::surer(pair, found, wider);
         }
         if self.params.search_mm == 0.0 && found.leaves_open(pair, search.range) {
             let far = Search { range: TWICE * search.range, ..*search };
-            let wide = far.begin((pair, factor), lattice, &[], passes, matched);
+            let wide = far.begin((pair, factor), lattice, self.starts_given(), passes, matched);
             let taken = wide.outdoes(pair, &found);
             asked.push(why_farther(search.range, &found, &wide, taken));
             if taken {

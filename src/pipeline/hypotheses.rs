@@ -7,6 +7,7 @@ use crate::matching::pair::Pair;
 use crate::numerics::ablation;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::bodies::Bodies;
+use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::types::{Counts, FieldParams, LevelReport};
 use std::time::Instant;
@@ -25,6 +26,11 @@ impl Start {
     /// Whether the whole volume was searched for this motion, rather than known ones followed.
     pub fn searched_all(&self) -> bool {
         self.followed == Some(0)
+    }
+
+    /// Whether it was given, not measured in another frame.
+    pub(super) fn is_given(&self) -> bool {
+        self.followed.is_none()
     }
 
     /// As far again as from `before` to here: where steady motion would be next.
@@ -214,8 +220,8 @@ impl Search<'_> {
         seconds: &mut f64,
     ) -> Begun {
         let refined = |motion| self.refined(pair, motion, passes);
-        let better = |a, b| Bodies::better(pair, a, b);
-        let course = known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
+        let agreeing = |a, b| Bodies::better(pair, a, b);
+        let course = known.iter().map(|s| s.on(lattice, factor)).reduce(agreeing).map(refined);
         let followed = known.first().and_then(|s| s.followed).filter(|&f| f < FOLLOWED);
         if let Some((motion, followed)) = course.as_ref().zip(followed)
             && timed(seconds, || self.is_confirmed(pair, motion))
@@ -235,8 +241,14 @@ impl Search<'_> {
         let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
         let own = refined(own.into());
         let in_doubt = counts.kept_share() < LOOSE || counts.kept < ENOUGH;
-        let given = known.iter().any(|s| s.followed.is_none());
-        let wins = |known: &Bodies| (in_doubt || given) && known.agree_better(pair, &own);
+        let given = known.iter().any(Start::is_given);
+        // Where few features agree, landmarks decide.
+        let marked = counts.kept_share() < BORNE_OUT && !pair.anchors.is_empty();
+        let better = |known: &Bodies| match marked {
+            true => landmarks::gained(pair, &own, known) > 0.0,
+            false => known.agree_better(pair, &own),
+        };
+        let wins = |known: &Bodies| (in_doubt || given) && better(known);
         let motion = course.filter(wins).map_or(own, refined);
         Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }

@@ -1,7 +1,7 @@
 //! Landmarks: matches of known deviation in the same fit as the voxels.
 //!
-//! Each pulls the field by its distance from it over its variance, with Geman and McClure's weight,
-//! so that one that most others and the volumes speak against does not pull.
+//! Each pulls the field by its distance from it over its variance, with Cauchy's weight, so that one
+//! that most others and the volumes speak against hardly pulls.
 
 use crate::consistency::energy::distance;
 use crate::consistency::models::AffineMotion;
@@ -17,7 +17,7 @@ use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Grid, Landmark, LandmarkReport};
 
-/// Squared distance, over the variance, at which a landmark's weight is a quarter in the end: three
+/// Squared distance, over the variance, at which a landmark's weight is a half in the end: three
 /// standard deviations, as for matches.
 const SCALE: f64 = 9.0;
 
@@ -82,11 +82,22 @@ pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalE
     let at = |p| field.lattice.at(&field.coefficients, p);
     let scale = scale(to_come);
     for (anchor, q) in pair.anchors.iter().zip(squares(&pair.anchors, at)) {
-        let weight = (scale / (scale + q)).powi(2) / (anchor.sd * anchor.sd);
+        let weight = scale / (scale + q) / (anchor.sd * anchor.sd);
         let u = at(anchor.at);
         let pull = std::array::from_fn(|c| (weight * (anchor.displacement[c] - u[c])) as f32);
         equations.add(&field.lattice, anchor.at, weight as f32, pull);
     }
+}
+
+/// What a squared distance over the variance costs: the logarithm of its density (Cauchy).
+fn cost(q: f64) -> f64 {
+    SCALE * (q / SCALE).ln_1p()
+}
+
+/// How much better the landmarks agree with one motion than with another.
+pub(super) fn gained(pair: &Pair<'_>, from: &Bodies, to: &Bodies) -> f64 {
+    let of = |motion: &Bodies| squares(&pair.anchors, |p| motion.at(p)).into_iter().map(cost).sum::<f64>();
+    of(from) - of(to)
 }
 
 /// Adds how much worse a map agrees with the landmarks than `field` does, about each of the
@@ -100,7 +111,6 @@ pub(super) fn add_excess(
 ) {
     let free = squares(&pair.anchors, |p| field.lattice.at(&field.coefficients, p));
     let map = squares(&pair.anchors, |p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
-    let cost = |q: f64| SCALE * q / (SCALE + q);
     for ((anchor, free), map) in pair.anchors.iter().zip(free).zip(map) {
         windows.stencil_near(anchor.at).scatter((cost(map) - cost(free)) as f32, excess);
     }
