@@ -2,33 +2,18 @@
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "fixtures/texture.rs"]
+mod texture;
+
 use palpate::evaluate;
 use palpate::numerics::random::Random;
 use palpate::pipeline::field::{FieldResult, run};
 use palpate::pipeline::track::Tracker;
 use palpate::types::params::BodySource;
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, MotionModel, Volume};
+use texture::Texture;
 
 const SHAPE: [usize; 3] = [60, 56, 52];
-
-/// A sum of plane waves of 5 to 14 voxels with random phases, of variance 1.
-struct Texture(Vec<([f64; 3], f64)>);
-
-impl Texture {
-    fn new(seed: u64) -> Self {
-        let mut random = Random::new(seed, 5);
-        let wave = |random: &mut Random| {
-            let (direction, wavelength) = (random.direction(), random.uniform(5.0, 14.0));
-            (direction.map(|d| 2.0 * std::f64::consts::PI * d / wavelength), random.uniform(0.0, 6.3))
-        };
-        Self((0..40).map(|_| wave(&mut random)).collect())
-    }
-
-    fn at(&self, p: [f64; 3]) -> f64 {
-        let wave = |(k, phase): &([f64; 3], f64)| (k[0] * p[0] + k[1] * p[1] + k[2] * p[2] + phase).cos();
-        self.0.iter().map(wave).sum::<f64>() * (2.0 / self.0.len() as f64).sqrt()
-    }
-}
 
 /// A pair of volumes with its truth, and the label of each voxel (1, 2, ...).
 struct Scene {

@@ -3,6 +3,9 @@
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "fixtures/texture.rs"]
+mod texture;
+
 use palpate::error::FieldError;
 use palpate::numerics::random::Random;
 use palpate::pipeline::field::{FieldResult, run, run_from};
@@ -11,27 +14,9 @@ use palpate::pipeline::start::{Alignment, aligned};
 use palpate::types::{
     Affine, AffineMap, DenseField, FieldParams, Grid, Landmark, Mask, MotionModel, Volume, Voxels, WorldPoint,
 };
+use texture::Texture;
 
 const SHAPE: [usize; 3] = [52, 48, 44];
-
-/// Plane waves of 5 to 14 mm with random phases, of variance 1.
-struct Texture(Vec<([f64; 3], f64)>);
-
-impl Texture {
-    fn new(seed: u64) -> Self {
-        let mut random = Random::new(seed, 5);
-        let wave = |random: &mut Random| {
-            let (direction, wavelength) = (random.direction(), random.uniform(5.0, 14.0));
-            (direction.map(|d| 2.0 * std::f64::consts::PI * d / wavelength), random.uniform(0.0, 6.3))
-        };
-        Self((0..40).map(|_| wave(&mut random)).collect())
-    }
-
-    fn at(&self, p: [f64; 3]) -> f64 {
-        let wave = |(k, phase): &([f64; 3], f64)| (k[0] * p[0] + k[1] * p[1] + k[2] * p[2] + phase).cos();
-        self.0.iter().map(wave).sum::<f64>() * (2.0 / self.0.len() as f64).sqrt()
-    }
-}
 
 fn grid(shape: [usize; 3]) -> Grid {
     Grid::new(shape, Affine::scaled([1.0; 3], [-20.0, -30.0, 10.0]).unwrap()).unwrap()
@@ -123,11 +108,7 @@ fn same(v: f64) -> f64 {
 
 /// The volume as it lies after an affine map of the world.
 fn placed(volume: &Volume, map: &AffineMap) -> Volume {
-    let affine = volume.grid().affine();
-    let at = |v: [f64; 3]| map.at(affine.to_world(palpate::types::VoxelPoint(v))).0;
-    let (o, c) = (at([0.0; 3]), [at([1.0, 0.0, 0.0]), at([0.0, 1.0, 0.0]), at([0.0, 0.0, 1.0])]);
-    let row = |r: usize| [c[0][r] - o[r], c[1][r] - o[r], c[2][r] - o[r], o[r]];
-    let grid = Grid::new(volume.grid().shape(), Affine::new([row(0), row(1), row(2)]).unwrap()).unwrap();
+    let grid = map.grid(volume.grid()).unwrap();
     volume.clone().placed(grid).unwrap()
 }
 

@@ -34,9 +34,9 @@ const RECORD: &str = "pair.json";
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Table of pairs (CSV): initial, deformed, and as wanted mask,
-    /// start, deformed_mask, ignore, landmarks, labels, names, held, load,
-    /// force_n, scene, name, subject, session; paths count from the table's folder
+    /// Table of pairs (CSV): initial, deformed, and as wanted mask, start, deformed_mask, ignore,
+    /// landmarks, labels, names, held, load, force_n, scene, name, subject, session; paths count
+    /// from the table's folder
     table: PathBuf,
     /// Folder for the results; those that are there already are not made again
     #[arg(short, long, value_name = "DIR")]

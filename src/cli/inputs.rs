@@ -199,8 +199,14 @@ pub fn on_grid<'a>(volume: Voxels<'a>, grid: &Grid) -> Voxels<'a> {
 
 /// A mask on `grid`, which is that of `reference`.
 pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
-    let mask = io::read_mask(path)?;
+    let mask = some_mask(path)?;
     same_grid(path, mask.grid(), grid, reference)?;
+    Ok(mask)
+}
+
+/// A mask on its own grid that is not empty.
+pub fn some_mask(path: &Path) -> Result<Mask> {
+    let mask = io::read_mask(path)?;
     if mask.as_slice().iter().all(|v| *v == 0) {
         bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
     }

@@ -1,7 +1,7 @@
 //! What a user knows of a pair: starts, masks and landmarks.
 
 use super::console::Console;
-use super::inputs::{Part, name, read_landmarks, standing_for};
+use super::inputs::{Part, name, read_landmarks, some_mask, standing_for};
 use super::transform::{Given, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
@@ -9,7 +9,7 @@ use palpate::error::UnknownName;
 use palpate::field::warp::warp_labels;
 use palpate::io;
 use palpate::pipeline::known::{Known, StartMap};
-use palpate::pipeline::start::{Alignment, agreement, aligned};
+use palpate::pipeline::start::{Alignment, Compared, aligned};
 use palpate::types::{DenseField, Grid, Landmark, Mask, Voxels, WorldPoint};
 use std::path::{Path, PathBuf};
 
@@ -148,11 +148,12 @@ impl Knowledge {
             }
         };
         let at = |p: WorldPoint| start(p).unwrap_or(p);
-        let [there, here] = [agreement(initial, deformed, at), agreement(initial, deformed, |p| p)];
+        let compared = Compared::of(initial);
+        let [there, here] = [compared.agreement(deformed, at), compared.agreement(deformed, |p| p)];
         if there < here {
             warnings.push(format!(
-                "--initial: the volumes agree less at this start ({there:.2}) than where they lie ({here:.2}); check its direction: it leads \
-                 from the initial to the deformed volume, and ,-1 after a name turns it round"
+                "--initial: the volumes agree less at this start ({there:.2}; 1 is best) than where they lie ({here:.2}). A start leads from the \
+                 initial to the deformed volume; ,-1 after a name turns it round"
             ));
         }
         Ok(Some(start))
@@ -204,11 +205,7 @@ impl KnownInputs {
 /// A mask on `grid`, which is that of `reference`: resampled by nearest neighbour, with a note,
 /// where it lies on another one.
 pub fn mask_on(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
-    let mask = io::read_mask(path)?;
-    if mask.as_slice().iter().all(|v| *v == 0) {
-        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
-    }
-    resampled(path, mask, grid, reference, warnings)
+    resampled(path, some_mask(path)?, grid, reference, warnings)
 }
 
 /// The same of a label map or a mask that was read.

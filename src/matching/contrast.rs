@@ -35,6 +35,12 @@ pub enum Side {
     Deformed,
 }
 
+impl Side {
+    fn other(self) -> Self {
+        if self == Self::Initial { Self::Deformed } else { Self::Initial }
+    }
+}
+
 impl Relation {
     /// From the intensities of the two volumes at the same tissue; those that are not finite are
     /// left out. None where there are too few, or all alike.
@@ -77,26 +83,24 @@ impl Relation {
         (share, mean)
     }
 
-    /// The part of the variance of the volume `explained` that `values` (bins, one an intensity of
-    /// the other volume) explain.
-    fn part(&self, explained: Side, share: &[f64; BINS], values: &[f64; BINS]) -> f64 {
-        let (own, _) = self.means(if explained == Side::Initial { Side::Deformed } else { Side::Initial });
-        let moment = |w: &[f64; BINS], v: &dyn Fn(usize) -> f64, power: i32| -> f64 {
-            w.iter().enumerate().map(|(i, w)| w * v(i).powi(power)).sum()
-        };
-        let bins = |i: usize| i as f64;
-        let variance = moment(&own, &bins, 2) - moment(&own, &bins, 1).powi(2);
-        let of = |i: usize| values[i];
-        (moment(share, &of, 2) - moment(share, &of, 1).powi(2)) / variance.max(f64::MIN_POSITIVE)
-    }
-
     /// The part of the initial volume's variance that the deformed one explains, and the other way
     /// round (0 to 1).
     pub fn explained(&self) -> [f64; 2] {
+        let variance = |share: &[f64; BINS], values: &[f64; BINS]| {
+            let moment = |power: i32| share.iter().zip(values).map(|(s, v)| s * v.powi(power)).sum::<f64>();
+            moment(2) - moment(1).powi(2)
+        };
+        let bins = std::array::from_fn(|i| i as f64);
         [Side::Initial, Side::Deformed].map(|side| {
-            let (share, mean) = self.means(side);
-            self.part(side, &share, &mean)
+            let ((share, mean), (own, _)) = (self.means(side), self.means(side.other()));
+            variance(&share, &mean) / variance(&own, &bins).max(f64::MIN_POSITIVE)
         })
+    }
+
+    /// The larger of the two.
+    pub fn most(&self) -> f64 {
+        let [initial, deformed] = self.explained();
+        initial.max(deformed)
     }
 
     /// The part that a straight rising line explains, either way round: one contrast, whatever its
@@ -119,12 +123,11 @@ impl Relation {
 
     /// Intensities of the volume `side` as the other one has them.
     pub fn recast(&self, side: Side, values: &mut [f32]) {
-        let explained = if side == Side::Deformed { Side::Initial } else { Side::Deformed };
         let (own, other) = match side {
             Side::Initial => (self.ranges[0], self.ranges[1]),
             Side::Deformed => (self.ranges[1], self.ranges[0]),
         };
-        let (_, mean) = self.means(explained);
+        let (_, mean) = self.means(side.other());
         let scale = f64::from(other[1] - other[0]) / (BINS - 1) as f64;
         for v in values.iter_mut().filter(|v| v.is_finite()) {
             let at = bin(own, *v);

@@ -163,10 +163,10 @@ pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm:
 
 /// A mask of tissue where none is given: brighter than a tenth of the way from the dark to the
 /// bright end (2nd and 98th percentile) after smoothing; everything when that leaves less than 2 %
-/// of the volume.
+/// of the volume. Voxels that are not finite are dark.
 pub fn foreground(volume: &Voxels<'_>) -> Mask {
     let shape = volume.grid().shape();
-    let smooth = filters::gaussian(volume.as_slice(), shape, [1.0; 3]);
+    let smooth = filters::gaussian(&without_holes(volume), shape, [1.0; 3]);
     let stride = (smooth.len() / 400_000).max(1);
     let mut sample: Vec<f32> = smooth.iter().copied().step_by(stride).collect();
     let (lo, hi) = (quantile(&mut sample, 0.02), quantile(&mut sample, 0.98));
@@ -181,6 +181,16 @@ pub fn foreground(volume: &Voxels<'_>) -> Mask {
     let mut out = Mask::filled(*volume.grid(), 0);
     out.as_mut_slice().copy_from_slice(&crate::matching::pair::dilate(&inside, shape, 1));
     out
+}
+
+/// The values, with the darkest of them where there is none that is finite: a filter spreads those.
+fn without_holes<'a>(volume: &'a Voxels<'_>) -> Cow<'a, [f32]> {
+    let values = volume.as_slice();
+    if values.par_iter().all(|v| v.is_finite()) {
+        return values.into();
+    }
+    let darkest = values.iter().copied().filter(|v| v.is_finite()).fold(f32::INFINITY, f32::min);
+    values.iter().map(|v| if v.is_finite() { *v } else { darkest }).collect()
 }
 
 /// The mask with what it encloses in a slice across any axis: dark tissue inside a bright ring is

@@ -26,7 +26,7 @@ pub const CAUCHY: f32 = 2.385;
 /// Place that interpolation leaves unsure at any voxel, however steep (finest voxels): bright edges
 /// say no more than this. Measured on affine motions without noise, which come out .005 to .03 of a
 /// voxel off.
-const UNSURE: f64 = 0.02;
+pub const UNSURE: f64 = 0.02;
 
 /// Variance of the gradient that white noise leaves, along an axis (voxel^-2), over that of the
 /// residual.

@@ -144,6 +144,11 @@ impl From<SplineField> for Bodies {
 }
 
 impl Bodies {
+    /// One body at rest.
+    pub(super) fn still(pair: &Pair<'_>) -> Self {
+        SplineField::still(level::windows(pair)).into()
+    }
+
     /// With labels that stay as they are, one field each.
     pub(super) fn given(labels: Vec<u8>, fields: Vec<SplineField>) -> Self {
         Self { labels, fixed: true, fields }

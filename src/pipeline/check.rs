@@ -91,13 +91,10 @@ pub fn inputs<'a>(
     let mut first = fill(hide(bridged(initial, &lost[0]), empty[0]), not_finite[0] > 0 || empty[0].is_some());
     let bad = not_finite[1] > 0 || !lost[1].is_empty() || empty[1].is_some();
     let second = fill(without(hide(deformed.view(), empty[1]), &lost[1]), bad);
-    let unknown = not_finite[0] > 0 || empty[0].is_some();
-    if unknown {
+    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
+    if not_finite[0] > 0 || empty[0].is_some() {
         let nothing = empty[0].unwrap_or(ranges[0].low);
         first.as_mut_slice().iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = nothing);
-    }
-    let mut mask = mask.cloned().unwrap_or_else(|| foreground(&first));
-    if unknown {
         for (m, v) in mask.as_mut_slice().iter_mut().zip(initial.as_slice()) {
             if !v.is_finite() || Some(*v) == empty[0] {
                 *m = 0;
@@ -413,18 +410,8 @@ pub fn known(
 ) -> Result<(), FieldError> {
     params.check()?;
     mask_grid(initial, known.mask)?;
-    mask_grid(initial, known.initial_counts)?;
-    match known.deformed_counts {
-        Some(m) if !m.grid().same_as(deformed.grid()) => {
-            return Err(FieldError::GridMismatch {
-                what: "the deformed mask".into(),
-                found: m.grid().shape(),
-                reference: "the deformed volume".into(),
-                expected: deformed.grid().shape(),
-            });
-        }
-        _ => {}
-    }
+    on_grid("the mask of what counts", known.initial_counts, ("the initial volume", initial.grid()))?;
+    on_grid("the deformed mask", known.deformed_counts, ("the deformed volume", deformed.grid()))?;
     let refuse = |volume, what: &str, hint: &str| FieldError::Volume { volume, what: what.into(), hint: hint.into() };
     if params.method == Method::Full && params.bodies == BodySource::Given && known.mask.is_none() {
         return Err(refuse("mask", "is missing", "give the label map of the bodies as mask"));
@@ -442,12 +429,17 @@ pub fn known(
 /// # Errors
 /// [`FieldError::GridMismatch`] when it does not.
 pub fn mask_grid(initial: &Voxels<'_>, mask: Option<&Mask>) -> Result<(), FieldError> {
+    on_grid("the mask", mask, ("the initial volume", initial.grid()))
+}
+
+/// A mask, called `what`, must lie on the grid of a volume.
+fn on_grid(what: &str, mask: Option<&Mask>, (reference, grid): (&str, &Grid)) -> Result<(), FieldError> {
     match mask {
-        Some(m) if !m.grid().same_as(initial.grid()) => Err(FieldError::GridMismatch {
-            what: "the mask".into(),
+        Some(m) if !m.grid().same_as(grid) => Err(FieldError::GridMismatch {
+            what: what.into(),
             found: m.grid().shape(),
-            reference: "the initial volume".into(),
-            expected: initial.grid().shape(),
+            reference: reference.into(),
+            expected: grid.shape(),
         }),
         _ => Ok(()),
     }

@@ -11,7 +11,7 @@ use crate::matching::pair::{Anchor, Pair};
 use crate::numerics::ablation;
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::hypotheses::Search;
-use crate::pipeline::level::{self, SplineField};
+use crate::pipeline::level;
 use crate::types::{Agreement, FieldParams, Mask, Voxels};
 
 /// Part of what a gain and an offset leave of the variance that any relation must explain for the
@@ -52,17 +52,12 @@ fn relation(pair: &Pair<'_>, warped: &[f32]) -> Option<Relation> {
     Relation::of(inside.map(|((f, w), _)| [*f, *w]))
 }
 
-/// The larger of what either volume explains of the other.
-fn most(parts: [f64; 2]) -> f64 {
-    parts[0].max(parts[1])
-}
-
 /// How well the volumes agree at rest and under `motion`, whatever their contrast; from every
 /// second slice.
 pub(super) fn agreement(pair: &Pair<'_>, motion: &Bodies) -> Agreement {
     let some = pair.spans.slices(|k| k % 2 == 0);
-    let still = Bodies::from(SplineField::still(level::lattice(pair, 8)));
-    let of = |motion: &Bodies| relation(pair, &motion.warp(pair, &some)).map_or(0.0, |r| most(r.explained()));
+    let still = Bodies::still(pair);
+    let of = |motion: &Bodies| relation(pair, &motion.warp(pair, &some)).map_or(0.0, |r| r.most());
     Agreement { at_rest: of(&still), found: of(motion) }
 }
 
@@ -73,7 +68,7 @@ impl<'a> Scene<'a> {
     /// As [`Aligned::new`].
     pub fn common(&self, aligned: &Aligned<'_>) -> Result<Option<Common<'a>>, FieldError> {
         let pair = aligned.level(self.factors[0]);
-        let still = Bodies::from(SplineField::still(level::lattice(&pair, self.nodes)));
+        let still = Bodies::still(&pair);
         let at_rest = relation(&pair, &still.warp(&pair, &pair.spans));
         let Some(at_rest) = at_rest.filter(|r| differs(r) && ablation::is_on("contrast")) else { return Ok(None) };
         let mut found = at_rest.clone();
@@ -99,7 +94,7 @@ impl<'a> Scene<'a> {
     ///
     /// # Errors
     /// As [`Aligned::new`].
-    fn aligned<'b>(&self, initial: &'b Voxels<'b>, deformed: &'b Voxels<'b>) -> Result<Aligned<'b>, FieldError>
+    pub fn aligned<'b>(&self, initial: &'b Voxels<'b>, deformed: &'b Voxels<'b>) -> Result<Aligned<'b>, FieldError>
     where
         'a: 'b,
     {
@@ -136,14 +131,14 @@ impl<'a> Scene<'a> {
 
 /// Whether the intensities go together otherwise than in one contrast.
 fn differs(relation: &Relation) -> bool {
-    let (any, by_gain) = (most(relation.explained()), relation.explained_by_gain());
+    let (any, by_gain) = (relation.most(), relation.explained_by_gain());
     any - by_gain.max(0.0) > DIFFER * (1.0 - by_gain.max(0.0))
 }
 
 impl Common<'_> {
     /// The part of the variance that the relation explains under the motion (0 to 1).
     pub fn explained(&self) -> f64 {
-        most(self.relation.explained())
+        self.relation.most()
     }
 
     /// The name of the volume that was brought to the other's contrast.
@@ -165,8 +160,8 @@ impl Common<'_> {
     /// What to tell of it.
     pub fn said(&self) -> String {
         format!(
-            "the two volumes have different contrasts: intensities are matched by the relation that explains most ({:.0} % of the variance); \
-             the field is less accurate than in one contrast, most of all where that relation is flat",
+            "the two volumes have different contrasts, and the relation of their intensities explains {:.0} % of the variance. Expect a less \
+             accurate field than in one contrast, most of all where two tissues look alike",
             100.0 * self.explained()
         )
     }

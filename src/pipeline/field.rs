@@ -29,6 +29,7 @@ use crate::pipeline::stages::{self, Left, Stage};
 use crate::pipeline::start::{self, Begin};
 use crate::pipeline::uncertainty::{self, some_of};
 use crate::types::params::{BodySource, Interpolation, Method};
+use crate::types::points::covariance_after;
 use crate::types::*;
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
@@ -250,7 +251,6 @@ fn canonical(
     let search = search_mm(&grid, params.search_mm);
     let anchors = landmarks::anchors(known, &grid);
     let reach = TWICE * search;
-    let aligned = Aligned::new(&clean, &seen, &mask, reach)?.with_anchors(anchors.clone());
     let finest = finest_level(&grid, &mask, params.finest);
     let factors = worked_on(&grid, &mask, finest, search);
     let scene = contrast::Scene {
@@ -264,9 +264,10 @@ fn canonical(
         nodes: COARSE,
         params,
     };
+    let aligned = scene.aligned(&clean, &seen)?;
     let common = scene.common(&aligned)?;
     let aligned = match &common {
-        Some(c) => Aligned::new(&c.initial, &c.deformed, &mask, reach)?.with_anchors(anchors.clone()),
+        Some(c) => scene.aligned(&c.initial, &c.deformed)?,
         None => aligned,
     };
     clock.book("pyramid");
@@ -900,8 +901,7 @@ pub(super) fn too_few(
     (search, params): (f64, &FieldParams),
     started: bool,
 ) -> FieldError {
-    let still = Bodies::from(SplineField::still(level::lattice(pair, COARSE)));
-    let (plain, agreement) = (pair.plain(), contrast::agreement(pair, &still).at_rest);
+    let (plain, agreement) = (pair.plain(), contrast::agreement(pair, &Bodies::still(pair)).at_rest);
     let hint = match () {
         _ if plain > MOSTLY => format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: image finer or with less noise, or give --landmarks",
@@ -954,16 +954,11 @@ pub(super) fn said_of_model(rejected: bool) -> Option<String> {
 /// A level's match in world mm (RAS).
 pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
     let axes = spline::axes(grid);
-    let [xx, yy, zz, xy, xz, yz] = m.measured.covariance;
-    let c = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
-    let turned = |r: usize, s: usize| -> f64 {
-        (0..3).map(|a| (0..3).map(|b| axes[r][a] * c[a][b] * axes[s][b]).sum::<f64>()).sum()
-    };
     Match {
         initial: grid.affine().to_world(VoxelPoint(from_level(m.voxel, factor))),
         displacement: std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * m.measured.displacement[a]).sum()),
         ncc: m.ncc,
-        covariance: [turned(0, 0), turned(1, 1), turned(2, 2), turned(0, 1), turned(0, 2), turned(1, 2)],
+        covariance: covariance_after(&axes, &m.measured.covariance),
         kept: m.kept,
         raw: None,
     }

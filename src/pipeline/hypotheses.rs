@@ -220,8 +220,8 @@ impl Search<'_> {
         seconds: &mut f64,
     ) -> Begun {
         let refined = |motion| self.refined(pair, motion, passes);
-        let agreeing = |a, b| Bodies::better(pair, a, b);
-        let course = known.iter().map(|s| s.on(lattice, factor)).reduce(agreeing).map(refined);
+        let better = |a, b| Bodies::better(pair, a, b);
+        let course = known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
         let followed = known.first().and_then(|s| s.followed).filter(|&f| f < FOLLOWED);
         if let Some((motion, followed)) = course.as_ref().zip(followed)
             && timed(seconds, || self.is_confirmed(pair, motion))
@@ -244,11 +244,11 @@ impl Search<'_> {
         let given = known.iter().any(Start::is_given);
         // Where few features agree, landmarks decide.
         let marked = counts.kept_share() < BORNE_OUT && !pair.anchors.is_empty();
-        let better = |known: &Bodies| match marked {
+        let beats = |known: &Bodies| match marked {
             true => landmarks::gained(pair, &own, known) > 0.0,
             false => known.agree_better(pair, &own),
         };
-        let wins = |known: &Bodies| (in_doubt || given) && better(known);
+        let wins = |known: &Bodies| (in_doubt || given) && beats(known);
         let motion = course.filter(wins).map_or(own, refined);
         Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }

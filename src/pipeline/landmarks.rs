@@ -5,10 +5,10 @@
 
 use crate::consistency::energy::distance;
 use crate::consistency::models::AffineMotion;
-use crate::consistency::pruning::Measured;
+use crate::consistency::pruning::{GATE, Measured};
 use crate::field::spline;
 use crate::matching::pair::{Anchor, Pair};
-use crate::matching::residual::NormalEquations;
+use crate::matching::residual::{NormalEquations, UNSURE};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::statistics::median;
 use crate::pipeline::bodies::Bodies;
@@ -25,20 +25,14 @@ const SCALE: f64 = 9.0;
 const FALLS: f64 = 4.0;
 const SETTLING: usize = 3;
 
-/// The same distance beyond which a landmark is called wrong: one right one in a thousand is (chi
-/// square, three axes).
-const WRONG: f64 = 16.27;
-
-/// Least standard deviation of a landmark (voxels): what interpolation leaves unsure of any place.
-const SURE: f64 = 0.02;
-
-/// Landmarks from which a field of their own may start the search: an affine map takes four.
-const FEWEST: usize = 4;
+/// Landmarks from which a motion of their own may start the search: an affine map takes four.
+pub(super) const FEWEST: usize = 4;
 
 /// The landmarks on the initial volume's grid.
 pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
     let sd = if known.landmark_sd_mm > 0.0 { known.landmark_sd_mm } else { voxel(grid) };
-    let sd = sd.max(SURE * voxel(grid));
+    // Of no place more is known than interpolation leaves sure.
+    let sd = sd.max(UNSURE * voxel(grid));
     let axes = spline::axes(grid);
     let of = |l: &Landmark| {
         let d = l.deformed.minus(l.initial);
@@ -155,7 +149,7 @@ pub(super) fn report(
     let off: Vec<f64> = anchors.iter().map(|a| distance(at(a.at), a.displacement)).collect();
     let is_wrong = |i: &usize| {
         let variance = anchors[*i].sd.powi(2) + deviation(anchors[*i].at).powi(2);
-        off[*i].powi(2) / variance > WRONG
+        off[*i].powi(2) / variance > GATE
     };
     let wrong: Vec<usize> = (0..anchors.len()).filter(is_wrong).collect();
     Some(LandmarkReport {

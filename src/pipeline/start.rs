@@ -9,17 +9,18 @@ use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, SpaceError};
 use crate::matching::contrast::Relation;
 use crate::matching::levels::foreground;
+use crate::matching::residual::UNSURE;
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::sampling::nearest;
 use crate::numerics::small::{full, inverse};
 use crate::numerics::statistics::median;
 use crate::pipeline::field::{FieldResult, lengths};
 use crate::pipeline::known::{Known, StartMap};
+use crate::pipeline::landmarks::FEWEST;
 use crate::pipeline::stages::Stage;
 use crate::types::space::{Matrix3, determinant, dot, length};
 use crate::types::{
-    Affine, AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, StartReport, VoxelPoint, Voxels,
-    WorldPoint,
+    AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, StartReport, VoxelPoint, Voxels, WorldPoint,
 };
 use rayon::prelude::*;
 
@@ -62,22 +63,20 @@ pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Re
         return Err(refuse("has no value anywhere in the tissue", "check that it is a map from the initial volume"));
     }
     let [from, to] = [mean(pairs.iter().map(|p| p.0)), mean(pairs.iter().map(|p| p.1))];
-    let (mut spread, mut cross) = ([0.0; 6], [[0.0; 3]; 3]);
+    let (mut spread, mut cross) = ([[0.0; 3]; 3], [[0.0; 3]; 3]);
     for (x, y) in &pairs {
         let (d, e): ([f64; 3], [f64; 3]) = (x.minus(WorldPoint(from)), y.minus(WorldPoint(to)));
-        for (q, (a, b)) in [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
-            spread[q] += d[a] * d[b];
-        }
+        (0..3).for_each(|r| (0..3).for_each(|c| spread[r][c] += d[r] * d[c]));
         (0..3).for_each(|r| (0..3).for_each(|c| cross[r][c] += e[r] * d[c]));
     }
     // Across a slice, where there is nothing to go by, nothing is stretched or turned.
-    let little = 1e-9 * (spread[0] + spread[1] + spread[2]).max(f64::MIN_POSITIVE);
+    let little = 1e-9 * (spread[0][0] + spread[1][1] + spread[2][2]).max(f64::MIN_POSITIVE);
     for a in 0..3 {
-        spread[a] += little;
+        spread[a][a] += little;
         cross[a][a] += little;
     }
-    let [xx, yy, zz, xy, xz, yz] = inverse(&spread).unwrap_or([0.0; 6]);
-    let inverse = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+    let [[xx, xy, xz], [_, yy, yz], [_, _, zz]] = spread;
+    let inverse = full(&inverse(&[xx, yy, zz, xy, xz, yz]).unwrap_or([0.0; 6]));
     let linear: Matrix3 =
         std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| cross[r][k] * inverse[k][c]).sum()));
     if determinant(&linear) <= 0.0 {
@@ -98,19 +97,10 @@ fn about(linear: Matrix3, from: [f64; 3], to: [f64; 3]) -> Result<AffineMap, Spa
     AffineMap::new([row(0), row(1), row(2)])
 }
 
-/// The grid on which a volume lies once the world is taken back by `map`.
-pub(super) fn before(map: &AffineMap, grid: &Grid) -> Result<Grid, FieldError> {
-    let back = map.inverse();
-    let at = |v: [f64; 3]| back.at(grid.affine().to_world(VoxelPoint(v))).0;
-    let origin = at([0.0; 3]);
-    let columns: [[f64; 3]; 3] = std::array::from_fn(|c| at(std::array::from_fn(|a| f64::from(u8::from(a == c)))));
-    let row = |r: usize| [columns[0][r] - origin[r], columns[1][r] - origin[r], columns[2][r] - origin[r], origin[r]];
-    Ok(Grid::new(grid.shape(), Affine::new([row(0), row(1), row(2)])?)?)
-}
-
 /// Landmarks with the deformed places taken back by `map`.
-pub(super) fn landmarks_before(map: &AffineMap, landmarks: &[Landmark]) -> Vec<Landmark> {
-    landmarks.iter().map(|l| Landmark { deformed: map.inverse().at(l.deformed), ..*l }).collect()
+fn landmarks_before(map: &AffineMap, landmarks: &[Landmark]) -> Vec<Landmark> {
+    let back = map.inverse();
+    landmarks.iter().map(|l| Landmark { deformed: back.at(l.deformed), ..*l }).collect()
 }
 
 /// The map that brings the initial volume's tissue onto the deformed volume's.
@@ -141,7 +131,8 @@ pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> R
     };
     let turns = turned.into_iter().filter(|turn| !over(turn)).chain([identity]);
     let maps: Result<Vec<AffineMap>, _> = turns.map(|turn| about(turn, first.centre, second.centre)).collect();
-    let agreement = |map: &AffineMap| agreement(initial, deformed, |p| map.at(p));
+    let compared = Compared::of(initial);
+    let agreement = |map: &AffineMap| compared.agreement(deformed, |p| map.at(p));
     let best = maps?.into_iter().map(|m| (agreement(&m), m)).max_by(|a, b| a.0.total_cmp(&b.0));
     best.map(|b| b.1).ok_or(FieldError::NoOverlap { hint: "check both volumes".into() })
 }
@@ -182,14 +173,12 @@ impl Moments {
             let p = grid.centre(at).0;
             (0..3).for_each(|a| centre[a] += weight(at) / all * p[a]);
         }
-        let mut spread = [0.0; 6];
+        let mut spread = [[0.0; 3]; 3];
         for &at in &inside {
             let d = grid.centre(at).minus(WorldPoint(centre));
-            for (q, (a, b)) in [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
-                spread[q] += weight(at) / all * d[a] * d[b];
-            }
+            (0..3).for_each(|r| (0..3).for_each(|c| spread[r][c] += weight(at) / all * d[r] * d[c]));
         }
-        let mut axes = symmetric_eigen(&full(&spread)).map(|e| e.1);
+        let mut axes = symmetric_eigen(&spread).map(|e| e.1);
         if determinant(&axes) < 0.0 {
             axes[2] = axes[2].map(|v| -v);
         }
@@ -197,21 +186,32 @@ impl Moments {
     }
 }
 
-/// How well two volumes agree under a map, whatever their contrast (0 to 1): the part of one's
-/// variance that the other explains, less where less of the tissue is seen.
-pub fn agreement(initial: &Voxels<'_>, deformed: &Voxels<'_>, map: impl Fn(WorldPoint) -> WorldPoint) -> f64 {
-    let grid = initial.grid();
-    let tissue = foreground(initial);
-    let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
-    let some: Vec<usize> = inside.iter().copied().step_by(inside.len().div_ceil(10 * PLACES).max(1)).collect();
-    let seen = |at: usize| {
-        let there = deformed.grid().affine().to_voxel(map(grid.centre(at)));
-        nearest(deformed.grid().shape(), there).map_or(f32::NAN, |o| deformed.as_slice()[o])
-    };
-    let pairs: Vec<[f32; 2]> = some.iter().map(|&at| [initial.as_slice()[at], seen(at)]).collect();
-    let finite = pairs.iter().filter(|p| p[0].is_finite() && p[1].is_finite()).count();
-    let share = finite as f64 / some.len().max(1) as f64;
-    share * Relation::of(pairs.into_iter()).map_or(0.0, |r| r.explained().into_iter().fold(0.0, f64::max))
+/// The initial volume's tissue at places to compare with a deformed volume.
+pub struct Compared(Vec<(WorldPoint, f32)>);
+
+impl Compared {
+    /// From every so many voxels of the foreground.
+    pub fn of(initial: &Voxels<'_>) -> Self {
+        let grid = initial.grid();
+        let tissue = foreground(initial);
+        let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
+        let some = inside.iter().step_by(inside.len().div_ceil(10 * PLACES).max(1));
+        Self(some.map(|&at| (grid.centre(at), initial.as_slice()[at])).collect())
+    }
+
+    /// How well a deformed volume agrees under a map, whatever its contrast (0 to 1): the part of one's
+    /// variance that the other explains, less where less of the tissue is seen.
+    pub fn agreement(&self, deformed: &Voxels<'_>, map: impl Fn(WorldPoint) -> WorldPoint) -> f64 {
+        let grid = deformed.grid();
+        let seen = |x: WorldPoint| {
+            let there = grid.affine().to_voxel(map(x));
+            nearest(grid.shape(), there).map_or(f32::NAN, |at| deformed.as_slice()[at])
+        };
+        let pairs: Vec<[f32; 2]> = self.0.iter().map(|&(x, value)| [value, seen(x)]).collect();
+        let finite = pairs.iter().filter(|p| p[0].is_finite() && p[1].is_finite()).count();
+        let share = finite as f64 / pairs.len().max(1) as f64;
+        share * Relation::of(pairs.into_iter()).map_or(0.0, |r| r.most())
+    }
 }
 
 /// A start as a run takes it: its affine part apart, and what is known with that taken out.
@@ -243,9 +243,9 @@ impl<'a> Begin<'a> {
     /// The deformed volume's grid with the affine part taken out.
     ///
     /// # Errors
-    /// As [`before`].
-    pub fn grid(&self, deformed: &Grid) -> Result<Grid, FieldError> {
-        self.affine.as_ref().map_or(Ok(*deformed), |map| before(map, deformed))
+    /// [`SpaceError`] when it has no place there.
+    pub fn grid(&self, deformed: &Grid) -> Result<Grid, SpaceError> {
+        self.affine.as_ref().map_or(Ok(*deformed), |map| map.inverse().grid(deformed))
     }
 
     /// What is known, with the affine part taken out.
@@ -266,18 +266,16 @@ impl<'a> Begin<'a> {
     }
 }
 
-/// Rest of a start, as a part of a voxel, up to which it is affine.
-const AFFINE: f64 = 0.02;
-
 /// The displacement (mm, RAS) of a start at a place of the initial volume's world; 0 where it has
 /// none.
 pub(super) fn rest<'a>(start: &'a StartMap<'a>) -> impl Fn(WorldPoint) -> [f64; 3] + Sync + 'a {
     move |x| start(x).map_or([0.0; 3], |y| y.minus(x))
 }
 
-/// Whether a start whose affine part was taken out is more than that.
+/// Whether a start whose affine part was taken out is more than that, by what interpolation leaves
+/// unsure of any place.
 pub(super) fn bends(rest: impl Fn(WorldPoint) -> [f64; 3], grid: &Grid, mask: Option<&Mask>) -> bool {
-    places(grid, mask).into_iter().any(|x| length(rest(x)) > AFFINE * grid.least_spacing())
+    places(grid, mask).into_iter().any(|x| length(rest(x)) > UNSURE * grid.least_spacing())
 }
 
 impl FieldResult {
@@ -306,13 +304,10 @@ impl FieldResult {
     }
 }
 
-/// Landmarks that a rigid motion takes.
-const RIGID: usize = 4;
-
 /// The rigid motion nearest to landmarks most of which move further than `range` (mm).
 fn far_apart(landmarks: &[Landmark], range: f64) -> Option<AffineMap> {
     let mut lengths: Vec<f32> = landmarks.iter().map(|l| length(l.deformed.minus(l.initial)) as f32).collect();
-    if landmarks.len() < RIGID || f64::from(median(&mut lengths)) <= range {
+    if landmarks.len() < FEWEST || f64::from(median(&mut lengths)) <= range {
         return None;
     }
     let middle = mean(landmarks.iter().map(|l| l.initial));

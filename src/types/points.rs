@@ -1,6 +1,6 @@
 //! Feature points, matches and sparse displacement fields.
 
-use crate::types::space::{VoxelPoint, WorldPoint};
+use crate::types::space::{Matrix3, VoxelPoint, WorldPoint};
 use crate::types::transform::AffineMap;
 
 /// A corner-like place of a volume (3D Harris).
@@ -65,12 +65,7 @@ impl Match {
     #[must_use]
     pub fn followed_by(&self, map: &AffineMap) -> Self {
         let moved = |d: [f64; 3]| map.at(self.initial.moved(d)).minus(self.initial);
-        let [xx, yy, zz, xy, xz, yz] = self.covariance;
-        let (c, l) = ([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], map.rows());
-        let turned = |r: usize, s: usize| -> f64 {
-            (0..3).map(|a| (0..3).map(|b| l[r][a] * c[a][b] * l[s][b]).sum::<f64>()).sum()
-        };
-        let covariance = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|(r, s)| turned(r, s));
+        let covariance = covariance_after(&map.rows().map(|[x, y, z, _]| [x, y, z]), &self.covariance);
         let raw = self.raw.map(|raw| RawMatch { displacement: moved(raw.displacement), ..raw });
         Self { displacement: moved(self.displacement), covariance, raw, ..*self }
     }
@@ -79,6 +74,15 @@ impl Match {
     pub fn sigma(&self) -> f64 {
         ((self.covariance[0] + self.covariance[1] + self.covariance[2]) / 3.0).max(0.0).sqrt()
     }
+}
+
+/// A covariance (xx, yy, zz, xy, xz, yz) after a linear map.
+pub fn covariance_after(linear: &Matrix3, [xx, yy, zz, xy, xz, yz]: &[f64; 6]) -> [f64; 6] {
+    let c = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+    let after = |r: usize, s: usize| -> f64 {
+        (0..3).map(|a| (0..3).map(|b| linear[r][a] * c[a][b] * linear[s][b]).sum::<f64>()).sum()
+    };
+    [after(0, 0), after(1, 1), after(2, 2), after(0, 1), after(0, 2), after(1, 2)]
 }
 
 /// Matches of one pair of volumes.

@@ -2,7 +2,7 @@
 
 use crate::error::SpaceError;
 use crate::types::field::DenseField;
-use crate::types::space::{Affine, VoxelPoint, WorldPoint};
+use crate::types::space::{Affine, Grid, VoxelPoint, WorldPoint};
 
 /// Largest entry of the linear part of a transform, and of its shift (mm).
 const LARGEST: [f64; 2] = [1e4, 1e6];
@@ -41,6 +41,14 @@ impl AffineMap {
     #[inline]
     pub fn at(&self, p: WorldPoint) -> WorldPoint {
         self.0.to_world(VoxelPoint(p.0))
+    }
+
+    /// Where a grid goes.
+    ///
+    /// # Errors
+    /// [`SpaceError`] when it has no place there.
+    pub fn grid(&self, grid: &Grid) -> Result<Grid, SpaceError> {
+        Grid::new(grid.shape(), grid.affine().then(&self.0))
     }
 
     /// The map that undoes this one.
