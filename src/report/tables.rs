@@ -71,8 +71,9 @@ pub fn bodies(report: &FieldReport<'_>) -> String {
     table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm", "Expected error, mm"], &rows)
 }
 
-/// Landmarks drawn at most, the furthest first.
+/// Landmarks drawn at most, the furthest first, and the length of its bar (em).
 const LANDMARKS: usize = 20;
+const BAR: f64 = 10.0;
 
 /// How far the deformed place of each landmark is from where the field leads, as bars; red where the
 /// field contradicts it.
@@ -83,8 +84,8 @@ pub fn landmarks(report: &FieldReport<'_>) -> Option<String> {
     let most = order.first().map_or(0.0, |&i| l.distances_mm[i]).max(f64::MIN_POSITIVE);
     let row = |&i: &usize| {
         let (mm, colour) = (l.distances_mm[i], if l.wrong.contains(&(i + 1)) { "#d1495b" } else { "#2e86ab" });
-        let width = 100.0 * mm / most;
-        let bar = format!("<div style=\"width:{width:.1}%;min-width:2px;height:.7em;background:{colour}\"></div>");
+        let width = BAR * mm / most;
+        let bar = format!("<div style=\"width:{width:.2}em;min-width:2px;height:.7em;background:{colour}\"></div>");
         vec![format!("number {}", i + 1), format!("{mm:.2} mm"), bar]
     };
     let rows: Vec<_> = order.iter().take(LANDMARKS).map(row).collect();
