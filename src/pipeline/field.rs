@@ -226,7 +226,7 @@ fn canonical(
     starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    let (initial, deformed) = (counting(initial, known.initial_counts), counting(deformed, known.deformed_counts));
+    let [initial, deformed] = known.counting(initial, deformed);
     if params.method == Method::Sparse {
         let bends = known.start.is_some_and(|start| start::bends(start::rest(start), initial.grid(), known.mask));
         if bends {
@@ -245,8 +245,8 @@ fn canonical(
     };
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
         check::inputs(&initial, &deformed, known.mask)?;
-    let not_finite = told(not_finite, [&initial, &deformed], known);
-    let mask = counted(mask, known.initial_counts);
+    let not_finite = known.not_finite(not_finite, [&initial, &deformed]);
+    let mask = known.counted(mask);
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     let anchors = landmarks::anchors(known, &grid);
@@ -518,36 +518,6 @@ pub(super) fn agreement(pair: &Pair<'_>, bodies: &Bodies, model: MotionModel) ->
         return Err(FieldError::Worse { at_rest, found: now, hint });
     }
     Ok(found)
-}
-
-/// The volume without the voxels that do not count; what does is drawn on a little past them, so
-/// that patches beside them can be matched.
-fn counting<'a>(volume: &'a Voxels<'_>, counts: Option<&Mask>) -> Voxels<'a> {
-    let mut out = volume.view();
-    let Some(counts) = counts else { return out };
-    let left_out = out.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0);
-    left_out.for_each(|(v, _)| *v = f32::NAN);
-    check::drawn_on(out)
-}
-
-/// The mask without the voxels that do not count.
-pub(super) fn counted(mut mask: Mask, counts: Option<&Mask>) -> Mask {
-    if let Some(counts) = counts {
-        mask.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0).for_each(|(m, _)| *m = 0);
-    }
-    mask
-}
-
-/// Voxels that are not finite, less those that do not count.
-pub(super) fn told(not_finite: [usize; 2], volumes: [&Voxels<'_>; 2], known: &Known<'_>) -> [usize; 2] {
-    let counts = [known.initial_counts, known.deformed_counts];
-    std::array::from_fn(|v| match counts[v] {
-        Some(counts) => {
-            let values = volumes[v].as_slice().iter().zip(counts.as_slice());
-            values.filter(|(v, c)| **c != 0 && !v.is_finite()).count()
-        }
-        None => not_finite[v],
-    })
 }
 
 /// The fields that what is known suggests on the coarsest level: what is left of a start, and one

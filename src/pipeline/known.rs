@@ -2,7 +2,8 @@
 //! that were marked in both.
 
 use crate::numerics::orientation::Orientation;
-use crate::types::{Landmark, Mask, WorldPoint};
+use crate::pipeline::check::drawn_on;
+use crate::types::{Landmark, Mask, Voxels, WorldPoint};
 
 /// A map from the initial to the deformed volume (world mm, RAS); none where it has no value.
 pub type StartMap<'a> = dyn Fn(WorldPoint) -> Option<WorldPoint> + Sync + 'a;
@@ -28,6 +29,41 @@ impl<'a> Known<'a> {
     /// Only where to measure.
     pub fn mask(mask: Option<&'a Mask>) -> Self {
         Self { mask, ..Self::default() }
+    }
+
+    /// The volumes without the voxels that do not count; what does is drawn on a little past them,
+    /// so that patches beside them can be matched.
+    pub(super) fn counting<'b>(&self, initial: &'b Voxels<'_>, deformed: &'b Voxels<'_>) -> [Voxels<'b>; 2] {
+        let of = |volume: &'b Voxels<'_>, counts: Option<&Mask>| {
+            let mut out = volume.view();
+            let Some(counts) = counts else { return out };
+            let left_out = out.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0);
+            left_out.for_each(|(v, _)| *v = f32::NAN);
+            drawn_on(out)
+        };
+        [of(initial, self.initial_counts), of(deformed, self.deformed_counts)]
+    }
+
+    /// A mask of the initial volume without the voxels that do not count.
+    pub(super) fn counted(&self, mut mask: Mask) -> Mask {
+        if let Some(counts) = self.initial_counts {
+            let left_out = mask.as_mut_slice().iter_mut().zip(counts.as_slice()).filter(|(_, c)| **c == 0);
+            left_out.for_each(|(m, _)| *m = 0);
+        }
+        mask
+    }
+
+    /// Voxels of the two that are not finite, of `all` those that count.
+    pub(super) fn not_finite(&self, all: [usize; 2], volumes: [&Voxels<'_>; 2]) -> [usize; 2] {
+        let counts = [self.initial_counts, self.deformed_counts];
+        let of = |v: usize| match counts[v] {
+            Some(counts) => {
+                let values = volumes[v].as_slice().iter().zip(counts.as_slice());
+                values.filter(|(v, c)| **c != 0 && !v.is_finite()).count()
+            }
+            None => all[v],
+        };
+        [of(0), of(1)]
     }
 }
 

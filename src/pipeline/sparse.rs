@@ -129,8 +129,8 @@ pub(super) fn measure(
     let [initial, deformed] = [initial, deformed].map(check::tamed);
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
         check::inputs(&initial, &deformed, known.mask)?;
-    let not_finite = field::told(not_finite, [&initial, &deformed], known);
-    let mask = field::counted(mask, known.initial_counts);
+    let not_finite = known.not_finite(not_finite, [&initial, &deformed]);
+    let mask = known.counted(mask);
     let grid = *initial.grid();
     let flat = grid.is_single_slice();
     let search = field::search_mm(&grid, params.search_mm);
