@@ -5,7 +5,7 @@
 use palpate::mesh::tetrahedral::{Detail, Fineness, Mesher, mesh_labels};
 use palpate::numerics::random::Random;
 use palpate::pipeline::pressed::Pressed;
-use palpate::pipeline::stiffness::{Inputs, check, run};
+use palpate::pipeline::stiffness::{FieldQuality, Inputs, check, run};
 use palpate::stiffness::body::Body;
 use palpate::stiffness::forward::{Problem, Tie};
 use palpate::stiffness::identify::State;
@@ -314,7 +314,7 @@ fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
     let mut level = Level::new(&mesh, &body.phantom.truth, None, &map, &held, &load, None).unwrap();
     assert!(level.patches[1].curved());
     level.patches[1].contact = Contact::Sliding;
-    let setup = level.setup(Law::NeoHookean, 0.49, level.largest());
+    let setup = level.setup(Law::NeoHookean, &StiffnessParams::default(), level.largest());
     // Far from what the data say, so that the run ends where it starts, with the derivatives there.
     let here = setup.run(setup.start(), 0, 1e-9).unwrap();
     assert_eq!(here.state.theta, setup.start().theta);
@@ -394,7 +394,16 @@ fn squeezed(strain: f64, nu: f64) -> DenseField {
 fn identify(map: &Mask, field: &DenseField, params: &StiffnessParams) -> StiffnessResult {
     let (held, load) = (Place::Side(Side::parse("z-").unwrap()), Place::Side(Side::parse("z+").unwrap()));
     let names = |l: u8| format!("region {l}");
-    let inputs = Inputs { field, matches: None, labels: map, labelled: true, held: &held, load: &load, names: &names };
+    let inputs = Inputs {
+        field,
+        matches: None,
+        labels: map,
+        labelled: true,
+        held: &held,
+        load: &load,
+        names: &names,
+        quality: FieldQuality::default(),
+    };
     run(&inputs, params, &|_, _| {}).unwrap()
 }
 
@@ -562,8 +571,16 @@ fn a_flat_face_is_found_though_its_rim_is_rounded() {
         let (map, names) = (labels(shape, 1.0, cylinder), |l: u8| format!("region {l}"));
         for nodes in [3_000, 8_000, 20_000] {
             let (field, labels) = (&field, &map);
-            let inputs =
-                Inputs { field, matches: None, labels, labelled: true, held: &held, load: &load, names: &names };
+            let inputs = Inputs {
+                field,
+                matches: None,
+                labels,
+                labelled: true,
+                held: &held,
+                load: &load,
+                names: &names,
+                quality: FieldQuality::default(),
+            };
             check(&inputs, &StiffnessParams { nodes, ..Default::default() }).unwrap();
         }
     }
@@ -584,7 +601,8 @@ fn results_do_not_depend_on_the_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
         pool.install(|| identify(&map, &squeezed(0.05, 0.49), &params))
     });
-    assert_eq!(one.regions, two.regions);
+    // As text: what is unknown is not a number.
+    assert_eq!(format!("{:?}", one.regions), format!("{:?}", two.regions));
     assert_eq!(one.displacement, two.displacement);
 }
 
@@ -616,16 +634,22 @@ fn layers_under_a_punch_are_told_though_the_edge_is_known_to_a_voxel_only() {
 /// A found bug: small strain, which is not the law in the end, made a guided patch of a punch (from
 /// images a skin of 80 kPa came out as 101).
 #[test]
-fn a_guided_patch_must_be_worth_it_under_the_law_that_is_taken() {
+fn a_skin_under_a_punch_is_right_whatever_contact_is_taken() {
     let body = Pressed::new(&PhantomParams { seed: 3, ..PhantomParams::new(PhantomKind::Slab) }.sized(40)).unwrap();
     let labels = &body.phantom.stiffness.as_ref().unwrap().labels;
-    let params = StiffnessParams { force_n: Some(body.force_n), nodes: 4000, ..Default::default() };
+    let params = StiffnessParams { force_n: Some(body.force_n), nodes: 10_000, ..Default::default() };
     let result = body.measure(&body.phantom.truth, None, labels, &params).unwrap();
-    let contact: Vec<&Evidence> = result.evidence.iter().filter(|e| e.question == "contact").collect();
-    let guided = contact.iter().find(|e| e.model.ends_with("guided")).unwrap();
-    assert!(guided.bic < contact[0].bic && guided.reason.contains("small strain alone"), "{contact:?}");
-    assert!(!guided.chosen && contact.iter().filter(|e| e.chosen).count() == 1, "{contact:?}");
-    assert_eq!((result.law, result.patches[1].contact), (Law::NeoHookean, Contact::Sliding));
+    let chosen = result.evidence.iter().filter(|e| e.question == "contact" && e.chosen).count();
+    assert_eq!((result.law, chosen), (Law::NeoHookean, 1), "{:?}", result.evidence);
+    for r in &result.regions {
+        let off = r.youngs_modulus / body.modulus(r.label) - 1.0;
+        assert!(
+            off.abs() < 0.15 && off.abs() < 2.0 * r.sd / r.youngs_modulus,
+            "{} {off} {:?}",
+            r.name,
+            result.patches[1].contact
+        );
+    }
 }
 
 #[test]
@@ -651,7 +675,16 @@ fn held_where(
     let mask = Mask::from_voxels(*map.grid(), |_, p| u8::from(held(p.0)));
     let (held, load) = (Place::Mask(Box::new(mask), "held.nii.gz".into()), Place::Side(Side::parse("z+").unwrap()));
     let names = |l: u8| format!("region {l}");
-    let inputs = Inputs { field, matches: None, labels: map, labelled: true, held: &held, load: &load, names: &names };
+    let inputs = Inputs {
+        field,
+        matches: None,
+        labels: map,
+        labelled: true,
+        held: &held,
+        load: &load,
+        names: &names,
+        quality: FieldQuality::default(),
+    };
     run(&inputs, params, &|_, _| {}).unwrap()
 }
 
@@ -685,7 +718,7 @@ fn what_one_label_hides_is_warned_of_though_there_is_noise() {
         let field = noisy(&body.phantom.truth, noise, 5);
         for (labels, warned) in [(known, false), (&one, true)] {
             let result = identify(labels, &field, &params);
-            let said = result.warnings.iter().any(|w| w.contains("moduli may be off by more than stated"));
+            let said = result.warnings.iter().any(|w| w.contains("the model leaves over"));
             assert_eq!(said, warned, "{noise} mm: {:?}", result.warnings);
         }
     }
@@ -827,6 +860,7 @@ fn searched(field: &DenseField, known: &Mask, params: &StiffnessParams) -> Stiff
         held: &held,
         load: &load,
         names: &|label| format!("region {label}"),
+        quality: FieldQuality::default(),
     };
     run(&inputs, params, &|_, _| {}).unwrap()
 }
@@ -994,7 +1028,7 @@ fn two_like_inclusions_are_two_regions_beside_the_first() {
     // Regions are known less well without labels than with them: so much stays unknown of either.
     for ball in balls {
         assert!((ball.ratio - 5.0).abs() < 2.0 * ball.ratio_sd, "{ball:?}");
-        assert!((0.02 * 5f64.ln()..0.15).contains(&(ball.ratio_sd / ball.ratio)), "{ball:?}");
+        assert!((0.02 * 5f64.ln()..0.2).contains(&(ball.ratio_sd / ball.ratio)), "{ball:?}");
     }
     let found = result.found.unwrap();
     for label in [2, 3] {

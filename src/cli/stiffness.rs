@@ -12,12 +12,14 @@ use clap::Args;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline;
-use palpate::pipeline::stiffness::{ENOUGH, Inputs, inside};
+use palpate::pipeline::stiffness::{ENOUGH, FieldQuality, Inputs, inside};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
 use palpate::stiffness::patches::Place;
 use palpate::types::stiffness::{LawChoice, Side};
-use palpate::types::{DenseField, Grid, Mask, SparseField, StiffnessParams, StiffnessResult, Volume};
+use palpate::types::{
+    DenseField, ErrorSamples, Grid, Mask, MotionModel, SparseField, StiffnessParams, StiffnessResult, Trust, Volume,
+};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -78,10 +80,23 @@ pub struct Options {
     /// Total force on the loaded patch in N, its magnitude; without, moduli are ratios
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<f64>,
-    /// Poisson's ratio of all regions
-    #[arg(long, value_name = "NU", default_value_t = StiffnessParams::default().poisson, allow_negative_numbers = true)]
-    poisson: f64,
-    /// linear, neo-hookean, or auto: linear unless strains past 5 % or the data ask for more
+    /// Poisson's ratio of all regions, or LABEL=NU of one; may be given several times
+    /// [default: 0.49]
+    #[arg(long, value_name = "NU|LABEL=NU", value_delimiter = ',', allow_hyphen_values = true)]
+    poisson: Vec<String>,
+    /// Young's modulus of a label that is known (bone, a calibrated pad), in kPa: it is not sought,
+    /// and without a force it sets the scale; may be given several times
+    #[arg(long, value_name = "LABEL=KPA", value_delimiter = ',', requires = "labels")]
+    fixed: Vec<String>,
+    /// A table of what is known by label: columns label, and poisson or youngs_modulus_kpa or both;
+    /// an empty field is open
+    #[arg(long, value_name = "TABLE.csv", requires = "labels")]
+    materials: Option<PathBuf>,
+    /// One standard deviation of the border between two labels, in voxels: how well whoever drew
+    /// them knew it
+    #[arg(long, value_name = "VOXELS", default_value_t = StiffnessParams::default().label_sd)]
+    label_sd: f64,
+    /// linear, neo-hookean, or auto: the one that explains the field better
     #[arg(long, default_value = "auto")]
     model: LawChoice,
     /// Nodes of the mesh, about; 500 to 500,000
@@ -100,6 +115,9 @@ pub struct Options {
     /// Write into a folder that is not empty
     #[arg(long)]
     pub(super) overwrite: bool,
+    /// Exit with 1 where trust in the result is low
+    #[arg(long)]
+    strict: bool,
     /// Check everything, say what would be done, and write nothing
     #[arg(long)]
     pub(super) dry_run: bool,
@@ -108,9 +126,19 @@ pub struct Options {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { poisson, model, force, nodes, regions, .. } = *options;
-    let tried = regions.unwrap_or(StiffnessParams::default().regions);
-    let params = StiffnessParams { poisson, model, force_n: force, nodes, regions: tried };
+    let Options { model, force, nodes, regions, label_sd, .. } = *options;
+    let usual = StiffnessParams::default();
+    let known = Materials::of(options)?;
+    let params = StiffnessParams {
+        poisson: known.poisson.unwrap_or(usual.poisson),
+        poisson_of: known.poisson_of,
+        fixed: known.fixed,
+        label_sd,
+        model,
+        force_n: force,
+        nodes,
+        regions: regions.unwrap_or(usual.regions),
+    };
     params.check()?;
     if regions.is_some() && options.labels.is_some() {
         warn_all(console, &["--regions changes nothing with --labels, which say what the regions are".into()]);
@@ -232,12 +260,14 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     if options.images.is_empty() {
         inputs.extend(source.image.iter().map(|p| ("image", p.clone())));
     }
+    inputs.extend(source.summary.iter().chain(&source.samples).map(|p| ("field", p.clone())));
     let record = Recording::start(console, inputs);
     // Of a sequence.
     folder.supersede(|file| file == "frames.csv" || file == FOUND)?;
     let read = started.elapsed().as_secs_f64();
 
-    let result = setting.run(&field, matches.as_ref(), params, &|s, f| progress.set(s, f));
+    let quality = Quality::of(&source)?;
+    let result = setting.run(&field, matches.as_ref(), quality.told(), params, &|s, f| progress.set(s, f));
     let mut result = result.with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
     result.seconds.insert(0, ("read".into(), read));
     progress.set("write", 1.0);
@@ -266,7 +296,16 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         _ => String::new(),
     };
     let page = options.output.join("report.html");
-    console.say(&format!("{}{used}  results      {}", report::text(&result), page.display()))
+    console.say(&format!("{}{used}  results      {}", report::text(&result), page.display()))?;
+    strict(options, &result)
+}
+
+/// Refuses a result of low trust, once it is written, where that was asked for.
+pub(super) fn strict(options: &Options, result: &StiffnessResult) -> Result<()> {
+    if options.strict && result.trust == Trust::Low {
+        bail!("--strict: trust in the moduli is low: {}", result.trust_reasons.join("; "));
+    }
+    Ok(())
 }
 
 /// Where the motion is read from.
@@ -275,6 +314,32 @@ struct Source {
     matches: Option<PathBuf>,
     /// The deformed volume drawn back to where the initial one lies.
     image: Option<PathBuf>,
+    /// What the field's own results say of its error.
+    summary: Option<PathBuf>,
+    samples: Option<PathBuf>,
+}
+
+/// What is known of a field's own error.
+#[derive(Debug, Default)]
+pub(super) struct Quality {
+    trust: Option<Trust>,
+    model: Option<MotionModel>,
+    samples: Option<ErrorSamples>,
+}
+
+impl Quality {
+    fn of(source: &Source) -> Result<Self> {
+        let summary = source.summary.as_ref().map(io::read_json).transpose()?.unwrap_or_default();
+        Ok(Self {
+            trust: serde_json::from_value(summary["trust"].clone()).ok(),
+            model: serde_json::from_value(summary["model"].clone()).ok(),
+            samples: source.samples.as_ref().map(io::read_samples).transpose()?,
+        })
+    }
+
+    fn told(&self) -> FieldQuality<'_> {
+        FieldQuality { trust: self.trust, model: self.model, samples: self.samples.as_ref() }
+    }
 }
 
 impl Source {
@@ -290,7 +355,13 @@ impl Source {
             Some(path) => Some(path.to_path_buf()),
             None => beside("matches.csv"),
         };
-        Ok(Self { image: beside("warped.nii.gz"), matches, field })
+        Ok(Self {
+            image: beside("warped.nii.gz"),
+            summary: beside("summary.json"),
+            samples: beside("posterior.nii.gz"),
+            matches,
+            field,
+        })
     }
 }
 
@@ -321,6 +392,11 @@ impl Setting {
         let held = place(&options.held, grid, reference, "--held")?;
         let load = place(&options.load, grid, reference, "--load")?;
         let names = names(options.names.as_deref(), &labels)?;
+        let known = Materials::of(options)?;
+        let mut given = known.poisson_of.iter().chain(&known.fixed).map(|k| k.0);
+        if let Some(label) = given.find(|l| !labels.as_slice().contains(l)).filter(|_| options.materials.is_none()) {
+            bail!(Usage(format!("--poisson and --fixed: the label map holds no label {label}")));
+        }
         Ok(Self { labels, labelled: options.labels.is_some(), held, load, names })
     }
 
@@ -329,18 +405,25 @@ impl Setting {
         &self,
         field: &DenseField,
         matches: Option<&SparseField>,
+        quality: FieldQuality<'_>,
         params: &StiffnessParams,
         progress: pipeline::stiffness::Progress<'_>,
     ) -> Result<StiffnessResult, StiffnessError> {
-        self.with(field, matches, |inputs| pipeline::stiffness::run(inputs, params, progress))
+        self.with(field, matches, quality, |inputs| pipeline::stiffness::run(inputs, params, progress))
     }
 
     /// What [`Self::run`] would refuse at its start.
     pub(super) fn check(&self, field: &DenseField, params: &StiffnessParams) -> Result<(), StiffnessError> {
-        self.with(field, None, |inputs| pipeline::stiffness::check(inputs, params))
+        self.with(field, None, FieldQuality::default(), |inputs| pipeline::stiffness::check(inputs, params))
     }
 
-    fn with<T>(&self, field: &DenseField, matches: Option<&SparseField>, run: impl FnOnce(&Inputs<'_>) -> T) -> T {
+    fn with<T>(
+        &self,
+        field: &DenseField,
+        matches: Option<&SparseField>,
+        quality: FieldQuality<'_>,
+        run: impl FnOnce(&Inputs<'_>) -> T,
+    ) -> T {
         run(&Inputs {
             field,
             matches,
@@ -349,6 +432,7 @@ impl Setting {
             held: &self.held,
             load: &self.load,
             names: &|label| self.names[label as usize].clone(),
+            quality,
         })
     }
 }
@@ -366,6 +450,57 @@ fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place>
             Ok(Place::Mask(Box::new(mask), name(path)))
         }
     }
+}
+
+/// What is known of the regions' materials.
+#[derive(Debug, Default)]
+struct Materials {
+    poisson: Option<f64>,
+    poisson_of: Vec<(u8, f64)>,
+    fixed: Vec<(u8, f64)>,
+}
+
+impl Materials {
+    /// From a table, and from what is given beside it, which comes first.
+    fn of(options: &Options) -> Result<Self> {
+        let mut out = Self::default();
+        for text in &options.poisson {
+            match text.split_once('=') {
+                None => out.poisson = Some(number(text, "--poisson", "0.49 or 1=0.49")?),
+                Some((label, nu)) => put(&mut out.poisson_of, label, nu, "--poisson", "1=0.49")?,
+            }
+        }
+        for text in &options.fixed {
+            let Some((label, e)) = text.split_once('=') else {
+                bail!(Usage(format!("--fixed: {text:?} is not of the form 3=15000 (label, kPa)")));
+            };
+            put(&mut out.fixed, label, e, "--fixed", "3=15000")?;
+        }
+        if let Some(path) = &options.materials {
+            for row in io::read_materials(path)? {
+                let known = |all: &[(u8, f64)]| all.iter().any(|k| k.0 == row.label);
+                let [poisson, fixed] = [known(&out.poisson_of), known(&out.fixed)];
+                out.poisson_of.extend(row.poisson.filter(|_| !poisson).map(|nu| (row.label, nu)));
+                out.fixed.extend(row.youngs_modulus.filter(|_| !fixed).map(|e| (row.label, e)));
+            }
+        }
+        Ok(out)
+    }
+}
+
+fn number(text: &str, flag: &str, form: &str) -> Result<f64> {
+    text.trim().parse().map_err(|_| Usage(format!("{flag}: {text:?} is not of the form {form}")).into())
+}
+
+fn put(all: &mut Vec<(u8, f64)>, label: &str, value: &str, flag: &str, form: &str) -> Result<()> {
+    let Ok(label) = label.trim().parse::<u8>() else {
+        bail!(Usage(format!("{flag}: {label:?} is no label (1 to 255); write it as {form}")));
+    };
+    if all.iter().any(|known| known.0 == label) {
+        bail!(Usage(format!("{flag}: label {label} is given twice")));
+    }
+    all.push((label, number(value, flag, form)?));
+    Ok(())
 }
 
 /// A name for every label; separated as on a command line or as in a table of pairs.

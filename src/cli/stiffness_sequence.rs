@@ -4,10 +4,11 @@ use super::Usage;
 use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
 use super::record::{Read, Recording};
-use super::stiffness::{FILES, FOUND, Options, Setting, common_inputs, images, patch_files, plan, write};
+use super::stiffness::{FILES, FOUND, Options, Setting, common_inputs, images, patch_files, plan, strict, write};
 use anyhow::{Context, Result, bail};
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
+use palpate::pipeline::stiffness::FieldQuality;
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
@@ -83,7 +84,9 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         let stage = format!("frame {frame}");
         let outcome = match force_n {
             Some(0.0) => Err(StiffnessError::NoForce),
-            _ => setting.run(&field, matches.as_ref(), &params, &|_, f| progress.set(&stage, part + f / count)),
+            _ => setting.run(&field, matches.as_ref(), FieldQuality::default(), &params, &|_, f| {
+                progress.set(&stage, part + f / count)
+            }),
         };
         if let Err(error) = &outcome {
             console.detail(&format!("frame {frame}: {error}"));
@@ -113,7 +116,8 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     warn_all(console, &shared.result.warnings);
     let page = options.output.join("report.html");
     let frames = report::sequence_text(&shared);
-    console.say(&format!("{}{frames}  results      {}", report::text(&shared.result), page.display()))
+    console.say(&format!("{}{frames}  results      {}", report::text(&shared.result), page.display()))?;
+    strict(options, &shared.result)
 }
 
 /// What the summary of a track says.

@@ -6,15 +6,16 @@
 //! (both programs take any consistent set).
 
 use super::atomic::write_atomic;
-use super::csv::write_table;
+use super::csv::{read_table, write_table};
+use super::format;
 use crate::error::IoError;
 use crate::types::space::{cross, dot};
-use crate::types::stiffness::{Law, Prescribed, RegionStiffness, SharedStiffness, StiffnessResult};
+use crate::types::stiffness::{Determined, Law, Prescribed, RegionStiffness, SharedStiffness, StiffnessResult};
 use std::io::{self, Write};
 use std::path::Path;
 
 /// Columns of regions.csv.
-const COLUMNS: [&str; 6] = ["label", "name", "youngs_modulus_kpa", "sd_kpa", "ratio", "identifiable"];
+const COLUMNS: [&str; 8] = ["label", "name", "youngs_modulus_kpa", "sd_kpa", "ratio", "identifiable", "state", "bound"];
 
 /// Writes a row for each frame and region: frame, motion_mm (mean), residual_mm, label, name, value
 /// (kPa, or the ratio without a force), sd, identifiable; a frame that tells nothing has one row
@@ -46,8 +47,8 @@ pub fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<
 }
 
 /// Writes label, name, Young's modulus (kPa), standard deviation (kPa; empty where not
-/// identifiable), ratio to the reference region, identifiable (1 or 0). Without a force the kPa
-/// columns are empty.
+/// identifiable), ratio to the reference region, identifiable (1 or 0), state (determined, bound,
+/// unknown or given) and, of a bound, lower or upper. Without a force the kPa columns are empty.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -62,9 +63,54 @@ pub fn write_regions(path: impl AsRef<Path>, regions: &[RegionStiffness], absolu
             kpa(r.sd),
             number(r.ratio),
             u8::from(r.identifiable).to_string(),
+            r.state.name().into(),
+            r.bound.filter(|_| r.state == Determined::Bound).unwrap_or_default().into(),
         ]
     };
     write_table(path.as_ref(), &COLUMNS, regions.iter().map(row))
+}
+
+/// What is known of a label's material.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct KnownMaterial {
+    /// The label.
+    pub label: u8,
+    /// Its Poisson's ratio, where it is given.
+    pub poisson: Option<f64>,
+    /// Its Young's modulus (kPa), where it is given.
+    pub youngs_modulus: Option<f64>,
+}
+
+/// Reads a table by label: the columns `label`, and `poisson` or `youngs_modulus_kpa` or both, where
+/// an empty field is open; other columns are left alone.
+///
+/// # Errors
+/// [`IoError`] names the line that cannot be read, and a table without these columns.
+pub fn read_materials(path: impl AsRef<Path>) -> Result<Vec<KnownMaterial>, IoError> {
+    let path = path.as_ref();
+    let table = read_table(path, ["label"])?;
+    let column = |name: &str| table.other_columns.iter().position(|c| c.eq_ignore_ascii_case(name));
+    let [poisson, modulus] = [column("poisson"), column("youngs_modulus_kpa")];
+    if poisson.is_none() && modulus.is_none() {
+        return Err(format(path, "has no column poisson or youngs_modulus_kpa", "name one of them in the first line"));
+    }
+    let mut out: Vec<KnownMaterial> = Vec::new();
+    for (row, (&[label], rest)) in table.numbers.iter().zip(&table.others).enumerate() {
+        let wrong = |what: String| format(path, format!("row {}: {what}", row + 1), "correct or remove that row");
+        if !(1.0..=255.0).contains(&label) || label.fract() != 0.0 {
+            return Err(wrong(format!("label is {label}, not a whole number from 1 to 255")));
+        }
+        let label = label as u8;
+        if out.iter().any(|m| m.label == label) {
+            return Err(wrong(format!("label {label} is there twice")));
+        }
+        let number = |column: Option<usize>| match column.map(|c| rest[c].trim()) {
+            None | Some("") => Ok(None),
+            Some(text) => text.parse().map(Some).map_err(|_| wrong(format!("{text:?} is not a number"))),
+        };
+        out.push(KnownMaterial { label, poisson: number(poisson)?, youngs_modulus: number(modulus)? });
+    }
+    Ok(out)
 }
 
 /// Elements of one material: its number of region, modulus (MPa) and elements.
@@ -161,8 +207,8 @@ pub fn write_inp(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(),
         for (patch, name) in ["HELD", "LOADED"].iter().enumerate() {
             node_set(w, name, result.prescribed.iter().filter(|p| p.patch as usize == patch).map(|p| p.node))?;
         }
-        let nu = result.poisson;
         for (label, e, _) in &materials {
+            let nu = result.poisson_of(*label);
             writeln!(w, "*MATERIAL, NAME=MATERIAL{label}")?;
             match result.law {
                 Law::Linear => writeln!(w, "*ELASTIC\n{e:.9e}, {nu}")?,
@@ -223,7 +269,7 @@ pub fn write_feb(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(),
                 w,
                 "\t\t<material id=\"{}\" name=\"material{label}\" type=\"{kind}\"><E>{e:.9e}</E><v>{}</v></material>",
                 i + 1,
-                result.poisson
+                result.poisson_of(*label)
             )?;
         }
         writeln!(w, "\t</Material>\n\t<Mesh>\n\t\t<Nodes name=\"body\">")?;

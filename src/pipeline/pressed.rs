@@ -52,7 +52,16 @@ impl Pressed {
     ) -> Result<StiffnessResult, StiffnessError> {
         let names = |label: u8| format!("region {label}");
         let (held, load) = (&self.held, &self.load);
-        let inputs = stiffness::Inputs { field, matches, labels, labelled: true, held, load, names: &names };
+        let inputs = stiffness::Inputs {
+            field,
+            matches,
+            labels,
+            labelled: true,
+            held,
+            load,
+            names: &names,
+            quality: stiffness::FieldQuality::default(),
+        };
         stiffness::run(&inputs, params, &|_, _| {})
     }
 

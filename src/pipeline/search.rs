@@ -7,20 +7,20 @@ use crate::stiffness::choice::choose;
 use crate::stiffness::geometry;
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::{Inclusion, SHAPES};
+use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
 use crate::stiffness::support::{Support, identify};
-use crate::stiffness::unlabelled::Map;
-use crate::stiffness::{maps, unlabelled};
-use crate::types::Mask;
-use crate::types::stiffness::{Evidence, Law, LeftOver, StiffnessParams};
+use crate::stiffness::unlabelled;
+use crate::types::stiffness::{Detectable, Evidence, Law, LeftOver, StiffnessParams};
+use crate::types::{Grid, Mask};
 use std::time::Instant;
 
 /// Times that found regions are drawn anew at most.
-const REDRAWN: usize = 3;
+const REDRAWN: usize = 5;
 /// Surfaces that move less than this stay (voxels).
 const STAYS: f64 = 0.2;
 /// Part of the residual that drawing anew must take away for another time.
-const WORTH: f64 = 0.005;
+const WORTH: f64 = 0.002;
 
 /// Regions and why these.
 pub(super) struct Found {
@@ -28,6 +28,8 @@ pub(super) struct Found {
     pub evidence: Vec<Evidence>,
     /// What one region leaves over, where no second one was found.
     pub left_over: Option<LeftOver>,
+    /// Which balls would have been seen.
+    pub detectable: Vec<Detectable>,
     pub seconds: f64,
 }
 
@@ -38,12 +40,23 @@ struct Candidate {
     estimate: Estimate,
 }
 
+impl Candidate {
+    /// What the model leaves over (mm, root mean square of one component) with the surface of the
+    /// body where the data put it.
+    fn shaped_rms(&self, search: &Search<'_>, grid: &Grid) -> Result<f64, StiffnessError> {
+        let setup = self.level.setup(search.law, search.params, self.level.largest());
+        let walls = Interface::walls(&self.labels);
+        let shaped = geometry::fit(&setup, &self.estimate, grid, (&walls, &[]))?;
+        Ok(shaped.map_or(self.estimate.rms, |g| g.fit.rms.min(self.estimate.rms)))
+    }
+}
+
 /// What all candidates are made from.
 struct Search<'a> {
     inputs: &'a Inputs<'a>,
     fineness: Fineness,
     law: Law,
-    poisson: f64,
+    params: &'a StiffnessParams,
 }
 
 impl Search<'_> {
@@ -57,25 +70,8 @@ impl Search<'_> {
     fn candidate(&self, labels: Mask, from: (&Level, &State)) -> Result<Candidate, StiffnessError> {
         let mut level = self.level(&labels)?;
         level.contact_like(from.0)?;
-        let estimate = identify(&level, self.law, self.poisson, from)?;
+        let estimate = identify(&level, self.law, self.params, from)?;
         Ok(Candidate { labels, level, estimate })
-    }
-
-    /// `count` regions of the map. Two that are alike are one class of moduli in two pieces: of all
-    /// numbers of classes, the one that explains most.
-    fn cut(&self, map: &Map, count: usize, from: (&Level, &State)) -> Result<Option<Candidate>, StiffnessError> {
-        let mut best: Option<Candidate> = None;
-        for classes in 2..=count {
-            let Some(labels) = unlabelled::regions(map, self.inputs.labels, classes, count) else { continue };
-            if best.as_ref().is_some_and(|b| b.labels.as_slice() == labels.as_slice()) {
-                continue;
-            }
-            let next = self.candidate(labels, from)?;
-            if best.as_ref().is_none_or(|b| next.estimate.rms < b.estimate.rms) {
-                best = Some(next);
-            }
-        }
-        Ok(best)
     }
 
     /// The regions of a candidate with their surfaces moved to where the data put them; none where
@@ -85,7 +81,7 @@ impl Search<'_> {
         if inclusions.is_empty() {
             return Ok(None);
         }
-        let setup = old.level.setup(self.law, self.poisson, old.level.largest());
+        let setup = old.level.setup(self.law, self.params, old.level.largest());
         let Some(fit) = geometry::fit(&setup, &old.estimate, grid, (&[], &inclusions))? else { return Ok(None) };
         if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
             return Ok(None);
@@ -95,6 +91,23 @@ impl Search<'_> {
             inclusion.draw(&mut labels, &std::array::from_fn(|k| offsets[k] * grid.least_spacing()));
         }
         self.candidate(labels, (&old.level, &old.estimate.state)).map(Some)
+    }
+
+    /// From which contrast on balls would be seen. The strain in a ball of contrast C is 5 / (2 C + 3)
+    /// of that around it (Eshelby 1957, incompressible), so that it disturbs the displacement by
+    /// 5 (C - 1) / (2 C + 3) of what a unit of ln C does at C = 1.
+    fn detectable(&self, one: &Candidate, support: &Support) -> Result<Vec<Detectable>, StiffnessError> {
+        let setup = one.level.setup(self.law, self.params, one.level.largest());
+        let least = support.least_seen();
+        let limit = |(diameter_mm, moved): (f64, f64)| {
+            let d = least / moved.max(f64::MIN_POSITIVE);
+            Detectable {
+                diameter_mm,
+                stiffer: (d < 2.5).then(|| (5.0 + 3.0 * d) / (5.0 - 2.0 * d)),
+                softer: (d < 5.0 / 3.0).then(|| (5.0 - 3.0 * d) / (5.0 + 2.0 * d)),
+            }
+        };
+        Ok(unlabelled::shown_by_balls(&setup, &one.estimate.state)?.into_iter().map(limit).collect())
     }
 
     /// Drawn anew as long as it helps. What cannot be drawn or solved anew stays as the map has it.
@@ -122,38 +135,40 @@ pub(super) fn regions(
     let started = Instant::now();
     progress("one region", 0.0);
     let fineness = coarse_fineness(inputs.labels, params);
-    let mut search = Search { inputs, fineness, law: Law::Linear, poisson: params.poisson };
+    let mut search = Search { inputs, fineness, law: Law::Linear, params };
     let mut one = search.level(inputs.labels)?;
     one.settle_shape()?;
-    let choice = choose(&mut one, params.model, params.poisson, 0)?;
+    let choice = choose(&mut one, params, 0)?;
     search.law = choice.law;
-    let noise = maps::noise(inputs.field, inputs.labels);
-    let mut support = Support::new(&one, &choice, noise);
-    let mut found: Option<Mask> = None;
-    if support.may_hold_more() && params.regions == 1 {
-        support.none(2, "not tried: at most one region is asked for");
-    } else if support.may_hold_more() {
-        progress("map", 0.2);
-        let setup = one.setup(choice.law, params.poisson, 0);
-        let state = &choice.estimate.state;
-        let map = unlabelled::map(&setup, state, support.target())?;
-        for count in 2..=params.regions {
-            progress("regions", 0.6 + 0.4 * count as f64 / (params.regions + 1) as f64);
-            let Some(candidate) = search.cut(&map, count, (&one, state))? else {
-                support.none(count, "not tried: the map does not fall into so many regions");
-                break;
-            };
-            let candidate = search.settled(candidate);
-            if !support.accept(&candidate.level, &candidate.estimate, count) {
-                break;
+    let grid = inputs.labels.grid();
+    let mut best = Candidate { labels: inputs.labels.clone(), level: one, estimate: choice.estimate };
+    let mut support = Support::new(&best.level, &best.estimate, best.shaped_rms(&search, grid)?);
+    let detectable = search.detectable(&best, &support)?;
+    let mut count = 1;
+    while support.may_hold_more() {
+        if count == params.regions {
+            if count == 1 {
+                support.none(2, "not tried: at most one region is asked for");
             }
-            found = Some(candidate.labels);
-            if !support.may_hold_more() {
-                break;
-            }
+            break;
         }
+        progress("map", 0.2 + 0.8 * (count - 1) as f64 / params.regions as f64);
+        let setup = best.level.setup(search.law, params, best.level.largest());
+        let map = unlabelled::map(&setup, &best.estimate.state, support.target())?;
+        let from = (&best.level, &best.estimate.state);
+        let tried = unlabelled::next_regions(&map, &best.labels).into_iter();
+        let tried = tried.filter_map(|labels| search.candidate(labels, from).ok());
+        let Some(next) = tried.min_by(|a, b| a.estimate.rms.total_cmp(&b.estimate.rms)) else {
+            support.none(count + 1, "not tried: no piece of the map stands out");
+            break;
+        };
+        let next = search.settled(next);
+        if !support.accept(&next.level, &next.estimate, count + 1, next.shaped_rms(&search, grid)?) {
+            break;
+        }
+        (best, count) = (next, count + 1);
     }
-    let left_over = if found.is_none() { support.left() } else { None };
-    let labels = found.unwrap_or_else(|| inputs.labels.clone());
-    Ok(Found { labels, evidence: support.evidence, left_over, seconds: started.elapsed().as_secs_f64() })
+    let left_over = if count == 1 { support.left() } else { None };
+    let seconds = started.elapsed().as_secs_f64();
+    Ok(Found { labels: best.labels, evidence: support.evidence, left_over, detectable, seconds })
 }

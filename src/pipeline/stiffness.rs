@@ -2,20 +2,26 @@
 
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
-use crate::numerics::sampling::nearest;
+use crate::numerics::sampling::{displacement, nearest};
 use crate::pipeline::search;
-use crate::stiffness::choice::{choose, settle};
+use crate::stiffness::choice::{choose, known_moduli, settle};
+use crate::stiffness::coherent::Fit;
 use crate::stiffness::identify::State;
 use crate::stiffness::inclusion::Inclusion;
 use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
-use crate::stiffness::patches::Place;
-use crate::stiffness::rim::{Outline, rim};
-use crate::stiffness::summary::Shape;
+use crate::stiffness::observations::Observation;
+use crate::stiffness::patches::{Patch, Place};
+use crate::stiffness::rim::{Outline, Rim, rim};
+use crate::stiffness::summary::Scale;
 use crate::stiffness::turn::Turn;
+use crate::stiffness::verdict::{Found, Shape, Verdict};
 use crate::stiffness::{geometry, maps, summary};
-use crate::types::stiffness::{Evidence, PatchReport, StiffnessParams, StiffnessResult};
-use crate::types::{Displacement, Mask, QuadraticMesh, SparseField, WorldPoint};
+use crate::strain::deviation::error_draws;
+use crate::types::stiffness::{Determined, Evidence, PatchReport, RegionStiffness, StiffnessParams, StiffnessResult};
+use crate::types::{
+    DenseField, Displacement, ErrorSamples, Mask, MotionModel, QuadraticMesh, SparseField, Trust, WorldPoint,
+};
 use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
@@ -39,6 +45,26 @@ pub struct Inputs<'a> {
     pub load: &'a Place,
     /// A name for each label.
     pub names: &'a dyn Fn(u8) -> String,
+    /// What is known of the field's own error.
+    pub quality: FieldQuality<'a>,
+}
+
+/// What is known of a field's own error; nothing of a field that comes alone.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct FieldQuality<'a> {
+    /// How far to rely on it.
+    pub trust: Option<Trust>,
+    /// The motion model that it came from.
+    pub model: Option<MotionModel>,
+    /// Random draws of its error.
+    pub samples: Option<&'a ErrorSamples>,
+}
+
+impl FieldQuality<'_> {
+    /// Its model, where that shows no difference between regions, whatever they are.
+    fn flat_model(&self) -> Option<MotionModel> {
+        self.model.filter(|model| *model != MotionModel::Free)
+    }
 }
 
 /// Matches that a body must hold for them to be taken unasked: what an identification needs, and a
@@ -111,13 +137,38 @@ fn unturned(
         return labelled(inputs, params, Vec::new(), progress);
     }
     let found = search::regions(inputs, params, &|s, f| progress(s, 0.5 * f))?;
-    let inputs = Inputs { labels: &found.labels, ..*inputs };
-    let mut result = labelled(&inputs, params, found.evidence, &|s, f| progress(s, 0.5 + 0.5 * f))?;
+    let (mut labels, mut evidence) = (found.labels, found.evidence);
+    let mut result = loop {
+        let inputs = Inputs { labels: &labels, ..*inputs };
+        let result = labelled(&inputs, params, evidence.clone(), &|s, f| progress(s, 0.5 + 0.5 * f))?;
+        let Some(like) = result.regions.iter().find(|r| is_like_the_first(r)) else { break result };
+        (labels, evidence) = without(&labels, like.label, evidence);
+    };
     result.warnings.extend(found.left_over.and_then(maps::left_over));
     result.left_over = found.left_over;
-    result.found = Some(found.labels);
+    result.detectable = found.detectable;
+    result.found = Some(labels);
     result.seconds.insert(0, ("search".into(), found.seconds));
     Ok(result)
+}
+
+/// Whether the modulus of a region that was found is within two deviations of the first one's.
+fn is_like_the_first(r: &RegionStiffness) -> bool {
+    r.label > 1 && r.state == Determined::Determined && r.ratio.ln().abs() < 2.0 * r.ratio_sd / r.ratio
+}
+
+/// Labels with one region given back to the first, and the evidence for that.
+fn without(labels: &Mask, label: u8, mut evidence: Vec<Evidence>) -> (Mask, Vec<Evidence>) {
+    let lower = |l: u8| if l == label { 1 } else { l - u8::from(l > label) };
+    let out = Mask::from_voxels(*labels.grid(), |o, _| lower(labels.as_slice()[o]));
+    let count = labels.as_slice().iter().copied().max().unwrap_or(1);
+    for e in evidence.iter_mut().filter(|e| e.question == "regions") {
+        e.chosen = e.model == (count - 1).to_string();
+        if e.model == count.to_string() {
+            e.reason = "on the fine mesh its modulus is within two deviations of the first one's".into();
+        }
+    }
+    (out, evidence)
 }
 
 /// How fine the mesh is on which all is chosen.
@@ -137,6 +188,83 @@ pub fn check(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<(), Stiffn
     without_turn(inputs, level).0
 }
 
+/// A body on the mesh on which all is chosen, and on the one that counts.
+struct Meshed {
+    coarse: Level,
+    fine: Level,
+    mesh: QuadraticMesh,
+}
+
+impl Meshed {
+    fn new(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<Self, StiffnessError> {
+        let mesher = Mesher::new(inputs.labels)?;
+        let level = |mesh: &QuadraticMesh, outline: Option<&Outline>| {
+            Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, outline)
+        };
+        let mut coarse = level(&mesher.mesh(&coarse_fineness(inputs.labels, params))?, None)?;
+        let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
+        let volume = maps::volume(inputs.labels);
+        let mesh = meshed(&mesher, volume, &rim, coarse.voxel, params.nodes as f64, RIM)?;
+        let outline = rim.outline.as_ref();
+        if !rim.places.is_empty() {
+            let nodes = COARSE * params.nodes as f64;
+            coarse = level(&meshed(&mesher, volume, &rim, coarse.voxel, nodes, 2.0 * RIM)?, outline)?;
+        }
+        let mut fine = level(&mesh, outline)?;
+        coarse.agree_on_shape(&mut fine)?;
+        if inputs.labelled {
+            coarse.open_borders(params.label_sd);
+            fine.open_borders(params.label_sd);
+        }
+        Ok(Self { coarse, fine, mesh })
+    }
+}
+
+/// A mesh of about so many nodes, finer along the rim of a punch: cubes of `size` voxels there.
+fn meshed(
+    mesher: &Mesher,
+    volume: f64,
+    rim: &Rim,
+    voxel: f64,
+    nodes: f64,
+    size: f64,
+) -> Result<QuadraticMesh, StiffnessError> {
+    if rim.places.is_empty() {
+        let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
+        let count = mesh.nodes().len() as f64;
+        // Thin layers and a rough surface take more than a block does.
+        return match count <= OVER * nodes {
+            true => Ok(mesh),
+            false => Ok(mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?),
+        };
+    }
+    let within = rim.outline.as_ref().map(|o| |p| o.within(p));
+    let wall = within.as_ref().map(|w| w as Wall<'_>);
+    let detail = |size: f64| Detail { near: &rim.places, size: size * voxel, wall };
+    // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the
+    // finest within the limit.
+    let mut best: Option<(f64, Fineness, Detail<'_>)> = None;
+    for coarser in COARSER {
+        for elsewhere in ELSEWHERE {
+            let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
+            let detail = detail(coarser * size);
+            let Some(count) = mesher.nodes(&fineness, detail) else { continue };
+            let count = count as f64 / nodes;
+            let rank = if count <= OVER { -count } else { count };
+            if best.as_ref().is_none_or(|(least, ..)| rank < *least) {
+                best = Some((rank, fineness, detail));
+            }
+        }
+        if best.as_ref().is_some_and(|(rank, ..)| *rank < 0.0) {
+            break;
+        }
+    }
+    // Where none of them keeps all parts, the mesher goes on to smaller cubes.
+    let plain = (Fineness::for_nodes(volume, nodes as usize), detail(size));
+    let (fineness, detail) = best.map_or(plain, |(_, fineness, detail)| (fineness, detail));
+    Ok(mesher.mesh_finer(&fineness, detail)?)
+}
+
 /// The chain for labelled regions; `tried` is the evidence that led to them.
 fn labelled(
     inputs: &Inputs<'_>,
@@ -146,86 +274,32 @@ fn labelled(
 ) -> Result<StiffnessResult, StiffnessError> {
     let mut clock = Clock { seconds: Vec::new(), since: Instant::now() };
     progress("mesh", 0.0);
-    let volume = maps::volume(inputs.labels);
-    let mesher = Mesher::new(inputs.labels)?;
-    let coarse_mesh = mesher.mesh(&coarse_fineness(inputs.labels, params))?;
+    let Meshed { mut coarse, mut fine, mesh } = Meshed::new(inputs, params)?;
+    let reference = fine.largest();
     clock.book("mesh");
 
-    progress("observe", 0.05);
-    let level = |mesh: &QuadraticMesh, outline: Option<&Outline>| {
-        Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, outline)
-    };
-    let mut coarse = level(&coarse_mesh, None)?;
-    let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
-    let outline = rim.outline.as_ref();
-    let within = outline.map(|o| |p| o.within(p));
-    let wall = within.as_ref().map(|w| w as Wall<'_>);
-    let detail = |size: f64| Detail { near: &rim.places, size: size * coarse.voxel, wall };
-    let meshed = |nodes: f64, size: f64| {
-        if rim.places.is_empty() {
-            let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
-            let count = mesh.nodes().len() as f64;
-            // Thin layers and a rough surface take more than a block does.
-            return match count <= OVER * nodes {
-                true => Ok(mesh),
-                false => mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize)),
-            };
-        }
-        // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the
-        // finest within the limit.
-        let mut best: Option<(f64, Fineness, Detail<'_>)> = None;
-        for coarser in COARSER {
-            for elsewhere in ELSEWHERE {
-                let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
-                let detail = detail(coarser * size);
-                let Some(count) = mesher.nodes(&fineness, detail) else { continue };
-                let count = count as f64 / nodes;
-                let rank = if count <= OVER { -count } else { count };
-                if best.as_ref().is_none_or(|(least, ..)| rank < *least) {
-                    best = Some((rank, fineness, detail));
-                }
-            }
-            if best.as_ref().is_some_and(|(rank, ..)| *rank < 0.0) {
-                break;
-            }
-        }
-        // Where none of them keeps all parts, the mesher goes on to smaller cubes.
-        let plain = (Fineness::for_nodes(volume, nodes as usize), detail(size));
-        let (fineness, detail) = best.map_or(plain, |(_, fineness, detail)| (fineness, detail));
-        mesher.mesh_finer(&fineness, detail)
-    };
-    let fine_mesh = meshed(params.nodes as f64, RIM)?;
-    if !rim.places.is_empty() {
-        let mesh = meshed(COARSE * params.nodes as f64, 2.0 * RIM)?;
-        coarse = level(&mesh, outline)?;
-    }
-    let mut fine = level(&fine_mesh, outline)?;
-    coarse.agree_on_shape(&mut fine)?;
-    let reference = fine.largest();
-    clock.book("observe");
-
     progress("coarse", 0.1);
-    let mut choice = choose(&mut coarse, params.model, params.poisson, reference)?;
+    let mut choice = choose(&mut coarse, params, reference)?;
     let mut hidden = Vec::new();
-    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params.poisson, reference), &choice.estimate)
-    {
+    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params, reference), &choice.estimate) {
         hidden.push(found);
         coarse.hidden.push(found.label);
-        choice = choose(&mut coarse, params.model, params.poisson, reference)?;
+        choice = choose(&mut coarse, params, reference)?;
     }
-    fine.hidden.clone_from(&coarse.hidden);
+    choice.estimate = known_moduli(&mut coarse, choice.law, params, reference, choice.estimate)?;
+    (fine.hidden, fine.known) = (coarse.hidden.clone(), coarse.known.clone());
     clock.book("coarse");
 
     progress("fine", 0.4);
     fine.touch_like(&coarse)?;
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
-    let estimate = fine.setup(choice.law, params.poisson, reference).run(start, 3, PRECISION)?;
-    let estimate = settle(&mut fine, choice.law, params.poisson, reference, estimate, (FINE_MOVES, PRECISION))?;
+    let estimate = fine.setup(choice.law, params, reference).run(start, 3, PRECISION)?;
+    let estimate = settle(&mut fine, choice.law, params, reference, estimate, (FINE_MOVES, PRECISION))?;
     clock.book("fine");
 
     progress("uncertainty", 0.9);
-    let setup = fine.setup(choice.law, params.poisson, reference);
-    let coarse_setup = coarse.setup(choice.law, params.poisson, reference);
+    let setup = fine.setup(choice.law, params, reference);
+    let coarse_setup = coarse.setup(choice.law, params, reference);
     let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
     // Of regions that were found the shapes are open as a whole.
     let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Interface::walls(inputs.labels) };
@@ -235,36 +309,39 @@ fn labelled(
         setup.advanced(&estimate.state, x, &estimate.columns, step)
     };
     let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
-    let noise = maps::noise(inputs.field, inputs.labels);
-    let alone = summary::moduli(&setup, &estimate, None, params.force_n);
-    let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), params.force_n)
-        .widened(&alone, summary::coherent(&estimate, fine.sample_noise(noise)));
-    let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), params.force_n);
+    let scale = Scale::of(&fine.body, params);
+    let misfit = fine.misfit(&estimate);
+    let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), scale);
+    let alone = summary::moduli(&setup, &estimate, None, scale);
+    let fit = geometry.as_ref().map_or_else(|| Fit::of(&coarse_setup, &choice.estimate), |g| g.fit.clone());
+    let more = fit.coherent(&coarse_setup, &choice.estimate, misfit.mm, &errors_drawn(inputs, &coarse))?;
+    let moduli = moduli.widened(&summary::with_covariance(&setup, &estimate, geometry.as_ref(), scale, &more));
+    let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), scale);
     let count = fine.body.labels.len();
     let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();
-    let ratio_change: Vec<f64> = (0..count).map(|r| mesh_change[r] - mesh_change[reference]).collect();
     let unseen = (0..count)
         .map(|r| summary::unseen(&coarse_setup, &choice.estimate, r, moduli.ratio_variance[r]))
         .collect::<Result<Vec<_>, _>>()?;
-    let changes = [mesh_change.as_slice(), &ratio_change];
-    let drawn = |label: &u8| geometry.is_some() && inclusions.iter().any(|i| i.label() == *label);
-    let shape = |label: &u8| match (inputs.labelled || *label == 1, drawn(label)) {
+    let drawn_anew = |label: &u8| geometry.is_some() && inclusions.iter().any(|i| i.label() == *label);
+    let shape = |label: &u8| match (inputs.labelled || *label == 1, drawn_anew(label)) {
         (true, _) => Shape::Given,
         (false, true) => Shape::Drawn,
         (false, false) => Shape::Cut,
     };
-    let shapes: Vec<Shape> = fine.body.labels.iter().map(shape).collect();
-    let regions = summary::regions(
-        &fine.body,
-        [&moduli, &alone],
-        inputs.names,
-        changes,
-        &unseen,
-        &shapes,
-        &hidden,
-        params.force_n.is_some(),
+    let found = Found {
+        moduli: &moduli,
+        alone: &alone,
+        mesh_change: &mesh_change,
+        unseen: &unseen,
+        shapes: &fine.body.labels.iter().map(shape).collect::<Vec<_>>(),
+        hidden: &hidden,
+        known: &fine.known,
+        flat_model: inputs.quality.flat_model(),
+        misfits: misfit.trust() == Trust::Low,
+        scale,
         reference,
-    );
+    };
+    let regions = found.regions(&fine.body, inputs.names);
     clock.book("uncertainty");
 
     let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);
@@ -272,37 +349,43 @@ fn labelled(
     let map_sd = of_region(&|r| regions[r].sd);
     let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
     let touching = [None, setup.touching(&state)];
-    let area = |i: usize| touching[i].as_ref().map_or_else(|| fine.patches[i].area(&fine.body), |t| t.1);
-    let mut warnings = maps::unfit(inputs.field, inputs.labels, &fine, &estimate, noise);
+    let area = |i: usize| match touching.get(i) {
+        Some(Some(touched)) => touched.1,
+        _ => fine.patches[i].area(&fine.body),
+    };
+    let verdict = Verdict::of(&misfit, inputs.quality.trust, &regions);
+    let mut warnings = maps::unfit(inputs.field, inputs.labels, &misfit);
+    warnings.extend(choice.warnings);
     warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
     warnings.extend(params.force_n.and_then(|force| maps::leaning(force, estimate.leaning)));
     warnings.extend(maps::not_shown(&hidden, &regions, reference));
+    warnings.extend(found.no_contrast());
     warnings.dedup();
-    let patches = [0, 1].map(|i| {
-        let p = &fine.patches[i];
-        PatchReport {
-            name: p.name.clone(),
-            area: area(i),
-            nodes: touching[i].as_ref().map_or(p.nodes.len(), |t| t.0.len()),
-            contact: p.contact,
-            translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
-            travel_mm: p.travelled(&fine.body),
-            residual_mm: p.residual[0].hypot(p.residual[1]),
-        }
-    });
-    let scale = moduli.log[reference].exp() / (2.0 * (1.0 + params.poisson));
+    let patch = |(i, p): (usize, &Patch)| PatchReport {
+        name: p.name.clone(),
+        area: area(i),
+        nodes: touching.get(i).and_then(|t| t.as_ref()).map_or(p.nodes.len(), |t| t.0.len()),
+        contact: p.contact,
+        translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
+        travel_mm: p.travelled(&fine.body),
+        residual_mm: p.residual[0].hypot(p.residual[1]),
+    };
+    let patches = fine.patches.iter().enumerate().map(patch).collect();
     let element_modulus = fine.body.region.iter().map(|&r| moduli.log[r as usize].exp()).collect();
     let strain = summary::strain(&setup, &state);
+    let kpa = moduli.log[reference].exp() / (2.0 * (1.0 + setup.poisson[reference]));
     clock.book("maps");
     Ok(StiffnessResult {
         correlation: summary::correlation(&moduli.covariance, count),
-        absolute: params.force_n.is_some(),
+        absolute: scale != Scale::Ratio,
         law: choice.law,
         poisson: params.poisson,
+        poisson_of: params.poisson_of.clone(),
         force_n: params.force_n,
+        label_sd: if inputs.labelled { params.label_sd } else { 0.0 },
         reference: fine.body.labels[reference],
         residual_mm: estimate.rms,
-        noise_mm: noise,
+        noise_mm: fine.noise * (fine.block.max(1) as f64).powf(1.5),
         evidence: tried.into_iter().chain(choice.evidence).collect(),
         patches,
         map,
@@ -310,9 +393,9 @@ fn labelled(
         residual,
         element_modulus,
         displacement: maps::node_displacement(&fine.body, &state),
-        prescribed: maps::prescribed(&setup, &state, touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice()))),
+        prescribed: maps::prescribed(&setup, &state, &touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice()))),
         faces: geometry.map(|g| g.faces).unwrap_or_default(),
-        model_force: estimate.force[0] * estimate.leaning * scale / 1000.0,
+        model_force: estimate.force[0] * estimate.leaning * kpa / 1000.0,
         mesh_change,
         strain,
         warnings,
@@ -320,10 +403,24 @@ fn labelled(
         samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
         labelled: inputs.labelled,
         left_over: None,
+        detectable: Vec::new(),
         found: None,
+        trust: verdict.trust,
+        trust_reasons: verdict.reasons,
         regions,
-        mesh: fine.moved(fine_mesh)?,
+        mesh: fine.moved(mesh)?,
     })
+}
+
+/// Draws of the field's error at the observations (mm, RAS); none where matches are taken in its
+/// place, or nothing is known of it.
+fn errors_drawn(inputs: &Inputs<'_>, level: &Level) -> Vec<Vec<[f64; 3]>> {
+    let Some(samples) = inputs.quality.samples.filter(|_| inputs.matches.is_none()) else { return Vec::new() };
+    let Ok(draws) = error_draws(inputs.field.grid(), samples) else { return Vec::new() };
+    let at = |error: &DenseField, o: &Observation| {
+        displacement(error, WorldPoint(o.place)).map(|v| if v.is_finite() { v } else { 0.0 })
+    };
+    draws.iter().map(|error| level.observations.iter().map(|o| at(error, o)).collect()).collect()
 }
 
 /// The body must have three dimensions and hang together.

@@ -4,7 +4,8 @@ use crate::error::StiffnessError;
 use crate::stiffness::maps;
 use crate::stiffness::sequence::{Said, combine};
 use crate::types::stiffness::{
-    FrameStiffness, Gain, Law, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams, StiffnessResult,
+    Determined, FrameStiffness, Gain, Law, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams,
+    StiffnessResult,
 };
 use crate::types::{Displacement, Mask};
 
@@ -65,7 +66,7 @@ impl Sequence {
             if result.absolute { (0..count).map(|r| combine(&of(r), 0)).collect() } else { ratios.clone() };
         for ((region, gain), ratio) in result.regions.iter_mut().zip(&gains).zip(&ratios) {
             let (Some(gain), Some(ratio)) = (gain.last(), ratio.last()) else { continue };
-            (region.identifiable, region.bound) = (true, None);
+            (region.identifiable, region.bound, region.state) = (true, None, Determined::Determined);
             (region.youngs_modulus, region.sd) = (gain.value, gain.sd);
             (region.ratio, region.ratio_sd) = (ratio.value, ratio.sd);
             let of_region = result.mesh.labels().iter().zip(&mut result.element_modulus);

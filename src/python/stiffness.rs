@@ -3,7 +3,7 @@
 use super::arrays::{self, Callback, Image, Rows, told};
 use super::field::kept;
 use crate::io;
-use crate::pipeline::stiffness::{ENOUGH, Inputs, inside, run};
+use crate::pipeline::stiffness::{ENOUGH, FieldQuality, Inputs, inside, run};
 use crate::report::stiffness::{InputNames, summary};
 use crate::stiffness::patches::Place;
 use crate::types::stiffness::{LawChoice, Side};
@@ -59,7 +59,7 @@ pub fn stiffness<'py>(
     threads: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let model: LawChoice = model.parse().map_err(told)?;
-    let params = StiffnessParams { poisson, model, force_n: force, nodes, regions };
+    let params = StiffnessParams { poisson, model, force_n: force, nodes, regions, ..StiffnessParams::default() };
     params.check().map_err(told)?;
     let field = arrays::displacement(&displacement, affine)?;
     let mut labels = match arrays::mask(Some(&body), &called[1], field.grid(), &called[0])? {
@@ -86,6 +86,7 @@ pub fn stiffness<'py>(
             held: &held,
             load: &load,
             names: &named,
+            quality: FieldQuality::default(),
         };
         run(&inputs, &params, tell)
     })?;

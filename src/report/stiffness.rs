@@ -14,7 +14,7 @@ use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Moment, Viewer};
 use crate::report::{chart, json};
 use crate::types::stiffness::{
-    Evidence, FrameStiffness, Gain, LeftOver, RegionStiffness, SharedStiffness, StiffnessResult,
+    Detectable, Determined, Evidence, FrameStiffness, Gain, LeftOver, RegionStiffness, SharedStiffness, StiffnessResult,
 };
 use crate::types::{DenseField, Mask, Volume, WorldPoint};
 use serde_json::{Map, Value, json};
@@ -38,12 +38,14 @@ pub struct InputNames {
 /// A modulus with its uncertainty, or the bound.
 fn modulus(r: &RegionStiffness, absolute: bool) -> String {
     let unit = if absolute { " kPa" } else { "" };
-    match r.bound {
-        Some("unknown") => "not seen by the data".into(),
-        Some("lower") => format!("above {}{unit} (a bound: not identifiable)", digits(r.youngs_modulus)),
-        Some(_) => format!("below {}{unit} (a bound: not identifiable)", digits(r.youngs_modulus)),
-        None if r.sd == 0.0 => format!("{}{unit} (reference)", digits(r.youngs_modulus)),
-        None => format!("{} +- {}{unit}", digits(r.youngs_modulus), digits(r.sd)),
+    let value = digits(r.youngs_modulus);
+    match (r.state, r.bound) {
+        (Determined::Unknown, _) => "unknown".into(),
+        (Determined::Given, _) => format!("{value}{unit} (given)"),
+        (Determined::Bound, Some("lower")) => format!("at least {value}{unit} (a bound)"),
+        (Determined::Bound, _) => format!("at most {value}{unit} (a bound)"),
+        (Determined::Determined, _) if r.sd == 0.0 => format!("{value}{unit} (reference)"),
+        (Determined::Determined, _) => format!("{value} +- {}{unit}", digits(r.sd)),
     }
 }
 
@@ -72,10 +74,30 @@ pub fn verdict(result: &StiffnessResult) -> String {
         (n, true) if seen == n => format!("All {n} regions are determined by the data."),
         (n, true) => format!("{seen} of {n} regions are determined by the data."),
     };
+    out.push_str(&limit(&result.detectable));
     if !result.absolute {
-        out.push_str(" No force was given, so moduli are ratios.");
+        out.push_str(" No force or modulus was given, so moduli are ratios.");
     }
+    let _ = write!(out, " Trust {}: {}.", result.trust.name(), result.trust_reasons.join("; "));
     out
+}
+
+/// Which balls would have been seen.
+fn limit(balls: &[Detectable]) -> String {
+    let said = |ball: &Detectable| {
+        let softer = ball.softer.map(|c| format!("at most {c:.2}"));
+        let stiffer = ball.stiffer.map(|c| format!("at least {c:.1}"));
+        let seen: Vec<String> = softer.into_iter().chain(stiffer).collect();
+        let seen = if seen.is_empty() { "no contrast".into() } else { seen.join(" or ") + " times the modulus" };
+        format!("{:.1} mm: {seen}", ball.diameter_mm)
+    };
+    match balls {
+        [] => String::new(),
+        _ => format!(
+            " A single ball would be seen from these on: {}.",
+            balls.iter().map(said).collect::<Vec<_>>().join("; ")
+        ),
+    }
 }
 
 /// What it means that a second region was not looked for.
@@ -84,7 +106,7 @@ fn one_region(left: Option<LeftOver>) -> String {
         return "The data do not support a second region: one modulus explains the field.".into();
     };
     let but = match left.may_be_surface() {
-        true => "which a surface half a voxel off may do as well as something softer or stiffer in it",
+        true => "which a surface a tenth of a voxel off may do as well as something softer or stiffer in it",
         false => "in which something softer or stiffer may be hidden",
     };
     format!(
@@ -102,9 +124,10 @@ fn asks_for_more(result: &StiffnessResult) -> bool {
 pub fn text(result: &StiffnessResult) -> String {
     let mut out = format!("{}\n", verdict(result));
     for r in &result.regions {
-        let _ = writeln!(out, "  {:12} {}, ratio {}", r.name, modulus(r, result.absolute), digits(r.ratio));
+        let ratio = if r.state == Determined::Unknown { String::new() } else { format!(", ratio {}", digits(r.ratio)) };
+        let _ = writeln!(out, "  {:12} {}{ratio}", r.name, modulus(r, result.absolute));
     }
-    let [held, load] = &result.patches;
+    let (held, load) = (&result.patches[0], &result.patches[1]);
     let _ = writeln!(
         out,
         "  model        {}, Poisson's ratio {}, held {} ({}), loaded {} ({})",
@@ -168,12 +191,16 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
         "unit": if result.absolute { "kPa" } else { "ratio to the reference region" },
         "labelled": result.labelled,
         "verdict": verdict(result),
+        "trust": result.trust,
+        "trust_reasons": result.trust_reasons,
         "regions": regions,
         "region_count": result.regions.len(),
         "reference": result.reference,
         "correlation": result.correlation,
         "model": result.law.name(),
         "poisson": result.poisson,
+        "poisson_of": result.poisson_of.iter().map(|(l, nu)| (l.to_string(), json!(nu))).collect::<Map<String, Value>>(),
+        "label_sd_voxels": result.label_sd,
         "force_n": result.force_n,
         "strain_p95": result.strain,
         "residual_mm": result.residual_mm,
@@ -182,7 +209,8 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
         "effective_samples": result.samples[1],
         "evidence": result.evidence,
         "left_over": result.left_over,
-        "patches": { "held": result.patches[0], "loaded": result.patches[1] },
+        "detectable": result.detectable,
+        "patches": { "held": result.patches[0], "loaded": result.patches[1], "cut": result.patches.get(2) },
         "face_offsets_voxels": result.faces.iter().map(|(n, v)| (n.clone(), json!(v))).collect::<Map<String, Value>>(),
         "mesh": { "nodes": result.mesh.nodes().len(), "elements": result.mesh.tetrahedra().len() },
         "seconds": seconds,
@@ -418,8 +446,8 @@ fn patch_table(result: &StiffnessResult) -> String {
             p.translation.map(short2).join(", ") + " mm",
         ]
     };
-    let [held, load] = &result.patches;
-    table(&["Patch", "Contact", "Area", "Motion"], &[row(("held", held)), row(("loaded", load))])
+    let rows: Vec<_> = ["held", "loaded", "cut"].into_iter().zip(&result.patches).map(row).collect();
+    table(&["Patch", "Contact", "Area", "Motion"], &rows)
 }
 
 fn correlation_table(result: &StiffnessResult) -> String {

@@ -1,27 +1,26 @@
 //! No more model than the data ask for: contact, law and number of regions by evidence.
 
 use crate::error::StiffnessError;
-use crate::stiffness::geometry::edge_step;
-use crate::stiffness::identify::{Estimate, State};
+use crate::stiffness::geometry::{self, open_steps};
+use crate::stiffness::identify::{Estimate, Setup};
 use crate::stiffness::level::Level;
 use crate::stiffness::patches::{Patch, travel};
-use crate::stiffness::summary;
+use crate::stiffness::summary::{self, Scale};
 use crate::types::space::dot;
-use crate::types::stiffness::{Contact, Evidence, Law, LawChoice};
+use crate::types::stiffness::{Contact, Evidence, Law, LawChoice, StiffnessParams};
 
 /// A model must beat a smaller one by this much (Kass and Raftery 1995: more than 10 is very
 /// strong).
 pub const MARGIN: f64 = 10.0;
-/// Largest principal strain (95th percentile over the body) up to which the law is left to the
-/// data. What a linear law leaves out is of the order of the strain (4.71 for a contrast of 5 at 7
-/// %), and a field from images is off by more than tells the two apart.
+/// Largest principal strain (95th percentile over the body) past which the linear law is off by
+/// more than a modulus is known to: what it leaves out is of the order of the strain.
 const SMALL_STRAIN: f64 = 0.05;
 /// Precision of forward solutions on the coarse mesh (mm).
 const COARSE: f64 = 1e-4;
 /// Iterations at most on the coarse mesh.
 const ITERATIONS: usize = 12;
 
-/// Moves of a punch's edge at most.
+/// Moves of the open parts of the shape at most.
 const MOVES: usize = 4;
 /// Those of each law before the two are compared: the law that is chosen goes on.
 const LAW_MOVES: usize = 2;
@@ -30,9 +29,12 @@ const LONGEST: f64 = 2.0;
 /// Shorter ones are left to the last step with all offsets (voxels).
 const SETTLED: f64 = 0.1;
 
-/// A guided patch takes over what the field says along the plate, with its errors: the squares must
-/// fall by so much (in ln).
+/// A guided or measured patch takes over what the field says, with its errors: the squares beyond
+/// the noise must fall by so much (in ln).
 const DECISIVE: f64 = 0.2;
+
+/// Part of the plates' motion by which a plate may miss a plane: strain is off by about as much.
+const PLANE: f64 = 0.02;
 
 /// What was chosen on the coarse mesh.
 #[derive(Debug)]
@@ -43,6 +45,8 @@ pub struct Choice {
     pub estimate: Estimate,
     /// All that was tried.
     pub evidence: Vec<Evidence>,
+    /// What to know before trusting it.
+    pub warnings: Vec<String>,
 }
 
 /// The Bayesian information criterion: `samples` ln(squares / samples) + `parameters` ln(samples).
@@ -50,27 +54,30 @@ pub fn bic(squares: f64, samples: f64, parameters: usize) -> f64 {
     samples * (squares.max(1e-300) / samples).ln() + parameters as f64 * samples.max(2.0).ln()
 }
 
-/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding or
-/// guided, or either where noise hides it.
-fn candidates(level: &Level) -> [Vec<Contact>; 2] {
-    let [held, load] = &level.patches;
+/// How a patch may touch, by its measured motion: sticking where it moves as one, else sliding,
+/// guided or measured, or any where noise hides it.
+fn candidates(level: &Level, patch: &Patch) -> Vec<Contact> {
+    let (held, load) = (&level.patches[0], &level.patches[1]);
     let travel = travel(&level.patches);
     let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
     let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
-    let one = |patch: &Patch| {
-        // Free sliding spreads a flat face by half the strain.
-        let free = 0.5 * strain * patch.radius;
-        let flat = !patch.curved();
-        if flat && patch.residual[1] < 0.25 * free {
-            vec![Contact::Sticking]
-        } else if flat && patch.residual[1] < 2.0 * level.surface_error {
-            // Noise hides whether it slides; what is inside tells.
-            vec![Contact::Sticking, Contact::Sliding]
-        } else {
-            vec![Contact::Sliding, Contact::Guided]
-        }
+    // Free sliding spreads a flat face by half the strain.
+    let free = 0.5 * strain * patch.radius;
+    let flat = !patch.curved();
+    let noise = 2.0 * level.surface_error;
+    let mut out = if flat && patch.residual[1] < 0.25 * free {
+        vec![Contact::Sticking]
+    } else if flat && patch.residual[1] < noise {
+        // Noise hides whether it slides; what is inside tells.
+        vec![Contact::Sticking, Contact::Sliding]
+    } else {
+        vec![Contact::Sliding, Contact::Guided]
     };
-    [one(held), one(load)]
+    // What keeps no plane is no plate.
+    if flat && patch.bulge() > PLANE * dot(travel, travel).sqrt() {
+        out.push(Contact::Measured);
+    }
+    out
 }
 
 /// Lets both patches touch so.
@@ -78,177 +85,326 @@ fn touch(level: &mut Level, contact: [Contact; 2]) {
     (level.patches[0].contact, level.patches[1].contact) = (contact[0], contact[1]);
 }
 
-/// Numbers that guided patches are given: twelve each.
-fn given(contact: [Contact; 2]) -> usize {
-    12 * contact.iter().filter(|c| **c == Contact::Guided).count()
+/// An estimate with the contact that it was made for.
+#[derive(Debug, Clone)]
+struct Tried {
+    contact: [Contact; 2],
+    /// Patches whose motion is read from the field.
+    read: usize,
+    /// How far the open parts of the shape were moved.
+    offsets: Vec<f64>,
+    /// Weighted squares with the shape where the data put it.
+    squares: f64,
+    /// The part of these that is more than noise.
+    beyond: f64,
+    estimate: Estimate,
 }
 
-/// The estimate under large strain from another one.
-///
-/// # Errors
-/// As [`crate::stiffness::identify::Setup::run`].
-fn large_strain_from(
-    level: &mut Level,
-    start: State,
-    poisson: f64,
-    reference: usize,
-) -> Result<Estimate, StiffnessError> {
-    let large = level.setup(Law::NeoHookean, poisson, reference).run(start, ITERATIONS, COARSE)?;
-    settle(level, Law::NeoHookean, poisson, reference, large, (LAW_MOVES, COARSE))
+impl Tried {
+    /// An estimate on a level as it is.
+    fn new(level: &Level, setup: &Setup<'_>, estimate: Estimate) -> Result<Self, StiffnessError> {
+        let shaped = geometry::fit(setup, &estimate, &level.grid, (&[], &[]))?;
+        let squares = shaped.map_or(estimate.squares, |g| g.fit.squares.min(estimate.squares));
+        let contact = [level.patches[0].contact, level.patches[1].contact];
+        let read = contact.iter().filter(|c| matches!(c, Contact::Guided | Contact::Measured)).count();
+        let noise = setup.noise.unwrap_or(0.0) / estimate.rms.max(f64::MIN_POSITIVE);
+        let beyond = (1.0 - noise * noise).max(0.0);
+        Ok(Self { contact, read, offsets: level.offsets(), squares, beyond, estimate })
+    }
+
+    fn score(&self, samples: f64) -> f64 {
+        bic(self.squares, samples, self.estimate.parameters)
+    }
+
+    /// The criterion, with what each contact that is read from the field must gain beyond it.
+    fn rank(&self, samples: f64) -> f64 {
+        self.score(samples) + self.read as f64 * MARGIN.max(DECISIVE * samples * self.beyond)
+    }
+
+    fn name(&self) -> String {
+        format!("held {}, loaded {}", self.contact[0].name(), self.contact[1].name())
+    }
 }
 
-/// Chooses how the patches touch and the law, on a coarse mesh. The patches of `level` get the
-/// contact chosen.
+/// The one that ranks first; none of none.
+fn first_ranked(tried: &[Tried]) -> Option<usize> {
+    let samples = tried.iter().map(|t| t.estimate.effective).fold(f64::INFINITY, f64::min);
+    (0..tried.len()).min_by(|&i, &k| tried[i].rank(samples).total_cmp(&tried[k].rank(samples)))
+}
+
+/// Chooses how the patches touch and the law, on a coarse mesh, which gets the contact chosen.
 ///
 /// # Errors
 /// [`StiffnessError`] where no candidate can be solved.
-pub fn choose(level: &mut Level, wanted: LawChoice, poisson: f64, reference: usize) -> Result<Choice, StiffnessError> {
-    let mut evidence = Vec::new();
-    let names = candidates(level);
-    let first = if wanted == LawChoice::NeoHookean { Law::NeoHookean } else { Law::Linear };
-    let mut tried: Vec<([Contact; 2], Estimate)> = Vec::new();
-    let mut failure = None;
-    for &a in &names[0] {
-        for &b in &names[1] {
-            touch(level, [a, b]);
-            let setup = level.setup(first, poisson, reference);
-            let mut start = setup.start();
-            if let Some((_, last)) = tried.last() {
-                (start.theta, start.x) = (last.state.theta.clone(), last.state.x.clone());
-            }
-            match setup.run(start, ITERATIONS, COARSE) {
-                Ok(e) => tried.push(([a, b], e)),
-                Err(e) => failure = Some(e),
-            }
-        }
-    }
-    let samples = tried.iter().map(|t| t.1.effective).fold(f64::INFINITY, f64::min);
-    let count = |t: &([Contact; 2], Estimate)| t.1.parameters + given(t.0);
-    let score = |t: &([Contact; 2], Estimate)| bic(t.1.squares, samples, count(t));
-    let guided = |t: &([Contact; 2], Estimate)| t.0.contains(&Contact::Guided);
-    let rank = |t| score(t) + if guided(t) { DECISIVE * samples } else { 0.0 };
-    let best = (0..tried.len()).fold(None, |m: Option<usize>, i| match m {
-        Some(k) if rank(&tried[k]) <= rank(&tried[i]) => Some(k),
-        _ => Some(i),
-    });
-    let Some(best) = best else { return Err(failure.unwrap_or(StiffnessError::NoEquilibrium)) };
-    for (i, t) in tried.iter().enumerate() {
-        evidence.push(Evidence {
-            question: "contact",
-            model: format!("held {}, loaded {}", t.0[0].name(), t.0[1].name()),
-            parameters: count(t),
-            residual_mm: t.1.rms,
-            bic: score(t),
-            chosen: i == best,
-            reason: match tried.len() {
-                1 => "both patches move as rigid bodies".into(),
-                _ if i == best => "explains the field best".into(),
-                _ if score(t) < score(&tried[best]) => {
-                    "hardly better, and takes the motion along the plate as given".into()
-                }
-                _ => "explains it less".into(),
-            },
-        });
-    }
-    let plain =
-        (0..tried.len()).filter(|&i| !guided(&tried[i])).min_by(|&i, &k| score(&tried[i]).total_cmp(&score(&tried[k])));
-    // Of a guided patch, what the evidence has of it and of the best one that is not.
-    let rival = plain.filter(|_| guided(&tried[best])).map(|plain| ([best, plain], tried[plain].clone()));
-    let (contact, mut estimate) = tried.swap_remove(best);
-    touch(level, contact);
-    let mut law = first;
-    if wanted != LawChoice::Linear && first == Law::Linear {
-        let strain = summary::strain(&level.setup(law, poisson, reference), &estimate.state);
-        let large_strain = strain > SMALL_STRAIN;
-        if !large_strain {
-            estimate = settle(level, law, poisson, reference, estimate, (LAW_MOVES, COARSE))?;
-        }
-        let edge = level.edge.map_or(0.0, |e| e.1);
-        let large = large_strain_from(level, estimate.state.clone(), poisson, reference)?;
-        let samples = estimate.effective.min(large.effective);
-        let scores = [&estimate, &large].map(|e| bic(e.squares, samples, e.parameters));
-        let better = large_strain || scores[1] + MARGIN < scores[0];
-        for (i, e) in [&estimate, &large].into_iter().enumerate() {
-            let gain = scores[0] - scores[1];
-            evidence.push(Evidence {
-                question: "law",
-                model: [Law::Linear, Law::NeoHookean][i].name().into(),
-                parameters: e.parameters,
-                residual_mm: e.rms,
-                bic: scores[i],
-                chosen: (i == 1) == better,
-                reason: if large_strain {
-                    let (strain, most) = (100.0 * strain, 100.0 * SMALL_STRAIN);
-                    format!("strains reach {strain:.0} %; past {most:.0} % small strain is off by about as much")
-                } else if better {
-                    format!("the strain asks for it: the criterion falls by {gain:.0}, {MARGIN} are needed")
-                } else {
-                    format!("small strain suffices: the criterion would fall by {gain:.0}, {MARGIN} are needed")
-                },
-            });
-        }
-        if better {
-            law = Law::NeoHookean;
-            estimate = large;
-            if let Some((of, (without, rival))) = rival {
-                let edge = level.edge.map_or(0.0, |e| e.1);
-                touch(level, without);
-                // One that cannot be solved is none.
-                let rival = large_strain_from(level, rival.state, poisson, reference).ok().filter(|rival| {
-                    let samples = estimate.effective.min(rival.effective);
-                    let gain = bic(rival.squares, samples, rival.parameters)
-                        - bic(estimate.squares, samples, estimate.parameters + given(contact));
-                    gain < DECISIVE * samples
-                });
-                if let Some(rival) = rival {
-                    estimate = rival;
-                    for (at, chosen, reason) in [
-                        (of[0], false, "explains the field best under small strain alone"),
-                        (of[1], true, "explains the field nearly as well under the law that is taken"),
-                    ] {
-                        (evidence[at].chosen, evidence[at].reason) = (chosen, reason.into());
-                    }
-                } else {
-                    touch(level, contact);
-                    level.move_edge(edge);
-                }
-            }
-        } else {
-            level.move_edge(edge);
-        }
-    } else {
-        evidence.push(Evidence {
-            question: "law",
-            model: law.name().into(),
-            parameters: estimate.parameters,
-            residual_mm: estimate.rms,
-            bic: bic(estimate.squares, estimate.effective, estimate.parameters),
-            chosen: true,
-            reason: "as asked".into(),
-        });
-    }
-    estimate = settle(level, law, poisson, reference, estimate, (MOVES, COARSE))?;
-    Ok(Choice { law, estimate, evidence })
+pub fn choose(level: &mut Level, params: &StiffnessParams, reference: usize) -> Result<Choice, StiffnessError> {
+    Chooser { level, params, reference, evidence: Vec::new(), warnings: Vec::new() }.run()
 }
 
-/// Moves the edge of a punch to where the data put it, and identifies again, until it stays, or has
-/// moved `moves` times. `precision`: of the forward solutions (mm).
+struct Chooser<'a> {
+    level: &'a mut Level,
+    params: &'a StiffnessParams,
+    reference: usize,
+    evidence: Vec<Evidence>,
+    warnings: Vec<String>,
+}
+
+impl Chooser<'_> {
+    fn run(mut self) -> Result<Choice, StiffnessError> {
+        let first = if self.params.model == LawChoice::NeoHookean { Law::NeoHookean } else { Law::Linear };
+        let (tried, best) = self.contact(first)?;
+        self.show_contacts(&tried, best);
+        let mut chosen = tried[best].clone();
+        self.touch(&chosen);
+        let mut law = first;
+        if self.params.model == LawChoice::Auto {
+            (law, chosen) = self.law(tried, best)?;
+        } else {
+            let (e, reason) = (&chosen.estimate, "as asked".to_string());
+            self.evidence.push(shown(
+                "law",
+                law.name().into(),
+                e,
+                bic(e.squares, e.effective, e.parameters),
+                true,
+                reason,
+            ));
+        }
+        let estimate = settle(self.level, law, self.params, self.reference, chosen.estimate, (MOVES, COARSE))?;
+        Ok(Choice { law, estimate, evidence: self.evidence, warnings: self.warnings })
+    }
+
+    /// Tries every contact under a law, and says which ranks first.
+    fn contact(&mut self, law: Law) -> Result<(Vec<Tried>, usize), StiffnessError> {
+        let [held, loaded] = [0, 1].map(|i| candidates(self.level, &self.level.patches[i]));
+        let mut tried: Vec<Tried> = Vec::new();
+        let mut failure = None;
+        let mut attempt = |tried: &mut Vec<Tried>, contact: [Contact; 2]| {
+            touch(self.level, contact);
+            let setup = self.level.setup(law, self.params, self.reference);
+            let mut start = setup.start();
+            if let Some(last) = tried.last() {
+                (start.theta, start.x) = (last.estimate.state.theta.clone(), last.estimate.state.x.clone());
+            }
+            match setup.run(start, ITERATIONS, COARSE).and_then(|e| Tried::new(self.level, &setup, e)) {
+                Ok(one) => tried.push(one),
+                Err(e) => failure = Some(e),
+            }
+        };
+        // The loaded patch first: it moves most.
+        for &contact in &loaded {
+            attempt(&mut tried, [held[0], contact]);
+        }
+        let along = first_ranked(&tried).map_or(loaded[0], |best| tried[best].contact[1]);
+        for &contact in &held[1..] {
+            attempt(&mut tried, [contact, along]);
+        }
+        let best = first_ranked(&tried).ok_or_else(|| failure.unwrap_or(StiffnessError::NoEquilibrium))?;
+        Ok((tried, best))
+    }
+
+    /// Brings the level to where an estimate was made.
+    fn touch(&mut self, tried: &Tried) {
+        touch(self.level, tried.contact);
+        self.level.move_to(&tried.offsets);
+    }
+
+    fn show_contacts(&mut self, tried: &[Tried], best: usize) {
+        let samples = tried.iter().map(|t| t.estimate.effective).fold(f64::INFINITY, f64::min);
+        for (i, t) in tried.iter().enumerate() {
+            let reason = match tried.len() {
+                1 => "both patches move as rigid bodies",
+                _ if i == best => "explains the field best",
+                _ if t.score(samples) < tried[best].score(samples) => {
+                    "hardly better, and takes the motion of the patch as read"
+                }
+                _ => "explains it less",
+            };
+            self.evidence.push(shown("contact", t.name(), &t.estimate, t.score(samples), i == best, reason.into()));
+        }
+    }
+
+    /// The law that the data ask for, and the contact that holds under it.
+    fn law(&mut self, mut tried: Vec<Tried>, best: usize) -> Result<(Law, Tried), StiffnessError> {
+        let small = tried[best].estimate.clone();
+        let small = settle(self.level, Law::Linear, self.params, self.reference, small, (LAW_MOVES, COARSE))?;
+        let strain = summary::strain(&self.level.setup(Law::Linear, self.params, self.reference), &small.state);
+        let setup = self.level.setup(Law::Linear, self.params, self.reference);
+        let small = Tried::new(self.level, &setup, small)?;
+        let large = self.large_strain_from(&small).or_else(|_| {
+            // A shape that was moved far may bear no large strain; what it changes stays to first order.
+            self.level.move_to(&vec![0.0; small.offsets.len()]);
+            self.large_strain_from(&small)
+        });
+        let Ok(large) = large else {
+            self.touch(&small);
+            let e = &small.estimate;
+            let criterion = bic(e.squares, e.effective, e.parameters);
+            let reason = "no equilibrium was found under the neo-Hookean one".to_string();
+            self.evidence.push(shown("law", Law::Linear.name().into(), e, criterion, true, reason));
+            if strain > SMALL_STRAIN {
+                self.warnings.push(format!(
+                    "strains reach {:.0} %, where the linear law is an approximation, but no equilibrium was found under the neo-Hookean one",
+                    100.0 * strain
+                ));
+            }
+            return Ok((Law::Linear, small));
+        };
+        let samples = small.estimate.effective.min(large.estimate.effective);
+        let gain = small.score(samples) - large.score(samples);
+        let law = self.judged(strain, gain);
+        for (of, t) in [(Law::Linear, &small), (Law::NeoHookean, &large)] {
+            let reason = reason(law, gain);
+            self.evidence.push(shown("law", of.name().into(), &t.estimate, t.score(samples), of == law, reason));
+        }
+        if law == Law::Linear {
+            self.touch(&small);
+            return Ok((law, small));
+        }
+        // A contact that is read from the field must be worth it under the law that is taken.
+        let plain = (0..tried.len()).filter(|&i| tried[i].read < tried[best].read);
+        let plain = plain.min_by(|&i, &k| tried[i].rank(samples).total_cmp(&tried[k].rank(samples)));
+        if let Some(plain) = plain {
+            let start = tried.swap_remove(plain);
+            self.touch(&start);
+            // One that cannot be solved is none.
+            if let Ok(rival) = self.large_strain_from(&start) {
+                let samples = large.estimate.effective.min(rival.estimate.effective);
+                if rival.rank(samples) < large.rank(samples) {
+                    let asked = [large.name(), rival.name()];
+                    for e in self.evidence.iter_mut().filter(|e| e.question == "contact") {
+                        e.chosen = e.model == asked[1];
+                        if let Some(k) = asked.iter().position(|name| *name == e.model) {
+                            e.reason = UNDER_LAW[k].into();
+                        }
+                    }
+                    return Ok((law, rival));
+                }
+            }
+            self.touch(&large);
+        }
+        Ok((law, large))
+    }
+
+    fn large_strain_from(&mut self, from: &Tried) -> Result<Tried, StiffnessError> {
+        let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
+        let large = setup.run(from.estimate.state.clone(), ITERATIONS, COARSE)?;
+        let large = settle(self.level, Law::NeoHookean, self.params, self.reference, large, (LAW_MOVES, COARSE))?;
+        let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
+        Tried::new(self.level, &setup, large)
+    }
+
+    /// The law by what its criterion gains; where that does not tell, by the strain.
+    fn judged(&mut self, strain: f64, gain: f64) -> Law {
+        let is_large = strain > SMALL_STRAIN;
+        let percent = 100.0 * strain;
+        if gain < -MARGIN && is_large {
+            self.warnings.push(format!(
+                "strains reach {percent:.0} %, where the linear law is an approximation, but the data prefer it: Poisson's ratio, \
+                 patches or labels may not be as assumed, or the field is not measured; compare with --model neo-hookean"
+            ));
+        } else if gain <= MARGIN && gain >= -MARGIN && is_large {
+            self.warnings.push(format!(
+                "the data do not tell the laws apart; as strains reach {percent:.0} % the neo-Hookean one is taken"
+            ));
+        }
+        if gain > MARGIN || (is_large && gain >= -MARGIN) { Law::NeoHookean } else { Law::Linear }
+    }
+}
+
+/// Why a contact gives way to another, and why that is taken, once the law is chosen.
+const UNDER_LAW: [&str; 2] = [
+    "explains the field best under small strain alone",
+    "explains the field nearly as well under the law that is taken",
+];
+
+fn reason(law: Law, gain: f64) -> String {
+    match law {
+        Law::NeoHookean if gain > MARGIN => {
+            format!("the strain asks for it: the criterion falls by {gain:.0}, {MARGIN} are needed")
+        }
+        Law::NeoHookean => "the data do not tell; the strain is past what the linear law bears".into(),
+        Law::Linear if gain < -MARGIN => {
+            format!("the linear law explains the field better: the criterion differs by {:.0}", -gain)
+        }
+        Law::Linear => format!("small strain suffices: the criterion would fall by {gain:.0}, {MARGIN} are needed"),
+    }
+}
+
+fn shown(question: &'static str, model: String, e: &Estimate, bic: f64, chosen: bool, reason: String) -> Evidence {
+    Evidence { question, model, parameters: e.parameters, residual_mm: e.rms, bic, chosen, reason }
+}
+
+/// Moves the open parts of the shape to where the data put them, and identifies again, until they
+/// stay, or have moved `moves` times. `precision`: of the forward solutions (mm).
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
 pub fn settle(
     level: &mut Level,
     law: Law,
-    poisson: f64,
+    params: &StiffnessParams,
     reference: usize,
     mut estimate: Estimate,
     (moves, precision): (usize, f64),
 ) -> Result<Estimate, StiffnessError> {
     for _ in 0..moves {
-        let step = edge_step(&level.setup(law, poisson, reference), &estimate, &level.grid)?;
-        let Some((step, (_, moved))) = step.zip(level.edge).filter(|(step, _)| step.abs() > SETTLED) else { break };
-        level.move_edge(moved + step.clamp(-LONGEST, LONGEST));
-        estimate = level.setup(law, poisson, reference).run(estimate.state, ITERATIONS, precision)?;
+        let steps = open_steps(&level.setup(law, params, reference), &estimate)?;
+        let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SETTLED)) else { break };
+        let before = level.offsets();
+        let next: Vec<f64> = before.iter().zip(&steps).map(|(b, s)| b + s.clamp(-LONGEST, LONGEST)).collect();
+        level.move_to(&next);
+        match level.setup(law, params, reference).run(estimate.state.clone(), ITERATIONS, precision) {
+            Ok(better) => estimate = better,
+            // A shape that cannot be solved is left alone.
+            Err(_) => {
+                level.move_to(&before);
+                break;
+            }
+        }
+    }
+    Ok(estimate)
+}
+
+/// Runs on which given moduli are settled at most: the scale moves little with what they change.
+const KNOWN_RUNS: usize = 3;
+/// Change of ln E under which they are settled.
+const KNOWN: f64 = 1e-3;
+
+/// Identifies again with the moduli that are given, beside the one that sets the scale, where the
+/// scale puts them.
+///
+/// # Errors
+/// As [`crate::stiffness::identify::Setup::run`].
+pub fn known_moduli(
+    level: &mut Level,
+    law: Law,
+    params: &StiffnessParams,
+    reference: usize,
+    mut estimate: Estimate,
+) -> Result<Estimate, StiffnessError> {
+    let scale = Scale::of(&level.body, params);
+    let sets = |r: usize| matches!(scale, Scale::Known(known, _) if known == r);
+    let given = |label: u8| params.fixed.iter().find(|f| f.0 == label).map(|f| f.1.ln());
+    let labels = level.body.labels.clone();
+    let others: Vec<(usize, f64)> =
+        (0..labels.len()).filter(|&r| !sets(r)).filter_map(|r| Some((r, given(labels[r])?))).collect();
+    for _ in 0..KNOWN_RUNS {
+        let setup = level.setup(law, params, reference);
+        let found = summary::moduli(&setup, &estimate, None, scale).log;
+        let off = |&(r, e): &(usize, f64)| (r, estimate.state.theta[r] + e - found[r]);
+        // Of the reference itself nothing can be moved: the scale says what it is.
+        let known: Vec<(u8, f64)> =
+            others.iter().filter(|o| o.0 != reference).map(off).map(|(r, t)| (labels[r], t)).collect();
+        let change = known.iter().map(|(label, t)| {
+            let r = labels.partition_point(|l| l < label);
+            (t - estimate.state.theta[r]).abs()
+        });
+        if change.fold(0.0, f64::max) < KNOWN {
+            break;
+        }
+        level.known = known;
+        let start = estimate.state.clone();
+        estimate = level.setup(law, params, reference).run(start, ITERATIONS, COARSE)?;
     }
     Ok(estimate)
 }

@@ -13,148 +13,116 @@
 //! it where it was measured from images. So the edge has an offset as well, all around.
 
 use crate::error::StiffnessError;
+use crate::numerics::cholesky::within;
 use crate::stiffness::body::Body;
+use crate::stiffness::border::Border;
+use crate::stiffness::coherent::Fit;
+use crate::stiffness::edge::Edge;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
 use crate::stiffness::inclusion::{Inclusion, SHAPES};
-use crate::stiffness::interface::{Interface, fade};
+use crate::stiffness::interface::Interface;
 use crate::stiffness::observations::{find, read};
-use crate::stiffness::patches::Patch;
-use crate::types::space::{dot, length};
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
 /// One standard deviation of a flat face (voxels): uniform over one voxel.
 const FACE: f64 = 0.288_675;
 /// One standard deviation of the edge of a punch (voxels).
 const EDGE: f64 = 3.0;
+/// The most standard deviations that an offset may come to.
+const MOST: f64 = 3.5;
+/// The same of the walls of a hole: a channel of 12 by 10 voxels came to 1.5 voxels.
+const MOST_OF_WALLS: f64 = 6.0;
 /// One standard deviation with which a mesh keeps to a flat interface (voxels): surfaces are moved
 /// by hundredths until volumes agree.
 const MESHED: f64 = 0.02;
-/// Free surface beside a punch at least (voxels).
-const BESIDE: f64 = 3.0;
 /// Least part of the box's face that a flat face fills.
 const FLAT: f64 = 0.2;
-/// Samples (components) for each independent one, at least: on a body of a few hundred cubic
-/// voxels' size the errors of a rounded edge reach that far.
-const DILUTION: f64 = 100.0;
 /// Power of the distance from the middle with which an offset fades inwards: the outermost tenth
 /// moves by two thirds or more.
 const FADE: i32 = 4;
+/// Offsets over which a derivative is taken (voxels): the next one where the one before has no
+/// equilibrium.
+const STEPS: [f64; 2] = [FACE, 0.25 * FACE];
 /// Precision of the solutions (mm).
 const PRECISION: f64 = 1e-6;
 
-/// What has an offset.
-#[derive(Debug, Clone, Copy)]
-enum Part<'a> {
-    /// A flat face: voxel axis, and whether it is the upper one.
-    Face(usize, bool),
-    /// The edge of the loaded patch.
-    Edge(Edge),
-    /// A flat border between two labels.
-    Interface(&'a Interface),
-    /// The surface of a region that was found without labels: how its shapes move the nodes (mm),
-    /// which one, and one standard deviation (mm).
-    Inclusion(&'a [[[f64; 3]; SHAPES]], usize, f64),
+/// A part of the body's shape that is known to a part of a voxel only.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// As in summary.json; none for one of the shapes of an inclusion.
+    pub name: Option<String>,
+    /// One standard deviation (voxels).
+    sigma: f64,
+    /// The most standard deviations that it may come to.
+    most: f64,
+    /// How each node moves for an offset of a voxel (mm, RAS).
+    movement: Vec<[f64; 3]>,
 }
 
-impl Part<'_> {
-    /// One standard deviation (voxels) on voxels of `voxel` mm.
-    fn sigma(self, voxel: f64) -> f64 {
-        match self {
-            Part::Face(..) | Part::Interface(_) => FACE,
-            Part::Edge(_) => EDGE,
-            Part::Inclusion(.., sigma) => sigma / voxel,
-        }
+impl Part {
+    /// The edge of a punch.
+    pub fn edge(edge: &Edge, body: &Body, voxel: f64) -> Self {
+        Self::of(body, Some("edge".into()), EDGE, |p| edge.widened(p, voxel))
     }
 
-    /// The most standard deviations that it may come to. The mesh rounds the edges in which the
-    /// walls of a hole meet, which makes it stiffer there, and the walls answer for that as well: a
-    /// channel of 12 by 10 voxels came to 1.5 voxels.
-    fn most(self) -> f64 {
-        match self {
-            Part::Interface(interface) if interface.is_wall() => 6.0,
-            _ => 3.5,
-        }
+    /// The border between two labels, which moves along its normal as `border` says; `sigma` in
+    /// voxels.
+    pub fn border(border: Border, sigma: f64, voxel: f64) -> Self {
+        let movement = border.normals.iter().map(|n| n.map(|v| voxel * v)).collect();
+        Self { name: Some(border.name), sigma, most: MOST, movement }
     }
 
-    /// None for a shape.
-    fn name(self) -> Option<String> {
-        match self {
-            Part::Face(axis, upper) => Some(format!("{}{axis}", if upper { '+' } else { '-' })),
-            Part::Edge(_) => Some("edge".into()),
-            Part::Interface(interface) => Some(interface.name()),
-            Part::Inclusion(..) => None,
-        }
+    /// A flat face of the box of the body: voxel axis, and whether it is the upper one.
+    fn face(body: &Body, grid: &Grid, axis: usize, upper: bool) -> Self {
+        let name = format!("{}{axis}", if upper { '+' } else { '-' });
+        let [low, high] = bounds(body, grid);
+        let middle = 0.5 * (low[axis] + high[axis]);
+        Self::of(body, Some(name), FACE, |p| {
+            let mut q = grid.affine().to_voxel(WorldPoint(p)).0;
+            let part = (q[axis] - middle) / (high[axis] - middle);
+            let part = if upper { part } else { -part };
+            if part > 0.0 {
+                q[axis] += if upper { 1.0 } else { -1.0 } * part.powi(FADE);
+            }
+            grid.affine().to_world(VoxelPoint(q)).0
+        })
+    }
+
+    /// A flat border between two labels, or the wall of a hole. The mesh rounds the edges in which
+    /// the walls of a hole meet, and the walls answer for that as well.
+    fn interface(interface: &Interface, body: &Body, grid: &Grid) -> Self {
+        let part = Self::of(body, Some(interface.name()), FACE, |p| interface.moved(p, grid, 1.0));
+        Self { most: if interface.is_wall() { MOST_OF_WALLS } else { MOST }, ..part }
+    }
+
+    /// The shapes of a region that was found without labels.
+    fn inclusion(inclusion: &Inclusion, body: &Body, voxel: f64) -> Vec<Self> {
+        let shapes = inclusion.shapes(&body.places);
+        let one = |k: usize| {
+            let movement = shapes.iter().map(|s| s[k].map(|v| voxel * v)).collect();
+            Self { name: None, sigma: inclusion.prior() / voxel, most: MOST, movement }
+        };
+        (0..SHAPES).map(one).collect()
+    }
+
+    fn of(body: &Body, name: Option<String>, sigma: f64, moved: impl Fn([f64; 3]) -> [f64; 3]) -> Self {
+        let one = |p: &[f64; 3]| {
+            let q = moved(*p);
+            std::array::from_fn(|a| q[a] - p[a])
+        };
+        Self { name, sigma, most: MOST, movement: body.places.iter().map(one).collect() }
+    }
+
+    /// Adds what an offset (voxels) moves to the nodes' places (mm, RAS).
+    pub fn shift(&self, places: &mut [[f64; 3]], offset: f64) {
+        places.iter_mut().zip(&self.movement).for_each(|(p, m)| (0..3).for_each(|a| p[a] += offset * m[a]));
     }
 
     /// The body with this part moved outwards by `offset` voxels.
-    fn moved(self, body: &Body, grid: &Grid, offset: f64) -> Body {
-        match self {
-            Part::Face(axis, upper) => shifted(body, grid, axis, upper, offset),
-            Part::Edge(edge) => {
-                let wider = offset * grid.least_spacing();
-                body.with_places(body.places.iter().map(|p| edge.widened(*p, wider)).collect())
-            }
-            Part::Interface(interface) => {
-                body.with_places(body.places.iter().map(|p| interface.moved(*p, grid, offset)).collect())
-            }
-            Part::Inclusion(nodes, shape, _) => {
-                let by = offset * grid.least_spacing();
-                let place = |(p, u): (&[f64; 3], &[[f64; 3]; SHAPES])| std::array::from_fn(|a| p[a] + by * u[shape][a]);
-                body.with_places(body.places.iter().zip(nodes).map(place).collect())
-            }
-        }
-    }
-}
-
-/// The edge of a flat punch.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Edge {
-    middle: [f64; 3],
-    normal: [f64; 3],
-    /// Of the punch (mm): of a round one, or between the half side and the half diagonal of a
-    /// square one.
-    radius: f64,
-    /// Distance from the edge over which the surface beside it gives way (mm).
-    beside: f64,
-}
-
-impl Edge {
-    /// None where a patch is curved, or reaches to the end of its side. `voxel` is the least voxel
-    /// size (mm).
-    pub fn of(patch: &Patch, body: &Body, voxel: f64) -> Option<Self> {
-        if patch.curved() {
-            return None;
-        }
-        let mut edge =
-            Self { middle: patch.middle, normal: patch.normal, radius: 2f64.sqrt() * patch.radius, beside: 0.0 };
-        let upright = body.surface.iter().filter(|f| dot(f.normal, patch.normal).abs() < 0.5);
-        let near = |p: &[f64; 3]| edge.apart(*p).1.abs() < edge.radius;
-        let places = upright.flat_map(|f| f.nodes).map(|n| body.places[n as usize]).filter(near);
-        let end = places.map(|p| length(edge.apart(p).0)).fold(f64::INFINITY, f64::min);
-        edge.beside = (end - edge.radius).min(edge.radius);
-        (edge.beside > BESIDE * voxel).then_some(edge)
-    }
-
-    /// Of the punch (mm).
-    pub fn radius(&self) -> f64 {
-        self.radius
-    }
-
-    /// Across and along the normal from the middle of the patch (mm).
-    fn apart(&self, p: [f64; 3]) -> ([f64; 3], f64) {
-        let d: [f64; 3] = std::array::from_fn(|a| p[a] - self.middle[a]);
-        let height = dot(d, self.normal);
-        (std::array::from_fn(|a| d[a] - height * self.normal[a]), height)
-    }
-
-    /// Where `p` comes to lie when the punch is wider by `offset` (mm) all around: what is below
-    /// moves less and less.
-    pub fn widened(&self, p: [f64; 3], offset: f64) -> [f64; 3] {
-        let (across, height) = self.apart(p);
-        let beyond = ((length(across) - self.radius) / self.beside).max(0.0);
-        let below = (height.abs() / self.radius).min(1.0);
-        let part = fade(beyond) * (1.0 - below).powi(2);
-        std::array::from_fn(|a| p[a] + offset * part * across[a] / self.radius)
+    fn moved(&self, body: &Body, offset: f64) -> Body {
+        let mut places = body.places.clone();
+        self.shift(&mut places, offset);
+        body.with_places(places)
     }
 }
 
@@ -172,6 +140,8 @@ pub struct Geometry {
     pub covariance: Vec<f64>,
     /// Derivative of ln force by each offset (1/voxel).
     pub force_slope: Vec<f64>,
+    /// What all parameters are known to.
+    pub fit: Fit,
 }
 
 /// Fits the offsets about an estimate; none when the body has no flat face, no punch and no
@@ -185,44 +155,29 @@ pub fn fit(
     grid: &Grid,
     (interfaces, inclusions): (&[Interface], &[Inclusion]),
 ) -> Result<Option<Geometry>, StiffnessError> {
-    let mut parts = flat_faces(setup.body, grid);
-    parts.extend(setup.edge.map(|(edge, _)| Part::Edge(edge)));
-    let moving: Vec<_> = inclusions.iter().map(|i| (i.shapes(&setup.body.places), i.prior())).collect();
-    parts.extend(moving.iter().flat_map(|(nodes, sigma)| (0..SHAPES).map(|k| Part::Inclusion(nodes, k, *sigma))));
-    let without = parts.len();
-    let (walls, borders): (Vec<_>, Vec<_>) = interfaces.iter().partition(|i| i.is_wall());
-    parts.extend(borders.into_iter().map(Part::Interface));
-    let without_walls = parts.len();
-    parts.extend(walls.into_iter().map(Part::Interface));
-    // Labels that are wrong by more than a voxel do not take the faces with them, nor walls the
-    // labels.
-    let mut counts = vec![parts.len(), without_walls, without];
-    counts.dedup();
-    for count in counts {
-        if let Some(found) = offsets(setup, estimate, grid, &parts[..count])? {
-            return Ok(Some(found));
-        }
-    }
-    Ok(None)
+    let (body, voxel) = (setup.body, grid.least_spacing());
+    let faces = flat_faces(body, grid);
+    let inclusions: Vec<Part> = inclusions.iter().flat_map(|i| Part::inclusion(i, body, voxel)).collect();
+    let flat: Vec<Part> = interfaces.iter().map(|i| Part::interface(i, body, grid)).collect();
+    let open = setup.open.iter().map(|(p, moved)| (p, *moved));
+    let all: Vec<(&Part, f64)> =
+        faces.iter().chain(&inclusions).chain(&flat).map(|part| (part, 0.0)).chain(open).collect();
+    offsets(setup, estimate, &all)
 }
 
-/// How much further outwards the edge of the punch lies (voxels), for all that the data say; none
-/// where there is no such edge.
+/// How much further outwards each of the open parts lies (voxels), for all that the data say; none
+/// where there is none.
 ///
 /// # Errors
 /// As [`Setup::run`].
-pub fn edge_step(setup: &Setup<'_>, estimate: &Estimate, grid: &Grid) -> Result<Option<f64>, StiffnessError> {
-    let Some((edge, _)) = setup.edge else { return Ok(None) };
-    Ok(offsets(setup, estimate, grid, &[Part::Edge(edge)])?.map(|g| g.faces[0].1))
+pub fn open_steps(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Vec<f64>>, StiffnessError> {
+    let parts: Vec<(&Part, f64)> = setup.open.iter().map(|(p, moved)| (p, *moved)).collect();
+    let found = offsets(setup, estimate, &parts)?;
+    Ok(found.map(|g| g.step[g.step.len() - parts.len()..].to_vec()))
 }
 
 /// Fits the offsets of some parts about an estimate.
-fn offsets(
-    setup: &Setup<'_>,
-    estimate: &Estimate,
-    grid: &Grid,
-    parts: &[Part<'_>],
-) -> Result<Option<Geometry>, StiffnessError> {
+fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Result<Option<Geometry>, StiffnessError> {
     let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
     // What an offset changes is smooth: it is read in the middle of a block.
@@ -230,36 +185,35 @@ fn offsets(
     let mut rows = estimate.rows.clone();
     let factor = setup.problem(&estimate.state).factorise(x)?;
     let mut force_slope = Vec::new();
-    for part in parts {
-        let body = part.moved(setup.body, grid, FACE);
-        let found = find(&body, &places);
-        let moved = Setup { body: &body, ..setup.clone() };
-        let problem = moved.problem(&estimate.state);
-        let y = match problem.solve_near(x, &factor, PRECISION) {
-            Some(y) => y,
-            None => problem.solve(Some(x), PRECISION)?.x,
-        };
-        let column = before.iter().zip(&found).map(|(before, now)| match (before, now) {
-            (Some(before), Some(now)) => {
-                let (old, new) = (read(&[*before], setup.body, x), read(&[*now], &body, &y));
-                std::array::from_fn(|a| (new[a] - old[a]) / FACE)
-            }
-            _ => [0.0; 3],
+    for (part, _) in parts {
+        let column = STEPS.into_iter().find_map(|by| {
+            let body = part.moved(setup.body, by);
+            let moved = Setup { body: &body, ..setup.clone() };
+            let problem = moved.problem(&estimate.state);
+            let near = problem.solve_near(x, &factor, PRECISION);
+            let y = near.or_else(|| problem.solve(Some(x), PRECISION).ok().map(|s| s.x))?;
+            let found = find(&body, &places);
+            let column = before.iter().zip(&found).map(|(before, now)| match (before, now) {
+                (Some(before), Some(now)) => {
+                    let (old, new) = (read(&[*before], setup.body, x), read(&[*now], &body, &y));
+                    std::array::from_fn(|a| (new[a] - old[a]) / by)
+                }
+                _ => [0.0; 3],
+            });
+            let force = moved.forces(&problem, &estimate.state, &y)[0];
+            Some((column.collect(), (force / estimate.force[0]).ln() / by))
         });
-        rows.push(column.collect());
-        let force = moved.forces(&problem, &estimate.state, &y)[0];
-        force_slope.push((force / estimate.force[0]).ln() / FACE);
+        // Of a shape that has no equilibrium nothing is told.
+        let (row, slope) = column.unwrap_or_else(|| (vec![[0.0; 3]; places.len()], 0.0));
+        rows.push(row);
+        force_slope.push(slope);
     }
-    let (p, voxel) = (rows.len(), grid.least_spacing());
+    let p = rows.len();
     let mut prior = setup.prior_terms(&estimate.state);
-    // The edge has been moved already.
-    let moved = |part: &Part<'_>| if matches!(part, Part::Edge(_)) { setup.edge.map_or(0.0, |e| e.1) } else { 0.0 };
-    prior.extend(parts.iter().map(|part| (part.sigma(voxel).powi(-2), moved(part))));
+    prior.extend(parts.iter().map(|(part, moved)| (part.sigma.powi(-2), *moved)));
     let scale = setup.scale(&estimate.residuals);
     let weights = setup.weights(&estimate.residuals, scale);
-    // Residuals hang together: as many independent samples as the estimate found, and no more than
-    // a model that knows the surface this badly can claim.
-    let dilution = (3.0 * estimate.residuals.len() as f64 / estimate.effective).max(DILUTION);
+    let dilution = setup.dilution(estimate);
     let blocks = grouped_normal(setup.observations, &rows, &estimate.residuals, &weights);
     let variance = estimate.squares / (3.0 * estimate.residuals.len() as f64) * dilution;
     let mut a = vec![0.0; p * p];
@@ -272,8 +226,15 @@ fn offsets(
         a[k * p + k] += weight;
         step[k] -= weight * distance;
     }
-    let factor = crate::numerics::cholesky::Cholesky::new(a, p).ok_or(StiffnessError::Unsolvable)?;
-    factor.solve(&mut step);
+    // What would go far beyond what is open stops there.
+    let first = p - parts.len();
+    let free = std::iter::repeat_n([f64::NEG_INFINITY, f64::INFINITY], first);
+    let limited = parts.iter().map(|(part, moved)| {
+        let most = part.most * part.sigma;
+        [(-most - moved).min(0.0), (most - moved).max(0.0)]
+    });
+    let room: Vec<[f64; 2]> = free.chain(limited).collect();
+    let step = within(&a, &step, &room).ok_or(StiffnessError::Unsolvable)?;
     let rest: Vec<[f64; 3]> = (0..estimate.residuals.len())
         .map(|i| {
             std::array::from_fn(|c| estimate.residuals[i][c] - (0..p).map(|k| step[k] * rows[k][i][c]).sum::<f64>())
@@ -281,27 +242,26 @@ fn offsets(
         .collect();
     let blocks = grouped_normal(setup.observations, &rows, &rest, &weights);
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
-    let (mut covariance, _, _) = covariance(&blocks, &prior, squares, 3.0 * rest.len() as f64)?;
-    let first = p - parts.len();
+    let samples = 3.0 * rest.len() as f64;
+    let (raw, squares) = (squares, squares.max(samples * setup.floor * setup.floor));
+    let (mut covariance, information, _) = covariance(&blocks, &prior, squares, samples)?;
     // What the mesh itself is off by, however well the data tell the place: all else follows it as
     // it would another place.
     let by_data = covariance.clone();
-    for k in (first..p).filter(|k| matches!(parts[k - first], Part::Interface(_))) {
+    for k in first..p {
         let follows: Vec<f64> = (0..p).map(|i| MESHED * by_data[i * p + k] / by_data[k * p + k]).collect();
         covariance.iter_mut().enumerate().for_each(|(at, v)| *v += follows[at / p] * follows[at % p]);
     }
-    if step[first..].iter().zip(parts).any(|(v, part)| (v + moved(part)).abs() > part.most() * part.sigma(voxel)) {
-        // So far beyond what a voxel map leaves open it is not the shape that is wrong.
-        return Ok(None);
-    }
-    let found = || parts.iter().zip(step[first..].iter().copied());
-    let faces = found().filter_map(|(part, offset)| part.name().map(|name| (name, offset))).collect();
-    let shapes = found().filter(|(part, _)| matches!(part, Part::Inclusion(..))).map(|(_, offset)| offset).collect();
-    Ok(Some(Geometry { faces, shapes, step, covariance, force_slope }))
+    let found = || parts.iter().zip(&step[first..]).map(|((part, moved), step)| (part, moved + step));
+    let faces = found().filter_map(|(part, offset)| part.name.clone().map(|name| (name, offset))).collect();
+    let shapes = found().filter(|(part, _)| part.name.is_none()).map(|(_, offset)| offset).collect();
+    let rms = (rest.iter().flatten().map(|r| r * r).sum::<f64>() / samples).sqrt();
+    let fit = Fit { rows, information, prior, rms, squares, raw: raw / squares.max(f64::MIN_POSITIVE) };
+    Ok(Some(Geometry { faces, shapes, step, covariance, force_slope, fit }))
 }
 
 /// Box faces (voxel axis, positive side) that the surface fills by [`FLAT`] or more.
-fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part<'static>> {
+fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part> {
     let voxel = |p: [f64; 3]| grid.affine().to_voxel(WorldPoint(p)).0;
     let [low, high] = bounds(body, grid);
     let spacing = grid.spacing();
@@ -314,7 +274,7 @@ fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part<'static>> {
             let on = |n: &u32| (voxel(body.places[*n as usize])[axis] - end).abs() < 0.3;
             let flat: f64 = body.surface.iter().filter(|f| f.nodes[..3].iter().all(on)).map(|f| f.area).sum();
             if flat > FLAT * area {
-                out.push(Part::Face(axis, positive));
+                out.push(Part::face(body, grid, axis, positive));
             }
         }
     }
@@ -331,20 +291,4 @@ fn bounds(body: &Body, grid: &Grid) -> [[f64; 3]; 2] {
         }
     }
     [low, high]
-}
-
-/// The body with one face moved outwards by `offset` voxels.
-fn shifted(body: &Body, grid: &Grid, axis: usize, positive: bool, offset: f64) -> Body {
-    let [low, high] = bounds(body, grid);
-    let middle = 0.5 * (low[axis] + high[axis]);
-    let place = |p: &[f64; 3]| {
-        let mut q = grid.affine().to_voxel(WorldPoint(*p)).0;
-        let part = (q[axis] - middle) / (high[axis] - middle);
-        let part = if positive { part } else { -part };
-        if part > 0.0 {
-            q[axis] += if positive { offset } else { -offset } * part.powi(FADE);
-        }
-        grid.affine().to_world(VoxelPoint(q)).0
-    };
-    body.with_places(body.places.iter().map(place).collect())
 }

@@ -11,7 +11,7 @@ use crate::numerics::sparse::Factor;
 use crate::numerics::statistics::percentile;
 use crate::stiffness::body::Body;
 use crate::stiffness::forward::{Problem, Solution, Tie};
-use crate::stiffness::geometry::Edge;
+use crate::stiffness::geometry::Part;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::{Patch, travel};
@@ -58,10 +58,10 @@ pub struct Setup<'a> {
     pub body: &'a Body,
     /// The law.
     pub law: Law,
-    /// Poisson's ratio.
-    pub poisson: f64,
-    /// Held and loaded patch.
-    pub patches: [Patch; 2],
+    /// Poisson's ratio of each region.
+    pub poisson: Vec<f64>,
+    /// Held and loaded patch, then the others.
+    pub patches: Vec<Patch>,
     /// What was measured.
     pub observations: &'a [Observation],
     /// The region whose modulus is 1.
@@ -71,8 +71,11 @@ pub struct Setup<'a> {
     /// The model's own error (in units of the observations' sigma): no residual is taken to be
     /// smaller.
     pub floor: f64,
-    /// The edge of a punch, and how far it has been moved outwards (voxels).
-    pub edge: Option<(Edge, f64)>,
+    /// Noise of an observation (mm, one component), where it is known apart from what the model
+    /// leaves over.
+    pub noise: Option<f64>,
+    /// Parts of the shape that are open, and how far each has been moved outwards (voxels).
+    pub open: &'a [(Part, f64)],
     /// Regions whose ln(mu / mu_reference) is not free, and its values.
     pub pinned: Vec<(usize, f64)>,
 }
@@ -83,7 +86,7 @@ pub struct State {
     /// ln(mu / mu_reference) of each region.
     pub theta: Vec<f64>,
     /// Change of the plates' motion from the fitted one (mm).
-    pub plates: [Vec<f64>; 2],
+    pub plates: Vec<Vec<f64>>,
     /// The solution.
     pub x: Option<Vec<f64>>,
 }
@@ -137,7 +140,7 @@ impl Setup<'_> {
 
     /// The forward problem for a state.
     pub fn problem(&self, state: &State) -> Problem<'_> {
-        let material = |&r: &u16| Material { mu: state.theta[r as usize].exp(), poisson: self.poisson };
+        let material = |&r: &u16| Material { mu: state.theta[r as usize].exp(), poisson: self.poisson[r as usize] };
         let materials: Vec<Material> = self.body.region.iter().map(material).collect();
         let mut ties: Vec<Tie> = Vec::new();
         for (patch, change) in self.patches.iter().zip(&state.plates) {
@@ -154,8 +157,7 @@ impl Setup<'_> {
                 ties.extend(guided.ties(self.body, &[]).into_iter().map(|t| Tie { strength: 1e-7, ..t }));
             }
         }
-        let [_, loaded] = &self.patches;
-        let plate = loaded.plate(self.body, &state.plates[1], |e| materials[e].mu);
+        let plate = self.patches[1].plate(self.body, &state.plates[1], |e| materials[e].mu);
         Problem { plate, ..Problem::new(self.body, self.law, materials, ties) }
     }
 
@@ -168,7 +170,7 @@ impl Setup<'_> {
 
     /// A state with equal moduli and the plates as fitted.
     pub fn start(&self) -> State {
-        let plates = [0, 1].map(|i| vec![0.0; self.patches[i].parameters()]);
+        let plates = self.patches.iter().map(|p| vec![0.0; p.parameters()]).collect();
         State { theta: vec![0.0; self.body.labels.len()], plates, x: None }
     }
 
@@ -235,20 +237,33 @@ impl Setup<'_> {
         ties.iter().map(|t| problem.pull(t, x)).fold([0.0; 3], |sum, f| std::array::from_fn(|a| sum[a] + f[a]))
     }
 
+    /// Force (kPa mm^2) of the loaded patch on the body: what all other patches hold against it
+    /// where a plate presses, and its own ties' else.
+    fn whole_force(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 3] {
+        let sign = if problem.plate.is_some() { -1.0 } else { 1.0 };
+        let all = self.bearing(problem).map(|i| self.reaction(problem, state, x, i));
+        all.fold([0.0; 3], |sum, f| std::array::from_fn(|a| sum[a] + sign * f[a]))
+    }
+
+    /// The patches whose ties tell the force on the loaded one.
+    fn bearing(&self, problem: &Problem<'_>) -> impl Iterator<Item = usize> {
+        let pressed = problem.plate.is_some();
+        (0..self.patches.len()).filter(move |&i| (i == 1) != pressed)
+    }
+
     /// Force (kPa mm^2) with which each plate pushes the body across it (loaded, held). That of a
     /// plate on a curved body is what the ties hold against it: linear in `x`, so it needs no
     /// better solution than that.
     pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
-        let held = self.reaction(problem, state, x, 0);
         let n = self.patches[1].normal;
-        let counter = if problem.plate.is_some() { dot(held, n) } else { -dot(self.reaction(problem, state, x, 1), n) };
-        [counter, -dot(held, self.patches[0].normal)]
+        let pushed = self.whole_force(problem, state, x);
+        [-dot(pushed, n), -dot(self.reaction(problem, state, x, 0), self.patches[0].normal)]
     }
 
     /// By how many times the whole force on the loaded plate is more than its part across it (1 at
     /// least), told as in `forces`.
     fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
-        let whole = self.reaction(problem, state, x, usize::from(problem.plate.is_none()));
+        let whole = self.whole_force(problem, state, x);
         length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
     }
 
@@ -295,7 +310,7 @@ impl Setup<'_> {
     /// [`StiffnessError`] when the forward problem cannot be solved.
     pub fn run(&self, start: State, most: usize, precision: f64) -> Result<Estimate, StiffnessError> {
         let free = self.free();
-        let parameters = free.len() + self.patches[0].parameters() + self.patches[1].parameters();
+        let parameters = free.len() + self.patches.iter().map(Patch::parameters).sum::<usize>();
         let mut state = start;
         self.pinned.iter().for_each(|&(r, value)| state.theta[r] = value);
         let mut factorisations = 0;
@@ -519,21 +534,22 @@ impl Setup<'_> {
     /// Derivatives of ln(force on the loaded plate).
     fn force_slope(&self, problem: &Problem<'_>, columns: &[f64], force: f64) -> Vec<f64> {
         let n = self.body.pattern.unknowns();
-        // As in `forces`.
-        let own = usize::from(problem.plate.is_none());
-        let sign = if own == 1 { -1.0 } else { 1.0 };
-        let first = self.free().len() + own * self.patches[0].parameters();
-        let (patch, normal) = (&self.patches[own], self.patches[1].normal);
-        let ties = patch.ties(self.body, &[]);
+        let (sign, normal) = (if problem.plate.is_some() { 1.0 } else { -1.0 }, self.patches[1].normal);
+        let first = |i: usize| self.free().len() + self.patches[..i].iter().map(Patch::parameters).sum::<usize>();
+        let bearing: Vec<_> =
+            self.bearing(problem).map(|i| (&self.patches[i], first(i), self.patches[i].ties(self.body, &[]))).collect();
         let slope = |(k, y): (usize, &[f64])| {
-            let push = |tie: &Tie| {
-                let target = match k.checked_sub(first) {
-                    Some(k) if k < patch.parameters() => patch.basis(k, self.body.places[tie.node as usize]),
-                    _ => [0.0; 3],
+            let pushed = |(patch, first, ties): &(&Patch, usize, Vec<Tie>)| -> f64 {
+                let push = |tie: &Tie| {
+                    let target = match k.checked_sub(*first) {
+                        Some(k) if k < patch.parameters() => patch.basis(k, self.body.places[tie.node as usize]),
+                        _ => [0.0; 3],
+                    };
+                    sign * dot(problem.pull(&Tie { target, ..*tie }, y), normal)
                 };
-                sign * dot(problem.pull(&Tie { target, ..*tie }, y), normal)
+                ties.iter().map(push).sum()
             };
-            ties.iter().map(push).sum::<f64>() / force
+            bearing.iter().map(pushed).sum::<f64>() / force
         };
         columns.chunks_exact(n).enumerate().map(slope).collect()
     }

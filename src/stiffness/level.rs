@@ -4,17 +4,21 @@ use crate::error::StiffnessError;
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::tetrahedron::shapes;
 use crate::stiffness::body::Body;
+use crate::stiffness::border;
+use crate::stiffness::edge::Edge;
 use crate::stiffness::elements::Mapping;
-use crate::stiffness::geometry::Edge;
-use crate::stiffness::identify::{Setup, State};
+use crate::stiffness::geometry::Part;
+use crate::stiffness::identify::{Estimate, Setup, State};
+use crate::stiffness::maps;
 use crate::stiffness::observations::{Observation, find, from_field, from_matches, readings};
-use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
+use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion, deformation};
 use crate::stiffness::rim::Outline;
-use crate::types::stiffness::Law;
+use crate::stiffness::verdict::Misfit;
+use crate::types::stiffness::{Law, StiffnessParams};
 use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
 
 /// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
-const FLOOR: f64 = 0.005;
+pub(super) const FLOOR: f64 = 0.005;
 /// Observations needed for each parameter, at least.
 const NEEDED: usize = 100;
 
@@ -27,35 +31,38 @@ pub struct Level {
     pub observations: Vec<Observation>,
     /// Voxels along the edge of an averaged block; 0 for matches.
     pub block: usize,
-    /// Held and loaded.
-    pub patches: [Patch; 2],
+    /// Held and loaded, then the cut where the body ends with the volume, if it does.
+    pub patches: Vec<Patch>,
     /// Typical standard error of the motion of a surface node (mm).
     pub surface_error: f64,
     /// The same, read from nearer voxels (mm).
     pub sharp_error: f64,
     /// Voxels around a surface node that are read for it.
     pub near: f64,
+    /// Noise of a sample (mm, one component), from the field's own roughness.
+    pub noise: f64,
     /// Least voxel size (mm).
     pub voxel: f64,
     /// The voxels.
     pub grid: Grid,
-    /// The edge of a punch, and how far it has been moved outwards (voxels).
-    pub edge: Option<(Edge, f64)>,
+    /// The edge of a punch.
+    edge: Option<Edge>,
+    /// One standard deviation of the borders between labels (voxels); 0 where they are known.
+    label_sd: f64,
+    /// Parts of the shape that are open, the edge of a punch first, and how far each has been moved
+    /// outwards (voxels).
+    open: Vec<(Part, f64)>,
     /// Labels of regions that the data do not show: they are taken to be as stiff as the reference.
     pub hidden: Vec<u8>,
-    /// Node places before the edge was moved (mm, RAS).
+    /// ln(mu / mu_reference) of the labels whose modulus is given.
+    pub known: Vec<(u8, f64)>,
+    /// Node places before the open parts were moved (mm, RAS).
     unmoved: Vec<[f64; 3]>,
     /// Whether the order of elimination was settled for its contact.
     ordered: bool,
 }
 
 impl Level {
-    /// Noise of a sample, a mean over its block, in a field that is rough by `noise` a voxel (mm,
-    /// one component).
-    pub fn sample_noise(&self, noise: f64) -> f64 {
-        noise / (self.block.max(1) as f64).powf(1.5)
-    }
-
     /// Reads field (and matches, where given) onto a mesh of `labels`.
     ///
     /// # Errors
@@ -72,7 +79,7 @@ impl Level {
         let body = Body::new(mesh)?;
         let voxel = field.grid().least_spacing();
         let motion = SurfaceMotion::new(&body, field, labels);
-        let patches = patches::find(&body, &motion, held, load, outline, voxel)?;
+        let patches = patches::find(&body, &motion, held, load, outline, field.grid())?;
         let (observations, block) = match matches {
             Some(m) => (from_matches(&body, field, m), 0),
             None => from_field(&body, field, labels),
@@ -84,7 +91,10 @@ impl Level {
             unmoved: body.places.clone(),
             grid: *field.grid(),
             edge: None,
+            label_sd: 0.0,
+            open: Vec::new(),
             hidden: Vec::new(),
+            known: Vec::new(),
             ordered: false,
             body,
             observations,
@@ -93,9 +103,10 @@ impl Level {
             surface_error: motion.error,
             sharp_error: motion.sharp_error,
             near: motion.near,
+            noise: maps::noise(field, labels) / (block.max(1) as f64).powf(1.5),
             voxel,
         };
-        out.find_edge();
+        out.open_parts();
         Ok(out)
     }
 
@@ -104,12 +115,28 @@ impl Level {
         patches::on_plane(self.voxel, self.sharp_error)
     }
 
-    /// Moves the edge of the punch: `outwards` voxels from where the surface's motion put it.
-    pub fn move_edge(&mut self, outwards: f64) {
-        let Some((edge, moved)) = &mut self.edge else { return };
-        *moved = outwards;
-        let place = |p: &[f64; 3]| edge.widened(*p, outwards * self.voxel);
-        self.body = self.body.with_places(self.unmoved.iter().map(place).collect());
+    /// Opens the borders between labels, known to one standard deviation of `sd` voxels.
+    pub fn open_borders(&mut self, sd: f64) {
+        self.label_sd = sd;
+        self.open_parts();
+    }
+
+    /// How far each open part has been moved outwards (voxels).
+    pub fn offsets(&self) -> Vec<f64> {
+        self.open.iter().map(|o| o.1).collect()
+    }
+
+    /// Moves the open parts, each so many voxels outwards from where the voxels put it.
+    pub fn move_to(&mut self, offsets: &[f64]) {
+        if self.offsets() == offsets {
+            return;
+        }
+        let mut places = self.unmoved.clone();
+        for ((part, moved), offset) in self.open.iter_mut().zip(offsets) {
+            *moved = *offset;
+            part.shift(&mut places, *offset);
+        }
+        self.body = self.body.with_places(places);
         let found = readings(&self.body, &self.observations);
         for (o, found) in self.observations.iter_mut().zip(found) {
             // What is within rounding of the surface stays in its element.
@@ -151,7 +178,7 @@ impl Level {
     /// # Errors
     /// As [`Body::new`].
     pub fn settle_shape(&mut self) -> Result<(), StiffnessError> {
-        self.find_edge();
+        self.open_parts();
         if let Some(nodes) = self.patches[1].near_contact(&self.body).filter(|_| !self.ordered) {
             self.body.eliminate_last(&nodes)?;
             self.ordered = true;
@@ -159,43 +186,52 @@ impl Level {
         Ok(())
     }
 
-    /// The edge of the punch where it lies before it is moved; none where the loaded patch is
-    /// curved.
-    fn find_edge(&mut self) {
-        self.edge = Edge::of(&self.patches[1], &self.body, self.voxel).map(|edge| (edge, 0.0));
+    /// The open parts where they lie before they are moved; a loaded patch that is curved has no
+    /// edge.
+    fn open_parts(&mut self) {
+        let offsets = self.offsets();
+        self.move_to(&vec![0.0; offsets.len()]);
+        self.edge = Edge::of(&self.patches[1], &self.body, self.voxel);
+        let edge = self.edge.iter().map(|edge| Part::edge(edge, &self.body, self.voxel));
+        let borders = if self.label_sd > 0.0 { border::all(&self.body) } else { Vec::new() };
+        let borders = borders.into_iter().map(|b| Part::border(b, self.label_sd, self.voxel));
+        self.open = edge.chain(borders).map(|part| (part, 0.0)).collect();
     }
 
-    /// Takes over how the body touches the plates from another mesh, and, as facets end elsewhere,
-    /// an edge of the punch that makes the patch as large.
+    /// Takes over how the body touches the plates from another mesh, where it has moved its borders,
+    /// and, as facets end elsewhere, an edge of the punch that makes the patch as large.
     ///
     /// # Errors
     /// As [`Body::new`].
     pub fn touch_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
         self.contact_like(other)?;
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
-        if let Some((edge, _)) = self.edge {
-            self.move_edge(edge.radius() / self.voxel * ((asked / own).sqrt() - 1.0));
+        let of = |part: &Part| other.open.iter().find(|(p, _)| p.name == part.name).map_or(0.0, |o| o.1);
+        let mut offsets: Vec<f64> = self.open.iter().map(|(part, _)| of(part)).collect();
+        if let (Some(edge), Some(offset)) = (&self.edge, offsets.first_mut()) {
+            *offset = edge.radius() / self.voxel * ((asked / own).sqrt() - 1.0);
         }
+        self.move_to(&offsets);
         Ok(())
     }
 
-    /// The mesh as the edge was moved.
+    /// The mesh as its open parts were moved.
     pub fn moved(&self, mesh: QuadraticMesh) -> Result<QuadraticMesh, StiffnessError> {
-        match self.edge {
-            Some((_, moved)) if moved != 0.0 => {
+        match self.offsets().iter().any(|offset| *offset != 0.0) {
+            true => {
                 let nodes = self.body.places.iter().map(|p| WorldPoint(*p)).collect();
                 Ok(QuadraticMesh::new(nodes, mesh.tetrahedra().to_vec(), mesh.labels().to_vec())?)
             }
-            _ => Ok(mesh),
+            false => Ok(mesh),
         }
     }
 
     /// The identification on this mesh.
-    pub fn setup(&self, law: Law, poisson: f64, reference: usize) -> Setup<'_> {
+    pub fn setup(&self, law: Law, params: &StiffnessParams, reference: usize) -> Setup<'_> {
         Setup {
             body: &self.body,
             law,
-            poisson,
+            poisson: self.body.labels.iter().map(|&label| params.poisson_of(label)).collect(),
             patches: self.patches.clone(),
             observations: &self.observations,
             reference,
@@ -203,11 +239,26 @@ impl Level {
             // of the motion's change.
             plate_prior: 0.25 * self.voxel + 3.0 * self.surface_error,
             floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
-            edge: self.edge,
-            pinned: (0..self.body.labels.len())
-                .filter(|&r| self.hidden.contains(&self.body.labels[r]))
-                .map(|r| (r, 0.0))
-                .collect(),
+            noise: (self.block > 0).then_some(self.noise),
+            open: &self.open,
+            pinned: (0..self.body.labels.len()).filter_map(|r| Some((r, self.pinned(self.body.labels[r])?))).collect(),
+        }
+    }
+
+    /// ln(mu / mu_reference) of a label that is not free.
+    fn pinned(&self, label: u8) -> Option<f64> {
+        let known = self.known.iter().find(|k| k.0 == label).map(|k| k.1);
+        known.or(self.hidden.contains(&label).then_some(0.0))
+    }
+
+    /// What the model leaves over of the field.
+    pub fn misfit(&self, estimate: &Estimate) -> Misfit {
+        let own = self.noise;
+        let seen: Vec<_> = self.observations.iter().map(|o| (o.place, o.displacement)).collect();
+        Misfit {
+            mm: (estimate.rms * estimate.rms - own * own).max(0.0).sqrt(),
+            noise_mm: own,
+            deformation_mm: deformation(&seen),
         }
     }
 

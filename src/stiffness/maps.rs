@@ -3,15 +3,15 @@
 use crate::numerics::statistics::noise_sigma;
 use crate::stiffness::body::{Body, sorted};
 use crate::stiffness::forward::Tie;
-use crate::stiffness::identify::{Estimate, Setup, State};
+use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
-use crate::stiffness::patches::travel;
+use crate::stiffness::patches::border_of;
 use crate::stiffness::summary::{BEARS, Hidden};
-use crate::types::space::length;
+use crate::stiffness::verdict::Misfit;
 use crate::types::stiffness::{Contact, LeftOver, Prescribed, RegionStiffness, StiffnessParams};
-use crate::types::{Displacement, Mask, Volume, WorldPoint};
-use std::collections::{BTreeSet, HashSet};
+use crate::types::{Displacement, Mask, Trust, Volume, WorldPoint};
+use std::collections::BTreeSet;
 
 /// Volume of the voxels that are not 0 (mm^3).
 pub fn volume(labels: &Mask) -> f64 {
@@ -70,10 +70,10 @@ pub fn node_displacement(body: &Body, state: &State) -> Vec<[f64; 3]> {
 
 /// What the patches prescribe: the ties, and of the nodes with which a curved patch touches its
 /// plate the solution. `touching` are these for each patch.
-pub fn prescribed(setup: &Setup<'_>, state: &State, touching: [Option<&[u32]>; 2]) -> Vec<Prescribed> {
+pub fn prescribed(setup: &Setup<'_>, state: &State, touching: &[Option<&[u32]>]) -> Vec<Prescribed> {
     let mut out = Vec::new();
-    for (number, (patch, touching)) in (0u8..).zip(setup.patches.iter().zip(touching)) {
-        let Some(nodes) = touching else {
+    for (number, patch) in (0u8..).zip(&setup.patches) {
+        let Some(Some(nodes)) = touching.get(number as usize) else {
             let tied = patch.ties(setup.body, &state.plates[number as usize]);
             let one =
                 |t: Tie| Prescribed { node: t.node, patch: number, direction: t.direction, displacement: t.target };
@@ -116,12 +116,8 @@ pub fn left_over(left: LeftOver) -> Option<String> {
     })
 }
 
-/// Part of the plates' motion that the model may leave over without a word.
-const LEFT: f64 = 0.1;
-
-/// What of the field was left out, and whether the model leaves over much more than its noise (mm,
-/// of a voxel).
-pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &Estimate, noise: f64) -> Vec<String> {
+/// What of the field was left out, and whether the model leaves over much more than its noise.
+pub fn unfit(field: &Displacement<'_>, labels: &Mask, misfit: &Misfit) -> Vec<String> {
     let mut out = Vec::new();
     let body = labels.as_slice().iter().enumerate().filter(|(_, l)| **l > 0);
     let empty = body.filter(|(o, _)| field.at(*o).iter().any(|v| !v.is_finite())).count();
@@ -131,63 +127,42 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, level: &Level, estimate: &
              the mask"
         ));
     }
-    let travel = length(travel(&level.patches));
-    let own = level.sample_noise(noise);
-    let misfit = (estimate.rms * estimate.rms - own * own).max(0.0).sqrt();
-    if misfit > LEFT * travel {
-        out.push(format!(
-            "what the model leaves over, {misfit:.3} mm, is {:.0} % of the plates' motion ({travel:.2} mm): body, patches or law \
-             do not fit the field, or it is noisy; do not trust the moduli",
-            100.0 * misfit / travel
-        ));
-    } else if misfit > MUCH * travel && misfit > ROUGH * own {
-        out.push(format!(
-            "what the model leaves over beyond the field's rough noise, {misfit:.3} mm, is {:.1} % of the plates' motion: body, labels, patches, \
-             Poisson's ratio or law are not quite as assumed, or noise is smooth over several voxels, and moduli may be off by more than stated",
-            100.0 * misfit / travel
-        ));
+    let part = 100.0 * misfit.share();
+    let left = format!(
+        "the model leaves over {:.3} mm beyond the noise of the field, {part:.1} % of the deformation:",
+        misfit.mm
+    );
+    match misfit.trust() {
+        Trust::High => {}
+        Trust::Moderate => out.push(format!(
+            "{left} body, labels, patches, Poisson's ratio or law are not quite as assumed, or noise is smooth over several voxels; \
+             the deviations count it as an error that is everywhere at once"
+        )),
+        Trust::Low => out.push(format!(
+            "{left} body, patches or law do not fit the field, or it is too noisy; no modulus is given. Check --held and --load, the labels, \
+             and where the residual map is large"
+        )),
     }
     out
 }
 
-/// The part of the plates' motion from which it is said to be much. Phantoms with the right
-/// assumptions, the linear law among them, leave 0.003 to 0.015, layers from images 0.02,
-/// fingertips from images 0.03 to 0.04 (these are warned of). A body of which a part was cut off
-/// leaves 0.08, one beside a wall that was not modelled 0.06, one label over a ball five times as
-/// stiff 0.027.
-const MUCH: f64 = 0.025;
-/// The least misfit over the noise of a sample that stands out of it: together they are then 1.03
-/// times that noise.
-const ROUGH: f64 = 0.25;
-
 /// Part of the surface that may lie on the volume's border without a word.
 const CUT_OFF: f64 = 0.02;
 
-/// Says so where the body ends with the volume, away from the patches: nobody knows what pulls
-/// there.
+/// Says so where the body ends with the volume, away from the held and the loaded patch.
 fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
+    let cut = level.patches.get(2)?;
     let (body, grid) = (&level.body, labels.grid());
-    let patches: HashSet<usize> = level.patches.iter().flat_map(|p| p.facets.iter().copied()).collect();
-    let (mut on, mut all, mut sides) = (0.0, 0.0, BTreeSet::new());
-    for (f, facet) in body.surface.iter().enumerate() {
-        all += facet.area;
-        let at = grid.affine().to_voxel(WorldPoint(facet.centre)).0;
-        let border = (0..3).filter(|&a| grid.shape()[a] > 1).find_map(|a| {
-            let last = (grid.shape()[a] - 1) as f64;
-            (at[a] < 0.0 || at[a] > last).then(|| if at[a] < 0.0 { SIDES[a][0] } else { SIDES[a][1] })
-        });
-        if let Some(side) = border.filter(|_| !patches.contains(&f)) {
-            on += facet.area;
-            sides.insert(side);
-        }
-    }
-    let named: Vec<&str> = sides.into_iter().collect();
-    (on > CUT_OFF * all).then(|| {
+    let side = |&f: &usize| border_of(grid, body.surface[f].centre).map(|(a, last)| SIDES[a][usize::from(last)]);
+    let sides: BTreeSet<&str> = cut.facets.iter().filter_map(side).collect();
+    let all: f64 = body.surface.iter().map(|f| f.area).sum();
+    let part = cut.area(body) / all;
+    (part > CUT_OFF).then(|| {
         format!(
-            "the body ends at the volume's border ({} along the voxels' axes, {:.0} % of its surface) and was taken to end there, free of \
-             force: if it goes on beyond, moduli are off by tens of per cent; image and label the whole of it",
-            named.join(", "),
-            100.0 * on / all
+            "the body ends at the volume's border ({} along the voxels' axes, {:.0} % of its surface) and is taken to go on beyond: there \
+             it moves as measured; if it does end there, leave a voxel of background around it",
+            sides.into_iter().collect::<Vec<_>>().join(", "),
+            100.0 * part
         )
     })
 }
@@ -221,7 +196,7 @@ pub fn warnings(
     }
     for r in regions.iter().filter(|r| !r.identifiable) {
         let value = match r.bound {
-            Some("unknown") => "it is shown as stiff as the largest region",
+            Some("unknown") => "no value is given",
             Some("upper") => "its value is an upper bound",
             _ => "its value is a lower bound",
         };
@@ -253,8 +228,15 @@ pub fn warnings(
         }
     }
     out.extend(cut_off(level, labels));
-    if params.poisson < 0.4 {
-        out.push(format!("Poisson's ratio {} is low for soft tissue, which is nearly incompressible", params.poisson));
+    for (of, nu) in params
+        .poisson_of
+        .iter()
+        .map(|(label, nu)| (format!(" of label {label}"), *nu))
+        .chain([(String::new(), params.poisson)])
+    {
+        if nu < 0.4 {
+            out.push(format!("Poisson's ratio{of}, {nu}, is low for soft tissue, which is nearly incompressible"));
+        }
     }
     out
 }

@@ -20,6 +20,8 @@ pub mod patches;
 
 pub mod plate;
 
+pub mod smoothed;
+
 pub mod rim;
 
 pub mod identify;
@@ -30,6 +32,8 @@ pub mod choice;
 
 pub mod summary;
 
+pub mod verdict;
+
 pub mod maps;
 
 pub mod sequence;
@@ -39,6 +43,12 @@ pub mod unlabelled;
 pub mod support;
 
 pub mod geometry;
+
+pub mod coherent;
+
+pub mod edge;
+
+pub mod border;
 
 pub mod inclusion;
 

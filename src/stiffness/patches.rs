@@ -17,10 +17,12 @@ use crate::stiffness::forward::Tie;
 use crate::stiffness::observations::at_surface;
 use crate::stiffness::plate;
 use crate::stiffness::rim::Outline;
+use crate::stiffness::smoothed::Smoothed;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Contact, Side};
-use crate::types::{Displacement, Mask, VoxelPoint, WorldPoint};
+use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Voxels around a surface node that are read for its motion.
 const REACH: f64 = 3.0;
@@ -31,8 +33,14 @@ const NEAR: f64 = 1.8;
 /// Noise of that (voxels) beyond which it tells a touch worse than a reading from further around.
 const NOISY: f64 = 0.1;
 
+/// Error that a read displacement has at least (voxels).
+const LEAST_ERROR: f64 = 0.001;
+
 /// Cosine of the angle to a side within which a facet faces it.
 const FACING: f64 = 0.3;
+
+/// Least area of a patch (squares of the voxel's side): enough voxels to tell its six numbers.
+const LEAST_AREA: f64 = 9.0;
 
 /// What ends further beyond the plane of a plate (voxels) passes beside it.
 const BESIDE: f64 = 1.0;
@@ -113,9 +121,9 @@ pub struct Patch {
     pub rigid: [f64; 6],
     /// How it touches.
     pub contact: Contact,
-    /// For each node the tangential motion besides the rigid one (mm), a quadratic fit; used by
-    /// [`Contact::Guided`].
-    guided: Vec<[f64; 3]>,
+    /// For each node the measured motion besides the rigid one, smoothed (mm); used by
+    /// [`Contact::Guided`] along the plane and by [`Contact::Measured`].
+    measured: Smoothed,
     /// For each node the motion besides the plate's (mm) of one that lies a little inside of a flat
     /// face, on its rounded rim.
     rim: Vec<[f64; 3]>,
@@ -171,7 +179,7 @@ impl Patch {
     /// [plate](Self::plate) only.
     pub fn ties(&self, body: &Body, change: &[f64]) -> Vec<Tie> {
         let directions: &[Option<[f64; 3]>] = match (self.contact, self.curved()) {
-            (Contact::Sticking, _) | (Contact::Guided, false) => &[None],
+            (Contact::Sticking | Contact::Measured, _) | (Contact::Guided, false) => &[None],
             (Contact::Sliding, false) => &[Some(self.normal)],
             (Contact::Sliding, true) => &[],
             (Contact::Guided, true) => &tangents(self.normal).map(Some),
@@ -183,10 +191,16 @@ impl Patch {
                 let b = self.basis(k, p);
                 (0..3).for_each(|a| u[a] += c * b[a]);
             }
-            if self.contact == Contact::Guided {
-                (0..3).for_each(|a| u[a] += self.guided[i][a]);
+            let measured = self.measured.values[i];
+            match self.contact {
+                Contact::Guided => {
+                    let across = dot(measured, self.normal);
+                    (0..3).for_each(|a| u[a] += measured[a] - across * self.normal[a]);
+                }
+                Contact::Measured => (0..3).for_each(|a| u[a] += measured[a]),
+                Contact::Sticking | Contact::Sliding => {}
             }
-            if !self.curved() {
+            if !self.curved() && self.contact != Contact::Measured {
                 (0..3).for_each(|a| u[a] += self.rim[i][a]);
             }
             directions.iter().map(move |&direction| Tie { node, direction, target: u, strength: 1.0 })
@@ -198,7 +212,7 @@ impl Patch {
     /// motion; none where the patch is flat or sticks. `modulus` (kPa) is the shear modulus of an
     /// element.
     pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<plate::Plate> {
-        let Landing { plane: (q, _), facets } = self.landed().filter(|_| self.contact != Contact::Sticking)?;
+        let Landing { plane: (q, _), facets } = self.landed().filter(|_| self.slides())?;
         let stiffness = plate::STIFF * self.backing(body, modulus) / self.area(body);
         let facing = facets.iter().map(|&f| &body.surface[f]);
         let mut out = plate::Plate::touching(body, facing, self.normal, stiffness);
@@ -214,6 +228,18 @@ impl Patch {
     /// Sum over its facets of their area (mm^2) times a value of the element behind.
     pub fn backing(&self, body: &Body, value: impl Fn(usize) -> f64) -> f64 {
         self.facets.iter().map(|&f| value(body.surface[f].element as usize) * body.surface[f].area).sum()
+    }
+
+    /// By how much the measured motion, smoothed, misses that of a rigid plate along its normal (mm,
+    /// root mean square).
+    pub fn bulge(&self) -> f64 {
+        let all = self.measured.values.iter().map(|v| dot(*v, self.normal).powi(2));
+        (all.sum::<f64>() / self.nodes.len().max(1) as f64).sqrt()
+    }
+
+    /// Whether a plate may slide along it.
+    fn slides(&self) -> bool {
+        matches!(self.contact, Contact::Sliding | Contact::Guided)
     }
 
     /// Whether it is curved before it is pressed.
@@ -286,12 +312,12 @@ fn refuse(which: &'static str, place: &Place, what: &str, hint: &str) -> Stiffne
 }
 
 /// How the loaded patch moves against the held one (mm).
-pub fn travel([held, load]: &[Patch; 2]) -> [f64; 3] {
-    std::array::from_fn(|a| load.rigid[a] - held.rigid[a])
+pub fn travel(patches: &[Patch]) -> [f64; 3] {
+    std::array::from_fn(|a| patches[1].rigid[a] - patches[0].rigid[a])
 }
 
-/// Finds the held and the loaded patch. `voxel` is the least voxel size (mm); `outline` that of a
-/// punch on the loaded side, where it is known.
+/// Finds the held and the loaded patch, and the cut where the body ends with the volume. `outline`
+/// is that of a punch on the loaded side, where it is known.
 ///
 /// # Errors
 /// [`StiffnessError::Patch`] for a patch without surface, [`StiffnessError::NoLoad`] when they do not move against each other.
@@ -301,8 +327,9 @@ pub fn find(
     held: &Place,
     load: &Place,
     outline: Option<&Outline>,
-    voxel: f64,
-) -> Result<[Patch; 2], StiffnessError> {
+    grid: &Grid,
+) -> Result<Vec<Patch>, StiffnessError> {
+    let voxel = grid.least_spacing();
     if held == load {
         return Err(refuse("loaded", load, "is the held one", "choose two different sides"));
     }
@@ -312,7 +339,7 @@ pub fn find(
         Place::Mask(mask, _) => masked_facets(body, mask),
     };
     let area: f64 = base.iter().map(|&f| body.surface[f].area).sum();
-    if base.is_empty() || area < 9.0 * voxel * voxel {
+    if base.is_empty() || area < LEAST_AREA * voxel * voxel {
         return Err(refuse("held", held, "is empty: no surface of the body lies there", hint_held));
     }
     let mut held_patch = build(body, motion, held.name(), base, None, voxel)
@@ -367,7 +394,45 @@ pub fn find(
     let before = held_patch.clone();
     round_rim(body, &mut held_patch, &load_patch, voxel);
     round_rim(body, &mut load_patch, &before, voxel);
-    Ok([held_patch, load_patch])
+    let mut out = vec![held_patch, load_patch];
+    out.extend(cut(body, motion, &out, grid));
+    Ok(out)
+}
+
+/// The surface of the body on the volume's border that no patch holds: tissue goes on beyond it, and
+/// it moves as measured.
+fn cut(body: &Body, motion: &SurfaceMotion, patches: &[Patch], grid: &Grid) -> Option<Patch> {
+    let taken: HashSet<usize> = patches.iter().flat_map(|p| p.facets.iter().copied()).collect();
+    let beyond = |f: &usize| !taken.contains(f) && border_of(grid, body.surface[*f].centre).is_some();
+    let facets: Vec<usize> = (0..body.surface.len()).filter(beyond).collect();
+    let voxel = grid.least_spacing();
+    if facets.iter().map(|&f| body.surface[f].area).sum::<f64>() < LEAST_AREA * voxel * voxel {
+        return None;
+    }
+    let mut out = build(body, motion, "cut".into(), facets, None, voxel)?;
+    // What another patch holds stays with it.
+    let taken: HashSet<u32> = patches.iter().flat_map(|p| p.nodes.iter().copied()).collect();
+    let free: Vec<bool> = out.nodes.iter().map(|n| !taken.contains(n)).collect();
+    let mut keep = free.iter();
+    out.nodes.retain(|_| *keep.next().unwrap_or(&true));
+    out.measured.values = kept_of(&out.measured.values, &free);
+    out.rim = kept_of(&out.rim, &free);
+    out.contact = Contact::Measured;
+    (out.nodes.len() >= 3).then_some(out)
+}
+
+fn kept_of<T: Copy>(all: &[T], keep: &[bool]) -> Vec<T> {
+    all.iter().zip(keep).filter(|(_, keep)| **keep).map(|(v, _)| *v).collect()
+}
+
+/// The side of the volume that a place of the surface (mm, RAS) lies on: voxel axis, and whether it
+/// is the last one along it.
+pub(super) fn border_of(grid: &Grid, p: [f64; 3]) -> Option<(usize, bool)> {
+    let at = grid.affine().to_voxel(WorldPoint(p)).0;
+    (0..3).filter(|&a| grid.shape()[a] > 1).find_map(|a| {
+        let last = (grid.shape()[a] - 1) as f64;
+        (at[a] < 0.0 || at[a] > last).then_some((a, at[a] > 0.0))
+    })
 }
 
 /// Area (mm^2) of the surface on the plane of a patch that is not of it and moves as it does.
@@ -383,7 +448,7 @@ fn moving_with(body: &Body, motion: &SurfaceMotion, patch: &Patch, voxel: f64) -
             && dot(sub(facet.centre, patch.middle), patch.normal).abs() < 2.0 * voxel;
         if on { facet.nodes.iter().filter(|n| with(**n)).count() as f64 / facet.nodes.len() as f64 } else { 0.0 }
     };
-    let own: std::collections::HashSet<usize> = patch.facets.iter().copied().collect();
+    let own: HashSet<usize> = patch.facets.iter().copied().collect();
     let others = body.surface.iter().enumerate().filter(|(f, _)| !own.contains(f)).map(|(_, facet)| facet);
     others.map(|facet| facet.area * part(facet)).sum()
 }
@@ -449,6 +514,17 @@ fn facets_within(body: &Body, side: Side, outline: &Outline) -> Vec<usize> {
     let d = side.direction();
     let under = |f: &usize| dot(body.surface[*f].normal, d) > FACING && outline.holds(body.surface[*f].centre);
     (0..body.surface.len()).filter(under).collect()
+}
+
+/// What displacements at places have besides the nearest rigid motion: root mean square (mm, one
+/// component).
+pub fn deformation(seen: &[([f64; 3], [f64; 3])]) -> f64 {
+    let n = seen.len().max(1) as f64;
+    let middle: [f64; 3] = std::array::from_fn(|a| seen.iter().map(|s| s.0[a]).sum::<f64>() / n);
+    let radius = (seen.iter().map(|s| square(sub(s.0, middle))).sum::<f64>() / n).sqrt();
+    let rigid = fit_rigid(seen, middle, radius.max(f64::MIN_POSITIVE)).unwrap_or_default();
+    let rest = |(p, u): &([f64; 3], [f64; 3])| square(sub(*u, rigid_motion(&rigid, middle, radius, *p)));
+    (seen.iter().map(rest).sum::<f64>() / (3.0 * n)).sqrt()
 }
 
 /// A plane: a point (mm) and its outward unit normal.
@@ -631,8 +707,13 @@ fn build(
         (rest.iter().map(one).sum::<f64>() / rest.len() as f64).sqrt()
     };
     let residual = [part(true), part(false)];
-    let quadratic = fit_quadratic(&rest, middle, radius, normal);
-    let guided = nodes.iter().map(|&n| quadratic(body.places[n as usize])).collect();
+    let places: Vec<[f64; 3]> = nodes.iter().map(|&n| body.places[n as usize]).collect();
+    let independent = total / (motion.near * voxel).powi(2);
+    let besides =
+        |(p, n): (&[f64; 3], &u32)| motion.sharp[*n as usize].map(|u| sub(u, rigid_motion(&rigid, middle, radius, *p)));
+    let read: Vec<Option<[f64; 3]>> = places.iter().zip(&nodes).map(besides).collect();
+    let least = LEAST_ERROR * voxel;
+    let measured = Smoothed::new(&places, &read, [least, motion.sharp_error.max(least)], independent);
     let landing = plane.map(|plane| Landing { plane, facets: facets_before(body, motion, plane, voxel) });
     let bends = plane
         .is_some_and(|plane| bent(body, motion, &nodes, |p| rigid_motion(&rigid, middle, radius, p), plane, voxel));
@@ -646,7 +727,7 @@ fn build(
         radius,
         rigid,
         contact,
-        guided,
+        measured,
         rim,
         residual,
         landing,
@@ -721,38 +802,4 @@ fn fit_rigid(seen: &[([f64; 3], [f64; 3])], middle: [f64; 3], radius: f64) -> Op
         }
     }
     Some(rigid)
-}
-
-/// A quadratic polynomial of the place in the patch's plane, fitted to the part of the motion
-/// across `normal`.
-fn fit_quadratic(
-    rest: &[([f64; 3], [f64; 3])],
-    middle: [f64; 3],
-    radius: f64,
-    normal: [f64; 3],
-) -> impl Fn([f64; 3]) -> [f64; 3] {
-    let [t, s] = tangents(normal);
-    let row = move |p: [f64; 3]| {
-        let r = sub(p, middle);
-        let (a, b) = (dot(r, t) / radius, dot(r, s) / radius);
-        [1.0, a, b, a * a, a * b, b * b]
-    };
-    let (mut m, mut b) = ([[0.0; 6]; 6], [[0.0; 6]; 2]);
-    for (p, u) in rest {
-        let f = row(*p);
-        for i in 0..6 {
-            b[0][i] += f[i] * dot(*u, t);
-            b[1][i] += f[i] * dot(*u, s);
-            for j in 0..6 {
-                m[i][j] += f[i] * f[j];
-            }
-        }
-    }
-    (0..6).for_each(|i| m[i][i] *= 1.0 + 1e-6);
-    let fit = b.map(|b| solve(&m, &b).unwrap_or([0.0; 6]));
-    move |p| {
-        let f = row(p);
-        let [a, b] = fit.map(|c| (0..6).map(|i| c[i] * f[i]).sum::<f64>());
-        std::array::from_fn(|k| a * t[k] + b * s[k])
-    }
 }

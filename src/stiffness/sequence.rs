@@ -127,6 +127,7 @@ fn weights(frames: &[Frame]) -> Vec<f64> {
 mod tests {
     use super::*;
     use crate::numerics::random::Random;
+    use crate::types::stiffness::Determined;
 
     fn variance(frames: &[Frame], weights: &[f64]) -> f64 {
         let own: f64 = frames.iter().zip(weights).map(|(f, w)| (w * f.data).powi(2)).sum();
@@ -164,6 +165,7 @@ mod tests {
             ratio: 1.0,
             ratio_sd: 0.0,
             identifiable: true,
+            state: Determined::Determined,
             bound: None,
             volume: 1.0,
             data_sd: [data, 0.0],

@@ -9,47 +9,11 @@ use crate::stiffness::geometry::Geometry;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::law::largest_principal_strain;
 use crate::types::space::dot;
-use crate::types::stiffness::{Law, RegionStiffness};
+use crate::types::stiffness::{Law, StiffnessParams};
 
 /// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies
 /// within two of them).
-const VAGUE: f64 = 0.35;
-/// What is left at surface and interfaces of a label map, as a standard deviation of ln E: this,
-/// and this much more for each unit of |ln contrast| (the displacement tells less and less of a
-/// stiffer inclusion). From the spread over the phantoms.
-const INTERFACE: [f64; 2] = [0.006, 0.005];
-/// In place of the latter where a region was found without labels and has the shape that the map
-/// gave it. From six phantoms.
-const CUT: f64 = 0.15;
-/// The same where its shape was drawn anew: nine functions leave more of it open than labels do.
-/// From bodies of an independent solver.
-const DRAWN: f64 = 0.02;
-/// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
-const RESOLVED: f64 = 0.1;
-
-/// Where the shape of a region comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Shape {
-    /// From labels.
-    Given,
-    /// From the map without labels.
-    Cut,
-    /// Drawn anew from there, and open.
-    Drawn,
-}
-
-impl Shape {
-    /// Standard deviation of ln E for each unit of |ln contrast|, for what the shape is not known
-    /// to (1).
-    fn slope(self) -> f64 {
-        match self {
-            Shape::Given => INTERFACE[1],
-            Shape::Cut => CUT,
-            Shape::Drawn => DRAWN,
-        }
-    }
-}
-
+pub(super) const VAGUE: f64 = 0.35;
 /// A region is looked at more closely where a modulus e times as large moves no tissue by this part
 /// of the plates' motion.
 const DOUBTED: f64 = 0.02;
@@ -70,19 +34,6 @@ const HIGH: f64 = 2.5;
 /// labels leave open.
 const SEEN: f64 = 3.9;
 
-/// Variance of the moduli over what the scatter over blocks says, where the misfit is not the
-/// field's own noise. Errors of meshes, contacts and measured fields are everywhere at once, which
-/// blocks of one body do not show: over the phantoms (three kinds, three seeds, exact fields and
-/// images) moduli were off by 4 to 5 times that.
-const COHERENT: f64 = 20.0;
-
-/// By how much the variance of the data grows for misfit beyond the noise of a sample, `own` (mm,
-/// one component), and beyond the floor that is counted as such already. Added to 1.
-pub fn coherent(estimate: &Estimate, own: f64) -> f64 {
-    let all = (estimate.rms * estimate.rms).max(f64::MIN_POSITIVE);
-    (1.0 - own * own / all).max(0.0) * estimate.raw * (COHERENT - 1.0)
-}
-
 /// ln E of each region with gradient and covariance.
 #[derive(Debug, Clone)]
 pub struct Moduli {
@@ -95,21 +46,56 @@ pub struct Moduli {
 }
 
 impl Moduli {
-    /// With `by` times the covariance of `data` more.
-    pub fn widened(mut self, data: &Moduli, by: f64) -> Self {
-        let add = |own: &mut Vec<f64>, more: &[f64]| own.iter_mut().zip(more).for_each(|(a, b)| *a += by * b);
+    /// With the covariance of `data` more.
+    #[must_use]
+    pub fn widened(mut self, data: &Moduli) -> Self {
+        let add = |own: &mut Vec<f64>, more: &[f64]| own.iter_mut().zip(more).for_each(|(a, b)| *a += b);
         add(&mut self.covariance, &data.covariance);
         add(&mut self.ratio_variance, &data.ratio_variance);
         self
     }
 }
 
-/// The moduli of an estimate; `force_n`, the whole force on the plate (N), sets the scale,
-/// `geometry` corrects for the faces' offsets.
-pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry>, force_n: Option<f64>) -> Moduli {
+/// What sets the scale of the moduli.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Scale {
+    /// Nothing: they are ratios to the reference region.
+    Ratio,
+    /// The whole force on the loaded patch (N).
+    Force(f64),
+    /// Young's modulus of a region (kPa).
+    Known(usize, f64),
+}
+
+impl Scale {
+    /// By a force where there is one, else by the first label whose modulus is given.
+    pub fn of(body: &Body, params: &StiffnessParams) -> Self {
+        let known = params.fixed.iter().find_map(|(label, e)| Some((body.labels.iter().position(|l| l == label)?, *e)));
+        match (params.force_n, known) {
+            (Some(force), _) => Self::Force(force),
+            (None, Some((region, e))) => Self::Known(region, e),
+            (None, None) => Self::Ratio,
+        }
+    }
+}
+
+/// The moduli of an estimate; `geometry` corrects for the offsets of the shape.
+pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry>, scale: Scale) -> Moduli {
+    let covariance = geometry.map_or(&estimate.covariance, |g| &g.covariance);
+    with_covariance(setup, estimate, geometry, scale, covariance)
+}
+
+/// The same with another covariance of the parameters and offsets.
+pub fn with_covariance(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    geometry: Option<&Geometry>,
+    scale: Scale,
+    covariance: &[f64],
+) -> Moduli {
     let regions = setup.body.labels.len();
     let none = vec![0.0; estimate.parameters];
-    let (step, covariance) = geometry.map_or((&none, &estimate.covariance), |g| (&g.step, &g.covariance));
+    let step = geometry.map_or(&none, |g| &g.step);
     let p = step.len();
     let free = setup.free();
     let mut gradient = vec![0.0; regions * p];
@@ -118,17 +104,27 @@ pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry
     }
     let ratio_variance =
         (0..regions).map(|r| free.iter().position(|&f| f == r).map_or(0.0, |k| covariance[k * p + k])).collect();
-    let mut shift = 0.0;
-    if let Some(force) = force_n {
-        let slopes = estimate.force_slope.iter().chain(geometry.iter().flat_map(|g| &g.force_slope));
-        for (k, slope) in slopes.enumerate() {
-            (0..regions).for_each(|r| gradient[r * p + k] -= slope);
+    // ln of Young's modulus over the reference's shear modulus.
+    let young = |r: usize| estimate.state.theta[r] + (2.0 * (1.0 + setup.poisson[r])).ln();
+    let shift = match scale {
+        Scale::Ratio => -young(setup.reference),
+        Scale::Force(force) => {
+            let slopes = estimate.force_slope.iter().chain(geometry.iter().flat_map(|g| &g.force_slope));
+            for (k, slope) in slopes.enumerate() {
+                (0..regions).for_each(|r| gradient[r * p + k] -= slope);
+            }
+            (1000.0 * force / (estimate.force[0] * estimate.leaning)).ln()
         }
-        let whole = estimate.force[0] * estimate.leaning;
-        shift = (1000.0 * force / whole * 2.0 * (1.0 + setup.poisson)).ln();
-    }
+        Scale::Known(known, e) => {
+            let own: Vec<f64> = gradient[known * p..(known + 1) * p].to_vec();
+            for row in gradient.chunks_exact_mut(p.max(1)) {
+                row.iter_mut().zip(&own).for_each(|(g, own)| *g -= own);
+            }
+            e.ln() - young(known)
+        }
+    };
     let change = |r: usize| (0..p).map(|k| gradient[r * p + k] * step[k]).sum::<f64>();
-    let log = (0..regions).map(|r| estimate.state.theta[r] + shift + change(r)).collect();
+    let log = (0..regions).map(|r| young(r) + shift + change(r)).collect();
     let entry = |i: usize| {
         let (r, s) = (i / regions, i % regions);
         let inner = |a: usize| (0..p).map(|b| covariance[a * p + b] * gradient[s * p + b]).sum::<f64>();
@@ -236,83 +232,6 @@ pub fn unseen(
     let samples = estimate.effective;
     let rise = bic(end.squares, samples, 0) - bic(estimate.squares, samples, 0);
     Ok((rise < 4.0).then_some(side))
-}
-
-/// Everything about the regions. `alone` are the moduli as if the surface were known: the part of
-/// the uncertainty that more data of the same body lower. `mesh_change` is the change of ln E from
-/// the coarse to the fine mesh, of which a third counts as the error of the fine one, or all of it
-/// where it is large. `shapes` says where each region's came from.
-///
-/// What is `hidden` can bear anything from none to all of its share of the force, where one is
-/// known (`absolute`): so much are all moduli at most.
-pub fn regions(
-    body: &Body,
-    [moduli, alone]: [&Moduli; 2],
-    names: &dyn Fn(u8) -> String,
-    [mesh_change, ratio_change]: [&[f64]; 2],
-    unseen: &[Option<&'static str>],
-    shapes: &[Shape],
-    hidden: &[Hidden],
-    absolute: bool,
-    reference: usize,
-) -> Vec<RegionStiffness> {
-    let count = body.labels.len();
-    let borne = hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
-    let one = |r: usize| {
-        let mesh = |change: f64| if change.abs() < RESOLVED { change / 3.0 } else { change };
-        let slope = shapes[r].slope();
-        let interface = INTERFACE[0] + slope * (moduli.log[r] - moduli.log[reference]).abs();
-        let data = moduli.covariance[r * count + r].max(0.0);
-        let model = if data > 0.0 { interface * interface } else { 0.0 };
-        let sd = (data + mesh(mesh_change[r]).powi(2) + model).sqrt();
-        let between = if r == reference { 0.0 } else { mesh(ratio_change[r]).powi(2) + interface * interface };
-        let ratio_sd = (moduli.ratio_variance[r] + between).sqrt();
-        let hides = hidden.iter().find(|h| h.label == body.labels[r]);
-        let at_most = match hides {
-            Some(h) => Some(h.share),
-            None => (absolute && borne > BEARS).then_some(1.0 - borne),
-        };
-        let unknown = hides.is_some_and(|h| !absolute || h.share < BEARS) || at_most.is_some_and(|share| share < BEARS);
-        let limited = at_most.map(|_| if unknown { "unknown" } else { "upper" });
-        let unseen = limited.or(unseen[r]).or((sd > VAGUE).then_some(if moduli.log[r] >= moduli.log[reference] {
-            "lower"
-        } else {
-            "upper"
-        }));
-        let value = match unseen {
-            None | Some("unknown") => moduli.log[r],
-            Some(_) if limited.is_some() => {
-                moduli.log[r] - at_most.unwrap_or(1.0).ln()
-                    + 2.0 * moduli.covariance[reference * count + reference].max(0.0).sqrt()
-            }
-            // Two standard deviations from the estimate, towards the side that the data exclude.
-            // What is all but rigid moves in proportion to its compliance, what is all but empty to
-            // its modulus: there the deviation of the logarithm is a relative one.
-            Some("lower") => moduli.log[r] - (2.0 * sd).ln_1p(),
-            Some(_) => moduli.log[r] + (2.0 * sd).ln_1p(),
-        };
-        let e = value.exp();
-        // The force bounds moduli, not ratios: those of regions that are seen stand.
-        let ratio = match limited {
-            Some(_) if hides.is_some() => f64::INFINITY,
-            Some(_) => (moduli.log[r] - moduli.log[reference]).exp(),
-            None => (value - moduli.log[reference]).exp(),
-        };
-        let seen = unseen.is_none();
-        RegionStiffness {
-            label: body.labels[r],
-            name: names(body.labels[r]),
-            youngs_modulus: e,
-            sd: if seen { e * sd } else { f64::INFINITY },
-            ratio,
-            ratio_sd: if seen { ratio * ratio_sd } else { f64::INFINITY },
-            identifiable: seen,
-            bound: unseen,
-            volume: body.volumes[r],
-            data_sd: [alone.covariance[r * count + r], alone.ratio_variance[r]].map(|v| v.max(0.0).sqrt()),
-        }
-    };
-    (0..count).map(one).collect()
 }
 
 /// Correlation from a covariance.

@@ -9,18 +9,23 @@
 //! fifth, and the new region's modulus must differ from the first one's by two standard deviations and by a quarter.
 
 use crate::error::StiffnessError;
-use crate::stiffness::choice::{Choice, MARGIN, bic};
+use crate::stiffness::choice::{MARGIN, bic};
+use crate::stiffness::coherent::Fit;
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::SHAPES;
-use crate::stiffness::level::Level;
+use crate::stiffness::level::{FLOOR, Level};
 use crate::stiffness::patches::travel;
 use crate::types::space::dot;
-use crate::types::stiffness::{Evidence, Law, LeftOver};
+use crate::types::stiffness::{Evidence, Law, LeftOver, StiffnessParams};
 
 /// How far a residual must stand out of the noise of a sample (1).
 const DISCREPANCY: f64 = 1.1;
 /// The part of the power of a voxel's noise that a misfit must have (1).
 const TRACE: f64 = 0.1;
+
+/// One standard deviation with which a mesh keeps to the surface of a body between its voxels: 0.04
+/// to 0.08 of balls and ellipsoids (voxels).
+const SURFACE: f64 = 0.1;
 
 /// The case for more regions, so far.
 #[derive(Debug)]
@@ -29,6 +34,8 @@ pub struct Support {
     noise: [f64; 2],
     /// What geometry alone may do (mm).
     geometry: f64,
+    /// The error of the finite elements (mm).
+    floor: f64,
     /// Squares, misfit beyond the noise (mm), effective samples and parameters of the model that
     /// stands.
     squares: f64,
@@ -44,8 +51,13 @@ pub struct Support {
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-pub fn identify(level: &Level, law: Law, poisson: f64, from: (&Level, &State)) -> Result<Estimate, StiffnessError> {
-    level.setup(law, poisson, level.largest()).run(level.carry(from.0, from.1), 12, 1e-4)
+pub fn identify(
+    level: &Level,
+    law: Law,
+    params: &StiffnessParams,
+    from: (&Level, &State),
+) -> Result<Estimate, StiffnessError> {
+    level.setup(law, params, level.largest()).run(level.carry(from.0, from.1), 12, 1e-4)
 }
 
 /// Why a model is not taken whose criterion falls by `gain`.
@@ -57,18 +69,18 @@ fn too_little(gain: f64) -> String {
 }
 
 impl Support {
-    /// From the identification of one region; `noise` is the field's roughness (mm).
-    pub fn new(level: &Level, choice: &Choice, noise: f64) -> Self {
-        let [held, load] = &level.patches;
+    /// From the identification of one region; `rms` is what it leaves over (mm) with the surface where the data put it.
+    pub fn new(level: &Level, e: &Estimate, rms: f64) -> Self {
+        let (held, load) = (&level.patches[0], &level.patches[1]);
         let travel = travel(&level.patches);
         let apart: [f64; 3] = std::array::from_fn(|a| load.middle[a] - held.middle[a]);
         let strain = dot(travel, travel).sqrt() / dot(apart, apart).sqrt().max(1e-9);
-        let e = &choice.estimate;
-        let sample = level.sample_noise(noise);
-        let misfit = (e.rms * e.rms - sample * sample).max(0.0).sqrt();
+        let (sample, noise) = (level.noise, level.noise * (level.block.max(1) as f64).powf(1.5));
+        let misfit = (rms * rms - sample * sample).max(0.0).sqrt();
         let mut out = Self {
             noise: [noise, sample],
-            geometry: 0.5 * level.voxel * strain,
+            geometry: SURFACE * level.voxel * strain,
+            floor: FLOOR * level.voxel,
             squares: e.squares,
             misfit,
             effective: e.effective,
@@ -116,7 +128,7 @@ impl Support {
         }
         (self.misfit <= self.geometry).then(|| {
             format!(
-                "its misfit of {:.4} mm is no more than a surface known to half a voxel explains ({:.4} mm)",
+                "its misfit of {:.4} mm is no more than the surface, known to a tenth of a voxel, explains ({:.4} mm)",
                 self.misfit, self.geometry
             )
         })
@@ -155,28 +167,46 @@ impl Support {
         self.close();
     }
 
-    /// Judges the estimate with `count` regions; true makes it the model that stands.
-    pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize) -> bool {
-        let misfit = (e.rms * e.rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
+    /// The least misfit (mm) that would lead to a second region.
+    pub fn least_seen(&self) -> f64 {
+        let [voxel, sample] = self.noise;
+        let noise = sample.max(self.floor);
+        let stands_out = (DISCREPANCY * DISCREPANCY - 1.0).sqrt() * sample;
+        let asked = MARGIN + (1 + SHAPES) as f64 * self.effective.max(2.0).ln();
+        let by_criterion = noise * (asked / self.effective.max(1.0)).exp_m1().sqrt();
+        [stands_out, TRACE.sqrt() * voxel, self.geometry, by_criterion].into_iter().fold(0.0, f64::max)
+    }
+
+    /// Judges the estimate with `count` regions, which leaves over `rms` (mm) with the surface where
+    /// the data put it; true makes it the model that stands.
+    pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize, rms: f64) -> bool {
+        let misfit = (rms * rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
         let parameters = e.parameters + SHAPES * (count - 1);
         let samples = self.effective.min(e.effective);
         let gain = bic(self.squares, samples, self.parameters) - bic(e.squares, samples, parameters);
-        let setup = level.setup(Law::Linear, 0.49, level.largest());
+        let setup = level.setup(Law::Linear, &StiffnessParams::default(), level.largest());
+        let coherent = Fit::of(&setup, e).coherent(&setup, e, misfit, &[]).unwrap_or_default();
         let contrast = setup
             .free()
             .iter()
             .enumerate()
             .map(|(k, &r)| {
-                let sd = e.covariance[k * e.parameters + k].max(0.0).sqrt();
+                let at = k * e.parameters + k;
+                let sd = (e.covariance[at].max(0.0) + coherent.get(at).copied().unwrap_or(f64::INFINITY)).sqrt();
                 (e.state.theta[r].abs(), sd)
             })
-            .fold((f64::INFINITY, 0.0), |m, c| if c.0 < m.0 { c } else { m });
+            // The one that stands out least.
+            .fold((f64::INFINITY, 1.0), |m, c| if c.0 / c.1 < m.0 / m.1 { c } else { m });
         let why = if gain <= MARGIN {
             Some(too_little(gain))
         } else if misfit > 0.8 * self.misfit {
             Some(format!("the misfit falls from {:.4} to {misfit:.4} mm only", self.misfit))
         } else if contrast.0 < (2.0 * contrast.1).max(0.22) {
-            Some(format!("its modulus differs by a factor of {:.2} only", contrast.0.exp()))
+            Some(format!(
+                "its modulus differs by a factor of {:.2} only, known to {:.0} %",
+                contrast.0.exp(),
+                100.0 * contrast.1
+            ))
         } else {
             None
         };
@@ -224,7 +254,18 @@ mod tests {
     fn said(noise: f64, misfit: f64) -> (bool, Option<LeftOver>) {
         let noise = [noise, noise / 8f64.sqrt()];
         let (squares, effective, parameters, rms) = (1.0, 100.0, 6, misfit);
-        let s = Support { noise, geometry: 0.015, squares, misfit, effective, parameters, rms, evidence: Vec::new() };
+        let floor = 0.005;
+        let s = Support {
+            noise,
+            geometry: 0.015,
+            floor,
+            squares,
+            misfit,
+            effective,
+            parameters,
+            rms,
+            evidence: Vec::new(),
+        };
         (s.may_hold_more(), s.left())
     }
 

@@ -4,17 +4,20 @@
 //! minimises the misfit plus kappa times the total variation along the lattice's edges (smoothed
 //! absolute differences, reweighted each iteration; Vogel and Oman 1996); kappa falls until the
 //! residual is that of the noise (discrepancy principle, Morozov 1966). Total variation loses
-//! contrast, so the map only tells *where*: it is cut into connected regions, whose moduli are then
-//! identified as if they had been labelled.
+//! contrast, so the map only tells *where*: the piece that stands out most becomes a region, whose
+//! modulus is then identified as if it had been labelled, and the next map is of what is beyond it.
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::filters::gaussian;
+use crate::numerics::statistics::percentile;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::Observation;
+use crate::stiffness::patches::Patch;
+use crate::types::Mask;
 use crate::types::space::dot;
-use crate::types::{Mask, VoxelPoint};
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 
 /// Lattice nodes at most.
 const NODES: f64 = 420.0;
@@ -26,6 +29,14 @@ const SMOOTH: f64 = 0.05;
 const ITERATIONS: usize = 9;
 /// Standard deviation of the Gaussian that rounds regions (lattice steps).
 const ROUND: f64 = 0.4;
+/// Percentile of the map that counts as its furthest value: a hundredth of the body may be the map's
+/// own corners.
+const FURTHEST: f64 = 99.0;
+/// Pieces of the map that are tried as the next region.
+const TRIED: usize = 3;
+/// Part of the map's furthest value down to which a region reaches: total variation flattens a
+/// region and lets its border lie about there.
+const HALF: f64 = 0.4;
 /// Parts of the body smaller than this are no region of their own.
 const SMALLEST: f64 = 0.004;
 
@@ -111,10 +122,133 @@ impl Lattice {
         kept.into_iter().map(|(n, w)| (n, w / sum.max(1e-12))).collect()
     }
 
+    /// Places of the used nodes (mm, RAS).
+    fn places(&self) -> Vec<[f64; 3]> {
+        let place = |o: usize| {
+            let at = [o % self.count[0], o / self.count[0] % self.count[1], o / (self.count[0] * self.count[1])];
+            std::array::from_fn(|a| self.low[a] + self.size * at[a] as f64)
+        };
+        (0..self.number.len()).filter(|&o| self.number[o] != u32::MAX).map(place).collect()
+    }
+
+    /// The function that is 1 within a ball (mm) and 0 around it, by the means of the lattice's own
+    /// functions over it; none where the ball reaches past the lattice.
+    fn ball(&self, middle: [f64; 3], radius: f64) -> Option<BTreeMap<u32, f64>> {
+        let volume = 4.0 / 3.0 * std::f64::consts::PI * radius.powi(3);
+        let share = volume / self.size.powi(3) / WITHIN as f64;
+        let mut out = BTreeMap::new();
+        for k in 0..WITHIN {
+            // Evenly over the ball: shells of one volume, turned by the golden angle.
+            let t = (k as f64 + 0.5) / WITHIN as f64;
+            let (height, turn) = (1.0 - 2.0 * ((k as f64 * 0.618_034).fract()), k as f64 * 2.399_963);
+            let (r, flat) = (radius * t.cbrt(), (1.0 - height * height).sqrt());
+            let d = [flat * turn.cos(), flat * turn.sin(), height].map(|v| r * v);
+            let place: [f64; 3] = std::array::from_fn(|a| middle[a] + d[a]);
+            for (node, w) in self.corners(place) {
+                let number = self.number[node];
+                if w > 1e-9 && number == u32::MAX {
+                    return None;
+                }
+                *out.entry(number).or_insert(0.0) += share * w;
+            }
+            let past = (0..3).any(|a| {
+                let q = (place[a] - self.low[a]) / self.size;
+                q < 0.0 || q > (self.count[a] - 1) as f64
+            });
+            if past {
+                return None;
+            }
+        }
+        out.remove(&u32::MAX);
+        Some(out.into_iter().map(|(node, w)| (node, w.min(1.0))).collect())
+    }
+
     /// The function at a place.
     pub fn at(&self, values: &[f64], p: [f64; 3]) -> f64 {
         self.weights(p).iter().map(|&(n, w)| w * values[n as usize]).sum()
     }
+}
+
+/// What a map is made from.
+struct Basis {
+    lattice: Lattice,
+    /// Nodes and weights at the middle of each element.
+    weights: Vec<Vec<(u32, f64)>>,
+    /// Observations that are used.
+    picked: Vec<Observation>,
+}
+
+impl Basis {
+    fn new(setup: &Setup<'_>) -> Self {
+        let body = setup.body;
+        let middle = |c: &[u32; 10]| -> [f64; 3] {
+            std::array::from_fn(|a| (0..4).map(|i| body.places[c[i] as usize][a]).sum::<f64>() / 4.0)
+        };
+        let lattice = Lattice::new(&body.places, body.volumes.iter().sum());
+        let weights = body.cells.iter().map(|c| lattice.weights(middle(c))).collect();
+        let step = setup.observations.len().div_ceil(SAMPLES).max(1);
+        let picked = setup.observations.iter().step_by(step).cloned().collect();
+        Self { lattice, weights, picked }
+    }
+}
+
+/// Parts of the body's least extent that are the diameters of balls whose limit is told.
+const DIAMETERS: [f64; 3] = [0.25, 0.35, 0.5];
+/// Places in a ball over which the lattice's functions are averaged.
+const WITHIN: usize = 200;
+
+/// For balls of some diameters (mm): what one moves, the plates fitted again, for a unit of ln mu
+/// (mm, root mean square of one component), where it moves less than in three of four places.
+///
+/// # Errors
+/// As [`Setup::run`].
+pub fn shown_by_balls(setup: &Setup<'_>, identified: &State) -> Result<Vec<(f64, f64)>, StiffnessError> {
+    let Basis { lattice, weights, picked } = Basis::new(setup);
+    let problem = setup.problem(identified);
+    let solution = problem.solve(identified.x.as_deref(), 1e-4)?;
+    let all = jacobian(setup, &problem, &solution, &weights, &picked, lattice.used)?;
+    let (rows, used) = (3 * picked.len(), lattice.used);
+    let column = |k: usize| &all[k * rows..(k + 1) * rows];
+    let plates = orthonormal((used..all.len() / rows).map(|k| column(k).to_vec()));
+    let extent = (0..3).map(|a| {
+        let at = setup.body.places.iter().map(|p| p[a]);
+        at.clone().fold(f64::NEG_INFINITY, f64::max) - at.fold(f64::INFINITY, f64::min)
+    });
+    let least = extent.fold(f64::INFINITY, f64::min);
+    let of = |diameter: f64| {
+        let moved = |middle: [f64; 3]| {
+            let parts = lattice.ball(middle, 0.5 * diameter)?;
+            let mut sum = vec![0.0; rows];
+            for (node, w) in parts {
+                sum.iter_mut().zip(column(node as usize)).for_each(|(s, v)| *s += w * v);
+            }
+            for plate in &plates {
+                let along: f64 = sum.iter().zip(plate).map(|(s, p)| s * p).sum();
+                sum.iter_mut().zip(plate).for_each(|(s, p)| *s -= along * p);
+            }
+            Some((sum.iter().map(|v| v * v).sum::<f64>() / rows as f64).sqrt())
+        };
+        let mut found: Vec<f64> = lattice.places().into_par_iter().filter_map(moved).collect();
+        (!found.is_empty()).then(|| (diameter, percentile(&mut found, 25.0)))
+    };
+    Ok(DIAMETERS.into_iter().filter_map(|part| of(part * least)).collect())
+}
+
+/// The vectors made orthogonal to each other, each of length 1; those that add nothing left out.
+fn orthonormal(vectors: impl Iterator<Item = Vec<f64>>) -> Vec<Vec<f64>> {
+    let mut out: Vec<Vec<f64>> = Vec::new();
+    for mut v in vectors {
+        let whole = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        for b in out.iter().chain(&out) {
+            let along: f64 = v.iter().zip(b).map(|(x, y)| x * y).sum();
+            v.iter_mut().zip(b).for_each(|(x, y)| *x -= along * y);
+        }
+        let left = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if left > 1e-6 * whole {
+            out.push(v.into_iter().map(|x| x / left).collect());
+        }
+    }
+    out
 }
 
 /// The map: lattice and ln mu at its nodes, mean zero.
@@ -128,32 +262,24 @@ pub struct Map {
     pub rms: f64,
 }
 
-/// Finds the map from a homogeneous state. `target` (mm, one component) is the residual that ends
-/// the search.
+/// Finds the map of ln mu beyond that of the regions, from the state in which these are identified.
+/// `target` (mm, one component) is the residual that ends the search.
 ///
 /// # Errors
 /// As [`Setup::run`].
-pub fn map(setup: &Setup<'_>, homogeneous: &State, target: f64) -> Result<Map, StiffnessError> {
+pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, StiffnessError> {
     let body = setup.body;
-    let centres: Vec<[f64; 3]> = body
-        .cells
-        .iter()
-        .map(|c| std::array::from_fn(|a| (0..4).map(|i| body.places[c[i] as usize][a]).sum::<f64>() / 4.0))
-        .collect();
-    let lattice = Lattice::new(&body.places, body.volumes.iter().sum());
-    let weights: Vec<Vec<(u32, f64)>> = centres.iter().map(|&c| lattice.weights(c)).collect();
+    let Basis { lattice, weights, picked } = Basis::new(setup);
     let used = lattice.used;
-    let step = setup.observations.len().div_ceil(SAMPLES).max(1);
-    let picked: Vec<Observation> = setup.observations.iter().step_by(step).cloned().collect();
-    let plates = setup.patches[0].parameters() + setup.patches[1].parameters();
+    let plates: usize = setup.patches.iter().map(Patch::parameters).sum();
     let p = used + plates;
     let mut values = vec![0.0; used];
-    let mut state = homogeneous.clone();
+    let mut state = identified.clone();
     let (mut kappa, mut best): (f64, Option<(f64, Vec<f64>)>) = (0.0, None);
     for iteration in 0..ITERATIONS {
         let mut problem = setup.problem(&state);
         for (m, w) in problem.materials.iter_mut().zip(&weights) {
-            m.mu = w.iter().map(|&(n, w)| w * values[n as usize]).sum::<f64>().exp();
+            m.mu *= w.iter().map(|&(n, w)| w * values[n as usize]).sum::<f64>().exp();
         }
         let solution = problem.solve(state.x.as_deref(), 1e-4)?;
         let residuals: Vec<[f64; 3]> = picked
@@ -267,40 +393,55 @@ fn jacobian(
     Ok(sides.par_chunks(n).flat_map_iter(|y| picked.iter().flat_map(move |o| o.read(body, y))).collect())
 }
 
-/// The body's voxels in `wanted` regions of like ln mu: k-means of the map at the voxels in so many
-/// `classes`, then the largest connected pieces. Label 1 is the largest region. None when fewer
-/// come out.
-pub fn regions(map: &Map, body: &Mask, classes: usize, wanted: usize) -> Option<Mask> {
-    let grid = *body.grid();
-    let inside: Vec<usize> = (0..grid.len()).filter(|&o| body.as_slice()[o] > 0).collect();
+/// `labels` with one region more, taken from the first one: the pieces of it in which the map lies
+/// far above or below its middle value, the ones that weigh most first.
+pub fn next_regions(map: &Map, labels: &Mask) -> Vec<Mask> {
+    let grid = *labels.grid();
+    let inside: Vec<usize> = (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0).collect();
     let value = |&o: &usize| {
         let [i, j, k] = grid.voxel(o);
-        let p = grid.affine().to_world(VoxelPoint([i as f64, j as f64, k as f64]));
-        map.lattice.at(&map.values, p.0)
+        map.lattice.at(&map.values, grid.world(i, j, k).0)
     };
     let values: Vec<f64> = inside.par_iter().map(value).collect();
-    let centres = means(&values, classes);
-    let class =
-        |v: f64| (0..centres.len()).fold(0, |m, k| if (v - centres[k]).abs() < (v - centres[m]).abs() { k } else { m });
-    let mut classes = vec![u8::MAX; grid.len()];
-    inside.iter().zip(&values).for_each(|(&o, &v)| classes[o] = class(v) as u8);
-    let pieces = connected(&classes, grid.shape());
-    let smallest = (SMALLEST * inside.len() as f64) as usize;
-    let mut large: Vec<(usize, usize)> =
-        pieces.1.iter().enumerate().filter(|(_, n)| **n > smallest).map(|(i, &n)| (n, i)).collect();
-    large.sort_by(|a, b| b.cmp(a));
-    if large.len() < wanted {
-        return None;
+    let middle = percentile(&mut values.clone(), 50.0);
+    let mut pieces: Vec<(f64, Vec<usize>)> = Vec::new();
+    for sign in [1.0, -1.0] {
+        let above: Vec<f64> = values.iter().map(|v| sign * (v - middle)).collect();
+        let limit = HALF * percentile(&mut above.clone(), FURTHEST);
+        if limit <= 0.0 {
+            continue;
+        }
+        let mut near = vec![u8::MAX; grid.len()];
+        let mut weight = vec![0.0; grid.len()];
+        for (&o, v) in inside.iter().zip(&above).filter(|(o, v)| labels.as_slice()[**o] == 1 && **v > limit) {
+            (near[o], weight[o]) = (0, v * v);
+        }
+        let (piece, sizes) = connected(&near, grid.shape());
+        let mut found: Vec<(f64, Vec<usize>)> = vec![(0.0, Vec::new()); sizes.len()];
+        for o in inside.iter().copied().filter(|&o| near[o] == 0) {
+            let own = &mut found[piece[o] as usize];
+            own.0 += weight[o];
+            own.1.push(o);
+        }
+        pieces.extend(found.into_iter().filter(|p| p.1.len() as f64 >= SMALLEST * inside.len() as f64));
     }
-    large.truncate(wanted);
-    let mut labels = vec![0u8; grid.len()];
-    for &o in &inside {
-        let at = large.iter().position(|l| l.1 == pieces.0[o] as usize);
-        labels[o] = at.map_or(1, |k| k as u8 + 1);
-    }
+    pieces.sort_by(|a, b| b.0.total_cmp(&a.0));
+    pieces.truncate(TRIED);
+    pieces.iter().filter_map(|(_, piece)| with_region(map, labels, piece)).collect()
+}
+
+/// `labels` with a piece of the first region as one more, rounded.
+fn with_region(map: &Map, labels: &Mask, piece: &[usize]) -> Option<Mask> {
+    let grid = *labels.grid();
+    let next = labels.as_slice().iter().copied().max()?.checked_add(1)?;
+    let mut drawn = labels.as_slice().to_vec();
+    piece.iter().for_each(|&o| drawn[o] = next);
     let sigma = grid.spacing().map(|s| ROUND * map.lattice.size / s);
-    let labels = rounded(&labels, grid.shape(), sigma, wanted);
-    (1..=wanted as u8).all(|l| labels.contains(&l)).then(|| Mask::from_vec(grid, labels).ok()).flatten()
+    let round = rounded(&drawn, grid.shape(), sigma, usize::from(next));
+    // The regions that are there keep their shapes.
+    let kept = |(old, new): (&u8, &u8)| if *old == 1 && *new == next { next } else { *old };
+    let out: Vec<u8> = labels.as_slice().iter().zip(&round).map(kept).collect();
+    (out.contains(&next) && out.contains(&1)).then(|| Mask::from_vec(grid, out).ok()).flatten()
 }
 
 /// Each voxel takes the label that weighs most in a Gaussian around it: the map cannot tell spikes
@@ -317,26 +458,6 @@ fn rounded(labels: &[u8], shape: [usize; 3], sigma: [f64; 3], count: usize) -> V
         });
     }
     labels.iter().zip(best).map(|(&l, b)| if l == 0 { 0 } else { b.1 }).collect()
-}
-
-/// Centres of `count` classes on a line (Lloyd's iteration from even quantiles of the range).
-fn means(values: &[f64], count: usize) -> Vec<f64> {
-    let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), &v| (l.min(v), h.max(v)));
-    let mut centres: Vec<f64> = (0..count).map(|k| low + (high - low) * (k as f64 + 0.5) / count as f64).collect();
-    for _ in 0..50 {
-        let mut sums = vec![(0.0, 0.0); count];
-        for &v in values {
-            let k = (0..count).fold(0, |m, k| if (v - centres[k]).abs() < (v - centres[m]).abs() { k } else { m });
-            sums[k].0 += v;
-            sums[k].1 += 1.0;
-        }
-        for (c, s) in centres.iter_mut().zip(sums) {
-            if s.1 > 0.0 {
-                *c = s.0 / s.1;
-            }
-        }
-    }
-    centres
 }
 
 /// Number of each voxel's face-connected piece of one class, and their sizes.

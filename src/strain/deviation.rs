@@ -21,6 +21,36 @@ pub struct Draws {
     errors: Vec<DenseField>,
 }
 
+/// Draws of a field's error (mm, RAS), on a grid half as wide as the nodes of the samples; `full` is
+/// the field's own.
+///
+/// # Errors
+/// [`SpaceError`] when the places have no grid.
+pub fn error_draws(full: &Grid, samples: &ErrorSamples) -> Result<Vec<DenseField>, SpaceError> {
+    errors_on(&thinned(full, samples)?.1, samples)
+}
+
+fn errors_on(grid: &Grid, samples: &ErrorSamples) -> Result<Vec<DenseField>, SpaceError> {
+    drawn(grid, samples).map(|values| DenseField::from_vec(*grid, values)).collect()
+}
+
+/// Every so many voxels of a grid: places half as far apart as the nodes of the samples.
+fn thinned(full: &Grid, samples: &ErrorSamples) -> Result<([usize; 3], Grid), SpaceError> {
+    let (shape, spacing) = (full.shape(), full.spacing());
+    // The nodes may run along other axes: the closest along any counts for all.
+    let nodes = samples.nodes();
+    let thick = (0..3).filter(|&a| nodes.shape()[a] > 1);
+    let apart = thick.map(|a| nodes.spacing()[a]).fold(f64::INFINITY, f64::min);
+    let step: [usize; 3] = std::array::from_fn(|a| ((apart / (2.0 * spacing[a])) as usize).clamp(1, shape[a]));
+    let (linear, WorldPoint(origin)) = (full.affine().linear(), full.affine().origin());
+    let row = |r: usize| {
+        let [x, y, z] = std::array::from_fn(|a| linear[r][a] * step[a] as f64);
+        [x, y, z, origin[r]]
+    };
+    let affine = Affine::new(std::array::from_fn(row))?;
+    Ok((step, Grid::new(std::array::from_fn(|a| (shape[a] - 1) / step[a] + 1), affine)?))
+}
+
 /// Displacement gradients by place: as measured, then with each draw of the error; none outside the
 /// bodies.
 pub type Gradients = Vec<Vec<Option<Matrix3>>>;
@@ -32,25 +62,11 @@ impl Draws {
     /// [`SpaceError`] when the places have no grid.
     pub fn new(field: &DenseField, bodies: &[u8], samples: &ErrorSamples) -> Result<Self, SpaceError> {
         let full = *field.grid();
-        let (shape, spacing) = (full.shape(), full.spacing());
-        // The nodes may run along other axes: the closest along any counts for all.
-        let nodes = samples.nodes();
-        let thick = (0..3).filter(|&a| nodes.shape()[a] > 1);
-        let apart = thick.map(|a| nodes.spacing()[a]).fold(f64::INFINITY, f64::min);
-        let step: [usize; 3] = std::array::from_fn(|a| ((apart / (2.0 * spacing[a])) as usize).clamp(1, shape[a]));
-        let (linear, WorldPoint(origin)) = (full.affine().linear(), full.affine().origin());
-        let row = |r: usize| {
-            let [x, y, z] = std::array::from_fn(|a| linear[r][a] * step[a] as f64);
-            [x, y, z, origin[r]]
-        };
-        let affine = Affine::new(std::array::from_fn(row))?;
-        let grid = Grid::new(std::array::from_fn(|a| (shape[a] - 1) / step[a] + 1), affine)?;
+        let (step, grid) = thinned(&full, samples)?;
         let at = |place: usize| offset(&grid, step, &full, place);
         let thinned = DenseField::from_voxels(grid, |o, _| field.at(at(o)).map(f64::from));
         let labels = if bodies.is_empty() { Vec::new() } else { (0..grid.len()).map(|o| bodies[at(o)]).collect() };
-        let errors =
-            drawn(&grid, samples).map(|values| DenseField::from_vec(grid, values)).collect::<Result<_, _>>()?;
-        Ok(Self { step, grid, field: thinned, bodies: labels, errors })
+        Ok(Self { step, grid, field: thinned, bodies: labels, errors: errors_on(&grid, samples)? })
     }
 
     /// Where the places are.

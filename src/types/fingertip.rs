@@ -134,10 +134,16 @@ pub struct StiffnessFolder {
 pub struct StiffnessRegion {
     /// Its name.
     pub name: String,
-    /// Young's modulus, or the bound.
+    /// Young's modulus, or the bound; NaN where it is unknown.
+    #[serde(deserialize_with = "or_nan")]
     pub youngs_modulus: f64,
     /// `lower` or `upper` where it is not identifiable.
     pub bound: Option<String>,
+}
+
+/// A number, or NaN for null.
+fn or_nan<'de, D: serde::Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::NAN))
 }
 
 /// A column of tissue between a pad's surface and its back plate.

@@ -1,7 +1,7 @@
 //! What the field pipeline gives back.
 
 use crate::types::{ExpectedError, TetMesh, TriMesh};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// The mesh through the kept matches: tetrahedra, or triangles for one slice.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,7 +13,7 @@ pub enum Mesh {
 }
 
 /// The smallest motion that explains the matches.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionModel {
     /// Nothing moves.

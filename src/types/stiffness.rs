@@ -2,7 +2,7 @@
 
 use crate::error::{ParamError, UnknownName};
 use crate::types::names::choose;
-use crate::types::{Mask, QuadraticMesh, Volume};
+use crate::types::{Mask, QuadraticMesh, Trust, Volume};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
@@ -101,8 +101,10 @@ pub enum Contact {
     Sticking,
     /// It stays on the plate's plane and slides without friction.
     Sliding,
-    /// It stays on the plate's plane, and moves along it as measured (a quadratic fit).
+    /// It stays on the plate's plane, and moves along it as measured (smoothed).
     Guided,
+    /// It moves as measured, smoothed by no more than its noise asks for.
+    Measured,
 }
 
 impl Contact {
@@ -112,6 +114,7 @@ impl Contact {
             Contact::Sticking => "sticking",
             Contact::Sliding => "sliding",
             Contact::Guided => "guided",
+            Contact::Measured => "measured",
         }
     }
 }
@@ -122,6 +125,13 @@ pub struct StiffnessParams {
     /// Poisson's ratio of all regions (1): 0 to below 0.5. Soft tissue is nearly incompressible;
     /// 0.49 is usual in elastography (Goenezen, Barbone, Oberai 2011).
     pub poisson: f64,
+    /// Poisson's ratio of single labels, where it is not that of all.
+    pub poisson_of: Vec<(u8, f64)>,
+    /// Young's modulus of labels whose modulus is known (kPa): bone, or a calibrated pad, which
+    /// sets the scale in place of a force.
+    pub fixed: Vec<(u8, f64)>,
+    /// One standard deviation of the border between two labels along its normal (voxels): 0 to 5.
+    pub label_sd: f64,
     /// The law.
     pub model: LawChoice,
     /// Total force on the loaded patch (N), its magnitude; none gives ratios.
@@ -134,19 +144,40 @@ pub struct StiffnessParams {
 
 impl Default for StiffnessParams {
     fn default() -> Self {
-        Self { poisson: 0.49, model: LawChoice::Auto, force_n: None, nodes: 20_000, regions: 4 }
+        Self {
+            poisson: 0.49,
+            poisson_of: Vec::new(),
+            fixed: Vec::new(),
+            label_sd: 0.5,
+            model: LawChoice::Auto,
+            force_n: None,
+            nodes: 20_000,
+            regions: 4,
+        }
     }
 }
 
 impl StiffnessParams {
+    /// Poisson's ratio of a label.
+    pub fn poisson_of(&self, label: u8) -> f64 {
+        self.poisson_of.iter().find(|p| p.0 == label).map_or(self.poisson, |p| p.1)
+    }
+
     /// Checks every range.
     ///
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn check(&self) -> Result<(), ParamError> {
-        if !(self.poisson >= 0.0 && self.poisson < 0.5) {
+        let ratios = self.poisson_of.iter().map(|p| p.1).chain([self.poisson]);
+        if let Some(value) = ratios.into_iter().find(|nu| !(0.0..0.5).contains(nu)) {
             let range = "0 or more and below 0.5 (exactly incompressible tissue has no stiffness matrix; try 0.499)";
-            return Err(ParamError { name: "poisson", value: self.poisson, range });
+            return Err(ParamError { name: "poisson", value, range });
+        }
+        if let Some(&(_, value)) = self.fixed.iter().find(|f| !(f.1 > 0.0 && f.1.is_finite())) {
+            return Err(ParamError { name: "fixed", value, range: "above 0 kPa" });
+        }
+        if !(0.0..=5.0).contains(&self.label_sd) {
+            return Err(ParamError { name: "label-sd", value: self.label_sd, range: "0 to 5 voxels" });
         }
         if let Some(force) = self.force_n
             && !(force > 0.0 && force.is_finite())
@@ -164,6 +195,32 @@ impl StiffnessParams {
     }
 }
 
+/// What the data say of a region's modulus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Determined {
+    /// They determine it, within its standard deviation.
+    Determined,
+    /// They exclude one side: it lies beyond the value that is given.
+    Bound,
+    /// They say nothing of it.
+    Unknown,
+    /// It was given.
+    Given,
+}
+
+impl Determined {
+    /// As in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Determined => "determined",
+            Self::Bound => "bound",
+            Self::Unknown => "unknown",
+            Self::Given => "given",
+        }
+    }
+}
+
 /// Young's modulus of one region.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RegionStiffness {
@@ -171,8 +228,8 @@ pub struct RegionStiffness {
     pub label: u8,
     /// Its name.
     pub name: String,
-    /// Young's modulus: kPa where a force is known, else over that of the reference region. Of a
-    /// region that is not identifiable, the bound that the data give.
+    /// Young's modulus: kPa where a force or a modulus is known, else over that of the reference
+    /// region. Of a bound its value; NaN where it is unknown.
     pub youngs_modulus: f64,
     /// One standard deviation, in the same unit; infinite where not identifiable.
     pub sd: f64,
@@ -180,8 +237,10 @@ pub struct RegionStiffness {
     pub ratio: f64,
     /// One standard deviation of the ratio.
     pub ratio_sd: f64,
-    /// Whether the data determine it.
+    /// Whether the data determine it, or it was given.
     pub identifiable: bool,
+    /// What the data say of it.
+    pub state: Determined,
     /// `lower` or `upper` where it is not: the modulus lies beyond `youngs_modulus`; `unknown`
     /// where it may be any.
     pub bound: Option<&'static str>,
@@ -213,12 +272,23 @@ pub struct Evidence {
     pub reason: String,
 }
 
+/// From which contrast on a ball would be found without labels, in three of four places.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Detectable {
+    /// Its diameter (mm).
+    pub diameter_mm: f64,
+    /// Its modulus over that around it, where it is stiffer; none where not even a rigid one is seen.
+    pub stiffer: Option<f64>,
+    /// The same where it is softer; none where not even a hole is seen.
+    pub softer: Option<f64>,
+}
+
 /// What one modulus leaves over of a field in which no second region was found.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LeftOver {
     /// Root mean square misfit beyond the noise of a sample (mm, one component).
     pub misfit_mm: f64,
-    /// What a surface known to half a voxel explains (mm).
+    /// What a surface known to a tenth of a voxel explains (mm).
     pub surface_mm: f64,
 }
 
@@ -262,8 +332,16 @@ pub struct StiffnessResult {
     pub law: Law,
     /// Poisson's ratio that was assumed.
     pub poisson: f64,
+    /// That of single labels, where it is another.
+    pub poisson_of: Vec<(u8, f64)>,
     /// The force that was given (N).
     pub force_n: Option<f64>,
+    /// One standard deviation of the borders between labels (voxels).
+    pub label_sd: f64,
+    /// How far to rely on it: the worst of the field's trust and of what the model leaves over.
+    pub trust: Trust,
+    /// Why.
+    pub trust_reasons: Vec<String>,
     /// Label of the region that ratios refer to.
     pub reference: u8,
     /// Root mean square residual (mm, one component).
@@ -272,8 +350,8 @@ pub struct StiffnessResult {
     pub noise_mm: f64,
     /// Everything tried.
     pub evidence: Vec<Evidence>,
-    /// Held and loaded patch.
-    pub patches: [PatchReport; 2],
+    /// Held and loaded patch, then the cut where the body ends with the volume, if it does.
+    pub patches: Vec<PatchReport>,
     /// Young's modulus on the mask's grid (0 outside).
     pub map: Volume,
     /// Its standard deviation.
@@ -308,8 +386,17 @@ pub struct StiffnessResult {
     pub labelled: bool,
     /// Without labels, what a single region leaves over where that is more than noise.
     pub left_over: Option<LeftOver>,
+    /// Without labels, which balls would have been found.
+    pub detectable: Vec<Detectable>,
     /// Without labels, the regions that were found (1 and on; 0 outside).
     pub found: Option<Mask>,
+}
+
+impl StiffnessResult {
+    /// Poisson's ratio of a label.
+    pub fn poisson_of(&self, label: u8) -> f64 {
+        self.poisson_of.iter().find(|p| p.0 == label).map_or(self.poisson, |p| p.1)
+    }
 }
 
 /// A displacement that a plate or base prescribes at a node.
@@ -317,7 +404,7 @@ pub struct StiffnessResult {
 pub struct Prescribed {
     /// The node.
     pub node: u32,
-    /// 0 held, 1 loaded.
+    /// 0 held, 1 loaded, 2 the cut at the volume's border.
     pub patch: u8,
     /// The direction that is prescribed, a unit vector; none for all three components.
     pub direction: Option<[f64; 3]>,
