@@ -39,7 +39,10 @@ pub fn write_mjcf(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<()
         writeln!(w, "<!-- palpate {}: identified stiffness.\n     {ABOUT} -->", env!("CARGO_PKG_VERSION"))?;
         writeln!(w, "<mujoco model=\"palpate\">")?;
         let step = STEP[0];
-        writeln!(w, "\t<option timestep=\"{step}\" integrator=\"discrete\" solver=\"CG\" gravity=\"0 0 0\"/>")?;
+        writeln!(
+            w,
+            "\t<option timestep=\"{step}\" integrator=\"discrete\" solver=\"CG\" iterations=\"1000\" gravity=\"0 0 0\"/>"
+        )?;
         bodies(w, result, &tetrahedra, &fixed)?;
         writeln!(w, "\t<deformable>")?;
         moduli(result).into_iter().try_for_each(|(label, young)| flex(w, result, &tetrahedra, label, young))?;

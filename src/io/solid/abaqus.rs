@@ -1,7 +1,7 @@
 //! Meshes of Abaqus and CalculiX (`.inp`): `*NODE`, `*ELEMENT`, `*NSET`, one part at most.
 
-use super::super::flaw::Flaw;
 use super::edit::Edit;
+use crate::io::flaw::Flaw;
 use crate::types::{Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write;

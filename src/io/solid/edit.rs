@@ -23,7 +23,13 @@ impl Edit {
         let name = node.tag_name().name();
         match own.strip_suffix("/>") {
             Some(open) => Self { at: range.start + open.len()..range.end, text: format!(">\n{text}</{name}>") },
-            None => Self::insert(range.start + own.rfind("</").unwrap_or(own.len()), text.into()),
+            None => {
+                let inside = &own[..own.rfind("</").unwrap_or(own.len())];
+                // A closing tag on a line of its own keeps its indentation.
+                let indented = inside.trim_end_matches([' ', '\t']);
+                let end = if indented.ends_with('\n') { indented.len() } else { inside.len() };
+                Self::insert(range.start + end, text.into())
+            }
         }
     }
 }

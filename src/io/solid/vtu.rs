@@ -1,8 +1,8 @@
 //! VTK XML unstructured grids (`.vtu`) as VTK, meshio and palpate write them: arrays as text, in
 //! base64, or appended as base64 or raw; plain or packed with zlib; one piece.
 
-use super::super::flaw::Flaw;
 use super::edit::Edit;
+use crate::io::flaw::Flaw;
 use crate::types::{Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use libdeflater::Decompressor;
