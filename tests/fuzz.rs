@@ -14,7 +14,7 @@ use flate2::{Compression, write::GzEncoder, write::ZlibEncoder};
 use palpate::io::{self, SceneOverrides};
 use palpate::numerics::random::Random;
 
-use palpate::types::{Affine, DenseField, FieldParams, Grid, Transform, Volume};
+use palpate::types::{Affine, DenseField, FieldParams, Grid, TetMesh, Transform, Volume, WorldPoint};
 use peak_alloc::PeakAlloc;
 use std::fs;
 use std::io::Write;
@@ -125,6 +125,16 @@ fn kinds() -> Vec<Kind> {
     let [Transform::Affine(map)] = map[..] else { panic!("no affine map") };
     io::write_affine(at("ants.mat"), &map, io::AffineFormat::Itk).unwrap();
     let ants = fs::read(at("ants.mat")).unwrap();
+    let corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(WorldPoint).to_vec();
+    let tetrahedron = TetMesh::new(corners, vec![[0, 1, 2, 3]]).unwrap();
+    io::write_tet_mesh(at("body.vtu"), &tetrahedron, &[[0.0; 3]; 4], &[]).unwrap();
+    let vtu = fs::read(at("body.vtu")).unwrap();
+    let inp = "*NODE, NSET=ALL\n1, 0, 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n4, 0, 0, 1\n*ELEMENT, TYPE=C3D4\n7, 1, 2, 3, 4\n\
+        *NSET, NSET=HELD, GENERATE\n1, 3, 2\n";
+    let feb = "<febio_spec version=\"4.0\"><Mesh><Nodes><node id=\"1\">0,0,0</node><node id=\"2\">1,0,0</node>\
+        <node id=\"3\">0,1,0</node><node id=\"4\">0,0,1</node></Nodes><Elements type=\"tet4\"><elem id=\"1\">1,2,3,4</elem>\
+        </Elements><NodeSet name=\"held\">1,3</NodeSet></Mesh></febio_spec>";
+    let solid = |path: &Path| nothing(io::SolidFile::read(path));
     let kind = |name, good, read, ratio, checked| Kind { name, good, read, ratio, checked, beside: Vec::new() };
     vec![
         kind("v.nii", nifti.clone(), volume as fn(&Path) -> Option<Vec<f32>>, 2, false),
@@ -150,6 +160,10 @@ fn kinds() -> Vec<Kind> {
         kind("chain.tfm", itk.into(), transform, 64, false),
         kind("matrix.mat", matrix.into(), transform, 64, false),
         kind("0GenericAffine.mat", ants, transform, 64, false),
+        kind("body.inp", inp.into(), solid, 64, false),
+        kind("body.feb", feb.into(), solid, 64, false),
+        // A byte of a packed array becomes a number of eight.
+        kind("body.vtu", vtu, solid, 10 * 1032, false),
         Kind {
             beside: vec![("stiffness.nii.gz", gzip(&nifti))],
             ..kind("summary.json", told.to_vec(), |p| nothing(io::read_stiffness(p.parent()?)), 64, false)

@@ -80,7 +80,16 @@ fn everything_promised_is_written() {
     assert!(stages.contains_key("read") && stages.contains_key("mesh"), "{stages:?}");
     assert!(page.contains("<h3>Distributions</h3>"));
     assert!(page.contains("lower") && !page.contains("NaN") && !page.contains("http"));
-    for file in ["stiffness_sd.nii.gz", "residual.nii.gz", "mesh.vtu", "model.feb", "model.inp"] {
+    for file in [
+        "stiffness_sd.nii.gz",
+        "residual.nii.gz",
+        "mesh.vtu",
+        "model.feb",
+        "model.inp",
+        "model.scn",
+        "model.xml",
+        "model.msh",
+    ] {
         assert!(fs::metadata(results.join(file)).unwrap().len() > 500, "{file}");
     }
     check_febio(&fs::read_to_string(results.join("model.feb")).unwrap());

@@ -81,6 +81,10 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
                 "regions looked for, moduli as ratios",
                 "stiffness --field results/displacement.nii.gz --mask tissue.nii.gz -o stiffness",
             ),
+            (
+                "the measured motion on your own mesh",
+                "stiffness --field results --labels labels.nii.gz --mesh body.inp --mesh-set HELD --mesh-set LOADED -o stiffness",
+            ),
         ],
     ),
     ("fingertip", &[("for a grasp scene", "fingertip stiffness -o fingertip.toml")]),

@@ -35,12 +35,14 @@ pub fn image(description: &str) -> Option<&'static str> {
 }
 
 /// What a table is, columns that no other kind has all of, and a command that takes it.
-const TABLES: [(&str, &[&str], &str); 19] = [
+const TABLES: [(&str, &[&str], &str); 21] = [
     ("trajectories of tracked points", &["point", "frame", "x", "y", "z", "sigma"], ""),
     ("strain of regions over time", &["frame", "label", "mean_e1", "volume_change"], ""),
     ("strain of regions", &["label", "component", "mean", "mean_sd"], ""),
     ("stiffness of regions", &["label", "name", "youngs_modulus_kpa", "identifiable"], ""),
     ("stiffness of regions by frame", &["frame", "label", "value", "identifiable"], ""),
+    ("measured boundary conditions of a mesh", &["node", "ux", "cov_xx", "patch"], ""),
+    ("Young's modulus of a mesh's elements", &["element", "label", "youngs_modulus"], ""),
     ("results of a batch", &["name", "status", "stage", "reason"], ""),
     ("stiffness of the regions of a batch", &["name", "region", "youngs_modulus", "unit"], ""),
     ("table of pairs", &["initial", "deformed"], "palpate batch FILE -o BATCH"),

@@ -67,6 +67,8 @@ mod track;
 
 mod transform;
 
+mod mesh_option;
+
 mod stiffness;
 
 mod stiffness_sequence;

@@ -6,6 +6,7 @@ use super::convention::Convention;
 use super::dry_run;
 use super::inputs::{Part, check_distinct, file_of, name, on_grid, read_labels, read_mask, standing_for, warn_all};
 use super::limits::mesh_fits;
+use super::mesh_option::{self, MeshOption};
 use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -24,7 +25,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// What is written.
-pub(super) const FILES: [&str; 9] = [
+pub(super) const FILES: [&str; 12] = [
     "stiffness.nii.gz",
     "stiffness_sd.nii.gz",
     "residual.nii.gz",
@@ -32,6 +33,9 @@ pub(super) const FILES: [&str; 9] = [
     "mesh.vtu",
     "model.feb",
     "model.inp",
+    "model.scn",
+    "model.xml",
+    "model.msh",
     "summary.json",
     "report.html",
 ];
@@ -123,6 +127,8 @@ pub struct Options {
     pub(super) dry_run: bool,
     #[command(flatten)]
     convention: Convention,
+    #[command(flatten)]
+    mesh: MeshOption,
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
@@ -174,6 +180,7 @@ pub(super) fn common_inputs(options: &Options) -> Read {
         ("labels", options.labels.as_ref()),
         ("mask", options.mask.as_ref()),
         ("field_deformed", options.convention.deformed()),
+        ("mesh", options.mesh.path()),
     ]);
     let patches = [("held", &options.held), ("load", &options.load)];
     let files = patches.into_iter().filter(|(_, text)| Side::parse(text).is_none());
@@ -233,9 +240,10 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let given: Vec<&Path> = [Some(source.field.as_path()), Some(body), source.matches.as_deref()]
         .into_iter()
         .flatten()
-        .chain(patches.iter().chain(&options.images).map(PathBuf::as_path))
+        .chain(patches.iter().chain(&options.images).chain(options.mesh.path()).map(PathBuf::as_path))
         .collect();
-    let results: Vec<PathBuf> = FILES.iter().chain(&[FOUND]).map(|f| options.output.join(f)).collect();
+    let results: Vec<PathBuf> =
+        FILES.iter().chain(&[FOUND]).chain(&mesh_option::FILES).map(|f| options.output.join(f)).collect();
     check_distinct(&given, &results)?;
 
     let started = Instant::now();
@@ -249,6 +257,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         (matches, source.matches) = (None, None);
     }
     let images = images(options, source.image.as_deref(), field.grid())?;
+    let on_mesh = options.mesh.measure(&field, &setting.labels, &source.field)?;
     if options.dry_run {
         setting.check(&field, params).with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
         drop(progress);
@@ -262,8 +271,8 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     }
     inputs.extend(source.summary.iter().chain(&source.samples).map(|p| ("field", p.clone())));
     let record = Recording::start(console, inputs);
-    // Of a sequence.
-    folder.supersede(|file| file == "frames.csv" || file == FOUND)?;
+    // Of a sequence, or of another mesh.
+    folder.supersede(|file| file == "frames.csv" || file == FOUND || mesh_option::FILES.contains(&file))?;
     let read = started.elapsed().as_secs_f64();
 
     let quality = Quality::of(&source)?;
@@ -279,6 +288,11 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         load: options.load.clone(),
     };
     write(&mut folder, &mut result)?;
+    if let Some(on_mesh) = on_mesh {
+        let labels = result.found.as_ref().unwrap_or(&setting.labels);
+        let said = on_mesh.write(&mut folder, labels, &result)?;
+        result.warnings.extend(said);
+    }
     let record = record.finish();
     let told = in_summary(report::summary(&result, &names), &record);
     folder.write("summary.json", |p| io::write_json(p, &told))?;
@@ -541,6 +555,9 @@ pub(super) fn write(folder: &mut OutputFolder, result: &mut StiffnessResult) -> 
     folder.write("mesh.vtu", |p| io::write_quadratic_mesh(p, &result.mesh, &result.displacement, &data))?;
     folder.write("model.feb", |p| io::write_feb(p, result))?;
     folder.write("model.inp", |p| io::write_inp(p, result))?;
+    folder.write("model.scn", |p| io::write_sofa(p, result))?;
+    folder.write("model.xml", |p| io::write_mjcf(p, result))?;
+    folder.write("model.msh", |p| io::write_msh(p, result))?;
     result.seconds.push(("write".into(), started.elapsed().as_secs_f64()));
     Ok(())
 }

@@ -53,6 +53,14 @@ pub mod strain;
 
 pub mod stiffness;
 
+mod simulators;
+
+pub mod sofa;
+
+pub mod mujoco;
+
+pub mod solid;
+
 pub mod trials;
 
 pub mod batch;
@@ -99,6 +107,7 @@ pub use live::abandon;
 pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
+pub use mujoco::{write_mjcf, write_msh};
 pub use nifti::{
     PackedField, STRAIN_BITS, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact,
     write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field, write_steps,
@@ -108,6 +117,8 @@ pub use output::OutputFolder;
 pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
+pub use sofa::write_sofa;
+pub use solid::{SolidFile, write_boundary, write_element_moduli};
 pub use stiffness::{KnownMaterial, read_materials, write_feb, write_frames, write_inp, write_regions};
 pub use strain::write_region_strains;
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};

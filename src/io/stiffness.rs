@@ -132,7 +132,7 @@ fn axis_of(p: &Prescribed) -> Option<usize> {
 }
 
 /// The displacement components that are prescribed at a node.
-fn components(p: &Prescribed) -> Vec<(usize, f64)> {
+pub(super) fn components(p: &Prescribed) -> Vec<(usize, f64)> {
     match (p.direction, axis_of(p)) {
         (None, _) => (0..3).map(|a| (a, p.displacement[a])).collect(),
         (Some(d), Some(a)) => {
@@ -147,7 +147,7 @@ fn components(p: &Prescribed) -> Vec<(usize, f64)> {
 /// Nodes and axes that hold the body where what is prescribed leaves it free to move as a rigid
 /// body (plates that slide): without force, as nothing else acts along them. Each holds what is
 /// still free better than any other would.
-fn pins(result: &StiffnessResult) -> Vec<(u32, usize)> {
+pub(super) fn pins(result: &StiffnessResult) -> Vec<(u32, usize)> {
     let place = |p: &Prescribed| result.mesh.nodes()[p.node as usize];
     let Some(first) = result.prescribed.first().map(place) else { return Vec::new() };
     let arm = |p: &Prescribed| place(p).minus(first);

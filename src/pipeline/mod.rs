@@ -33,6 +33,8 @@ pub mod stiffness;
 
 pub mod stiffness_sequence;
 
+pub mod boundary;
+
 pub mod cpu;
 
 pub mod trials;

@@ -127,6 +127,15 @@ fn drawn(grid: &Grid, samples: &ErrorSamples) -> impl Iterator<Item = Vec<f32>> 
         .map(move |s| (0..3).flat_map(|c| all.iter().map(move |values| values[3 * s + c])).collect())
 }
 
+/// What each sample says the error is at a place (mm, RAS).
+pub fn errors_at(samples: &ErrorSamples, place: WorldPoint) -> Vec<[f64; 3]> {
+    let nodes = samples.nodes().len();
+    let taps = taps(samples.nodes(), place);
+    let of = |component: &[f32]| taps.iter().map(|&(node, w)| f64::from(w * component[node])).sum::<f64>();
+    let each = |sample: &Vec<f32>| std::array::from_fn(|c| of(&sample[c * nodes..(c + 1) * nodes]));
+    samples.values().iter().map(each).collect()
+}
+
 /// The at most 64 nodes that act at a place (mm), with their weights.
 fn taps(nodes: &Grid, place: WorldPoint) -> Vec<(usize, f32)> {
     let shape = nodes.shape();

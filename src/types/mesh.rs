@@ -100,7 +100,7 @@ impl QuadraticMesh {
     }
 }
 
-fn check<'a>(nodes: &[WorldPoint], mut indices: impl Iterator<Item = &'a u32>) -> Result<(), MeshError> {
+pub(super) fn check<'a>(nodes: &[WorldPoint], mut indices: impl Iterator<Item = &'a u32>) -> Result<(), MeshError> {
     if let Some(node) = nodes.iter().position(|p| p.0.iter().any(|v| !v.is_finite())) {
         return Err(MeshError::NotFinite { node });
     }

@@ -39,6 +39,8 @@ pub mod names;
 
 pub mod stiffness;
 
+pub mod solid;
+
 pub mod fingertip;
 
 pub mod scene;
@@ -67,6 +69,7 @@ pub use result::{
 };
 pub use samples::ErrorSamples;
 pub use scene::Scene;
+pub use solid::{ElementModulus, Measured, MeasuredNode, SolidElement, SolidMesh, SolidShape};
 pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use strain::{GaugeTrial, RegionStrain, StrainMeasure, StrainSummary};
