@@ -35,6 +35,8 @@ pub mod stiffness_sequence;
 
 pub mod boundary;
 
+pub mod planning;
+
 pub mod cpu;
 
 pub mod trials;

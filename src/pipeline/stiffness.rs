@@ -189,14 +189,16 @@ pub fn check(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<(), Stiffn
 }
 
 /// A body on the mesh on which all is chosen, and on the one that counts.
-struct Meshed {
-    coarse: Level,
-    fine: Level,
+pub(super) struct Meshed {
+    /// Where all is chosen.
+    pub coarse: Level,
+    /// Where moduli are found.
+    pub fine: Level,
     mesh: QuadraticMesh,
 }
 
 impl Meshed {
-    fn new(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<Self, StiffnessError> {
+    pub fn new(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<Self, StiffnessError> {
         let mesher = Mesher::new(inputs.labels)?;
         let level = |mesh: &QuadraticMesh, outline: Option<&Outline>| {
             Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, outline)
@@ -424,7 +426,7 @@ fn errors_drawn(inputs: &Inputs<'_>, level: &Level) -> Vec<Vec<[f64; 3]>> {
 }
 
 /// The body must have three dimensions and hang together.
-fn whole(labels: &Mask) -> Result<(), StiffnessError> {
+pub(super) fn whole(labels: &Mask) -> Result<(), StiffnessError> {
     let grid = labels.grid();
     let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
     for o in (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0) {

@@ -69,6 +69,8 @@ pub mod strain;
 
 pub mod certify;
 
+pub mod plan;
+
 pub mod stiffness;
 
 pub mod axes;

@@ -12,7 +12,7 @@ const ALIGNED: f64 = 0.15;
 
 /// By how much less data tell whose error `share` (of its squares) is everywhere at once, of so many
 /// samples.
-fn dilution(share: f64, samples: f64) -> f64 {
+pub fn dilution(share: f64, samples: f64) -> f64 {
     ALIGNED * ALIGNED * samples * share
 }
 

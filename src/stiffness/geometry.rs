@@ -156,13 +156,41 @@ pub fn fit(
     (interfaces, inclusions): (&[Interface], &[Inclusion]),
 ) -> Result<Option<Geometry>, StiffnessError> {
     let (body, voxel) = (setup.body, grid.least_spacing());
-    let faces = flat_faces(body, grid);
-    let inclusions: Vec<Part> = inclusions.iter().flat_map(|i| Part::inclusion(i, body, voxel)).collect();
-    let flat: Vec<Part> = interfaces.iter().map(|i| Part::interface(i, body, grid)).collect();
+    let mut fixed = flat_faces(body, grid);
+    fixed.extend(inclusions.iter().flat_map(|i| Part::inclusion(i, body, voxel)));
+    fixed.extend(interfaces.iter().map(|i| Part::interface(i, body, grid)));
     let open = setup.open.iter().map(|(p, moved)| (p, *moved));
-    let all: Vec<(&Part, f64)> =
-        faces.iter().chain(&inclusions).chain(&flat).map(|part| (part, 0.0)).chain(open).collect();
+    let all: Vec<(&Part, f64)> = fixed.iter().map(|part| (part, 0.0)).chain(open).collect();
     offsets(setup, estimate, &all)
+}
+
+/// What the offsets of the open parts of the shape change, and how well each is known beforehand.
+#[derive(Debug, Clone, Default)]
+pub struct Open {
+    /// Change of the displacement at the observations for an offset (mm/voxel), one row an offset.
+    pub rows: Vec<Vec<[f64; 3]>>,
+    /// Derivative of ln force by each offset (1/voxel).
+    pub force_slope: Vec<f64>,
+    /// One standard deviation of each offset before anything is measured (voxels).
+    pub sigma: Vec<f64>,
+}
+
+/// What the offsets that [`fit`] seeks change about an estimate: none where nothing is open.
+///
+/// # Errors
+/// As [`Setup::run`].
+pub fn open(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    grid: &Grid,
+    interfaces: &[Interface],
+) -> Result<Open, StiffnessError> {
+    let mut fixed = flat_faces(setup.body, grid);
+    fixed.extend(interfaces.iter().map(|i| Part::interface(i, setup.body, grid)));
+    let parts: Vec<(&Part, f64)> = fixed.iter().chain(setup.open.iter().map(|o| &o.0)).map(|p| (p, 0.0)).collect();
+    let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(Open::default()) };
+    let (rows, force_slope) = columns(setup, estimate, x, &parts)?;
+    Ok(Open { rows, force_slope, sigma: parts.iter().map(|p| p.0.sigma).collect() })
 }
 
 /// How much further outwards each of the open parts lies (voxels), for all that the data say; none
@@ -176,15 +204,18 @@ pub fn open_steps(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Vec<f
     Ok(found.map(|g| g.step[g.step.len() - parts.len()..].to_vec()))
 }
 
-/// Fits the offsets of some parts about an estimate.
-fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Result<Option<Geometry>, StiffnessError> {
-    let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
+/// What the offsets of some parts change at the observations (mm/voxel), and of ln force (1/voxel).
+fn columns(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    x: &[f64],
+    parts: &[(&Part, f64)],
+) -> Result<(Vec<Vec<[f64; 3]>>, Vec<f64>), StiffnessError> {
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
     // What an offset changes is smooth: it is read in the middle of a block.
     let before = find(setup.body, &places);
-    let mut rows = estimate.rows.clone();
     let factor = setup.problem(&estimate.state).factorise(x)?;
-    let mut force_slope = Vec::new();
+    let (mut rows, mut force_slope) = (Vec::new(), Vec::new());
     for (part, _) in parts {
         let column = STEPS.into_iter().find_map(|by| {
             let body = part.moved(setup.body, by);
@@ -208,6 +239,30 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
         rows.push(row);
         force_slope.push(slope);
     }
+    Ok((rows, force_slope))
+}
+
+/// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh is
+/// off by in each, however well the data tell the place: all else follows it as it would another
+/// place. `voxel` is that of the image over the one that offsets count in.
+pub fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f64> {
+    let mut out = by_data.clone();
+    for k in first..p {
+        let follows: Vec<f64> = (0..p).map(|i| MESHED * voxel * by_data[i * p + k] / by_data[k * p + k]).collect();
+        out.iter_mut().enumerate().for_each(|(at, v)| *v += follows[at / p] * follows[at % p]);
+    }
+    out
+}
+
+/// Fits the offsets of some parts about an estimate.
+fn offsets(
+    setup: &Setup<'_>,
+    estimate: &Estimate,
+    parts: &[(&Part, f64)],
+) -> Result<Option<Geometry>, StiffnessError> {
+    let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
+    let (columns, force_slope) = columns(setup, estimate, x, parts)?;
+    let rows: Vec<Vec<[f64; 3]>> = estimate.rows.iter().cloned().chain(columns).collect();
     let p = rows.len();
     let mut prior = setup.prior_terms(&estimate.state);
     prior.extend(parts.iter().map(|(part, moved)| (part.sigma.powi(-2), *moved)));
@@ -244,14 +299,8 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
     let squares: f64 = rest.iter().zip(&weights).map(|(r, w)| w * r.iter().map(|v| v * v).sum::<f64>()).sum();
     let samples = 3.0 * rest.len() as f64;
     let (raw, squares) = (squares, squares.max(samples * setup.floor * setup.floor));
-    let (mut covariance, information, _) = covariance(&blocks, &prior, squares, samples)?;
-    // What the mesh itself is off by, however well the data tell the place: all else follows it as
-    // it would another place.
-    let by_data = covariance.clone();
-    for k in first..p {
-        let follows: Vec<f64> = (0..p).map(|i| MESHED * by_data[i * p + k] / by_data[k * p + k]).collect();
-        covariance.iter_mut().enumerate().for_each(|(at, v)| *v += follows[at / p] * follows[at % p]);
-    }
+    let (by_data, information, _) = covariance(&blocks, &prior, squares, samples)?;
+    let covariance = with_mesh(by_data, p, first, 1.0);
     let found = || parts.iter().zip(&step[first..]).map(|((part, moved), step)| (part, moved + step));
     let faces = found().filter_map(|(part, offset)| part.name.clone().map(|name| (name, offset))).collect();
     let shapes = found().filter(|(part, _)| part.name.is_none()).map(|(_, offset)| offset).collect();

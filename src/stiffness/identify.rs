@@ -174,7 +174,11 @@ impl Setup<'_> {
         State { theta: vec![0.0; self.body.labels.len()], plates, x: None }
     }
 
-    pub(super) fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
+    /// Solves the forward problem for a state; `precision` (mm) ends Newton's method.
+    ///
+    /// # Errors
+    /// [`StiffnessError`] when no equilibrium is found.
+    pub fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
         let problem = self.problem(state);
         // What was measured to touch is nearer to the truth than what a body as it was would touch.
         let plate = problem.plate.as_ref().filter(|_| state.x.is_none());
@@ -254,7 +258,7 @@ impl Setup<'_> {
     /// Force (kPa mm^2) with which each plate pushes the body across it (loaded, held). That of a
     /// plate on a curved body is what the ties hold against it: linear in `x`, so it needs no
     /// better solution than that.
-    pub(super) fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
+    pub fn forces(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> [f64; 2] {
         let n = self.patches[1].normal;
         let pushed = self.whole_force(problem, state, x);
         [-dot(pushed, n), -dot(self.reaction(problem, state, x, 0), self.patches[0].normal)]
@@ -262,7 +266,7 @@ impl Setup<'_> {
 
     /// By how many times the whole force on the loaded plate is more than its part across it (1 at
     /// least), told as in `forces`.
-    fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
+    pub fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
         let whole = self.whole_force(problem, state, x);
         length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
     }
@@ -455,7 +459,7 @@ impl Setup<'_> {
     }
 
     /// 1 / variance and present distance of each parameter's prior.
-    pub(super) fn prior_terms(&self, state: &State) -> Vec<(f64, f64)> {
+    pub fn prior_terms(&self, state: &State) -> Vec<(f64, f64)> {
         let moduli = self.free().into_iter().map(|r| (PRIOR.powi(-2), state.theta[r]));
         let plates = state.plates.iter().flatten().map(|&c| (self.plate_prior.powi(-2), c));
         moduli.chain(plates).collect()

@@ -172,6 +172,11 @@ fn spread(block: usize) -> f64 {
     ((block * block - 1) as f64 / 12.0).sqrt()
 }
 
+/// Voxels along the edge of the blocks that a body of so many voxels is averaged over.
+pub fn block_for(voxels: usize) -> usize {
+    (1..6).find(|b| voxels / (b * b * b) <= SAMPLES).unwrap_or(6)
+}
+
 /// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The
 /// second value is the number of voxels along a block's edge. The model's mean is taken as well:
 /// where strain changes, that is not the displacement at the middle.
@@ -180,7 +185,7 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
     let [nx, ny, nz] = grid.shape();
     let inside = mask.as_slice();
     let voxels = inside.iter().filter(|&&v| v > 0).count();
-    let block = (1..6).find(|b| voxels / (b * b * b) <= SAMPLES).unwrap_or(6);
+    let block = block_for(voxels);
     let middle = 0.5 * (block - 1) as f64;
     let parts: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
     let row = |k: usize| {

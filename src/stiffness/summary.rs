@@ -13,7 +13,7 @@ use crate::types::stiffness::{Law, StiffnessParams};
 
 /// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies
 /// within two of them).
-pub(super) const VAGUE: f64 = 0.35;
+pub const VAGUE: f64 = 0.35;
 /// A region is looked at more closely where a modulus e times as large moves no tissue by this part
 /// of the plates' motion.
 const DOUBTED: f64 = 0.02;
@@ -27,12 +27,12 @@ const MOST_MOVED: f64 = 0.02;
 /// Precision of the solution for that (part of the plates' motion).
 const ALIKE: f64 = 0.02;
 /// Part of the force from which a region that is not seen makes a bound of the others' moduli.
-pub(super) const BEARS: f64 = 0.03;
+pub const BEARS: f64 = 0.03;
 /// Contrasts beyond e^this are checked against a rigid region (12).
 const HIGH: f64 = 2.5;
 /// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and
 /// labels leave open.
-const SEEN: f64 = 3.9;
+pub const SEEN: f64 = 3.9;
 
 /// ln E of each region with gradient and covariance.
 #[derive(Debug, Clone)]

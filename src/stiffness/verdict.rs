@@ -93,6 +93,11 @@ pub struct Found<'a> {
     pub reference: usize,
 }
 
+/// The error of ln E on the fine mesh, of a `change` of it from the coarse to the fine one.
+pub fn mesh_error(change: f64) -> f64 {
+    if change.abs() < RESOLVED { change / 3.0 } else { change }
+}
+
 /// Which side of a modulus is open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Side {
@@ -164,13 +169,12 @@ impl Found<'_> {
     /// Standard deviation of ln E and of ln of the ratio to the reference.
     fn deviations(&self, r: usize) -> [f64; 2] {
         let (count, reference) = (self.moduli.log.len(), self.reference);
-        let mesh = |change: f64| if change.abs() < RESOLVED { change / 3.0 } else { change };
         let shape = self.shapes[r].slope() * (self.moduli.log[r] - self.moduli.log[reference]).abs();
         let data = self.moduli.covariance[r * count + r].max(0.0);
-        let sd = (data + mesh(self.mesh_change[r]).powi(2) + shape * shape).sqrt();
+        let sd = (data + mesh_error(self.mesh_change[r]).powi(2) + shape * shape).sqrt();
         let between = match r == reference {
             true => 0.0,
-            false => mesh(self.mesh_change[r] - self.mesh_change[reference]).powi(2) + shape * shape,
+            false => mesh_error(self.mesh_change[r] - self.mesh_change[reference]).powi(2) + shape * shape,
         };
         [sd, (self.moduli.ratio_variance[r] + between).sqrt()]
     }

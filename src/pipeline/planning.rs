@@ -1,0 +1,558 @@
+//! What a press would tell of assumed moduli, before anything is measured.
+//!
+//! The forward model of `stiffness` gives the field of a press. The field is read as a measured one
+//! would be, and the sensitivities of moduli, plates and open parts of the shape give the
+//! information of its samples. Press, voxel size and noise scale that information; its inverse is
+//! the covariance that `stiffness` would state. All is under the linear law.
+
+use crate::error::{ParamError, StiffnessError};
+use crate::mesh::tetrahedral::{Fineness, Mesher};
+use crate::numerics::cholesky::Cholesky;
+use crate::numerics::neighbours::Neighbours;
+use crate::numerics::tetrahedron::shapes;
+use crate::pipeline::field::{Clock, Progress};
+use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, whole};
+use crate::stiffness::body::Body;
+use crate::stiffness::elements::Mapping;
+use crate::stiffness::coherent::dilution;
+use crate::stiffness::geometry::{self, Open};
+use crate::stiffness::identify::{Estimate, Setup, State};
+use crate::stiffness::interface::Interface;
+use crate::stiffness::level::Level;
+use crate::stiffness::observations::{block_for, find, read};
+use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
+use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
+use crate::stiffness::verdict::mesh_error;
+use crate::stiffness::maps;
+use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion, Press};
+use crate::types::space::dot;
+use crate::types::stiffness::{Contact, Law, LawChoice, StiffnessParams};
+use crate::types::{DenseField, Mask};
+
+/// What is planned for.
+#[derive(Clone, Copy)]
+pub struct PlanInputs<'a> {
+    /// The regions; 0 outside the body.
+    pub labels: &'a Mask,
+    /// Where the body is to be held.
+    pub held: &'a Place,
+    /// Where it is to be pressed.
+    pub load: &'a Place,
+    /// A name for each label.
+    pub names: &'a dyn Fn(u8) -> String,
+}
+
+/// What a press does to a body of the assumed moduli.
+#[derive(Debug, Clone)]
+pub struct Simulated {
+    /// The displacement on the labels' grid (mm, RAS), without noise; 0 outside the body.
+    pub field: DenseField,
+    /// Force of the plate on the body (N).
+    pub force_n: f64,
+    /// Largest principal strain (1), 95th percentile over the body.
+    pub strain: f64,
+}
+
+/// Precision of forward solutions (mm).
+const PRECISION: f64 = 1e-5;
+/// Part of what faces the load from which its end is a flat face, which is pressed as a whole.
+const FLAT: f64 = 0.6;
+/// Cosine of the angle to the load within which a facet faces it.
+const FACING: f64 = 0.7;
+/// Largest press over the body's extent along the load: beyond, a linear law says nothing.
+const DEEPEST: f64 = 0.5;
+/// Fewest samples of a body that `stiffness` takes.
+const NEEDED: f64 = 100.0;
+/// Voxels around a surface node that are read for its motion.
+const REACH: f64 = 3.0;
+/// Nodes over what is asked for from which a coarser mesh is made.
+const OVER: f64 = 1.15;
+
+/// The body with its plates, before it is pressed.
+struct Bench<'a> {
+    inputs: &'a PlanInputs<'a>,
+    params: &'a PlanParams,
+    body: Body,
+    /// Outward unit vector of the loaded side (RAS).
+    outward: [f64; 3],
+    /// Surface nodes that the plate moves as a whole; none where the side is curved.
+    flat: Option<Vec<u32>>,
+    /// Extent of the body along the load (mm).
+    extent: f64,
+}
+
+impl<'a> Bench<'a> {
+    fn new(inputs: &'a PlanInputs<'a>, params: &'a PlanParams) -> Result<Self, StiffnessError> {
+        params.check()?;
+        whole(inputs.labels)?;
+        let labels = inputs.labels.as_slice();
+        if let Some(&label) = labels.iter().find(|l| **l > 0 && params.modulus(**l).is_none()) {
+            let range = "a label with an assumed modulus: give one for every label, as 1=20,2=100 (kPa)";
+            return Err(ParamError { name: "modulus: label", value: f64::from(label), range }.into());
+        }
+        let mesher = Mesher::new(inputs.labels)?;
+        let (volume, nodes) = (maps::volume(inputs.labels), params.stiffness.nodes as f64);
+        let mut mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
+        let count = mesh.nodes().len() as f64;
+        if count > OVER * nodes {
+            // Thin layers take more nodes than a block does.
+            mesh = mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?;
+        }
+        let body = Body::new(&mesh)?;
+        let mut out = Self { inputs, params, body, outward: [0.0; 3], flat: None, extent: 0.0 };
+        out.place_plate()?;
+        Ok(out)
+    }
+
+    fn voxel(&self) -> f64 {
+        self.inputs.labels.grid().least_spacing()
+    }
+
+    /// The surface motion of nodes that go in by `depth` (mm) along `along`, the others at rest.
+    fn motion(&self, depth: impl Fn(u32) -> f64, along: impl Fn(u32) -> [f64; 3]) -> SurfaceMotion {
+        let mut displacement = vec![None; self.body.places.len()];
+        for n in self.body.nodes_on(0..self.body.surface.len()) {
+            displacement[n as usize] = Some(along(n).map(|v| -depth(n) * v));
+        }
+        SurfaceMotion { sharp: displacement.clone(), displacement, error: 0.0, sharp_error: 0.0, near: REACH }
+    }
+
+    fn find(&self, motion: &SurfaceMotion) -> Result<Vec<Patch>, StiffnessError> {
+        let PlanInputs { labels, held, load, .. } = *self.inputs;
+        let mut found = patches::find(&self.body, motion, held, load, None, labels.grid())?;
+        // Where the body ends with the volume it is left free.
+        found.truncate(2);
+        Ok(found)
+    }
+
+    /// Which way the load goes, and what it moves.
+    fn place_plate(&mut self) -> Result<(), StiffnessError> {
+        let body = &self.body;
+        match self.inputs.load {
+            Place::Side(side) => {
+                self.outward = side.direction();
+                let (d, voxel) = (self.outward, self.voxel());
+                let height = |n: u32| dot(body.places[n as usize], d);
+                let facing: Vec<usize> =
+                    (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > FACING).collect();
+                let end = facing.iter().flat_map(|&f| body.surface[f].nodes).map(height).fold(f64::NEG_INFINITY, f64::max);
+                let near = |f: &usize| body.surface[*f].nodes.iter().filter(|n| height(**n) > end - voxel).count() >= 3;
+                let area = |all: &[usize]| all.iter().map(|&f| body.surface[f].area).sum::<f64>();
+                let at_end: Vec<usize> = facing.iter().copied().filter(near).collect();
+                self.flat = (area(&at_end) > FLAT * area(&facing)).then(|| body.nodes_on(at_end));
+            }
+            Place::Mask(..) => {
+                // A push all over tells which surface the masks cover.
+                let mut normals = vec![[0.0; 3]; body.places.len()];
+                for f in &body.surface {
+                    f.nodes.iter().for_each(|&n| (0..3).for_each(|a| normals[n as usize][a] += f.area * f.normal[a]));
+                }
+                let unit = |n: u32| {
+                    let v = normals[n as usize];
+                    let length = dot(v, v).sqrt().max(f64::MIN_POSITIVE);
+                    v.map(|c| c / length)
+                };
+                let loaded = self.find(&self.motion(|_| self.voxel(), unit))?.swap_remove(1);
+                (self.outward, self.flat) = (loaded.normal, Some(loaded.nodes));
+            }
+        }
+        let all = self.body.places.iter().map(|p| dot(*p, self.outward));
+        let [low, high] = all.fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)]);
+        self.extent = high - low;
+        Ok(())
+    }
+
+    /// How the loaded patch touches.
+    fn contact(&self) -> Contact {
+        if self.flat.is_some() { self.params.contact } else { Contact::Sliding }
+    }
+
+    /// The patches with the loaded one moved in by `press` mm.
+    fn pressed(&self, press: f64) -> Result<Vec<Patch>, StiffnessError> {
+        let height = |n: u32| dot(self.body.places[n as usize], self.outward);
+        let end = (0..self.body.places.len() as u32).map(height).fold(f64::NEG_INFINITY, f64::max);
+        let depth = |n: u32| match &self.flat {
+            Some(nodes) => if nodes.binary_search(&n).is_ok() { press } else { 0.0 },
+            None => (height(n) - (end - press)).max(0.0),
+        };
+        let mut found = self.find(&self.motion(depth, |_| self.outward))?;
+        found[1].contact = self.contact();
+        Ok(found)
+    }
+
+    /// ln of the shear moduli of a body's regions over the `reference`'s.
+    fn theta(&self, body: &Body, reference: usize) -> Vec<f64> {
+        let mu = |label: u8| {
+            let e = self.params.modulus(label).unwrap_or(1.0);
+            e / (2.0 * (1.0 + self.params.stiffness.poisson_of(label)))
+        };
+        body.labels.iter().map(|&l| (mu(l) / mu(body.labels[reference])).ln()).collect()
+    }
+
+    /// The field of a press of so many mm.
+    fn simulate(&self, press: f64) -> Result<Simulated, StiffnessError> {
+        if press > DEEPEST * self.extent {
+            let range = "half of the body's extent along the load at most; press less";
+            return Err(ParamError { name: "press", value: press, range }.into());
+        }
+        let mut body = self.body.clone();
+        let patches = self.pressed(press)?;
+        if let Some(nodes) = patches[1].near_contact(&body) {
+            body.eliminate_last(&nodes)?;
+        }
+        let poisson: Vec<f64> = body.labels.iter().map(|&l| self.params.stiffness.poisson_of(l)).collect();
+        let theta = self.theta(&body, 0);
+        let setup = Setup {
+            body: &body,
+            law: Law::Linear,
+            poisson,
+            patches,
+            observations: &[],
+            reference: 0,
+            plate_prior: 1.0,
+            floor: 1.0,
+            open: &[],
+            pinned: Vec::new(),
+        };
+        let mut state = State { theta, ..setup.start() };
+        let (problem, solution) = setup.solve(&state, PRECISION)?;
+        let force = setup.forces(&problem, &state, &solution.x)[0] * setup.leaning(&problem, &state, &solution.x);
+        let e = self.params.modulus(body.labels[0]).unwrap_or(1.0);
+        let kpa = e / (2.0 * (1.0 + setup.poisson[0]));
+        let field = on_grid(&body, &solution.x, self.inputs.labels);
+        state.x = Some(solution.x);
+        Ok(Simulated { field, force_n: force * kpa / 1000.0, strain: summary::strain(&setup, &state) })
+    }
+
+    /// The parameters of a measurement of a press with the force `force` (N).
+    fn measurement(&self, force: f64) -> StiffnessParams {
+        let fixed = Vec::new();
+        StiffnessParams { model: LawChoice::Linear, force_n: Some(force.abs()), fixed, ..self.params.stiffness.clone() }
+    }
+}
+
+/// The displacement at the voxels of the labels; that of the nearest element where a voxel's centre
+/// lies just outside the mesh.
+fn on_grid(body: &Body, x: &[f64], labels: &Mask) -> DenseField {
+    let grid = *labels.grid();
+    let inside: Vec<usize> = (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0).collect();
+    let world = |o: usize| {
+        let at = grid.voxel(o).map(|v| v as f64);
+        grid.affine().to_world(crate::types::VoxelPoint(at)).0
+    };
+    let places: Vec<[f64; 3]> = inside.iter().map(|&o| world(o)).collect();
+    let near = Neighbours::new(&body.places);
+    let mut holder = vec![0u32; body.places.len()];
+    for (e, nodes) in body.cells.iter().enumerate() {
+        nodes.iter().for_each(|&n| holder[n as usize] = e as u32);
+    }
+    let beside = |p: [f64; 3]| {
+        let &n = near.within(p, f64::INFINITY, 1).first()?;
+        let nodes = body.cells[holder[n] as usize].map(|m| body.places[m as usize]);
+        // One whose shape leads far away is not gone by.
+        let l = Mapping::of(&nodes).locate(p).filter(|l| l.iter().all(|v| *v > -1.0));
+        Some(match l {
+            Some(l) => read(&[(holder[n], shapes(l))], body, x),
+            None => body.displacement(x, n as u32),
+        })
+    };
+    let mut values = vec![[0.0; 3]; grid.len()];
+    for ((o, p), found) in inside.iter().zip(&places).zip(find(body, &places)) {
+        values[*o] = match found {
+            Some(reading) => read(&[reading], body, x),
+            None => beside(*p).unwrap_or_default(),
+        };
+    }
+    DenseField::from_voxels(grid, |o, _| values[o])
+}
+
+/// The field of one press on the assumed moduli, without noise.
+///
+/// # Errors
+/// As [`run`].
+pub fn simulate(inputs: &PlanInputs<'_>, params: &PlanParams, press_mm: f64) -> Result<Simulated, StiffnessError> {
+    Bench::new(inputs, params)?.simulate(press_mm)
+}
+
+/// The information of one solved press, and what it takes to scale it.
+struct Solved {
+    /// The press that was solved for (mm).
+    press: f64,
+    /// Largest principal strain there (1).
+    strain: f64,
+    /// Force there (N).
+    force: f64,
+    /// Free moduli, and plate parameters after them; offsets follow.
+    counts: [usize; 2],
+    /// Sum over the samples of the products of the parameters' columns (mm^2), row by row.
+    information: Vec<f64>,
+    /// 1 / variance of each parameter's prior, on voxels of the labels' size.
+    prior: Vec<f64>,
+    /// Derivative of ln force by each parameter.
+    force_slope: Vec<f64>,
+    /// For each region its number among the free moduli.
+    free: Vec<Option<usize>>,
+    /// Error of ln E (and of ln of its ratio) by the mesh, for each region.
+    mesh: Vec<[f64; 2]>,
+    /// What the mesh leaves over (mm, root mean square of one component).
+    rest: f64,
+    /// The error of the finite elements (mm).
+    floor: f64,
+    /// Voxels of the body, voxels along the edge of a block, samples.
+    sampled: (usize, usize, f64),
+    /// Regions that the field shows nothing of.
+    hidden: Vec<bool>,
+    /// Whether those bear so much force that others are bounds.
+    borne: bool,
+    /// Regions so far from the reference that they are as good as rigid or empty.
+    far: Vec<bool>,
+    /// The region that ratios refer to.
+    reference: usize,
+}
+
+impl Solved {
+    fn new(bench: &Bench<'_>, press: f64) -> Result<Self, StiffnessError> {
+        let Simulated { field, force_n, strain } = bench.simulate(press)?;
+        let PlanInputs { labels, held, load, names } = *bench.inputs;
+        let quality = FieldQuality::default();
+        let inputs = Inputs { field: &field, matches: None, labels, labelled: true, held, load, names, quality };
+        let params = bench.measurement(force_n);
+        let mut level = Meshed::new(&inputs, &params)?.coarse;
+        level.patches[0].contact = Contact::Sticking;
+        level.patches[1].contact = bench.contact();
+        level.settle_shape()?;
+        Self::of(bench, &level, &params, (press, force_n, strain))
+    }
+
+    fn of(
+        bench: &Bench<'_>,
+        level: &Level,
+        params: &StiffnessParams,
+        (press, force, strain): (f64, f64, f64),
+    ) -> Result<Self, StiffnessError> {
+        let reference = level.largest();
+        let mut setup = level.setup(Law::Linear, params, reference);
+        let theta = bench.theta(&level.body, reference);
+        let mut estimate = true_state(&setup, &theta)?;
+        // Of a region that nothing is seen of the others are told as if it were known.
+        let (mut hidden, mut borne) = (vec![false; theta.len()], 0.0);
+        while let Some(found) = summary::least_seen(&setup, &estimate) {
+            let Some(r) = level.body.labels.iter().position(|l| *l == found.label) else { break };
+            (hidden[r], borne) = (true, borne + found.share);
+            setup.pinned.push((r, theta[r]));
+            estimate = true_state(&setup, &theta)?;
+        }
+        let interfaces = Interface::all(bench.inputs.labels);
+        let Open { rows, force_slope, sigma } = geometry::open(&setup, &estimate, &level.grid, &interfaces)?;
+        let found = summary::moduli(&setup, &estimate, None, Scale::Force(force.abs())).log;
+        let change = |r: usize| bench.params.modulus(level.body.labels[r]).unwrap_or(1.0).ln() - found[r];
+        let mesh = (0..theta.len())
+            .map(|r| [mesh_error(change(r)), mesh_error(change(r) - change(reference))])
+            .collect();
+        let all: Vec<&Vec<[f64; 3]>> = estimate.rows.iter().chain(&rows).collect();
+        let product = |i: usize| {
+            let (a, b) = (all[i / all.len()], all[i % all.len()]);
+            a.iter().zip(b).map(|(u, v)| dot(*u, *v)).sum::<f64>()
+        };
+        let mut prior: Vec<f64> = setup.prior_terms(&estimate.state).iter().map(|p| p.0).collect();
+        prior.extend(sigma.iter().map(|s| s.powi(-2)));
+        let free = setup.free();
+        let inside = bench.inputs.labels.as_slice().iter().filter(|l| **l > 0).count();
+        Ok(Self {
+            press,
+            strain,
+            force,
+            counts: [free.len(), estimate.parameters],
+            information: (0..all.len() * all.len()).map(product).collect(),
+            prior,
+            force_slope: estimate.force_slope.iter().chain(&force_slope).copied().collect(),
+            free: (0..theta.len()).map(|r| free.iter().position(|f| *f == r)).collect(),
+            mesh,
+            rest: estimate.rms,
+            floor: setup.floor,
+            sampled: (inside, level.block.max(1), estimate.residuals.len() as f64),
+            hidden,
+            borne: borne > BEARS,
+            far: theta.iter().map(|t| t.abs() > SEEN).collect(),
+            reference,
+        })
+    }
+
+    /// Relative standard deviation of each region's modulus and its scatter by noise alone, at
+    /// `press` mm, voxels `voxel` times those of the labels, and `noise` mm in each.
+    fn expected(&self, press: f64, voxel: f64, noise: f64, ratios: bool) -> Option<Vec<[f64; 2]>> {
+        let p = self.prior.len();
+        let [moduli, plates] = self.counts;
+        let deeper = press / self.press;
+        // A unit of a plate's parameter is a mm whatever the press; moduli and offsets change what
+        // the press makes.
+        let is_plate = |k: usize| (moduli..plates).contains(&k);
+        let factor = |k: usize| if is_plate(k) { 1.0 } else { deeper };
+        let (inside, block, samples) = self.sampled;
+        let voxels = inside as f64 / voxel.powi(3);
+        let wide = block_for(voxels as usize) as f64;
+        let count = samples * (block as f64 / (voxel * wide)).powi(3);
+        if count < NEEDED {
+            return None;
+        }
+        let model = (deeper * self.rest).max(voxel * self.floor);
+        let variance = noise * noise / wide.powi(3) + model * model;
+        let weight = count / samples / variance;
+        let information: Vec<f64> =
+            (0..p * p).map(|i| self.information[i] * factor(i / p) * factor(i % p) * weight).collect();
+        // The priors of plates and offsets are so many voxels.
+        let prior = |k: usize| if k < moduli { self.prior[k] } else { self.prior[k] / (voxel * voxel) };
+        let inverse = |dilution: f64| {
+            let mut a: Vec<f64> = information.iter().map(|v| v / dilution).collect();
+            (0..p).for_each(|k| a[k * p + k] += prior(k));
+            Some(Cholesky::new(a, p)?.inverse())
+        };
+        let stated = geometry::with_mesh(inverse(1.0)?, p, plates, voxel);
+        // The model's own error is everywhere at once, and offsets are fitted with samples that
+        // count for less; that is what makes moduli scatter.
+        let dilution = dilution(model * model / variance, count).max(1.0);
+        let fitted = inverse(dilution)?;
+        let stated: Vec<f64> = stated.iter().zip(&fitted).map(|(a, b)| a + b).collect();
+        let slope = |k: usize| if is_plate(k) { self.force_slope[k] / deeper } else { self.force_slope[k] };
+        let one = |r: usize| {
+            let gradient: Vec<f64> = (0..p)
+                .map(|k| f64::from(u8::from(self.free[r] == Some(k))) - if ratios { 0.0 } else { slope(k) })
+                .collect();
+            let through = |a: &[f64]| -> Vec<f64> { (0..p).map(|i| product(&a[i * p..(i + 1) * p], &gradient)).collect() };
+            let data = product(&gradient, &through(&stated));
+            let by = through(&fitted);
+            let scatter: f64 = (0..p).map(|i| by[i] * product(&information[i * p..(i + 1) * p], &by)).sum::<f64>();
+            let mesh = self.mesh[r][usize::from(ratios)];
+            [(data.max(0.0) + mesh * mesh).sqrt(), scatter.max(0.0).sqrt() / dilution]
+        };
+        Some((0..self.free.len()).map(one).collect())
+    }
+
+    /// Whether a region is known, and not just a bound, with a deviation of `sd`.
+    fn determines(&self, r: usize, sd: f64, ratios: bool) -> bool {
+        sd <= VAGUE && !self.hidden[r] && !self.far[r] && (ratios || !self.borne)
+    }
+}
+
+fn product(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+/// The estimate at given moduli, with the plates as the field has them.
+fn true_state(setup: &Setup<'_>, theta: &[f64]) -> Result<Estimate, StiffnessError> {
+    setup.run(State { theta: theta.to_vec(), ..setup.start() }, 0, PRECISION)
+}
+
+fn sorted(mut values: Vec<f64>) -> Vec<f64> {
+    values.sort_by(f64::total_cmp);
+    values.dedup();
+    values
+}
+
+/// The expected deviation of each modulus for every press, voxel size and noise.
+///
+/// # Errors
+/// [`StiffnessError`] for parameters out of range, a label without a modulus, a body that is not
+/// whole, patches that are not found, and equations that cannot be solved for any press.
+pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>) -> Result<Plan, StiffnessError> {
+    let mut clock = Clock::start();
+    progress("mesh", 0.0);
+    let bench = Bench::new(inputs, params)?;
+    let given = &params.press_mm;
+    let usual = || PlanParams::PRESS.map(|part| part * bench.extent).to_vec();
+    let presses = sorted(if given.is_empty() { usual() } else { given.clone() });
+    let own = bench.voxel();
+    let voxels = sorted(if params.voxel_mm.is_empty() { vec![own] } else { params.voxel_mm.clone() });
+    clock.book("mesh");
+
+    // Of a flat patch one solution serves all presses; a curved one touches with more of itself.
+    let mut warnings = Vec::new();
+    let mut solved: Vec<(f64, Solved)> = Vec::new();
+    let deepest = presses.len() - 1;
+    let wanted: Vec<f64> = if bench.flat.is_some() { vec![presses[deepest]] } else { presses.clone() };
+    let mut failure = None;
+    for (i, &press) in wanted.iter().enumerate() {
+        progress("press", 0.1 + 0.85 * i as f64 / wanted.len() as f64);
+        match Solved::new(&bench, press) {
+            Ok(found) => solved.push((press, found)),
+            Err(error @ StiffnessError::Param(_)) => return Err(error),
+            Err(error) => {
+                warnings.push(format!("a press of {press:.3} mm is left out: {error}"));
+                failure = Some(error);
+            }
+        }
+    }
+    clock.book("presses");
+    let Some(first) = solved.first() else { return Err(failure.unwrap_or(StiffnessError::NoEquilibrium)) };
+    let of = |press: f64| if bench.flat.is_some() { Some(&first.1) } else { solved.iter().find(|s| s.0 == press).map(|s| &s.1) };
+
+    let body = &bench.body;
+    let reference = first.1.reference;
+    let regions: Vec<PlannedRegion> = (0..body.labels.len())
+        .map(|r| PlannedRegion {
+            label: body.labels[r],
+            name: (inputs.names)(body.labels[r]),
+            youngs_modulus: params.modulus(body.labels[r]).unwrap_or(f64::NAN),
+            volume: body.volumes[r],
+            wanted: !params.ratios || r != reference,
+        })
+        .collect();
+    let mut expected = Vec::new();
+    for &voxel in &voxels {
+        let usual = || PlanParams::NOISE.map(|part| part * voxel).to_vec();
+        let noises = sorted(if params.noise_mm.is_empty() { usual() } else { params.noise_mm.clone() });
+        let before = expected.len();
+        for &noise in &noises {
+            for &press in &presses {
+                let Some((solved, found)) = of(press).and_then(|s| Some((s, s.expected(press, voxel / own, noise, params.ratios)?)))
+                else {
+                    continue;
+                };
+                expected.extend(regions.iter().zip(found).enumerate().map(|(r, (region, [sd, scatter]))| {
+                    let determined = solved.determines(r, sd, params.ratios);
+                    let (label, name) = (region.label, region.name.clone());
+                    let enough = determined && region.wanted && sd <= params.want;
+                    Expected { press_mm: press, voxel_mm: voxel, noise_mm: noise, label, name, sd, scatter, determined, enough }
+                }));
+            }
+        }
+        if expected.len() == before {
+            warnings.push(format!("voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"));
+        }
+    }
+    if expected.is_empty() {
+        let value = voxels[0];
+        let range = "small enough that the body holds 100 voxels; take smaller ones";
+        return Err(ParamError { name: "voxel", value, range }.into());
+    }
+    let told = |&press: &f64| {
+        let solved = of(press)?;
+        let deeper = press / solved.press;
+        Some(Press { press_mm: press, strain: deeper * solved.strain, force_n: deeper * solved.force.abs() })
+    };
+    let presses: Vec<Press> = presses.iter().filter_map(told).collect();
+    let large: Vec<String> =
+        presses.iter().filter(|p| p.strain > LARGE_STRAIN).map(|p| format!("{:.3}", p.press_mm)).collect();
+    if !large.is_empty() {
+        warnings.push(format!(
+            "strains pass {:.0} % at {} mm: the plan's law is linear, and `stiffness` takes the neo-Hookean one there",
+            100.0 * LARGE_STRAIN,
+            large.join(", ")
+        ));
+    }
+    clock.book("options");
+    Ok(Plan {
+        want: params.want,
+        ratios: params.ratios,
+        regions,
+        sides: [inputs.held.name(), inputs.load.name()],
+        contact: bench.contact(),
+        extent_mm: bench.extent,
+        label_voxel_mm: own,
+        presses,
+        voxel_mm: voxels,
+        expected,
+        warnings,
+        seconds: clock.0,
+    })
+}

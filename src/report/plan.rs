@@ -1,0 +1,1 @@
+//! report.html, summary.json and the sentences of `palpate plan`.
