@@ -87,6 +87,16 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ),
         ],
     ),
+    (
+        "plan",
+        &[
+            ("before a measurement, moduli as expected", "plan --labels labels.nii.gz --modulus 1=20,2=100 -o plan"),
+            (
+                "some presses, voxels and noises, 5 % wanted",
+                "plan --labels labels.nii.gz --modulus 1=20,2=100 --want 5 --press 0.5,1,2 --voxel 0.5,1 --noise 0.05 -o plan",
+            ),
+        ],
+    ),
     ("fingertip", &[("for a grasp scene", "fingertip stiffness -o fingertip.toml")]),
     (
         "batch",

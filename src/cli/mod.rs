@@ -53,6 +53,8 @@ mod outputs;
 
 mod peers;
 
+mod plan;
+
 mod phantom;
 
 mod record;
@@ -150,6 +152,8 @@ enum Command {
     Certify(certify::Options),
     /// Young's modulus from a displacement field, region by region or without regions
     Stiffness(stiffness::Options),
+    /// Which press, voxel size and noise would give a wanted deviation of each modulus, from labels
+    Plan(plan::Options),
     /// Reduce a stiffness map of a finger pad to a fingertip for grasps
     Fingertip(fingertip::Options),
     /// Take a table of pairs through field, stiffness, fingertip and grasp, in parallel and
@@ -253,6 +257,7 @@ fn dispatch(command: &Command, console: &Console) -> anyhow::Result<()> {
         Command::Strain(options) => strain::run(options, console),
         Command::Certify(options) => certify::run(options, console),
         Command::Stiffness(options) => stiffness::run(options, console),
+        Command::Plan(options) => plan::run(options, console),
         Command::Fingertip(options) => fingertip::run(options, console),
         Command::Batch(options) => batch::run(options, console),
         Command::Grasp(options) => grasp::run(options, console),

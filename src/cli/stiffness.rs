@@ -451,7 +451,7 @@ impl Setting {
     }
 }
 
-fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place> {
+pub(super) fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place> {
     match Side::parse(text) {
         Some(side) => Ok(Place::Side(side)),
         None => {
@@ -502,11 +502,11 @@ impl Materials {
     }
 }
 
-fn number(text: &str, flag: &str, form: &str) -> Result<f64> {
+pub(super) fn number(text: &str, flag: &str, form: &str) -> Result<f64> {
     text.trim().parse().map_err(|_| Usage(format!("{flag}: {text:?} is not of the form {form}")).into())
 }
 
-fn put(all: &mut Vec<(u8, f64)>, label: &str, value: &str, flag: &str, form: &str) -> Result<()> {
+pub(super) fn put(all: &mut Vec<(u8, f64)>, label: &str, value: &str, flag: &str, form: &str) -> Result<()> {
     let Ok(label) = label.trim().parse::<u8>() else {
         bail!(Usage(format!("{flag}: {label:?} is no label (1 to 255); write it as {form}")));
     };
@@ -518,7 +518,7 @@ fn put(all: &mut Vec<(u8, f64)>, label: &str, value: &str, flag: &str, form: &st
 }
 
 /// A name for every label; separated as on a command line or as in a table of pairs.
-fn names(given: Option<&str>, labels: &Mask) -> Result<Vec<String>> {
+pub(super) fn names(given: Option<&str>, labels: &Mask) -> Result<Vec<String>> {
     let mut out: Vec<String> = (0..256).map(|l| format!("region {l}")).collect();
     for pair in given.into_iter().flat_map(|g| g.split([',', ';'])) {
         let parsed = pair.split_once('=').and_then(|(l, n)| Some((l.trim().parse::<u8>().ok()?, n.trim())));

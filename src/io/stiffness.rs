@@ -9,6 +9,7 @@ use super::atomic::write_atomic;
 use super::csv::{read_table, write_table};
 use super::format;
 use crate::error::IoError;
+use crate::types::plan::Plan;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Determined, Law, Prescribed, RegionStiffness, SharedStiffness, StiffnessResult};
 use std::io::{self, Write};
@@ -42,6 +43,33 @@ pub fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<
                 })
                 .collect(),
         }
+    });
+    write_table(path.as_ref(), &COLUMNS, rows)
+}
+
+/// Writes a row for each choice of a plan and region: press, voxel and noise (mm), label, name,
+/// expected standard deviation and the scatter by noise alone (%), determined and enough (1 or 0).
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_plan(path: impl AsRef<Path>, plan: &Plan) -> Result<(), IoError> {
+    const COLUMNS: [&str; 9] = [
+        "press_mm",
+        "voxel_mm",
+        "noise_mm",
+        "label",
+        "name",
+        "expected_sd_percent",
+        "scatter_percent",
+        "determined",
+        "enough",
+    ];
+    let rows = plan.expected.iter().map(|e| {
+        let lengths = [e.press_mm, e.voxel_mm, e.noise_mm].map(|v| format!("{v:.6}"));
+        let sds = [e.sd, e.scatter].map(|v| format!("{:.4}", 100.0 * v));
+        let said = [e.determined, e.enough].map(|v| u8::from(v).to_string());
+        let named = [e.label.to_string(), e.name.clone()];
+        lengths.into_iter().chain(named).chain(sds).chain(said).collect()
     });
     write_table(path.as_ref(), &COLUMNS, rows)
 }

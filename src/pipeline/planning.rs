@@ -14,8 +14,7 @@ use crate::pipeline::field::{Clock, Progress};
 use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, whole};
 use crate::stiffness::body::Body;
 use crate::stiffness::elements::Mapping;
-use crate::stiffness::coherent::dilution;
-use crate::stiffness::geometry::{self, Open};
+use crate::stiffness::geometry::{self, DILUTION, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
@@ -344,7 +343,12 @@ impl Solved {
         }
         let interfaces = Interface::all(bench.inputs.labels);
         let Open { rows, force_slope, sigma } = geometry::open(&setup, &estimate, &level.grid, &interfaces)?;
-        let found = summary::moduli(&setup, &estimate, None, Scale::Force(force.abs())).log;
+        let left = Geometry {
+            step: last_step(&setup, &estimate)?,
+            covariance: vec![0.0; estimate.parameters * estimate.parameters],
+            ..Geometry::default()
+        };
+        let found = summary::moduli(&setup, &estimate, Some(&left), Scale::Force(force.abs())).log;
         let change = |r: usize| bench.params.modulus(level.body.labels[r]).unwrap_or(1.0).ln() - found[r];
         let mesh = (0..theta.len())
             .map(|r| [mesh_error(change(r)), mesh_error(change(r) - change(reference))])
@@ -441,6 +445,19 @@ fn product(a: &[f64], b: &[f64]) -> f64 {
 /// The estimate at given moduli, with the plates as the field has them.
 fn true_state(setup: &Setup<'_>, theta: &[f64]) -> Result<Estimate, StiffnessError> {
     setup.run(State { theta: theta.to_vec(), ..setup.start() }, 0, PRECISION)
+}
+
+/// The step of all parameters that an estimate would still take, to first order.
+fn last_step(setup: &Setup<'_>, estimate: &Estimate) -> Result<Vec<f64>, StiffnessError> {
+    let (p, rows) = (estimate.parameters, &estimate.rows);
+    let sum = |a: &[[f64; 3]], b: &[[f64; 3]]| a.iter().zip(b).map(|(u, v)| dot(*u, *v)).sum::<f64>();
+    let mut a: Vec<f64> = (0..p * p).map(|i| sum(&rows[i / p], &rows[i % p])).collect();
+    let variance = estimate.rms * estimate.rms;
+    let prior = setup.prior_terms(&estimate.state);
+    (0..p).for_each(|k| a[k * p + k] += variance * prior[k].0);
+    let mut step: Vec<f64> = rows.iter().map(|row| sum(row, &estimate.residuals)).collect();
+    Cholesky::new(a, p).ok_or(StiffnessError::Unsolvable)?.solve(&mut step);
+    Ok(step)
 }
 
 fn sorted(mut values: Vec<f64>) -> Vec<f64> {

@@ -39,11 +39,9 @@ pub mod names;
 
 pub mod stiffness;
 
-<<<<<<< HEAD
 pub mod solid;
-=======
+
 pub mod plan;
->>>>>>> 2f15aba (Planning: information of a press on assumed moduli)
 
 pub mod fingertip;
 
