@@ -64,14 +64,21 @@ fn measured(field: &DenseField, labels: &Mask, force: f64, params: &PlanParams, 
 
 /// For each region: planned deviation and scatter, mean reported deviation, scatter and mean error
 /// over `seeds` measurements (all relative).
-fn compared(labels: &Mask, params: &PlanParams, [press, noise]: [f64; 2], seeds: u64, sides: [&Place; 2]) -> Vec<[f64; 5]> {
+fn compared(
+    labels: &Mask,
+    params: &PlanParams,
+    [press, noise]: [f64; 2],
+    seeds: u64,
+    sides: [&Place; 2],
+) -> Vec<[f64; 5]> {
     let params = PlanParams { press_mm: vec![press], noise_mm: vec![noise], ..params.clone() };
     let plan = planned(labels, &params, sides);
     let [held, load] = sides;
     let inputs = PlanInputs { labels, held, load, names: &|l| format!("region {l}") };
     let truth = planning::simulate(&inputs, &params, press).unwrap();
-    let runs: Vec<StiffnessResult> =
-        (0..seeds).map(|s| measured(&noisy(&truth.field, labels, noise, s), labels, truth.force_n, &params, sides)).collect();
+    let runs: Vec<StiffnessResult> = (0..seeds)
+        .map(|s| measured(&noisy(&truth.field, labels, noise, s), labels, truth.force_n, &params, sides))
+        .collect();
     let n = seeds as f64;
     plan.expected
         .iter()
@@ -194,7 +201,8 @@ fn the_command_writes_what_it_says_and_refuses_what_it_cannot_plan() {
     palpate::io::write_labels(at.join("labels.nii.gz"), &ball(), "test").unwrap();
     let usual = ["plan", "--labels", "labels.nii.gz", "--nodes", "1500"];
     let with = |more: &[&str], code: i32| fixtures::run(at, &[&usual[..], more].concat(), code);
-    let (out, _) = with(&["--modulus", "1=20,2=60", "--names", "2=lump", "--want", "8", "--noise", "0.05", "-o", "p"], 0);
+    let (out, _) =
+        with(&["--modulus", "1=20,2=60", "--names", "2=lump", "--want", "8", "--noise", "0.05", "-o", "p"], 0);
     for part in ["To know region 1 and lump to 8 % press ", "sticking", "mm of 20", "report.html"] {
         assert!(out.contains(part), "{part} is missing in\n{out}");
     }

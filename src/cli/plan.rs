@@ -118,7 +118,10 @@ fn check_labels(labels: &Mask, params: &PlanParams, path: &Path) -> Result<()> {
     let missing = |l: &u8| held[*l as usize] && params.modulus(*l).is_none();
     if let Some(label) = (1..=255u8).find(missing) {
         let example = format!("--modulus {label}=20");
-        bail!(Usage(format!("--modulus: {} holds label {label}, of which no modulus is assumed; add {example}", name(path))));
+        bail!(Usage(format!(
+            "--modulus: {} holds label {label}, of which no modulus is assumed; add {example}",
+            name(path)
+        )));
     }
     for (flag, given) in [("--modulus", &params.moduli), ("--poisson", &params.stiffness.poisson_of)] {
         if let Some((label, _)) = given.iter().find(|g| !held[g.0 as usize]) {

@@ -119,9 +119,7 @@ pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
 pub use sofa::write_sofa;
 pub use solid::{SolidFile, write_boundary, write_element_moduli};
-pub use stiffness::{
-    KnownMaterial, read_materials, write_feb, write_frames, write_inp, write_plan, write_regions,
-};
+pub use stiffness::{KnownMaterial, read_materials, write_feb, write_frames, write_inp, write_plan, write_regions};
 pub use strain::write_region_strains;
 pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};

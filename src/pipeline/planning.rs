@@ -13,16 +13,17 @@ use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::field::{Clock, Progress};
 use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, whole};
 use crate::stiffness::body::Body;
+use crate::stiffness::coherent::dilution;
 use crate::stiffness::elements::Mapping;
-use crate::stiffness::geometry::{self, DILUTION, Geometry, Open};
+use crate::stiffness::geometry::{self, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
+use crate::stiffness::maps;
 use crate::stiffness::observations::{block_for, find, read};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
 use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
 use crate::stiffness::verdict::mesh_error;
-use crate::stiffness::maps;
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion, Press};
 use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Law, LawChoice, StiffnessParams};
@@ -134,7 +135,8 @@ impl<'a> Bench<'a> {
                 let height = |n: u32| dot(body.places[n as usize], d);
                 let facing: Vec<usize> =
                     (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > FACING).collect();
-                let end = facing.iter().flat_map(|&f| body.surface[f].nodes).map(height).fold(f64::NEG_INFINITY, f64::max);
+                let end =
+                    facing.iter().flat_map(|&f| body.surface[f].nodes).map(height).fold(f64::NEG_INFINITY, f64::max);
                 let near = |f: &usize| body.surface[*f].nodes.iter().filter(|n| height(**n) > end - voxel).count() >= 3;
                 let area = |all: &[usize]| all.iter().map(|&f| body.surface[f].area).sum::<f64>();
                 let at_end: Vec<usize> = facing.iter().copied().filter(near).collect();
@@ -171,7 +173,13 @@ impl<'a> Bench<'a> {
         let height = |n: u32| dot(self.body.places[n as usize], self.outward);
         let end = (0..self.body.places.len() as u32).map(height).fold(f64::NEG_INFINITY, f64::max);
         let depth = |n: u32| match &self.flat {
-            Some(nodes) => if nodes.binary_search(&n).is_ok() { press } else { 0.0 },
+            Some(nodes) => {
+                if nodes.binary_search(&n).is_ok() {
+                    press
+                } else {
+                    0.0
+                }
+            }
             None => (height(n) - (end - press)).max(0.0),
         };
         let mut found = self.find(&self.motion(depth, |_| self.outward))?;
@@ -210,6 +218,7 @@ impl<'a> Bench<'a> {
             reference: 0,
             plate_prior: 1.0,
             floor: 1.0,
+            noise: None,
             open: &[],
             pinned: Vec::new(),
         };
@@ -350,9 +359,8 @@ impl Solved {
         };
         let found = summary::moduli(&setup, &estimate, Some(&left), Scale::Force(force.abs())).log;
         let change = |r: usize| bench.params.modulus(level.body.labels[r]).unwrap_or(1.0).ln() - found[r];
-        let mesh = (0..theta.len())
-            .map(|r| [mesh_error(change(r)), mesh_error(change(r) - change(reference))])
-            .collect();
+        let mesh =
+            (0..theta.len()).map(|r| [mesh_error(change(r)), mesh_error(change(r) - change(reference))]).collect();
         let all: Vec<&Vec<[f64; 3]>> = estimate.rows.iter().chain(&rows).collect();
         let product = |i: usize| {
             let (a, b) = (all[i / all.len()], all[i % all.len()]);
@@ -422,7 +430,8 @@ impl Solved {
             let gradient: Vec<f64> = (0..p)
                 .map(|k| f64::from(u8::from(self.free[r] == Some(k))) - if ratios { 0.0 } else { slope(k) })
                 .collect();
-            let through = |a: &[f64]| -> Vec<f64> { (0..p).map(|i| product(&a[i * p..(i + 1) * p], &gradient)).collect() };
+            let through =
+                |a: &[f64]| -> Vec<f64> { (0..p).map(|i| product(&a[i * p..(i + 1) * p], &gradient)).collect() };
             let data = product(&gradient, &through(&stated));
             let by = through(&fitted);
             let scatter: f64 = (0..p).map(|i| by[i] * product(&information[i * p..(i + 1) * p], &by)).sum::<f64>();
@@ -501,7 +510,9 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
     }
     clock.book("presses");
     let Some(first) = solved.first() else { return Err(failure.unwrap_or(StiffnessError::NoEquilibrium)) };
-    let of = |press: f64| if bench.flat.is_some() { Some(&first.1) } else { solved.iter().find(|s| s.0 == press).map(|s| &s.1) };
+    let of = |press: f64| {
+        if bench.flat.is_some() { Some(&first.1) } else { solved.iter().find(|s| s.0 == press).map(|s| &s.1) }
+    };
 
     let body = &bench.body;
     let reference = first.1.reference;
@@ -521,7 +532,8 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
         let before = expected.len();
         for &noise in &noises {
             for &press in &presses {
-                let Some((solved, found)) = of(press).and_then(|s| Some((s, s.expected(press, voxel / own, noise, params.ratios)?)))
+                let Some((solved, found)) =
+                    of(press).and_then(|s| Some((s, s.expected(press, voxel / own, noise, params.ratios)?)))
                 else {
                     continue;
                 };
@@ -529,12 +541,24 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
                     let determined = solved.determines(r, sd, params.ratios);
                     let (label, name) = (region.label, region.name.clone());
                     let enough = determined && region.wanted && sd <= params.want;
-                    Expected { press_mm: press, voxel_mm: voxel, noise_mm: noise, label, name, sd, scatter, determined, enough }
+                    Expected {
+                        press_mm: press,
+                        voxel_mm: voxel,
+                        noise_mm: noise,
+                        label,
+                        name,
+                        sd,
+                        scatter,
+                        determined,
+                        enough,
+                    }
                 }));
             }
         }
         if expected.len() == before {
-            warnings.push(format!("voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"));
+            warnings.push(format!(
+                "voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"
+            ));
         }
     }
     if expected.is_empty() {

@@ -50,7 +50,9 @@ fn own(plan: &Plan, region: &PlannedRegion) -> String {
     }
     let Some(best) = plan.best(region.label) else { return String::new() };
     let hint = match best.scatter < BY_NOISE * best.sd {
-        true => "What limits it is how well its border and faces are known: smaller voxels or a smaller --label-sd help, less noise hardly.",
+        true => {
+            "What limits it is how well its border and faces are known: smaller voxels or a smaller --label-sd help, less noise hardly."
+        }
         false => "Press more, lower the noise, or load it from another side.",
     };
     let at = choice([best.press_mm, best.voxel_mm, best.noise_mm]);
@@ -61,7 +63,9 @@ fn own(plan: &Plan, region: &PlannedRegion) -> String {
 pub fn sentences(plan: &Plan) -> Vec<String> {
     let labels: Vec<u8> = plan.determined().map(|r| r.label).collect();
     let mut out = match plan.choice(&labels) {
-        Some(found) => vec![format!("To know {} to {} % {}.", listed(plan.determined()), percent(plan.want), choice(found))],
+        Some(found) => {
+            vec![format!("To know {} to {} % {}.", listed(plan.determined()), percent(plan.want), choice(found))]
+        }
         None => plan.determined().map(|r| own(plan, r)).collect(),
     };
     let lost = plan.undetermined().count();
@@ -159,7 +163,11 @@ pub fn text(report: &PlanReport<'_>) -> String {
     let extent = significant(plan.extent_mm);
     let _ = writeln!(out, "  press        {presses} mm of {extent} mm, strains up to {} %", percent(deepest));
     let _ = writeln!(out, "  voxel        {} mm", numbers(plan.voxel_mm.iter().copied()));
-    let _ = writeln!(out, "  noise        {} mm, white, in each voxel and component", numbers(noises(plan, None).into_iter()));
+    let _ = writeln!(
+        out,
+        "  noise        {} mm, white, in each voxel and component",
+        numbers(noises(plan, None).into_iter())
+    );
     for r in plan.regions.iter().filter(|r| r.wanted) {
         let said = match plan.best(r.label) {
             Some(e) => format!(
@@ -230,11 +238,8 @@ pub fn page(report: &PlanReport<'_>) -> String {
             percent(LARGE_STRAIN),
         );
     }
-    let presses: Vec<Vec<String>> = plan
-        .presses
-        .iter()
-        .map(|p| vec![significant(p.press_mm), percent(p.strain), significant(p.force_n)])
-        .collect();
+    let presses: Vec<Vec<String>> =
+        plan.presses.iter().map(|p| vec![significant(p.press_mm), percent(p.strain), significant(p.force_n)]).collect();
     let rows: Vec<Vec<String>> = plan
         .expected
         .iter()

@@ -255,11 +255,7 @@ pub fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f
 }
 
 /// Fits the offsets of some parts about an estimate.
-fn offsets(
-    setup: &Setup<'_>,
-    estimate: &Estimate,
-    parts: &[(&Part, f64)],
-) -> Result<Option<Geometry>, StiffnessError> {
+fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Result<Option<Geometry>, StiffnessError> {
     let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
     let (columns, force_slope) = columns(setup, estimate, x, parts)?;
     let rows: Vec<Vec<[f64; 3]>> = estimate.rows.iter().cloned().chain(columns).collect();

@@ -63,7 +63,11 @@ impl PlanParams {
         self.stiffness.check()?;
         let positive = |v: f64| v > 0.0 && v.is_finite();
         if let Some(m) = self.moduli.iter().find(|m| !positive(m.1)) {
-            return Err(ParamError { name: "modulus", value: m.1, range: "above 0 kPa; give the value that you expect" });
+            return Err(ParamError {
+                name: "modulus",
+                value: m.1,
+                range: "above 0 kPa; give the value that you expect",
+            });
         }
         if !(0.001..=1.0).contains(&self.want) {
             let range = "0.1 to 100 per cent: the deviation that you want of each modulus, 10 say";
@@ -196,10 +200,10 @@ impl Plan {
             let strain = f64::from(u8::from(self.strain(e.press_mm) > LARGE_STRAIN));
             [strain, -e.noise_mm, -e.voxel_mm, e.press_mm]
         };
-        let less = |a: &&Expected, b: &&Expected| {
-            demand(a).partial_cmp(&demand(b)).unwrap_or(std::cmp::Ordering::Equal)
-        };
-        let found = self.expected.iter().filter(|e| !labels.is_empty() && labels.contains(&e.label)).filter(all).min_by(less);
+        let less =
+            |a: &&Expected, b: &&Expected| demand(a).partial_cmp(&demand(b)).unwrap_or(std::cmp::Ordering::Equal);
+        let found =
+            self.expected.iter().filter(|e| !labels.is_empty() && labels.contains(&e.label)).filter(all).min_by(less);
         found.map(|e| [e.press_mm, e.voxel_mm, e.noise_mm])
     }
 
