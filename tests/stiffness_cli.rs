@@ -384,6 +384,59 @@ fn bad_numbers_are_usage_errors_that_say_the_range() {
 }
 
 #[test]
+fn what_is_known_by_label_is_checked() {
+    let folder = folder();
+    let bad: [(&[&str], &[&str]); 6] = [
+        (&["--poisson", "1=0.6"], &["poisson", "0.6", "below 0.5"]),
+        (&["--poisson", "7=0.3"], &["no label 7"]),
+        (&["--poisson", "soft"], &["--poisson", "soft", "1=0.49"]),
+        (&["--fixed", "15000"], &["--fixed", "15000", "3=15000"]),
+        (&["--fixed", "2=20,2=30"], &["label 2 is given twice"]),
+        (&["--label-sd", "-1"], &["label-sd", "0 to 5"]),
+    ];
+    for (given, said) in bad {
+        let given: Vec<String> = given.chunks(2).map(|pair| pair.join("=")).collect();
+        refused(folder.path(), &given.iter().map(String::as_str).collect::<Vec<_>>(), 2, said);
+    }
+    fs::write(folder.path().join("m.csv"), "label,poisson\n1,0.4\n1,0.3\n").unwrap();
+    refused(folder.path(), &["--materials", "m.csv"], 1, &["m.csv", "row 2", "label 1 is there twice"]);
+    fs::write(folder.path().join("m.csv"), "label,name\n1,skin\n").unwrap();
+    refused(folder.path(), &["--materials", "m.csv"], 1, &["m.csv", "no column poisson"]);
+}
+
+/// A block of one modulus: a label of 20 kPa makes the other one 20 kPa too, without a force.
+#[test]
+fn a_modulus_that_is_given_sets_the_scale() {
+    let folder = folder();
+    fs::write(folder.path().join("m.csv"), "label,youngs_modulus_kpa\n2,20\n1,\n").unwrap();
+    run(folder.path(), &[&BASE[..], &["--materials", "m.csv", "--poisson", "1=0.49", "--strict"]].concat(), 0);
+    let text = fs::read_to_string(folder.path().join("results/summary.json")).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let [one, two] = [0, 1].map(|r| &summary["regions"][r]);
+    assert_eq!((&two["state"], &two["youngs_modulus"], &two["sd"]), (&"given".into(), &20.0.into(), &0.0.into()));
+    let [e, sd] = ["youngs_modulus", "sd"].map(|k| one[k].as_f64().unwrap());
+    assert!(one["state"] == "determined" && (e - 20.0).abs() < 2.0 * sd && sd < 4.0, "{one}");
+    assert!(summary["absolute"] == true && summary["unit"] == "kPa" && summary["trust"] != "low", "{text}");
+}
+
+/// A wave that no elastic body makes: no number, low trust, and exit code 1 where that is asked for.
+#[test]
+fn a_field_that_no_body_makes_gives_no_number() {
+    let folder = folder();
+    let path = folder.path().join("field.nii.gz");
+    let mut field = io::read_field(&path).unwrap();
+    let g = *field.grid();
+    for (o, v) in field.as_mut_slice()[..g.len()].iter_mut().enumerate() {
+        *v += 0.6 * (g.voxel(o)[2] as f32).sin();
+    }
+    io::write_field(&path, &field).unwrap();
+    let (out, err) = run(folder.path(), &[&BASE[..], &["--strict"]].concat(), 1);
+    assert!(out.contains("Trust low") && err.contains("--strict"), "{out}{err}");
+    let table = fs::read_to_string(folder.path().join("results/regions.csv")).unwrap();
+    assert!(table.lines().skip(1).all(|row| row.ends_with(",,,,0,unknown,")), "{table}");
+}
+
+#[test]
 fn a_number_of_regions_beside_labels_is_said_to_change_nothing() {
     let folder = folder();
     let (_, err) = run(folder.path(), &[&BASE[..], &["--regions", "3", "--dry-run"]].concat(), 0);
