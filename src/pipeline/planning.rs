@@ -9,6 +9,7 @@ use crate::error::{ParamError, StiffnessError};
 use crate::mesh::tetrahedral::{Fineness, Mesher};
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::neighbours::Neighbours;
+use crate::numerics::random::Random;
 use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::field::{Clock, Progress};
 use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, whole};
@@ -18,10 +19,10 @@ use crate::stiffness::elements::Mapping;
 use crate::stiffness::geometry::{self, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::level::Level;
+use crate::stiffness::level::{Level, plate_prior};
 use crate::stiffness::maps;
 use crate::stiffness::observations::{block_for, find, read};
-use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion};
+use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
 use crate::stiffness::verdict::mesh_error;
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion, Press};
@@ -232,6 +233,15 @@ impl<'a> Bench<'a> {
         Ok(Simulated { field, force_n: force * kpa / 1000.0, strain: summary::strain(&setup, &state) })
     }
 
+    /// Error of the motion read at a surface node over the noise of a voxel (1).
+    fn reading(&self) -> f64 {
+        let grid = *self.inputs.labels.grid();
+        let mut random = Random::new(1, 0);
+        let noise = (0..3 * grid.len()).map(|_| random.normals()[0]).collect::<Vec<f64>>();
+        let field = DenseField::from_voxels(grid, |o, _| std::array::from_fn(|a| noise[3 * o + a]));
+        SurfaceMotion::new(&self.body, &field, self.inputs.labels).error
+    }
+
     /// The parameters of a measurement of a press with the force `force` (N).
     fn measurement(&self, force: f64) -> StiffnessParams {
         let fixed = Vec::new();
@@ -304,8 +314,8 @@ struct Solved {
     mesh: Vec<[f64; 2]>,
     /// What the mesh leaves over (mm, root mean square of one component).
     rest: f64,
-    /// The error of the finite elements (mm).
-    floor: f64,
+    /// The plates' prior without noise (mm), on voxels of the labels' size.
+    plate_prior: f64,
     /// Voxels of the body, voxels along the edge of a block, samples.
     sampled: (usize, usize, f64),
     /// Regions that the field shows nothing of.
@@ -381,7 +391,7 @@ impl Solved {
             free: (0..theta.len()).map(|r| free.iter().position(|f| *f == r)).collect(),
             mesh,
             rest: estimate.rms,
-            floor: setup.floor,
+            plate_prior: setup.plate_prior,
             sampled: (inside, level.block.max(1), estimate.residuals.len() as f64),
             hidden,
             borne: borne > BEARS,
@@ -391,8 +401,9 @@ impl Solved {
     }
 
     /// Relative standard deviation of each region's modulus and its scatter by noise alone, at
-    /// `press` mm, voxels `voxel` times those of the labels, and `noise` mm in each.
-    fn expected(&self, press: f64, voxel: f64, noise: f64, ratios: bool) -> Option<Vec<[f64; 2]>> {
+    /// `press` mm, voxels `voxel` times those of the labels, `noise` mm in each, and `surface` mm in
+    /// the motion of a surface node.
+    fn expected(&self, press: f64, voxel: f64, [noise, surface]: [f64; 2], ratios: bool) -> Option<Vec<[f64; 2]>> {
         let p = self.prior.len();
         let [moduli, plates] = self.counts;
         let deeper = press / self.press;
@@ -412,8 +423,13 @@ impl Solved {
         let weight = count / samples / variance;
         let information: Vec<f64> =
             (0..p * p).map(|i| self.information[i] * factor(i / p) * factor(i % p) * weight).collect();
-        // The priors of plates and offsets are so many voxels.
-        let prior = |k: usize| if k < moduli { self.prior[k] } else { self.prior[k] / (voxel * voxel) };
+        // Offsets are so many voxels; plates are known to a part of one, and to the noise.
+        let looser = (voxel * self.plate_prior + plate_prior(0.0, surface)) / self.plate_prior;
+        let prior = |k: usize| match k {
+            _ if k < moduli => self.prior[k],
+            _ if k < plates => self.prior[k] / (looser * looser),
+            _ => self.prior[k] / (voxel * voxel),
+        };
         let inverse = |dilution: f64| {
             let mut a: Vec<f64> = information.iter().map(|v| v / dilution).collect();
             (0..p).for_each(|k| a[k * p + k] += prior(k));
@@ -525,20 +541,26 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
             wanted: !params.ratios || r != reference,
         })
         .collect();
-    let mut expected = Vec::new();
+    let reading = bench.reading();
+    let (mut expected, mut least_press, mut unfelt) = (Vec::new(), f64::INFINITY, Vec::new());
     for &voxel in &voxels {
         let usual = || PlanParams::NOISE.map(|part| part * voxel).to_vec();
         let noises = sorted(if params.noise_mm.is_empty() { usual() } else { params.noise_mm.clone() });
         let before = expected.len();
         for &noise in &noises {
+            let surface = reading * noise;
+            let least = least_travel(surface, voxel);
+            least_press = least_press.min(least);
+            if presses[0] <= least {
+                unfelt.push(format!("{least:.3} mm at {noise:.3} mm of noise"));
+            }
             for &press in &presses {
-                let Some((solved, found)) =
-                    of(press).and_then(|s| Some((s, s.expected(press, voxel / own, noise, params.ratios)?)))
-                else {
-                    continue;
-                };
+                let found =
+                    of(press).and_then(|s| Some((s, s.expected(press, voxel / own, [noise, surface], params.ratios)?)));
+                let Some((solved, found)) = found else { continue };
+                let felt = press > least;
                 expected.extend(regions.iter().zip(found).enumerate().map(|(r, (region, [sd, scatter]))| {
-                    let determined = solved.determines(r, sd, params.ratios);
+                    let determined = felt && solved.determines(r, sd, params.ratios);
                     let (label, name) = (region.label, region.name.clone());
                     let enough = determined && region.wanted && sd <= params.want;
                     Expected {
@@ -549,6 +571,7 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
                         name,
                         sd,
                         scatter,
+                        felt,
                         determined,
                         enough,
                     }
@@ -565,6 +588,11 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
         let value = voxels[0];
         let range = "small enough that the body holds 100 voxels; take smaller ones";
         return Err(ParamError { name: "voxel", value, range }.into());
+    }
+    unfelt.dedup();
+    if !unfelt.is_empty() {
+        let all = unfelt.join(", ");
+        warnings.push(format!("`stiffness` refuses a press that does not stand out of the noise: it must pass {all}"));
     }
     let told = |&press: &f64| {
         let solved = of(press)?;
@@ -591,6 +619,7 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
         extent_mm: bench.extent,
         label_voxel_mm: own,
         presses,
+        least_press_mm: least_press,
         voxel_mm: voxels,
         expected,
         warnings,

@@ -4,7 +4,7 @@ use crate::report::grasp::tile;
 use crate::report::html::{document, escape, warned};
 use crate::report::json::seconds;
 use crate::report::plot::{Line, Plot};
-use crate::report::scale::{percent, significant};
+use crate::report::scale::{percent, short, significant};
 use crate::report::tables::table;
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion};
 use serde_json::{Value, json};
@@ -36,15 +36,25 @@ fn listed<'a>(regions: impl Iterator<Item = &'a PlannedRegion>) -> String {
     }
 }
 
+/// A length (mm) as it was given.
+fn length(mm: f64) -> String {
+    if mm < 0.01 { significant(mm) } else { short(mm) }
+}
+
+/// The wanted deviation (%).
+fn want(plan: &Plan) -> String {
+    short(100.0 * plan.want)
+}
+
 /// A choice in words.
 fn choice([press, voxel, noise]: [f64; 3]) -> String {
-    let [press, voxel, noise] = [press, voxel, noise].map(significant);
+    let [press, voxel, noise] = [press, voxel, noise].map(length);
     format!("press {press} mm at voxels of {voxel} mm and {noise} mm of noise")
 }
 
 /// What one region takes, where no choice gives all regions as wanted.
 fn own(plan: &Plan, region: &PlannedRegion) -> String {
-    let want = percent(plan.want);
+    let want = want(plan);
     if let Some(found) = plan.choice(&[region.label]) {
         return format!("To know {} to {want} % {}.", region.name, choice(found));
     }
@@ -63,13 +73,14 @@ fn own(plan: &Plan, region: &PlannedRegion) -> String {
 pub fn sentences(plan: &Plan) -> Vec<String> {
     let labels: Vec<u8> = plan.determined().map(|r| r.label).collect();
     let mut out = match plan.choice(&labels) {
-        Some(found) => {
-            vec![format!("To know {} to {} % {}.", listed(plan.determined()), percent(plan.want), choice(found))]
-        }
+        Some(found) => vec![format!("To know {} to {} % {}.", listed(plan.determined()), want(plan), choice(found))],
         None => plan.determined().map(|r| own(plan, r)).collect(),
     };
     let lost = plan.undetermined().count();
-    if lost > 0 {
+    if !plan.is_felt() {
+        let least = length(plan.least_press_mm);
+        out.push(format!("No press here stands out of the noise: press more than {least} mm, or lower the noise."));
+    } else if lost > 0 {
         let (verb, it) = if lost == 1 { ("is", "it") } else { ("are", "them") };
         out.push(format!(
             "{} {verb} not determined by any of these: load {it} from another side.",
@@ -141,7 +152,7 @@ fn plate(plan: &Plan) -> String {
 }
 
 fn numbers(values: impl Iterator<Item = f64>) -> String {
-    values.map(significant).collect::<Vec<_>>().join(", ")
+    values.map(length).collect::<Vec<_>>().join(", ")
 }
 
 /// Noises that were tried, at a voxel size or at any (mm).
@@ -160,7 +171,7 @@ pub fn text(report: &PlanReport<'_>) -> String {
     let _ = writeln!(out, "  model        {}", plate(plan));
     let presses = numbers(plan.presses.iter().map(|p| p.press_mm));
     let deepest = plan.presses.last().map_or(0.0, |p| p.strain);
-    let extent = significant(plan.extent_mm);
+    let extent = length(plan.extent_mm);
     let _ = writeln!(out, "  press        {presses} mm of {extent} mm, strains up to {} %", percent(deepest));
     let _ = writeln!(out, "  voxel        {} mm", numbers(plan.voxel_mm.iter().copied()));
     let _ = writeln!(
@@ -173,13 +184,13 @@ pub fn text(report: &PlanReport<'_>) -> String {
             Some(e) => format!(
                 "{} % at best (press {} mm, voxel {} mm, noise {} mm)",
                 percent(e.sd),
-                significant(e.press_mm),
-                significant(e.voxel_mm),
-                significant(e.noise_mm)
+                length(e.press_mm),
+                length(e.voxel_mm),
+                length(e.noise_mm)
             ),
             None => "not determined".into(),
         };
-        let _ = writeln!(out, "  {:<12} assumed {} kPa: {said}", r.name, significant(r.youngs_modulus));
+        let _ = writeln!(out, "  {:<12} assumed {} kPa: {said}", r.name, short(r.youngs_modulus));
     }
     let _ = writeln!(out, "  time         {:.1} s", plan.seconds.iter().map(|t| t.1).sum::<f64>());
     out
@@ -194,9 +205,9 @@ fn plot(plan: &Plan, region: &PlannedRegion, voxel: f64) -> String {
         .map(|(k, noise)| {
             let at = |e: &&Expected| e.voxel_mm == voxel && e.noise_mm == noise;
             // A bound has no deviation to show.
-            let value = |e: &Expected| if e.sd <= DRAWN { 100.0 * e.sd } else { f64::NAN };
+            let value = |e: &Expected| if e.felt && e.sd <= DRAWN { 100.0 * e.sd } else { f64::NAN };
             let points = plan.of(region.label).filter(at).map(|e| [e.press_mm, value(e)]).collect();
-            Line::new(&format!("noise {} mm", significant(noise)), k % 3, k >= 3, points)
+            Line::new(&format!("noise {} mm", length(noise)), k % 3, k >= 3, points)
         })
         .collect();
     let ends = plan.presses.iter().map(|p| p.press_mm);
@@ -212,14 +223,14 @@ pub fn page(report: &PlanReport<'_>) -> String {
     let plan = report.plan;
     let labels: Vec<u8> = plan.determined().map(|r| r.label).collect();
     let all = plan.choice(&labels);
-    let figure = |k: usize| all.map_or_else(|| "none".into(), |c| significant(c[k]));
+    let figure = |k: usize| all.map_or_else(|| "none".into(), |c| length(c[k]));
     let mut body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>{} <span>plan</span></h1><p class=\"verdict\">{}</p></header>\
          <div class=\"tiles\">{}{}{}{}{}</div>",
         env!("CARGO_PKG_VERSION"),
         escape(report.labels),
         escape(&sentences(plan).join(" ")),
-        tile(&percent(plan.want), "%", "wanted deviation of each modulus"),
+        tile(&want(plan), "%", "wanted deviation of each modulus"),
         tile(&figure(0), "mm", "press"),
         tile(&figure(1), "mm", "voxel"),
         tile(&figure(2), "mm", "noise of a displacement"),
@@ -233,24 +244,25 @@ pub fn page(report: &PlanReport<'_>) -> String {
             body,
             "<section><h2>Voxels of {} mm</h2><p class=\"lead\">One standard deviation of the {}. A break in a line is a press that \
              tells nothing; the upright line is where strain passes {} %.</p><div class=\"grid\">{plots}</div></section>",
-            significant(voxel),
+            length(voxel),
             quantity(plan),
-            percent(LARGE_STRAIN),
+            short(100.0 * LARGE_STRAIN),
         );
     }
     let presses: Vec<Vec<String>> =
-        plan.presses.iter().map(|p| vec![significant(p.press_mm), percent(p.strain), significant(p.force_n)]).collect();
+        plan.presses.iter().map(|p| vec![length(p.press_mm), percent(p.strain), significant(p.force_n)]).collect();
     let rows: Vec<Vec<String>> = plan
         .expected
         .iter()
         .filter(|e| plan.regions.iter().any(|r| r.wanted && r.label == e.label))
         .map(|e| {
-            let said = match (e.enough, e.determined) {
-                (true, _) => "yes",
-                (false, true) => "no",
-                (false, false) => "not determined",
+            let said = match (e.enough, e.determined, e.felt) {
+                (true, ..) => "yes",
+                (_, true, _) => "no",
+                (.., true) => "not determined",
+                _ => "lost in noise",
             };
-            let lengths = [e.press_mm, e.voxel_mm, e.noise_mm].map(significant);
+            let lengths = [e.press_mm, e.voxel_mm, e.noise_mm].map(length);
             let sds = [e.sd, e.scatter].map(|v| if v <= DRAWN { percent(v) } else { "over 100".into() });
             lengths.into_iter().chain([escape(&e.name)]).chain(sds).chain([said.into()]).collect()
         })
@@ -273,15 +285,15 @@ pub fn page(report: &PlanReport<'_>) -> String {
 fn settings(report: &PlanReport<'_>) -> String {
     let plan = report.plan;
     let assumed: Vec<String> =
-        plan.regions.iter().map(|r| format!("{} {} kPa", escape(&r.name), significant(r.youngs_modulus))).collect();
+        plan.regions.iter().map(|r| format!("{} {} kPa", escape(&r.name), short(r.youngs_modulus))).collect();
     let stiffness = &report.params.stiffness;
     let rows = [
         vec!["Model".into(), escape(&plate(plan))],
         vec!["Assumed".into(), assumed.join(", ")],
-        vec!["Poisson's ratio".into(), significant(stiffness.poisson)],
-        vec!["Deviation of borders".into(), format!("{} voxel", significant(stiffness.label_sd))],
-        vec!["Extent along the load".into(), format!("{} mm", significant(plan.extent_mm))],
-        vec!["Wanted".into(), format!("{} % of the {}", percent(plan.want), quantity(plan))],
+        vec!["Poisson's ratio".into(), short(stiffness.poisson)],
+        vec!["Deviation of borders".into(), format!("{} voxel", short(stiffness.label_sd))],
+        vec!["Extent along the load".into(), format!("{} mm", length(plan.extent_mm))],
+        vec!["Wanted".into(), format!("{} % of the {}", want(plan), quantity(plan))],
     ];
     table(&[], &rows)
 }

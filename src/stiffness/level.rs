@@ -22,6 +22,14 @@ pub(super) const FLOOR: f64 = 0.005;
 /// Observations needed for each parameter, at least.
 const NEEDED: usize = 100;
 
+/// One standard deviation of a plate's motion about the fitted one (mm), where that of a surface
+/// node is known to `error` mm and voxels are `voxel` mm wide.
+pub fn plate_prior(voxel: f64, error: f64) -> f64 {
+    // The surface motion is extrapolated by half a voxel; the plate may be off by as much of the
+    // motion's change.
+    0.25 * voxel + 3.0 * error
+}
+
 /// A mesh with patches and observations.
 #[derive(Debug)]
 pub struct Level {
@@ -235,9 +243,7 @@ impl Level {
             patches: self.patches.clone(),
             observations: &self.observations,
             reference,
-            // The surface motion is extrapolated by half a voxel; the plate may be off by as much
-            // of the motion's change.
-            plate_prior: 0.25 * self.voxel + 3.0 * self.surface_error,
+            plate_prior: plate_prior(self.voxel, self.surface_error),
             floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
             noise: (self.block > 0).then_some(self.noise),
             open: &self.open,

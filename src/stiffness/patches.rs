@@ -316,6 +316,12 @@ pub fn travel(patches: &[Patch]) -> [f64; 3] {
     std::array::from_fn(|a| patches[1].rigid[a] - patches[0].rigid[a])
 }
 
+/// How far the loaded patch must go in against the held one to count as pressed (mm), where the
+/// motion of a surface node is known to `error` mm and voxels are `voxel` mm wide.
+pub fn least_travel(error: f64, voxel: f64) -> f64 {
+    (4.0 * error).max(0.02 * voxel)
+}
+
 /// Finds the held and the loaded patch, and the cut where the body ends with the volume. `outline`
 /// is that of a punch on the loaded side, where it is known.
 ///
@@ -373,7 +379,7 @@ pub fn find(
             (facets, None, if moved.is_finite() { moved } else { 0.0 })
         }
     };
-    let noise = (4.0 * motion.error).max(0.02 * voxel);
+    let noise = least_travel(motion.error, voxel);
     if moved.is_nan() || moved <= noise {
         return Err(StiffnessError::NoLoad { moved, noise });
     }

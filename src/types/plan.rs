@@ -103,6 +103,8 @@ pub struct Expected {
     pub sd: f64,
     /// By how much measurements of the same body scatter by noise alone, over the modulus (1).
     pub scatter: f64,
+    /// Whether the press stands out of the noise; `stiffness` refuses one that does not.
+    pub felt: bool,
     /// Whether the modulus is determined, and not just a bound of it.
     pub determined: bool,
     /// Whether it is known as well as wanted.
@@ -154,6 +156,8 @@ pub struct Plan {
     pub label_voxel_mm: f64,
     /// What each press does, ascending.
     pub presses: Vec<Press>,
+    /// The least press that stands out of the least noise that was tried (mm).
+    pub least_press_mm: f64,
     /// Voxel sizes that were tried (mm), ascending.
     pub voxel_mm: Vec<f64>,
     /// Every choice and region: by voxel size, noise, press, label.
@@ -172,6 +176,11 @@ impl Plan {
     /// The expectations of a region.
     pub fn of(&self, label: u8) -> impl Iterator<Item = &Expected> {
         self.expected.iter().filter(move |e| e.label == label)
+    }
+
+    /// Whether any choice stands out of its noise.
+    pub fn is_felt(&self) -> bool {
+        self.expected.iter().any(|e| e.felt)
     }
 
     /// Largest principal strain at a press (1).
