@@ -413,7 +413,8 @@ fn a_modulus_that_is_given_sets_the_scale() {
     let text = fs::read_to_string(folder.path().join("results/summary.json")).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
     let [one, two] = [0, 1].map(|r| &summary["regions"][r]);
-    assert_eq!((&two["state"], &two["youngs_modulus"], &two["sd"]), (&"given".into(), &20.0.into(), &0.0.into()));
+    assert!(two["state"] == "given" && (two["youngs_modulus"].as_f64().unwrap() - 20.0).abs() < 1e-9, "{two}");
+    assert_eq!(two["sd"], 0.0);
     let [e, sd] = ["youngs_modulus", "sd"].map(|k| one[k].as_f64().unwrap());
     assert!(one["state"] == "determined" && (e - 20.0).abs() < 2.0 * sd && sd < 4.0, "{one}");
     assert!(summary["absolute"] == true && summary["unit"] == "kPa" && summary["trust"] != "low", "{text}");
@@ -427,7 +428,7 @@ fn a_field_that_no_body_makes_gives_no_number() {
     let mut field = io::read_field(&path).unwrap();
     let g = *field.grid();
     for (o, v) in field.as_mut_slice()[..g.len()].iter_mut().enumerate() {
-        *v += 0.6 * (g.voxel(o)[2] as f32).sin();
+        *v += 0.3 * (g.voxel(o)[2] as f32).sin();
     }
     io::write_field(&path, &field).unwrap();
     let (out, err) = run(folder.path(), &[&BASE[..], &["--strict"]].concat(), 1);

@@ -314,6 +314,8 @@ struct Solved {
     mesh: Vec<[f64; 2]>,
     /// What the mesh leaves over (mm, root mean square of one component).
     rest: f64,
+    /// The error of the finite elements (mm).
+    floor: f64,
     /// The plates' prior without noise (mm), on voxels of the labels' size.
     plate_prior: f64,
     /// Voxels of the body, voxels along the edge of a block, samples.
@@ -391,6 +393,7 @@ impl Solved {
             free: (0..theta.len()).map(|r| free.iter().position(|f| *f == r)).collect(),
             mesh,
             rest: estimate.rms,
+            floor: setup.floor,
             plate_prior: setup.plate_prior,
             sampled: (inside, level.block.max(1), estimate.residuals.len() as f64),
             hidden,
