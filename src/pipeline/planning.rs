@@ -441,7 +441,7 @@ impl Solved {
         let stated = geometry::with_mesh(inverse(1.0)?, p, plates, voxel);
         // The model's own error is everywhere at once, and offsets are fitted with samples that
         // count for less; that is what makes moduli scatter.
-        let dilution = dilution(model * model / variance, count).max(1.0);
+        let dilution = dilution(model * model / variance, 3.0 * count).max(1.0);
         let fitted = inverse(dilution)?;
         let stated: Vec<f64> = stated.iter().zip(&fitted).map(|(a, b)| a + b).collect();
         let slope = |k: usize| if is_plate(k) { self.force_slope[k] / deeper } else { self.force_slope[k] };
