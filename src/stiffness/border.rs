@@ -34,7 +34,7 @@ pub struct Border {
 pub fn all(body: &Body) -> Vec<Border> {
     let met = faces(body);
     let mut on: HashMap<u32, usize> = HashMap::new();
-    for (_, faces) in &met {
+    for faces in met.values() {
         let mut nodes: Vec<u32> = faces.iter().flat_map(|f| f.0).collect();
         nodes.sort_unstable();
         nodes.dedup();

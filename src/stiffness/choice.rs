@@ -302,7 +302,7 @@ impl Chooser<'_> {
                 "strains reach {percent:.0} %, where the linear law is an approximation, but the data prefer it: Poisson's ratio, \
                  patches or labels may not be as assumed, or the field is not measured; compare with --model neo-hookean"
             ));
-        } else if gain <= MARGIN && gain >= -MARGIN && is_large {
+        } else if (-MARGIN..=MARGIN).contains(&gain) && is_large {
             self.warnings.push(format!(
                 "the data do not tell the laws apart; as strains reach {percent:.0} % the neo-Hookean one is taken"
             ));

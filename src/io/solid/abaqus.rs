@@ -184,7 +184,7 @@ impl Reader {
         if generate {
             let bound = |i: usize| parts.get(i).map(|p| number::<u64>(p)).transpose();
             let (first, last, step) = (bound(0)?.unwrap_or(0), bound(1)?.unwrap_or(0), bound(2)?.unwrap_or(1).max(1));
-            let inside = |n: &&u64| (first..=last).contains(*n) && (**n - first) % step == 0;
+            let inside = |n: &&u64| (first..=last).contains(*n) && (**n - first).is_multiple_of(step);
             return Ok(self.numbers.iter().filter(inside).map(|n| self.places[n]).collect());
         }
         let mut out = Vec::new();

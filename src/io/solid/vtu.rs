@@ -108,12 +108,12 @@ impl<'a> Store<'a> {
             "binary" => {
                 let text: Vec<u8> =
                     array.text().unwrap_or_default().bytes().filter(|b| !b.is_ascii_whitespace()).collect();
-                self.from_base64(&text)
+                self.base64_bytes(&text)
             }
             "appended" => {
                 let offset = array.attribute("offset").and_then(|o| o.parse::<usize>().ok());
                 let data = offset.and_then(|o| self.appended?.get(o..)).ok_or_else(cut)?;
-                if self.raw { self.from_raw(data) } else { self.from_base64(data) }
+                if self.raw { self.raw_bytes(data) } else { self.base64_bytes(data) }
             }
             other => return Err(Flaw::new(format!("the array {name:?} is stored as {other:?}"), AGAIN)),
         };
@@ -132,7 +132,7 @@ impl<'a> Store<'a> {
     }
 
     /// Bytes of an array that follow on their header.
-    fn from_raw(&self, data: &[u8]) -> Option<Vec<u8>> {
+    fn raw_bytes(&self, data: &[u8]) -> Option<Vec<u8>> {
         let first = self.header(data, 0)?;
         if !self.packed {
             return Some(data.get(self.word()..self.word().checked_add(first)?)?.to_vec());
@@ -143,7 +143,7 @@ impl<'a> Store<'a> {
     }
 
     /// The same in base64, where a packed array's header stands by itself.
-    fn from_base64(&self, data: &[u8]) -> Option<Vec<u8>> {
+    fn base64_bytes(&self, data: &[u8]) -> Option<Vec<u8>> {
         let decode = |from: usize, bytes: usize| {
             let length = bytes.div_ceil(3).checked_mul(4)?;
             STANDARD.decode(data.get(from..from.checked_add(length)?)?).ok()
