@@ -173,7 +173,8 @@ fn a_pad_becomes_a_tip_that_a_grasp_reads() {
 /// A map as `palpate stiffness` leaves it: tissue of `modulus` by position (mm) under bone from z =
 /// `top` up, pressed from z-.
 fn pad_folder(map: Volume, poisson: f64, travel: f64, force: Option<f64>) -> StiffnessFolder {
-    let known = |name: &str, youngs_modulus| StiffnessRegion { name: name.into(), youngs_modulus, bound: None };
+    let known =
+        |name: &str, youngs_modulus| StiffnessRegion { name: name.into(), youngs_modulus, bound: None, poisson: None };
     StiffnessFolder {
         map,
         absolute: true,
@@ -222,7 +223,8 @@ fn elements_of_a_finger_pad_press_as_the_phantom_does() {
     let map = Volume::from_voxels(*body.initial.grid(), |o, _| values[o]);
     let half = 0.5 * body.initial.grid().least_spacing();
     let mut folder = pad_folder(map, told.poisson, 1.5 + half, Some(told.force_n));
-    folder.regions = vec![StiffnessRegion { name: "bone".into(), youngs_modulus: 15_000.0, bound: None }];
+    folder.regions =
+        vec![StiffnessRegion { name: "bone".into(), youngs_modulus: 15_000.0, bound: None, poisson: None }];
     let out = of_map(&folder, 2000, &|_, _| ()).unwrap();
     let plate = out.pad.plate.as_ref().unwrap();
     let [low, high] = [1.5 - half, 1.5 + half].map(|d| plate.at(d).unwrap());
@@ -232,7 +234,8 @@ fn elements_of_a_finger_pad_press_as_the_phantom_does() {
     // Bone that is known by a low bound only is a back plate all the same.
     let soft = Volume::from_voxels(*body.initial.grid(), |o, _| if values[o] > 1000.0 { 23.0 } else { values[o] });
     folder.map = soft;
-    folder.regions[0] = StiffnessRegion { name: "bone".into(), youngs_modulus: 23.0, bound: Some("lower".into()) };
+    folder.regions[0] =
+        StiffnessRegion { name: "bone".into(), youngs_modulus: 23.0, bound: Some("lower".into()), poisson: None };
     let again = of_map(&folder, 2000, &|_, _| ()).unwrap();
     assert_eq!(again.pad.plate.unwrap().curve, plate.curve);
 }

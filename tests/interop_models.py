@@ -128,8 +128,16 @@ def sofa(folder):
     start = values("MechanicalObject", "position").reshape(-1, 3)
     assert np.allclose(rest, places * 1e-3, atol=1e-8)
     tetrahedra = values("TetrahedronSetTopologyContainer", "tetrahedra").astype(int).reshape(-1, 4)
-    young = values("TetrahedronFEMForceField", "youngModulus")
-    assert len(young) == len(tetrahedra) and body.find("TetrahedronFEMForceField").get("method") in ("small", "large")
+    listed, young, poisson = [], [], []
+    for part in body.findall("Node"):
+        force = part.find("TetrahedronFEMForceField")
+        assert force.get("method") in ("small", "large")
+        listed.append(np.array(part.find("TetrahedronSetTopologyContainer").get("tetrahedra").split(), int).reshape(-1, 4))
+        young.append(np.array(force.get("youngModulus").split(), float))
+        assert len(young[-1]) == len(listed[-1])
+        poisson.append(np.full(len(young[-1]), float(force.get("poissonRatio"))))
+    assert {tuple(t) for t in np.concatenate(listed)} == {tuple(t) for t in tetrahedra}, "tetrahedra without a material"
+    tetrahedra, young, poisson = (np.concatenate(part) for part in (listed, young, poisson))
     fixed = np.zeros((len(rest), 3), bool)
     for constraint in body.findall("FixedProjectiveConstraint"):
         fixed[np.array(constraint.get("indices").split(), int)] = True
@@ -137,7 +145,6 @@ def sofa(folder):
         axes = [bool(int(v)) for v in constraint.get("fixedDirections").split()]
         fixed[np.array(constraint.get("indices").split(), int)] |= axes
     assert np.array_equal(start[~fixed], rest[~fixed]) and fixed.any()
-    poisson = values("TetrahedronFEMForceField", "poissonRatio")[0]
     check("SOFA's scene by definition", 1e3 * solve(rest, tetrahedra, young, poisson, fixed, start - rest), ours)
 
 
@@ -230,13 +237,20 @@ def covariance(folder):
 
 def main():
     with tempfile.TemporaryDirectory() as root:
+        # MuJoCo writes its log where it runs.
+        os.chdir(root)
         at = lambda name: os.path.join(root, name)
         poisson = 0.3
         palpate("phantom", "inclusion", "--size", 24, "--poisson", poisson, "--amplitude", 0.5, "--contrast", 3, "-o", at("block"))
         field, labels = at("block/truth.nii.gz"), at("block/labels.nii.gz")
-        for name, given in (("stuck", (field, labels)), ("sliding", sliding(at, poisson))):
-            print(f"{name} plates:")
-            palpate("stiffness", "--field", given[0], "--labels", given[1], "--force", 3, "--nodes", 1500, "--poisson", poisson, "-o", at(name))
+        two = ["--poisson", "2=0.15"]
+        for name, given, more in (
+            ("stuck plates", (field, labels), []),
+            ("sliding plates", sliding(at, poisson), []),
+            ("two Poisson's ratios", (field, labels), two),
+        ):
+            print(f"{name}:")
+            palpate("stiffness", "--field", given[0], "--labels", given[1], "--force", 3, "--nodes", 1500, "--poisson", poisson, *more, "-o", at(name))
             inside = lambda file: os.path.join(at(name), file)
             for part in (gmsh, calculix, sofa, mujoco):
                 part(inside)

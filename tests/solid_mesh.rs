@@ -143,8 +143,8 @@ fn measured() -> Measured {
         displacement: [0.1, -0.2, 0.01 * f64::from(n)],
         covariance: Some([4e-4, 1e-5, 2e-5, 5e-4, 3e-5, 6e-4]),
     };
-    let soft = ElementModulus { label: 2, modulus: 12.5 };
-    Measured { nodes: vec![node(0), node(3)], elements: vec![Some(soft), None], poisson: 0.3 }
+    let soft = ElementModulus { label: 2, modulus: 12.5, poisson: 0.3 };
+    Measured { nodes: vec![node(0), node(3)], elements: vec![Some(soft), None] }
 }
 
 #[test]

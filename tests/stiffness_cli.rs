@@ -405,6 +405,35 @@ fn what_is_known_by_label_is_checked() {
 }
 
 /// A block of one modulus: a label of 20 kPa makes the other one 20 kPa too, without a force.
+/// SOFA, MuJoCo and a mesh of the user's had the ratio of all regions alone.
+#[test]
+fn each_export_has_the_ratio_of_each_region() {
+    let folder = folder();
+    let mesh = "*NODE\n1, 0, 8, 4\n2, 8, 8, 4\n3, 0, 16, 4\n4, 0, 8, 6\n5, 0, 8, 16\n6, 8, 8, 16\n7, 0, 16, 16\n\
+                8, 0, 8, 14\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4\n2, 5, 7, 6, 8\n";
+    fs::write(folder.path().join("body.inp"), mesh).unwrap();
+    let given = ["--force", "0.1", "--poisson", "0.3", "--poisson", "2=0.4", "--mesh", "body.inp"];
+    run(folder.path(), &[&BASE[..], &given].concat(), 0);
+    let text = |name: &str| fs::read_to_string(folder.path().join("results").join(name)).unwrap();
+    let ratios = |name: &str, before: &str, after: char| -> Vec<String> {
+        text(name).split(before).skip(1).map(|rest| rest.split(after).next().unwrap().trim().to_string()).collect()
+    };
+    assert_eq!(ratios("model.scn", "poissonRatio=\"", '"'), ["0.3", "0.4"]);
+    assert_eq!(ratios("model.xml", " poisson=\"", '"'), ["0.3", "0.4"]);
+    let materials = |name: &str| -> Vec<String> {
+        let lines = ratios(name, "*ELASTIC\n", '\n');
+        lines.iter().map(|l| l.rsplit(", ").next().unwrap().to_string()).collect()
+    };
+    assert_eq!(materials("boundary.inp"), ["0.3", "0.4"]);
+    let scene = text("model.scn");
+    let count = |key: &str| -> Vec<usize> {
+        let parts = scene.split("<Node name=\"material").skip(1);
+        parts.map(|p| p.split(key).nth(1).unwrap().split('"').next().unwrap().split_whitespace().count()).collect()
+    };
+    let [corners, moduli] = [" tetrahedra=\"", "youngModulus=\""].map(count);
+    assert!(corners.len() == 2 && corners.iter().zip(&moduli).all(|(c, m)| *c == 4 * m && *m > 0));
+}
+
 #[test]
 fn a_modulus_that_is_given_sets_the_scale() {
     let folder = folder();

@@ -178,6 +178,7 @@ fn exact_fingertip(output: &Path, told: &Value, regions: &[Value]) -> Result<()>
         name: r["name"].as_str().unwrap_or_default().into(),
         youngs_modulus: number(&r["youngs_modulus_kpa"]),
         bound: None,
+        poisson: None,
     };
     let exact = StiffnessFolder {
         map,

@@ -129,7 +129,7 @@ impl OnMesh {
     pub fn write(self, folder: &mut OutputFolder, labels: &Mask, result: &StiffnessResult) -> Result<Vec<String>> {
         let Self { name, file, nodes, asked } = self;
         let mesh = file.mesh();
-        let measured = Measured { nodes, elements: moduli(mesh, labels, result), poisson: result.poisson };
+        let measured = Measured { nodes, elements: moduli(mesh, labels, result) };
         folder.write("boundary.csv", |p| io::write_boundary(p, mesh, &measured))?;
         folder.write("elements.csv", |p| io::write_element_moduli(p, mesh, &measured))?;
         folder.write(&format!("boundary.{}", file.ending()), |p| file.write(p, &measured))?;

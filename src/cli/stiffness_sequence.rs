@@ -12,14 +12,15 @@ use palpate::pipeline::stiffness::FieldQuality;
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
-use palpate::types::{SparseField, StiffnessParams};
+use palpate::types::{SparseField, StiffnessParams, Trust};
 use std::path::{Path, PathBuf};
 
 /// A frame: its number, its field, the force on the plate.
 type Frame = (usize, PathBuf, Option<f64>);
 
 pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path, console: &Console) -> Result<()> {
-    let frames = frames(options, from, &Tracked::of(from)?)?;
+    let tracked = Tracked::of(from)?;
+    let frames = frames(options, from, &tracked)?;
     let patches = patch_files(options);
     let others = patches.iter().chain(&options.images).map(PathBuf::as_path);
     let given: Vec<&Path> = frames.iter().map(|f| f.1.as_path()).chain([body]).chain(others).collect();
@@ -84,7 +85,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         let stage = format!("frame {frame}");
         let outcome = match force_n {
             Some(0.0) => Err(StiffnessError::NoForce),
-            _ => setting.run(&field, matches.as_ref(), FieldQuality::default(), &params, &|_, f| {
+            _ => setting.run(&field, matches.as_ref(), tracked.quality(*frame), &params, &|_, f| {
                 progress.set(&stage, part + f / count)
             }),
         };
@@ -126,6 +127,8 @@ struct Tracked {
     /// Numbers of all other frames, and whether each was measured; none in a summary that does not
     /// list them.
     others: Option<Vec<(usize, bool)>>,
+    /// How far to rely on frames, where the summary says so.
+    trust: Vec<(usize, Trust)>,
 }
 
 impl Tracked {
@@ -139,7 +142,17 @@ impl Tracked {
         };
         let one = |f: &serde_json::Value| Some((f["frame"].as_u64()? as usize, f["lost"].is_null()));
         let others = summary["frames"].as_array().map(|all| all.iter().filter_map(one).collect());
-        Ok(Self { reference, others })
+        let trust = |f: &serde_json::Value| {
+            Some((f["frame"].as_u64()? as usize, serde_json::from_value(f["trust"].clone()).ok()?))
+        };
+        let trust = summary["frames"].as_array().map(|all| all.iter().filter_map(trust).collect());
+        Ok(Self { reference, others, trust: trust.unwrap_or_default() })
+    }
+
+    /// What is known of the error of a frame's field.
+    fn quality(&self, frame: usize) -> FieldQuality<'static> {
+        let trust = self.trust.iter().find(|t| t.0 == frame).map(|t| t.1);
+        FieldQuality { trust, ..FieldQuality::default() }
     }
 
     /// Whether a field in the folder is of this track: an earlier one may have left others behind.

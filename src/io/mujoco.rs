@@ -125,7 +125,7 @@ fn flex(
     for node in own.into_iter().flatten() {
         write!(w, "{} ", nodes.partition_point(|n| n < node))?;
     }
-    let (poisson, damping) = (result.poisson, STEP[1]);
+    let (poisson, damping) = (result.poisson_of(label), STEP[1]);
     writeln!(w, "\">\n\t\t\t<elasticity young=\"{young:.6e}\" poisson=\"{poisson}\" damping=\"{damping}\"/>")?;
     writeln!(w, "\t\t\t<contact contype=\"0\" conaffinity=\"0\" selfcollide=\"none\"/>\n\t\t</flex>")
 }

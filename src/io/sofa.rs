@@ -46,7 +46,7 @@ pub fn write_sofa(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<()
         state(w, result)?;
         let mass: f64 = masses(&result.mesh, &tetrahedra).iter().sum();
         writeln!(w, "\t\t<UniformMass totalMass=\"{mass:.9e}\"/>")?;
-        material(w, result)?;
+        material(w, result, &tetrahedra)?;
         constraints(w, result)?;
         writeln!(w, "\t</Node>\n</Node>")
     })
@@ -68,14 +68,28 @@ fn state(w: &mut impl Write, result: &StiffnessResult) -> io::Result<()> {
     writeln!(w, "\"/>")
 }
 
-fn material(w: &mut impl Write, result: &StiffnessResult) -> io::Result<()> {
+/// A node for each Poisson's ratio, with the tetrahedra that have it: older versions of SOFA know one
+/// ratio a force field.
+fn material(w: &mut impl Write, result: &StiffnessResult, tetrahedra: &[[u32; 4]]) -> io::Result<()> {
     let method = if result.law == Law::Linear { "small" } else { "large" };
-    write!(w, "\t\t<TetrahedronFEMForceField method=\"{method}\" poissonRatio=\"{}\" youngModulus=\"", result.poisson)?;
-    for e in &result.element_modulus {
-        let modulus = e * PASCAL;
-        (0..PARTS).try_for_each(|_| write!(w, "{modulus:.6e} "))?;
+    let ratio = |e: usize| result.poisson_of(result.mesh.labels()[e]);
+    let mut ratios: Vec<f64> = (0..result.element_modulus.len()).map(ratio).collect();
+    ratios.sort_unstable_by(f64::total_cmp);
+    ratios.dedup();
+    for (k, nu) in ratios.into_iter().enumerate() {
+        let own: Vec<usize> = (0..result.element_modulus.len()).filter(|&e| ratio(e) == nu).collect();
+        write!(w, "\t\t<Node name=\"material{}\">\n\t\t\t<TetrahedronSetTopologyContainer tetrahedra=\"", k + 1)?;
+        for [a, b, c, d] in own.iter().flat_map(|e| &tetrahedra[PARTS * e..PARTS * (e + 1)]) {
+            write!(w, "{a} {b} {c} {d} ")?;
+        }
+        write!(w, "\"/>\n\t\t\t<TetrahedronFEMForceField method=\"{method}\" poissonRatio=\"{nu}\" youngModulus=\"")?;
+        for e in own {
+            let modulus = result.element_modulus[e] * PASCAL;
+            (0..PARTS).try_for_each(|_| write!(w, "{modulus:.6e} "))?;
+        }
+        writeln!(w, "\"/>\n\t\t</Node>")?;
     }
-    writeln!(w, "\"/>")
+    Ok(())
 }
 
 /// One constraint for each set of axes that nodes are held along.

@@ -97,7 +97,8 @@ pub fn moduli(mesh: &SolidMesh, labels: &Mask, result: &StiffnessResult) -> Vec<
     let one = |element| {
         let at = nearest(grid.shape(), grid.affine().to_voxel(mesh.centroid(element)))?;
         let label = labels.as_slice()[at];
-        (label > 0).then(|| ElementModulus { label, modulus: f64::from(result.map.as_slice()[at]) })
+        let modulus = f64::from(result.map.as_slice()[at]);
+        (label > 0).then(|| ElementModulus { label, modulus, poisson: result.poisson_of(label) })
     };
     mesh.elements().iter().map(one).collect()
 }

@@ -110,7 +110,8 @@ impl PadOutcome {
 /// The finite elements of a map and the flat plate that presses them.
 struct Elements<'a> {
     map: &'a Volume,
-    poisson: f64,
+    /// Poisson's ratio of tissue of a modulus (kPa).
+    poisson: &'a dyn Fn(f64) -> f64,
     bone: &'a (dyn Fn(usize) -> bool + Sync),
     /// What is held; the bone where it is not a side.
     held: Option<Side>,
@@ -129,7 +130,8 @@ impl Elements<'_> {
         let side = self.held.map(|side| base(&body, side, self.map.grid().least_spacing()));
         let hard = || body.nodes_in(|r| usize::from(body.labels[r]) == moduli.len());
         let held = side.filter(|nodes| !nodes.is_empty()).unwrap_or_else(hard);
-        let press = Press { body: &body, moduli: &of_class, poisson: self.poisson, held, outward: self.outward };
+        let poisson: Vec<f64> = of_class.iter().map(|&e| (self.poisson)(e)).collect();
+        let press = Press { body: &body, moduli: &of_class, poisson: &poisson, held, outward: self.outward };
         let forces = press.forces(depths, &|f| progress("press", f))?;
         Ok((forces, mesh.nodes().len()))
     }
@@ -258,6 +260,13 @@ pub fn of_map(folder: &StiffnessFolder, nodes: usize, progress: Progress<'_>) ->
     if nodes == 0 {
         return Ok(out);
     }
-    let (poisson, held) = (folder.poisson, Side::parse(&folder.held));
-    Ok(out.pressed(&Elements { map: &folder.map, poisson, bone: &bone, held, outward: side, nodes }, progress))
+    let poisson = |modulus: f64| {
+        let apart = |r: &&StiffnessRegion| (r.youngs_modulus / modulus).ln().abs();
+        let known = folder.regions.iter().filter(|r| r.youngs_modulus > 0.0);
+        let nearest = known.min_by(|a, b| apart(a).total_cmp(&apart(b)));
+        nearest.and_then(|r| r.poisson).unwrap_or(folder.poisson)
+    };
+    let held = Side::parse(&folder.held);
+    let elements = Elements { map: &folder.map, poisson: &poisson, bone: &bone, held, outward: side, nodes };
+    Ok(out.pressed(&elements, progress))
 }

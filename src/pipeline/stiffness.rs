@@ -14,7 +14,7 @@ use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::{Patch, Place};
 use crate::stiffness::rim::{Outline, Rim, rim};
 use crate::stiffness::summary::Scale;
-use crate::stiffness::turn::Turn;
+use crate::stiffness::turn::{Affinity, Turn};
 use crate::stiffness::verdict::{Found, Shape, Verdict};
 use crate::stiffness::{geometry, maps, summary};
 use crate::strain::deviation::error_draws;
@@ -355,8 +355,10 @@ fn labelled(
         Some(Some(touched)) => touched.1,
         _ => fine.patches[i].area(&fine.body),
     };
-    let verdict = Verdict::of(&misfit, inputs.quality.trust, &regions);
+    let is_affine = Affinity::of(inputs.field, inputs.labels).is_some_and(|a| a.is_all_of(inputs.field, inputs.labels));
+    let verdict = Verdict::of(&misfit, inputs.quality.trust, is_affine, &regions);
     let mut warnings = maps::unfit(inputs.field, inputs.labels, &misfit);
+    warnings.extend(maps::one_map(is_affine, regions.len()));
     warnings.extend(choice.warnings);
     warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
     warnings.extend(params.force_n.and_then(|force| maps::leaning(force, estimate.leaning)));

@@ -4,12 +4,12 @@ use crate::error::{FieldError, IoError};
 use crate::io;
 use crate::python::PalpateError;
 use crate::types::{
-    Affine, DenseField, Displacement, Grid, Mask, Match, Mesh, SparseField, Volume, Voxels, WorldPoint,
+    Affine, DenseField, Displacement, ErrorSamples, Grid, Mask, Match, Mesh, SparseField, Volume, Voxels, WorldPoint,
 };
-use ndarray::{Array2, Array3, Array4, Dimension, ShapeBuilder};
+use ndarray::{Array2, Array3, Array4, Array5, Dimension, ShapeBuilder};
 use numpy::{
-    IntoPyArray, PyArray2, PyArray3, PyArray4, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArray4,
-    PyUntypedArrayMethods,
+    IntoPyArray, PyArray2, PyArray3, PyArray4, PyArray5, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3,
+    PyReadonlyArray4, PyReadonlyArray5, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 use serde_json::Value;
@@ -20,6 +20,8 @@ use std::sync::Mutex;
 pub type Rows = [[f64; 4]; 3];
 /// A scalar volume and its affine.
 pub type Image<'py> = (PyReadonlyArray3<'py, f32>, Rows);
+/// Samples of a field's error, and the affine of their nodes.
+pub type Samples<'py> = (PyReadonlyArray5<'py, f32>, Rows);
 /// Volumes, their affine, and the time between them (s).
 pub type Series<'py> = (Vec<Bound<'py, PyArray3<f32>>>, Rows, Option<f64>);
 /// A callable of a stage's name and the part that is done (0 to 1).
@@ -75,6 +77,25 @@ pub fn displacement<'a>(array: &'a PyReadonlyArray4<'_, f32>, rows: Rows) -> PyR
         return Err(told("a displacement has three components, on the last axis"));
     }
     Displacement::lent(grid(array.shape(), rows)?, values(array)?).map_err(told)
+}
+
+/// Errors that a field may have, (nx, ny, nz, n, 3), and the affine of their nodes, as the file keeps
+/// them.
+pub fn samples<'py>(py: Python<'py>, samples: &ErrorSamples) -> PyResult<(Bound<'py, PyArray5<f32>>, Rows)> {
+    let ([x, y, z], n) = (samples.nodes().shape(), samples.nodes().len());
+    let parts = (0..3).flat_map(|c| samples.values().iter().map(move |s| &s[c * n..(c + 1) * n]));
+    let all: Vec<f32> = parts.flatten().map(|v| io::stored(*v)).collect();
+    let array = Array5::from_shape_vec((x, y, z, samples.values().len(), 3).f(), all).map_err(told)?;
+    Ok((array.into_pyarray(py), stored_rows(samples.nodes())))
+}
+
+/// The same the other way.
+pub fn error_samples((array, rows): &Samples<'_>) -> PyResult<ErrorSamples> {
+    let [.., count, 3] = array.shape()[..] else { return Err(told("samples of an error have three components")) };
+    let (nodes, all) = (grid(array.shape(), *rows)?, values(array)?);
+    let n = nodes.len();
+    let one = |k: usize| (0..3).flat_map(|c| all[(c * count + k) * n..][..n].iter().copied()).collect();
+    ErrorSamples::new(nodes, (0..count).map(one).collect()).map_err(told)
 }
 
 /// Matches from the columns of matches.csv.

@@ -96,6 +96,9 @@ pub fn field<'py>(
     })?;
     let (result, matches, warped, jacobian, uncertainty, summary) = measured.map_err(told)?;
     let out = PyDict::new(py);
+    let (samples, nodes_affine) = arrays::samples(py, &result.samples)?;
+    out.set_item("posterior", samples)?;
+    out.set_item("posterior_affine", nodes_affine)?;
     out.set_item("affine", arrays::stored_rows(result.displacement.grid()))?;
     let (nodes, elements) = arrays::mesh(py, &result.mesh);
     out.set_item("displacement", arrays::array4(py, kept_field(result.displacement))?)?;

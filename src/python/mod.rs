@@ -33,8 +33,8 @@ pyo3::create_exception!(
 /// Of the command line's flags, by command, where the package's functions have them in their
 /// signatures.
 fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
-    let StiffnessParams { poisson, nodes, regions, .. } = StiffnessParams::default();
-    let stiffness = json!({ "poisson": poisson, "nodes": nodes, "regions": regions });
+    let StiffnessParams { poisson, nodes, regions, label_sd, .. } = StiffnessParams::default();
+    let stiffness = json!({ "poisson": poisson, "nodes": nodes, "regions": regions, "label_sd": label_sd });
     arrays::python(py, &json!({ "stiffness": stiffness, "fingertip": { "nodes": NODES } }))
 }
 

@@ -11,7 +11,7 @@ use crate::types::{Grid, StiffnessParams};
 use numpy::{PyReadonlyArray2, PyReadonlyArray4};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 /// A side by its name, or a mask.
 #[derive(FromPyObject)]
@@ -37,7 +37,7 @@ fn place(patch: &Patch<'_>, grid: &Grid, name: &str) -> PyResult<Place> {
 /// Young's modulus from a displacement (mm, RAS), with all that `palpate stiffness` writes but the
 /// models.
 #[pyfunction]
-#[pyo3(signature = (displacement, affine, matches, unasked, body, labelled, names, held, load, force, poisson, model, nodes, regions, called, progress=None, threads=None))]
+#[pyo3(signature = (displacement, affine, matches, unasked, body, labelled, names, held, load, force, poisson, poisson_of, fixed, label_sd, model, nodes, regions, field_summary, samples, called, progress=None, threads=None))]
 pub fn stiffness<'py>(
     py: Python<'py>,
     displacement: PyReadonlyArray4<'py, f32>,
@@ -51,15 +51,29 @@ pub fn stiffness<'py>(
     load: Patch<'py>,
     force: Option<f64>,
     poisson: f64,
+    poisson_of: BTreeMap<u8, f64>,
+    fixed: BTreeMap<u8, f64>,
+    label_sd: f64,
     model: &str,
     nodes: usize,
     regions: usize,
+    field_summary: &str,
+    samples: Option<arrays::Samples<'py>>,
     called: [String; 2],
     progress: Callback,
     threads: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let model: LawChoice = model.parse().map_err(told)?;
-    let params = StiffnessParams { poisson, model, force_n: force, nodes, regions, ..StiffnessParams::default() };
+    let params = StiffnessParams {
+        poisson,
+        poisson_of: poisson_of.into_iter().collect(),
+        fixed: fixed.into_iter().collect(),
+        label_sd,
+        model,
+        force_n: force,
+        nodes,
+        regions,
+    };
     params.check().map_err(told)?;
     let field = arrays::displacement(&displacement, affine)?;
     let mut labels = match arrays::mask(Some(&body), &called[1], field.grid(), &called[0])? {
@@ -72,6 +86,17 @@ pub fn stiffness<'py>(
     if let Some(label) = names.keys().find(|l| !labels.as_slice().contains(l)) {
         return Err(told(format!("names: the label map holds no label {label}")));
     }
+    let mut known = params.poisson_of.iter().chain(&params.fixed).map(|k| k.0);
+    if let Some(label) = known.find(|l| !labels.as_slice().contains(l)) {
+        return Err(told(format!("poisson and fixed: the label map holds no label {label}")));
+    }
+    let of_field: serde_json::Value = serde_json::from_str(field_summary).map_err(told)?;
+    let samples = samples.as_ref().map(arrays::error_samples).transpose()?;
+    let quality = FieldQuality {
+        trust: serde_json::from_value(of_field["trust"].clone()).ok(),
+        model: serde_json::from_value(of_field["model"].clone()).ok(),
+        samples: samples.as_ref(),
+    };
     let (held, load) = (place(&held, field.grid(), "held")?, place(&load, field.grid(), "load")?);
     // Of too few matches in the body the field itself tells more, as on the command line.
     let matches = matches.map(|m| arrays::matches(&m)).transpose()?;
@@ -86,7 +111,7 @@ pub fn stiffness<'py>(
             held: &held,
             load: &load,
             names: &named,
-            quality: FieldQuality::default(),
+            quality,
         };
         run(&inputs, &params, tell)
     })?;

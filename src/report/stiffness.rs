@@ -177,6 +177,7 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
         .map(|(r, change)| {
             let mut v = json!(r);
             v["mesh_change"] = json!(change.exp_m1());
+            v["poisson"] = json!(result.poisson_of(r.label));
             v
         })
         .collect();

@@ -146,6 +146,15 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, misfit: &Misfit) -> Vec<St
     out
 }
 
+/// Says so where the field is one affine map and there are regions to be told apart.
+pub fn one_map(is_affine: bool, regions: usize) -> Option<String> {
+    (is_affine && regions > 1).then(|| {
+        "the displacement field is one affine map: either all regions are equally stiff, or the registration was limited to affine maps \
+         and shows no contrast. Measure with a free field"
+            .into()
+    })
+}
+
 /// Part of the surface that may lie on the volume's border without a word.
 const CUT_OFF: f64 = 0.02;
 

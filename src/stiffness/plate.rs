@@ -214,8 +214,8 @@ pub struct Press<'a> {
     pub body: &'a Body,
     /// Young's modulus of each region of the body (kPa).
     pub moduli: &'a [f64],
-    /// Poisson's ratio.
-    pub poisson: f64,
+    /// Poisson's ratio of each.
+    pub poisson: &'a [f64],
     /// Nodes that do not move.
     pub held: Vec<u32>,
     /// Unit normal of the plate, out of the body (RAS).
@@ -237,10 +237,12 @@ impl Press<'_> {
     pub fn forces(&self, depths: &[f64], progress: &dyn Fn(f64)) -> Result<Vec<[f64; 2]>, StiffnessError> {
         let body = self.body;
         let softest = self.moduli.iter().copied().filter(|e| *e > 0.0).fold(f64::INFINITY, f64::min);
-        let of = |e: f64| Material::of_youngs_modulus(e.clamp(softest, RIGID * softest), self.poisson);
+        let of =
+            |r: usize| Material::of_youngs_modulus(self.moduli[r].clamp(softest, RIGID * softest), self.poisson[r]);
         let still = |&node: &u32| Tie { node, direction: None, target: [0.0; 3], strength: 1.0 };
-        let materials: Vec<Material> = body.region.iter().map(|&r| of(self.moduli[r as usize])).collect();
-        let plate = Plate::touching(body, body.surface.iter(), self.outward, STIFF * of(softest).mu);
+        let materials: Vec<Material> = body.region.iter().map(|&r| of(usize::from(r))).collect();
+        let least = materials.iter().map(|m| m.mu).fold(f64::INFINITY, f64::min);
+        let plate = Plate::touching(body, body.surface.iter(), self.outward, STIFF * least);
         let top = plate.height;
         let held = self.held.iter().map(still).collect();
         let mut problem = Problem { plate: Some(plate), ..Problem::new(body, Law::NeoHookean, materials, held) };

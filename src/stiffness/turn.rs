@@ -12,6 +12,8 @@ use crate::types::{DenseField, Displacement, Mask, SparseField, WorldPoint};
 /// Turns that are left in (degrees): taken for small, one moves what lies 30 mm away by 5
 /// micrometres too far.
 const LEAST: f64 = 1.0;
+/// What an affine map leaves over of the deformation when it is all of it (1).
+const ROUNDING: f64 = 1e-4;
 
 /// A rotation about the middle of a body after its motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,29 +23,39 @@ pub struct Turn {
     middle: [f64; 3],
 }
 
-impl Turn {
-    /// By how much the body of `labels` turned; none where that is under a degree, or the field
-    /// says nothing of it.
+/// The affine motion nearest to a field over a body: q = after + gradient (p - before).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Affinity {
+    before: [f64; 3],
+    after: [f64; 3],
+    gradient: Matrix3,
+}
+
+/// Places of the body (mm, RAS) before and after the motion, where the field says something.
+fn moved<'a>(field: &'a Displacement<'_>, labels: &'a Mask) -> impl Iterator<Item = ([f64; 3], [f64; 3])> + 'a {
+    let grid = field.grid();
+    let body = (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0);
+    body.filter_map(|o| {
+        let (p, u) = (grid.centre(o), field.at(o).map(f64::from));
+        u.iter().all(|v| v.is_finite()).then(|| (p.0, p.moved(u).0))
+    })
+}
+
+impl Affinity {
+    /// That of a field over the body of `labels`; none where the field says nothing of it.
     pub fn of(field: &Displacement<'_>, labels: &Mask) -> Option<Self> {
-        let grid = field.grid();
-        let moved = |o: usize| -> Option<([f64; 3], [f64; 3])> {
-            let [i, j, k] = grid.voxel(o);
-            let (p, u) = (grid.world(i, j, k).0, field.at(o).map(f64::from));
-            u.iter().all(|v| v.is_finite()).then(|| (p, std::array::from_fn(|a| p[a] + u[a])))
-        };
-        let body = || (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0).filter_map(moved);
         let (mut count, mut before, mut after) = (0.0, [0.0; 3], [0.0; 3]);
-        for (p, q) in body() {
+        for (p, q) in moved(field, labels) {
             count += 1.0;
             (0..3).for_each(|a| (before[a], after[a]) = (before[a] + p[a], after[a] + q[a]));
         }
-        let [before, middle] = [before, after].map(|sum| sum.map(|v| v / count));
+        let [before, after] = [before, after].map(|sum| sum.map(|v| v / count));
         let (mut spread, mut with) = ([[0.0; 3]; 3], [[0.0; 3]; 3]);
-        for (p, q) in body() {
+        for (p, q) in moved(field, labels) {
             for r in 0..3 {
                 for c in 0..3 {
                     spread[r][c] += (p[r] - before[r]) * (p[c] - before[c]);
-                    with[r][c] += (q[r] - middle[r]) * (p[c] - before[c]);
+                    with[r][c] += (q[r] - after[r]) * (p[c] - before[c]);
                 }
             }
         }
@@ -51,7 +63,30 @@ impl Turn {
         for (row, with) in gradient.iter_mut().zip(with) {
             *row = cholesky_solve(spread, with)?;
         }
-        let turn = Self { rotation: rotation(gradient)?, middle };
+        Some(Self { before, after, gradient })
+    }
+
+    /// Whether it is all of the field but for rounding: free registrations leave a hundredth of the
+    /// deformation and more, those limited to affine maps what single precision does, 1e-6.
+    pub fn is_all_of(&self, field: &Displacement<'_>, labels: &Mask) -> bool {
+        let (mut left, mut whole) = (0.0, 0.0);
+        for (p, q) in moved(field, labels) {
+            let arm: [f64; 3] = std::array::from_fn(|a| p[a] - self.before[a]);
+            for r in 0..3 {
+                left += (q[r] - self.after[r] - dot(self.gradient[r], arm)).powi(2);
+                whole += (q[r] - self.after[r] - arm[r]).powi(2);
+            }
+        }
+        left < ROUNDING * ROUNDING * whole
+    }
+}
+
+impl Turn {
+    /// By how much the body of `labels` turned; none where that is under a degree, or the field
+    /// says nothing of it.
+    pub fn of(field: &Displacement<'_>, labels: &Mask) -> Option<Self> {
+        let Affinity { after, gradient, .. } = Affinity::of(field, labels)?;
+        let turn = Self { rotation: rotation(gradient)?, middle: after };
         (turn.degrees() > LEAST).then_some(turn)
     }
 

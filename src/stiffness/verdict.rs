@@ -245,7 +245,8 @@ pub struct Verdict {
 
 impl Verdict {
     /// From what the model leaves over, how far to rely on the field, and the regions.
-    pub fn of(misfit: &Misfit, field: Option<Trust>, regions: &[RegionStiffness]) -> Self {
+    /// `is_affine` says whether the field is one affine map.
+    pub fn of(misfit: &Misfit, field: Option<Trust>, is_affine: bool, regions: &[RegionStiffness]) -> Self {
         let percent = 100.0 * misfit.share();
         let mut reasons = vec![match misfit.share() {
             0.0 => "the model leaves over no more than noise".to_string(),
@@ -253,9 +254,13 @@ impl Verdict {
         }];
         reasons.extend(field.map(|t| format!("trust in the field is {}", t.name())));
         let known = regions.iter().filter(|r| r.identifiable).count();
-        let own = if known == 0 { Trust::Low } else { Trust::High };
+        let flat = is_affine && regions.len() > 1;
+        let own = if known == 0 || flat { Trust::Low } else { Trust::High };
         if known == 0 {
             reasons.push("no modulus is determined".into());
+        }
+        if flat {
+            reasons.push("the field is one affine map, as of a registration that shows no contrast".into());
         }
         let trust = [Some(misfit.trust()), field, Some(own)].into_iter().flatten().max().unwrap_or(own);
         Self { trust, reasons }

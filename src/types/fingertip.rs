@@ -113,7 +113,7 @@ pub struct StiffnessFolder {
     pub map: Volume,
     /// Whether it is in kPa.
     pub absolute: bool,
-    /// Poisson's ratio.
+    /// Poisson's ratio of regions that have none of their own.
     pub poisson: f64,
     /// Name, modulus and bound (`lower`, `upper` or none) of each region.
     pub regions: Vec<StiffnessRegion>,
@@ -139,6 +139,9 @@ pub struct StiffnessRegion {
     pub youngs_modulus: f64,
     /// `lower` or `upper` where it is not identifiable.
     pub bound: Option<String>,
+    /// Poisson's ratio; that of the folder where none is said.
+    #[serde(default)]
+    pub poisson: Option<f64>,
 }
 
 /// A number, or NaN for null.

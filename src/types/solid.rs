@@ -170,6 +170,8 @@ pub struct ElementModulus {
     pub label: u8,
     /// Young's modulus (kPa, or the ratio to the reference region where no force is known).
     pub modulus: f64,
+    /// Poisson's ratio that the modulus goes with.
+    pub poisson: f64,
 }
 
 /// What is written on a mesh of the user.
@@ -179,6 +181,4 @@ pub struct Measured {
     pub nodes: Vec<MeasuredNode>,
     /// What each element is made of; none where it lies outside the map.
     pub elements: Vec<Option<ElementModulus>>,
-    /// Poisson's ratio that the moduli go with.
-    pub poisson: f64,
 }

@@ -1,6 +1,7 @@
 """The Python package gives the bits of the command line, and its words."""
 
 import csv
+import json
 import subprocess
 import sys
 import threading
@@ -271,6 +272,29 @@ def test_errors_of_the_other_parts_are_those_of_the_command_line_too(shell, pair
             call()
         # An array has no file of its own to be called by.
         assert str(caught.value) in said.replace(str(displacement), "displacement"), said
+
+
+def test_what_is_known_by_label_equals_the_command_line(shell, pad, tmp_path):
+    folder, elastic = pad
+    source = shell.folder / "pad-field/displacement.nii.gz"
+    data = nibabel.load(source)
+    alone = tmp_path / "alone.nii.gz"
+    alone.write_bytes(source.read_bytes())
+    labels = folder / "labels.nii.gz"
+    first, second = (int(v) for v in np.unique(np.asarray(nibabel.load(labels).dataobj))[1:3])
+    shell(
+        "stiffness", "--field", alone, "--labels", labels, "--nodes=500", f"--poisson={first}=0.45", f"--fixed={second}=30",
+        "--label-sd=1", *[f"--{key}={elastic[key]}" for key in ("held", "load")], "-o", tmp_path / "known",
+    )
+    found = palpate.stiffness(
+        (lps(np.asarray(data.dataobj)[:, :, :, 0, :]), data.affine), labels=labels, nodes=500, poisson={first: 0.45},
+        fixed={second: 30.0}, label_sd=1.0, held=elastic["held"], load=elastic["load"],
+    )
+    summary = json.loads((tmp_path / "known/summary.json").read_text())
+    for key in summary.keys() - {*TIMES, "inputs"}:
+        assert found.summary[key] == summary[key], key
+    with pytest.raises(palpate.PalpateError, match="no label 99"):
+        palpate.stiffness((lps(np.asarray(data.dataobj)[:, :, :, 0, :]), data.affine), labels=labels, fixed={99: 1.0})
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc to know the peak of memory")

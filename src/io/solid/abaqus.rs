@@ -2,7 +2,7 @@
 
 use super::edit::Edit;
 use crate::io::flaw::Flaw;
-use crate::types::{Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
+use crate::types::{ElementModulus, Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write;
 
@@ -270,20 +270,21 @@ fn boundary(mesh: &SolidMesh, measured: &Measured, prefix: &str) -> String {
 
 /// A set of elements, a material (MPa) and a section for each region.
 fn materials(mesh: &SolidMesh, measured: &Measured) -> String {
-    let mut regions: BTreeMap<u8, (f64, Vec<u64>)> = BTreeMap::new();
+    let mut regions: BTreeMap<u8, (ElementModulus, Vec<u64>)> = BTreeMap::new();
     for (element, found) in mesh.elements().iter().zip(&measured.elements) {
         if let Some(found) = found {
-            regions.entry(found.label).or_insert((found.modulus, Vec::new())).1.push(element.number);
+            regions.entry(found.label).or_insert((*found, Vec::new())).1.push(element.number);
         }
     }
     let mut out = String::new();
-    for (label, (modulus, elements)) in regions.into_iter().filter(|r| r.1.0.is_finite() && r.1.0 > 0.0) {
+    let known = |e: &ElementModulus| e.modulus.is_finite() && e.modulus > 0.0;
+    for (label, (material, elements)) in regions.into_iter().filter(|r| known(&r.1.0)) {
         let _ = writeln!(out, "** palpate: identified modulus of region {label}, MPa\n*ELSET, ELSET=PALPATE{label}");
         for line in elements.chunks(PER_LINE) {
             let line: Vec<String> = line.iter().map(u64::to_string).collect();
             let _ = writeln!(out, "{},", line.join(", "));
         }
-        let (e, nu) = (modulus / 1000.0, measured.poisson);
+        let (e, nu) = (material.modulus / 1000.0, material.poisson);
         let _ = writeln!(out, "*MATERIAL, NAME=PALPATE{label}\n*ELASTIC\n{e:.9e}, {nu}");
         let _ = writeln!(out, "*SOLID SECTION, ELSET=PALPATE{label}, MATERIAL=PALPATE{label}");
     }

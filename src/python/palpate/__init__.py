@@ -122,7 +122,9 @@ class _Result:
 
 
 def _square(parts: Dict[str, Any]) -> Dict[str, Any]:
-    parts["affine"] = np.array([*parts["affine"], [0.0, 0.0, 0.0, 1.0]])
+    for key in ("affine", "posterior_affine"):
+        if key in parts:
+            parts[key] = np.array([*parts[key], [0.0, 0.0, 0.0, 1.0]])
     return parts
 
 
@@ -139,6 +141,10 @@ class Field(_Result):
     uncertainty: np.ndarray
     #: (nx, ny, nz), the body of each voxel of the mask, from 1; 0 outside it.
     bodies: np.ndarray
+    #: (nx, ny, nz, n, 3), mm, RAS, n samples of the field's error: coefficients of cubic B-splines at nodes.
+    posterior: np.ndarray
+    #: (4, 4), nodes of ``posterior`` to world mm (RAS).
+    posterior_affine: np.ndarray
     #: (n, 9), the columns of matches.csv: x, y, z, dx, dy, dz (mm, RAS), ncc, sigma (mm), kept.
     matches: np.ndarray
     #: (n, 3), mm, RAS, initial places of the mesh's nodes.
@@ -255,7 +261,9 @@ def stiffness(
     load: Union[str, Image] = "z+",
     force: Optional[float] = None,
     matches: Union[None, bool, np.ndarray] = None,
-    poisson: float = _DEFAULTS["stiffness"]["poisson"],
+    poisson: Union[float, Mapping[int, float]] = _DEFAULTS["stiffness"]["poisson"],
+    fixed: Mapping[int, float] = {},
+    label_sd: float = _DEFAULTS["stiffness"]["label_sd"],
     model: str = "auto",
     nodes: int = _DEFAULTS["stiffness"]["nodes"],
     regions: int = _DEFAULTS["stiffness"]["regions"],
@@ -267,21 +275,26 @@ def stiffness(
     ``displacement`` is a `Field`, or an (nx, ny, nz, 3) array (mm, RAS) with its affine. ``held`` and ``load`` are sides
     (``"z-"``) or masks that cover the patch; ``force`` is the total force on the loaded patch in N. ``matches`` are taken in
     place of the field inside the body: those of the `Field` where there are enough, ``False`` for none, or an (n, 9) array.
+    ``poisson`` is one ratio, or a mapping from labels to theirs (the default for others). ``fixed`` maps labels to moduli
+    that are known (kPa); without a force they set the scale. ``label_sd`` is one standard deviation of the border between
+    two labels (voxels). A `Field` also brings its trust, its model and samples of its error.
     """
     if (labels is None) == (mask is None):
         raise PalpateError("give either labels or mask")
     body, what = (labels, "labels") if labels is not None else (mask, "mask")
     if isinstance(displacement, Field):
         array, affine = displacement.displacement, displacement.affine
-        beside = displacement.matches
+        beside, told = displacement.matches, displacement.summary
+        samples = (np.require(displacement.posterior, np.float32, ["F", "A"]), _rows(displacement.posterior_affine))
     else:
         array, affine = displacement
-        beside = None
+        beside, told, samples = None, {}, None
     array = np.asarray(array)
     if array.ndim == 5 and array.shape[3] == 1:
         array = array[:, :, :, 0, :]
     unasked = matches is None
     taken = beside if matches is None or matches is True else None if matches is False else np.asarray(matches, float)
+    by_label = dict(poisson) if isinstance(poisson, Mapping) else {}
     place = lambda patch, name: patch if isinstance(patch, str) and len(patch) == 2 else _image(patch, name)
     return Stiffness(
         _square(
@@ -296,10 +309,15 @@ def stiffness(
                 place(held, "held"),
                 place(load, "load"),
                 force,
-                poisson,
+                _DEFAULTS["stiffness"]["poisson"] if by_label else poisson,
+                by_label,
+                dict(fixed),
+                label_sd,
                 model,
                 nodes,
                 regions,
+                _json.dumps({key: told.get(key) for key in ("trust", "model")}),
+                samples,
                 ["displacement", _called(body, what)],
                 progress,
                 threads,
