@@ -161,7 +161,7 @@ impl Spread {
 }
 
 /// Number of pairs, and counts, medians and quartiles of each region; the keys are those of
-/// docs/file-formats.md.
+/// docs/reference/file-formats.md.
 pub fn summary(outcomes: &[PairOutcome]) -> Value {
     let quartile = |s: &Spread, q: f64| (s.seen() > 0).then(|| s.at(q)).filter(|v| v.is_finite());
     let spread = |s: &Spread| {
