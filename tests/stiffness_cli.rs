@@ -409,8 +409,8 @@ fn what_is_known_by_label_is_checked() {
 #[test]
 fn each_export_has_the_ratio_of_each_region() {
     let folder = folder();
-    let mesh = "*NODE\n1, 0, 8, 4\n2, 8, 8, 4\n3, 0, 16, 4\n4, 0, 8, 6\n5, 0, 8, 16\n6, 8, 8, 16\n7, 0, 16, 16\n\
-                8, 0, 8, 14\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4\n2, 5, 7, 6, 8\n";
+    let mesh = "*NODE\n1, 0, 8, 4\n2, 8, 8, 4\n3, 0, 16, 4\n4, 0, 8, 6\n5, 0, 8, 13\n6, 8, 8, 13\n7, 0, 16, 13\n\
+                8, 0, 8, 10\n*ELEMENT, TYPE=C3D4\n1, 1, 2, 3, 4\n2, 5, 7, 6, 8\n";
     fs::write(folder.path().join("body.inp"), mesh).unwrap();
     let given = ["--force", "0.1", "--poisson", "0.3", "--poisson", "2=0.4", "--mesh", "body.inp"];
     run(folder.path(), &[&BASE[..], &given].concat(), 0);

@@ -73,7 +73,7 @@ fn the_stiffness_report_too() {
     palpate(folder.path()).args(phantom).assert().success();
     let stiffness = ["stiffness", "--field", "block/truth.nii.gz", "--labels", "block/labels.nii.gz"];
     let images = ["--image", "block/initial.nii.gz", "--image", "block/deformed.nii.gz"];
-    let rest = ["--nodes", "800", "--model", "linear", "--quiet", "-o", "stiffness"];
+    let rest = ["--nodes", "1500", "--model", "linear", "--quiet", "-o", "stiffness"];
     palpate(folder.path()).args(stiffness).args(images).args(rest).assert().success();
     let said = all_is_well(&folder.path().join("stiffness/report.html"), 25);
     assert!(!said.contains("at least") && !said.contains("unknown"), "{said}");

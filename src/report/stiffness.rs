@@ -228,6 +228,9 @@ pub struct Shown<'a> {
     pub images: &'a [(String, Volume)],
 }
 
+/// Voxels from one stripe of a hatching to the next.
+const STRIPES: usize = 3;
+
 /// Maps, displacement and mesh over the images in a viewer, with the scales of the pictures.
 fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Values<'_>, &Panel); 3]) -> String {
     let overlays: Vec<Layer<'_>> = maps
@@ -310,11 +313,16 @@ fn page_with(
     };
     let seen = result.regions.iter().filter(|r| r.identifiable).map(|r| r.youngs_modulus).fold(0.0, f64::max);
     let seen = if seen > 0.0 { seen } else { top(moduli, 1.0) };
-    let map = panel(
+    let bounds: Vec<f32> =
+        result.regions.iter().filter(|r| r.state == Determined::Bound).map(|r| r.youngs_modulus as f32).collect();
+    // Stripes along a diagonal of the voxels show on sections along every axis.
+    let striped = |o: usize| bounds.contains(&map[o]) && grid.voxel(o).iter().sum::<usize>() % STRIPES == 0;
+    let hatched: Values<'_> = &|o| if striped(o) { f32::NAN } else { moduli(o) };
+    let map_panel = panel(
         "Young's modulus",
-        moduli,
+        hatched,
         Scale::from_zero(seen, unit, ColorMap::Viridis),
-        "One value a region. A region that is not identifiable shows its bound, at the end of the scale if beyond; one that is not seen at all the largest region's.",
+        "One value per region. Hatched: the value is a bound, at the end of the scale if beyond. Without colour: unknown.",
     )?;
     let sd = panel(
         "Standard deviation",
@@ -352,7 +360,7 @@ fn page_with(
         region_table(result)
     );
     out.push_str(extra);
-    let maps = [(moduli, &map), (deviations, &sd), (residuals, &rest)];
+    let maps = [(moduli, &map_panel), (deviations, &sd), (residuals, &rest)];
     let viewer = look(result, &inside, shown, maps);
     let _ = write!(out, "<section><h2>Look</h2><article class=\"wide\">{viewer}</article></section>");
     let some = sample(grid.len(), Some(&inside));
@@ -364,7 +372,7 @@ fn page_with(
         out,
         "<section><h2>Maps</h2><div class=\"grid\">{}{}{}<article class=\"wide\"><h3>Distributions</h3><div class=\"charts\">\
          {distributions}</div></article></div></section>",
-        card(&map),
+        card(&map_panel),
         card(&sd),
         card(&rest)
     );
