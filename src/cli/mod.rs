@@ -51,6 +51,8 @@ mod markups;
 
 mod outputs;
 
+mod own;
+
 mod peers;
 
 mod plan;
@@ -85,7 +87,6 @@ use clap::error::ErrorKind;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use console::Console;
 use std::ffi::OsString;
-use std::process::ExitCode;
 use std::time::Duration;
 
 /// Measures how soft tissue deforms inside, from a pair of MR volumes.
@@ -206,9 +207,10 @@ fn whole() -> clap::Command {
     examples::with_examples(Cli::command())
 }
 
-/// The whole program.
-pub fn run() -> ExitCode {
-    let typed: Vec<OsString> = std::env::args_os().collect();
+/// The whole program; returns its exit code. `typed` are the words of the command line, the
+/// program's name first; `own` are those that start this program again.
+pub fn run(typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
+    own::remember(own);
     let words: Vec<String> = typed.iter().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let (matches, words, warning) = match whole().try_get_matches_from(&typed) {
         Ok(matches) => (matches, words, None),
@@ -232,17 +234,17 @@ pub fn run() -> ExitCode {
         Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
     };
     match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) if console::is_closed_pipe(&error) => ExitCode::SUCCESS,
+        Ok(()) => 0,
+        Err(error) if console::is_closed_pipe(&error) => 0,
         Err(error) => failed(&console, &error),
     }
 }
 
 /// Says why, and with which code the program ends.
-fn failed(console: &Console, error: &anyhow::Error) -> ExitCode {
+fn failed(console: &Console, error: &anyhow::Error) -> u8 {
     console.error(error);
     let usage = error.is::<Usage>() || error.is::<palpate::error::ParamError>();
-    ExitCode::from(if usage { 2 } else { 1 })
+    if usage { 2 } else { 1 }
 }
 
 /// Runs one command.
