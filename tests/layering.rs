@@ -1,4 +1,4 @@
-//! Holds the layer table of docs/architecture.md: who may import whom, who opens files, who prints.
+//! Holds the layer table of CONTRIBUTING.md: who may import whom, who opens files, who prints.
 #![allow(clippy::unwrap_used)]
 
 use std::fs;

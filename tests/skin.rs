@@ -279,7 +279,7 @@ fn bad_scenes_are_refused() {
         ("displacement = 3.0e-4", "displacement = 4.0e-3", ["load.displacement", "less than the thickness"]),
         ("poisson = 0.45", "poisson = 0.5", ["block.poisson", "below 0.5"]),
         ("[load]", "[loads]", ["loads", "did you mean 'load'"]),
-        ("ramp = 1.0", "ramp = \"1\"", ["ramp", "docs/skin.md"]),
+        ("ramp = 1.0", "ramp = \"1\"", ["ramp", "docs/reference/skin.md"]),
     ] {
         assert!(SCENE.contains(from), "{from}");
         let (out, err, folder) = run(&SCENE.replacen(from, to, 1), 1);

@@ -1,4 +1,4 @@
-//! What docs/trust.md promises of files, limits and repeated runs: killed, stopped, out of time,
+//! What docs/explanation/trust.md promises of files, limits and repeated runs: killed, stopped, out of time,
 //! memory and permission.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used)]

@@ -133,7 +133,7 @@ def chart(rows, groups, path):
         for c, e, m in points:
             axis.scatter(c, e, s=46, color=colour(m), zorder=2)
         axis.axhline(still, color="0.75", ls=":", lw=1)
-        axis.annotate("doing nothing", (1, still), xycoords=("axes fraction", "data"), xytext=(-4, 3), textcoords="offset points", ha="right", color="0.5")
+        axis.annotate("before registration", (1, still), xycoords=("axes fraction", "data"), xytext=(-4, 3), textcoords="offset points", ha="right", color="0.5")
         axis.set(xscale="log", yscale="log", xlabel="CPU time (s), files included", ylabel="mean error (mm)")
         axis.set_title(f"{title} ({count} cases)", fontsize=11)
         low, high = axis.get_xlim()
@@ -166,7 +166,7 @@ def table(rows, groups):
             if r["still_mm"] not in ("", "nan"):
                 still[r["method"]].append(float(r["still_mm"]))
         identity = np.mean(list({r["case"]: float(r["identity_mm"]) for r in some}.values()))
-        out += [f"### {title}", "", f"{count} cases, doing nothing {identity:.2f} mm.", ""]
+        out += [f"### {title}", "", f"{count} cases, {identity:.2f} mm before registration.", ""]
         out += ["| method | mean error (mm) | 95 % (mm) | gradient error | still tissue (mm) | folds | CPU (s) | wall (s) | memory (MB) |"]
         out += ["|---|---|---|---|---|---|---|---|---|"]
         for m in sorted(columns["cpu_s"], key=columns["cpu_s"].get):

@@ -18,7 +18,7 @@ use std::time::Instant;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Scene file (.toml); docs/grasp.md shows one
+    /// Scene file (.toml); docs/reference/grasp.md shows one
     scene: PathBuf,
     #[command(flatten)]
     target: Target,

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Scene file (.toml); docs/skin.md shows one
+    /// Scene file (.toml); docs/reference/skin.md shows one
     scene: PathBuf,
     #[command(flatten)]
     target: Target,

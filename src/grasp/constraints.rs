@@ -9,7 +9,7 @@
 //! d_n2 = a + W/2 + r_2 . n        d_t2 = r_2 . t - a (theta_2 + theta)
 //! ```
 //!
-//! and the tilts are theta - theta_1 and -(theta + theta_2) (docs/grasp.md has both signs settled).
+//! and the tilts are theta - theta_1 and -(theta + theta_2) (docs/reference/grasp.md has both signs settled).
 //! Rows of a Jacobian stand in the order d_n1, d_n2, d_t1, d_t2; coordinates in the order x, y,
 //! theta, theta_1, theta_2.
 

@@ -1,7 +1,7 @@
 //! The soft-finger grasp simulator: two 1-DOF fingers with soft tips that hold a rectangular
 //! object.
 //!
-//! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue); docs/grasp.md has every
+//! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue); docs/reference/grasp.md has every
 //! equation and two signs of the slides that had to be settled. Order: [`models`] (fingertips), [`constraints`] (where
 //! they touch), [`statics`] (equilibria), [`control`], [`plant`] (forces), [`minimal`] and [`multipliers`] (equations of
 //! motion), [`integrators`], [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail),

@@ -3,7 +3,7 @@
 //!
 //! Source: T. Inoue and S. Hirai, "Elastic Model of Deformable Fingertip for Soft-Fingered
 //! Manipulation", IEEE Trans. Robotics 22(6), 2006, and S. Hirai's slides. The tilt is the angle
-//! between the back plate and the object's face, with the sign of docs/grasp.md; SI units
+//! between the back plate and the object's face, with the sign of docs/reference/grasp.md; SI units
 //! throughout.
 
 use crate::grasp::tabulated::Tabulated;

@@ -181,7 +181,7 @@ impl<'a> Statics<'a> {
         a > 0.0 && a * b - d * d > 0.0 && a * (b * c - g * g) - d * (d * c - g * e) + e * (d * g - b * e) > 0.0
     }
 
-    /// The closed form at joint angles 0 (docs/grasp.md): x = theta = 0, and for tips that deform
+    /// The closed form at joint angles 0 (docs/reference/grasp.md): x = theta = 0, and for tips that deform
     /// along the face y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the
     /// force that soft ones have at d_0. That of tabulated tips is found next to it; its eigenvalue
     /// is not a number where there is none.

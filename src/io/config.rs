@@ -34,7 +34,7 @@ pub fn read_config(path: impl AsRef<Path>) -> Result<FieldParams, IoError> {
     let mut params = FieldParams::preset(preset);
     for (key, value) in given {
         params = with(&params, &key, &value).ok_or_else(|| {
-            let hint = "see docs/file-formats.md for what each key takes";
+            let hint = "see docs/reference/file-formats.md for what each key takes";
             format(path, format!("{key} is {value}, which it cannot be"), hint)
         })?;
     }

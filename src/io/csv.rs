@@ -56,9 +56,11 @@ pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
         (true, ..) => Ok(TableKind::Matches),
         (_, true, _) => Ok(TableKind::Landmarks),
         (.., true) => Ok(TableKind::Points),
-        _ => {
-            Err(format(path, "is no table of matches, landmarks or points", "see docs/file-formats.md for the columns"))
-        }
+        _ => Err(format(
+            path,
+            "is no table of matches, landmarks or points",
+            "see docs/reference/file-formats.md for the columns",
+        )),
     }
 }
 

@@ -23,7 +23,7 @@ const STEP: [f64; 2] = [0.002, 0.05];
 const ABOUT: &str = "Units: m, Pa, kg, s; places are world RAS. Needs MuJoCo 3.13 or later.\n     One flex a region, each with \
     the one Young's modulus that a flex has; regions share the bodies of their common nodes.\n     The law is MuJoCo's \
     Saint Venant-Kirchhoff: as the linear law for small strain, and not neo-Hookean past it.\n     Linear tetrahedra lock \
-    as Poisson's ratio nears 0.5: see docs/stiffness.md. Density and damping are choices, not measured.\n     The body \
+    as Poisson's ratio nears 0.5: see docs/reference/stiffness.md. Density and damping are choices, not measured.\n     The body \
     starts at rest. Bring ctrl up to that of the key \"pressed\" step by step; or reset to that key, which is the \
     identified state.";
 

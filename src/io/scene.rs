@@ -348,7 +348,7 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
     let raw: RawScene = Value::Table(table).try_into().map_err(|error: toml::de::Error| {
         // The message's further lines name the place: "in `object.mass`".
         let message = error.to_string().trim_end().replace('\n', " ");
-        format(path, message, "docs/grasp.md shows a whole scene")
+        format(path, message, "docs/reference/grasp.md shows a whole scene")
     })?;
     let named = |error: crate::error::UnknownName, key: &str| format(path, error.to_string(), format!("correct {key}"));
     let default = Scene::reference();

@@ -75,7 +75,7 @@ pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
     }
     let raw: RawScene = Value::Table(table).try_into().map_err(|error: toml::de::Error| {
         let message = error.to_string().trim_end().replace('\n', " ");
-        format(path, message, "docs/skin.md shows a whole scene")
+        format(path, message, "docs/reference/skin.md shows a whole scene")
     })?;
     let mut layers = Vec::with_capacity(raw.layer.len());
     for (number, l) in raw.layer.into_iter().enumerate() {
@@ -109,7 +109,7 @@ pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
             poisson: block.poisson.unwrap_or(0.45),
         },
     };
-    scene.check().map_err(|e| format(path, e.to_string(), "docs/skin.md has all keys and their ranges"))?;
+    scene.check().map_err(|e| format(path, e.to_string(), "docs/reference/skin.md has all keys and their ranges"))?;
     Ok(scene)
 }
 

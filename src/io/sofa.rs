@@ -23,7 +23,7 @@ const PLUGINS: [&str; 8] = [
 const ABOUT: &str = "Units: m, Pa, kg; places are world RAS; density that of water.\n     Prescribed nodes stand at their pressed \
     place from the first step on, and all others are at rest.\n     One step is long against all waves: after a few the body \
     is in balance.\n     youngModulus has one value a tetrahedron. Linear tetrahedra lock as Poisson's ratio nears 0.5: see \
-    docs/stiffness.md.\n     Checked by definition, not by SOFA.";
+    docs/reference/stiffness.md.\n     Checked by definition, not by SOFA.";
 
 /// Writes one scene that needs no other file: linear tetrahedra, Young's modulus of each, and the
 /// displacement of held and loaded nodes. The linear law gives `method="small"`, the neo-Hookean

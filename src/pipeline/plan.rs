@@ -89,7 +89,7 @@ pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<()
 /// Memory of a field run on these grids (bytes): 14 MB, 18 bytes a voxel of both volumes up to 20
 /// million voxels and 13 past them, and 4 for a volume whose axes do not run right, anterior and
 /// superior, of which a copy is made. Measured on head phantoms of 0.6 to 313 million voxels
-/// (docs/performance.md), which it meets to 8 %.
+/// (docs/explanation/performance.md), which it meets to 8 %.
 pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
     let voxels = (initial.len() + deformed.len()) as u64;
     let copy = |grid: &Grid| if Orientation::of(grid).is_canonical() { 0 } else { 4 * grid.len() as u64 };

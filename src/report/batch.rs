@@ -36,8 +36,8 @@ pub const COLUMNS: [&str; 21] = [
 ];
 
 /// Columns of regions.csv over all pairs.
-pub const REGION_COLUMNS: [&str; 10] =
-    ["name", "subject", "session", "label", "region", "youngs_modulus", "sd", "unit", "identifiable", "bound"];
+pub const REGION_COLUMNS: [&str; 11] =
+    ["name", "subject", "session", "label", "region", "youngs_modulus", "sd", "unit", "identifiable", "bound", "state"];
 
 /// A value as text; nothing where there is none.
 fn text(v: &Value) -> String {
@@ -103,7 +103,7 @@ pub fn region_rows(o: &PairOutcome) -> Vec<Vec<String>> {
         let mut row = vec![o.name.clone(), o.subject.clone(), o.session.clone()];
         row.extend(["label", "name", "youngs_modulus", "sd"].map(|k| text(&r[k])));
         row.push(if o.stiffness["absolute"] == true { "kPa".into() } else { "ratio".into() });
-        row.extend([u8::from(r["identifiable"] == true).to_string(), text(&r["bound"])]);
+        row.extend([u8::from(r["identifiable"] == true).to_string(), text(&r["bound"]), text(&r["state"])]);
         row
     };
     list(&o.stiffness["regions"]).iter().map(one).collect()
@@ -161,7 +161,7 @@ impl Spread {
 }
 
 /// Number of pairs, and counts, medians and quartiles of each region; the keys are those of
-/// docs/file-formats.md.
+/// docs/reference/file-formats.md.
 pub fn summary(outcomes: &[PairOutcome]) -> Value {
     let quartile = |s: &Spread, q: f64| (s.seen() > 0).then(|| s.at(q)).filter(|v| v.is_finite());
     let spread = |s: &Spread| {

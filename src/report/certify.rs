@@ -50,7 +50,7 @@ pub fn headline(c: &Certificate) -> String {
     format!("Strain to ± {} % at a gauge of {} mm; {smoothed}.", percent(c.strain_noise), significant(c.gauge_mm))
 }
 
-/// The keys are those of docs/file-formats.md.
+/// The keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &CertifyReport<'_>) -> Value {
     let c = report.certificate;
     let mut out = json!({

@@ -112,7 +112,7 @@ pub fn events(run: &GraspRun) -> Value {
     json!(run.events)
 }
 
-/// summary.json; the keys are those of docs/file-formats.md.
+/// summary.json; the keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &GraspReport<'_>) -> Value {
     let (scene, run) = (report.scene, report.run);
     let seconds: Map<String, Value> = report.seconds.iter().map(|(s, t)| (s.clone(), json!(t))).collect();

@@ -105,7 +105,7 @@ pub fn text(report: &AnalysisReport<'_>) -> String {
     out
 }
 
-/// summary.json; the keys are those of docs/file-formats.md.
+/// summary.json; the keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &AnalysisReport<'_>) -> Value {
     let a = report.analysis;
     let seconds: Map<String, Value> = report.seconds.iter().map(|(s, t)| (s.clone(), json!(t))).collect();

@@ -17,7 +17,7 @@ pub fn seconds(stages: &[(String, f64)]) -> Map<String, Value> {
     stages.iter().map(|(stage, t)| (stage.clone(), json!(t))).collect()
 }
 
-/// The keys are those of docs/file-formats.md.
+/// The keys are those of docs/reference/file-formats.md.
 pub fn field_summary(report: &FieldReport<'_>) -> Value {
     let (s, judged) = (report.summary, verdict(report));
     let [initial, deformed, mask] = report.names;

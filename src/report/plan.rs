@@ -102,7 +102,7 @@ fn quantity(plan: &Plan) -> &'static str {
     if plan.ratios { "ratio to the largest region" } else { "Young's modulus, with the force known" }
 }
 
-/// The keys are those of docs/file-formats.md.
+/// The keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &PlanReport<'_>) -> Value {
     let plan = report.plan;
     let region = |r: &PlannedRegion| {

@@ -40,7 +40,7 @@ fn figures(samples: &[SkinSample], scene: &SkinScene) -> [f64; 3] {
     [samples.iter().map(|s| s.stress).fold(0.0, f64::max), held, left]
 }
 
-/// The keys are those of docs/file-formats.md.
+/// The keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &SkinReport<'_>) -> Value {
     let figures = |samples: Option<&[SkinSample]>| {
         samples.map(|s| {

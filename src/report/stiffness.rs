@@ -167,7 +167,7 @@ pub fn evidence_line(e: &Evidence) -> String {
     format!("{}: {}: {tried}{mark} ({})", e.question, e.model, e.reason)
 }
 
-/// summary.json; the keys are those of docs/file-formats.md.
+/// summary.json; the keys are those of docs/reference/file-formats.md.
 pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
     let seconds: Map<String, Value> = result.seconds.iter().map(|(s, t)| (s.clone(), json!(t))).collect();
     let regions: Vec<Value> = result

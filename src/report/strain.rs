@@ -76,7 +76,7 @@ fn gauge(s: &StrainSummary) -> String {
     format!("{} mm ({sides} along the voxel axes), {why}", significant(s.gauge_mm))
 }
 
-/// The keys are those of docs/file-formats.md.
+/// The keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &StrainReport<'_>) -> Value {
     let s = report.summary;
     let mut regions: BTreeMap<String, Map<String, Value>> = BTreeMap::new();

@@ -210,7 +210,7 @@ fn gray([low, high]: [f64; 2]) -> Scale {
     Scale { low, high, unit: "", map: ColorMap::Gray }
 }
 
-/// The keys are those of docs/file-formats.md.
+/// The keys are those of docs/reference/file-formats.md.
 pub fn summary(report: &TrackReport<'_>) -> Value {
     let t = report.tracked;
     let each = of_frames(t).map(|(frame, text)| format!("frame {frame}: {text}"));

@@ -163,7 +163,7 @@ impl FieldParams {
         "seed",
     ];
 
-    /// The values of a preset (docs/accuracy.md has the measurements behind them).
+    /// The values of a preset (docs/explanation/accuracy.md has the measurements behind them).
     pub fn preset(preset: Preset) -> Self {
         let balanced = Self {
             preset,

@@ -239,7 +239,7 @@ impl Scene {
     }
 
     /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest
-    /// (docs/grasp.md).
+    /// (docs/reference/grasp.md).
     pub fn reference() -> Self {
         let motion = |degrees: [f64; 2]| Motion { target: degrees.map(f64::to_radians), duration: 0.5, hold: 1.0 };
         Self {

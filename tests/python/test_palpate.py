@@ -364,7 +364,7 @@ def test_the_tutorial_runs(pad, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     known = {"NAMES": elastic["names"], "HELD": elastic["held"], "LOAD": elastic["load"], "FORCE": elastic["force_n"]}
     known["EXAMPLES"] = str(ROOT / "examples")
-    blocks = (ROOT / "docs/tutorial-python.md").read_text().split("```python\n")[1:]
+    blocks = (ROOT / "docs/tutorials/python.md").read_text().split("```python\n")[1:]
     assert len(blocks) == 8
     for number, block in enumerate(blocks):
         exec(compile(block.split("```")[0], f"tutorial block {number}", "exec"), known)
