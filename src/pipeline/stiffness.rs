@@ -4,21 +4,23 @@ use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::{displacement, nearest};
 use crate::pipeline::search;
-use crate::stiffness::choice::{choose, known_moduli, settle};
+use crate::stiffness::choice::{Choice, choose, known_moduli, settle};
 use crate::stiffness::coherent::Fit;
-use crate::stiffness::identify::State;
+use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::Inclusion;
 use crate::stiffness::interface::Interface;
 use crate::stiffness::level::Level;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::{Patch, Place};
 use crate::stiffness::rim::{Outline, Rim, rim};
-use crate::stiffness::summary::Scale;
+use crate::stiffness::summary::{Hidden, Scale};
 use crate::stiffness::turn::{Affinity, Turn};
 use crate::stiffness::verdict::{Found, Shape, Verdict};
 use crate::stiffness::{geometry, maps, summary};
 use crate::strain::deviation::error_draws;
-use crate::types::stiffness::{Determined, Evidence, PatchReport, RegionStiffness, StiffnessParams, StiffnessResult};
+use crate::types::stiffness::{
+    Determined, Evidence, Law, LawChoice, PatchReport, RegionStiffness, StiffnessParams, StiffnessResult,
+};
 use crate::types::{
     DenseField, Displacement, ErrorSamples, Mask, MotionModel, QuadraticMesh, SparseField, Trust, WorldPoint,
 };
@@ -281,22 +283,29 @@ fn labelled(
     clock.book("mesh");
 
     progress("coarse", 0.1);
-    let mut choice = choose(&mut coarse, params, reference)?;
     let mut hidden = Vec::new();
-    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params, reference), &choice.estimate) {
-        hidden.push(found);
-        coarse.hidden.push(found.label);
-        choice = choose(&mut coarse, params, reference)?;
-    }
-    choice.estimate = known_moduli(&mut coarse, choice.law, params, reference, choice.estimate)?;
-    (fine.hidden, fine.known) = (coarse.hidden.clone(), coarse.known.clone());
+    let mut choice = chosen(&mut coarse, params, reference, &mut hidden)?;
     clock.book("coarse");
 
     progress("fine", 0.4);
-    fine.touch_like(&coarse)?;
-    let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(&coarse, &choice.estimate.state) };
-    let estimate = fine.setup(choice.law, params, reference).run(start, 3, PRECISION)?;
-    let estimate = settle(&mut fine, choice.law, params, reference, estimate, (FINE_MOVES, PRECISION))?;
+    let estimate = match identified(&coarse, &mut fine, &choice, params, reference) {
+        Ok(estimate) => estimate,
+        // What the coarse mesh bears the fine one need not.
+        Err(StiffnessError::NoEquilibrium | StiffnessError::InsideOut)
+            if params.model == LawChoice::Auto && choice.law == Law::NeoHookean =>
+        {
+            [&mut coarse, &mut fine].into_iter().for_each(Level::move_back);
+            let linear = StiffnessParams { model: LawChoice::Linear, ..params.clone() };
+            choice = chosen(&mut coarse, &linear, reference, &mut hidden)?;
+            choice.warnings.push(
+                "the neo-Hookean law found no equilibrium on the fine mesh, and the linear one is taken, which is an approximation: \
+                 check the field, the labels and the patches"
+                    .into(),
+            );
+            identified(&coarse, &mut fine, &choice, &linear, reference)?
+        }
+        Err(error) => return Err(error),
+    };
     clock.book("fine");
 
     progress("uncertainty", 0.9);
@@ -414,6 +423,39 @@ fn labelled(
         regions,
         mesh: fine.moved(mesh)?,
     })
+}
+
+/// Contact, law, shape and moduli on the coarse mesh; regions that the data do not show are left out
+/// one after the other, and added to `hidden`.
+fn chosen(
+    coarse: &mut Level,
+    params: &StiffnessParams,
+    reference: usize,
+    hidden: &mut Vec<Hidden>,
+) -> Result<Choice, StiffnessError> {
+    let mut choice = choose(coarse, params, reference)?;
+    while let Some(found) = summary::least_seen(&coarse.setup(choice.law, params, reference), &choice.estimate) {
+        hidden.push(found);
+        coarse.hidden.push(found.label);
+        choice = choose(coarse, params, reference)?;
+    }
+    choice.estimate = known_moduli(coarse, choice.law, params, reference, choice.estimate)?;
+    Ok(choice)
+}
+
+/// The moduli on the fine mesh, from those on the coarse one.
+fn identified(
+    coarse: &Level,
+    fine: &mut Level,
+    choice: &Choice,
+    params: &StiffnessParams,
+    reference: usize,
+) -> Result<Estimate, StiffnessError> {
+    (fine.hidden, fine.known) = (coarse.hidden.clone(), coarse.known.clone());
+    fine.touch_like(coarse)?;
+    let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(coarse, &choice.estimate.state) };
+    let estimate = fine.setup(choice.law, params, reference).run(start, 3, PRECISION)?;
+    settle(fine, choice.law, params, reference, estimate, (FINE_MOVES, PRECISION))
 }
 
 /// Draws of the field's error at the observations (mm, RAS); none where matches are taken in its

@@ -232,7 +232,7 @@ impl Chooser<'_> {
         let small = Tried::new(self.level, &setup, small)?;
         let large = self.large_strain_from(&small).or_else(|_| {
             // A shape that was moved far may bear no large strain; what it changes stays to first order.
-            self.level.move_to(&vec![0.0; small.offsets.len()]);
+            self.level.move_back();
             self.large_strain_from(&small)
         });
         let Ok(large) = large else {

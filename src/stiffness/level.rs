@@ -154,6 +154,11 @@ impl Level {
         }
     }
 
+    /// Moves the open parts back to where the voxels put them.
+    pub fn move_back(&mut self) {
+        self.move_to(&vec![0.0; self.open.len()]);
+    }
+
     /// Makes both meshes of a body agree on which patches are curved: the one with more nodes there
     /// knows better, as a coarse mesh rounds the rim of a flat face. Unknowns are numbered anew
     /// where a plate presses a curved one.
@@ -197,8 +202,7 @@ impl Level {
     /// The open parts where they lie before they are moved; a loaded patch that is curved has no
     /// edge.
     fn open_parts(&mut self) {
-        let offsets = self.offsets();
-        self.move_to(&vec![0.0; offsets.len()]);
+        self.move_back();
         self.edge = Edge::of(&self.patches[1], &self.body, self.voxel);
         let edge = self.edge.iter().map(|edge| Part::edge(edge, &self.body, self.voxel));
         let borders = if self.label_sd > 0.0 { border::all(&self.body) } else { Vec::new() };
