@@ -3,6 +3,9 @@
 //!
 //! The modules stand in the order of the pipeline.
 
+// `cli` uses what any other program would.
+extern crate self as palpate;
+
 pub mod error;
 
 pub mod types;
@@ -40,6 +43,9 @@ pub mod evaluate;
 pub mod report;
 
 pub mod pipeline;
+
+#[doc(hidden)]
+pub mod cli;
 
 #[cfg(feature = "python")]
 mod python;

@@ -1,7 +1,8 @@
 //! The command line of `palpate`.
 
-mod cli;
+use std::process::ExitCode;
 
-fn main() -> std::process::ExitCode {
-    cli::run()
+fn main() -> ExitCode {
+    let own = std::env::current_exe().map_or_else(|_| "palpate".into(), Into::into);
+    ExitCode::from(palpate::cli::run(std::env::args_os().collect(), vec![own]))
 }

@@ -10,6 +10,7 @@ use super::console::Console;
 use super::field::Tuning;
 use super::inputs::name;
 use super::limits::ATTENDED;
+use super::own;
 use super::record::{self, Recording};
 use anyhow::{Result, bail};
 use clap::Args;
@@ -390,8 +391,9 @@ fn record(stage: &Stage) -> Result<Value> {
 /// Runs a stage as a process of its own, which ends with this one; its words go to `<stage>.log` in
 /// `folder`.
 fn execute(stage: &Stage, folder: &Path, threads: usize) -> Result<()> {
-    let mut command = Command::new(std::env::current_exe()?);
-    command.args(&stage.arguments).args(["--threads", &threads.to_string()]).env(ATTENDED, "1");
+    let own = own::words();
+    let mut command = Command::new(&own[0]);
+    command.args(&own[1..]).args(&stage.arguments).args(["--threads", &threads.to_string()]).env(ATTENDED, "1");
     let mut process = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn()?;
     let _open = process.stdin.take();
     let done = process.wait_with_output()?;

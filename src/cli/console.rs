@@ -1,21 +1,29 @@
 //! stdout and stderr.
 
 use indicatif::{ProgressBar, ProgressStyle};
-use std::io::{ErrorKind, Write, stderr, stdout};
-use std::sync::Arc;
+use std::io::{ErrorKind, IsTerminal, Write, stderr, stdout};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 /// What was typed, and how much to say.
 #[derive(Debug, Clone)]
 pub struct Console {
     quiet: bool,
     verbose: bool,
+    /// Progress as XML on stdout.
+    xml: bool,
     arguments: Arc<[String]>,
 }
 
 impl Console {
     /// `arguments` are those of the program, the command first.
     pub fn new(quiet: bool, verbose: bool, arguments: &[String]) -> Self {
-        Self { quiet, verbose, arguments: arguments.into() }
+        Self { quiet, verbose, xml: false, arguments: arguments.into() }
+    }
+
+    /// The same with progress as XML on stdout, as 3D Slicer reads it.
+    pub fn with_xml(self, xml: bool) -> Self {
+        Self { xml, ..self }
     }
 
     /// The same for a command that this one runs.
@@ -60,32 +68,84 @@ impl Console {
         let _ = writeln!(stderr(), "error: {said}");
     }
 
-    /// A bar on stderr: hidden when that is no terminal, or with --quiet.
+    /// How far a command is: a bar where stderr is a terminal, a line a stage where it is not, none
+    /// with --quiet.
     pub fn progress(&self) -> Progress {
-        let bar = if self.quiet { ProgressBar::hidden() } else { ProgressBar::new(1000) };
-        if let Ok(style) = ProgressStyle::with_template("{msg:16} {bar:40} {percent:>3} %  {elapsed}") {
-            bar.set_style(style);
-        }
-        Progress(bar)
+        let shown = match () {
+            _ if self.xml => Shown::Xml,
+            _ if self.quiet => Shown::Nothing,
+            _ if stderr().is_terminal() => Shown::Bar(bar()),
+            _ => Shown::Lines(Instant::now()),
+        };
+        Progress { shown, last: Mutex::default() }
     }
 }
 
-/// A running bar; it is wiped when dropped.
-pub struct Progress(ProgressBar);
+fn bar() -> ProgressBar {
+    let bar = ProgressBar::new(1000);
+    if let Ok(style) = ProgressStyle::with_template("{msg:16} {bar:40} {percent:>3} %  {elapsed}") {
+        bar.set_style(style);
+    }
+    bar
+}
+
+/// Running progress; a bar is wiped when it is dropped.
+pub struct Progress {
+    shown: Shown,
+    /// The stage and the percent that were shown last.
+    last: Mutex<(String, u64)>,
+}
+
+enum Shown {
+    Nothing,
+    Bar(ProgressBar),
+    /// Since when.
+    Lines(Instant),
+    Xml,
+}
 
 impl Progress {
     /// Shows the stage and the fraction of the whole (0 to 1).
     pub fn set(&self, stage: &str, fraction: f64) {
-        if self.0.message() != stage {
-            self.0.set_message(stage.to_string());
+        let percent = (100.0 * fraction.clamp(0.0, 1.0)) as u64;
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_new = last.0 != stage;
+        match &self.shown {
+            Shown::Nothing => {}
+            Shown::Bar(bar) => {
+                if is_new {
+                    bar.set_message(stage.to_string());
+                }
+                bar.set_position((1000.0 * fraction.clamp(0.0, 1.0)) as u64);
+            }
+            // What is done within a second needs no word.
+            Shown::Lines(since) if is_new && since.elapsed().as_secs_f64() > 1.0 => {
+                let _ = writeln!(stderr(), "{percent:>3} %  {stage}");
+            }
+            Shown::Lines(_) => {}
+            Shown::Xml => {
+                let mut out = stdout().lock();
+                if is_new {
+                    let _ = writeln!(out, "<filter-comment>{stage}</filter-comment>");
+                }
+                if is_new || percent != last.1 {
+                    let _ = writeln!(out, "<filter-progress>{:.2}</filter-progress>", percent as f64 / 100.0);
+                    let _ = out.flush();
+                }
+            }
         }
-        self.0.set_position((1000.0 * fraction.clamp(0.0, 1.0)) as u64);
+        if is_new {
+            last.0 = stage.to_string();
+        }
+        last.1 = percent;
     }
 }
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        self.0.finish_and_clear();
+        if let Shown::Bar(bar) = &self.shown {
+            bar.finish_and_clear();
+        }
     }
 }
 

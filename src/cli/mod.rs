@@ -51,6 +51,8 @@ mod markups;
 
 mod outputs;
 
+mod own;
+
 mod peers;
 
 mod plan;
@@ -64,6 +66,8 @@ mod repeat;
 mod sequence;
 
 mod skin;
+
+mod slicer;
 
 mod track;
 
@@ -85,7 +89,7 @@ use clap::error::ErrorKind;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use console::Console;
 use std::ffi::OsString;
-use std::process::ExitCode;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Measures how soft tissue deforms inside, from a pair of MR volumes.
@@ -206,9 +210,15 @@ fn whole() -> clap::Command {
     examples::with_examples(Cli::command())
 }
 
-/// The whole program.
-pub fn run() -> ExitCode {
-    let typed: Vec<OsString> = std::env::args_os().collect();
+/// The whole program; returns its exit code. `typed` are the words of the command line, the
+/// program's name first; `own` are those that start this program again.
+pub fn run(mut typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
+    own::remember(own);
+    named_for_command(&mut typed);
+    if let Some(description) = slicer::description(&typed, &whole()) {
+        return u8::from(Console::new(false, false, &[]).say(&description).is_err());
+    }
+    let asked = slicer::Asked::taken(&mut typed);
     let words: Vec<String> = typed.iter().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let (matches, words, warning) = match whole().try_get_matches_from(&typed) {
         Ok(matches) => (matches, words, None),
@@ -220,29 +230,41 @@ pub fn run() -> ExitCode {
         Err(error) => error.exit(),
     };
     let Cli { common, command } = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.format(&mut whole()).exit());
-    let console = Console::new(common.quiet, common.verbose, &words);
+    let console = Console::new(common.quiet, common.verbose, &words).with_xml(asked.progress);
     warning.iter().for_each(|text| console.warn(text));
     limits::watch(console.clone(), common.timeout);
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool
     // for each small step.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(common.threads.unwrap_or(0).into()).build();
-    let work = || dispatch(&command, &console);
+    let results = matches.subcommand().and_then(|(_, m)| m.try_get_one::<PathBuf>("output").ok().flatten());
+    let work = || dispatch(&command, &console).and_then(|()| asked.hand_over(results.map(PathBuf::as_path)));
     let done = match pool {
         Ok(pool) => pool.install(work),
         Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
     };
     match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) if console::is_closed_pipe(&error) => ExitCode::SUCCESS,
+        Ok(()) => 0,
+        Err(error) if console::is_closed_pipe(&error) => 0,
         Err(error) => failed(&console, &error),
     }
 }
 
+/// Puts the command first where the program is called by a link named for it, as palpate-field: 3D
+/// Slicer knows one module a program.
+fn named_for_command(typed: &mut Vec<OsString>) {
+    let name = typed.first().and_then(|word| Path::new(word).file_stem()).map(|n| n.to_string_lossy().into_owned());
+    if let Some(command) = name.as_deref().and_then(|n| n.strip_prefix("palpate-"))
+        && whole().find_subcommand(command).is_some()
+    {
+        typed.insert(1, command.into());
+    }
+}
+
 /// Says why, and with which code the program ends.
-fn failed(console: &Console, error: &anyhow::Error) -> ExitCode {
+fn failed(console: &Console, error: &anyhow::Error) -> u8 {
     console.error(error);
     let usage = error.is::<Usage>() || error.is::<palpate::error::ParamError>();
-    ExitCode::from(if usage { 2 } else { 1 })
+    if usage { 2 } else { 1 }
 }
 
 /// Runs one command.

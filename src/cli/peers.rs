@@ -1,6 +1,7 @@
 //! Other tools beside this one: each in a process of its own, by the script that the benchmarks
 //! use.
 
+use super::own;
 use anyhow::{Context, Result, bail};
 use palpate::io;
 use palpate::pipeline::trials::{Case, Variant};
@@ -102,7 +103,7 @@ impl Peers {
         let [fixed, moving] = ["fixed.nii.gz", "moving.nii.gz"].map(|n| self.folder.join(n));
         io::write_volume(&fixed, &case.initial, "palpate chart")?;
         io::write_volume(&moving, &case.deformed, "palpate chart")?;
-        let own = std::env::current_exe().context("this program cannot find itself")?;
+        let own = own::words();
         let pair = [&fixed, &moving].map(|p| p.clone().into_os_string());
         let presets = Variant::presets();
         let tools: Vec<&Tool> = self.tools.iter().filter(|t| t.missing.is_empty() && t.name != SIMULATOR).collect();
@@ -112,7 +113,8 @@ impl Peers {
             progress(out.len() as f64 / count);
             // A folder a run: what one leaves is not taken for another's.
             let results = io::Scratch::new()?;
-            let mut command = vec![own.clone().into_os_string(), "field".into()];
+            let mut command = own.clone();
+            command.push("field".into());
             command.extend(pair.clone());
             command.extend(["-o".into(), results.path().into()]);
             let flags = ["--force", "--quiet", "--threads", "2", "--preset", preset.method.as_str()];

@@ -121,7 +121,7 @@ pub use sofa::write_sofa;
 pub use solid::{SolidFile, write_boundary, write_element_moduli};
 pub use stiffness::{KnownMaterial, read_materials, write_feb, write_frames, write_inp, write_plan, write_regions};
 pub use strain::write_region_strains;
-pub use text::{list, read_json, read_text, write_bytes, write_json, write_text};
+pub use text::{copy, list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
 pub use transform::{
     AffineFormat, FieldFormat, StoredTransforms, TransformSource, read_transform, write_affine, write_field_as,

@@ -61,6 +61,16 @@ pub fn write_text(path: impl AsRef<Path>, text: &str) -> Result<(), IoError> {
     write_bytes(path, text.as_bytes())
 }
 
+/// Copies a file.
+///
+/// # Errors
+/// [`IoError`] when one cannot be read, or the other not written.
+pub fn copy(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<(), IoError> {
+    let from = from.as_ref();
+    let mut file = File::open(from).map_err(os(from, "read"))?;
+    write_atomic(to.as_ref(), |w| std::io::copy(&mut file, w).map(drop))
+}
+
 /// Writes bytes as they are.
 ///
 /// # Errors

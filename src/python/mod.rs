@@ -22,6 +22,7 @@ use crate::pipeline::fingertip::NODES;
 use crate::types::StiffnessParams;
 use pyo3::prelude::*;
 use serde_json::json;
+use std::ffi::OsString;
 
 pyo3::create_exception!(
     palpate,
@@ -38,6 +39,13 @@ fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
     arrays::python(py, &json!({ "stiffness": stiffness, "fingertip": { "nodes": NODES } }))
 }
 
+/// The command line: `words` with the program's name first, `own` what starts it again. Returns the
+/// exit code.
+#[pyfunction]
+fn command_line(py: Python<'_>, words: Vec<OsString>, own: Vec<OsString>) -> u8 {
+    py.detach(|| crate::cli::run(words, own))
+}
+
 /// `palpate._palpate`.
 #[pymodule]
 fn _palpate(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -47,6 +55,7 @@ fn _palpate(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(arrays::read_volume, module)?)?;
     module.add_function(wrap_pyfunction!(arrays::read_series, module)?)?;
     module.add_function(wrap_pyfunction!(field::field, module)?)?;
+    module.add_function(wrap_pyfunction!(command_line, module)?)?;
     module.add_function(wrap_pyfunction!(stiffness::stiffness, module)?)?;
     module.add_function(wrap_pyfunction!(pad::fingertip, module)?)?;
     module.add_function(wrap_pyfunction!(grasp::grasp, module)?)?;
