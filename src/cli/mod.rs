@@ -215,7 +215,7 @@ fn whole() -> clap::Command {
 pub fn run(mut typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
     own::remember(own);
     named_for_command(&mut typed);
-    if let Some(description) = slicer::description(&typed, &whole()) {
+    if let Some(description) = slicer::description(&typed, whole()) {
         return u8::from(Console::new(false, false, &[]).say(&description).is_err());
     }
     let asked = slicer::Asked::taken(&mut typed);

@@ -78,12 +78,14 @@ impl Asked {
 }
 
 /// The description that a command line asks for, if it does.
-pub fn description(typed: &[OsString], program: &Command) -> Option<String> {
+pub fn description(typed: &[OsString], mut program: Command) -> Option<String> {
     let [_, name, flag] = typed else { return None };
     if flag != "--xml" {
         return None;
     }
     let (name, returns) = MODULES.iter().find(|m| name == m.0)?;
+    // Places of arguments are numbered then.
+    program.build();
     Some(xml(program.find_subcommand(name)?, returns))
 }
 

@@ -221,6 +221,7 @@ impl<'a> Bench<'a> {
             floor: 1.0,
             noise: None,
             open: &[],
+            settled: false,
             pinned: Vec::new(),
         };
         let mut state = State { theta, ..setup.start() };

@@ -296,7 +296,8 @@ fn labelled(
         {
             [&mut coarse, &mut fine].into_iter().for_each(Level::move_back);
             let linear = StiffnessParams { model: LawChoice::Linear, ..params.clone() };
-            choice = chosen(&mut coarse, &linear, reference, &mut hidden)?;
+            let again = chosen(&mut coarse, &linear, reference, &mut hidden)?;
+            choice = Choice { evidence: without_large_strain(choice.evidence), ..again };
             choice.warnings.push(
                 "the neo-Hookean law found no equilibrium on the fine mesh, and the linear one is taken, which is an approximation: \
                  check the field, the labels and the patches"
@@ -423,6 +424,15 @@ fn labelled(
         regions,
         mesh: fine.moved(mesh)?,
     })
+}
+
+/// The evidence where the law that was chosen cannot be solved on the fine mesh.
+fn without_large_strain(mut evidence: Vec<Evidence>) -> Vec<Evidence> {
+    for e in evidence.iter_mut().filter(|e| e.question == "law") {
+        e.chosen = e.model == Law::Linear.name();
+        e.reason = "the neo-Hookean law found no equilibrium on the fine mesh".into();
+    }
+    evidence
 }
 
 /// Contact, law, shape and moduli on the coarse mesh; regions that the data do not show are left out

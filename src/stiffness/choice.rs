@@ -335,7 +335,9 @@ fn shown(question: &'static str, model: String, e: &Estimate, bic: f64, chosen: 
 }
 
 /// Moves the open parts of the shape to where the data put them, and identifies again, until they
-/// stay, or have moved `moves` times. `precision`: of the forward solutions (mm).
+/// stay, or have moved `moves` times. A move stands if it explains the data better, as told by the
+/// squares and by what was known of the offsets; else half of it is tried. `precision`: of the
+/// forward solutions (mm).
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
@@ -347,20 +349,29 @@ pub fn settle(
     mut estimate: Estimate,
     (moves, precision): (usize, f64),
 ) -> Result<Estimate, StiffnessError> {
+    level.settled = false;
     for _ in 0..moves {
-        let steps = open_steps(&level.setup(law, params, reference), &estimate)?;
+        let setup = level.setup(law, params, reference);
+        let steps = open_steps(&setup, &estimate)?;
         let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SETTLED)) else { break };
-        let before = level.offsets();
-        let next: Vec<f64> = before.iter().zip(&steps).map(|(b, s)| b + s.clamp(-LONGEST, LONGEST)).collect();
-        level.move_to(&next);
-        match level.setup(law, params, reference).run(estimate.state.clone(), ITERATIONS, precision) {
-            Ok(better) => estimate = better,
+        let variance = setup.variance(&estimate);
+        let misfit = |level: &Level, e: &Estimate| {
+            e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.price()
+        };
+        let (before, least) = (level.offsets(), misfit(level, &estimate));
+        let better = [1.0, 0.5].into_iter().find_map(|part| {
+            let moved = |(b, s): (&f64, &f64)| b + part * s.clamp(-LONGEST, LONGEST);
+            level.move_to(&before.iter().zip(&steps).map(moved).collect::<Vec<f64>>());
             // A shape that cannot be solved is left alone.
-            Err(_) => {
-                level.move_to(&before);
-                break;
-            }
-        }
+            let found = level.setup(law, params, reference).run(estimate.state.clone(), ITERATIONS, precision).ok()?;
+            (misfit(level, &found) < least).then_some(found)
+        });
+        let Some(better) = better else {
+            level.move_to(&before);
+            level.settled = true;
+            break;
+        };
+        estimate = better;
     }
     Ok(estimate)
 }

@@ -30,6 +30,12 @@ impl Setup<'_> {
         let together = dilution(self.share(estimate.squares, estimate.rms, samples), samples);
         together.max(samples / estimate.effective)
     }
+
+    /// Variance of a weighted square, in units of the observations' sigma: that of an independent
+    /// sample.
+    pub(super) fn variance(&self, estimate: &Estimate) -> f64 {
+        estimate.squares / (3.0 * estimate.residuals.len() as f64) * self.dilution(estimate)
+    }
 }
 
 /// What a fit says of its parameters.

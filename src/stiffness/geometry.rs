@@ -113,6 +113,11 @@ impl Part {
         Self { name, sigma, most: MOST, movement: body.places.iter().map(one).collect() }
     }
 
+    /// What an offset (voxels) is off from what was known of it (squared standard deviations).
+    pub fn price(&self, offset: f64) -> f64 {
+        (offset / self.sigma).powi(2)
+    }
+
     /// Adds what an offset (voxels) moves to the nodes' places (mm, RAS).
     pub fn shift(&self, places: &mut [[f64; 3]], offset: f64) {
         places.iter_mut().zip(&self.movement).for_each(|(p, m)| (0..3).for_each(|a| p[a] += offset * m[a]));
@@ -264,9 +269,8 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
     prior.extend(parts.iter().map(|(part, moved)| (part.sigma.powi(-2), *moved)));
     let scale = setup.scale(&estimate.residuals);
     let weights = setup.weights(&estimate.residuals, scale);
-    let dilution = setup.dilution(estimate);
+    let variance = setup.variance(estimate);
     let blocks = grouped_normal(setup.observations, &rows, &estimate.residuals, &weights);
-    let variance = estimate.squares / (3.0 * estimate.residuals.len() as f64) * dilution;
     let mut a = vec![0.0; p * p];
     let mut step = vec![0.0; p];
     for block in &blocks {
@@ -282,7 +286,8 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
     let free = std::iter::repeat_n([f64::NEG_INFINITY, f64::INFINITY], first);
     let limited = parts.iter().map(|(part, moved)| {
         let most = part.most * part.sigma;
-        [(-most - moved).min(0.0), (most - moved).max(0.0)]
+        let stays = setup.settled && setup.open.iter().any(|(open, _)| std::ptr::eq(open, *part));
+        if stays { [0.0; 2] } else { [(-most - moved).min(0.0), (most - moved).max(0.0)] }
     });
     let room: Vec<[f64; 2]> = free.chain(limited).collect();
     let step = within(&a, &step, &room).ok_or(StiffnessError::Unsolvable)?;

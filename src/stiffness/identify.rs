@@ -76,6 +76,8 @@ pub struct Setup<'a> {
     pub noise: Option<f64>,
     /// Parts of the shape that are open, and how far each has been moved outwards (voxels).
     pub open: &'a [(Part, f64)],
+    /// Whether moving them further was found to explain the data worse.
+    pub settled: bool,
     /// Regions whose ln(mu / mu_reference) is not free, and its values.
     pub pinned: Vec<(usize, f64)>,
 }
@@ -301,7 +303,7 @@ impl Setup<'_> {
         residuals.iter().zip(weights).map(|(r, w)| w * dot(*r, *r)).sum()
     }
 
-    fn prior(&self, state: &State) -> f64 {
+    pub(super) fn prior(&self, state: &State) -> f64 {
         let moduli: f64 = self.free().iter().map(|&r| (state.theta[r] / PRIOR).powi(2)).sum();
         let plates: f64 = state.plates.iter().flatten().map(|c| (c / self.plate_prior).powi(2)).sum();
         moduli + plates

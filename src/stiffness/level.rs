@@ -60,6 +60,8 @@ pub struct Level {
     /// Parts of the shape that are open, the edge of a punch first, and how far each has been moved
     /// outwards (voxels).
     open: Vec<(Part, f64)>,
+    /// Whether moving them further was found to explain the data worse.
+    pub settled: bool,
     /// Labels of regions that the data do not show: they are taken to be as stiff as the reference.
     pub hidden: Vec<u8>,
     /// ln(mu / mu_reference) of the labels whose modulus is given.
@@ -101,6 +103,7 @@ impl Level {
             edge: None,
             label_sd: 0.0,
             open: Vec::new(),
+            settled: false,
             hidden: Vec::new(),
             known: Vec::new(),
             ordered: false,
@@ -132,6 +135,11 @@ impl Level {
     /// How far each open part has been moved outwards (voxels).
     pub fn offsets(&self) -> Vec<f64> {
         self.open.iter().map(|o| o.1).collect()
+    }
+
+    /// What their offsets are off from what was known of them (squared standard deviations).
+    pub fn price(&self) -> f64 {
+        self.open.iter().map(|(part, offset)| part.price(*offset)).sum()
     }
 
     /// Moves the open parts, each so many voxels outwards from where the voxels put it.
@@ -251,6 +259,7 @@ impl Level {
             floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
             noise: (self.block > 0).then_some(self.noise),
             open: &self.open,
+            settled: self.settled,
             pinned: (0..self.body.labels.len()).filter_map(|r| Some((r, self.pinned(self.body.labels[r])?))).collect(),
         }
     }
