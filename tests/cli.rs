@@ -554,9 +554,11 @@ fn volumes_in_unlike_units_are_refused_before_any_work() {
     put("fine.nii", 0.1, [20, 20, 20]);
     put("lost.nii", 1.0, [20, 20, 20]);
     put("crop.nii", 2.0, [4, 4, 4]);
+    put("um.nii", 0.0015, [20, 20, 20]);
     let cases = [
         ("mm.nii", "m.nii", "44 mm, about 1000 times as long; one of them is likely in metres or micrometres"),
         ("cm.nii", "mm.nii", "about 10 times as long; one of them is likely in centimetres"),
+        ("um.nii", "mm.nii", "0.03 mm, and that of mm.nii is 44 mm, about 1467 times as long"),
         ("fine.nii", "lost.nii", "lost.nii has voxels of 1 mm on every side, as where a header was lost"),
     ];
     for (initial, deformed, message) in cases {
