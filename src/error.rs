@@ -4,8 +4,48 @@
 //! Errors about a file carry its path (added in `io`); the command line joins context with
 //! `anyhow`.
 
-use std::path::PathBuf;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
 use thiserror::Error;
+
+/// Text on one line, without what would steer a terminal: control characters, and those that turn
+/// the direction of writing, are escaped as in JSON.
+pub fn plain(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '\n' => out.push_str("\\n"),
+            '\r' => out.push_str("\\r"),
+            '\t' => out.push_str("\\t"),
+            '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => escape(&mut out, c),
+            c if c.is_control() => escape(&mut out, c),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+fn escape(out: &mut String, c: char) {
+    out.push_str(&format!("\\u{:04x}", u32::from(c)));
+}
+
+/// How a name that someone else gave is shown.
+pub trait Shown {
+    /// As [`plain`] text.
+    fn shown(&self) -> String;
+}
+
+impl Shown for OsStr {
+    fn shown(&self) -> String {
+        plain(&self.to_string_lossy())
+    }
+}
+
+impl Shown for Path {
+    fn shown(&self) -> String {
+        self.as_os_str().shown()
+    }
+}
 
 /// Geometry: affines, grids, lengths.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -137,7 +177,7 @@ pub struct UnknownName {
 #[non_exhaustive]
 pub enum IoError {
     /// The operating system refused.
-    #[error("{path}: cannot {action}: {source}; {hint}", path = path.display(), hint = os_hint(source))]
+    #[error("{path}: cannot {action}: {source}; {hint}", path = path.shown(), hint = os_hint(source))]
     Os {
         /// The file.
         path: PathBuf,
@@ -147,7 +187,7 @@ pub enum IoError {
         source: std::io::Error,
     },
     /// The file is not what it should be.
-    #[error("{path}: {what}; {hint}", path = path.display())]
+    #[error("{path}: {what}; {hint}", path = path.shown())]
     Format {
         /// The file.
         path: PathBuf,
@@ -463,6 +503,15 @@ pub enum SceneError {
         /// Normal displacement by the geometry (m).
         by_geometry: f64,
     },
+    /// A layer of skin that yields too fast to be followed.
+    #[error(
+        "some layer yields faster than the load lasts by a factor of {factor:.0e}, so rounding leaves no digit of the response; leave out \
+         the dashpot that does so, or correct the modulus beside it"
+    )]
+    Stiff {
+        /// Duration of the load over the shortest time constant (1).
+        factor: f64,
+    },
     /// Motions of joints that are locked.
     #[error("finger.fixed is true, but there are motions; remove the [[motion]] tables or set fixed = false")]
     FixedMotion,
@@ -509,7 +558,7 @@ pub enum FingertipError {
         degrees: f64,
     },
     /// Moduli without unit.
-    #[error("the stiffness map holds ratios; run palpate stiffness with --force, so that it is in kPa")]
+    #[error("the stiffness map holds ratios; run palpate stiffness with --total-force, so that it is in kPa")]
     NotAbsolute,
     /// A number out of range.
     #[error(transparent)]

@@ -135,7 +135,7 @@ fn a_folder_with_something_else_is_left_alone() {
     fs::create_dir(folder.path().join("out")).unwrap();
     fs::write(folder.path().join("out/mine.txt"), "mine").unwrap();
     let (_, err) = run(folder.path(), &FAST, 1);
-    assert!(err.contains("not a batch") && err.contains("--force"), "{err}");
+    assert!(err.contains("not a batch") && err.contains("--overwrite"), "{err}");
     assert_eq!(fs::read_dir(folder.path().join("out")).unwrap().count(), 1);
     run(folder.path(), &[&FAST[..], &["--force"]].concat(), 0);
 }
@@ -274,4 +274,58 @@ fn what_a_pair_was_made_from_is_seen_to_change() {
     run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--config", "c.toml"], 1);
     run(folder.path(), &["batch", "pairs.csv", "-o", "out", "--config", "c.toml", "--collect"], 1);
     assert_eq!(statuses(folder.path()), ["one failed"]);
+}
+
+#[test]
+fn what_a_later_stage_would_refuse_is_found_before_the_first_one_runs() {
+    let folder = folder(&[
+        "name,initial,deformed,labels,held,load,scene",
+        "grid,initial.nii.gz,deformed.nii.gz,other.nii,,,",
+        "fraction,initial.nii.gz,deformed.nii.gz,half.nii,,,",
+        "empty,initial.nii.gz,deformed.nii.gz,none.nii,,,",
+        "patch,initial.nii.gz,deformed.nii.gz,mask.nii.gz,other.nii,y+,",
+        "scene,initial.nii.gz,deformed.nii.gz,mask.nii.gz,y-,y+,absent.toml",
+    ]);
+    let at = |name: &str| folder.path().join(name);
+    fs::write(at("other.nii"), fixtures::Nifti::filled([20, 20, 20], 1.0).bytes()).unwrap();
+    let grid = *palpate::io::read_volume(at("initial.nii.gz")).unwrap().grid();
+    for (name, value) in [("half.nii", 0.5), ("none.nii", 0.0)] {
+        palpate::io::write_volume(at(name), &palpate::types::Volume::from_voxels(grid, |_, _| value), "").unwrap();
+    }
+    run(folder.path(), &FAST, 1);
+    for row in rows(folder.path(), "out/batch.csv") {
+        assert_eq!((row["status"].as_str(), row["stage"].as_str()), ("failed", "check"), "{row:?}");
+        assert!(!at("out").join(&row["name"]).exists(), "{row:?}");
+    }
+    let reasons: Vec<String> = rows(folder.path(), "out/batch.csv").into_iter().map(|r| r["reason"].clone()).collect();
+    for (reason, part) in
+        reasons.iter().zip(["other.nii is on another grid", "0.5", "no voxel has a label", "other.nii", "absent.toml"])
+    {
+        assert!(reason.contains(part), "{part}: {reason}");
+    }
+}
+
+#[test]
+fn a_second_run_tells_the_seconds_that_the_results_took_and_their_trust() {
+    let folder = folder(&["name,initial,deformed", "one,initial.nii.gz,deformed.nii.gz"]);
+    run(folder.path(), &FAST, 0);
+    let first = rows(folder.path(), "out/batch.csv");
+    for more in [&[][..], &["--collect"]] {
+        run(folder.path(), &[&FAST[..], more].concat(), 0);
+        let again = rows(folder.path(), "out/batch.csv");
+        assert_eq!(first[0]["seconds"], again[0]["seconds"]);
+        assert_eq!(first[0]["trust"], again[0]["trust"]);
+    }
+    assert!(first[0]["seconds"].parse::<f64>().unwrap() > 0.0);
+    assert!(["high", "moderate", "low"].contains(&first[0]["trust"].as_str()), "{first:?}");
+}
+
+#[test]
+fn two_batches_do_not_write_into_one_folder_at_a_time() {
+    let folder = folder(&["name,initial,deformed", "one,initial.nii.gz,deformed.nii.gz"]);
+    let out = folder.path().join("out");
+    fs::create_dir(&out).unwrap();
+    let _held = palpate::io::hold(&out).unwrap();
+    let (_, err) = run(folder.path(), &FAST, 1);
+    assert!(err.contains("out") && err.contains("another run"), "{err}");
 }

@@ -285,7 +285,7 @@ fn an_output_folder_that_is_not_empty() {
     fs::create_dir(folder.path().join("results")).unwrap();
     fs::write(folder.path().join("results/mine.txt"), "mine").unwrap();
     let (_, err) = run(folder.path(), &["phantom", "block", "--size", "16", "-o", "results"], 1);
-    assert!(err.contains("--force"), "{err}");
+    assert!(err.contains("--overwrite"), "{err}");
     assert_eq!(fs::read_dir(folder.path().join("results")).unwrap().count(), 1);
     run(folder.path(), &["phantom", "block", "--size", "16", "-o", "results", "--force"], 0);
     assert_eq!(fs::read_to_string(folder.path().join("results/mine.txt")).unwrap(), "mine");
@@ -537,7 +537,7 @@ fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     // Again into the same folder it may; into one that holds something else it may not.
     fs::remove_file(demo.join("summary.json")).unwrap();
     let (_, err) = run(folder.path(), &command, 1);
-    assert!(err.contains("palpate-demo") && err.contains("--force"), "{err}");
+    assert!(err.contains("palpate-demo") && err.contains("--overwrite"), "{err}");
 }
 
 #[test]
@@ -554,9 +554,11 @@ fn volumes_in_unlike_units_are_refused_before_any_work() {
     put("fine.nii", 0.1, [20, 20, 20]);
     put("lost.nii", 1.0, [20, 20, 20]);
     put("crop.nii", 2.0, [4, 4, 4]);
+    put("um.nii", 0.0015, [20, 20, 20]);
     let cases = [
         ("mm.nii", "m.nii", "44 mm, about 1000 times as long; one of them is likely in metres or micrometres"),
         ("cm.nii", "mm.nii", "about 10 times as long; one of them is likely in centimetres"),
+        ("um.nii", "mm.nii", "0.03 mm, and that of mm.nii is 44 mm, about 1467 times as long"),
         ("fine.nii", "lost.nii", "lost.nii has voxels of 1 mm on every side, as where a header was lost"),
     ];
     for (initial, deformed, message) in cases {
@@ -581,4 +583,130 @@ fn a_search_beyond_the_volume_is_capped_and_said() {
     assert!(out.contains(&format!("search       {side} mm")), "{out}");
     let (_, err) = run(folder.path(), &[&pair[..], &["7"]].concat(), 0);
     assert!(!err.contains("longest side"), "{err}");
+}
+
+/// A result of which nothing is left is an error, one of which a part is left says how much.
+#[test]
+fn an_empty_result_is_an_error_and_a_part_is_told_with_its_share() {
+    let folder = small_pair();
+    let at = |name: &str| folder.path().join(name);
+    let truth = palpate::io::read_field(at("truth.nii.gz")).unwrap();
+    let grid = *truth.grid();
+    let write = |name: &str, u: &dyn Fn([f64; 3]) -> [f64; 3]| {
+        let n = grid.len();
+        let mut values = vec![0f32; 3 * n];
+        for o in 0..n {
+            let v = u(grid.voxel(o).map(|i| i as f64));
+            (0..3).for_each(|c| values[c * n + o] = v[c] as f32);
+        }
+        palpate::io::write_field(at(name), &palpate::types::DenseField::from_vec(grid, values).unwrap()).unwrap();
+    };
+    write("far.nii", &|_| [1e30; 3]);
+    write("lost.nii", &|_| [f64::NAN; 3]);
+    write("steep.nii", &|v| [1e30 * v[0], 0.0, 0.0]);
+    write("half.nii", &|v| if v[0] < 16.0 { [1e30, 0.0, 0.0] } else { [0.0; 3] });
+    fs::write(at("beyond.csv"), "x,y,z\n9000,9000,9000\n").unwrap();
+    fs::write(at("none.csv"), "x,y,z,dx,dy,dz,ncc,sigma,kept\n1,2,3,0,0,0,1,0.1,0\n").unwrap();
+    let empty: [&[&str]; 8] = [
+        &["warp", "initial.nii.gz", "--field", "far.nii", "-o", "x.nii"],
+        &["warp", "initial.nii.gz", "--field", "lost.nii", "-o", "x.nii"],
+        &["warp", "mask.nii.gz", "--field", "far.nii", "-o", "x.nii"],
+        &["invert", "far.nii", "-o", "x.nii"],
+        &["invert", "lost.nii", "-o", "x.nii"],
+        &["warp", "--points", "beyond.csv", "--field", "truth.nii.gz", "-o", "x.csv"],
+        &["warp", "--points", "beyond.csv", "--field", "truth.nii.gz", "-o", "x.mrk.json"],
+        &["markups", "none.csv", "-o", "x.mrk.json"],
+    ];
+    for arguments in empty {
+        let (out, _) = run(folder.path(), arguments, 1);
+        assert!(out.is_empty(), "{arguments:?}: {out}");
+        for name in ["x.nii", "x.csv", "x.mrk.json"] {
+            assert!(!at(name).exists(), "{arguments:?} wrote {name}");
+        }
+    }
+    for name in ["steep.nii", "half.nii"] {
+        let (out, err) = run(folder.path(), &["invert", name, "-o", "x.nii"], 0);
+        let share = [" % of its voxels, to ", " %) come from outside its grid"];
+        assert!(share.iter().any(|s| out.contains(s)) && err.contains("Jacobian"), "{name}: {out}{err}");
+        let (out, _) = run(folder.path(), &["warp", "initial.nii.gz", "--field", name, "-o", "w.nii"], 0);
+        assert!(out.contains("% of the voxels come from outside"), "{name}: {out}");
+    }
+    let (out, _) = run(folder.path(), &["invert", "truth.nii.gz", "-o", "x.nii"], 0);
+    assert!(!out.contains("of its voxels"), "{out}");
+}
+
+/// Numbers that no computation can keep are errors, not NaN, null or another number.
+#[test]
+fn numbers_that_would_be_lost_are_errors_and_labels_stay_whole() {
+    let folder = small_pair();
+    let at = |name: &str| folder.path().join(name);
+    let scene =
+        fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/skin.toml")).unwrap();
+    for (key, value) in [("e0", "1e300"), ("e0", "1e30"), ("c0", "1e-300"), ("maxwell", "[[1e300, 1.0e4]]")] {
+        let line = scene.lines().find(|l| l.trim_start().starts_with(&format!("{key} ="))).unwrap();
+        fs::write(at("s.toml"), scene.replacen(line, &format!("{key} = {value}"), 1)).unwrap();
+        let (out, err) = run(folder.path(), &["skin", "s.toml", "-o", "x"], 1);
+        assert!(out.is_empty() && err.contains("s.toml") && err.contains("digit"), "{key} = {value}: {out}{err}");
+        assert!(!at("x").exists());
+    }
+    for value in ["nan", "inf", "-inf"] {
+        fs::write(at("c.toml"), format!("search_mm = {value}\n")).unwrap();
+        let arguments = ["field", "initial.nii.gz", "deformed.nii.gz", "-o", "x", "--config", "c.toml"];
+        let (_, err) = run(folder.path(), &arguments, 1);
+        assert!(err.contains(&format!("search_mm is {value}, not a finite number")), "{err}");
+    }
+
+    // A label that single precision has not, in every format.
+    let mut nifti = Nifti::filled([8, 8, 8], 0.0).bytes();
+    nifti[70..72].copy_from_slice(&8i16.to_le_bytes());
+    let labels: Vec<i32> =
+        (0..512).map(|o| if o % 8 < 4 { 16_777_217 } else { 16_777_216 * i32::from(o % 8 < 6) }).collect();
+    nifti[352..].copy_from_slice(&labels.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>());
+    fs::write(at("l.nii"), &nifti).unwrap();
+    for (output, offset) in [("w.nii", 352), ("w.mha", 0)] {
+        let arguments = ["warp", "l.nii", "--reference", "l.nii", "--interpolation", "nearest", "-o", output];
+        run(folder.path(), &arguments, 0);
+        let bytes = fs::read(at(output)).unwrap();
+        let start = if offset == 0 { bytes.len() - 4 * 512 } else { offset };
+        let found: Vec<i32> =
+            bytes[start..].chunks_exact(4).map(|b| i32::from_le_bytes(b.try_into().unwrap())).collect();
+        assert!(found == labels, "{output}");
+    }
+    let (_, err) = run(folder.path(), &["field", "initial.nii.gz", "deformed.nii.gz", "--mask", "l.nii", "-o", "x"], 1);
+    assert!(err.contains("16777217"), "{err}");
+}
+
+/// Old names of options work, and the one that meant something else says what it is called now.
+#[test]
+fn old_names_of_options_still_work() {
+    let folder = small_pair();
+    let press =
+        ["stiffness", "--field", "truth.nii.gz", "--mask", "mask.nii.gz", "--held", "y-", "--load", "y+", "-o", "x"];
+    let (new, err) = run(folder.path(), &[&press[..], &["--total-force", "2", "--dry-run"]].concat(), 0);
+    assert!(!err.contains("--total-force"), "{err}");
+    for old in [&["--force", "2"][..], &["--force=2"]] {
+        let (out, err) = run(folder.path(), &[&press[..], old, &["--dry-run"]].concat(), 0);
+        assert_eq!(out, new);
+        assert!(err.contains("--force is called --total-force now"), "{err}");
+    }
+    run(folder.path(), &["phantom", "block", "--size", "16", "-o", "p"], 0);
+    for flag in ["--force", "--overwrite"] {
+        run(folder.path(), &["phantom", "block", "--size", "16", "-o", "p", flag], 0);
+    }
+}
+
+/// How to silence warnings is said with the first one alone.
+#[test]
+fn how_to_silence_warnings_is_said_once() {
+    let folder = small_pair();
+    let mut far = Nifti::ramp([12, 12, 12]);
+    far.values[5] = f32::NAN;
+    fs::write(folder.path().join("odd.nii"), far.bytes()).unwrap();
+    let arguments = ["field", "odd.nii", "odd.nii", "-o", "x", "--search", "190", "--dry-run"];
+    let output = fixtures::palpate(folder.path()).args(arguments).output().unwrap();
+    let err = text(&output.stderr);
+    assert!(err.matches("warning: ").count() >= 2, "{err}");
+    assert_eq!(err.matches("--quiet silences").count(), 1, "{err}");
+    let quiet = fixtures::palpate(folder.path()).args(arguments).arg("--quiet").output().unwrap();
+    assert!(!text(&quiet.stderr).contains("warning"), "{}", text(&quiet.stderr));
 }

@@ -314,7 +314,7 @@ fn a_forged_poissons_ratio_is_refused() {
 fn bad_folders_are_refused() {
     let ratios = stiffness_folder(false, "bone");
     let (_, err) = palpate(ratios.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);
-    assert!(err.contains("ratios") && err.contains("--force"), "{err}");
+    assert!(err.contains("ratios") && err.contains("--total-force"), "{err}");
     let soft = stiffness_folder(true, "muscle");
     let (_, err) = palpate(soft.path(), &["fingertip", "stiffness", "-o", "tip.toml"], 1);
     assert!(err.contains("no bone") && err.contains("--names"), "{err}");

@@ -141,6 +141,187 @@ fn headers_with_flaws_are_named_and_allocate_nothing() {
     assert!(io::read_volume(&none).unwrap_err().to_string().contains("absent.raw"));
 }
 
+/// What ITK 5.4 makes of headers whose lines say one thing under several names, or twice: spacing,
+/// origin and directions as SimpleITK gives them (LPS).
+#[test]
+fn metaimage_headers_are_read_as_itk_reads_them() {
+    let folder = TempDir::new().unwrap();
+    const TURNED: &str = "0 1 0 -1 0 0 0 0 1";
+    const OTHER: &str = "1 0 0 0 0 1 0 -1 0";
+    // First and second axis of TURNED and of OTHER.
+    let (turned, other, none) =
+        ([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+    let at = [0.0; 3];
+    let cases: Vec<(String, [f64; 3], [f64; 3], [[f64; 3]; 2])> = vec![
+        ("ElementSize = 2 2 3".into(), [2.0, 2.0, 3.0], at, none),
+        ("ElementSize = 2 2 3\nElementSpacing = 1 1 5".into(), [1.0, 1.0, 5.0], at, none),
+        ("ElementSpacing = 1 1 5\nElementSize = 2 2 3".into(), [1.0, 1.0, 5.0], at, none),
+        ("ElementSpacing = 1 2 3\nElementSpacing = 4 5 6".into(), [4.0, 5.0, 6.0], at, none),
+        ("Position = 4 5 6".into(), [1.0; 3], [4.0, 5.0, 6.0], none),
+        ("Position = 4 5 6\nOffset = 1 2 3".into(), [1.0; 3], [1.0, 2.0, 3.0], none),
+        ("Offset = 1 2 3\nPosition = 4 5 6".into(), [1.0; 3], [1.0, 2.0, 3.0], none),
+        ("Origin = 7 8 9\nOffset = 1 2 3".into(), [1.0; 3], [7.0, 8.0, 9.0], none),
+        ("Offset = 1 2 3\nOffset = 4 5 6".into(), [1.0; 3], [4.0, 5.0, 6.0], none),
+        (format!("Rotation = {TURNED}"), [1.0; 3], at, turned),
+        (format!("Orientation = {TURNED}"), [1.0; 3], at, turned),
+        (format!("Orientation = {OTHER}\nTransformMatrix = {TURNED}"), [1.0; 3], at, turned),
+        (format!("Orientation = {TURNED}\nRotation = {OTHER}"), [1.0; 3], at, other),
+        ("DistanceUnits = mm".into(), [1.0; 3], at, none),
+    ];
+    for (lines, spacing, origin, axes) in cases {
+        let header = format!("NDims = 3\n{lines}\nDimSize = 4 3 2\nElementType = MET_SHORT\nElementDataFile = LOCAL\n");
+        let volume = io::read_volume(write(&folder, "a.mha", &[header.as_bytes(), &raw(false)])).unwrap();
+        let grid = volume.grid();
+        let lps = |p: WorldPoint| [-p.0[0], -p.0[1], p.0[2]];
+        let first = lps(grid.world(0, 0, 0));
+        assert_eq!(first, origin, "{lines}");
+        for (a, next) in [(0, grid.world(1, 0, 0)), (1, grid.world(0, 1, 0))] {
+            let step: Vec<f64> = lps(next).iter().zip(first).map(|(n, f)| n - f).collect();
+            assert_eq!(step, axes[a].map(|v| v * spacing[a]), "{lines}, axis {a}");
+        }
+        assert_eq!(grid.spacing(), spacing, "{lines}");
+    }
+    for unit in ["cm", "um"] {
+        let header = format!("{META}DistanceUnits = {unit}\nElementDataFile = LOCAL\n");
+        let error =
+            io::read_volume(write(&folder, "u.mha", &[header.as_bytes(), &raw(false)])).unwrap_err().to_string();
+        assert!(error.contains(unit) && error.contains("mm"), "{error}");
+    }
+}
+
+#[test]
+fn lengths_in_a_stated_unit_come_to_millimetres() {
+    let folder = TempDir::new().unwrap();
+    let nrrd = |units: &str| format!("{NRRD}space units: {units}\nendian: little\nencoding: raw\n\n");
+    let tenth = NRRD.replace("(2,0,0) (0, 0, 3) (0,-4,0)", "(0.2,0,0) (0, 0, 0.3) (0,-0.4,0)");
+    let tenth = tenth.replace("(-10,-20,30)", "(-1,-2,3)");
+    let cm = format!("{tenth}space units: \"cm\" \"cm\" \"cm\"\nendian: little\nencoding: raw\n\n");
+    check(&write(&folder, "mm.nrrd", &[nrrd("\"mm\" \"mm\" \"mm\"").as_bytes(), &raw(false)]));
+    check(&write(&folder, "cm.nrrd", &[cm.as_bytes(), &raw(false)]));
+    let error = io::read_volume(write(&folder, "s.nrrd", &[nrrd("\"s\" \"mm\" \"mm\"").as_bytes(), &raw(false)]));
+    assert!(error.unwrap_err().to_string().contains("space units"));
+    let points = |units: &str| {
+        let json = format!(
+            "{{\"markups\": [{{\"coordinateSystem\": \"RAS\", {units} \"controlPoints\": [{{\"position\": [1, 2, 3]}}]}}]}}"
+        );
+        io::read_points(write(&folder, "p.mrk.json", &[json.as_bytes()]))
+    };
+    for (units, mm) in [
+        ("", 1.0),
+        ("\"coordinateUnits\": \"mm\",", 1.0),
+        ("\"coordinateUnits\": \"cm\",", 10.0),
+        ("\"coordinateUnits\": \"m\",", 1000.0),
+        ("\"coordinateUnits\": [\"um\", \"um\", \"um\"],", 0.001),
+    ] {
+        assert_eq!(points(units).unwrap().points, [WorldPoint([mm, 2.0 * mm, 3.0 * mm])], "{units}");
+    }
+    for units in
+        ["\"coordinateUnits\": \"s\",", "\"coordinateUnits\": [\"mm\", \"cm\", \"mm\"],", "\"coordinateUnits\": 3,"]
+    {
+        let error = points(units).unwrap_err().to_string();
+        assert!(error.contains("p.mrk.json") && error.contains("coordinateUnits"), "{units}: {error}");
+    }
+}
+
+#[test]
+fn colours_are_no_vectors_and_no_grey_values() {
+    let folder = TempDir::new().unwrap();
+    let bytes = [0u8; 72];
+    let nrrd = |kind: &str, number: &str| {
+        NRRD.replace("short", number)
+            .replace("dimension: 3", "dimension: 4")
+            .replace("4 3 2", "3 4 3 2")
+            .replace("(2,0,0)", "none (2,0,0)")
+            .replace("kinds: ", &format!("kinds: {kind} "))
+            + "endian: little\nencoding: raw\n\n"
+    };
+    let refused = |name: &str, header: &str, message: &str| {
+        let path = write(&folder, name, &[header.as_bytes(), &bytes]);
+        let error = io::read_field(&path).unwrap_err().to_string();
+        assert!(error.contains(name) && error.contains(message), "{error}");
+        assert!(io::read_volume(&path).is_err());
+    };
+    for kind in ["RGB-color", "HSV-color", "XYZ-color", "3-color"] {
+        refused("c.nrrd", &nrrd(kind, "uchar"), "colours");
+    }
+    refused("v.nrrd", &nrrd("vector", "uchar"), "uint8");
+    let meta = META.replace("MET_SHORT", "MET_UCHAR") + "ElementNumberOfChannels = 3\nElementDataFile = LOCAL\n";
+    refused("c.mha", &meta, "uint8");
+    let grid = *io::read_volume(write(&folder, "a.mha", &[META.as_bytes(), b"ElementDataFile = LOCAL\n", &raw(false)]))
+        .unwrap()
+        .grid();
+    io::write_field(folder.path().join("f.nii"), &DenseField::zeros(grid)).unwrap();
+    let mut nifti = fs::read(folder.path().join("f.nii")).unwrap();
+    nifti[70..74].copy_from_slice(&[2, 0, 8, 0]); // uint8
+    let error = io::read_field(write(&folder, "f.nii", &[&nifti])).unwrap_err().to_string();
+    assert!(error.contains("uint8"), "{error}");
+}
+
+#[test]
+fn a_packing_that_is_not_read_is_named_with_its_command() {
+    let folder = TempDir::new().unwrap();
+    for (name, head, program) in [
+        ("a.nii.zst", &b"\x28\xb5\x2f\xfd\0\0"[..], "zstd -d"),
+        ("a.nii.bz2", b"BZh91AY&SY", "bzip2 -dk"),
+        ("a.nii.xz", b"\xfd7zXZ\0\0\x04", "xz -dk"),
+        ("a.nii.lz4", b"\x04\x22\x4d\x18rest", "lz4 -d"),
+        ("a.zip", b"PK\x03\x04rest", "unzip"),
+        ("a.csv", b"\x28\xb5\x2f\xfd\xff\xff", "zstd -d"),
+    ] {
+        let path = write(&folder, name, &[head]);
+        let error = match name {
+            "a.csv" => io::read_text(&path).unwrap_err().to_string(),
+            _ => io::read_volume(&path).unwrap_err().to_string(),
+        };
+        assert!(error.contains(name) && error.contains(program), "{error}");
+    }
+}
+
+/// As SPM writes them: header and voxels apart.
+#[test]
+fn a_pair_of_header_and_voxels_is_read_by_either_name() {
+    let folder = TempDir::new().unwrap();
+    let grid = *io::read_volume(write(&folder, "a.mha", &[META.as_bytes(), b"ElementDataFile = LOCAL\n", &raw(false)]))
+        .unwrap()
+        .grid();
+    let volume = palpate::types::Volume::from_voxels(grid, |at, _| f32::from(values()[at]));
+    io::write_volume(folder.path().join("one.nii"), &volume, "").unwrap();
+    let one = fs::read(folder.path().join("one.nii")).unwrap();
+    let head = |offset: f32| {
+        let mut head = one[..348].to_vec();
+        head[344..348].copy_from_slice(b"ni1\0");
+        head[108..112].copy_from_slice(&offset.to_le_bytes());
+        head
+    };
+    write(&folder, "p.hdr", &[&head(0.0)]);
+    write(&folder, "p.img", &[&one[352..]]);
+    write(&folder, "later.HDR", &[&head(16.0)]);
+    write(&folder, "later.IMG", &[&[7; 16], &one[352..]]);
+    write(&folder, "packed.hdr.gz", &[&gzip(&head(0.0))]);
+    write(&folder, "packed.img.gz", &[&gzip(&one[352..])]);
+    for name in ["p.hdr", "p.img", "later.HDR", "later.IMG", "packed.hdr.gz", "packed.img.gz"] {
+        check(&folder.path().join(name));
+        let other = io::files_of(folder.path().join(name));
+        assert_eq!(other.len(), 2, "{name}: a change of either counts, {other:?}");
+    }
+    let (stored, _) = io::read_header(folder.path().join("packed.img.gz")).unwrap();
+    assert_eq!(stored.format, "NIfTI-1 pair, gzip");
+    // The same in NIfTI's other form, as a series.
+    let mut series = io::Series::open(folder.path().join("packed.hdr.gz")).unwrap();
+    assert_eq!(series.read(0).unwrap().as_slice(), volume.as_slice());
+    assert_eq!(series.read(0).unwrap().as_slice(), volume.as_slice());
+    let alone = write(&folder, "alone.hdr", &[&head(0.0)]);
+    assert!(io::read_volume(alone).unwrap_err().to_string().contains(".img is not there"));
+    let short = write(&folder, "p.img", &[&one[352..380]]);
+    assert!(io::read_volume(short).unwrap_err().to_string().contains("cut short"));
+    // Before NIfTI there was no telling left from right.
+    let mut old = head(0.0);
+    old[344..348].fill(0);
+    write(&folder, "old.hdr", &[&old]);
+    let old = write(&folder, "old.img", &[&one[352..]]);
+    assert!(io::read_volume(old).unwrap_err().to_string().contains("ANALYZE"));
+}
+
 #[test]
 fn no_bytes_make_the_readers_panic() {
     let folder = TempDir::new().unwrap();

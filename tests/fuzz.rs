@@ -116,6 +116,12 @@ fn kinds() -> Vec<Kind> {
         "patches":{"held":{"translation":[0,0,0]},"loaded":{"translation":[0,0,1],"travel_mm":1}}}"#;
     let fingertip = b"youngs_modulus = 1e4\n[pad]\ncalibration = 1.02\nfinite_element_nodes = 2500\n";
     let slices = [0, 1, 2].map(|n| slices::Slice::new(n).bytes());
+    let in_syntax = |syntax| slices::Slice { syntax, ..slices::Slice::new(1) }.bytes();
+    let three = [0, 1, 2].map(slices::Slice::new);
+    let mut pair = nifti[..348].to_vec();
+    pair[344..348].copy_from_slice(b"ni1\0");
+    pair[108..112].fill(0);
+    let units = r#"{"markups":[{"coordinateUnits":["cm","cm","cm"],"controlPoints":[{"position":[1,2,3]}]}]}"#;
     let itk = "#Insight Transform File V1.0\n#Transform 0\nTransform: CompositeTransform_double_3_3\n#Transform 1\n\
         Transform: Euler3DTransform_double_3_3\nParameters: 0.1 0.2 0.3 4 5 6\nFixedParameters: 1 2 3 0\n#Transform 2\n\
         Transform: DisplacementFieldTransform_double_3_3\nParameters: 1 2 3 4 5 6\n\
@@ -172,6 +178,16 @@ fn kinds() -> Vec<Kind> {
             beside: vec![("0", slices[0].clone()), ("2", slices[2].clone())],
             ..kind("slice.dcm", slices[1].clone(), |p| volume(p.parent()?), 64, false)
         },
+        kind("big.dcm", in_syntax(slices::BIG_ENDIAN), volume, 64, false),
+        // A byte of these unpacks to many, of which each pair becomes a number of four.
+        kind("deflated.dcm", in_syntax(slices::DEFLATED), volume, 8 * 1032, false),
+        kind("rle.dcm", in_syntax(slices::RLE), volume, 8 * 64, false),
+        kind("jpeg.dcm", include_bytes!("fixtures/lossless.dcm").to_vec(), volume, 8 * 512, false),
+        kind("frames.dcm", slices::Slice::enhanced(&three, slices::EXPLICIT), volume, 64, false),
+        kind("frames_rle.dcm", slices::Slice::enhanced(&three, slices::RLE), volume, 8 * 64, false),
+        kind("mosaic.dcm", slices::Slice::mosaic(&three), volume, 64, false),
+        Kind { beside: vec![("p.img", raw.clone())], ..kind("p.hdr", pair, volume, 64, false) },
+        kind("units.mrk.json", units.into(), |p| nothing(io::read_points(p)), 64, false),
     ]
 }
 

@@ -250,7 +250,7 @@ fn the_analysis_writes_what_is_promised() {
     assert_eq!(fs::read_dir(&results).unwrap().count(), 7);
     // A folder with results is not written into again.
     let (_, err) = run(folder.path(), &["grasp-analysis", "scene.toml", "-o", "r"], 1);
-    assert!(err.contains("--force"), "{err}");
+    assert!(err.contains("--overwrite"), "{err}");
     let (_, err) = run(folder.path(), &["grasp-analysis", "scene.toml", "-o", "."], 1);
     assert!(err.contains("not empty"), "{err}");
 }

@@ -99,7 +99,8 @@ fn a_dry_run_checks_and_writes_nothing() {
     assert!(out.contains("1 volumes against number 0") && out.contains("displacement_001.nii.gz"), "{out}");
     let stiffness = ["stiffness", "--field", "truth.nii.gz", "--mask", "mask.nii.gz", "-o", "results", "--dry-run"];
     // The pair's motion is no press; between these sides it looks like one.
-    let (out, _) = run(folder.path(), &[&stiffness[..], &["--force", "2", "--held", "y-", "--load", "y+"]].concat(), 0);
+    let (out, _) =
+        run(folder.path(), &[&stiffness[..], &["--total-force", "2", "--held", "y-", "--load", "y+"]].concat(), 0);
     assert!(out.contains("2 N: moduli in kPa") && out.contains("about 20,000 nodes"), "{out}");
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), before);
 

@@ -187,7 +187,7 @@ def own_mesh(folder, field, labels, poisson):
     for name, options in (("body.vtu", {}), ("plain.vtu", {"compression": None}), ("text.vtu", {"binary": False}), ("body.inp", {"float_fmt": ".9e"})):
         mesh.write(folder(name), **options)
         out = folder("with-" + name)
-        palpate("stiffness", "--field", field, "--labels", labels, "--force", 3, "--nodes", 1000, "--poisson", poisson, "--mesh", folder(name),
+        palpate("stiffness", "--field", field, "--labels", labels, "--total-force", 3, "--nodes", 1000, "--poisson", poisson, "--mesh", folder(name),
                 "-o", out)
         rows = table(os.path.join(out, "boundary.csv"))
         found = np.array([[float(row["u" + c]) for c in "xyz"] for row in rows])
@@ -250,7 +250,7 @@ def main():
             ("two Poisson's ratios", (field, labels), two),
         ):
             print(f"{name}:")
-            palpate("stiffness", "--field", given[0], "--labels", given[1], "--force", 3, "--nodes", 1500, "--poisson", poisson, *more, "-o", at(name))
+            palpate("stiffness", "--field", given[0], "--labels", given[1], "--total-force", 3, "--nodes", 1500, "--poisson", poisson, *more, "-o", at(name))
             inside = lambda file: os.path.join(at(name), file)
             for part in (gmsh, calculix, sofa, mujoco):
                 part(inside)

@@ -229,7 +229,7 @@ def main():
         palpate("field", folder("initial.nii.gz"), folder("deformed.nii.gz"), "--mask", folder("mask.nii.gz"), "-o", folder("results"))
         palpate("phantom", "inclusion", "--size", 24, "-o", folder("block"))
         palpate("stiffness", "--field", folder("block/truth.nii.gz"), "--labels", folder("block/labels.nii.gz"),
-                "--force", 3, "--nodes", 1500, "-o", folder("stiffness"))
+                "--total-force", 3, "--nodes", 1500, "-o", folder("stiffness"))
         for check in (formats, nifti2, greedy, transformix, markups, grid_transform, meshes, febio):
             check(folder)
 

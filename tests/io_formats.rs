@@ -125,6 +125,27 @@ fn bad_tables_are_refused_with_their_line() {
     refused(read_points(folder.path().join("none.csv")), &["none.csv: cannot read", "check the spelling"]);
 }
 
+#[test]
+fn a_quote_never_takes_the_rest_of_a_table_for_one_cell() {
+    let folder = tempdir().unwrap();
+    let points = |text: &str| read_points(put(&folder, "p.csv", text.as_bytes()));
+    refused(points("x,y,z,n\n1,2,3,\"a\n4,5,6,b\n"), &["p.csv", "line 2", "never closed"]);
+    refused(points("x,y,z,n\n1,2,3,a\n4,5,6,\""), &["line 3", "never closed"]);
+    refused(points("x,y,z,n\n1,2,3,\"a\n4,5,6,\"b\"\n"), &["line 3", "line 2", "closes"]);
+    refused(points("x,y,z,\"n\n1,2,3,a\n"), &["line 1", "never closed"]);
+    refused(points("\"x,y,z,n\n1,2,3,a\n"), &["line 1", "never closed"]);
+    // What the rules allow.
+    let names = |text: &str| -> Vec<String> { points(text).unwrap().others.concat() };
+    assert_eq!(
+        names("x,y,z,n\n1,2,3,\"a, b\"\n4,5,6,\"c \"\"d\"\"\"\r\n7,8,9,6\" nail\n"),
+        ["a, b", "c \"d\"", "6\" nail"]
+    );
+    assert_eq!(names("\u{feff}\"x\",y,z,n\n\n1,2,3,\"two\nlines\"\n1,2,3,\"\""), ["two\nlines", ""]);
+    let pairs = put(&folder, "pairs.csv", b"initial,deformed,name\na.nii,b.nii,\"one\nc.nii,d.nii,two\n");
+    refused(palpate::io::read_pairs(&pairs), &["pairs.csv", "line 2", "never closed"]);
+    refused(palpate::io::columns_of(&pairs), &["pairs.csv", "line 2", "never closed"]);
+}
+
 /// The arrays of a .vtu, unpacked by the rules of the VTK file formats guide.
 fn vtu_arrays(path: &Path) -> BTreeMap<String, Vec<u8>> {
     let text = std::fs::read_to_string(path).unwrap();
@@ -268,7 +289,7 @@ fn a_folder_with_files_needs_force() {
     let folder = tempdir().unwrap();
     let old = put(&folder, "old.txt", b"old");
     put(&folder, "one.txt", b"old");
-    refused(OutputFolder::create(folder.path(), false), &["not empty", "--force"]);
+    refused(OutputFolder::create(folder.path(), false), &["not empty", "--overwrite"]);
     let mut output = OutputFolder::create(folder.path(), true).unwrap();
     output.write("one.txt", |p| write_text(p, "new")).unwrap();
     assert_eq!(std::fs::read(folder.path().join("one.txt")).unwrap(), b"old");

@@ -183,6 +183,20 @@ fn violations(part: &str, source: &str) -> Vec<String> {
     wrong
 }
 
+/// What is done in one place for all: files are opened to read where pipes are refused, and names of
+/// others shown where what would steer a terminal is escaped.
+fn elsewhere(inside: &str, source: &str) -> Vec<String> {
+    let code = without_tests(&code_only(source));
+    // Locks, a file that is being written, and what the system tells of itself.
+    let opens = ["io/source.rs", "io/live.rs", "io/nifti/write.rs", "io/memory.rs"].contains(&inside);
+    let reads = ["File::open", "fs::read", "read_to_string"].into_iter().filter(|name| !opens && names(&code, name));
+    let mut wrong: Vec<String> = reads.map(|name| format!("{name} outside io/source.rs")).collect();
+    if code.contains(".display()") {
+        wrong.push("display() of a name, not shown()".into());
+    }
+    wrong
+}
+
 /// Every `.rs` file below `folder`.
 fn sources(folder: &Path) -> Vec<PathBuf> {
     let mut out = Vec::new();
@@ -211,7 +225,8 @@ fn every_file_keeps_to_its_layer() {
         }
         seen += 1;
         let source = fs::read_to_string(&path).unwrap();
-        wrong.extend(violations(part, &source).into_iter().map(|v| format!("{}: {v}", inside.display())));
+        let all = violations(part, &source).into_iter().chain(elsewhere(&inside.to_string_lossy(), &source));
+        wrong.extend(all.map(|v| format!("{}: {v}", inside.display())));
     }
     assert!(seen > 20, "only {seen} files found");
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
@@ -237,6 +252,14 @@ fn the_checker_sees_what_is_forbidden() {
         let found = violations(part, source);
         assert!(found.iter().any(|v| v.contains(what)), "{source}: {found:?}");
     }
+}
+
+#[test]
+fn the_checker_sees_what_belongs_in_one_place() {
+    for bad in ["let f = File::open(p)?;", "let t = fs::read_to_string(p)?;", "format!(\"{}\", p.display())"] {
+        assert_eq!(elsewhere("io/csv.rs", bad).len(), 1, "{bad}");
+    }
+    assert!(elsewhere("io/source.rs", "File::open(p)").is_empty() && elsewhere("io/csv.rs", "p.shown()").is_empty());
 }
 
 #[test]

@@ -50,7 +50,8 @@ fn refused(folder: &Path, more: &[&str], code: i32, parts: &[&str]) {
 #[test]
 fn everything_promised_is_written() {
     let folder = folder();
-    let (out, _) = run(folder.path(), &[&BASE[..], &["--force", "0.1", "--names", "1=lower,2=upper"]].concat(), 0);
+    let (out, _) =
+        run(folder.path(), &[&BASE[..], &["--total-force", "0.1", "--names", "1=lower,2=upper"]].concat(), 0);
     assert!(out.contains("All 2 regions are determined by the data.") && out.contains("lower"), "{out}");
     let results = folder.path().join("results");
     let table = fs::read_to_string(results.join("regions.csv")).unwrap();
@@ -130,7 +131,7 @@ fn the_report_shows_the_tissue_behind_the_maps() {
 #[test]
 fn calculix_solves_our_model_to_our_displacements() {
     let folder = folder();
-    run(folder.path(), &[&BASE[..], &["--force", "0.1"]].concat(), 0);
+    run(folder.path(), &[&BASE[..], &["--total-force", "0.1"]].concat(), 0);
     let results = folder.path().join("results");
     let summary = serde_json::from_str(&fs::read_to_string(results.join("summary.json")).unwrap()).unwrap();
     run_calculix(&results, &summary);
@@ -148,8 +149,11 @@ fn the_force_that_was_given_is_the_whole_one() {
     io::write_field(folder.path().join("field.nii.gz"), &field).unwrap();
     io::write_labels(folder.path().join("labels.nii.gz"), &Mask::from_voxels(g, |o, _| u8::from(block(o))), "")
         .unwrap();
-    let (out, err) =
-        run(folder.path(), &[&BASE[..], &["--force", "0.1", "--model", "linear", "--poisson", "0.3"]].concat(), 0);
+    let (out, err) = run(
+        folder.path(),
+        &[&BASE[..], &["--total-force", "0.1", "--model", "linear", "--poisson", "0.3"]].concat(),
+        0,
+    );
     assert!(err.contains("the plate pushes sideways as well"), "{out}{err}");
     let results = folder.path().join("results");
     if std::process::Command::new("ccx").arg("model").current_dir(&results).output().is_err() {
@@ -374,7 +378,7 @@ fn displacements(vtu: &str) -> Vec<[f64; 3]> {
 #[test]
 fn bad_numbers_are_usage_errors_that_say_the_range() {
     let folder = folder();
-    refused(folder.path(), &["--force", "-2"], 2, &["force", "-2", "above 0 N", "without a sign"]);
+    refused(folder.path(), &["--total-force", "-2"], 2, &["force", "-2", "above 0 N", "without a sign"]);
     refused(folder.path(), &["--poisson", "0.5"], 2, &["poisson", "0.5", "below 0.5", "0.499"]);
     refused(folder.path(), &["--nodes", "3"], 2, &["nodes"]);
     refused(folder.path(), &["--names", "7=skin"], 2, &["no label 7"]);
@@ -514,7 +518,7 @@ fn a_body_pulled_apart_is_refused_with_what_may_be_wrong() {
 #[test]
 fn forces_without_a_sequence_are_refused() {
     // They went unheard: --field, which --sequence conflicts with, had lifted the requirement.
-    refused(folder().path(), &["--forces", "1,2"], 2, &["--forces", "--sequence", "--force"]);
+    refused(folder().path(), &["--forces", "1,2"], 2, &["--forces", "--sequence", "--total-force"]);
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! What the program is built from: licences that may be passed on, no system libraries, one place
-//! for each crate.
+//! for each crate, no known flaw, no newer compiler. `deny.toml` says the same to cargo-deny.
 #![allow(clippy::unwrap_used)]
 
+use semver::{Version, VersionReq};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::process::{Command, Output};
@@ -97,5 +98,45 @@ fn every_part_comes_from_the_registry() {
     for p in packages().iter().filter(|p| p["name"] != "palpate") {
         let source = p["source"].as_str().unwrap_or_default();
         assert!(source.starts_with("registry+"), "{}: {source:?}", p["name"]);
+    }
+}
+
+/// The compiler that `Cargo.toml` says is enough is enough for every part; clippy's
+/// `incompatible_msrv` says the same of what our own code uses.
+#[test]
+fn no_part_needs_a_newer_compiler_than_we_say() {
+    let version = |p: &Value| -> Option<Vec<u64>> {
+        p["rust_version"].as_str().map(|v| v.split('.').map(|n| n.parse().unwrap()).collect())
+    };
+    let packages = packages();
+    let ours = version(packages.iter().find(|p| p["name"] == "palpate").unwrap()).unwrap();
+    for p in &packages {
+        let needed = version(p).unwrap_or_default();
+        assert!(needed[..needed.len().min(2)] <= ours[..2], "{} {} needs Rust {needed:?}", p["name"], p["version"]);
+    }
+}
+
+/// Advisories of RustSec as they were when `fixtures/advisories.tsv` was made: a version with a known
+/// vulnerability, or with code that is not sound, is no part of it.
+#[test]
+fn no_part_has_a_known_flaw() {
+    let snapshot = include_str!("fixtures/advisories.tsv");
+    let lines: Vec<Vec<&str>> =
+        snapshot.lines().filter(|l| !l.starts_with('#')).map(|l| l.split('\t').collect()).collect();
+    assert!(lines.len() > 1000 && lines.iter().all(|l| l.len() == 5));
+    let ranges = |text: &str| -> Vec<VersionReq> {
+        text.split('|').filter(|r| !r.is_empty()).map(|r| VersionReq::parse(r).unwrap()).collect()
+    };
+    let flawed = |name: &str, version: &Version| -> Vec<&str> {
+        let of = lines.iter().filter(|l| l[0] == name && matches!(l[2], "vulnerability" | "unsound"));
+        of.filter(|l| !ranges(l[3]).iter().chain(&ranges(l[4])).any(|r| r.matches(version))).map(|l| l[1]).collect()
+    };
+    // One that is known to be bad, and what came after it.
+    assert_eq!(flawed("smallvec", &Version::new(1, 6, 0)), ["RUSTSEC-2021-0003"]);
+    assert!(flawed("smallvec", &Version::new(1, 6, 1)).is_empty());
+    for p in packages() {
+        let (name, version) = (p["name"].as_str().unwrap(), p["version"].as_str().unwrap());
+        let found = flawed(name, &Version::parse(version).unwrap());
+        assert!(found.is_empty(), "{name} {version}: {found:?}");
     }
 }

@@ -122,7 +122,7 @@ def main():
     scored = mask & ndimage.binary_erosion(filled, iterations=5)
     print("| method | fluid | gray | white | mean | folds | spread of log J | CPU (s) |\n|---|---|---|---|---|---|---|---|")
     for method in ["nothing", *options.methods]:
-        more = ["--force", *(["--mask", mask_path] if method.endswith("mask") else [])]
+        more = ["--overwrite", *(["--mask", mask_path] if method.endswith("mask") else [])]
         cpu, u = 0.0, np.zeros((3, *shape), np.float32)
         if method != "nothing":
             try:

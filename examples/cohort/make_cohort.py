@@ -39,7 +39,7 @@ def make(folder, subjects=20, size=28, presses=2, palpate=os.environ.get("PALPAT
     (folder / "scene.toml").write_text(SCENE.read_text())
     for press in range(1, presses + 1):
         command = [palpate, "phantom", "fingertip", "--size", size, "--amplitude", 1.0 + 0.5 * press / presses]
-        command += ["--seed", 1 + press, "--force", "-o", folder / f"press-{press}"]
+        command += ["--seed", 1 + press, "--overwrite", "-o", folder / f"press-{press}"]
         subprocess.run([str(c) for c in command], check=True, stdout=subprocess.DEVNULL)
     rows = []
     for number in range(1, subjects + 1):

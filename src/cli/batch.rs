@@ -8,12 +8,13 @@
 use super::Usage;
 use super::console::Console;
 use super::field::Tuning;
-use super::inputs::name;
+use super::inputs::{name, read_labels, same_grid};
 use super::limits::ATTENDED;
 use super::own;
 use super::record::{self, Recording};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io::{self, read_header};
 use palpate::pipeline::plan;
 use palpate::report::batch as report;
@@ -43,8 +44,8 @@ pub struct Options {
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Write into a folder that holds something else
-    #[arg(long)]
-    force: bool,
+    #[arg(long, alias = "force")]
+    overwrite: bool,
     /// Pairs at a time at most [default: as many as threads]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
@@ -72,7 +73,7 @@ struct Stage {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { table, output, force, jobs, memory, nodes, collect, tuning } = options;
+    let Options { table, output, overwrite, jobs, memory, nodes, collect, tuning } = options;
     tuning.params()?;
     palpate::types::StiffnessParams { nodes: *nodes, ..Default::default() }.check()?;
     if memory.is_some_and(|gb| !(gb.is_finite() && gb > 0.0)) {
@@ -80,10 +81,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let pairs = io::read_pairs(table)?;
     let used = io::list(output).is_ok_and(|files| !files.is_empty());
-    if used && !force && !collect && !output.join(TABLE).exists() {
-        bail!("{}: holds something that is not a batch; choose another --output, or add --force", output.display());
+    if used && !overwrite && !collect && !output.join(TABLE).exists() {
+        bail!("{}: holds something that is not a batch; choose another --output, or add --overwrite", output.shown());
     }
     io::make_folder(output)?;
+    let _held = io::hold(output)?;
     // What each stage has read is in its own summary.
     let record = Recording::start(console, record::inputs(&[("table", Some(table)), ("config", tuning.config())]));
     let outcomes: Vec<PairOutcome> = match collect {
@@ -105,15 +107,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         "{}: {}\n  table        {}\n  results      {}",
         name(table),
         report::verdict(&outcomes),
-        output.join(TABLE).display(),
-        output.join("report.html").display()
-    ))?;
+        output.join(TABLE).shown(),
+        output.join("report.html").shown()
+    ));
     let failed = outcomes.iter().filter(|o| o.status == Status::Failed).count();
     if failed > 0 {
         bail!(
             "{failed} of {} pairs failed; {} says why, and the next run tries them again",
             pairs.len(),
-            output.join(TABLE).display()
+            output.join(TABLE).shown()
         );
     }
     Ok(())
@@ -149,13 +151,15 @@ fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
     let mut outcome = PairOutcome { status: Status::Done, ..PairOutcome::waiting(pair) };
     // Made by a batch, a stage counts where its record stands: one that failed when it was run
     // again has left older results.
-    let recorded = io::read_json(folder.join(RECORD)).ok().and_then(|r| r["stages"].as_array().map(Vec::len));
+    let earlier = io::read_json(folder.join(RECORD)).unwrap_or_default();
+    outcome.seconds = took(&earlier);
+    let recorded = earlier["stages"].as_array().map(Vec::len);
     for (k, stage) in stages(pair, &folder, tuning, 0).into_iter().enumerate() {
         if !stage.marker.exists() || recorded.is_some_and(|n| n <= k) {
             let log = io::read_text(folder.join(format!("{}.log", stage.name))).unwrap_or_default();
             outcome.status = Status::Failed;
             outcome.stage = stage.name;
-            outcome.reason = reason(&log).unwrap_or_else(|| format!("there is no {}", stage.marker.display()));
+            outcome.reason = reason(&log).unwrap_or_else(|| format!("there is no {}", stage.marker.shown()));
             break;
         }
     }
@@ -165,13 +169,13 @@ fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
 
 /// What is to be run for a pair: each stage as far as the table's columns go.
 fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stage> {
-    let text = |p: &Path| p.display().to_string();
+    let text = |p: &Path| p.to_string_lossy().into_owned();
     let at = |part: &str| text(&folder.join(part));
     let flag = |key: &str, value: Option<String>| value.map(|v| format!("--{key}={v}"));
     let files = |list: &[Option<&PathBuf>]| list.iter().flatten().map(|p| (*p).clone()).collect::<Vec<_>>();
     let owned = |words: &[&str]| words.iter().map(|w| w.to_string()).collect::<Vec<_>>();
 
-    let mut field = owned(&["field", &text(&pair.initial), &text(&pair.deformed), "--force", "-o", &at("field")]);
+    let mut field = owned(&["field", &text(&pair.initial), &text(&pair.deformed), "--overwrite", "-o", &at("field")]);
     field.extend(flag("mask", pair.mask.as_deref().map(text)));
     field.extend(flag("deformed-mask", pair.deformed_mask.as_deref().map(text)));
     field.extend(pair.ignore.iter().filter_map(|m| flag("ignore", Some(text(m)))));
@@ -205,9 +209,8 @@ fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stag
     stiffness.extend(flag("names", pair.names.clone()));
     stiffness.extend(flag("held", pair.held.clone()));
     stiffness.extend(flag("load", pair.load.clone()));
-    stiffness.extend(flag("force", pair.force_n.map(|f| f.to_string())));
-    let patches = [&pair.held, &pair.load].into_iter().flatten().map(PathBuf::from).filter(|p| p.is_file());
-    let inputs = std::iter::once(labels.clone()).chain(patches).collect();
+    stiffness.extend(flag("total-force", pair.force_n.map(|f| f.to_string())));
+    let inputs = std::iter::once(labels.clone()).chain(patches(pair)).collect();
     out.push(Stage { name: "stiffness", arguments: stiffness, inputs, marker: folder.join("stiffness/summary.json") });
     let Some(scene) = &pair.scene else { return out };
     out.push(Stage {
@@ -219,11 +222,26 @@ fn stages(pair: &Pair, folder: &Path, tuning: &Tuning, nodes: usize) -> Vec<Stag
     // The scene is copied beside the fingertip that it names.
     out.push(Stage {
         name: "grasp",
-        arguments: owned(&["grasp", &at("scene.toml"), "--force", "-o", &at("grasp")]),
+        arguments: owned(&["grasp", &at("scene.toml"), "--overwrite", "-o", &at("grasp")]),
         inputs: vec![scene.clone()],
         marker: folder.join("grasp/summary.json"),
     });
     out
+}
+
+/// Masks that say where a body is held or pressed.
+fn patches(pair: &Pair) -> impl Iterator<Item = PathBuf> {
+    [&pair.held, &pair.load].into_iter().flatten().map(PathBuf::from).filter(|p| p.is_file())
+}
+
+/// What is kept of the stages of a pair: what each was run on, and how long it took (s).
+fn kept(records: &[Value], seconds: &[f64]) -> Value {
+    json!({ "stages": records, "seconds": seconds })
+}
+
+/// How long the results of a pair took, by what is kept of its stages (s).
+fn took(kept: &Value) -> f64 {
+    kept["seconds"].as_array().into_iter().flatten().filter_map(Value::as_f64).sum()
 }
 
 /// What may run at a time.
@@ -251,7 +269,7 @@ impl Batch<'_> {
         let output = &self.options.output;
         let outcomes = Mutex::new(self.pairs.iter().map(PairOutcome::waiting).collect::<Vec<_>>());
         io::write_rows(output.join(TABLE), &report::COLUMNS, locked(&outcomes).iter().map(report::row).collect())?;
-        let needs: Vec<Result<u64>> = self.pairs.iter().map(|p| self.memory(p)).collect();
+        let needs: Vec<Result<u64>> = self.pairs.iter().map(|p| self.check(p)).collect();
         let most = needs.iter().flatten().copied().filter(|n| *n <= self.budget).max().unwrap_or(1).max(1);
         let abreast = ((self.budget / most) as usize).clamp(1, jobs.max(1));
         let threads = (rayon::current_num_threads() / abreast).max(1);
@@ -307,11 +325,22 @@ impl Batch<'_> {
         }
     }
 
-    /// Memory that a pair's largest stage needs (bytes), from the headers of its volumes.
-    fn memory(&self, pair: &Pair) -> Result<u64> {
+    /// Checks what a stage after the first would find only then, and gives the memory that the
+    /// largest one needs (bytes).
+    fn check(&self, pair: &Pair) -> Result<u64> {
         let grids = [&pair.initial, &pair.deformed].map(|p| read_header(p).map(|h| h.0.grid));
         let [initial, deformed] = grids;
-        let field = plan::memory(&initial?, &deformed?);
+        let (initial, deformed) = (initial?, deformed?);
+        if let Some(labels) = &pair.labels {
+            read_labels(labels, &initial, &pair.initial)?;
+        }
+        for patch in patches(pair) {
+            same_grid(&patch, &read_header(&patch)?.0.grid, &initial, &pair.initial)?;
+        }
+        if let Some(scene) = &pair.scene {
+            io::read_text(scene)?;
+        }
+        let field = plan::memory(&initial, &deformed);
         Ok(field.max(if pair.labels.is_some() { plan::stiffness_memory(self.options.nodes) } else { 0 }))
     }
 
@@ -334,24 +363,26 @@ impl Batch<'_> {
             None => self.stages(pair, &folder, threads),
         };
         match done {
-            Ok(ran) => outcome.status = if ran { Status::Done } else { Status::Skipped },
+            Ok((ran, seconds)) => {
+                (outcome.status, outcome.seconds) = (if ran { Status::Done } else { Status::Skipped }, seconds);
+            }
             Err((stage, reason)) => {
                 (outcome.status, outcome.stage, outcome.reason) = (Status::Failed, stage, reason);
+                outcome.seconds = started.elapsed().as_secs_f64();
             }
         }
-        outcome.seconds = started.elapsed().as_secs_f64();
         if outcome.status != Status::Failed {
             gather(&folder, &mut outcome);
         }
         outcome
     }
 
-    /// All stages of a pair that are not done yet; whether there was one. An error is the stage and
-    /// the reason.
-    fn stages(&self, pair: &Pair, folder: &Path, threads: usize) -> Result<bool, (&'static str, String)> {
+    /// All stages of a pair that are not done yet; whether there was one, and how long all took, in
+    /// this run or an earlier one (s). An error is the stage and the reason.
+    fn stages(&self, pair: &Pair, folder: &Path, threads: usize) -> Result<(bool, f64), (&'static str, String)> {
         let path = folder.join(RECORD);
         let earlier = io::read_json(&path).unwrap_or_default();
-        let (mut records, mut ran): (Vec<Value>, bool) = (Vec::new(), false);
+        let (mut records, mut seconds, mut ran): (Vec<Value>, Vec<f64>, bool) = (Vec::new(), Vec::new(), false);
         for (k, stage) in stages(pair, folder, &self.options.tuning, self.options.nodes).into_iter().enumerate() {
             let told = |e: &dyn std::fmt::Display| (stage.name, e.to_string());
             let record = record(&stage).map_err(|e| told(&e))?;
@@ -359,21 +390,25 @@ impl Batch<'_> {
                 ran = true;
                 io::make_folder(folder).map_err(|e| told(&e))?;
                 // From here on the old results do not count.
-                io::write_json(&path, &json!({ "stages": records })).map_err(|e| told(&e))?;
+                io::write_json(&path, &kept(&records, &seconds)).map_err(|e| told(&e))?;
                 if stage.name == "grasp"
                     && let Some(scene) = &pair.scene
                 {
                     let copy = io::read_text(scene).and_then(|text| io::write_text(folder.join("scene.toml"), &text));
                     copy.map_err(|e| told(&e))?;
                 }
+                let started = Instant::now();
                 execute(&stage, folder, threads).map_err(|e| told(&e))?;
+                seconds.push(started.elapsed().as_secs_f64());
+            } else {
+                seconds.push(earlier["seconds"][k].as_f64().unwrap_or(0.0));
             }
             records.push(record);
             if ran {
-                io::write_json(&path, &json!({ "stages": records })).map_err(|e| told(&e))?;
+                io::write_json(&path, &kept(&records, &seconds)).map_err(|e| told(&e))?;
             }
         }
-        Ok(ran)
+        Ok((ran, seconds.iter().sum()))
     }
 }
 

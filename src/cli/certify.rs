@@ -4,7 +4,7 @@ use super::console::Console;
 use super::convention::Convention;
 use super::field::Tuning;
 use super::inputs::{Part, check_distinct, file_of, name, read_mask, read_volume, same_grid, standing_for, warn_all};
-use super::limits::cap_search;
+use super::limits::{cap_search, field_fits};
 use super::outputs::Target;
 use super::record::{self, Recording};
 use anyhow::{Context, Result};
@@ -46,6 +46,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let given: Vec<&Path> = [initial].into_iter().chain(second).chain(mask).chain(like).map(PathBuf::as_path).collect();
     check_distinct(&given, &target.files(&FILES))?;
     target.check()?;
+    field_fits(initial, second.as_ref().unwrap_or(initial))?;
     let mut inputs =
         record::inputs(&[("initial", Some(initial)), ("second", second.as_ref()), ("mask", mask.as_ref())]);
     inputs.extend(like.as_ref().map(|p| Ok::<_, anyhow::Error>(("like", file_of(p, Part::Field)?))).transpose()?);
@@ -95,5 +96,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     warn_all(console, &found.certificate.warnings);
-    console.say(&format!("{}{}", text(&report), target.look()))
+    console.say(&format!("{}{}", text(&report), target.look()));
+    Ok(())
 }

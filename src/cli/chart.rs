@@ -3,12 +3,14 @@
 use super::Usage;
 use super::console::Console;
 use super::inputs::{read_landmarks, read_mask, same_grid, warn_all};
+use super::limits::field_fits;
 use super::outputs::Target;
 use super::peers::Peers;
 use super::record::Recording;
 use super::stress::part;
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::evaluate;
 use palpate::evaluate::frontier::{is_relative, standings};
 use palpate::grasp::simulate::simulate;
@@ -56,25 +58,26 @@ fn one_of(folder: &Path, names: &[&str]) -> Option<PathBuf> {
 fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Case> {
     if !folder.is_dir() {
         let what = if folder.exists() { "is not a folder" } else { "does not exist" };
-        bail!("{} {what}; --case takes a folder as palpate phantom writes it", folder.display());
+        bail!("{} {what}; --case takes a folder as palpate phantom writes it", folder.shown());
     }
     let needed = |names: &[&str]| {
-        one_of(folder, names).with_context(|| format!("{}: holds no {}", folder.display(), names.join(" or ")))
+        one_of(folder, names).with_context(|| format!("{}: holds no {}", folder.shown(), names.join(" or ")))
     };
     let reference = needed(&["initial.nii.gz", "fixed.nii.gz", "initial.nii", "fixed.nii"])?;
-    let initial = io::read_volume(&reference)?;
-    let deformed = io::read_volume(needed(&["deformed.nii.gz", "moving.nii.gz", "deformed.nii", "moving.nii"])?)?;
+    let other = needed(&["deformed.nii.gz", "moving.nii.gz", "deformed.nii", "moving.nii"])?;
+    field_fits(&reference, &other)?;
+    let (initial, deformed) = (io::read_volume(&reference)?, io::read_volume(other)?);
     let truth = one_of(folder, &["truth.nii.gz", "truth.nii"]);
     let mask = one_of(folder, &["mask.nii.gz", "mask.nii"]);
     let landmarks = one_of(folder, &["landmarks.csv"]);
     if truth.is_none() && landmarks.is_none() {
-        bail!("{}: holds neither truth.nii.gz nor landmarks.csv, so nothing can be scored", folder.display());
+        bail!("{}: holds neither truth.nii.gz nor landmarks.csv, so nothing can be scored", folder.shown());
     }
     let mask = mask.map(|m| read_mask(&m, initial.grid(), &reference)).transpose()?;
     let read_truth = |path: &PathBuf| -> Result<DenseField> {
         let field = io::read_field(path)?;
         same_grid(path, field.grid(), initial.grid(), &reference)?;
-        evaluate::check_numbers("truth", &field, mask.as_ref()).with_context(|| path.display().to_string())?;
+        evaluate::check_numbers("truth", &field, mask.as_ref()).with_context(|| path.shown())?;
         Ok(field)
     };
     let truth = truth.as_ref().map(read_truth).transpose()?;
@@ -91,7 +94,7 @@ fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Ca
 fn case_names(folders: &[PathBuf]) -> Result<Vec<String>> {
     let whole: Vec<PathBuf> = folders.iter().map(|f| f.canonicalize().unwrap_or_else(|_| f.clone())).collect();
     if let Some(i) = (1..whole.len()).find(|&i| whole[..i].contains(&whole[i])) {
-        bail!(Usage(format!("--case {} is given twice", folders[i].display())));
+        bail!(Usage(format!("--case {} is given twice", folders[i].shown())));
     }
     let short = |path: &PathBuf, parts: usize| {
         let all: Vec<_> = path.iter().map(|p| p.to_string_lossy()).collect();
@@ -214,7 +217,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     let look = target.output.join("chart.html");
-    console.say(&format!("{}  results      {}", report::text(&groups), look.display()))
+    console.say(&format!("{}  results      {}", report::text(&groups), look.shown()));
+    Ok(())
 }
 
 /// The other tools; says which are left out, and goes on without any where they cannot be looked

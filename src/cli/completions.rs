@@ -5,6 +5,7 @@ use anyhow::Result;
 use clap::{Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man;
+use palpate::error::Shown;
 use palpate::io::{self, OutputFolder};
 use std::path::PathBuf;
 
@@ -18,7 +19,8 @@ pub struct Options {
 pub fn run(options: &Options, mut command: Command, console: &Console) -> Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(options.shell, &mut command, "palpate", &mut script);
-    console.say(&String::from_utf8_lossy(&script))
+    console.say(&String::from_utf8_lossy(&script));
+    Ok(())
 }
 
 #[derive(Debug, Args)]
@@ -38,7 +40,8 @@ pub fn run_man(options: &ManOptions, mut command: Command, console: &Console) ->
         Ok(bytes)
     };
     let Some(output) = &options.output else {
-        return console.say(&String::from_utf8_lossy(&page(&command, "palpate")?));
+        console.say(&String::from_utf8_lossy(&page(&command, "palpate")?));
+        return Ok(());
     };
     let mut folder = OutputFolder::create(output, true)?;
     let mut put = |name: &str, command: &Command| -> Result<()> {
@@ -53,5 +56,6 @@ pub fn run_man(options: &ManOptions, mut command: Command, console: &Console) ->
         pages += 1;
     }
     folder.commit()?;
-    console.say(&format!("Wrote {pages} pages into {}.", output.display()))
+    console.say(&format!("Wrote {pages} pages into {}.", output.shown()));
+    Ok(())
 }

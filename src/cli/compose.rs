@@ -6,6 +6,7 @@ use super::inputs::{check_distinct, check_output_file, name};
 use super::transform::{Given, Volumes, percent, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io::{self, AffineFormat};
 use palpate::transforms::Chain;
 use palpate::types::{DenseField, Grid};
@@ -51,11 +52,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let Some(map) = chain.affine() else {
             bail!(Usage(format!(
                 "{}: the chain holds a field, so it is no affine transform; end the name in .nii.gz",
-                output.display()
+                output.shown()
             )));
         };
         io::write_affine(output, &map, AffineFormat::Itk)?;
-        return console.say(&format!("Wrote {}: one affine transform, as ITK has it.", output.display()));
+        console.say(&format!("Wrote {}: one affine transform, as ITK has it.", output.shown()));
+        return Ok(());
     }
     let reference = reference.as_ref().map(io::read_header).transpose()?;
     let grid = reference.as_ref().map(|(stored, _)| &stored.grid).or(chain.grid()).copied();
@@ -66,7 +68,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         ));
     };
     io::write_field(output, &joined(&chain, &grid, console)?)?;
-    console.say(&format!("Wrote {}: one field for {} transforms.", output.display(), chain.0.len()))
+    console.say(&format!("Wrote {}: one field for {} transforms.", output.shown(), chain.0.len()));
+    Ok(())
 }
 
 /// Whether the name is that of an affine transform.
@@ -89,9 +92,8 @@ pub fn joined(chain: &Chain, grid: &Grid, console: &Console) -> Result<DenseFiel
     }
     if lost > 0 {
         let share = percent(lost, grid.len());
-        console.say(&format!(
-            "{share} of the voxels lead out of a field of the chain, and have NaN for a displacement."
-        ))?;
+        console
+            .say(&format!("{share} of the voxels lead out of a field of the chain, and have NaN for a displacement."));
     }
     Ok(field)
 }

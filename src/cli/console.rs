@@ -1,11 +1,15 @@
 //! stdout and stderr.
 
 use indicatif::{ProgressBar, ProgressStyle};
-use std::io::{ErrorKind, IsTerminal, Write, stderr, stdout};
-use std::sync::{Arc, Mutex, PoisonError};
+use palpate::error::plain;
+use std::io::{self, ErrorKind, IsTerminal, Write, stderr, stdout};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
-/// What was typed, and how much to say.
+
+/// What was typed, and how much to say. What is said cannot steer a terminal, whatever names and
+/// files hold.
 #[derive(Debug, Clone)]
 pub struct Console {
     quiet: bool,
@@ -13,12 +17,15 @@ pub struct Console {
     /// Progress as XML on stdout.
     xml: bool,
     arguments: Arc<[String]>,
+    warned: Arc<AtomicBool>,
+    /// Why stdout takes no more.
+    lost: Arc<OnceLock<io::Error>>,
 }
 
 impl Console {
     /// `arguments` are those of the program, the command first.
     pub fn new(quiet: bool, verbose: bool, arguments: &[String]) -> Self {
-        Self { quiet, verbose, xml: false, arguments: arguments.into() }
+        Self { quiet, verbose, xml: false, arguments: arguments.into(), warned: Arc::default(), lost: Arc::default() }
     }
 
     /// The same with progress as XML on stdout, as 3D Slicer reads it.
@@ -36,24 +43,36 @@ impl Console {
         &self.arguments
     }
 
-    /// Results, on stdout.
-    pub fn say(&self, text: &str) -> anyhow::Result<()> {
+    /// Results, on stdout. What it does not take is told by [`Console::lost`] at the end: the work
+    /// goes on.
+    pub fn say(&self, text: &str) {
+        let lines: Vec<String> = text.trim_end().split('\n').map(plain_cells).collect();
         let mut out = stdout().lock();
-        writeln!(out, "{}", text.trim_end())?;
-        Ok(out.flush()?)
+        if self.lost.get().is_none()
+            && let Err(error) = writeln!(out, "{}", lines.join("\n")).and_then(|()| out.flush())
+        {
+            let _ = self.lost.set(error);
+        }
+    }
+
+    /// Why stdout did not take all; none where it did, or whoever read it has left, as `head` does.
+    pub fn lost(&self) -> Option<&io::Error> {
+        self.lost.get().filter(|e| e.kind() != ErrorKind::BrokenPipe)
     }
 
     /// Something to know before trusting the result.
     pub fn warn(&self, text: &str) {
         if !self.quiet {
-            let _ = writeln!(stderr(), "warning: {text}; --quiet silences");
+            let first = !self.warned.swap(true, Ordering::Relaxed);
+            let hint = if first { " (--quiet silences warnings)" } else { "" };
+            let _ = writeln!(stderr(), "warning: {}{hint}", plain(text));
         }
     }
 
     /// Something for who wants to know more.
     pub fn detail(&self, text: &str) {
         if self.verbose {
-            let _ = writeln!(stderr(), "{text}");
+            let _ = writeln!(stderr(), "{}", plain(text));
         }
     }
 
@@ -65,7 +84,7 @@ impl Console {
                 said = format!("{said}: {cause}");
             }
         }
-        let _ = writeln!(stderr(), "error: {said}");
+        let _ = writeln!(stderr(), "error: {}", plain(&said));
     }
 
     /// How far a command is: a bar where stderr is a terminal, a line a stage where it is not, none
@@ -149,7 +168,7 @@ impl Drop for Progress {
     }
 }
 
-/// Whether whoever read stdout has left, as `head` does.
-pub fn is_closed_pipe(error: &anyhow::Error) -> bool {
-    error.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == ErrorKind::BrokenPipe)
+/// [`plain`] text between tabs, which stay.
+fn plain_cells(line: &str) -> String {
+    line.split('\t').map(plain).collect::<Vec<_>>().join("\t")
 }

@@ -7,6 +7,7 @@ use super::inputs::{check_distinct, check_output_file};
 use super::transform::{Given, Volumes, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::UnknownName;
 use palpate::io::{self, AffineFormat, FieldFormat};
 use palpate::types::names::choose;
@@ -74,17 +75,18 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         (None, [Transform::Inverse(found)]) => field(output, &joined(&chain, found.grid(), console)?, *to, &grids)?,
         _ => bail!(Usage(format!(
             "{} holds several transforms; make one field of them first with palpate compose",
-            transform.path.display()
+            transform.path.shown()
         ))),
     }
-    console.say(&format!("Wrote {}.", output.display()))
+    console.say(&format!("Wrote {}.", output.shown()));
+    Ok(())
 }
 
 fn affine(output: &Path, map: &AffineMap, to: Target, grids: &[Option<Grid>; 2]) -> Result<()> {
     if !is_affine(output) {
         bail!(Usage(format!(
             "{}: an affine transform is no field: end the name in {}, or make a field with palpate compose --reference",
-            output.display(),
+            output.shown(),
             AFFINES.join(" or ")
         )));
     }
@@ -103,7 +105,7 @@ fn affine(output: &Path, map: &AffineMap, to: Target, grids: &[Option<Grid>; 2])
 fn field(output: &Path, field: &DenseField, to: Target, grids: &[Option<Grid>; 2]) -> Result<()> {
     if is_affine(output) {
         let endings = FIELDS.join(" or ");
-        bail!(Usage(format!("{}: the transform is a field: end the name in {endings}", output.display())));
+        bail!(Usage(format!("{}: the transform is a field: end the name in {endings}", output.shown())));
     }
     let format = match (to, &grids[1]) {
         (Target::Itk | Target::Greedy, _) => FieldFormat::Itk,

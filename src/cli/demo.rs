@@ -8,6 +8,7 @@ use super::inputs::name;
 use super::record::{self, Recording};
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser};
+use palpate::error::Shown;
 use palpate::evaluate;
 use palpate::grasp::simulate::simulate;
 use palpate::io::{self, OutputFolder, SceneOverrides};
@@ -43,8 +44,8 @@ pub struct Options {
     #[arg(short, long, value_name = "DIR", default_value = "palpate-demo")]
     output: PathBuf,
     /// Write into a folder that is not empty
-    #[arg(long)]
-    force: bool,
+    #[arg(long, alias = "force")]
+    overwrite: bool,
     /// Voxels of the phantom along x; the field of view stays
     #[arg(long, value_name = "N")]
     size: Option<usize>,
@@ -56,22 +57,24 @@ pub struct Options {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { output, force, size, nodes, tuning } = options;
+    let Options { output, overwrite, size, nodes, tuning } = options;
     let params = tuning.params()?;
     let earlier = ["phantom", "summary.json"].iter().all(|f| output.join(f).exists());
     let used = io::list(output).is_ok_and(|files| !files.is_empty());
-    if used && !earlier && !force {
-        bail!("{}: is not empty; choose another folder, or write into it with --force", output.display());
+    if used && !earlier && !overwrite {
+        bail!("{}: is not empty; choose another folder, or write into it with --overwrite", output.shown());
     }
-    let at = |part: &str| output.join(part).display().to_string();
+    // Held from here on: no other run comes between the steps.
+    let mut folder = OutputFolder::create(output, true)?;
+    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
     let record = Recording::start(console, record::inputs(&[("config", tuning.config())]));
     let step = |words: &[&str]| -> Result<()> {
-        console.say(&format!("\n$ palpate {}", words.join(" ")))?;
+        console.say(&format!("\n$ palpate {}", words.join(" ")));
         let Cli { command, .. } = Cli::try_parse_from([&["palpate"], words].concat())?;
         super::dispatch(&command, &console.for_command(words))
     };
     let (seed, cells, nodes) = (params.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
-    let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--force", "-o"];
+    let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--overwrite", "-o"];
     let phantom = at("phantom");
     make.push(&phantom);
     if let Some(cells) = &cells {
@@ -91,7 +94,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         (file("initial.nii.gz"), file("deformed.nii.gz"), file("mask.nii.gz"), file("labels.nii.gz"));
     let (field, stiffness, tip, scene, grasp) =
         (at("field"), at("stiffness"), at("fingertip.toml"), at("scene.toml"), at("grasp"));
-    let mut measure = vec!["field", &initial, &deformed, "--mask", &mask, "--force", "-o", &field];
+    let mut measure = vec!["field", &initial, &deformed, "--mask", &mask, "--overwrite", "-o", &field];
     let tuned = tuning.arguments();
     measure.extend(tuned.iter().map(String::as_str));
     step(&measure)?;
@@ -108,7 +111,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         &held,
         "--load",
         &load,
-        "--force",
+        "--total-force",
         &newton,
         "--nodes",
         &nodes,
@@ -118,14 +121,13 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     ])?;
     step(&["fingertip", &stiffness, "-o", &tip])?;
     io::write_text(output.join("scene.toml"), SCENE)?;
-    step(&["grasp", &scene, "--force", "-o", &grasp])?;
+    step(&["grasp", &scene, "--overwrite", "-o", &grasp])?;
 
     let (mut rows, metrics) = field_rows(output)?;
     rows.extend(stiffness_rows(output, &regions)?);
     rows.extend(press_row(output, &told)?);
     exact_fingertip(output, &told, &regions)?;
     rows.extend(grasp_rows(output)?);
-    let mut folder = OutputFolder::create(output, true)?;
     let parts = [
         ("Field", "field/report.html"),
         ("Stiffness", "stiffness/report.html"),
@@ -143,7 +145,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
     folder.write("report.html", |p| io::write_text(p, &on_page(page(&rows, &parts), &record)))?;
     folder.commit()?;
-    console.say(&format!("\n{}\nLook at {}", text(&rows), output.join("report.html").display()))
+    console.say(&format!("\n{}\nLook at {}", text(&rows), output.join("report.html").shown()));
+    Ok(())
 }
 
 /// The field against the exact displacement.

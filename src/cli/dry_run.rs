@@ -4,6 +4,7 @@ use super::inputs::name;
 use super::limits::bytes;
 use super::outputs::Target;
 use anyhow::Result;
+use palpate::error::Shown;
 use palpate::pipeline::plan::{FieldPlan, stiffness_memory};
 use palpate::report::scale::{short, thousands};
 use palpate::types::{FieldParams, Grid, Mask, StiffnessParams};
@@ -32,7 +33,7 @@ fn end(out: &mut String, folder: &Path, files: &[impl AsRef<str>]) {
         }
         all => all.join(", "),
     };
-    line(out, "into", &folder.display().to_string());
+    line(out, "into", &folder.shown());
     line(out, "files", &shown);
     out.push_str("Nothing was written.");
 }

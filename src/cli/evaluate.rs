@@ -6,6 +6,7 @@ use super::convention::Convention;
 use super::inputs::{Part, name, read_landmarks, read_mask, standing_for, warn_all};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::report::text;
 use palpate::types::Mask;
 use palpate::{evaluate, io};
@@ -101,14 +102,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         }
     }
     warn_all(console, &warnings);
-    console.say(&if *json { serde_json::to_string_pretty(&values)? } else { told })
+    console.say(&if *json { serde_json::to_string_pretty(&values)? } else { told });
+    Ok(())
 }
 
 /// A label map on a grid of its own, with a label at least.
 fn read_label_map(path: &Path) -> Result<Mask> {
     let labels = io::read_labels(path)?;
     if labels.as_slice().iter().all(|l| *l == 0) {
-        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.display());
+        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.shown());
     }
     Ok(labels)
 }

@@ -74,7 +74,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         &[
             (
                 "regions known, moduli in kPa",
-                "stiffness --field results/displacement.nii.gz --labels labels.nii.gz --held z- --load z+ --force 3.6 -o \
+                "stiffness --field results/displacement.nii.gz --labels labels.nii.gz --held z- --load z+ --total-force 3.6 -o \
                  stiffness",
             ),
             (

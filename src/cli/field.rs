@@ -9,6 +9,7 @@ use super::outputs::{AFFINE_FILE, FIELD_FILES, Measured, STRAIN_FILES, Target, w
 use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::{StrainError, UnknownName};
 use palpate::pipeline::field::{FieldResult, Progress};
 use palpate::pipeline::strain::{StrainInput, StrainParams, StrainResult};
@@ -95,7 +96,7 @@ impl Tuning {
     /// The same as command-line arguments.
     pub fn arguments(&self) -> Vec<String> {
         let mut out = Vec::new();
-        out.extend(self.config.iter().flat_map(|c| ["--config".into(), c.display().to_string()]));
+        out.extend(self.config.iter().flat_map(|c| ["--config".into(), c.to_string_lossy().into_owned()]));
         out.extend(self.preset.iter().flat_map(|p| ["--preset".into(), preset_name(*p)]));
         out.extend(self.method.iter().flat_map(|m| ["--method".into(), method_name(*m)]));
         out.extend(self.model.iter().flat_map(|m| ["--model".into(), model_name(*m)]));
@@ -117,7 +118,7 @@ impl Tuning {
         let files = summary["files"].as_array().into_iter().flatten();
         let full = files.filter(|f| f["role"] == "mask").find_map(|f| f["path"].as_str());
         let mask = full.or(summary["inputs"]["mask"].as_str()).filter(|m| !m.is_empty());
-        let said = |mask| format!("{}: its run had the mask {mask}, this one has none; add --mask", file.display());
+        let said = |mask| format!("{}: its run had the mask {mask}, this one has none; add --mask", file.shown());
         mask.map(said).into_iter().collect()
     }
 
@@ -130,7 +131,7 @@ impl Tuning {
             |flag: &str| earlier.iter().any(|a| *a == flag || a.strip_prefix(flag).is_some_and(|r| r.starts_with('=')));
         let missing: Vec<&str> = known.left_out().into_iter().filter(|flag| had(flag)).collect();
         (!missing.is_empty()).then(|| {
-            format!("{}: its run had {}, this one has not; give that again", file.display(), missing.join(" and "))
+            format!("{}: its run had {}, this one has not; give that again", file.shown(), missing.join(" and "))
         })
     }
 
@@ -208,7 +209,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         params.bodies = BodySource::Bonded;
     }
     if bodies.is_none() && params.bodies == BodySource::Given {
-        let config = tuning.config().map(|c| c.display().to_string()).unwrap_or_default();
+        let config = tuning.config().map(|c| c.shown()).unwrap_or_default();
         bail!("{config}: its run was made with --bodies; give the label map again");
     }
     if bodies.is_some() && params.method == Method::Sparse {
@@ -246,7 +247,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let plan = pipeline::plan::field(&fixed, &moving, known.mask(), &params)?;
         warn_all(console, &warnings);
         let volumes = [(initial, fixed.grid()), (deformed, moving.grid())];
-        return console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
+        console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);
+        return Ok(());
     }
     let mut folder = target.create()?;
     folder.supersede(|file| file == AFFINE_FILE)?;
@@ -295,7 +297,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     drop(progress);
     explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
-    console.say(&format!("{summary}{}", target.look()))
+    console.say(&format!("{summary}{}", target.look()));
+    Ok(())
 }
 
 /// Everything that is read, for the summary.
@@ -343,14 +346,11 @@ fn bodies_of(path: &Path, mut labels: Mask, mask: Option<&Mask>, rigid: &[u8]) -
     let found: BTreeSet<u8> = labels.as_slice().iter().copied().filter(|l| *l != 0).collect();
     let names = || found.iter().map(u8::to_string).collect::<Vec<_>>().join(", ");
     match (found.len(), rigid.iter().find(|r| !found.contains(r))) {
-        (0, _) => bail!("{}: no body lies in the mask; give labels that are 1 or more in the tissue", path.display()),
+        (0, _) => bail!("{}: no body lies in the mask; give labels that are 1 or more in the tissue", path.shown()),
         (n, _) if n > BODIES => {
-            bail!(
-                "{}: {n} bodies; give at most {BODIES} labels, one a part that slides along the others",
-                path.display()
-            )
+            bail!("{}: {n} bodies; give at most {BODIES} labels, one a part that slides along the others", path.shown())
         }
-        (_, Some(label)) => bail!("{}: --rigid {label} is no body of it; there are {}", path.display(), names()),
+        (_, Some(label)) => bail!("{}: --rigid {label} is no body of it; there are {}", path.shown(), names()),
         _ => Ok(labels),
     }
 }

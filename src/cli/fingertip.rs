@@ -5,6 +5,7 @@ use super::inputs::{check_output_file, name, warn_all};
 use super::limits::mesh_fits;
 use anyhow::{Context, Result};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::fingertip::profile_force;
 use palpate::io;
 use palpate::pipeline::fingertip::{NODES, PadOutcome, check_nodes, of_map};
@@ -33,8 +34,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let folder = io::read_stiffness(stiffness)?;
     let from = name(stiffness);
     let progress = console.progress();
-    let outcome =
-        of_map(&folder, *nodes, &|s, f| progress.set(s, f)).with_context(|| stiffness.display().to_string())?;
+    let outcome = of_map(&folder, *nodes, &|s, f| progress.set(s, f)).with_context(|| stiffness.shown())?;
     drop(progress);
     let PadOutcome { pad, at_press, .. } = &outcome;
     let (radius, calibration) = (outcome.radius_mm(), outcome.calibration(folder.force_n));
@@ -85,7 +85,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         false => "  grasp        the hemisphere of one modulus\n".into(),
     };
     warn_all(console, &outcome.warnings(&folder));
-    console.say(&format!("{text}  results      {}", output.display()))
+    console.say(&format!("{text}  results      {}", output.shown()));
+    Ok(())
 }
 
 /// Force over indentation of the map's finite elements, of its columns, of one modulus and of the

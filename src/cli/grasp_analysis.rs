@@ -63,5 +63,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.3} s")));
     warn_all(console, &warnings);
-    console.say(&format!("{}{}", grasp_analysis::text(&report), target.look()))
+    console.say(&format!("{}{}", grasp_analysis::text(&report), target.look()));
+    Ok(())
 }

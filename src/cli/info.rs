@@ -6,6 +6,7 @@ use super::inputs::{name, two_places};
 use super::kinds;
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io::{self, Form, ImageKind, SceneOverrides, Series, TableKind};
 use palpate::pipeline::plan::memory;
 use palpate::report::info::{self, Facts};
@@ -41,7 +42,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             true => serde_json::to_string_pretty(&all.iter().map(Facts::json).collect::<Vec<Value>>())?,
             false => all.iter().map(Facts::text).collect::<Vec<_>>().join("\n"),
         };
-        console.say(&said)?;
+        console.say(&said);
     }
     let last = unread.pop();
     unread.iter().for_each(|error| console.error(error));
@@ -85,7 +86,7 @@ fn of_folder(mut facts: Facts, path: &Path) -> Result<Facts> {
     } else if path.join("phantom.json").is_file() {
         facts.is("phantom of palpate");
         of_phantom(&mut facts, &io::read_json(path.join("phantom.json"))?);
-        let folder = path.display();
+        let folder = path.shown();
         if path.join("initial.nii.gz").is_file() {
             facts.does(&format!("palpate field {folder} {folder} --mask {folder} --truth {folder} -o FIELD"));
             facts.does(&format!("palpate evaluate FIELD --truth {folder} --mask {folder}"));
@@ -114,7 +115,7 @@ fn of_json(mut facts: Facts, path: &Path) -> Result<Facts> {
     } else if told["stages"].is_array() {
         facts.is("record of a pair of palpate batch");
     } else {
-        bail!("{}: is JSON, but no summary of palpate; nothing can be done with it", path.display());
+        bail!("{}: is JSON, but no summary of palpate; nothing can be done with it", path.shown());
     }
     Ok(facts)
 }
@@ -142,12 +143,12 @@ fn of_summary(facts: &mut Facts, summary: &Value, path: &Path, folder: &Path) {
     let command = command(summary);
     if let Ok(record) = serde_json::from_value::<RunRecord>(summary.clone()) {
         facts.add("command line", command_line(&record), record.command_line.into());
-        facts.does(&format!("palpate {command} --config {} -o AGAIN    # the same run", path.display()));
+        facts.does(&format!("palpate {command} --config {} -o AGAIN    # the same run", path.shown()));
     }
     if summary.get("params").is_some() {
-        facts.does(&format!("palpate field INITIAL DEFORMED -o AGAIN --config {}", path.display()));
+        facts.does(&format!("palpate field INITIAL DEFORMED -o AGAIN --config {}", path.shown()));
     }
-    let folder = folder.display();
+    let folder = folder.shown();
     match command {
         "field" | "demo" => {
             facts.does(&format!("palpate strain {folder} -o STRAIN"));
@@ -168,32 +169,29 @@ fn of_toml(facts: &mut Facts, path: &Path) -> Result<()> {
             facts.is("grasp scene");
             facts.add("motions", scene.scene.motions.len().to_string(), scene.scene.motions.len().into());
             facts.add("sweep", format!("{} cases", scene.sweep.len()), scene.sweep.len().into());
-            facts.does(&format!("palpate grasp {} -o GRASP", path.display()));
-            facts.does(&format!("palpate grasp-analysis {} -o ANALYSIS", path.display()));
+            facts.does(&format!("palpate grasp {} -o GRASP", path.shown()));
+            facts.does(&format!("palpate grasp-analysis {} -o ANALYSIS", path.shown()));
         }
         (_, Ok(scene), _) => {
             facts.is("skin scene");
             facts.add("layers", scene.layers.len().to_string(), scene.layers.len().into());
-            facts.does(&format!("palpate skin {} -o SKIN", path.display()));
+            facts.does(&format!("palpate skin {} -o SKIN", path.shown()));
         }
         _ if tip.is_ok() => {
             facts.is("fingertip for a grasp scene");
             let kpa = 1e-3 * io::read_fingertip_modulus(path)?;
             facts.add("modulus", format!("{} kPa", significant(kpa)), kpa.into());
-            facts.does(&format!(
-                "palpate grasp SCENE.toml -o GRASP    # with [fingertip] file = \"{}\"",
-                path.display()
-            ));
+            facts.does(&format!("palpate grasp SCENE.toml -o GRASP    # with [fingertip] file = \"{}\"", path.shown()));
         }
         (.., Ok(params)) => {
             facts.is("parameters of a field run");
             facts.add("params", serde_json::to_string(&params)?, serde_json::to_value(&params)?);
-            facts.does(&format!("palpate field INITIAL DEFORMED -o DIR --config {}", path.display()));
+            facts.does(&format!("palpate field INITIAL DEFORMED -o DIR --config {}", path.shown()));
         }
         (Err(grasp), Err(skin), Err(config)) => {
             bail!(
                 "{}: is neither a scene nor parameters.\n  as a grasp scene: {grasp}\n  as a skin scene: {skin}\n  as parameters: {config}",
-                path.display()
+                path.shown()
             );
         }
     }
@@ -208,7 +206,7 @@ fn of_elastix(path: &Path) -> bool {
 /// Affine transforms, and chains of them and of fields.
 fn of_transform(facts: &mut Facts, path: &Path) -> Result<()> {
     let found = io::read_transform(path, None, None, None)?;
-    let (shown, count, chain) = (path.display(), found.transforms.len(), Chain(found.transforms));
+    let (shown, count, chain) = (path.shown(), found.transforms.len(), Chain(found.transforms));
     facts.is(if count > 1 { "transforms in a row" } else { "transform" });
     facts.add("transforms", count.to_string(), count.into());
     if let Some(map) = chain.affine() {
@@ -225,7 +223,7 @@ fn of_transform(facts: &mut Facts, path: &Path) -> Result<()> {
 }
 
 fn of_table(mut facts: Facts, path: &Path) -> Result<Facts> {
-    let shown = path.display();
+    let shown = path.shown();
     let slicer = io::is_slicer(path);
     if slicer {
         facts.add("format", "point list of 3D Slicer".into(), "Slicer".into());
@@ -296,7 +294,7 @@ fn of_form(mut facts: Facts, path: &Path) -> Result<Facts> {
 
 fn of_image(mut facts: Facts, path: &Path) -> Result<Facts> {
     let (stored, kind) = io::read_header(path)?;
-    let shown = path.display();
+    let shown = path.shown();
     if !stored.description.is_empty() {
         facts.add("description", stored.description.clone(), stored.description.clone().into());
     }

@@ -5,6 +5,7 @@ use super::console::Console;
 use anyhow::{Result, anyhow, bail};
 use clap::builder::{PathBufValueParser, TypedValueParser};
 use palpate::error::FieldError;
+use palpate::error::Shown;
 use palpate::evaluate;
 use palpate::field::warp::warp_image;
 use palpate::io::{self, ImageKind, Stored};
@@ -14,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 /// The last part of a path, for messages and reports.
 pub fn name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+    path.file_name().unwrap_or(path.as_os_str()).shown()
 }
 
 /// Whether two paths name one existing file.
@@ -97,7 +98,7 @@ const SHOWN: usize = 12;
 /// # Errors
 /// When the folder has no such file; says what it has.
 pub fn file_of(path: &Path, part: Part) -> Result<PathBuf> {
-    part.of(path).map_err(|why| anyhow!("{}: {why}", path.display()))
+    part.of(path).map_err(|why| anyhow!("{}: {why}", path.shown()))
 }
 
 /// The same for an argument of the command line.
@@ -115,7 +116,7 @@ fn replaces(output: &Path, input: &Path) -> bool {
 pub fn check_distinct(inputs: &[&Path], outputs: &[PathBuf]) -> Result<()> {
     for output in outputs {
         if let Some(input) = inputs.iter().find(|input| replaces(output, input)) {
-            bail!(Usage(format!("{} is an input and would be overwritten; choose another --output", input.display())));
+            bail!(Usage(format!("{} is an input and would be overwritten; choose another --output", input.shown())));
         }
     }
     Ok(())
@@ -128,15 +129,15 @@ pub fn check_output_file(path: &Path, endings: &[&str]) -> Result<()> {
         let what = if folder.exists() { "is not a folder" } else { "does not exist" };
         bail!(
             "{}: cannot be written, because {} {what}; create it or choose another --output",
-            path.display(),
-            folder.display()
+            path.shown(),
+            folder.shown()
         );
     }
     if path.is_dir() {
-        bail!(Usage(format!("{} is a folder; give --output the name of a file", path.display())));
+        bail!(Usage(format!("{} is a folder; give --output the name of a file", path.shown())));
     }
     if !endings.iter().any(|e| name(path).to_lowercase().ends_with(e)) {
-        bail!(Usage(format!("{}: the name must end in {}", path.display(), endings.join(" or "))));
+        bail!(Usage(format!("{}: the name must end in {}", path.shown(), endings.join(" or "))));
     }
     Ok(())
 }
@@ -157,14 +158,14 @@ pub fn warn_of_two_places(path: &Path, warnings: &mut Vec<String>) {
 
 /// The same of what is known to be stored there.
 pub fn warn_of_places(path: &Path, stored: &Stored, warnings: &mut Vec<String>) {
-    warnings.extend(two_places(stored).map(|w| format!("{}: {w}", path.display())));
+    warnings.extend(two_places(stored).map(|w| format!("{}: {w}", path.shown())));
 }
 
 /// A volume to measure on; warns of two placements and about single voxels without a number and
 /// refuses a volume without any.
 pub fn read_volume(path: &Path, warnings: &mut Vec<String>) -> Result<Volume> {
     warn_of_two_places(path, warnings);
-    usable(io::read_volume(path)?, &path.display().to_string(), warnings)
+    usable(io::read_volume(path)?, &path.shown(), warnings)
 }
 
 /// Warns of single voxels of `volume`, called `path`, that are no number.
@@ -208,7 +209,7 @@ pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
 pub fn some_mask(path: &Path) -> Result<Mask> {
     let mask = io::read_mask(path)?;
     if mask.as_slice().iter().all(|v| *v == 0) {
-        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.display());
+        bail!("{}: the mask is empty; give one that is 1 in the tissue", path.shown());
     }
     Ok(mask)
 }
@@ -218,7 +219,7 @@ pub fn read_labels(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
     let labels = io::read_labels(path)?;
     same_grid(path, labels.grid(), grid, reference)?;
     if labels.as_slice().iter().all(|v| *v == 0) {
-        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.display());
+        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.shown());
     }
     Ok(labels)
 }
@@ -227,9 +228,9 @@ pub fn read_labels(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
 pub fn same_grid(path: &Path, found: &Grid, grid: &Grid, reference: &Path) -> Result<()> {
     if !grid.same_as(found) {
         bail!(FieldError::GridMismatch {
-            what: path.display().to_string(),
+            what: path.shown(),
             found: found.shape(),
-            reference: reference.display().to_string(),
+            reference: reference.shown(),
             expected: grid.shape(),
         });
     }
@@ -252,7 +253,7 @@ pub fn read_landmarks(files: &[PathBuf], grid: &Grid, warnings: &mut Vec<String>
     let [x, y, z] = landmarks[first].initial.0;
     let said = format!(
         "{}: {} of {} landmarks lie outside the initial volume (the first is number {}, at {x:.1}, {y:.1}, {z:.1})",
-        file.display(),
+        file.shown(),
         outside.len(),
         landmarks.len(),
         first + 1

@@ -4,10 +4,17 @@ use super::compose::FIELDS;
 use super::console::Console;
 use super::convention::Convention;
 use super::inputs::{check_distinct, check_output_file};
+use super::transform::percent;
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::field::inverse::invert;
 use palpate::io;
+use palpate::numerics::inversion::residual;
+use palpate::numerics::sampling::inside;
+use palpate::types::DenseField;
+use palpate::types::space::length;
+use rayon::prelude::*;
 use std::path::PathBuf;
 
 /// An inverse that is off by more than this somewhere is worth a warning (mm).
@@ -28,13 +35,22 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { field, output, convention } = options;
     check_distinct(&[field], std::slice::from_ref(output))?;
     check_output_file(output, &FIELDS)?;
-    let inverse = invert(&convention.read(field)?, None);
-    if inverse.outside == inverse.field.grid().len() {
+    let original = convention.read(field)?;
+    let inverse = invert(&original, None);
+    let all = inverse.field.grid().len();
+    if inverse.outside == all {
         bail!(
             "{}: the field leads away from its own grid, so its inverse there would be empty; compose it with what brings it \
              back, and name a grid: palpate compose {},-1 --reference IMAGE",
-            field.display(),
-            field.display()
+            field.shown(),
+            field.shown()
+        );
+    }
+    let undone = undone(&original, &inverse.field);
+    if undone == 0 {
+        bail!(
+            "{}: the field has no inverse: nowhere is there one that undoes it to {RESIDUAL_MM} mm; look at its Jacobian determinant",
+            field.shown()
         );
     }
     io::write_field(output, &inverse.field)?;
@@ -52,10 +68,31 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             inverse.not_finite
         ));
     }
-    console.say(&format!(
-        "Wrote {}: undoes the field to {:.4} mm; {} voxels come from outside its grid.",
-        output.display(),
-        inverse.max_residual_mm,
-        inverse.outside
-    ))
+    // What comes from outside the grid is undone by nothing that is known.
+    let to = match undone + inverse.outside == all {
+        true => format!("{:.4} mm", inverse.max_residual_mm),
+        false => format!(
+            "{RESIDUAL_MM} mm in {} of its voxels, to {:.4} mm at worst",
+            percent(undone, all),
+            inverse.max_residual_mm
+        ),
+    };
+    let outside = match inverse.outside {
+        0 => "none comes from outside its grid".into(),
+        n => format!("{n} voxels ({}) come from outside its grid", percent(n, all)),
+    };
+    console.say(&format!("Wrote {}: undoes the field to {to}; {outside}.", output.shown()));
+    Ok(())
+}
+
+/// Voxels whose place the field leads to from where the inverse says, to [`RESIDUAL_MM`].
+fn undone(field: &DenseField, inverse: &DenseField) -> usize {
+    let grid = *inverse.grid();
+    let good = |at: &usize| {
+        let [i, j, k] = grid.voxel(*at);
+        let y = grid.world(i, j, k);
+        let x = y.moved(inverse.at(*at).map(f64::from));
+        inside(field.grid().shape(), field.grid().affine().to_voxel(x)) && length(residual(field, x, y)) <= RESIDUAL_MM
+    };
+    (0..grid.len()).into_par_iter().filter(good).count()
 }

@@ -5,6 +5,7 @@ use super::inputs::{Part, name, read_landmarks, some_mask, standing_for};
 use super::transform::{Given, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::UnknownName;
 use palpate::field::warp::warp_labels;
 use palpate::io;
@@ -110,7 +111,7 @@ impl Knowledge {
             let left_out = counts.as_mut_slice().iter_mut().zip(ignored.as_slice()).filter(|(_, i)| **i != 0);
             left_out.for_each(|(c, _)| *c = 0);
             if counts.as_slice().iter().all(|c| *c == 0) {
-                bail!("{}: nothing is left that counts; give a mask that is 0 in the tissue", path.display());
+                bail!("{}: nothing is left that counts; give a mask that is 0 in the tissue", path.shown());
             }
         }
         Ok(KnownInputs {
@@ -217,8 +218,8 @@ pub fn resampled(path: &Path, labels: Mask, grid: &Grid, reference: &Path, warni
     if placed.as_slice().iter().all(|v| *v == 0) {
         bail!(
             "{}: does not overlap {} in world space; check both headers (palpate info)",
-            path.display(),
-            reference.display()
+            path.shown(),
+            reference.shown()
         );
     }
     warnings.push(format!(

@@ -4,8 +4,9 @@
 use super::console::Console;
 use super::inputs::name;
 use anyhow::{Result, bail};
+use palpate::error::Shown;
 use palpate::io;
-use palpate::pipeline::plan::{memory, stiffness_memory};
+use palpate::pipeline::plan::{memory, stiffness_memory, strain_memory};
 use palpate::report::scale::short;
 use palpate::types::{FieldParams, Grid};
 use std::path::Path;
@@ -35,13 +36,13 @@ fn longest(grid: &Grid) -> f64 {
     (0..3).map(|a| size[a] * grid.shape()[a] as f64).fold(0.0, f64::max)
 }
 
-/// How far the logarithm (to base 10) of a ratio of sides may be off one of a factor of ten.
+/// How far the logarithm (to base 10) of a ratio of sides may be under one, that of a factor of ten.
 const ABOUT: f64 = 0.1;
 /// Ratio of the numbers of voxels along a side up to which two volumes may show the same part.
 const ALIKE: f64 = 2.5;
 
-/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10,
-/// 100 or 1000: their units differ, or one has lost its header.
+/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10 or
+/// more: their units differ, or one has lost its header.
 pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
     let (small, large) =
         if longest(a) < longest(b) { ((initial, a), (deformed, b)) } else { ((deformed, b), (initial, a)) };
@@ -50,26 +51,25 @@ pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) ->
     let alike = (voxels(a) / voxels(b)).max(voxels(b) / voxels(a)) <= ALIKE;
     let unit = match log.round() {
         1.0 => "centimetres",
-        2.0 => "another unit than mm",
         3.0 => "metres or micrometres",
-        _ => return Ok(()),
+        _ => "another unit than mm",
     };
-    if !alike || (log - log.round()).abs() > ABOUT {
+    if !alike || log < 1.0 - ABOUT {
         return Ok(());
     }
     let lost = |g: &Grid| g.spacing().iter().all(|s| (s - 1.0).abs() < 1e-6);
     let cause = match [small, large].into_iter().find(|v| lost(v.1)) {
-        Some((path, _)) => format!("{} has voxels of 1 mm on every side, as where a header was lost", path.display()),
+        Some((path, _)) => format!("{} has voxels of 1 mm on every side, as where a header was lost", path.shown()),
         None => format!("one of them is likely in {unit}"),
     };
     bail!(
         "{}: its longest side is {} mm, and that of {} is {} mm, about {} times as long; {cause}; correct the voxel size \
          in its header, or crop the larger volume",
-        small.0.display(),
+        small.0.shown(),
         short(longest(small.1)),
-        large.0.display(),
+        large.0.shown(),
         short(longest(large.1)),
-        10f64.powf(log.round())
+        if (log - log.round()).abs() > ABOUT { 10f64.powf(log).round() } else { 10f64.powf(log.round()) }
     );
 }
 
@@ -99,11 +99,26 @@ pub fn grids_fit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) ->
     bail!(
         "{} and {}: a field needs about {} of memory, but only {} are left; close other programs, crop both to the tissue, \
          or halve their resolution, which needs {halved} (the presets need the same)",
-        initial.display(),
-        deformed.display(),
+        initial.shown(),
+        deformed.shown(),
         bytes(needed),
         bytes(left)
     );
+}
+
+/// Refuses a field whose strain needs more memory than is left.
+pub fn strain_fits(field: &Path) -> Result<()> {
+    let Ok((stored, _)) = io::read_header(field) else { return Ok(()) };
+    let (needed, left) = (strain_memory(&stored.grid), io::memory_left().unwrap_or(u64::MAX));
+    if needed > left {
+        bail!(
+            "{}: its strain needs about {} of memory, but only {} are left; close other programs, or crop the field to the tissue",
+            field.shown(),
+            bytes(needed),
+            bytes(left)
+        );
+    }
+    Ok(())
 }
 
 /// Refuses a mesh that needs more memory than is left.
@@ -154,19 +169,41 @@ pub fn watch(console: Console, limit: Option<Duration>) {
     }
 }
 
-/// Ends the program in its own way on SIGINT and SIGTERM; they are caught when this returns, so
-/// before anything is made. Without a thread for it they end the program in the system's way.
+/// Ends the program in its own way on the signals that end one; they are caught when this returns,
+/// so before anything is made. Without a thread for it they end the program in the system's way. A
+/// file past the limit of its size (`ulimit -f`) is an error of who writes it, not the end.
 #[cfg(unix)]
 fn catch_signals(console: Console) {
-    use signal_hook::consts::{SIGINT, SIGTERM};
+    use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGXCPU, SIGXFSZ};
+    let _ = signal_hook::flag::register(SIGXFSZ, std::sync::Arc::default());
+    let mut wanted = vec![SIGINT, SIGTERM, SIGQUIT, SIGXCPU];
+    // Started by nohup it stays ignored.
+    if !is_ignored(SIGHUP) {
+        wanted.push(SIGHUP);
+    }
     let (waiting, caught) = std::sync::mpsc::channel::<()>();
     let _ = std::thread::Builder::new().name("signals".into()).spawn(move || {
-        let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM]) else { return };
+        let Ok(mut signals) = signal_hook::iterator::Signals::new(wanted) else { return };
         drop(waiting);
         if let Some(signal) = signals.forever().next() {
-            stop(&console, if signal == SIGINT { "stopped by Ctrl-C" } else { "stopped by a signal" }, 128 + signal);
+            let why = match signal {
+                SIGINT => "stopped by Ctrl-C",
+                SIGHUP => "stopped: its terminal was closed",
+                SIGXCPU => "stopped: its CPU time is used up (ulimit -t)",
+                _ => "stopped by a signal",
+            };
+            stop(&console, why, 128 + signal);
         }
     });
     // Comes back once the other end is dropped.
     let _ = caught.recv();
+}
+
+/// Whether the process was started with the signal ignored, as far as the system tells.
+#[cfg(unix)]
+fn is_ignored(signal: i32) -> bool {
+    let status = io::read_text("/proc/self/status").unwrap_or_default();
+    let mask =
+        status.lines().find_map(|l| l.strip_prefix("SigIgn:")).and_then(|m| u64::from_str_radix(m.trim(), 16).ok());
+    mask.is_some_and(|m| m >> (signal - 1) & 1 == 1)
 }

@@ -2,8 +2,9 @@
 
 use super::console::Console;
 use super::inputs::{check_distinct, check_output_file};
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io::{self, TableKind};
 use palpate::types::WorldPoint;
 use std::path::PathBuf;
@@ -55,11 +56,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         }
     };
     let all = rows.len();
+    if all == 0 {
+        bail!("{}: holds no match that is kept, so there is no point to write", path.shown());
+    }
     let step = all.div_ceil(*most as usize).max(1);
     rows = rows.into_iter().step_by(step).collect();
     let points: Vec<WorldPoint> = rows.iter().map(|r| r.0).collect();
     let labels: Vec<String> = rows.iter().map(|r| r.1.clone()).collect();
     let about: Vec<String> = rows.iter().map(|r| r.2.clone()).collect();
     io::write_markups(output, &points, &labels, &about)?;
-    console.say(&format!("Wrote {}: {} of {all} points.", output.display(), points.len()))
+    console.say(&format!("Wrote {}: {} of {all} points.", output.shown(), points.len()));
+    Ok(())
 }

@@ -4,6 +4,7 @@ use super::Usage;
 use super::inputs::name;
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io::{self, OutputFolder, SolidFile};
 use palpate::pipeline::boundary::{Known, at_nodes, moduli};
 use palpate::types::{DenseField, Grid, Mask, Measured, MeasuredNode, SolidMesh, StiffnessResult, WorldPoint};
@@ -77,7 +78,7 @@ fn patches(path: &Path, mesh: &SolidMesh, sets: &[String]) -> Result<Vec<(String
         let Some((found, nodes)) = mesh.sets().iter().find(|s| s.0.eq_ignore_ascii_case(asked)) else {
             let all: Vec<&str> = mesh.sets().iter().map(|s| s.0.as_str()).collect();
             let has = if all.is_empty() { "it has none".into() } else { format!("it has {}", all.join(", ")) };
-            bail!("{}: holds no set of nodes {asked:?}; {has}", path.display());
+            bail!("{}: holds no set of nodes {asked:?}; {has}", path.shown());
         };
         let mut own = nodes.clone();
         own.sort_unstable();
@@ -100,7 +101,7 @@ fn elsewhere(path: &Path, mesh: &SolidMesh, body: &Mask) -> String {
     format!(
         "{}: no node lies at the body, so none has a measured displacement; the mesh spans {} mm and the body {} mm: the mesh \
          must be in world mm, RAS (from metres: times 1000; from LPS: x and y with the other sign)",
-        path.display(),
+        path.shown(),
         spans(low, high),
         spans(from, to)
     )

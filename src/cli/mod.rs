@@ -65,6 +65,8 @@ mod repeat;
 
 mod sequence;
 
+mod series;
+
 mod skin;
 
 mod slicer;
@@ -88,6 +90,7 @@ mod warp;
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use console::Console;
+use palpate::error::plain;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -117,6 +120,10 @@ struct Common {
     /// Stop after so many seconds, with nothing half-written left [default: no limit]
     #[arg(long, global = true, value_name = "SECONDS", value_parser = seconds)]
     timeout: Option<Duration>,
+    /// Which series of a DICOM folder is meant, by its UID; of several, each folder takes one that it
+    /// holds, in order
+    #[arg(long, global = true, value_name = "UID", value_delimiter = ',')]
+    series: Vec<String>,
     /// No progress and no warnings on stderr
     #[arg(long, global = true)]
     quiet: bool,
@@ -219,15 +226,19 @@ pub fn run(mut typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
         return u8::from(Console::new(false, false, &[]).say(&description).is_err());
     }
     let asked = slicer::Asked::taken(&mut typed);
+    let typed = match series::chosen(typed) {
+        Ok(typed) => typed,
+        Err(error) => return failed(&Console::new(false, false, &[]), &error),
+    };
     let words: Vec<String> = typed.iter().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let (matches, words, warning) = match whole().try_get_matches_from(&typed) {
         Ok(matches) => (matches, words, None),
         Err(error) if MISSING.contains(&error.kind()) => match repeat::repeated(&typed) {
             Ok(Some(again)) => (again.matches, again.arguments, again.warning),
-            Ok(None) => error.exit(),
+            Ok(None) => complain(&error, &words),
             Err(error) => return failed(&Console::new(false, false, &words), &error),
         },
-        Err(error) => error.exit(),
+        Err(error) => complain(&error, &words),
     };
     let Cli { common, command } = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.format(&mut whole()).exit());
     let console = Console::new(common.quiet, common.verbose, &words).with_xml(asked.progress);
@@ -243,8 +254,13 @@ pub fn run(mut typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
         Err(error) => Err(anyhow::anyhow!("no thread could be started: {error}; try fewer with --threads")),
     };
     match done {
-        Ok(()) => 0,
-        Err(error) if console::is_closed_pipe(&error) => 0,
+        Ok(()) => match console.lost() {
+            None => 0,
+            Some(lost) => {
+                let said = "all is done and every file is written, but stdout did not take the whole summary";
+                failed(&console, &anyhow::anyhow!("{said}: {lost}"))
+            }
+        },
         Err(error) => failed(&console, &error),
     }
 }
@@ -257,6 +273,22 @@ fn named_for_command(typed: &mut Vec<OsString>) {
         && whole().find_subcommand(command).is_some()
     {
         typed.insert(1, command.into());
+    }
+}
+
+/// Says what is wrong with the command line, or the help: of words that would steer a terminal, what
+/// would be wrong with them escaped.
+fn complain(error: &clap::Error, words: &[String]) -> ! {
+    let safe: Vec<String> = words.iter().map(|word| plain(word)).collect();
+    if safe == words {
+        error.exit();
+    }
+    match whole().try_get_matches_from(std::iter::once("palpate".to_string()).chain(safe)) {
+        Err(again) => again.exit(),
+        Ok(_) => {
+            Console::new(false, false, &[]).error(&anyhow::anyhow!("{error}"));
+            std::process::exit(error.exit_code());
+        }
     }
 }
 

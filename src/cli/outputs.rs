@@ -4,6 +4,7 @@ use super::record::Recording;
 use anyhow::Result;
 use clap::Args;
 use palpate::error::IoError;
+use palpate::error::Shown;
 use palpate::field::jacobian::{determinant_at, determinant_rows};
 use palpate::field::warp::{warp_rows, warped_at};
 use palpate::io::{self, OutputFolder};
@@ -61,8 +62,8 @@ pub struct Target {
     #[arg(short, long, value_name = "DIR")]
     pub output: PathBuf,
     /// Write into a folder that is not empty
-    #[arg(long)]
-    force: bool,
+    #[arg(long, alias = "force")]
+    overwrite: bool,
 }
 
 impl Target {
@@ -76,17 +77,17 @@ impl Target {
     /// # Errors
     /// As there.
     pub fn check(&self) -> Result<()> {
-        Ok(OutputFolder::check(&self.output, self.force)?)
+        Ok(OutputFolder::check(&self.output, self.overwrite)?)
     }
 
     /// Makes the folder ready.
     pub fn create(&self) -> Result<OutputFolder> {
-        Ok(OutputFolder::create(&self.output, self.force)?)
+        Ok(OutputFolder::create(&self.output, self.overwrite)?)
     }
 
     /// The last line of a summary: what to look at.
     pub fn look(&self) -> String {
-        format!("  results      {}", self.output.join("report.html").display())
+        format!("  results      {}", self.output.join("report.html").shown())
     }
 }
 

@@ -3,6 +3,7 @@
 
 use super::own;
 use anyhow::{Context, Result, bail};
+use palpate::error::Shown;
 use palpate::io;
 use palpate::pipeline::trials::{Case, Variant};
 use palpate::types::grasp::GraspRun;
@@ -42,7 +43,7 @@ fn python() -> Command {
 }
 
 fn output(command: &mut Command) -> Result<Output> {
-    let told = format!("cannot run {}; set PYTHON to where python3 is", command.get_program().display());
+    let told = format!("cannot run {}; set PYTHON to where python3 is", command.get_program().shown());
     command.output().context(told)
 }
 
@@ -74,7 +75,7 @@ impl Peers {
         let listed = String::from_utf8_lossy(&found.stdout);
         let tools: Vec<Tool> = listed.lines().filter_map(tool).filter(|t| !NOT_SHOWN.contains(&&*t.name)).collect();
         if !found.status.success() || tools.is_empty() {
-            bail!("{} does not run the script that knows them: {}", python().get_program().display(), reason(&found));
+            bail!("{} does not run the script that knows them: {}", python().get_program().shown(), reason(&found));
         }
         Ok(Self { folder: folder.into(), tools })
     }
@@ -117,7 +118,7 @@ impl Peers {
             command.push("field".into());
             command.extend(pair.clone());
             command.extend(["-o".into(), results.path().into()]);
-            let flags = ["--force", "--quiet", "--threads", "2", "--preset", preset.method.as_str()];
+            let flags = ["--overwrite", "--quiet", "--threads", "2", "--preset", preset.method.as_str()];
             command.extend(flags.map(Into::into));
             let (method, settings) = (format!("palpate {}", preset.method), format!("{}, 2 threads", preset.settings));
             let variant = Variant { varied: "whole command", method, settings, ..preset };

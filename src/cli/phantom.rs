@@ -4,6 +4,7 @@ use super::console::Console;
 use super::{Usage, sequence};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::{SynthError, UnknownName};
 use palpate::io::{self, OutputFolder};
 use palpate::report::{figure, panels};
@@ -26,8 +27,8 @@ pub struct Options {
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Write into a folder that is not empty
-    #[arg(long)]
-    force: bool,
+    #[arg(long, alias = "force")]
+    overwrite: bool,
     /// Voxels along x; the field of view stays [default: by kind]
     #[arg(long, value_name = "N")]
     size: Option<usize>,
@@ -160,14 +161,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         Kind::Pair(kind) => kind,
         Kind::Sequence(kind) => {
             let params = options.sequence(kind)?;
-            let mut folder = OutputFolder::create(&options.output, options.force)?;
+            let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
             let summary = sequence::write(&mut folder, &params, console)?;
             folder.commit()?;
-            return console.say(&format!("{summary}  results      {}", picture.display()));
+            console.say(&format!("{summary}  results      {}", picture.shown()));
+            return Ok(());
         }
     };
     let params = options.params(kind)?;
-    let mut folder = OutputFolder::create(&options.output, options.force)?;
+    let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let phantom = synth::phantom(&params)?;
     write(&mut folder, &phantom)?;
     folder.commit()?;
@@ -180,8 +182,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         d.max_mm,
         d.mask_voxels,
         phantom.landmarks.len(),
-        picture.display()
-    ))
+        picture.shown()
+    ));
+    Ok(())
 }
 
 /// Stages both volumes, truth, mask, landmarks, description and picture.

@@ -9,6 +9,7 @@ use super::record::{self, Recording};
 use super::stiffness::{names, number, place, put};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io;
 use palpate::pipeline::planning::{self, PlanInputs};
 use palpate::report::plan::{PlanReport, page, summary, text};
@@ -149,7 +150,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     progress.set("read", 0.0);
     let labels = io::read_labels(path)?;
     if labels.as_slice().iter().all(|l| *l == 0) {
-        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.display());
+        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.shown());
     }
     check_labels(&labels, &params, path)?;
     let named = names(options.names.as_deref(), &labels)?;
@@ -171,5 +172,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     warn_all(console, &plan.warnings);
-    console.say(&format!("{}{}", text(&report), target.look()))
+    console.say(&format!("{}{}", text(&report), target.look()));
+    Ok(())
 }

@@ -29,7 +29,7 @@ impl Recording {
         let folder = std::env::current_dir().unwrap_or_default();
         let record = RunRecord {
             command_line: console.arguments().to_vec(),
-            working_folder: folder.display().to_string(),
+            working_folder: folder.to_string_lossy().into_owned(),
             date: rfc3339(since.as_secs()),
             files: Vec::new(),
         };
@@ -52,7 +52,7 @@ fn hashed(inputs: &Read) -> Vec<InputFile> {
     let of = |(role, path): &(&'static str, PathBuf)| {
         let one = |file: PathBuf| {
             let (bytes, sha256) = io::digest(&file).unwrap_or_default();
-            let path = absolute(&file).unwrap_or(file).display().to_string();
+            let path = absolute(&file).unwrap_or(file).to_string_lossy().into_owned();
             InputFile { role: (*role).into(), path, bytes, sha256 }
         };
         io::files_of(path).into_iter().map(one).collect::<Vec<_>>()

@@ -4,6 +4,7 @@
 use super::{Common, Usage, whole};
 use anyhow::{Context, Result, bail};
 use clap::Parser;
+use palpate::error::Shown;
 use palpate::io;
 use palpate::types::record::{InputFile, RunRecord};
 use serde_json::Value;
@@ -19,8 +20,8 @@ struct Again {
     config: PathBuf,
     #[arg(short, long)]
     output: PathBuf,
-    #[arg(long, alias = "overwrite")]
-    force: bool,
+    #[arg(long, alias = "force")]
+    overwrite: bool,
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
@@ -31,10 +32,7 @@ struct Again {
 const SAID: [&str; 4] = ["--quiet", "--verbose", "-v", "--dry-run"];
 
 /// The flag with which a command writes into a folder that is not empty.
-fn overwrites(command: &str) -> &'static str {
-    // --force is a force there.
-    if command == "stiffness" { "--overwrite" } else { "--force" }
-}
+const OVERWRITE: &str = "--overwrite";
 
 /// A run to be made again.
 pub struct Repeated {
@@ -51,7 +49,7 @@ pub struct Repeated {
 /// When the summary does not tell how to repeat it, or an input is gone or has changed.
 pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
     let Ok(again) = Again::try_parse_from(arguments) else { return Ok(None) };
-    let (config, shown) = (&again.config, again.config.display());
+    let (config, shown) = (&again.config, again.config.shown());
     let summary = match io::read_json(config) {
         Ok(summary) if summary["command"].is_string() => summary,
         Err(error) if config.extension().is_some_and(|e| e == "json") => return Err(error.into()),
@@ -68,12 +66,13 @@ pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
     check(&record.files).with_context(|| format!("{shown}: its run cannot be repeated"))?;
 
     let output = absolute(&again.output).unwrap_or(again.output);
-    let overwrite = overwrites(&again.command);
     let mut arguments = record.command_line.clone();
-    arguments.retain(|a| a != overwrite && !SAID.contains(&a.as_str()));
-    arguments.push(format!("--output={}", output.display()));
-    if again.force {
-        arguments.push(overwrite.into());
+    // Its old name is that of a force where there is one.
+    let overwrites = |a: &str| a == OVERWRITE || a == "--force" && again.command != "stiffness";
+    arguments.retain(|a| !overwrites(a) && !SAID.contains(&a.as_str()));
+    arguments.push(format!("--output={}", output.to_string_lossy()));
+    if again.overwrite {
+        arguments.push(OVERWRITE.into());
     }
     if again.dry_run {
         arguments.push("--dry-run".into());
@@ -81,7 +80,7 @@ pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
     arguments.extend(again.common.arguments());
     let folder = Path::new(&record.working_folder);
     std::env::set_current_dir(folder).with_context(|| {
-        format!("{shown}: paths of its run count from {}, which cannot be entered; name the inputs", folder.display())
+        format!("{shown}: paths of its run count from {}, which cannot be entered; name the inputs", folder.shown())
     })?;
     // What comes later goes before.
     let parser = whole().mut_subcommand(&again.command, |c| c.args_override_self(true));
@@ -91,7 +90,7 @@ pub fn repeated(arguments: &[OsString]) -> Result<Option<Repeated>> {
         let first = told.lines().next().unwrap_or_default().trim_start_matches("error: ").to_string();
         anyhow::anyhow!("{shown}: this version does not take the arguments of its run ({first}); name the inputs too")
     })?;
-    Ok(Some(Repeated { arguments, matches, warning: other_version(&shown.to_string(), &summary) }))
+    Ok(Some(Repeated { arguments, matches, warning: other_version(&shown, &summary) }))
 }
 
 /// Says so where another version has made the run.

@@ -4,12 +4,14 @@ use super::console::Console;
 use super::inputs::{check_distinct, name, warn_all};
 use super::outputs::Target;
 use super::record::{self, Recording};
-use anyhow::Result;
+use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io;
 use palpate::pipeline;
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::skin::{SkinReport, page, summary, text};
+use palpate::types::skin::SkinSample;
 use std::path::PathBuf;
 
 #[derive(Debug, Args)]
@@ -23,12 +25,17 @@ pub struct Options {
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { scene: path, target } = options;
     let scene = io::read_skin_scene(path)?;
+    pipeline::skin::check(&scene).with_context(|| path.shown())?;
     check_distinct(&[path], &target.files(&["response.csv", "summary.json", "report.html"]))?;
     let mut folder = target.create()?;
     let record = Recording::start(console, record::inputs(&[("scene", Some(path))]));
     let progress = console.progress();
     progress.set("skin", 0.0);
     let outcome = pipeline::skin::run(&scene);
+    let finite = |s: &SkinSample| s.strain.iter().chain([&s.stress, &s.displacement]).all(|v| v.is_finite());
+    if !outcome.column.iter().all(finite) {
+        bail!("{}: the response is no finite number: its values lie too far apart; correct them", path.shown());
+    }
     let name = name(path);
     let warnings: Vec<String> =
         pipeline::skin::notes(&scene, &outcome).into_iter().map(|w| format!("{name}: {w}")).collect();
@@ -50,5 +57,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     warn_all(console, &warnings);
-    console.say(&format!("{}{}", text(&report), target.look()))
+    console.say(&format!("{}{}", text(&report), target.look()));
+    Ok(())
 }

@@ -10,6 +10,7 @@ use super::mesh_option::{self, MeshOption};
 use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline;
@@ -82,7 +83,7 @@ pub struct Options {
     #[arg(long, value_name = "AXIS|FILE", default_value = "z+", allow_hyphen_values = true)]
     pub(super) load: String,
     /// Total force on the loaded patch in N, its magnitude; without, moduli are ratios
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    #[arg(long = "total-force", alias = "force", value_name = "N", allow_negative_numbers = true)]
     force: Option<f64>,
     /// Poisson's ratio of all regions, or LABEL=NU of one; may be given several times
     /// [default: 0.49]
@@ -146,6 +147,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         regions: regions.unwrap_or(usual.regions),
     };
     params.check()?;
+    if console.arguments().iter().any(|a| a == "--force" || a.starts_with("--force=")) {
+        warn_all(console, &["--force is called --total-force now; the old name goes with the next release".into()]);
+    }
     if regions.is_some() && options.labels.is_some() {
         warn_all(console, &["--regions changes nothing with --labels, which say what the regions are".into()]);
     }
@@ -157,7 +161,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     // Clap drops a requirement that conflicts with what is given.
     if !options.forces.is_empty() && options.sequence.is_none() {
-        bail!(Usage("--forces belongs to --sequence; for a single field give --force".into()));
+        bail!(Usage("--forces belongs to --sequence; for a single field give --total-force".into()));
     }
     let body = options.labels.as_ref().or(options.mask.as_ref());
     let Some(body) = body else { bail!(Usage("give --labels or --mask".into())) };
@@ -195,7 +199,7 @@ pub(super) fn images(options: &Options, beside: Option<&Path>, grid: &Grid) -> R
     let read = |path: &Path| -> Result<Volume> {
         let shown = on_grid(io::read_volume(path)?, grid);
         if !shown.as_slice().iter().any(|v| v.is_finite() && *v != 0.0) {
-            bail!("{}: shows nothing where the field lies; check the file and its affine", path.display());
+            bail!("{}: shows nothing where the field lies; check the file and its affine", path.shown());
         }
         Ok(shown)
     };
@@ -231,7 +235,8 @@ pub(super) fn plan(
         frames,
         &options.output,
         &files,
-    ))
+    ));
+    Ok(())
 }
 
 fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, console: &Console) -> Result<()> {
@@ -310,7 +315,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
         _ => String::new(),
     };
     let page = options.output.join("report.html");
-    console.say(&format!("{}{used}  results      {}", report::text(&result), page.display()))?;
+    console.say(&format!("{}{used}  results      {}", report::text(&result), page.shown()));
     strict(options, &result)
 }
 

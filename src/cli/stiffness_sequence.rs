@@ -6,6 +6,7 @@ use super::inputs::{check_distinct, name, warn_all};
 use super::record::{Read, Recording};
 use super::stiffness::{FILES, FOUND, Options, Setting, common_inputs, images, patch_files, plan, strict, write};
 use anyhow::{Context, Result, bail};
+use palpate::error::Shown;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline::stiffness::FieldQuality;
@@ -54,7 +55,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     for (at, (_, path, _)) in frames.iter().enumerate() {
         let field = io::read_field(path)?;
         if !field.grid().same_as(&grid) {
-            bail!("{}: lies on another grid than {}; take fields of one track", path.display(), frames[0].1.display());
+            bail!("{}: lies on another grid than {}; take fields of one track", path.shown(), frames[0].1.shown());
         }
         order.push((at, motion(&field, &setting.labels)));
     }
@@ -117,7 +118,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     warn_all(console, &shared.result.warnings);
     let page = options.output.join("report.html");
     let frames = report::sequence_text(&shared);
-    console.say(&format!("{}{frames}  results      {}", report::text(&shared.result), page.display()))?;
+    console.say(&format!("{}{frames}  results      {}", report::text(&shared.result), page.shown()));
     strict(options, &shared.result)
 }
 
@@ -138,7 +139,7 @@ impl Tracked {
         let summary = io::read_json(&path).context(hint)?;
         let reference = match summary["reference"].as_u64() {
             Some(frame) if summary["command"] == "track" => frame as usize,
-            _ => bail!("{}: is not the summary of a track; {hint}", path.display()),
+            _ => bail!("{}: is not the summary of a track; {hint}", path.shown()),
         };
         let one = |f: &serde_json::Value| Some((f["frame"].as_u64()? as usize, f["lost"].is_null()));
         let others = summary["frames"].as_array().map(|all| all.iter().filter_map(one).collect());
@@ -185,7 +186,7 @@ fn frames(options: &Options, from: &Path, tracked: &Tracked) -> Result<Vec<Frame
         .collect();
     found.sort();
     if found.is_empty() {
-        bail!("{}: holds no displacement_<t>.nii.gz; give a folder that palpate track wrote", from.display());
+        bail!("{}: holds no displacement_<t>.nii.gz; give a folder that palpate track wrote", from.shown());
     }
     // A force for each frame, lost ones too, as they were taken.
     let here: Vec<usize> = found.iter().map(|f| f.0).collect();

@@ -4,10 +4,12 @@ use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
 use super::inputs::{Part, check_distinct, file_of, name, read_labels, read_mask, same_grid, standing_for, warn_all};
+use super::limits::strain_fits;
 use super::outputs::{STRAIN_FILES, StrainMaps, Target, at_places, write_strain};
 use super::record::{self, Read, Recording};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::UnknownName;
 use palpate::io;
 use palpate::pipeline::field::mesh_of;
@@ -83,7 +85,7 @@ impl Source {
             ("summary.json", "how far to trust the field is not known"),
         ] {
             if there(part).is_none() {
-                warnings.push(format!("{}: {part} is missing: {lost}", path.display()));
+                warnings.push(format!("{}: {part} is missing: {lost}", path.shown()));
             }
         }
         let field = convention.read(path)?;
@@ -122,9 +124,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let given: Vec<&Path> = [path].into_iter().chain(mask).chain(labels).map(PathBuf::as_path).chain(vectors).collect();
     check_distinct(&given, &target.files(&files))?;
     if path.is_dir() && path.canonicalize().ok() == target.output.canonicalize().ok() {
-        bail!(Usage(format!("{}: its summary would be overwritten; choose another --output", path.display())));
+        bail!(Usage(format!("{}: its summary would be overwritten; choose another --output", path.shown())));
     }
     target.check()?;
+    strain_fits(&file_of(path, Part::Field).unwrap_or_else(|_| path.clone()))?;
     let mut inputs: Read = parts(path).into_iter().map(|p| ("field", p)).collect();
     inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref())]));
     inputs.extend(fibres.iter().filter(|f| !f.contains('=')).map(|f| ("fibres", PathBuf::from(f))));
@@ -171,7 +174,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     warn_all(console, &result.summary.warnings);
-    console.say(&format!("{}{}", text(&report), target.look()))
+    console.say(&format!("{}{}", text(&report), target.look()));
+    Ok(())
 }
 
 /// The files of a results folder that are read, or the one file.

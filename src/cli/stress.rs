@@ -6,6 +6,7 @@ use super::outputs::Target;
 use super::record::Recording;
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::UnknownName;
 use palpate::evaluate::stated::stated;
 use palpate::io;
@@ -121,5 +122,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     let look = target.output.join("stress.html");
-    console.say(&format!("{}  results      {}", report::text(&curves, field.as_ref()), look.display()))
+    console.say(&format!("{}  results      {}", report::text(&curves, field.as_ref()), look.shown()));
+    Ok(())
 }

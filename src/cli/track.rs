@@ -15,6 +15,7 @@ use super::record::{self, Read, Recording};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::FieldError;
+use palpate::error::Shown;
 use palpate::field::jacobian::determinant_at;
 use palpate::field::warp::warp_image;
 use palpate::io::{self, PackedField, Series, Stored};
@@ -76,7 +77,7 @@ impl<'a> Source<'a> {
         };
         let series = Series::open(one)?;
         if series.frames() < 2 {
-            bail!(Usage(format!("{}: is one volume; give two or more, or a 4-D file", one.display())));
+            bail!(Usage(format!("{}: is one volume; give two or more, or a 4-D file", one.shown())));
         }
         Ok(Self::Series(one, Box::new(series)))
     }
@@ -121,7 +122,7 @@ impl<'a> Source<'a> {
             Self::Files(files, headers) => {
                 let path = &files[frame];
                 warn_of_places(path, &headers[frame], warnings);
-                Ok((io::read_volume(path)?, path.display().to_string()))
+                Ok((io::read_volume(path)?, path.shown()))
             }
             Self::Series(_, series) => {
                 let volume = series.read(frame)?;
@@ -203,7 +204,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         let plan = plan(&mut source, (origin, &reference), inside, &params, &mut warnings)?;
         warn_all(console, &warnings);
         let plan = dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files(frames, origin))?;
-        return console.say(&plan);
+        console.say(&plan);
+        return Ok(());
     }
     let mut folder = target.create()?;
     let record = Recording::start(console, inputs);
@@ -315,7 +317,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     folder.commit()?;
     drop(progress);
     warn_all(console, &all_warnings(&report));
-    console.say(&format!("{}{}", text(&report), target.look()))
+    console.say(&format!("{}{}", text(&report), target.look()));
+    Ok(())
 }
 
 /// Says so where files come in the order of their letters but not of their numbers: a shell lists

@@ -3,6 +3,7 @@
 use super::console::Console;
 use anyhow::Result;
 use clap::Args;
+use palpate::error::Shown;
 use palpate::error::UnknownName;
 use palpate::io::{self, TransformSource};
 use palpate::transforms::Chain;
@@ -72,7 +73,7 @@ pub fn read_chain(given: &[Given], grids: &[Option<Grid>; 2], console: &Console)
             console.warn(&format!(
                 "{}: 4 x 4 numbers do not say whose they are, and were taken as greedy's or NiftyReg's (RAS mm, fixed to \
                  moving); write fsl: before the name for FLIRT's, greedy: to be sure",
-                path.display()
+                path.shown()
             ));
         }
         let part = Chain(found.transforms);

@@ -8,16 +8,15 @@ use super::inputs::{check_distinct, check_output_file};
 use super::transform::{Given, Volumes, percent, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
+use palpate::error::Shown;
 use palpate::io;
 use palpate::numerics::labels::is_label_map;
 use palpate::numerics::sampling::Interpolation;
 use palpate::transforms::Chain;
 use palpate::transforms::resample::{Resampled, resample};
 use palpate::types::{Grid, Transform, Volume, WorldPoint};
+use rayon::prelude::*;
 use std::path::{Path, PathBuf};
-
-/// The largest whole number up to which single precision has all.
-const WHOLE: f32 = 16_777_216.0;
 
 #[derive(Debug, Args)]
 #[command(
@@ -109,52 +108,79 @@ fn move_image(path: &Path, options: &Options, console: &Console) -> Result<()> {
     let labels = stored.labels || is_label_map(&volume);
     let chosen = interpolation.unwrap_or(if labels { Interpolation::Nearest } else { Interpolation::Linear });
     let exact = matches!(chosen, Interpolation::Nearest | Interpolation::Label);
+    let (volume, codes) = if exact { ranked(path, volume)? } else { (volume, Vec::new()) };
     check_labels(path, &volume, chosen)?;
-    match interpolation {
-        None if labels => console.say(&format!(
-            "{} is a label map: each voxel takes the nearest one's label (--interpolation chooses).",
-            path.display()
-        ))?,
-        Some(_) if labels && !exact => console.warn(&format!(
+    if labels && !exact {
+        console.warn(&format!(
             "{} looks like a label map, and between two labels there is none; leave --interpolation out, or take label",
-            path.display()
-        )),
-        _ => {}
+            path.shown()
+        ));
     }
     let Resampled { image: warped, outside } = resample(&volume, &chain, &grid, chosen, 0.0);
     if outside == grid.len() {
         bail!(
             "{}: no voxel of the output would come from inside it; check the order of the transforms, that each is the right \
              way round (,-1 turns one, --inverse all), and whose they are (fsl:, niftyreg:)",
-            path.display()
+            path.shown()
         );
     }
     match io::labels_of(&warped, output).ok().filter(|_| exact) {
+        _ if !codes.is_empty() => {
+            let of: Vec<i64> = warped.as_slice().iter().map(|&rank| codes[rank as usize]).collect();
+            io::write_codes(output, warped.grid(), &of, "palpate: labels, warped")?;
+        }
         Some(labels) => io::write_labels(output, &labels, "palpate: labels, warped")?,
         // No value appears that was not there.
         None if exact => io::write_exact(output, &warped, "palpate: warped")?,
         None => io::write_volume(output, &warped, "palpate: warped")?,
     }
+    if labels && interpolation.is_none() {
+        console.say(&format!(
+            "{} is a label map: each voxel takes the nearest one's label (--interpolation chooses).",
+            path.shown()
+        ));
+    }
     if outside > 0 {
         let share = percent(outside, grid.len());
-        console.say(&format!("{share} of the voxels come from outside {} and are 0.", path.display()))?;
+        console.say(&format!("{share} of the voxels come from outside {} and are 0.", path.shown()));
     }
-    console.say(&format!("Wrote {}.", output.display()))
+    console.say(&format!("Wrote {}.", output.shown()));
+    Ok(())
+}
+
+/// Labels past what single precision tells apart as their ranks, with the label of each rank; 0,
+/// which stands outside, comes first. Other volumes stay as they are.
+fn ranked(path: &Path, volume: Volume) -> Result<(Volume, Vec<i64>)> {
+    if volume.as_slice().iter().all(|v| v.abs() < io::WHOLE) {
+        return Ok((volume, Vec::new()));
+    }
+    let Some(all) = io::read_integers(path)? else { return Ok((volume, Vec::new())) };
+    let mut codes: Vec<i64> = all.iter().copied().filter(|c| *c != 0).collect();
+    codes.par_sort_unstable();
+    codes.dedup();
+    codes.insert(0, 0);
+    if codes.len() > io::WHOLE as usize {
+        bail!("{}: holds {} different numbers, more than labels", path.shown(), codes.len());
+    }
+    let rank = |c: &i64| if *c == 0 { 0.0 } else { 1.0 + codes[1..].partition_point(|other| other < c) as f32 };
+    let ranks = all.par_iter().map(rank).collect();
+    Ok((Volume::from_vec(*volume.grid(), ranks)?, codes))
 }
 
 /// Refuses numbers that cannot be told apart where no new one may appear, and fractions as labels.
 fn check_labels(path: &Path, volume: &Volume, interpolation: Interpolation) -> Result<()> {
     let exact = matches!(interpolation, Interpolation::Nearest | Interpolation::Label);
-    if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > WHOLE) {
+    if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > io::WHOLE) {
         bail!(
-            "{}: holds {v}, and numbers beyond {WHOLE} cannot be told apart in single precision; give labels smaller numbers",
-            path.display()
+            "{}: holds {v}, and numbers beyond {} cannot be told apart in single precision; give labels smaller numbers",
+            path.shown(),
+            io::WHOLE
         );
     }
     if let Some(v) = volume.as_slice().iter().find(|v| interpolation == Interpolation::Label && v.fract() != 0.0) {
         bail!(
             "{}: holds {v}, and labels are whole numbers; take --interpolation linear or cubic for an image",
-            path.display()
+            path.shown()
         );
     }
     Ok(())
@@ -175,6 +201,13 @@ fn move_points(points: &Path, chain: &Chain, output: &Path, console: &Console) -
     let moved: Vec<Option<WorldPoint>> = table.points.iter().map(|&p| chain.at(p)).collect();
     let listed = io::is_slicer(output);
     let lost = moved.iter().filter(|p| p.is_none()).count();
+    if lost == moved.len() {
+        bail!(
+            "{}: none of its {lost} points lies where the transforms lead; places are world mm, RAS (those in LPS have x and y with the \
+             other sign)",
+            points.shown()
+        );
+    }
     if lost > 0 {
         let became = if listed { "were left out" } else { "became NaN" };
         console.warn(&format!("{lost} of {} points lie outside the field's grid and {became}", moved.len()));
@@ -182,5 +215,6 @@ fn move_points(points: &Path, chain: &Chain, output: &Path, console: &Console) -
     table.points = moved.into_iter().map(|p| p.unwrap_or(WorldPoint([f64::NAN; 3]))).collect();
     io::write_points(output, &table)?;
     let kept = table.points.len() - if listed { lost } else { 0 };
-    console.say(&format!("Wrote {}: {kept} points.", output.display()))
+    console.say(&format!("Wrote {}: {kept} points.", output.shown()));
+    Ok(())
 }

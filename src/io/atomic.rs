@@ -4,15 +4,12 @@
 //! is removed when anything fails. There is no fsync: a power cut may lose the file, a full disk or
 //! a crash cannot tear it.
 
-use super::live::{Live, as_a_whole};
+use super::live::{Live, as_a_whole, prefix, sweep};
 use super::{format, os};
 use crate::error::IoError;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use tempfile::Builder;
-
-/// Start of the names of all temporary files and folders.
-pub(super) const TEMPORARY: &str = ".palpate-";
 
 /// Creates or replaces `path` with what `write` writes.
 pub(super) fn write_atomic(
@@ -23,8 +20,9 @@ pub(super) fn write_atomic(
         return Err(format(path, "exists and is not a regular file", "choose another name for the output"));
     }
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    sweep(folder);
     let mut builder = Builder::new();
-    builder.prefix(TEMPORARY).suffix(".tmp");
+    builder.prefix(prefix()).suffix(".tmp");
     // Without this a temporary file is readable by its owner only, and keeps that after the rename.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));

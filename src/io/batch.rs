@@ -1,13 +1,12 @@
 //! Tables of pairs and of their results, and what tells whether a file is still the same.
 
-use super::csv::{damaged, write_table};
+use super::csv::{damaged, open_table, write_table};
 use super::scene::known_names;
 use super::{format, os};
 use crate::error::IoError;
 use crate::types::batch::Pair;
-use csv::{ReaderBuilder, Trim};
 use std::collections::BTreeMap;
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
@@ -34,6 +33,9 @@ pub const PAIR_COLUMNS: [&str; 16] = [
     "session",
 ];
 
+/// No table has more: each takes some hundred bytes of memory, whatever its line.
+const MOST_PAIRS: usize = 100_000;
+
 /// Reads a table of pairs: comma-separated, one header line with some of [`PAIR_COLUMNS`] in any
 /// order, `initial` and `deformed` among them. Paths count from the table's folder. An empty place
 /// is as a column left out. Without a name a pair is called `sub-<subject>_ses-<session>`, or
@@ -45,13 +47,16 @@ pub const PAIR_COLUMNS: [&str; 16] = [
 pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     let path = path.as_ref();
     let folder = path.parent().unwrap_or(Path::new(""));
-    let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(File::open(path).map_err(os(path, "read"))?);
-    let header: Vec<String> = reader.headers().map_err(|e| damaged(path, e))?.iter().map(str::to_lowercase).collect();
+    let (header, mut reader) = open_table(path)?;
+    let header: Vec<String> = header.iter().map(str::to_lowercase).collect();
     known_names(path, "line 1", header.iter().map(String::as_str), &PAIR_COLUMNS)?;
     let mut lines = BTreeMap::new();
     let mut pairs = Vec::new();
     for record in reader.records() {
         let record = record.map_err(|e| damaged(path, e))?;
+        if pairs.len() == MOST_PAIRS {
+            return Err(format(path, format!("has more than {MOST_PAIRS} pairs"), "divide the table"));
+        }
         let line = record.position().map_or(0, csv::Position::line);
         let flaw = |what: String, hint: &str| format(path, format!("line {line}: {what}"), hint);
         let text = |column: &str| {
@@ -67,7 +72,7 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
         };
         // A side of the body stays as it is, a file counts from the table.
         let side = |column: &str| {
-            let at_table = |v: String| if v.len() == 2 { v } else { folder.join(v).display().to_string() };
+            let at_table = |v: String| if v.len() == 2 { v } else { folder.join(v).to_string_lossy().into_owned() };
             text(column).map(at_table)
         };
         let force_n = match text("force_n") {
@@ -127,8 +132,8 @@ fn start(folder: &Path, text: &str) -> String {
     let (source, path) = text.split_once(':').map_or(("", text), |(source, path)| (source, path));
     match (source, path) {
         ("", "centre" | "center" | "moments" | "principal") => text.to_string(),
-        ("", path) => folder.join(path).display().to_string(),
-        (source, path) => format!("{source}:{}", folder.join(path).display()),
+        ("", path) => folder.join(path).to_string_lossy().into_owned(),
+        (source, path) => format!("{source}:{}", folder.join(path).to_string_lossy()),
     }
 }
 
@@ -147,7 +152,7 @@ pub fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String
 /// [`IoError`] when it is not there or cannot be read.
 pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
     let path = path.as_ref();
-    let beside = super::image::voxels_beside(path);
+    let beside = super::image::others(path);
     let own = if path.is_dir() { super::list(path)? } else { vec![path.to_path_buf()] };
     let files: Vec<PathBuf> = own.into_iter().chain(beside).collect();
     let mut whole = (0, 0);

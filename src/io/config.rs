@@ -2,13 +2,11 @@
 //! JSON or TOML.
 
 use super::scene::{known_names, parse_table};
-use super::{format, os};
+use super::{format, source};
 use crate::error::IoError;
 use crate::types::FieldParams;
 use crate::types::params::Preset;
 use serde_json::{Map, Value};
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// No file of parameters is longer (bytes).
@@ -22,9 +20,7 @@ const LONGEST: u64 = 1 << 24;
 /// a wrong type or out of range.
 pub fn read_config(path: impl AsRef<Path>) -> Result<FieldParams, IoError> {
     let path = path.as_ref();
-    let mut text = String::new();
-    let file = File::open(path).map_err(os(path, "read"))?;
-    file.take(LONGEST).read_to_string(&mut text).map_err(os(path, "read"))?;
+    let text = source::keyed(path, LONGEST, source::MOST_VALUES)?;
     let given = if text.trim_start().starts_with('{') { from_json(path, &text)? } else { from_toml(path, &text)? };
     let preset = match given.get("preset") {
         Some(value) => serde_json::from_value(value.clone())
@@ -75,6 +71,10 @@ fn from_toml(path: &Path, text: &str) -> Result<Map<String, Value>, IoError> {
     }
     known_names(path, "the configuration", table.keys().map(String::as_str), &FieldParams::KEYS)?;
     let odd = |what: String| format(path, what, "write key = value, with text in quotes");
+    // JSON has no such numbers and would say null.
+    if let Some((key, value)) = table.iter().find(|(_, v)| v.as_float().is_some_and(|v| !v.is_finite())) {
+        return Err(format(path, format!("{key} is {value}, not a finite number"), "correct that key"));
+    }
     match serde_json::to_value(&table).map_err(|e| odd(e.to_string()))? {
         Value::Object(given) => Ok(given),
         _ => Err(odd("holds no keys".into())),

@@ -3,12 +3,13 @@
 //! Columns are found by name, in any order and case. Every error names the file and the line.
 
 use super::atomic::write_atomic;
-use super::{format, markups, os};
+use super::flaw::Flaw;
+use super::{format, markups, os, source};
 use crate::error::IoError;
+use crate::error::Shown;
 use crate::types::{Landmark, Match, RawMatch, SparseField, WorldPoint};
-use csv::{ReaderBuilder, StringRecord, Trim, Writer};
-use std::fs::File;
-use std::io::Read;
+use csv::{Reader, ReaderBuilder, StringRecord, Trim, Writer};
+use std::io::Cursor;
 use std::path::Path;
 
 const MATCH_COLUMNS: [&str; 9] = ["x", "y", "z", "dx", "dy", "dz", "ncc", "sigma", "kept"];
@@ -48,8 +49,7 @@ pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
     if markups::is_slicer(path) {
         return Ok(TableKind::Points);
     }
-    let file = File::open(path).map_err(os(path, "read"))?;
-    let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(file.take(1 << 16));
+    let mut reader = reader_of(source::head(path, 1 << 16)?);
     let header = reader.headers().map_err(|e| damaged(path, e))?.clone();
     let has = |names: &[&str]| names.iter().all(|n| header.iter().any(|h| h.eq_ignore_ascii_case(n)));
     match (has(&MATCH_COLUMNS), has(&LANDMARK_COLUMNS), has(&POINT_COLUMNS)) {
@@ -143,7 +143,7 @@ pub fn read_landmarks(path: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> 
 pub fn read_landmark_pair(initial: impl AsRef<Path>, deformed: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> {
     let (a, b) = (read_points(initial.as_ref())?, read_points(deformed.as_ref())?);
     if a.points.len() != b.points.len() {
-        let what = format!("has {} points, {} has {}", b.points.len(), initial.as_ref().display(), a.points.len());
+        let what = format!("has {} points, {} has {}", b.points.len(), initial.as_ref().shown(), a.points.len());
         return Err(format(deformed.as_ref(), what, "give the same landmarks in both, in the same order"));
     }
     let labels = |t: &PointTable| {
@@ -240,11 +240,63 @@ pub(super) struct Table<const N: usize> {
     pub(super) others: Vec<Vec<String>>,
 }
 
+fn reader_of(bytes: Vec<u8>) -> Reader<Cursor<Vec<u8>>> {
+    ReaderBuilder::new().trim(Trim::All).from_reader(Cursor::new(bytes))
+}
+
+/// No table has more columns.
+const MOST_COLUMNS: usize = 1000;
+
+/// The header line of a table, and the reader of the lines after it.
+pub(super) fn open_table(path: &Path) -> Result<(StringRecord, Reader<Cursor<Vec<u8>>>), IoError> {
+    let bytes = source::bytes(path, source::LONGEST_TEXT)?;
+    check_quotes(&bytes).map_err(|flaw| flaw.at(path))?;
+    let mut reader = reader_of(bytes);
+    let header = reader.headers().map_err(|e| damaged(path, e))?.clone();
+    Ok((header, reader))
+}
+
+/// Refuses quotes that could make one cell of the rest of a table (RFC 4180, 2.5 to 2.7): one that is
+/// not closed, and text after a closed one. Also a first line that is no header.
+fn check_quotes(bytes: &[u8]) -> Result<(), Flaw> {
+    let (mut line, mut opened, mut columns) = (1, None, Some(1));
+    let mut at = if bytes.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };
+    let mut start = true;
+    while let Some(&b) = bytes.get(at) {
+        line += usize::from(b == b'\n');
+        match (opened, b) {
+            (Some(_), b'"') if bytes.get(at + 1) == Some(&b'"') => at += 1,
+            (Some(from), b'"') => {
+                opened = None;
+                if !matches!(bytes.get(at + 1), None | Some(b',' | b'\r' | b'\n')) {
+                    let what = format!("line {line}: text follows the quote that closes what line {from} opened");
+                    return Err(Flaw::new(what, "put a comma after it, or write a quote in a cell twice"));
+                }
+            }
+            (Some(_), _) => {}
+            (None, b'"') if start => opened = Some(line),
+            (None, b',') => {
+                columns = columns.map(|n| n + 1);
+                if columns.is_some_and(|n| n > MOST_COLUMNS) {
+                    let what = format!("line 1: has more than {MOST_COLUMNS} columns");
+                    return Err(Flaw::new(what, "the first line must name the columns; check which file it is"));
+                }
+            }
+            (None, b'\n' | b'\r') if !start || columns.is_some_and(|n| n > 1) => columns = None,
+            _ => {}
+        }
+        start = opened.is_none() && matches!(b, b',' | b'\n' | b'\r');
+        at += 1;
+    }
+    match opened {
+        Some(from) => Err(Flaw::new(format!("line {from}: a quote opens there and is never closed"), "close it")),
+        None => Ok(()),
+    }
+}
+
 /// All rows: the named columns as finite numbers, the others as text.
 pub(super) fn read_table<const N: usize>(path: &Path, names: [&str; N]) -> Result<Table<N>, IoError> {
-    let file = File::open(path).map_err(os(path, "read"))?;
-    let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(file);
-    let header = reader.headers().map_err(|e| damaged(path, e))?.clone();
+    let (header, mut reader) = open_table(path)?;
     let mut columns = [0; N];
     for (column, name) in columns.iter_mut().zip(names) {
         *column = header.iter().position(|h| h.eq_ignore_ascii_case(name)).ok_or_else(|| {

@@ -1,10 +1,9 @@
 //! SHA-256 of inputs: tells whether a file is still the same.
 
-use super::image::voxels_beside;
-use super::{format, os};
+use super::image::others;
+use super::{os, source};
 use crate::error::IoError;
 use sha2::{Digest, Sha256};
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -25,11 +24,7 @@ pub fn digest(path: impl AsRef<Path>) -> Result<(u64, String), IoError> {
     };
     let mut piece = vec![0; PIECE];
     for file in files {
-        // Opening a pipe would wait for who writes to it.
-        if !std::fs::metadata(&file).map_err(os(&file, "read"))?.is_file() {
-            return Err(format(&file, "is no regular file", "save it to a file first"));
-        }
-        let mut source = File::open(&file).map_err(os(&file, "read"))?;
+        let mut source = source::open(&file)?;
         loop {
             match source.read(&mut piece).map_err(os(&file, "read"))? {
                 0 => break,
@@ -44,11 +39,10 @@ pub fn digest(path: impl AsRef<Path>) -> Result<(u64, String), IoError> {
     Ok((bytes, digits))
 }
 
-/// All files that reading `path` reads: itself, and the file of voxels that a `.nhdr` or `.mhd`
-/// names.
+/// All files that reading `path` reads: itself, and the others that it names or is a part of.
 pub fn files_of(path: impl AsRef<Path>) -> Vec<PathBuf> {
     let path = path.as_ref();
-    std::iter::once(path.to_path_buf()).chain(voxels_beside(path)).collect()
+    std::iter::once(path.to_path_buf()).chain(others(path)).collect()
 }
 
 #[cfg(test)]

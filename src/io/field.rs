@@ -91,7 +91,9 @@ pub fn read_field_as(
             }
             (grid, values, intent.niftyreg && intent.kind == 0.0)
         }
-        Format::Folder => return Err(Flaw::new("is a folder, not a field", "name the file in it").at(path)),
+        Format::Dicom => {
+            return Err(Flaw::new("is a folder or DICOM, not a field", "name the file of a field").at(path));
+        }
         format if convention == FieldConvention::Lps || convention == FieldConvention::Ras => {
             let (grid, values) = raw_field(path, format)?;
             (grid, values, false)

@@ -1,13 +1,12 @@
 //! A folder of `palpate stiffness` read back, and fingertip files.
 
-use super::{format, os, write_text};
+use super::{format, write_text};
 use crate::error::IoError;
 use crate::io::image::read_volume;
 use crate::types::StiffnessParams;
 use crate::types::Volume;
 use crate::types::fingertip::{PadReduction, StiffnessFolder, StiffnessRegion};
 use serde::Deserialize;
-use std::fs;
 use std::path::Path;
 
 #[derive(Deserialize)]
@@ -52,7 +51,7 @@ struct RawPatch {
 pub fn read_stiffness(folder: impl AsRef<Path>) -> Result<StiffnessFolder, IoError> {
     let folder = folder.as_ref();
     let path = folder.join("summary.json");
-    let text = fs::read_to_string(&path).map_err(os(&path, "read"))?;
+    let text = super::source::keyed(&path, 1 << 24, 1 << 20)?;
     told(&path, &text, || read_volume(folder.join("stiffness.nii.gz")))
 }
 
@@ -110,8 +109,7 @@ pub fn read_fingertip_press(path: impl AsRef<Path>) -> Result<(bool, f64), IoErr
 
 /// What `find` finds in a fingertip file; `what` it is called where it is missing.
 fn found_in<T>(path: &Path, what: &str, find: impl Fn(&toml::Table) -> Option<T>) -> Result<T, IoError> {
-    let text = fs::read_to_string(path).map_err(os(path, "read"))?;
-    let table = super::scene::parse_table(path, &text)?;
+    let table = super::scene::read_table(path)?;
     find(&table).ok_or_else(|| format(path, format!("has no {what}"), "give a file that `palpate fingertip` wrote"))
 }
 

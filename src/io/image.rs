@@ -6,11 +6,9 @@
 
 use super::flaw::Flaw;
 use super::raw::RawImage;
-use super::{metaimage, nifti, nrrd, os};
+use super::{dicom, format, metaimage, nifti, nrrd, source};
 use crate::error::IoError;
 use crate::types::{Grid, Mask, Volume, Voxels};
-use std::fs::{self, File};
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Formats by their first bytes.
@@ -19,20 +17,27 @@ pub(super) enum Format {
     Nifti,
     Nrrd,
     MetaImage,
-    Folder,
+    /// A folder with a series, or a file of one.
+    Dicom,
 }
 
 impl Format {
     /// Of the file or folder at `path`.
     pub(super) fn of(path: &Path) -> Result<Self, IoError> {
         if path.is_dir() {
-            return Ok(Self::Folder);
+            return Ok(Self::Dicom);
         }
-        let mut head = Vec::new();
-        // What is no regular file is refused by whoever reads it; a pipe must not be opened (that
-        // waits) or drained here.
-        if fs::metadata(path).map_err(os(path, "read"))?.is_file() {
-            File::open(path).and_then(|f| f.take(64).read_to_end(&mut head)).map_err(os(path, "read"))?;
+        let whole = source::head(path, dicom::MARK as u64)?;
+        if dicom::is_dicom(&whole) {
+            return Ok(Self::Dicom);
+        }
+        let head = &whole[..whole.len().min(64)];
+        if let Some((name, command)) = source::packing(head) {
+            return Err(format(
+                path,
+                format!("is packed with {name}, which is not read"),
+                format!("unpack it: {command}"),
+            ));
         }
         let name = path.to_string_lossy().to_lowercase();
         let text = head.iter().all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace());
@@ -106,8 +111,8 @@ pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoErro
             };
             Ok((stored, kind))
         }
-        Format::Folder => {
-            let (stored, _) = super::dicom::series(path, false)?;
+        Format::Dicom => {
+            let (stored, _) = dicom::series(path, false)?;
             Ok((stored, ImageKind::Scalar))
         }
         format => {
@@ -122,7 +127,7 @@ pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoErro
     }
 }
 
-/// Reads only the header of a scalar volume: a file, or a folder with one DICOM series.
+/// Reads only the header of a scalar volume: a file, or a DICOM series.
 ///
 /// # Errors
 /// [`IoError`] where [`read_volume`] would refuse by the header and the file's size: no file, no scalar volume, or more voxels than
@@ -131,7 +136,7 @@ pub fn read_volume_header(path: impl AsRef<Path>) -> Result<Stored, IoError> {
     let path = path.as_ref();
     match Format::of(path)? {
         Format::Nifti => nifti::read::volume_header(path),
-        Format::Folder => super::dicom::series(path, false).map(|(stored, _)| stored),
+        Format::Dicom => dicom::series(path, false).map(|(stored, _)| stored),
         format => scalar(path, format).and_then(|image| image.check_size().map(|()| image.stored())),
     }
 }
@@ -154,15 +159,26 @@ fn raw(path: &Path, format: Format) -> Result<RawImage, IoError> {
     }
 }
 
-/// The file of voxels that a `.nhdr` or `.mhd` names; none where there is no other, or the header
-/// cannot be read.
-pub(super) fn voxels_beside(path: &Path) -> Option<PathBuf> {
-    let format = Format::of(path).ok().filter(|f| matches!(f, Format::Nrrd | Format::MetaImage))?;
-    raw(path, format).ok().map(|image| image.file).filter(|file| file != path)
+/// Other files that reading the image at `path` reads: the voxels that a `.nhdr` or `.mhd` names, the
+/// other one of a `.hdr`/`.img` pair, the other slices of a DICOM file; none of a folder, or where the
+/// header cannot be read.
+pub(super) fn others(path: &Path) -> Vec<PathBuf> {
+    let mut found: Vec<PathBuf> = match Format::of(path) {
+        _ if path.is_dir() => Vec::new(),
+        Ok(Format::Dicom) => dicom::files(path),
+        Ok(Format::Nifti) => {
+            let other = |from, to| nifti::read::beside(path, from, to);
+            other("hdr", "img").or_else(|| other("img", "hdr")).into_iter().collect()
+        }
+        Ok(format) => raw(path, format).into_iter().map(|image| image.file).collect(),
+        Err(_) => Vec::new(),
+    };
+    found.retain(|file| file != path);
+    found
 }
 
-/// Reads a scalar volume, in the file's intensity unit after its scaling: a file, or a folder with
-/// one DICOM series.
+/// Reads a scalar volume, in the file's intensity unit after its scaling: a file, or
+/// a DICOM series.
 ///
 /// Axes past the third must have length 1. Values that are not finite are given as they are (see
 /// [`count_non_finite`]); float64 beyond float32 becomes infinite.
@@ -173,8 +189,8 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
     let path = path.as_ref();
     let (grid, values) = match Format::of(path)? {
         Format::Nifti => nifti::read::volume(path)?,
-        Format::Folder => {
-            let (stored, values) = super::dicom::series(path, true)?;
+        Format::Dicom => {
+            let (stored, values) = dicom::series(path, true)?;
             (stored.grid, values)
         }
         format => {
@@ -185,13 +201,44 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
     Volume::from_vec(grid, values).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
 }
 
+/// Reads a scalar volume of whole numbers as they are stored, which single precision has only up to
+/// 2^24; none where it may have fractions, or is a DICOM series.
+///
+/// # Errors
+/// As [`read_volume`].
+pub fn read_integers(path: impl AsRef<Path>) -> Result<Option<Vec<i64>>, IoError> {
+    let path = path.as_ref();
+    match Format::of(path)? {
+        Format::Nifti => nifti::read::integers(path).map(|(_, values)| values),
+        Format::Dicom => Ok(None),
+        format => scalar(path, format)?.integers(),
+    }
+}
+
 /// Reads a label map: whole numbers 0 to 255, stored as any type.
 ///
 /// # Errors
 /// As [`read_volume`]; also when a value is anything else.
 pub fn read_labels(path: impl AsRef<Path>) -> Result<Mask, IoError> {
-    labels_of(&read_volume(path.as_ref())?, path.as_ref())
+    let (path, volume) = (path.as_ref(), read_volume(path.as_ref())?);
+    labels_of(&volume, path).map_err(|error| match volume.as_slice().iter().any(|v| v.abs() >= WHOLE) {
+        // The number as it is stored: single precision has lost its last digits.
+        true => {
+            match read_integers(path).ok().flatten().and_then(|all| all.into_iter().find(|v| !(0..256).contains(v))) {
+                Some(v) => {
+                    format(path, format!("holds the label {v}, but labels are whole numbers from 0 to 255"), LABELS)
+                }
+                None => error,
+            }
+        }
+        false => error,
+    })
 }
+
+/// From here on single precision has not all whole numbers.
+pub const WHOLE: f32 = 16_777_216.0;
+
+const LABELS: &str = "give a mask or label map, resampled with nearest neighbour";
 
 /// `volume`, called `path` in errors, as a label map.
 ///
@@ -204,7 +251,7 @@ pub fn labels_of(volume: &Voxels<'_>, path: &Path) -> Result<Mask, IoError> {
         let [nx, ny, _] = grid.shape();
         let (v, i, j, k) = (volume.as_slice()[at], at % nx, at / nx % ny, at / nx / ny);
         let what = format!("voxel ({i}, {j}, {k}) is {v}, but labels are whole numbers from 0 to 255");
-        return Err(Flaw::new(what, "give a mask or label map, resampled with nearest neighbour").at(path));
+        return Err(Flaw::new(what, LABELS).at(path));
     }
     let labels = volume.as_slice().iter().map(|&v| v as u8).collect();
     Mask::from_vec(grid, labels).map_err(|e| Flaw::new(e.to_string(), "export it again").at(path))
@@ -230,6 +277,7 @@ pub(super) fn raw_field(path: &Path, format: Format) -> Result<(Grid, Vec<f32>),
         let what = format!("is not a displacement field: {} numbers a voxel instead of 3", image.components);
         return Err(Flaw::new(what, "give a displacement field as ITK, Slicer or plastimatch write it").at(path));
     }
+    image.kind.check_signed().map_err(|flaw| flaw.at(path))?;
     let values = image.load()?;
     Ok((image.grid, values))
 }

@@ -1,11 +1,8 @@
 //! What a file is by its first bytes, where it is neither an image nor points.
 
-use super::csv::damaged;
-use super::os;
+use super::csv::{damaged, open_table};
+use super::source;
 use crate::error::IoError;
-use csv::{ReaderBuilder, Trim};
-use std::fs::{self, File};
-use std::io::Read;
 use std::path::Path;
 
 /// Bytes looked at.
@@ -41,12 +38,10 @@ pub enum Form {
 /// [`IoError`] when it is not there or cannot be read.
 pub fn form_of(path: impl AsRef<Path>) -> Result<Form, IoError> {
     let path = path.as_ref();
-    // Opening a pipe would wait for who writes to it.
-    if !fs::metadata(path).map_err(os(path, "read"))?.is_file() {
+    if path.is_dir() {
         return Ok(Form::Other);
     }
-    let mut head = Vec::new();
-    File::open(path).and_then(|f| f.take(HEAD).read_to_end(&mut head)).map_err(os(path, "read"))?;
+    let head = source::head(path, HEAD)?;
     let text = String::from_utf8_lossy(&head);
     let start = text.trim_start();
     Ok(match start {
@@ -82,9 +77,8 @@ fn mesh(text: &str) -> Form {
 /// [`IoError`] when it cannot be read or is no table of comma-separated values.
 pub fn columns_of(path: impl AsRef<Path>) -> Result<(Vec<String>, usize), IoError> {
     let path = path.as_ref();
-    let file = File::open(path).map_err(os(path, "read"))?;
-    let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(file);
-    let columns = reader.headers().map_err(|e| damaged(path, e))?.iter().map(String::from).collect();
+    let (header, mut reader) = open_table(path)?;
+    let columns = header.iter().map(String::from).collect();
     let mut rows = 0;
     for record in reader.byte_records() {
         record.map_err(|e| damaged(path, e))?;

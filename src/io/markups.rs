@@ -5,17 +5,14 @@
 //! takes them.
 
 use super::csv::PointTable;
-use super::{format, os, write_json};
+use super::raw::in_mm;
+use super::{format, source, write_json};
 use crate::error::IoError;
 use crate::types::WorldPoint;
+use crate::types::names::cut;
 use serde::Deserialize;
 use serde_json::{Value, json};
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
-
-/// No file of points is longer (bytes).
-const LONGEST: u64 = 1 << 28;
 
 #[derive(Deserialize)]
 struct Markups {
@@ -26,6 +23,8 @@ struct Markups {
 #[serde(rename_all = "camelCase")]
 struct List {
     coordinate_system: Option<Value>,
+    /// One for all axes, or a list of one an axis: the name of a unit, or of its UCUM code.
+    coordinate_units: Option<Value>,
     #[serde(default)]
     control_points: Vec<ControlPoint>,
 }
@@ -46,8 +45,7 @@ pub fn is_slicer(path: &Path) -> bool {
 
 /// Reads the points of either format, world mm RAS, with a column `label`.
 pub(super) fn read(path: &Path) -> Result<PointTable, IoError> {
-    let mut text = String::new();
-    File::open(path).and_then(|f| f.take(LONGEST).read_to_string(&mut text)).map_err(os(path, "read"))?;
+    let text = source::text(path, source::LONGEST_TEXT)?;
     let (points, labels) = match path.to_string_lossy().to_lowercase().ends_with(".fcsv") {
         true => read_fcsv(path, &text)?,
         false => read_json(path, &text)?,
@@ -89,14 +87,34 @@ fn read_json(path: &Path, text: &str) -> Result<Points, IoError> {
         Some(Value::String(system)) => to_ras(path, system)?,
         Some(other) => to_ras(path, &other.to_string())?,
     };
+    let unit = match &list.coordinate_units {
+        None => 1.0,
+        Some(units) => unit_in_mm(units).ok_or_else(|| {
+            let what = format!("has coordinateUnits {}", cut(&units.to_string()));
+            format(path, what, "save it in mm, or in another unit of length, the same along all axes")
+        })?,
+    };
     let defined = |p: &&ControlPoint| p.position_status.as_deref().is_none_or(|s| s == "defined");
     let mut out = Points::default();
     for p in list.control_points.iter().filter(defined) {
         let Some([x, y, z]) = p.position else { continue };
-        out.0.push([sign * x, sign * y, z]);
+        out.0.push([sign * unit * x, sign * unit * y, unit * z]);
         out.1.push(p.label.clone().unwrap_or_default());
     }
     Ok(out)
+}
+
+/// What a unit is in mm; none where it is none of length, or the axes differ.
+fn unit_in_mm(units: &Value) -> Option<f64> {
+    match units {
+        Value::String(name) => in_mm(name),
+        Value::Array(axes) => {
+            let each: Vec<f64> = axes.iter().map(unit_in_mm).collect::<Option<_>>()?;
+            each.first().copied().filter(|u| each.iter().all(|v| v == u))
+        }
+        Value::Object(coded) => coded.get("codeValue").or(coded.get("CodeValue")).and_then(unit_in_mm),
+        _ => None,
+    }
 }
 
 fn read_fcsv(path: &Path, text: &str) -> Result<Points, IoError> {

@@ -1,11 +1,12 @@
 //! MetaImage headers (ITK's MetaIO): `.mha`, or `.mhd` with one file of voxels beside it.
 //! Coordinates are LPS, as ITK has them; each row of `TransformMatrix` is the direction of one
-//! axis.
+//! axis. Lengths are mm.
 
 use super::flaw::Flaw;
 use super::raw::{Packing, RawImage, Start, grid_from_lps, head, line, numbers};
 use super::voxels::Kind;
 use crate::error::IoError;
+use crate::types::names::cut;
 use std::path::Path;
 
 const EXPORT: &str = "save it again from SimpleITK, or as .nii.gz";
@@ -38,7 +39,8 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         })?;
         fields.push((key.trim().to_lowercase(), value.trim().into()));
     }
-    let find = |names: &[&str]| fields.iter().find(|f| names.contains(&f.0.as_str())).map(|f| f.1.as_str());
+    // Of several names for one thing MetaIO takes the first one here, and of several lines the last.
+    let find = |names: &[&str]| names.iter().find_map(|n| fields.iter().rfind(|f| f.0 == *n)).map(|f| f.1.as_str());
     let odd = |name: &str, value: &str| {
         let shown: String = value.chars().take(60).collect();
         Flaw::new(format!("its MetaImage header has {name} = {shown}"), EXPORT)
@@ -64,8 +66,8 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         .collect::<Option<Vec<_>>>()
         .filter(|s| s.len() == n)
         .ok_or_else(|| odd("DimSize", text))?;
-    let spacing = list("ElementSpacing", &["elementspacing"], 1.0, n)?;
-    let offset = list("Offset", &["offset", "position", "origin"], 0.0, n)?;
+    let spacing = list("ElementSpacing", &["elementspacing", "elementsize"], 1.0, n)?;
+    let offset = list("Offset", &["origin", "offset", "position"], 0.0, n)?;
     let identity: Vec<f64> = (0..n * n).map(|i| f64::from(u8::from(i % (n + 1) == 0))).collect();
     let directions = match find(&["transformmatrix", "rotation", "orientation"]) {
         Some(text) => numbers(text).filter(|v| v.len() == n * n).ok_or_else(|| odd("TransformMatrix", text))?,
@@ -84,6 +86,10 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
             return Err(odd(key, text));
         }
     }
+    if let Some(unit) = find(&["distanceunits"]).filter(|u| !["mm", "?"].contains(u)) {
+        let what = format!("its MetaImage header has DistanceUnits = {}, which ITK takes as mm", cut(unit));
+        return Err(Flaw::new(what, "write the voxel size and the origin in mm"));
+    }
     if find(&["binarydata"]).is_some_and(|v| v.eq_ignore_ascii_case("false")) {
         return Err(odd("BinaryData", "False"));
     }
@@ -98,7 +104,7 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         return Err(Flaw::new("has its voxels in several files", EXPORT));
     }
     let start = match (local, skip) {
-        (true, _) => Start::At(from as u64),
+        (true, 0 | -1) => Start::At(from as u64),
         (false, -1) if !packed => Start::Last,
         (false, 0..) => Start::At(skip as u64),
         _ => return Err(odd("HeaderSize", &skip.to_string())),

@@ -19,7 +19,7 @@ mod metaimage;
 
 mod dicom;
 
-mod elements;
+mod source;
 
 mod raw;
 
@@ -92,6 +92,7 @@ pub use csv::{
     PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches, table_kind,
     write_landmarks, write_matches, write_points,
 };
+pub use dicom::{Series as DicomSeries, series_in};
 pub use digest::{digest, files_of};
 pub use field::{FieldConvention, read_field, read_field_as, read_samples};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
@@ -100,20 +101,20 @@ pub use grasp::{
     write_sweep, write_trajectory,
 };
 pub use image::{
-    ImageKind, Stored, count_non_finite, labels_of, read_header, read_labels, read_mask, read_volume,
-    read_volume_header,
+    ImageKind, Stored, WHOLE, count_non_finite, labels_of, read_header, read_integers, read_labels, read_mask,
+    read_volume, read_volume_header,
 };
-pub use live::abandon;
+pub use live::{Hold, abandon};
 pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
 pub use memory::memory_left;
 pub use mujoco::{write_mjcf, write_msh};
 pub use nifti::{
-    PackedField, STRAIN_BITS, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact,
-    write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field, write_steps,
-    write_tensor_deviations, write_tensors, write_vectors, write_volume,
+    PackedField, STRAIN_BITS, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_codes,
+    write_exact, write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field,
+    write_steps, write_tensor_deviations, write_tensors, write_vectors, write_volume,
 };
-pub use output::OutputFolder;
+pub use output::{OutputFolder, hold};
 pub use scene::{SceneFile, SceneOverrides, read_scene};
 pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
@@ -139,5 +140,13 @@ fn os(path: &Path, action: &'static str) -> impl FnOnce(std::io::Error) -> IoErr
 
 /// What is wrong with a file's content, and what to try.
 fn format(path: &Path, what: impl Into<String>, hint: impl Into<String>) -> IoError {
-    IoError::Format { path: path.into(), what: what.into(), hint: hint.into() }
+    let mut what = what.into();
+    if let Some((at, _)) = what.char_indices().nth(LONGEST_REASON) {
+        what.truncate(at);
+        what.push_str("...");
+    }
+    IoError::Format { path: path.into(), what, hint: hint.into() }
 }
+
+/// Characters of a reason that a message shows at most, whatever a file holds.
+const LONGEST_REASON: usize = 1000;

@@ -6,7 +6,7 @@
 //! files, text, hex and bzip2 are errors.
 
 use super::flaw::Flaw;
-use super::raw::{Packing, RawImage, Start, grid_from_lps, head, line, numbers};
+use super::raw::{Packing, RawImage, Start, grid_from_lps, head, in_mm, line, numbers};
 use super::voxels::Kind;
 use crate::error::IoError;
 use std::path::Path;
@@ -77,12 +77,19 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         }
     };
     let lps = |v: [f64; 3]| std::array::from_fn(|a| sign[a] * v[a]);
-    let grid = grid_from_lps(axes.shape, steps.map(lps), lps(origin))?;
-    if let Some(units) = find(&["space units"]).filter(|u| u.split_whitespace().any(|w| !w.contains("mm"))) {
-        return Err(odd("space units", units));
-    }
+    let unit = match find(&["space units"]) {
+        Some(text) => units_in_mm(text).ok_or_else(|| odd("space units", text))?,
+        None => [1.0; 3],
+    };
+    let scaled = |v: [f64; 3]| lps(std::array::from_fn(|a| unit[a] * v[a]));
+    let grid = grid_from_lps(axes.shape, steps.map(scaled), scaled(origin))?;
     if axes.components > 1 && find(&["measurement frame"]).and_then(numbers).is_some_and(|m| m != FRAME) {
         return Err(Flaw::new("has a measurement frame of its own for its vectors", EXPORT));
+    }
+    let colours = |kind: &str| kind.to_lowercase().ends_with("color");
+    if let Some(kinds) = find(&["kinds"]).filter(|k| k.split_whitespace().any(colours)) {
+        let what = format!("holds colours (kinds: {}), not numbers of one meaning", shortened(kinds));
+        return Err(Flaw::new(what, "convert it to one grey value a voxel"));
     }
     let big_endian = match find(&["endian"]).map(str::to_lowercase).as_deref() {
         Some("big") => true,
@@ -120,6 +127,18 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
     };
     let Axes { components, interleaved, .. } = axes;
     Ok(RawImage { format, placed, grid, components, interleaved, kind, big_endian, packing, start, file })
+}
+
+/// What one of each axis of space is in mm, from `"mm" "cm" "um"`; an empty name is mm.
+fn units_in_mm(text: &str) -> Option<[f64; 3]> {
+    let names: Vec<&str> = text.split_whitespace().map(|w| w.trim_matches('"')).collect();
+    let each: Vec<f64> =
+        names.iter().map(|n| if n.is_empty() { Some(1.0) } else { in_mm(n) }).collect::<Option<_>>()?;
+    match each[..] {
+        [x, y, z] => Some([x, y, z]),
+        [x, y] => Some([x, y, 1.0]),
+        _ => None,
+    }
 }
 
 /// The identity, row by row.

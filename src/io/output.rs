@@ -1,7 +1,6 @@
 //! A folder of results that appears as a whole or not at all.
 
-use super::atomic::TEMPORARY;
-use super::live::{Live, as_a_whole};
+use super::live::{EARLIER, Hold, Live, TEMPORARY, as_a_whole, prefix, sweep};
 use super::{format, os};
 use crate::error::IoError;
 use std::fs;
@@ -13,7 +12,8 @@ use tempfile::TempDir;
 /// Files are first written into a hidden folder inside the target (same file system, so that moving
 /// them is a rename) and moved by [`OutputFolder::commit`]. Dropped without a commit, it leaves the
 /// target as it was; folders that it had created are removed again. A killed process may leave the
-/// hidden folder; it is ignored next time.
+/// hidden folder, which the next run removes unless earlier results are in it. The target is held
+/// meanwhile: no other run can write into it.
 #[derive(Debug)]
 pub struct OutputFolder {
     path: PathBuf,
@@ -23,6 +23,7 @@ pub struct OutputFolder {
     earlier: Vec<String>,
     /// Folders made here, outermost first.
     created: Vec<(PathBuf, Live)>,
+    held: Option<Hold>,
 }
 
 impl OutputFolder {
@@ -35,14 +36,24 @@ impl OutputFolder {
         let path = path.as_ref();
         Self::check(path, force)?;
         let missing = |p: &&Path| !p.as_os_str().is_empty() && !p.exists();
-        let mut folder =
-            Self { path: path.into(), staging: None, names: Vec::new(), earlier: Vec::new(), created: Vec::new() };
+        let mut folder = Self {
+            path: path.into(),
+            staging: None,
+            names: Vec::new(),
+            earlier: Vec::new(),
+            created: Vec::new(),
+            held: None,
+        };
         let mut to_create: Vec<&Path> = path.ancestors().take_while(missing).collect();
         while let Some(next) = to_create.pop() {
             let live = Live::folder(next).map_err(os(next, "create the folder"))?;
             folder.created.push((next.into(), live));
         }
-        let staging = || tempfile::Builder::new().prefix(TEMPORARY).tempdir_in(path);
+        folder.held = Some(hold(path)?);
+        // What another run has written meanwhile counts.
+        Self::check(path, force)?;
+        sweep(path);
+        let staging = || tempfile::Builder::new().prefix(prefix()).tempdir_in(path);
         let staging = Live::temporary(staging, |made| made.path());
         folder.staging = Some(staging.map_err(os(path, "write into the folder"))?);
         Ok(folder)
@@ -65,7 +76,7 @@ impl OutputFolder {
                 return Err(format(
                     path,
                     "the folder is not empty",
-                    "choose another --output, or let files be replaced (--force; of palpate stiffness: --overwrite)",
+                    "choose another --output, or let files be replaced (--overwrite)",
                 ));
             }
         }
@@ -125,7 +136,7 @@ impl OutputFolder {
     pub fn commit(mut self) -> Result<Vec<PathBuf>, IoError> {
         let Some((staging, _)) = &self.staging else { return Ok(Vec::new()) };
         let targets: Vec<PathBuf> = self.names.iter().map(|name| self.path.join(name)).collect();
-        let earlier = staging.path().join("earlier");
+        let earlier = staging.path().join(EARLIER);
         let gone = self.earlier.iter().filter(|name| !self.names.contains(name));
         as_a_whole(|| {
             let mut back = Vec::new();
@@ -144,6 +155,20 @@ impl OutputFolder {
         self.created.clear();
         Ok(targets)
     }
+}
+
+/// Holds a folder for results for one run.
+///
+/// # Errors
+/// [`IoError`] when another run holds it, or it is gone.
+pub fn hold(path: impl AsRef<Path>) -> Result<Hold, IoError> {
+    let path = path.as_ref();
+    Hold::of(path).map_err(|error| match error.kind() {
+        std::io::ErrorKind::WouldBlock => {
+            format(path, "another run is writing into the folder", "wait until it ends, or choose another --output")
+        }
+        _ => os(path, "write into the folder")(error),
+    })
 }
 
 /// Moves `new`, if there is any, to `target`, what stands there to `earlier` first; `back` gets the

@@ -4,8 +4,8 @@ use super::flaw::Flaw;
 use super::gzip::{self, LARGEST_RATIO};
 use super::image::Stored;
 use super::memory::fits;
-use super::os;
-use super::voxels::{Kind, count, decode};
+use super::voxels::{Kind, count, decode, integers};
+use super::{os, source};
 use crate::error::IoError;
 use crate::types::{Affine, Grid};
 use std::fs::File;
@@ -50,13 +50,7 @@ pub(super) struct RawImage {
 /// The first lines of a file as far as they can belong to a header (text up to the first byte that
 /// is none, or 1 MiB).
 pub(super) fn head(path: &Path) -> Result<Vec<u8>, IoError> {
-    let file = File::open(path).map_err(os(path, "read"))?;
-    if !file.metadata().map_err(os(path, "read"))?.is_file() {
-        return Err(Flaw::new("is not a regular file", "give an image file").at(path));
-    }
-    let mut bytes = Vec::new();
-    file.take(LONGEST_HEADER).read_to_end(&mut bytes).map_err(os(path, "read"))?;
-    Ok(bytes)
+    source::head(path, LONGEST_HEADER)
 }
 
 /// A line of `bytes` from `from`, without its end, and where the next one begins; none past the
@@ -66,6 +60,20 @@ pub(super) fn line(bytes: &[u8], from: usize) -> Option<(String, usize)> {
     let end = rest.iter().position(|&b| b == b'\n')?;
     let text = String::from_utf8_lossy(&rest[..end]).trim_end_matches('\r').to_string();
     Some((text, from + end + 1))
+}
+
+/// What one of a unit of length is in mm, by its name in NRRD, Slicer (UCUM) and the like.
+pub(super) fn in_mm(unit: &str) -> Option<f64> {
+    Some(match unit {
+        "mm" | "millimeter" | "millimetre" => 1.0,
+        "cm" | "centimeter" | "centimetre" => 10.0,
+        "dm" => 100.0,
+        "m" | "meter" | "metre" => 1e3,
+        "um" | "\u{b5}m" | "\u{3bc}m" | "micron" | "micrometer" | "micrometre" => 1e-3,
+        "nm" => 1e-6,
+        "[in_i]" | "in" | "inch" => 25.4,
+        _ => return None,
+    })
 }
 
 /// `N` numbers separated by spaces or commas.
@@ -120,7 +128,7 @@ impl RawImage {
     fn open(&self) -> Result<(File, u64), IoError> {
         let path = &self.file;
         let needed = self.needed();
-        let file = File::open(path).map_err(os(path, "read"))?;
+        let file = source::open(path)?;
         let size = file.metadata().map_err(os(path, "read"))?.len();
         let start = match self.start {
             Start::At(at) => at,
@@ -136,8 +144,13 @@ impl RawImage {
         self.open().map(drop)
     }
 
-    /// The numbers, component after component.
-    pub(super) fn load(&self) -> Result<Vec<f32>, IoError> {
+    /// The whole numbers of a scalar image; none where it may have fractions.
+    pub(super) fn integers(&self) -> Result<Option<Vec<i64>>, IoError> {
+        Ok(integers(self.kind, self.big_endian, &self.bytes()?))
+    }
+
+    /// The bytes of all numbers.
+    fn bytes(&self) -> Result<Vec<u8>, IoError> {
         let path = &self.file;
         let needed = self.needed();
         let (mut file, start) = self.open()?;
@@ -164,7 +177,12 @@ impl RawImage {
         if (bytes.len() as u64) < needed {
             return Err(self.short(bytes.len() as u64));
         }
-        let values = decode(self.kind, self.big_endian, (1.0, 0.0), &bytes);
+        Ok(bytes)
+    }
+
+    /// The numbers, component after component.
+    pub(super) fn load(&self) -> Result<Vec<f32>, IoError> {
+        let values = decode(self.kind, self.big_endian, (1.0, 0.0), &self.bytes()?);
         if !self.interleaved || self.components == 1 {
             return Ok(values);
         }

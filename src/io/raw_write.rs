@@ -99,6 +99,8 @@ impl TextImage<'_> {
                 let kind = match self.kind {
                     Kind::U8 => "MET_UCHAR",
                     Kind::I16 => "MET_SHORT",
+                    Kind::I32 => "MET_INT",
+                    Kind::I64 => "MET_LONG_LONG",
                     _ => "MET_FLOAT",
                 };
                 let directions = [0, 1, 2].map(|c| join(&column(c).map(|v| v / spacing[c] + 0.0), " ")).join(" ");

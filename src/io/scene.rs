@@ -1,7 +1,7 @@
 //! Grasp scenes: TOML, SI units, angles in degrees. Every error names the file, the key, what is
 //! wrong and what to try.
 
-use super::{format, os};
+use super::{format, source};
 use crate::error::{IoError, SceneError};
 use crate::types::Fingertip;
 use crate::types::fingertip::FingertipModel;
@@ -11,7 +11,6 @@ use crate::types::scene::{
     rectangle_inertia,
 };
 use serde::Deserialize;
-use std::fs;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
@@ -102,8 +101,11 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
     Ok(SceneFile { scene, sweep, fingertip_file })
 }
 
+/// No scene and no fingertip is longer (bytes).
+const LONGEST: u64 = 1 << 22;
+
 pub(super) fn read_table(path: &Path) -> Result<Table, IoError> {
-    parse_table(path, &fs::read_to_string(path).map_err(os(path, "read"))?)
+    parse_table(path, &source::keyed(path, LONGEST, source::MOST_VALUES)?)
 }
 
 pub(super) fn parse_table(path: &Path, text: &str) -> Result<Table, IoError> {
@@ -155,7 +157,7 @@ pub(super) fn known_names<'a>(
             let found = names::choose("key", key, &choices).err();
             let hint =
                 found.as_ref().and_then(|e| e.nearest).map_or(String::new(), |n| format!("did you mean '{n}'? "));
-            let what = format!("{place} has the unknown key '{key}'");
+            let what = format!("{place} has the unknown key '{}'", names::cut(key));
             return Err(format(path, what, format!("{hint}known: {}", keys.join(", "))));
         }
     }

@@ -1,10 +1,10 @@
 //! A folder for files in between, removed when it is dropped.
 
-use super::live::Live;
+use super::live::{Live, prefix, sweep};
 use super::os;
 use crate::error::IoError;
 use std::path::Path;
-use tempfile::TempDir;
+use tempfile::{Builder, TempDir};
 
 /// A folder of its own under the system's folder for temporary files.
 #[derive(Debug)]
@@ -16,8 +16,10 @@ impl Scratch {
     /// # Errors
     /// [`IoError`] when it cannot be created.
     pub fn new() -> Result<Self, IoError> {
-        let made = Live::temporary(tempfile::tempdir, |made| made.path());
-        made.map(|(folder, live)| Self(folder, live)).map_err(os(&std::env::temp_dir(), "create a folder in"))
+        let folder = std::env::temp_dir();
+        sweep(&folder);
+        let made = Live::temporary(|| Builder::new().prefix(prefix()).tempdir_in(&folder), |made| made.path());
+        made.map(|(made, live)| Self(made, live)).map_err(os(&folder, "create a folder in"))
     }
 
     /// Where it is.

@@ -1,21 +1,20 @@
 //! JSON, text (HTML, SVG) and bytes (PNG).
 
 use super::atomic::write_atomic;
-use super::{format, os};
+use super::{format, os, source};
 use crate::error::IoError;
 use serde::Serialize;
 use serde_json::Value;
-use std::fs::File;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Reads a JSON file of at most 16 MB.
+/// Reads a JSON file of at most 16 MB and a million values.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read or is no JSON.
 pub fn read_json(path: impl AsRef<Path>) -> Result<Value, IoError> {
-    let (path, mut text) = (path.as_ref(), String::new());
-    File::open(path).and_then(|f| f.take(1 << 24).read_to_string(&mut text)).map_err(os(path, "read"))?;
+    let path = path.as_ref();
+    let text = source::keyed(path, 1 << 24, 1 << 20)?;
     serde_json::from_str(&text).map_err(|e| format(path, format!("is no JSON ({e})"), "check which file it is"))
 }
 
@@ -24,9 +23,7 @@ pub fn read_json(path: impl AsRef<Path>) -> Result<Value, IoError> {
 /// # Errors
 /// [`IoError`] when the file cannot be read or is no UTF-8.
 pub fn read_text(path: impl AsRef<Path>) -> Result<String, IoError> {
-    let (path, mut text) = (path.as_ref(), String::new());
-    File::open(path).and_then(|f| f.take(1 << 28).read_to_string(&mut text)).map_err(os(path, "read"))?;
-    Ok(text)
+    source::text(path.as_ref(), source::LONGEST_TEXT)
 }
 
 /// The files and folders in a folder, sorted.

@@ -1,5 +1,6 @@
 //! How voxels are stored, in any format.
 
+use super::flaw::Flaw;
 use rayon::prelude::*;
 
 /// The type of a stored number.
@@ -30,6 +31,18 @@ impl Kind {
             Self::U16 | Self::I16 => 2,
             Self::U32 | Self::I32 | Self::F32 => 4,
             Self::U64 | Self::I64 | Self::F64 => 8,
+        }
+    }
+
+    /// Refuses numbers without a sign where vectors are wanted.
+    pub(super) fn check_signed(self) -> Result<(), Flaw> {
+        match self {
+            Self::U8 | Self::U16 | Self::U32 | Self::U64 => {
+                let what =
+                    format!("holds three {} numbers a voxel, which have no sign: colours, not vectors", self.name());
+                Err(Flaw::new(what, "give a displacement field"))
+            }
+            _ => Ok(()),
         }
     }
 
@@ -72,6 +85,31 @@ pub(super) fn decode(kind: Kind, big_endian: bool, scaling: (f64, f64), bytes: &
         Kind::I64 => decode_as!(i64),
         Kind::F32 => decode_as!(f32),
         Kind::F64 => decode_as!(f64),
+    }
+}
+
+/// The whole numbers in `bytes` as they are stored; none of a type that has fractions, or where one
+/// is past 2^63.
+pub(super) fn integers(kind: Kind, big_endian: bool, bytes: &[u8]) -> Option<Vec<i64>> {
+    macro_rules! integers_as {
+        ($t:ty) => {{
+            let whole = |b: &[u8; size_of::<$t>()]| {
+                let stored = if big_endian { <$t>::from_be_bytes(*b) } else { <$t>::from_le_bytes(*b) };
+                i64::try_from(stored).ok()
+            };
+            bytes.as_chunks().0.par_iter().with_min_len(1 << 16).map(whole).collect()
+        }};
+    }
+    match kind {
+        Kind::U8 => integers_as!(u8),
+        Kind::I8 => integers_as!(i8),
+        Kind::U16 => integers_as!(u16),
+        Kind::I16 => integers_as!(i16),
+        Kind::U32 => integers_as!(u32),
+        Kind::I32 => integers_as!(i32),
+        Kind::U64 => integers_as!(u64),
+        Kind::I64 => integers_as!(i64),
+        Kind::F32 | Kind::F64 => None,
     }
 }
 

@@ -872,6 +872,8 @@ pub(super) fn too_few(
     started: bool,
 ) -> FieldError {
     let (plain, agreement) = (pair.plain(), contrast::agreement(pair, &Bodies::still(pair)).at_rest);
+    // Volumes of cells are under a millimetre.
+    let search = format!("{search:.*}", if search < 1.0 { 3 } else { 0 });
     let hint = match () {
         _ if plain > MOSTLY => format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: image finer or with less noise, or give --landmarks",
@@ -888,9 +890,9 @@ pub(super) fn too_few(
             100.0 * agreement
         ),
         _ if params.search_mm == 0.0 => {
-            format!("{search:.0} mm were looked over: if the tissue moved further, widen --search")
+            format!("{search} mm were looked over: if the tissue moved further, widen --search")
         }
-        _ => format!("{search:.0} mm were looked over: give --landmarks, or a start with --initial"),
+        _ => format!("{search} mm were looked over: give --landmarks, or a start with --initial"),
     };
     no_match(found, hint)
 }

@@ -1,6 +1,7 @@
 //! Layered skin: a scene to the response of the column and of the block, with and without its
 //! layers.
 
+use crate::error::SceneError;
 use crate::skin::{block, column};
 use crate::types::skin::{BlockRun, SkinSample, SkinScene};
 use std::time::Instant;
@@ -24,6 +25,18 @@ pub struct SkinOutcome {
 
 /// Precision of the column beyond which it is said.
 const ROUGH: f64 = 1e-6;
+
+/// Refuses a scene of whose response rounding would leave no digit.
+///
+/// # Errors
+/// [`SceneError::Stiff`].
+pub fn check(scene: &SkinScene) -> Result<(), SceneError> {
+    let precision = column::precision(scene);
+    match precision < 1.0 {
+        true => Ok(()),
+        false => Err(SceneError::Stiff { factor: precision / f64::EPSILON }),
+    }
+}
 
 /// What a user should know of a scene and its response.
 pub fn notes(scene: &SkinScene, outcome: &SkinOutcome) -> Vec<String> {

@@ -80,7 +80,7 @@ pub struct PairOutcome {
     pub stage: &'static str,
     /// Why; empty where none did.
     pub reason: String,
-    /// Wall time of this run (s).
+    /// Wall time that its results took, in this run or an earlier one (s).
     pub seconds: f64,
     /// Of `palpate field`.
     pub field: Value,

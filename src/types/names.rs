@@ -8,17 +8,30 @@ use crate::error::UnknownName;
 /// # Errors
 /// [`UnknownName`] lists the known names and suggests the nearest one (at most a third of its letters wrong).
 pub fn choose<T: Copy>(what: &'static str, found: &str, known: &[(&'static str, T)]) -> Result<T, UnknownName> {
-    let wanted = found.to_lowercase();
+    let (wanted, long) = (found.to_lowercase(), found.len() > LONGEST);
     if let Some((_, value)) = known.iter().find(|(name, _)| *name == wanted) {
         return Ok(*value);
     }
     let nearest = known
         .iter()
+        .filter(|_| !long)
         .map(|(name, _)| (edit_distance(&wanted, name), *name))
         .min()
         .filter(|(distance, name)| 3 * distance <= name.len().max(4))
         .map(|(_, name)| name);
-    Err(UnknownName { what, found: found.into(), known: known.iter().map(|(name, _)| *name).collect(), nearest })
+    Err(UnknownName { what, found: cut(found), known: known.iter().map(|(name, _)| *name).collect(), nearest })
+}
+
+/// No name is longer (bytes): of a longer one nothing near is looked for, and messages show its
+/// start.
+const LONGEST: usize = 100;
+
+/// The text, or the start of a long one, as a message shows it.
+pub fn cut(text: &str) -> String {
+    match text.char_indices().nth(LONGEST) {
+        Some((at, _)) => format!("{}...", &text[..at]),
+        None => text.into(),
+    }
 }
 
 /// Insertions, deletions, replacements and swaps of neighbours that turn `a` into `b` (optimal

@@ -51,7 +51,7 @@ def pad(shell):
     shell(
         "stiffness", "--field", "pad-field", "--labels", folder / "labels.nii.gz", "--nodes", 1500,
         "--names", ",".join(f"{k}={v}" for k, v in names.items()), "--held", elastic["held"], "--load", elastic["load"],
-        "--force", elastic["force_n"], "-o", "pad-stiffness",
+        "--total-force", elastic["force_n"], "-o", "pad-stiffness",
     )
     shell("fingertip", "pad-stiffness", "-o", "fingertip.toml")
     return folder, {**elastic, "names": names}

@@ -32,8 +32,10 @@ pub(super) struct Header {
     /// b, c, d, then the offset x, y, z.
     pub quatern: [f64; 6],
     pub srow: [[f64; 4]; 3],
-    /// Where the voxels may begin at the earliest.
-    pub first_offset: i64,
+    /// 1 or 2.
+    pub version: u8,
+    /// Whether the voxels stand in a file of their own.
+    pub pair: bool,
     /// Up to its first NUL, without characters that would disturb a terminal.
     pub description: String,
 }
@@ -59,12 +61,15 @@ impl Header {
     }
 
     fn version_1(head: &[u8]) -> Result<Self, Flaw> {
-        match &head[344..348] {
-            b"n+1\0" => {}
-            b"ni1\0" => return Err(Flaw::new("is the header of a .hdr/.img pair", CONVERT)),
-            [0, ..] => return Err(Flaw::new("is an ANALYZE 7.5 header, not NIfTI", CONVERT)),
+        let pair = match &head[344..348] {
+            b"n+1\0" => false,
+            b"ni1\0" => true,
+            [0, ..] => {
+                let what = "is an ANALYZE 7.5 header, which does not say where the patient's left is";
+                return Err(Flaw::new(what, CONVERT));
+            }
             _ => return Err(Flaw::new("is not a NIfTI file (wrong magic)", CONVERT)),
-        }
+        };
         let h = NiftiHeader::from_reader(head)
             .map_err(|e| Flaw::new(format!("the header cannot be parsed ({e})"), CONVERT))?;
         // The crate takes the byte order from dim[0]; sizeof_hdr has the last word.
@@ -87,17 +92,18 @@ impl Header {
             sform_code: h.sform_code.into(),
             quatern: [h.quatern_b, h.quatern_c, h.quatern_d, h.quatern_x, h.quatern_y, h.quatern_z].map(f64::from),
             srow: [h.srow_x, h.srow_y, h.srow_z].map(|row| row.map(f64::from)),
-            first_offset: 352,
+            version: 1,
+            pair,
             description: shown(&head[148..228]),
         })
     }
 
     fn version_2(head: &[u8], big_endian: bool) -> Result<Self, Flaw> {
-        match &head[4..12] {
-            b"n+2\0\r\n\x1a\n" => {}
-            b"ni2\0\r\n\x1a\n" => return Err(Flaw::new("is the header of a .hdr/.img pair", CONVERT)),
+        let pair = match &head[4..12] {
+            b"n+2\0\r\n\x1a\n" => false,
+            b"ni2\0\r\n\x1a\n" => true,
             _ => return Err(Flaw::new("is not a NIfTI file (wrong magic)", CONVERT)),
-        }
+        };
         let bytes = |at: usize, n: usize| {
             let mut b = [0; 8];
             b[..n].copy_from_slice(&head[at..at + n]);
@@ -124,7 +130,8 @@ impl Header {
             sform_code: int(348, 4),
             quatern: std::array::from_fn(|i| float(352 + 8 * i)),
             srow: std::array::from_fn(|r| std::array::from_fn(|c| float(400 + 32 * r + 8 * c))),
-            first_offset: 544,
+            version: 2,
+            pair,
             description: shown(&head[240..320]),
         })
     }
@@ -144,11 +151,16 @@ impl Header {
         Ok(axes)
     }
 
-    /// Where the voxels begin (bytes from the start of the unpacked file).
+    /// Where the voxels begin (bytes from the start of the unpacked file that holds them).
     pub(super) fn data_offset(&self) -> Result<u64, Flaw> {
+        let first = match (self.pair, self.version) {
+            (true, _) => 0,
+            (_, 1) => 352,
+            _ => 544,
+        };
         match self.vox_offset {
-            0 => Ok(self.first_offset as u64), // never filled in
-            at if at >= self.first_offset => Ok(at as u64),
+            0 => Ok(first as u64), // never filled in
+            at if at >= first => Ok(at as u64),
             at => Err(Flaw::new(
                 format!("vox_offset is {at}, inside the header or not a whole number"),
                 "rewrite the file with a NIfTI library",

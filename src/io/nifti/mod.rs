@@ -26,7 +26,7 @@ mod write;
 pub use series::Series;
 pub(super) use write::{ForeignField, write_foreign_field};
 pub use write::{
-    PackedField, STRAIN_BITS, length_bits, stored, stored_length, stored_steps, write_by_rows, write_exact,
-    write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field, write_steps,
-    write_tensor_deviations, write_tensors, write_vectors, write_volume,
+    PackedField, STRAIN_BITS, length_bits, stored, stored_length, stored_steps, write_by_rows, write_codes,
+    write_exact, write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field,
+    write_steps, write_tensor_deviations, write_tensors, write_vectors, write_volume,
 };

@@ -7,27 +7,39 @@ use crate::io::flaw::Flaw;
 use crate::io::image::Stored;
 use crate::io::memory::fits;
 use crate::io::voxels::{self, Kind, count};
-use crate::io::{gzip, os};
+use crate::io::{gzip, os, source};
 use crate::types::Grid;
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// The grid and the values of a scalar volume.
 pub(in crate::io) fn volume(path: &Path) -> Result<(Grid, Vec<f32>), IoError> {
-    load(path, scalar_layout).map(|(plan, values)| (plan.grid, values))
+    load(path, scalar_layout, decode).map(|(plan, values)| (plan.grid, values))
+}
+
+/// The grid and the whole numbers of a scalar volume; none where it may have fractions.
+pub(in crate::io) fn integers(path: &Path) -> Result<(Grid, Option<Vec<i64>>), IoError> {
+    let whole = |plan: &Plan, bytes: &[u8]| {
+        let plain = plan.scaling == (1.0, 0.0);
+        if plain { voxels::integers(plan.kind, plan.big_endian, bytes) } else { None }
+    };
+    load(path, scalar_layout, whole).map(|(plan, values)| (plan.grid, values))
 }
 
 /// The grid and the three components of a field, one after the other, as they are stored; and who
 /// wrote it how.
 pub(in crate::io) fn field(path: &Path, flat: bool) -> Result<(Grid, Vec<f32>, Intent), IoError> {
-    let (plan, values) = load(path, if flat { flat_field_layout } else { field_layout })?;
+    let (plan, values) = load(path, if flat { flat_field_layout } else { field_layout }, decode)?;
+    if plan.scaling.0 >= 0.0 && plan.scaling.1 >= 0.0 {
+        plan.kind.check_signed().map_err(|flaw| flaw.at(path))?;
+    }
     Ok((plan.grid, values, plan.intent))
 }
 
 /// The grid and the samples of a field's error (planar, three components each), LPS.
 pub(in crate::io) fn samples(path: &Path) -> Result<(Grid, Vec<Vec<f32>>), IoError> {
-    let (plan, values) = load(path, samples_layout)?;
+    let (plan, values) = load(path, samples_layout, decode)?;
     let n = plan.grid.len();
     let frames = values.len() / (3 * n);
     let of = |frame: usize| (0..3).flat_map(|c| &values[(c * frames + frame) * n..][..n]).copied().collect();
@@ -109,12 +121,14 @@ fn flat_field_layout(h: &Header, axes: [usize; 7]) -> Result<usize, Flaw> {
 
 type Layout = fn(&Header, [usize; 7]) -> Result<usize, Flaw>;
 
-/// A regular file, to be read from its start.
+/// The regular file with the voxels, to be read from its start, and the header, which stands in
+/// another file of a pair.
 pub(super) struct Opened {
     pub(super) file: File,
+    pub(super) voxels: PathBuf,
     /// As it is stored.
     pub(super) size: u64,
-    /// The first bytes, unpacked, at most [`LONGEST`].
+    /// The first bytes of the file with the header, unpacked, at most [`LONGEST`].
     pub(super) head: Vec<u8>,
     pub(super) packed: bool,
 }
@@ -129,11 +143,15 @@ impl Opened {
     fn stored(&self) -> Result<(Stored, i64), Flaw> {
         let header = Header::parse(&self.head)?;
         let axes = header.axes()?;
-        let format = match (header.first_offset, self.packed) {
-            (352, false) => "NIfTI-1",
-            (352, true) => "NIfTI-1, gzip",
-            (_, false) => "NIfTI-2",
-            (_, true) => "NIfTI-2, gzip",
+        let format = match (header.version, header.pair, self.packed) {
+            (1, false, false) => "NIfTI-1",
+            (1, false, true) => "NIfTI-1, gzip",
+            (1, true, false) => "NIfTI-1 pair",
+            (1, true, true) => "NIfTI-1 pair, gzip",
+            (_, false, false) => "NIfTI-2",
+            (_, false, true) => "NIfTI-2, gzip",
+            (_, true, false) => "NIfTI-2 pair",
+            (_, true, true) => "NIfTI-2 pair, gzip",
         };
         let placed = match (header.sform_code, header.qform_code) {
             (1.., _) => "sform",
@@ -152,13 +170,36 @@ impl Opened {
     }
 }
 
+/// Opens the file at `path`, and the other one of a `.hdr`/`.img` pair.
 pub(super) fn open(path: &Path) -> Result<Opened, IoError> {
-    // Before it is opened: opening a pipe waits for who writes into it.
-    let metadata = fs::metadata(path).map_err(os(path, "read"))?;
-    if !metadata.is_file() {
-        return Err(Flaw::new("is not a regular file", "give a .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd").at(path));
+    let own = open_one(path)?;
+    match (Header::parse(&own.head), beside(path, "img", "hdr")) {
+        (Ok(header), _) if header.pair => {
+            let voxels = beside(path, "hdr", "img").ok_or_else(|| {
+                let what = "is the header of a .hdr/.img pair whose .img is not there";
+                Flaw::new(what, "put the .img beside it, under the same name").at(path)
+            })?;
+            Ok(Opened { head: own.head, ..open_one(&voxels)? })
+        }
+        (Err(_), Some(header)) => Ok(Opened { head: open_one(&header)?.head, ..own }),
+        _ => Ok(own),
     }
-    let mut file = File::open(path).map_err(os(path, "read"))?;
+}
+
+/// The other file of a pair: that at `path` with the ending `to` in place of `from`, packed or not,
+/// where it is there.
+pub(in crate::io) fn beside(path: &Path, from: &str, to: &str) -> Option<PathBuf> {
+    let name = path.file_name()?.to_str()?;
+    let lower = name.to_ascii_lowercase();
+    let stem = lower.strip_suffix(".gz").unwrap_or(&lower).strip_suffix(from)?;
+    let stem = name.get(..stem.len()).filter(|s| s.ends_with('.'))?;
+    let names = [to, &format!("{to}.gz"), &to.to_uppercase()].map(|end| path.with_file_name(format!("{stem}{end}")));
+    names.into_iter().find(|other| other.is_file())
+}
+
+fn open_one(path: &Path) -> Result<Opened, IoError> {
+    let mut file = source::open(path)?;
+    let size = file.metadata().map_err(os(path, "read"))?.len();
     let mut head = Vec::new();
     file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
     let packed = gzip::is_gzip(&head);
@@ -166,12 +207,12 @@ pub(super) fn open(path: &Path) -> Result<Opened, IoError> {
         head = gzip::peek(head.chain(BufReader::new(&mut file)), LONGEST);
     }
     file.rewind().map_err(os(path, "read"))?;
-    Ok(Opened { file, size: metadata.len(), head, packed })
+    Ok(Opened { file, voxels: path.into(), size, head, packed })
 }
 
-/// The grid and all values, component after component; `layout` judges the axes and gives the
-/// number of components.
-fn load(path: &Path, layout: Layout) -> Result<(Plan, Vec<f32>), IoError> {
+/// The grid and what `decode` makes of the bytes of all values, component after component; `layout`
+/// judges the axes and gives the number of components.
+fn load<T>(path: &Path, layout: Layout, decode: impl Fn(&Plan, &[u8]) -> T) -> Result<(Plan, T), IoError> {
     let opened = open(path)?;
     let plan = Plan::new(&opened.head, layout).map_err(|flaw| flaw.at(path))?;
     let end = plan.end_within(opened.most()).map_err(|flaw| flaw.at(path))?;

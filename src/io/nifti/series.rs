@@ -5,8 +5,8 @@ use super::read::{Opened, Plan, decode, open};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
 use crate::io::gzip::{self, Members};
-use crate::io::os;
 use crate::io::voxels::count;
+use crate::io::{os, source};
 use crate::types::{Grid, Volume};
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 /// A 4-D NIfTI file, (nx, ny, nz, nt); a single volume is a series of one.
 pub struct Series {
     path: PathBuf,
+    voxels: PathBuf,
     plan: Plan,
     frames: usize,
     step_s: Option<f64>,
@@ -44,7 +45,7 @@ impl Series {
         let path = path.as_ref();
         let opened = open(path)?;
         let most = opened.most();
-        let Opened { file, head, packed, .. } = opened;
+        let Opened { file, voxels, head, packed, .. } = opened;
         let source = if packed { Source::packed(file) } else { Source::Plain(file) };
         let header = Header::parse(&head).map_err(|flaw| flaw.at(path))?;
         let plan = Plan::new(&head, layout).map_err(|flaw| flaw.at(path))?;
@@ -57,7 +58,7 @@ impl Series {
             _ => f64::NAN,
         };
         let step_s = Some(header.pixdim[4] * unit).filter(|s| s.is_finite() && *s > 0.0);
-        Ok(Self { path: path.into(), plan, frames, step_s, source })
+        Ok(Self { path: path.into(), voxels, plan, frames, step_s, source })
     }
 
     /// How many volumes there are.
@@ -91,7 +92,7 @@ impl Series {
         let mut data = Vec::new();
         let damaged = |e: io::Error| gzip::damaged(&e).at(path);
         if matches!(self.source, Source::Packed(_, done) if done > from) {
-            self.source = Source::packed(File::open(path).map_err(os(path, "read"))?);
+            self.source = Source::packed(source::open(&self.voxels)?);
         }
         match &mut self.source {
             Source::Plain(file) => {

@@ -56,6 +56,19 @@ pub fn write_exact(path: impl AsRef<Path>, volume: &Volume, description: &str) -
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v: f32| v.to_le_bytes()).map(drop)
 }
 
+/// Writes a label map as int32, or int64 where a label needs it.
+///
+/// # Errors
+/// As [`write_volume`].
+pub fn write_codes(path: impl AsRef<Path>, grid: &Grid, codes: &[i64], description: &str) -> Result<(), IoError> {
+    let (path, form) = (path.as_ref(), Form { description, ..Form::FLOATS });
+    match codes.iter().all(|c| i32::try_from(*c).is_ok()) {
+        true => write(path, grid, Form { datatype: 8, ..form }, &[codes], |_, v| (v as i32).to_le_bytes()).map(drop),
+        false => write(path, grid, Form { datatype: 1024, bits: 64, ..form }, &[codes], |_, v: i64| v.to_le_bytes())
+            .map(drop),
+    }
+}
+
 /// Writes a scalar volume as float32, each value rounded to a multiple of 2^-`bits`, so that it
 /// packs well.
 ///
@@ -390,6 +403,8 @@ fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
         let number = match datatype {
             2 => Kind::U8,
             4 => Kind::I16,
+            8 => Kind::I32,
+            1024 => Kind::I64,
             _ => Kind::F32,
         };
         let image = TextImage { format, grid, kind: number, components: parts, description };

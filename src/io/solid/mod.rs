@@ -12,11 +12,10 @@ use super::atomic::write_atomic;
 use super::csv::write_table;
 use super::flaw::Flaw;
 use super::memory::fits;
-use super::{format, os};
+use super::{format, os, source};
 use crate::error::IoError;
 use crate::types::{Measured, SolidMesh};
-use std::fs::{self, File};
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::Path;
 
 /// Bytes of memory that a byte of a file takes while it is read, about.
@@ -105,14 +104,9 @@ impl SolidFile {
 
 /// The bytes of a regular file that memory holds.
 fn whole(path: &Path) -> Result<Vec<u8>, IoError> {
-    let about = fs::metadata(path).map_err(os(path, "read"))?;
-    if !about.is_file() {
-        return Err(format(path, "is not a regular file", "name the file with the mesh"));
-    }
-    fits(TAKES.saturating_mul(about.len())).map_err(|flaw| flaw.at(path))?;
-    let mut bytes = Vec::new();
-    File::open(path).and_then(|f| f.take(about.len()).read_to_end(&mut bytes)).map_err(os(path, "read"))?;
-    Ok(bytes)
+    let size = source::open(path)?.metadata().map_err(os(path, "read"))?.len();
+    fits(TAKES.saturating_mul(size)).map_err(|flaw| flaw.at(path))?;
+    source::bytes(path, size)
 }
 
 fn text(bytes: &[u8]) -> Result<&str, Flaw> {

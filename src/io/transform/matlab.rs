@@ -7,10 +7,8 @@
 use super::itk::{Block, chain};
 use crate::error::IoError;
 use crate::io::flaw::Flaw;
-use crate::io::os;
+use crate::io::source;
 use crate::types::Transform;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// No file of affine transforms is longer (bytes).
@@ -34,8 +32,7 @@ pub(super) fn is_matlab(head: &[u8]) -> bool {
 
 /// Reads the transform of a file, initial to deformed.
 pub(super) fn read(path: &Path) -> Result<Vec<Transform>, IoError> {
-    let mut bytes = Vec::new();
-    File::open(path).and_then(|f| f.take(LONGEST).read_to_end(&mut bytes)).map_err(os(path, "read"))?;
+    let bytes = source::bytes(path, LONGEST)?;
     blocks(&bytes).and_then(chain).map_err(|flaw| flaw.at(path))
 }
 

@@ -22,12 +22,10 @@ mod write;
 pub use write::{AffineFormat, FieldFormat, write_affine, write_field_as};
 
 use super::field::{FieldConvention, read_field_as};
-use super::{format, os};
+use super::{format, source};
 use crate::error::{IoError, UnknownName};
 use crate::types::names::choose;
 use crate::types::{Grid, Transform};
-use std::fs::{self, File};
-use std::io::Read;
 use std::path::Path;
 use std::str::FromStr;
 
@@ -155,11 +153,7 @@ pub fn read_transform(
 
 /// Looks at the first bytes; refuses what is known and not read.
 fn content(path: &Path) -> Result<Content, IoError> {
-    let mut head = Vec::new();
-    // A pipe must not be opened here: that waits. Whoever reads it refuses it.
-    if fs::metadata(path).map_err(os(path, "read"))?.is_file() {
-        File::open(path).and_then(|f| f.take(512).read_to_end(&mut head)).map_err(os(path, "read"))?;
-    }
+    let head = source::head(path, 512)?;
     let refuse = |what: &str, hint: &str| Err(format(path, what, hint));
     let text = head.iter().all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace());
     let first = head.trim_ascii_start();
