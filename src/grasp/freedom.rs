@@ -2,7 +2,7 @@
 //! one or two 1-DOF fingers can set with their joint angles.
 
 use crate::grasp::constraints::Coordinates;
-use crate::grasp::models::tip_of;
+use crate::grasp::models::tips_of;
 use crate::grasp::statics::Statics;
 use crate::numerics::dense::rank;
 use crate::types::grasp::Freedom;
@@ -23,9 +23,10 @@ pub fn table(scene: &Scene) -> Vec<Freedom> {
 /// Constraints C = D(q) - d = 0 as rows over (q, d): pose, the first `fingers` joints, and the
 /// displacements that the model allows.
 fn freedom(scene: &Scene, model: FingertipModel, fingers: usize) -> Freedom {
-    let tip = tip_of(&scene.fingertip, model);
-    let scene = Scene { fingertip: crate::types::Fingertip { model, ..scene.fingertip.clone() }, ..scene.clone() };
-    let statics = Statics::new(&scene, tip.as_ref());
+    let scene = scene.with_model(model);
+    let tips = tips_of(&scene, model);
+    let statics = Statics::of(&scene, [tips[0].as_ref(), tips[1].as_ref()]);
+    let tip = statics.tips[0];
     let pinch = statics.pinch(&scene);
     let rows = statics.geometry.contact(&pinch.q).jacobian();
     let soft = [!tip.holds_normal(), !tip.holds_normal(), !tip.holds_tangent(), !tip.holds_tangent()];
@@ -36,8 +37,8 @@ fn freedom(scene: &Scene, model: FingertipModel, fingers: usize) -> Freedom {
                 row[..3 + joints].copy_from_slice(&rows[k][..3 + joints]);
                 row[5 + k] = if soft[k] { -1.0 } else { 0.0 };
                 // Lengths over the radius, so that all columns are of one size.
-                row[2] /= statics.geometry.radius;
-                (row[3], row[4]) = (row[3] / statics.geometry.radius, row[4] / statics.geometry.radius);
+                row[2] /= statics.geometry.scale();
+                (row[3], row[4]) = (row[3] / statics.geometry.scale(), row[4] / statics.geometry.scale());
                 row
             })
             .collect()

@@ -5,7 +5,7 @@
 //! brought back onto them after each step.
 
 use crate::grasp::control::Inputs;
-use crate::grasp::integrators::System;
+use crate::grasp::integrators::{Form, System};
 use crate::grasp::models::Tip;
 use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::statics::Equilibrium;
@@ -19,14 +19,6 @@ pub const STATE: usize = 13;
 pub struct Minimal<T>(pub Plant<T>);
 
 impl<T: Tip> System<STATE> for Minimal<T> {
-    const WORK: usize = 12;
-
-    fn start(&self, e: &Equilibrium) -> [f64; STATE] {
-        let mut s = [0.0; STATE];
-        s[..5].copy_from_slice(&e.q);
-        s
-    }
-
     #[inline(always)]
     fn rate(&self, inputs: &Inputs, s: &[f64; STATE]) -> ([f64; STATE], Reading) {
         let plant = &self.0;
@@ -40,7 +32,7 @@ impl<T: Tip> System<STATE> for Minimal<T> {
         let errors = [q[3] - inputs.desired[0], q[4] - inputs.desired[1]];
         let rate = [v[0], v[1], v[2], v[3], v[4], a[0], a[1], a[2], a[3], a[4], errors[0], errors[1], power];
         let sin_tilt = [contact.tilt(0).sin, contact.tilt(1).sin];
-        (rate, Reading { displacements: d, forces: f, sin_tilt })
+        (rate, Reading { displacements: d, forces: f, sin_tilt, places: contact.places() })
     }
 
     #[inline(always)]
@@ -51,6 +43,33 @@ impl<T: Tip> System<STATE> for Minimal<T> {
             s[..5].copy_from_slice(&q);
             s[5..10].copy_from_slice(&v);
         }
+    }
+}
+
+impl<T: Tip> Form<STATE> for Minimal<T> {
+    const WORK: usize = 12;
+    type Tip = T;
+
+    fn plant(&self) -> &Plant<T> {
+        &self.0
+    }
+
+    fn set_origin(&mut self, origin: [f64; 2]) {
+        self.0.geometry.origin = origin;
+    }
+
+    fn core(&self, s: &[f64; STATE]) -> [f64; STATE] {
+        *s
+    }
+
+    fn with_core(&self, core: &[f64; STATE]) -> [f64; STATE] {
+        *core
+    }
+
+    fn start(&self, e: &Equilibrium) -> [f64; STATE] {
+        let mut s = [0.0; STATE];
+        s[..5].copy_from_slice(&e.q);
+        s
     }
 
     fn energy(&self, s: &[f64; STATE]) -> (f64, f64) {

@@ -41,6 +41,8 @@ pub mod config;
 
 pub mod grasp;
 
+pub mod measured;
+
 pub mod fingertip;
 
 pub mod skin;
@@ -106,6 +108,7 @@ pub use image::{
 pub use live::abandon;
 pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
+pub use measured::{read_measured, write_measured};
 pub use memory::memory_left;
 pub use mujoco::{write_mjcf, write_msh};
 pub use nifti::{

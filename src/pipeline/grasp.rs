@@ -1,11 +1,12 @@
 //! A scene to a run, an ensemble of runs, or an analysis.
 
 use crate::error::GraspError;
-use crate::grasp::models::tip;
+use crate::grasp::models;
 use crate::grasp::simulate::{self, simulate};
 use crate::grasp::statics::Statics;
-use crate::grasp::{freedom, pinch, posture, stability, stepping};
+use crate::grasp::{freedom, measured, pinch, posture, stability, stepping};
 use crate::types::grasp::{GraspAnalysis, GraspRun, MotionRow, StableStep};
+use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::scene::{Push, SweepCase};
 use crate::types::{FingertipModel, Scene};
 use rayon::prelude::*;
@@ -43,7 +44,7 @@ pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspE
     let started = Instant::now();
     progress("compare", 0.7);
     let without_tangential = (scene.fingertip.model == FingertipModel::Parallel)
-        .then(|| simulate(&with_model(scene, FingertipModel::ParallelNormal), &|_| {}));
+        .then(|| simulate(&scene.with_model(FingertipModel::ParallelNormal), &|_| {}));
     seconds.push(("compare".into(), started.elapsed().as_secs_f64()));
     let started = Instant::now();
     progress("stable steps", 0.9);
@@ -53,7 +54,7 @@ pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspE
 }
 
 /// How far a joint may be from its target when a hold ends (rad).
-const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
+pub const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
 /// How far past the end of a tabulated tip's profile it may be pressed.
 const PAST: f64 = 1.02;
@@ -125,8 +126,9 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
         clock.1 = Instant::now();
         progress(stage, fraction);
     };
-    let soft = with_model(scene, FingertipModel::Parallel);
-    simulate::start(&soft, &Statics::new(&soft, tip(&soft.fingertip).as_ref()))?;
+    let soft = scene.with_model(FingertipModel::Parallel);
+    let tips = models::tips(&soft);
+    simulate::start(&soft, &Statics::of(&soft, [tips[0].as_ref(), tips[1].as_ref()]))?;
     let force = posture::force(&soft.fingertip);
     let (mut stability, mut surfaces, mut lost) = (Vec::new(), Vec::new(), Vec::new());
     for (step, _, found) in stability::postures(&soft, FingertipModel::Parallel) {
@@ -151,11 +153,9 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
     Ok((GraspAnalysis { force, surfaces, stability, lost, freedom, pinch, push, stable_steps }, clock.0))
 }
 
-/// `scene` with tips of another model.
-fn with_model(scene: &Scene, model: FingertipModel) -> Scene {
-    let mut scene = scene.clone();
-    scene.fingertip.model = model;
-    scene
+/// The tip models fitted to measurements on the scene's tip or of its motions.
+pub fn against(scene: &Scene, measured: &Measurements) -> MeasuredFit {
+    measured::fit(scene, measured)
 }
 
 /// The scene's pushes, or one of 10 N below the object's centre, with both joints fixed at the
@@ -163,6 +163,9 @@ fn with_model(scene: &Scene, model: FingertipModel) -> Scene {
 pub fn pushed(scene: &Scene) -> Scene {
     let mut scene = scene.clone();
     scene.finger.fixed = true;
+    if let Some(second) = &mut scene.second {
+        second.finger.fixed = true;
+    }
     scene.initial.joints = scene.motions.first().map_or(scene.initial.joints, |m| m.target);
     scene.motions.clear();
     if scene.pushes.is_empty() {

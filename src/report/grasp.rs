@@ -6,7 +6,7 @@ use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
 use crate::types::Scene;
-use crate::types::grasp::{Event, GraspRun, Sample, StableStep};
+use crate::types::grasp::{Event, EventKind, GraspRun, Sample, StableStep};
 use crate::types::scene::{Method, SweepCase};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -35,7 +35,8 @@ pub struct GraspReport<'a> {
 /// An event in one line: time, kind, finger, what.
 pub fn event_line(e: &Event) -> String {
     let finger = e.finger.map_or(String::new(), |f| format!(" of finger {f}"));
-    format!("{:.3} s: {}{finger}: {}", e.time, e.kind.name(), e.what)
+    let until = e.until.filter(|u| *u > e.time).map_or(String::new(), |u| format!(" to {u:.3}"));
+    format!("{:.3}{until} s: {}{finger}: {}", e.time, e.kind.name(), e.what)
 }
 
 /// What happened, in one sentence.
@@ -47,10 +48,21 @@ fn headline(report: &GraspReport<'_>) -> String {
         0 => format!("{} s", short(last)),
         _ => format!("{done} of {all} motions in {} s", short(last)),
     };
-    match run.events.iter().find(|e| e.kind.ends_run()) {
-        Some(event) => format!("{motions}, then the run ended: {}.", event_line(event)),
-        None if run.events.is_empty() => format!("{motions}; the grasp held throughout."),
-        None => format!("{motions}; tips slipped {} times.", run.events.len()),
+    let Some(flaw) = run.flaw() else { return format!("{motions}; the grasp held throughout.") };
+    let of_kind = run.events.iter().filter(|e| e.kind == flaw.kind).count();
+    let times = if of_kind == 1 { "once".into() } else { format!("{of_kind} times") };
+    match flaw.kind {
+        kind if kind.ends_run() => format!("{motions}, then the run ended: {}.", event_line(flaw)),
+        EventKind::Slip => {
+            let far = run.samples.iter().flat_map(|s| s.slip).fold(0.0, |m: f64, v| m.max(v.abs()));
+            format!("{motions}; the grasp slipped: tips slid {times}, by up to {:.2} mm.", 1e3 * far)
+        }
+        EventKind::ValidityRange => format!(
+            "{motions}; a tip was pressed out of the model's range {times}, first at {} s: forces from there on are \
+             extrapolated.",
+            short(flaw.time)
+        ),
+        _ => format!("{motions}; the object left its branch of equilibria {times}, first at {} s.", short(flaw.time)),
     }
 }
 
@@ -98,10 +110,14 @@ pub fn text(report: &GraspReport<'_>) -> String {
     }
     if !report.sweep.is_empty() {
         let done = report.sweep.iter().filter_map(|(_, r)| r.as_ref().ok()).filter(|r| r.completed);
-        let (all, slipped) =
-            done.fold((0, 0), |(all, slipped), r| (all + 1, slipped + usize::from(r.flaw().is_some())));
+        let slips = |r: &GraspRun| r.flaw().is_some_and(|e| e.kind == EventKind::Slip);
+        let (all, slipped) = done.fold((0, 0), |(all, slipped), r| (all + 1, slipped + usize::from(slips(r))));
+        let held = report.sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.flaw().is_none())).count();
         let scenes = report.sweep.len();
-        let _ = writeln!(out, "  sweep        {scenes} scenes, {all} ran to their end, {slipped} of them with slip");
+        let _ = writeln!(
+            out,
+            "  sweep        {scenes} scenes, {all} ran to their end, {slipped} of them with slip; {held} held throughout"
+        );
     }
     let _ = writeln!(out, "  time         {:.3} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
     out
@@ -122,7 +138,10 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
         .map(|(case, result)| {
             let values: Map<String, Value> = case.values.iter().map(|(k, v)| (k.clone(), json!(v))).collect();
             match result {
-                Ok(run) => json!({ "values": values, "completed": run.completed, "events": events(run) }),
+                Ok(run) => json!({
+                    "values": values, "completed": run.completed, "outcome": run.outcome(),
+                    "required_friction": run.required_friction, "events": events(run),
+                }),
                 Err(error) => json!({ "values": values, "completed": false, "error": error }),
             }
         })
@@ -136,6 +155,8 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
         "method": scene.integrator.method,
         "step": scene.integrator.step,
         "completed": run.completed,
+        "outcome": run.outcome(),
+        "required_friction": run.required_friction,
         "simulated_seconds": run.samples.last().map_or(0.0, |s| s.time),
         "steps": run.steps,
         "motions_finished": run.motions.iter().filter(|m| m.step > 0).count(),
@@ -175,6 +196,12 @@ pub fn time_plots(report: &GraspReport<'_>) -> String {
         Plot { title, across: "s", marks: &marks }.draw(&both(report, values))
     };
     let mm = |v: f64| 1e3 * v;
+    let slid = report.run.samples.iter().any(|s| s.slip != [0.0; 2]);
+    let mut lines = both(report, &[("needed", &|s| s.required_friction)]);
+    if let (Some(given), Some(last)) = (report.scene.object.friction, report.run.samples.last()) {
+        lines.push(Line::new("given", 1, false, vec![[0.0, given], [last.time, given]]));
+    }
+    let friction = Plot { title: "Coefficient of friction", across: "s", marks: &marks }.draw(&lines);
     [
         plot("Object's angle, degrees", &[("theta", &|s| s.pose[2].to_degrees())]),
         plot(
@@ -195,13 +222,12 @@ pub fn time_plots(report: &GraspReport<'_>) -> String {
             "Tangential force, N",
             &[("finger 1", &|s| s.tangential_force[0]), ("finger 2", &|s| s.tangential_force[1])],
         ),
-        plot(
-            "|f_t / f_n|, to be under the friction",
-            &[
-                ("finger 1", &|s| (s.tangential_force[0] / s.normal_force[0]).abs()),
-                ("finger 2", &|s| (s.tangential_force[1] / s.normal_force[1]).abs()),
-            ],
-        ),
+        friction,
+        if slid {
+            plot("Slip along the face, mm", &[("finger 1", &|s| mm(s.slip[0])), ("finger 2", &|s| mm(s.slip[1]))])
+        } else {
+            String::new()
+        },
     ]
     .concat()
 }
@@ -274,11 +300,12 @@ pub(super) fn steps_table(steps: &[StableStep]) -> String {
 /// The page.
 pub fn page(report: &GraspReport<'_>) -> String {
     let (scene, run) = (report.scene, report.run);
-    let bad = run.events.iter().any(|e| e.kind.ends_run());
-    let (class, word) = match (bad, run.events.is_empty()) {
-        (true, _) => ("low", "ended early"),
-        (false, true) => ("high", "held"),
-        (false, false) => ("moderate", "slipped"),
+    let (class, word) = match run.flaw().map(|e| e.kind) {
+        None => ("high", "held"),
+        Some(kind) if kind.ends_run() => ("low", "ended early"),
+        Some(EventKind::Slip) => ("low", "slipped"),
+        Some(EventKind::ValidityRange) => ("moderate", "out of range"),
+        Some(_) => ("moderate", "off its branch"),
     };
     let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
     let simulated = run.samples.last().map_or(0.0, |s| s.time);
@@ -401,7 +428,7 @@ pub(super) fn scene_table(scene: &Scene) -> String {
         ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
         ("Link, half span", format!("{}, {}", mm(finger.link), mm(scene.half_span()))),
         ("Object", format!("{} x {}, {} kg", mm(object.width), mm(object.height), short(object.mass))),
-        ("Friction", object.friction.map_or("not checked".into(), short)),
+        ("Friction", object.friction.map_or("without limit".into(), short)),
         ("First displacement", mm(scene.initial.normal_displacement)),
         ("Gains", format!("{}, {}, {}", short(finger.gains.kp), short(finger.gains.kd), short(finger.gains.ki))),
         ("Integrator", format!("{}, {} form, step {} ms", i.method.name(), i.formulation.name(), short(1e3 * i.step))),

@@ -2,13 +2,15 @@
 
 use crate::error::ReportError;
 use crate::report::grasp::{GraspReport, event_line, fixed2, scene_table, steps_table, tile, time_plots};
+use crate::report::grasp_measured::{fitted_words, measured};
 use crate::report::grasp_scene::animation;
 use crate::report::grasp_surface::{pinch_map, state_colour, state_words, surface};
 use crate::report::html::{document, escape};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
-use crate::types::grasp::{Freedom, GraspAnalysis, PinchState, PostureForce, Stability, StabilityRow};
+use crate::types::grasp::{Freedom, GraspAnalysis, Hold, PinchState, PostureForce, Stability, StabilityRow};
+use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::{FingertipModel, Scene};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -24,18 +26,35 @@ pub struct AnalysisReport<'a> {
     pub pushed: &'a Scene,
     /// What was found.
     pub analysis: &'a GraspAnalysis,
+    /// Measurements with the models fitted to them.
+    pub measured: Option<(&'a Measurements, &'a MeasuredFit)>,
     /// Stage names and wall seconds.
     pub seconds: &'a [(String, f64)],
 }
 
-/// Rows of one model.
-fn of(analysis: &GraspAnalysis, model: FingertipModel) -> impl Iterator<Item = &StabilityRow> {
-    analysis.stability.iter().filter(move |r| r.model == model)
+/// Rows of one model with one hold.
+fn of(analysis: &GraspAnalysis, model: FingertipModel, hold: Hold) -> impl Iterator<Item = &StabilityRow> {
+    analysis.stability.iter().filter(move |r| r.model == model && r.hold == hold)
 }
 
-/// How many rows of a model are of a class.
-fn count(analysis: &GraspAnalysis, model: FingertipModel, class: Stability) -> usize {
-    of(analysis, model).filter(|r| r.class == class).count()
+/// How many rows of a model with a hold are of a class.
+fn count(analysis: &GraspAnalysis, model: FingertipModel, hold: Hold, class: Stability) -> usize {
+    of(analysis, model, hold).filter(|r| r.class == class).count()
+}
+
+/// What the stationary poses of a model with a hold are, in words.
+fn classes(analysis: &GraspAnalysis, model: FingertipModel, hold: Hold) -> String {
+    let words = [
+        (Stability::Minimum, "a minimum"),
+        (Stability::Neutral, "neutral"),
+        (Stability::Saddle, "a saddle"),
+        (Stability::Maximum, "a maximum"),
+        (Stability::None, "not to be found nearby"),
+    ];
+    let all = of(analysis, model, hold).count();
+    let some = words.into_iter().map(|(class, word)| (count(analysis, model, hold, class), word)).filter(|w| w.0 > 0);
+    let parts: Vec<String> = some.map(|(n, word)| format!("{word} at {n}")).collect();
+    format!("{} of {all}", parts.join(", "))
 }
 
 /// Cells of the pinch map in a state, as a part of all.
@@ -47,14 +66,15 @@ fn share(analysis: &GraspAnalysis, state: PinchState) -> f64 {
 /// In one sentence.
 fn headline(report: &AnalysisReport<'_>) -> String {
     let a = report.analysis;
-    let all = of(a, FingertipModel::Parallel).count();
-    let radial = FingertipModel::Radial;
+    let [parallel, radial] = [FingertipModel::Parallel, FingertipModel::Radial];
+    let all = of(a, parallel, Hold::Friction).count();
     format!(
-        "The parallel model has a minimum of energy at {} of {} postures; the radial one is a saddle at {} and neutral at {} of them.",
-        count(a, FingertipModel::Parallel, Stability::Minimum),
+        "The parallel model has a minimum of energy at {} of {} postures; the radial one, held by friction, is {}, and without \
+         friction and weight {}.",
+        count(a, parallel, Hold::Friction, Stability::Minimum),
         all + a.lost.len(),
-        count(a, radial, Stability::Saddle),
-        count(a, radial, Stability::Neutral)
+        classes(a, radial, Hold::Friction),
+        classes(a, radial, Hold::Weightless)
     )
 }
 
@@ -101,6 +121,12 @@ pub fn text(report: &AnalysisReport<'_>) -> String {
         100.0 * share(a, PinchState::Good),
         a.pinch.angles.last().map_or(0.0, |v| v.to_degrees())
     );
+    if let Some((_, fit)) = report.measured {
+        let _ = writeln!(out, "  measured     {}", fit.verdict());
+        for model in &fit.models {
+            let _ = writeln!(out, "    {:<15} {}", model.model, fitted_words(model));
+        }
+    }
     let _ = writeln!(out, "  time         {:.2} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
     out
 }
@@ -131,6 +157,7 @@ pub fn summary(report: &AnalysisReport<'_>) -> Value {
         "freedom": freedom,
         "pinch_map": states,
         "push": { "events": a.push.events, "turn_deg": most, "left_deg": left, "energy_drift": a.push.energy_drift },
+        "measured": report.measured.map(|m| m.1),
         "stable_steps": a.stable_steps,
         "seconds": seconds,
         "scene": report.scene,
@@ -167,19 +194,30 @@ fn force_plots(f: &PostureForce) -> String {
         + &plot("Force against tilt, N", "tilt, degrees", &against_tilt)
 }
 
-/// Hessians as a table.
+/// Stationary poses and Hessians as a table.
 fn stability_table(rows: &[StabilityRow]) -> String {
-    let head = ["Posture", "theta 1, 2, deg", "Model", "Eigenvalues, N/m", "Gradient, N", "The pose is a"];
+    let head = [
+        "Posture",
+        "theta 1, 2, deg",
+        "Along the face",
+        "Model",
+        "Stationary pose, mm from the parallel equilibrium",
+        "Eigenvalues, N/m",
+        "Force left, N",
+        "It is",
+    ];
     let cells = |r: &StabilityRow| {
         let [a, b] = r.joints.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
         let eigenvalues: Vec<String> = r.eigenvalues.iter().map(|v| short((v * 10.0).round() / 10.0)).collect();
         vec![
             if r.step == 0 { "pinch".into() } else { r.step.to_string() },
             format!("{a}, {b}"),
+            r.hold.name().replace("-weightless", ", weightless"),
             r.model.name().into(),
+            r.distance.map_or("none within a radius".into(), |d| fixed2(1e3 * d)),
             eigenvalues.join(", "),
-            format!("{:.1e}", r.residual),
-            r.class.name().into(),
+            r.residual.map_or("-".into(), |v| format!("{v:.0e}")),
+            if r.class == Stability::None { "-".into() } else { r.class.name().into() },
         ]
     };
     table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
@@ -232,11 +270,14 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
     let classes: Vec<String> = a
         .stability
         .iter()
-        .filter(|r| r.step == step)
-        .map(|r| format!("{}: {} ({} N/m)", r.model.name(), r.class.name(), fixed2(r.eigenvalues[0])))
+        .filter(|r| r.step == step && r.hold == Hold::Friction)
+        .map(|r| {
+            let lowest = r.eigenvalues.first().map_or("none".into(), |v| format!("{} N/m", fixed2(*v)));
+            format!("{}: {} ({lowest})", r.model.name(), r.class.name())
+        })
         .collect();
     Ok(format!(
-        "<article><h3>{title}</h3><p>Smallest eigenvalue: {}.</p><div class=\"surfaces\">{pictures}</div></article>",
+        "<article><h3>{title}</h3><p>With friction, smallest eigenvalue at the own equilibrium: {}.</p><div class=\"surfaces\">{pictures}</div></article>",
         classes.join("; ")
     ))
 }
@@ -248,7 +289,7 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
 pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     let a = report.analysis;
     let (most, left) = push_turn(a);
-    let minima = count(a, FingertipModel::Parallel, Stability::Minimum);
+    let minima = count(a, FingertipModel::Parallel, Hold::Friction, Stability::Minimum);
     let mut body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>{} <span>grasp analysis</span></h1><p class=\"verdict\">{}</p></header>\
          <div class=\"tiles\">{}{}{}{}</div>",
@@ -265,6 +306,9 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         let _ =
             write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
     }
+    if let Some((measurements, fit)) = report.measured {
+        body.push_str(&measured(measurements, fit));
+    }
     let _ = write!(
         body,
         "<section><h2>Force depends on posture</h2><p class=\"lead\">Along the back plate's normal. Lines: springs in \
@@ -278,7 +322,7 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
          Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><h3>Hessians</h3>{}</article>",
         stability_table(&a.stability)
     );
-    let steps: Vec<usize> = of(a, FingertipModel::Parallel).map(|r| r.step).collect();
+    let steps: Vec<usize> = of(a, FingertipModel::Parallel, Hold::Friction).map(|r| r.step).collect();
     for &step in &steps {
         body.push_str(&surface_card(a, step)?);
     }
@@ -325,8 +369,8 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         crate::report::chart::stage_times(report.seconds)
     );
     body.push_str(
-        "<footer><p>The parallel model is judged at its own equilibria, the radial one at the same poses: without tangential \
-         springs nothing holds the object up, and its gradient says so.</p></footer>",
+        "<footer><p>Each model is judged at its own stationary pose next to the parallel model's equilibrium. Without friction \
+         nothing carries the weight: both faces push along one line, so there is no such pose unless the weight is left out too.</p></footer>",
     );
     Ok(document(&format!("{} grasp analysis", escape(report.name)), &body))
 }

@@ -48,7 +48,10 @@ impl FromStr for FingertipModel {
     }
 }
 
-/// A hemispherical soft fingertip; both fingers have the same.
+/// Least Young's modulus of a fingertip (Pa): brain and fat, the softest tissues, have about 1 kPa.
+pub const SOFTEST: f64 = 1e3;
+
+/// A hemispherical soft fingertip.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Fingertip {
     /// Radius a (m).
@@ -83,8 +86,11 @@ impl Fingertip {
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn check(&self) -> Result<(), ParamError> {
-        positive("fingertip.radius", self.radius, 1.0, "above 0 and at most 1 m")?;
-        positive("fingertip.youngs_modulus", self.youngs_modulus, 1e12, "above 0 and at most 1e12 Pa")?;
+        positive("fingertip.radius", self.radius, 1.0, "above 0 and at most 1 m (SI units: is it in mm?)")?;
+        if !(self.youngs_modulus >= SOFTEST && self.youngs_modulus <= 1e12) {
+            let range = "1000 to 1e12 Pa, from the softest tissues up (SI units: is it in kPa?)";
+            return Err(ParamError { name: "fingertip.youngs_modulus", value: self.youngs_modulus, range });
+        }
         self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))?;
         for pair in self.profile.windows(2) {
             positive("fingertip.profile_depth", pair[1][0] - pair[0][0], 1.0, "rising depths in m")?;
