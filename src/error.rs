@@ -466,6 +466,12 @@ pub enum SceneError {
     /// Motions of joints that are locked.
     #[error("finger.fixed is true, but there are motions; remove the [[motion]] tables or set fixed = false")]
     FixedMotion,
+    /// Fingers of two joints that should move.
+    #[error(
+        "fingers of two joints are not simulated; leave finger.links out and give finger.link, or look at them with \
+         `palpate grasp-analysis`"
+    )]
+    TwoJoints,
     /// Rigid tips and locked joints.
     #[error("rigid tips and fixed joints leave nothing to move; choose another fingertip.model or set fixed = false")]
     NothingMoves,

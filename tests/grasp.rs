@@ -15,7 +15,7 @@ use palpate::grasp::statics::{Lost, Statics};
 use palpate::grasp::{freedom, pinch, stability, stepping};
 use palpate::pipeline;
 use palpate::types::grasp::{EventKind, GraspRun, Hold, PinchState, Sample, Stability};
-use palpate::types::scene::{Formulation, Integrator, Method, Motion, Push, Rolling, SweepCase};
+use palpate::types::scene::{Formulation, Integrator, Method, Motion, Push, Rolling, Second, SweepCase};
 use palpate::types::{FingertipModel, Scene};
 use std::f64::consts::PI;
 
@@ -1088,6 +1088,71 @@ fn degrees_of_freedom_by_rank() {
     assert_eq!(found(FingertipModel::Radial, 2).2, 3);
 }
 
+/// The source's cases: rigid and soft tips on fingers of 1+1 and 1+2 joints.
+#[test]
+fn a_finger_of_two_joints_gives_rigid_tips_what_soft_ones_have_with_one() {
+    let table = freedom::table(&Scene::reference());
+    let row = |model, joints| table.iter().find(|f| f.model == model && f.joints == joints).unwrap();
+    let (rigid, soft) = (FingertipModel::Rigid, FingertipModel::Parallel);
+    for f in &table {
+        println!("{f:?} {} {}", f.controls(), f.torque_controls());
+    }
+    // One more joint is one more freedom, whatever the tips.
+    for (_, model) in FingertipModel::ALL {
+        assert_eq!(row(model, [1, 2]).freedom, row(model, [1, 1]).freedom + 1, "{}", model.name());
+        assert_eq!(row(model, [1, 2]).rank, 4);
+        assert!(row(model, [1, 1]).stable);
+    }
+    // By angles rigid tips have no grip to set; by torques they have, beside their motion.
+    assert_eq!((row(rigid, [1, 1]).freedom, row(rigid, [1, 2]).freedom), (1, 2));
+    assert_eq!((row(rigid, [1, 1]).controls(), row(rigid, [1, 2]).controls()), ("posture", "posture"));
+    assert_eq!(row(rigid, [1, 1]).torque_controls(), "grasp and posture");
+    assert_eq!(row(soft, [1, 1]).controls(), "grasp and posture");
+    assert_eq!(row(soft, [1, 2]).controls(), "grasp and posture");
+    assert_eq!((row(rigid, [1, 1]).contact_forces, row(soft, [1, 1]).contact_forces), (4, 6));
+}
+
+/// Fingers that are written as two and are alike move as one that is written once; fingers that
+/// differ rest where forces and moments balance.
+#[test]
+fn fingers_may_differ() {
+    let base = short();
+    let mut twice = base.clone();
+    twice.second = Some(Second { fingertip: base.fingertip.clone(), finger: base.finger.clone() });
+    assert!(apart(&run(&base).samples, &run(&twice).samples) < 1e-9);
+    // A thumb: thicker, softer, on a shorter link.
+    let mut thumb = twice.clone();
+    let second = thumb.second.as_mut().unwrap();
+    (second.fingertip.radius, second.fingertip.youngs_modulus) = (0.025, 1.2e5);
+    (second.finger.link, second.finger.half_span, second.finger.lift) = (0.045, 0.0485 + 0.005, -0.015);
+    thumb.check().unwrap();
+    let result = run(&thumb);
+    assert!(result.completed && result.events.is_empty(), "{:?}", result.events);
+    let first = result.samples[0];
+    let weight = 0.10 * 9.81;
+    assert!((first.tangential_force[0] + first.tangential_force[1] + weight).abs() < 1e-5, "{first:?}");
+    assert!((first.normal_force[0] - first.normal_force[1]).abs() < 0.05 * first.normal_force[0], "{first:?}");
+    assert!(first.normal[1] > 1.2 * first.normal[0], "the softer tip gives more: {first:?}");
+    // It begins at rest.
+    let still = run(&Scene { motions: Vec::new(), ..thumb.clone() }).samples;
+    assert!(apart(&still[..1], &still[still.len() - 1..]) < 1e-9);
+    // Both forms agree on it, and mirrored it moves as its mirror image.
+    let mut other = thumb.clone();
+    other.integrator.formulation = Formulation::Multipliers;
+    assert!(apart(&result.samples, &run(&other).samples) < 1e-8);
+    let mut mirrored = thumb.clone();
+    let was = std::mem::replace(
+        mirrored.second.as_mut().unwrap(),
+        Second { fingertip: thumb.fingertip.clone(), finger: thumb.finger.clone() },
+    );
+    (mirrored.fingertip, mirrored.finger) = (was.fingertip, was.finger);
+    mirrored.motions[0].target.reverse();
+    for (a, b) in result.samples.iter().zip(&run(&mirrored).samples) {
+        assert!((a.pose[0] + b.pose[0]).abs() < 1e-10 && (a.pose[1] - b.pose[1]).abs() < 1e-10, "{a:?} {b:?}");
+        assert!((a.pose[2] + b.pose[2]).abs() < 1e-9 && (a.normal_force[0] - b.normal_force[1]).abs() < 1e-6);
+    }
+}
+
 #[test]
 fn the_pinch_map_is_symmetric_and_agrees_with_the_motions() {
     let scene = Scene::reference();
@@ -1216,4 +1281,44 @@ fn a_soft_middle_on_a_stiff_rim_holds() {
     let scene = tabulated(vec![[0.0, 0.5 * E], [0.001, 0.8 * E], [0.004, 2.0 * E]]);
     let run = simulate(&scene, &|_| {}).unwrap();
     assert!(run.completed, "{:?}", run.events);
+}
+
+#[test]
+fn a_modulus_that_is_off_shows_in_the_grip_and_not_in_the_turn() {
+    // Why the demo scores the grip: the turn is geometry.
+    let scene = Scene::reference();
+    let end = |factor: f64| {
+        let last = *run(&scene.with_moduli(factor)).samples.last().unwrap();
+        let second = run(&scene.with_moduli(factor)).motions[2].reached;
+        (0.5 * (last.normal_force[0] + last.normal_force[1]), second.pose[2])
+    };
+    let (grip, turn) = end(1.0);
+    for factor in [0.5, 2.0] {
+        let (other, turned) = end(factor);
+        assert!((other / grip / factor - 1.0).abs() < 0.02, "{factor}: {other} {grip}");
+        assert!((turned / turn - 1.0).abs() < 0.02, "{factor}: {turned} {turn}");
+    }
+}
+
+#[test]
+fn deviations_and_bounds_of_the_moduli_become_bands() {
+    let mut scene = short();
+    assert!(pipeline::grasp::run(&scene, &|_, _| {}).unwrap().bands.is_none());
+    scene.fingertip.deviation = 0.1;
+    let outcome = pipeline::grasp::run(&scene, &|_, _| {}).unwrap();
+    let bands = outcome.bands.unwrap();
+    assert_eq!((bands.factors.len(), bands.low.len()), (2, outcome.run.samples.len()));
+    let [softer, stiffer] = [-0.1f64, 0.1].map(|f| run(&scene.with_moduli(f.exp())).samples);
+    for (k, s) in outcome.run.samples.iter().enumerate() {
+        let f = |s: &Sample| s.normal_force[0];
+        assert_eq!(f(&bands.low[k]), f(&softer[k]).min(f(s)).min(f(&stiffer[k])));
+        assert_eq!(f(&bands.high[k]), f(&softer[k]).max(f(s)).max(f(&stiffer[k])));
+        assert!(f(&bands.low[k]) < f(s) && f(s) < f(&bands.high[k]));
+    }
+    // Bounds widen them on their side.
+    scene.fingertip.bounds = Some([1.0, 3.0]);
+    let wide = pipeline::grasp::run(&scene, &|_, _| {}).unwrap().bands.unwrap();
+    let last = |s: &[Sample]| s.last().unwrap().normal_force[0];
+    assert_eq!(last(&wide.low), last(&bands.low));
+    assert!(last(&wide.high) > 2.0 * last(&bands.high));
 }

@@ -41,7 +41,8 @@ impl Geometry {
     /// Of a scene.
     pub fn of(scene: &Scene) -> Self {
         let [one, two] = scene.fingers();
-        let link = [one.link, two.link];
+        // Two links that hang straight are one of their length.
+        let link = [one, two].map(|f| f.upper.unwrap_or(0.0) + f.link);
         let base = scene.bases();
         let radius = scene.fingertips().map(|tip| tip.radius);
         // d_t = 0 where the object hangs level between the tips' mean height.

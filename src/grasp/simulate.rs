@@ -1,7 +1,7 @@
 //! A whole run: steps from border to border of the inputs, samples, and the watch over everything
 //! that can fail.
 
-use crate::error::GraspError;
+use crate::error::{GraspError, SceneError};
 use crate::grasp::branch::{Branch, Look, STRIDE};
 use crate::grasp::control::{Phase, SAME, Schedule};
 use crate::grasp::friction::Friction;
@@ -36,6 +36,9 @@ const MOST_EVENTS: usize = 1000;
 /// stabilisation gain that is unstable from the start.
 pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
     scene.check()?;
+    if scene.fingers().iter().any(|f| f.upper.is_some() && !f.fixed) {
+        return Err(SceneError::TwoJoints.into());
+    }
     let tips = scene.fingertips();
     let stiffness = tips.map(|tip| PI * tip.youngs_modulus);
     match scene.fingertip.model {

@@ -2,7 +2,7 @@
 
 use super::csv::write_table;
 use crate::error::{GraspError, IoError};
-use crate::types::grasp::{GraspAnalysis, GraspRun, MotionRow, Sample};
+use crate::types::grasp::{Bands, GraspAnalysis, GraspRun, MotionRow, Sample};
 use crate::types::scene::SweepCase;
 use std::path::Path;
 
@@ -55,6 +55,22 @@ pub fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<()
         std::iter::once(seconds(time)).chain(rest.map(number)).collect()
     });
     write_table(path.as_ref(), &Sample::COLUMNS, rows)
+}
+
+/// Writes the time (s) and the least and largest of each other column of [`Sample::COLUMNS`].
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_bands(path: impl AsRef<Path>, bands: &Bands) -> Result<(), IoError> {
+    let names = Sample::COLUMNS[1..].iter().flat_map(|c| [format!("{c}_low"), format!("{c}_high")]);
+    let header: Vec<String> = std::iter::once("time".to_string()).chain(names).collect();
+    let header: Vec<&str> = header.iter().map(String::as_str).collect();
+    let rows = bands.low.iter().zip(&bands.high).map(|(low, high)| {
+        let ([time, low @ ..], [_, high @ ..]) = (stored_sample(low), stored_sample(high));
+        let pairs = low.into_iter().zip(high).flat_map(|(a, b)| [number(a), number(b)]);
+        std::iter::once(seconds(time)).chain(pairs).collect()
+    });
+    write_table(path.as_ref(), &header, rows)
 }
 
 fn motion_row(m: &MotionRow) -> Vec<String> {
@@ -211,7 +227,7 @@ pub fn write_pinch_map(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Resu
         } else {
             let [_, x, y, theta, _, _, rest @ ..] = s.row();
             row.extend([x, y, theta.to_degrees()].map(number));
-            row.extend(rest.map(number));
+            row.extend(rest[..8].iter().copied().map(number));
             row.push(number(c.smallest_eigenvalue));
         }
         row

@@ -98,8 +98,8 @@ pub use digest::{digest, files_of};
 pub use field::{FieldConvention, read_field, read_field_as, read_samples};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
-    stored_motion, stored_sample, write_energy, write_motions, write_pinch_map, write_posture_force, write_stability,
-    write_sweep, write_trajectory,
+    stored_motion, stored_sample, write_bands, write_energy, write_motions, write_pinch_map, write_posture_force,
+    write_stability, write_sweep, write_trajectory,
 };
 pub use image::{
     ImageKind, Stored, count_non_finite, labels_of, read_header, read_labels, read_mask, read_volume,

@@ -53,7 +53,20 @@ pub struct SceneFile {
 /// Keys of each table; a test holds them against what is deserialised.
 const KEYS: [(&str, &[&str]); 10] = [
     ("", &["fingertip", "finger", "object", "initial", "gravity", "integrator", "motion", "push", "sweep"]),
-    ("fingertip", &["file", "radius", "youngs_modulus", "damping", "model", "profile_depth", "profile_modulus"]),
+    (
+        "fingertip",
+        &[
+            "file",
+            "radius",
+            "youngs_modulus",
+            "youngs_modulus_sd",
+            "youngs_modulus_bounds",
+            "damping",
+            "model",
+            "profile_depth",
+            "profile_modulus",
+        ],
+    ),
     ("finger", &["link", "links", "half_span", "base", "inertia", "gains", "fixed"]),
     ("object", &["width", "height", "mass", "inertia", "friction", "offset"]),
     ("initial", &["normal_displacement", "theta", "rest"]),
@@ -350,6 +363,8 @@ struct RawScene {
 struct RawFingertip {
     radius: Each<f64>,
     youngs_modulus: Each<f64>,
+    youngs_modulus_sd: Option<f64>,
+    youngs_modulus_bounds: Option<[f64; 2]>,
     damping: Option<Each<[f64; 2]>>,
     model: Option<String>,
     profile_depth: Option<Vec<f64>>,
@@ -513,6 +528,8 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
             youngs_modulus: moduli[i],
             damping: damping[i],
             model,
+            deviation: tip.youngs_modulus_sd.unwrap_or(0.0) / moduli[0],
+            bounds: tip.youngs_modulus_bounds.map(|b| b.map(|v| v / moduli[0])),
             profile: profile.clone(),
         };
         let finger = Finger {

@@ -5,7 +5,7 @@ use crate::grasp::models;
 use crate::grasp::simulate::{self, simulate};
 use crate::grasp::statics::Statics;
 use crate::grasp::{freedom, measured, pinch, posture, stability, stepping};
-use crate::types::grasp::{GraspAnalysis, GraspRun, MotionRow, StableStep};
+use crate::types::grasp::{Bands, GraspAnalysis, GraspRun, MotionRow, Sample, StableStep};
 use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::scene::{Push, SweepCase};
 use crate::types::{FingertipModel, Scene};
@@ -29,6 +29,8 @@ pub struct GraspOutcome {
     pub without_tangential: Option<Result<GraspRun, GraspError>>,
     /// Largest stable steps at the start and at each motion's target.
     pub stable_steps: Vec<StableStep>,
+    /// What the run may be, where the tips' moduli have a deviation or bounds.
+    pub bands: Option<Bands>,
     /// Stage names and wall seconds.
     pub seconds: Vec<(String, f64)>,
 }
@@ -47,10 +49,44 @@ pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspE
         .then(|| simulate(&scene.with_model(FingertipModel::ParallelNormal), &|_| {}));
     seconds.push(("compare".into(), started.elapsed().as_secs_f64()));
     let started = Instant::now();
+    progress("bands", 0.8);
+    let bands = bands(scene, &run)?;
+    if bands.is_some() {
+        seconds.push(("bands".into(), started.elapsed().as_secs_f64()));
+    }
+    let started = Instant::now();
     progress("stable steps", 0.9);
     let stable_steps = stable_steps(scene);
     seconds.push(("stable steps".into(), started.elapsed().as_secs_f64()));
-    Ok(GraspOutcome { run, without_tangential, stable_steps, seconds })
+    Ok(GraspOutcome { run, without_tangential, stable_steps, bands, seconds })
+}
+
+/// The run with moduli a deviation up and down, and at their bounds: the least and the largest of
+/// each quantity. None where neither is known.
+///
+/// # Errors
+/// [`GraspError`] where the scene has no start with one of these moduli.
+fn bands(scene: &Scene, run: &GraspRun) -> Result<Option<Bands>, GraspError> {
+    let tip = &scene.fingertip;
+    let mut factors = Vec::new();
+    if tip.deviation > 0.0 {
+        factors.extend([(-tip.deviation).exp(), tip.deviation.exp()]);
+    }
+    factors.extend(tip.bounds.into_iter().flatten().filter(|f| *f != 1.0));
+    if factors.is_empty() {
+        return Ok(None);
+    }
+    let runs: Vec<GraspRun> =
+        factors.par_iter().map(|f| simulate(&scene.with_moduli(*f), &|_| {})).collect::<Result<_, _>>()?;
+    let among = |pick: fn(f64, f64) -> f64| -> Vec<Sample> {
+        let at = |k: usize, s: &Sample| {
+            let others = runs.iter().filter_map(|r| r.samples.get(k)).filter(|o| (o.time - s.time).abs() < 1e-9);
+            others.fold(*s, |all, o| all.each(o, pick))
+        };
+        run.samples.iter().enumerate().map(|(k, s)| at(k, s)).collect()
+    };
+    let outcomes = runs.iter().map(GraspRun::outcome).collect();
+    Ok(Some(Bands { low: among(f64::min), high: among(f64::max), factors, outcomes }))
 }
 
 /// How far a joint may be from its target when a hold ends (rad).

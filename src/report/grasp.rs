@@ -6,7 +6,7 @@ use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
 use crate::types::Scene;
-use crate::types::grasp::{Event, EventKind, GraspRun, Sample, StableStep};
+use crate::types::grasp::{Bands, Event, EventKind, GraspRun, Sample, StableStep};
 use crate::types::scene::{Method, SweepCase};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -24,6 +24,8 @@ pub struct GraspReport<'a> {
     pub without_tangential: Option<&'a Result<GraspRun, String>>,
     /// Largest stable steps at the postures of the scene.
     pub stable_steps: &'a [StableStep],
+    /// What the run may be, by what is known of the tips' moduli.
+    pub bands: Option<&'a Bands>,
     /// The ensemble, with the error where a case has no result.
     pub sweep: &'a [(SweepCase, Result<GraspRun, String>)],
     /// Stage names and wall seconds.
@@ -78,6 +80,27 @@ fn range(samples: &[Sample], value: impl Fn(&Sample) -> f64) -> [f64; 2] {
     samples.iter().map(value).fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)])
 }
 
+/// What the deviation and the bounds of the moduli come to at the end, in words.
+fn bands_words(report: &GraspReport<'_>) -> Option<String> {
+    let bands = report.bands?;
+    let (low, high) = (bands.low.last()?, bands.high.last()?);
+    let [least, most] = bands.factors.iter().fold([1.0f64; 2], |r, f| [r[0].min(*f), r[1].max(*f)]);
+    let lost = bands.outcomes.iter().filter(|o| **o != "held").count();
+    let lost = match lost {
+        0 => String::new(),
+        n => format!("; {n} of {} runs with such moduli do not hold", bands.outcomes.len()),
+    };
+    Some(format!(
+        "{:+.0} to {:+.0} %: at the end the object stands at {:.2} to {:.2} degrees, gripped by {:.2} to {:.2} N{lost}",
+        100.0 * (least - 1.0),
+        100.0 * (most - 1.0),
+        low.pose[2].to_degrees(),
+        high.pose[2].to_degrees(),
+        0.5 * (low.normal_force[0] + low.normal_force[1]),
+        0.5 * (high.normal_force[0] + high.normal_force[1])
+    ))
+}
+
 /// A few lines for a terminal.
 pub fn text(report: &GraspReport<'_>) -> String {
     let (scene, run) = (report.scene, report.run);
@@ -98,6 +121,9 @@ pub fn text(report: &GraspReport<'_>) -> String {
     let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
     let _ = writeln!(out, "  object       turned {low:.2} to {high:.2} degrees");
     let _ = writeln!(out, "  force        up to {:.2} N at a contact", largest_force(&run.samples));
+    if let Some(words) = bands_words(report) {
+        let _ = writeln!(out, "  moduli       {words}");
+    }
     let drift = run.constraint_drift;
     let _ = writeln!(
         out,
@@ -157,6 +183,9 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
         "completed": run.completed,
         "outcome": run.outcome(),
         "required_friction": run.required_friction,
+        "moduli": report.bands.map(|b| json!({
+            "factors": b.factors, "outcomes": b.outcomes, "end_low": b.low.last(), "end_high": b.high.last(),
+        })),
         "simulated_seconds": run.samples.last().map_or(0.0, |s| s.time),
         "steps": run.steps,
         "motions_finished": run.motions.iter().filter(|m| m.step > 0).count(),
@@ -176,6 +205,14 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
 /// Lines of one quantity of both fingers, and of the run without tangential deformation dashed.
 fn both(report: &GraspReport<'_>, values: &[(&str, &dyn Fn(&Sample) -> f64)]) -> Vec<Line> {
     let mut lines = Vec::new();
+    if let Some(bands) = report.bands {
+        let step = bands.low.len().div_ceil(400).max(1);
+        for (colour, (_, value)) in values.iter().enumerate() {
+            let both = bands.low.iter().zip(&bands.high).step_by(step);
+            let between: Vec<[f64; 3]> = both.map(|(l, h)| [l.time, value(l), value(h)]).collect();
+            lines.push(Line::band("", colour, &between));
+        }
+    }
     let other = report.without_tangential.and_then(|r| r.as_ref().ok());
     for (dashed, run) in [(true, other), (false, Some(report.run))] {
         let Some(run) = run else { continue };
@@ -347,6 +384,7 @@ pub fn page(report: &GraspReport<'_>) -> String {
         body,
         "<article><h3>Postures reached</h3><p>At the end of each hold, with the desired joint angles.</p><div class=\"postures\">{postures}</div></article></div></section>"
     );
+    let shaded = bands_words(report).map_or(String::new(), |w| format!(" Shaded: moduli of the tips {}.", escape(&w)));
     let beside = match report.without_tangential {
         Some(Ok(other)) => match other.events.iter().find(|e| e.kind.ends_run()) {
             Some(e) => format!(
@@ -360,7 +398,7 @@ pub fn page(report: &GraspReport<'_>) -> String {
     };
     let _ = write!(
         body,
-        "<section><h2>Over time</h2><p class=\"lead\">{beside} Upright lines: ends of motions; red: events.</p><div class=\"plots\">{}</div></section>\
+        "<section><h2>Over time</h2><p class=\"lead\">{beside}{shaded} Upright lines: ends of motions; red: events.</p><div class=\"plots\">{}</div></section>\
          <section><h2>Numbers</h2><div class=\"grid\"><article class=\"wide\"><h3>Motions</h3>{}</article>",
         time_plots(report),
         motions(run)

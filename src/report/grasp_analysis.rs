@@ -105,7 +105,7 @@ pub fn text(report: &AnalysisReport<'_>) -> String {
     for (step, reason) in &a.lost {
         let _ = writeln!(out, "  motion {step}     cannot be reached: {reason}");
     }
-    for f in a.freedom.iter().filter(|f| f.fingers == 2) {
+    for f in a.freedom.iter().filter(|f| f.joints == [1, 1]) {
         let _ = writeln!(
             out,
             "  {:<15} {} degrees of freedom; two joint angles set {}",
@@ -143,6 +143,7 @@ pub fn summary(report: &AnalysisReport<'_>) -> Value {
         .map(|f| {
             let mut value = json!(f);
             value["controls"] = json!(f.controls());
+            value["torque_controls"] = json!(f.torque_controls());
             value
         })
         .collect();
@@ -226,21 +227,38 @@ fn stability_table(rows: &[StabilityRow]) -> String {
 fn freedom_table(rows: &[Freedom]) -> String {
     let head = [
         "Tips",
-        "Moving fingers",
+        "Joints that move",
         "Coordinates",
         "Rank",
         "Degrees of freedom",
         "of the object, joints locked",
+        "Contact forces",
+        "Stays at locked joints",
         "Joint angles set",
+        "Joint torques set",
     ];
     let cells = |f: &Freedom| {
-        let numbers = [f.fingers, f.coordinates, f.rank, f.freedom, f.object_freedom];
-        let mut row = vec![f.model.name().to_string()];
+        let numbers = [f.coordinates, f.rank, f.freedom, f.object_freedom, f.contact_forces];
+        let mut row = vec![f.model.name().to_string(), f.hand()];
         row.extend(numbers.map(|n| n.to_string()));
-        row.push(f.controls().into());
+        row.extend([if f.stable { "yes" } else { "no" }, f.controls(), f.torque_controls()].map(String::from));
         row
     };
     table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+}
+
+/// The table of the source: rigid against soft tips on fingers of 1+1 and 1+2 joints.
+fn short_freedom_table(rows: &[Freedom]) -> String {
+    let head = ["Tips, joints", "Grasp stable", "Posture and grasp by angles", "by torques"];
+    let yes = |v: bool| if v { "yes" } else { "no" }.to_string();
+    let shown = [FingertipModel::Rigid, FingertipModel::Parallel]
+        .into_iter()
+        .flat_map(|m| rows.iter().filter(move |f| f.model == m && f.fingers == 2));
+    let cells = |f: &Freedom| {
+        let name = if f.model == FingertipModel::Rigid { "rigid" } else { "soft" };
+        vec![format!("{name}, {}", f.hand()), yes(f.stable), yes(f.both_rank == 2), yes(f.torque_rank == 2)]
+    };
+    table(&head, &shown.map(cells).collect::<Vec<_>>())
 }
 
 /// The surfaces of one posture: parallel and radial side by side.
@@ -351,6 +369,7 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         run: &a.push,
         without_tangential: None,
         stable_steps: &a.stable_steps,
+        bands: None,
         sweep: &[],
         seconds: report.seconds,
         warnings: &[],

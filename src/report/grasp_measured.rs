@@ -34,12 +34,6 @@ pub fn fitted_words(model: &ModelFit) -> String {
     format!("E {} kPa{damping}, misfit {:.2e}; {evidence}", estimate(&model.youngs_modulus, 1e-3), model.rms)
 }
 
-/// Dots: each place alone between two gaps.
-fn dots(name: &str, colour: usize, places: impl Iterator<Item = [f64; 2]>) -> Line {
-    let gap = [f64::NAN, f64::NAN];
-    Line::new(name, colour, false, places.flat_map(|p| [p, gap]).collect())
-}
-
 /// The section of a page.
 pub fn measured(measurements: &Measurements, fit: &MeasuredFit) -> String {
     let head = ["Model", "E, kPa", "c_n, N s/m", "Misfit (rms)", "Log odds against the best"];
@@ -61,7 +55,7 @@ pub fn measured(measurements: &Measurements, fit: &MeasuredFit) -> String {
         Measurements::Force(points) => presses(points, fit),
         Measurements::Course(points) => {
             let channel = |title: &str, k: usize, scale: f64| {
-                let own = dots("measured", 3, points.iter().map(|p| [p.time, scale * p.pose[k]]));
+                let own = Line::dots("measured", 3, points.iter().map(|p| [p.time, scale * p.pose[k]]).collect());
                 let models = fit.models.iter().enumerate().map(|(i, m)| {
                     let line = points.iter().zip(&m.predicted).map(|(p, v)| [p.time, scale * v[k]]).collect();
                     Line::new(m.model, i, i > 0, line)
@@ -97,7 +91,7 @@ fn presses(points: &[ForcePoint], fit: &MeasuredFit) -> String {
         let mut at: Vec<usize> = (0..points.len()).filter(|&i| degrees(&points[i]) == *tilt).collect();
         at.sort_by(|a, b| points[*a].d.total_cmp(&points[*b].d));
         let place = |i: &usize, force: f64| [1e3 * points[*i].d, force];
-        lines.push(dots(&format!("{tilt} deg"), colour, at.iter().map(|i| place(i, points[*i].force))));
+        lines.push(Line::dots(&format!("{tilt} deg"), colour, at.iter().map(|i| place(i, points[*i].force)).collect()));
         for (k, model) in fit.models.iter().take(2).enumerate() {
             let line = at.iter().map(|i| place(i, model.predicted[*i][0])).collect();
             lines.push(Line::new("", colour, k > 0, line));
@@ -113,7 +107,8 @@ fn presses(points: &[ForcePoint], fit: &MeasuredFit) -> String {
         .iter()
         .enumerate()
         .map(|(k, m)| {
-            dots(m.model, k, points.iter().zip(&m.predicted).map(|(p, v)| [p.tilt.to_degrees(), p.force - v[0]]))
+            let off = points.iter().zip(&m.predicted).map(|(p, v)| [p.tilt.to_degrees(), p.force - v[0]]);
+            Line::dots(m.model, k, off.collect())
         })
         .collect();
     Plot { title: &title, across: "d, mm", marks: &[] }.draw(&lines)

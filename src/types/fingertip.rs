@@ -62,6 +62,13 @@ pub struct Fingertip {
     pub damping: [f64; 2],
     /// How it answers.
     pub model: FingertipModel,
+    /// Standard deviation of its moduli, over them (1); 0 where it is not known.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub deviation: f64,
+    /// Least and largest value that its moduli may have, over them (1), where only bounds of a
+    /// tissue are known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bounds: Option<[f64; 2]>,
     /// Depth (m) at which a face that comes straight on reaches springs, and their modulus (Pa), by
     /// rising depth; linear between, constant beyond. Of tabulated tips only; empty is
     /// `youngs_modulus` everywhere.
@@ -76,7 +83,7 @@ impl Fingertip {
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn new(radius: f64, youngs_modulus: f64, damping: [f64; 2], model: FingertipModel) -> Result<Self, ParamError> {
-        let tip = Self { radius, youngs_modulus, damping, model, profile: Vec::new() };
+        let tip = Self { radius, youngs_modulus, damping, model, deviation: 0.0, bounds: None, profile: Vec::new() };
         tip.check()?;
         Ok(tip)
     }
@@ -92,6 +99,17 @@ impl Fingertip {
             return Err(ParamError { name: "fingertip.youngs_modulus", value: self.youngs_modulus, range });
         }
         self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))?;
+        at_least_zero("fingertip.youngs_modulus_sd", self.deviation, "0 or more Pa")?;
+        if let Some([low, high]) = self.bounds
+            && !(low > 0.0 && low <= 1.0 && high >= 1.0 && high.is_finite())
+        {
+            let range = "[low, high] in Pa, around youngs_modulus";
+            return Err(ParamError {
+                name: "fingertip.youngs_modulus_bounds",
+                value: low * self.youngs_modulus,
+                range,
+            });
+        }
         for pair in self.profile.windows(2) {
             positive("fingertip.profile_depth", pair[1][0] - pair[0][0], 1.0, "rising depths in m")?;
         }
@@ -99,6 +117,12 @@ impl Fingertip {
             at_least_zero("fingertip.profile_depth", p[0], "0 or more m")?;
             positive("fingertip.profile_modulus", p[1], 1e12, "above 0 and at most 1e12 Pa")
         })
+    }
+
+    /// The same with all moduli times `factor`, which are then known.
+    pub fn scaled(&self, factor: f64) -> Self {
+        let profile = self.profile.iter().map(|[d, e]| [*d, e * factor]).collect();
+        Self { youngs_modulus: self.youngs_modulus * factor, deviation: 0.0, bounds: None, profile, ..self.clone() }
     }
 
     /// Young's modulus (Pa) of the springs that a face coming straight on reaches at `depth` (m).
@@ -145,6 +169,13 @@ pub struct StiffnessRegion {
     pub youngs_modulus: f64,
     /// `lower` or `upper` where it is not identifiable.
     pub bound: Option<String>,
+    /// Its standard deviation, in the unit of the modulus; NaN or 0 where it is unknown.
+    #[serde(default, deserialize_with = "or_nan")]
+    pub sd: f64,
+}
+
+fn is_zero(v: &f64) -> bool {
+    *v == 0.0
 }
 
 /// A number, or NaN for null.
@@ -205,6 +236,12 @@ pub struct PadReduction {
     pub profile_residual: f64,
     /// Columns.
     pub columns: usize,
+    /// Standard deviation of the hemisphere's modulus, over it (1): what those of the tissue and of
+    /// the press come to; 0 where none is known.
+    pub deviation: f64,
+    /// Least and largest modulus of the hemisphere over its own (1), where only a bound of a tissue
+    /// is known.
+    pub bounds: Option<[f64; 2]>,
     /// The forces of the map's finite elements, where they were solved; the hemispheres are then
     /// fitted to these.
     pub plate: Option<PlateCurve>,

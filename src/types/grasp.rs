@@ -62,6 +62,39 @@ impl Sample {
     }
 }
 
+impl Sample {
+    /// The smaller, or the larger, of each quantity by `pick`; the time stays.
+    pub fn each(&self, other: &Self, pick: fn(f64, f64) -> f64) -> Self {
+        let two = |a: [f64; 2], b: [f64; 2]| [pick(a[0], b[0]), pick(a[1], b[1])];
+        let [a, b] = [self.pose, other.pose];
+        Self {
+            time: self.time,
+            pose: [pick(a[0], b[0]), pick(a[1], b[1]), pick(a[2], b[2])],
+            joints: two(self.joints, other.joints),
+            normal: two(self.normal, other.normal),
+            tangential: two(self.tangential, other.tangential),
+            normal_force: two(self.normal_force, other.normal_force),
+            tangential_force: two(self.tangential_force, other.tangential_force),
+            required_friction: pick(self.required_friction, other.required_friction),
+            friction_margin: pick(self.friction_margin, other.friction_margin),
+            slip: two(self.slip, other.slip),
+        }
+    }
+}
+
+/// What the samples of a run may be, where the tips' moduli are known to a deviation or by bounds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bands {
+    /// Factors of the moduli that were run beside 1.
+    pub factors: Vec<f64>,
+    /// Least of each quantity at each time.
+    pub low: Vec<Sample>,
+    /// Largest.
+    pub high: Vec<Sample>,
+    /// How each of the runs went.
+    pub outcomes: Vec<&'static str>,
+}
+
 /// The grasp at the end of a motion's hold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MotionRow {
@@ -345,8 +378,13 @@ pub struct PostureForce {
 pub struct Freedom {
     /// The model of the tips.
     pub model: FingertipModel,
-    /// Fingers whose joint moves; with one, the other is locked.
+    /// Fingers that move; with one, the other is locked.
     pub fingers: usize,
+    /// Joints of the left and of the right finger that move.
+    pub joints: [usize; 2],
+    /// Components of force and moment that both contacts carry; three of them are balanced by the
+    /// object.
+    pub contact_forces: usize,
     /// Coordinates: pose, joints, and the displacements that the tips allow.
     pub coordinates: usize,
     /// Rank of the constraints' Jacobian.
@@ -361,6 +399,12 @@ pub struct Freedom {
     pub grasp_rank: usize,
     /// Rank of d(theta, grip force)/d(joint angles): 2 when both can be set at once.
     pub both_rank: usize,
+    /// The same for joint torques: rigid tips answer to them by their grip where to angles they
+    /// cannot.
+    pub torque_rank: usize,
+    /// Whether the object stays where it is with the joints locked, held by constraints or in a
+    /// minimum of energy.
+    pub stable: bool,
 }
 
 impl Freedom {
@@ -373,6 +417,20 @@ impl Freedom {
             (0, 1.., _) => "grasp",
             _ => "neither",
         }
+    }
+
+    /// What the joint torques can set, in words.
+    pub fn torque_controls(&self) -> &'static str {
+        match (self.torque_rank, self.posture_rank, self.grasp_rank) {
+            (2.., ..) => "grasp and posture",
+            (1, 0, 0) => "grasp",
+            _ => self.controls(),
+        }
+    }
+
+    /// The joints as they are written, such as `1+2`; a locked finger has 0.
+    pub fn hand(&self) -> String {
+        format!("{}+{}", self.joints[0], self.joints[1])
     }
 }
 

@@ -298,6 +298,16 @@ impl Scene {
         [[-span(one, a), one.lift], [span(two, b), two.lift]]
     }
 
+    /// The same with all moduli of the tips times `factor`.
+    pub fn with_moduli(&self, factor: f64) -> Self {
+        let mut scene = self.clone();
+        scene.fingertip = scene.fingertip.scaled(factor);
+        if let Some(second) = &mut scene.second {
+            second.fingertip = second.fingertip.scaled(factor);
+        }
+        scene
+    }
+
     /// The same with tips of another model.
     pub fn with_model(&self, model: FingertipModel) -> Self {
         let mut scene = self.clone();
@@ -318,6 +328,8 @@ impl Scene {
                 youngs_modulus: 2.0e5,
                 damping: [20.0, 20.0],
                 model: FingertipModel::Parallel,
+                deviation: 0.0,
+                bounds: None,
                 profile: Vec::new(),
             },
             finger: Finger {
