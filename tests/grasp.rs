@@ -880,8 +880,13 @@ fn a_step_that_is_too_long_is_refused_with_the_stable_one() {
         // Just under the limit it runs; just above it is refused.
         scene.integrator.step = 0.98 * stable;
         assert!(simulate(&scene, &|_| {}).is_ok());
-        scene.integrator.step = 1.05 * stable;
-        assert!(matches!(simulate(&scene, &|_| {}), Err(GraspError::BadStep { .. })));
+        // It is that of all postures; the start alone may bear a little more.
+        scene.integrator.step = 1.3 * stable;
+        let refused = match simulate(&scene, &|_| {}) {
+            Err(error) => matches!(error, GraspError::BadStep { .. }),
+            Ok(run) => run.events.iter().any(|e| e.kind == EventKind::BadStep),
+        };
+        assert!(refused, "{} {}", method.name(), formulation.name());
     }
 }
 
@@ -1004,6 +1009,48 @@ fn a_step_that_becomes_too_long_on_the_way_is_found() {
     let (kind, time, _, _) = ends_with(&[[6.0, 6.0]], change);
     assert_eq!(kind, EventKind::BadStep);
     assert!(time > 0.5, "{time}");
+}
+
+/// A step of 1.25e-4 s was advised, of the start alone and rounded up, and then failed.
+#[test]
+fn advice_in_refusals_works_when_it_is_followed() {
+    let digits = |text: &str, after: &str| -> f64 {
+        let rest = &text[text.find(after).unwrap_or_else(|| panic!("{after}: {text}")) + after.len()..];
+        rest.trim_start().split([' ', ',', ';', ')']).next().unwrap().parse().unwrap()
+    };
+    for (modulus, damping, step) in [(2e5, 20.0, 5e-3), (2e6, 2.0, 5e-3), (5e6, 5.0, 2e-3), (2e5, 0.0, 1e-2)] {
+        for method in [Method::Rk4, Method::SemiImplicitEuler] {
+            let mut scene = Scene::reference();
+            scene.motions.truncate(3);
+            (scene.fingertip.youngs_modulus, scene.fingertip.damping) = (modulus, [damping; 2]);
+            (scene.integrator.method, scene.integrator.step) = (method, step);
+            let text = match simulate(&scene, &|_| {}) {
+                Err(error) => error.to_string(),
+                Ok(run) => run.flaw().unwrap().what.clone(),
+            };
+            scene.integrator.step = digits(&text, "integrator.step at or under");
+            let followed = simulate(&scene, &|_| {}).unwrap().outcome();
+            assert_ne!(followed, "bad-step", "{text}");
+        }
+    }
+    let mut scene = short();
+    (scene.integrator.formulation, scene.integrator.baumgarte) = (Formulation::Multipliers, 4321.0);
+    let text = simulate(&scene, &|_| {}).unwrap_err().to_string();
+    scene.integrator.baumgarte = digits(&text, "integrator.baumgarte at or under");
+    assert!(simulate(&scene, &|_| {}).is_ok(), "{text}");
+    // Too heavy: either way that is named holds it.
+    let mut heavy = short();
+    heavy.object.mass = 3.0;
+    let text = simulate(&heavy, &|_| {}).unwrap_err().to_string();
+    let mut stiffer = heavy.clone();
+    stiffer.fingertip.youngs_modulus = digits(&text, "fingertip.youngs_modulus to");
+    let mut deeper = heavy.clone();
+    deeper.initial.normal_displacement = digits(&text, "initial.normal_displacement to");
+    deeper.finger.half_span = 0.05 - deeper.initial.normal_displacement;
+    for scene in [&mut stiffer, &mut deeper] {
+        scene.integrator.step = 1e-4;
+        assert!(simulate(scene, &|_| {}).is_ok(), "{text}");
+    }
 }
 
 #[test]
@@ -1321,4 +1368,123 @@ fn deviations_and_bounds_of_the_moduli_become_bands() {
     let last = |s: &[Sample]| s.last().unwrap().normal_force[0];
     assert_eq!(last(&wide.low), last(&bands.low));
     assert!(last(&wide.high) > 2.0 * last(&bands.high));
+}
+
+/// The short scene with tips whose branches have these moduli (over the springs') and times (s).
+fn relaxing(branches: &[[f64; 2]]) -> Scene {
+    let mut scene = short();
+    scene.fingertip.maxwell = branches.iter().map(|[share, time]| [share * E, share * E * time]).collect();
+    scene
+}
+
+#[test]
+fn relaxing_tips_follow_the_convolution_of_their_springs_force() {
+    let branches = [[0.8, 0.02], [0.5, 0.3]];
+    let mut scene = relaxing(&branches);
+    (scene.integrator.step, scene.integrator.output_every, scene.fingertip.damping) = (2e-4, 2e-4, [0.0; 2]);
+    scene.finger.gains.ki = 0.0;
+    let result = run(&scene);
+    assert!(result.completed && result.events.is_empty(), "{:?}", result.events);
+    assert!(result.energy_drift < 1e-6, "{}", result.energy_drift);
+    let tip = Parallel { stiffness: PI * E };
+    // p' = (f - p) / tau, exactly for a force that is linear between samples.
+    let mut p = [[0.0; 2]; 2];
+    let (mut last, mut most, mut lag) = ([0.0; 2], 0.0f64, 0.0f64);
+    for (n, s) in result.samples.iter().enumerate() {
+        let tilts = [s.pose[2] - s.joints[0], -(s.pose[2] + s.joints[1])];
+        for i in 0..2 {
+            let f = tip.gradient(s.normal[i], s.tangential[i], Tilt::of(tilts[i])).normal;
+            let mut whole = f;
+            for (b, [share, time]) in branches.iter().enumerate() {
+                let h = scene.integrator.output_every;
+                let kept = (-h / time).exp();
+                p[b][i] = if n == 0 {
+                    f
+                } else {
+                    let slope = (f - last[i]) / h;
+                    f - slope * time + (p[b][i] - last[i] + slope * time) * kept
+                };
+                whole += share * (f - p[b][i]);
+            }
+            last[i] = f;
+            most = most.max((whole - s.normal_force[i]).abs());
+            lag = lag.max((whole - f).abs());
+        }
+    }
+    assert!(lag > 0.5 && most < 1e-5 * lag, "{most} of {lag}");
+}
+
+#[test]
+fn tips_that_relax_end_where_elastic_ones_do() {
+    let mut scene = relaxing(&[[1.0, 0.005], [0.7, 0.02]]);
+    scene.motions[0].hold = 2.0;
+    let mut elastic = scene.clone();
+    elastic.fingertip.maxwell.clear();
+    let [slow, quick] = [&scene, &elastic].map(|s| run(s).motions[1].reached);
+    for k in 0..3 {
+        assert!((slow.pose[k] - quick.pose[k]).abs() < 1e-6, "{slow:?} {quick:?}");
+    }
+    assert!((slow.normal_force[0] - quick.normal_force[0]).abs() < 1e-3);
+    // And slide as they do, with their energy accounted for.
+    scene.object.friction = Some(0.9 * run(&scene).required_friction);
+    let slid = run(&scene);
+    assert_eq!(slid.outcome(), "slip");
+    assert!(slid.energy_drift < 1e-4, "{}", slid.energy_drift);
+    // The multiplier form has no place for branches, and says so.
+    scene.integrator.formulation = Formulation::Multipliers;
+    assert!(simulate(&scene, &|_| {}).unwrap_err().to_string().contains("maxwell"));
+}
+
+/// The tip of examples/human_fingertip.toml.
+fn human() -> Scene {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/human_fingertip.toml");
+    palpate::io::read_scene(path, &palpate::io::SceneOverrides::default()).unwrap().scene
+}
+
+#[test]
+fn a_stiffening_tip_has_its_closed_form_and_what_is_published_of_fingertips() {
+    let scene = human();
+    let (e, by) = (scene.fingertip.youngs_modulus, scene.fingertip.stiffening.unwrap());
+    let tip = tip_of(&scene.fingertip, FingertipModel::Tabulated);
+    // F = 2 pi E L^2 (exp(d / L) - 1 - d / L), along the face 2 pi E L (exp(d / L) - 1).
+    let closed = |d: f64| 2.0 * PI * e * by * by * ((d / by).exp_m1() - d / by);
+    let (mut forces, mut drags) = (Vec::new(), Vec::new());
+    for step in 2..=18 {
+        let d = 2.5e-4 * f64::from(step);
+        let (f, k) = (tip.gradient(d, 0.0, Tilt::of(0.0)).normal, tip.curvature(d, 0.0, Tilt::of(0.0))[1][1]);
+        assert!(relative(f, closed(d)) < 0.02, "{d}: {f} {}", closed(d));
+        assert!(relative(k, 2.0 * PI * e * by * (d / by).exp_m1()) < 0.03, "{d}: {k}");
+        forces.push(f);
+        drags.push(k);
+    }
+    // Exponential from 0.5 N on (Pawluk and Howe 1999): the slope of ln F changes by a fifth up to 5 N.
+    let slope = |a: f64, b: f64| (closed(b) / closed(a)).ln() / (b - a);
+    let depth = |force: f64| {
+        let (mut low, mut high) = (0.0, scene.fingertip.radius);
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            if closed(middle) < force { low = middle } else { high = middle }
+        }
+        low
+    };
+    let [a, b, c, d] = [0.5, 0.6, 4.5, 5.0].map(depth);
+    assert!(slope(a, b) / slope(c, d) < 1.4 && depth(5.0) < 0.6 * scene.fingertip.radius);
+    // Stiffness along the face grows in proportion to the normal force (Pataky et al. 2005); of one
+    // modulus it would grow with its root.
+    let ratio = |i: usize, j: usize| (drags[j] / drags[i]).ln() / (forces[j] / forces[i]).ln();
+    assert!(ratio(8, 16) > 0.8, "{}", ratio(8, 16));
+}
+
+#[test]
+fn the_human_fingertip_holds_and_relaxes() {
+    let result = run(&human());
+    assert!(result.completed, "{:?}", result.events);
+    // What is left of the force at the end of a hold of 3 s, over its peak.
+    let grip = |s: &Sample| 0.5 * (s.normal_force[0] + s.normal_force[1]);
+    let (peak, end) = (result.samples.iter().map(grip).fold(0.0, f64::max), grip(result.samples.last().unwrap()));
+    println!(
+        "grip {peak:.2} N, {end:.2} N after the hold; {:?}",
+        result.events.iter().map(|e| (e.kind, e.time)).collect::<Vec<_>>()
+    );
+    assert!(end < 0.7 * peak && end > 0.2 * peak, "{peak} {end}");
 }

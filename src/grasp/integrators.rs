@@ -5,14 +5,16 @@
 //! II.4, II.5); E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (I.1.2).
 
 use crate::grasp::control::{Inputs, Phase};
-use crate::grasp::minimal;
 use crate::grasp::models::Tip;
+use crate::grasp::multipliers;
 use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
 /// Equations of motion of first order. The first five entries of a state are positions, the next
-/// five their rates; from 13 on, slides, or four more positions and four more rates may follow.
+/// five their rates; from 13 on follow what branches of the tips follow, slides, or in the
+/// multiplier form four more positions and four more rates.
 pub trait System<const N: usize> {
     /// Rates of a state, and what its contacts show.
     fn rate(&self, inputs: &Inputs, state: &[f64; N]) -> ([f64; N], Reading);
@@ -34,11 +36,11 @@ pub trait Form<const N: usize>: System<N> {
     /// Counts d_t from `origin` (m) from now on.
     fn set_origin(&mut self, origin: [f64; 2]);
 
-    /// The state in minimal coordinates.
-    fn core(&self, state: &[f64; N]) -> [f64; minimal::STATE];
+    /// The state in minimal coordinates, with what branches of its tips follow.
+    fn core(&self, state: &[f64; N]) -> [f64; relaxing::STATE];
 
-    /// The state of minimal coordinates.
-    fn with_core(&self, core: &[f64; minimal::STATE]) -> [f64; N];
+    /// The state of such coordinates.
+    fn with_core(&self, core: &[f64; relaxing::STATE]) -> [f64; N];
 
     /// The state at rest in an equilibrium.
     fn start(&self, equilibrium: &Equilibrium) -> [f64; N];
@@ -117,7 +119,7 @@ impl Stepper for SemiImplicitEuler {
         for k in 0..5 {
             next[k] = state[k] + h * next[5 + k];
         }
-        if N > 20 {
+        if N == multipliers::STATE {
             for k in 13..17 {
                 next[k] = state[k] + h * next[4 + k];
             }

@@ -8,6 +8,7 @@ use crate::grasp::control::Inputs;
 use crate::grasp::integrators::{Form, System};
 use crate::grasp::models::Tip;
 use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
@@ -58,12 +59,14 @@ impl<T: Tip> Form<STATE> for Minimal<T> {
         self.0.geometry.origin = origin;
     }
 
-    fn core(&self, s: &[f64; STATE]) -> [f64; STATE] {
-        *s
+    fn core(&self, s: &[f64; STATE]) -> [f64; relaxing::STATE] {
+        let mut core = [0.0; relaxing::STATE];
+        core[..STATE].copy_from_slice(s);
+        core
     }
 
-    fn with_core(&self, core: &[f64; STATE]) -> [f64; STATE] {
-        *core
+    fn with_core(&self, core: &[f64; relaxing::STATE]) -> [f64; STATE] {
+        std::array::from_fn(|k| core[k])
     }
 
     fn start(&self, e: &Equilibrium) -> [f64; STATE] {
@@ -81,8 +84,6 @@ impl<T: Tip> Form<STATE> for Minimal<T> {
     fn drift(&self, s: &[f64; STATE]) -> ConstraintDrift {
         let (q, v) = ([s[0], s[1], s[2], s[3], s[4]], [s[5], s[6], s[7], s[8], s[9]]);
         let contact = self.0.geometry.contact(&q);
-        let (d, w) = (contact.displacements(), contact.rates(&v));
-        let held = |a: usize, x: &[f64; 4]| if self.0.holds(a) { x[a].abs().max(x[a + 1].abs()) } else { 0.0 };
-        ConstraintDrift { normal: held(0, &d), rolling_velocity: held(2, &w), rolling: held(2, &d) }
+        self.0.drift(&contact.displacements(), &contact.rates(&v))
     }
 }

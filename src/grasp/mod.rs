@@ -4,7 +4,8 @@
 //! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue); docs/grasp.md has every
 //! equation and two signs of the slides that had to be settled. Order: [`models`] (fingertips), [`constraints`] (where
 //! they touch), [`statics`] (equilibria), [`control`], [`plant`] (forces), [`minimal`] and [`multipliers`] (equations of
-//! motion), [`friction`] and [`sliding`] (tips that slide), [`integrators`], [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail),
+//! motion), [`relaxing`] (tips that relax), [`friction`] and [`sliding`] (tips that
+//! slide), [`integrators`], [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail),
 //! [`simulate`] (the loop), then the
 //! analyses: [`stability`], [`freedom`], [`pinch`], [`posture`], [`measured`].
 //!
@@ -26,6 +27,8 @@ pub mod control;
 pub mod plant;
 
 pub mod minimal;
+
+pub mod relaxing;
 
 pub mod friction;
 

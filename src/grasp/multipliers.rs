@@ -12,6 +12,7 @@ use crate::grasp::integrators::{Form, System};
 use crate::grasp::minimal;
 use crate::grasp::models::Tip;
 use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 use crate::types::scene::Rolling;
@@ -83,16 +84,18 @@ impl<T: Tip> Form<STATE> for Multipliers<T> {
         self.plant.geometry.origin = origin;
     }
 
-    fn core(&self, s: &[f64; STATE]) -> [f64; minimal::STATE] {
-        std::array::from_fn(|k| s[k])
+    fn core(&self, s: &[f64; STATE]) -> [f64; relaxing::STATE] {
+        let mut core = [0.0; relaxing::STATE];
+        core[..minimal::STATE].copy_from_slice(&s[..minimal::STATE]);
+        core
     }
 
-    fn with_core(&self, core: &[f64; minimal::STATE]) -> [f64; STATE] {
+    fn with_core(&self, core: &[f64; relaxing::STATE]) -> [f64; STATE] {
         let (q, v) = (std::array::from_fn(|k| core[k]), std::array::from_fn(|k| core[5 + k]));
         let contact = self.plant.geometry.contact(&q);
         let (d, w) = (contact.displacements(), contact.rates(&v));
         let mut s = [0.0; STATE];
-        s[..minimal::STATE].copy_from_slice(core);
+        s[..minimal::STATE].copy_from_slice(&core[..minimal::STATE]);
         for k in (0..4).filter(|&k| !self.plant.holds(k)) {
             (s[13 + k], s[17 + k]) = (d[k], w[k]);
         }

@@ -6,7 +6,7 @@ use crate::grasp::models::{Gradient, Tip};
 use crate::grasp::statics::Equilibrium;
 use crate::numerics::dense;
 use crate::types::Scene;
-use crate::types::grasp::Sample;
+use crate::types::grasp::{ConstraintDrift, Sample};
 use crate::types::scene::Gains;
 
 /// Fingers, tips and object of a scene, with tips of one model.
@@ -25,6 +25,8 @@ pub struct Plant<T> {
     /// c_n and c_t of each tip (N s/m); 0 where the model holds the row.
     pub damping: [[f64; 2]; 2],
     gains: [Gains; 2],
+    /// Maxwell branches of both tips: modulus over the springs' (1) and time (s).
+    pub branches: Vec<[f64; 2]>,
     /// Torque that holds the first equilibrium: the preload of each controller's integral (N m).
     preload: [f64; 2],
 }
@@ -83,6 +85,7 @@ impl<T: Tip> Plant<T> {
             weight: object.mass * scene.gravity,
             damping: scene.fingertips().map(|tip| kept(tip.damping)),
             gains: [one.gains, two.gains],
+            branches: scene.fingertip.branches(),
             preload: start.torques,
         }
     }
@@ -211,6 +214,12 @@ impl<T: Tip> Plant<T> {
         let lost = n1 * w[0] * w[0] + n2 * w[1] * w[1] + t1 * w[2] * w[2] + t2 * w[3] * w[3];
         let pushed = inputs.force[0] * v[0] + inputs.force[1] * v[1] + contact.turn(inputs.moment) * v[2];
         pushed + torques[0] * v[3] + torques[1] * v[4] - lost
+    }
+
+    /// Violations of the held rows at the displacements `d` (m) and their rates `w` (m/s).
+    pub fn drift(&self, d: &[f64; 4], w: &[f64; 4]) -> ConstraintDrift {
+        let held = |a: usize, x: &[f64; 4]| if self.holds(a) { x[a].abs().max(x[a + 1].abs()) } else { 0.0 };
+        ConstraintDrift { normal: held(0, d), rolling_velocity: held(2, w), rolling: held(2, d) }
     }
 
     /// Kinetic and potential energy (J) with the displacements `d`; and the elastic and kinetic

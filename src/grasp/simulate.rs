@@ -1,7 +1,7 @@
 //! A whole run: steps from border to border of the inputs, samples, and the watch over everything
 //! that can fail.
 
-use crate::error::{GraspError, SceneError};
+use crate::error::{GraspError, SceneError, below};
 use crate::grasp::branch::{Branch, Look, STRIDE};
 use crate::grasp::control::{Phase, SAME, Schedule};
 use crate::grasp::friction::Friction;
@@ -10,7 +10,9 @@ use crate::grasp::minimal::Minimal;
 use crate::grasp::models::{self, Tip};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing::Relaxing;
 use crate::grasp::sliding::{self, Sliding};
+use crate::grasp::stability;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
 use crate::grasp::stepping::{self, LIMIT};
 use crate::grasp::tabulated::Tabulated;
@@ -35,6 +37,11 @@ const MOST_EVENTS: usize = 1000;
 /// [`GraspError`] where nothing can be simulated: a scene out of range, no stable equilibrium at the start, or a step or
 /// stabilisation gain that is unstable from the start.
 pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
+    attempt(scene, progress, true)
+}
+
+/// The same; without `advice` a step that is too long is not answered with one that is not.
+fn attempt(scene: &Scene, progress: Progress<'_>, advice: bool) -> Result<GraspRun, GraspError> {
     scene.check()?;
     if scene.fingers().iter().any(|f| f.upper.is_some() && !f.fixed) {
         return Err(SceneError::TwoJoints.into());
@@ -43,26 +50,36 @@ pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, Grasp
     let stiffness = tips.map(|tip| PI * tip.youngs_modulus);
     match scene.fingertip.model {
         FingertipModel::Parallel => {
-            with_tips(scene, stiffness.map(|stiffness| models::Parallel { stiffness }), progress)
+            with_tips(scene, stiffness.map(|stiffness| models::Parallel { stiffness }), progress, advice)
         }
         FingertipModel::ParallelNormal => {
-            with_tips(scene, stiffness.map(|stiffness| models::ParallelNormal { stiffness }), progress)
+            with_tips(scene, stiffness.map(|stiffness| models::ParallelNormal { stiffness }), progress, advice)
         }
-        FingertipModel::Radial => with_tips(scene, stiffness.map(|stiffness| models::Radial { stiffness }), progress),
-        FingertipModel::Rigid => with_tips(scene, [models::Rigid; 2], progress),
-        FingertipModel::Tabulated => with_tips(scene, tips.map(Tabulated::of), progress),
+        FingertipModel::Radial => {
+            with_tips(scene, stiffness.map(|stiffness| models::Radial { stiffness }), progress, advice)
+        }
+        FingertipModel::Rigid => with_tips(scene, [models::Rigid; 2], progress, advice),
+        FingertipModel::Tabulated => with_tips(scene, tips.map(Tabulated::of), progress, advice),
     }
 }
 
-fn with_tips<T: Tip + Clone>(scene: &Scene, tips: [T; 2], progress: Progress<'_>) -> Result<GraspRun, GraspError> {
+fn with_tips<T: Tip + Clone>(
+    scene: &Scene,
+    tips: [T; 2],
+    progress: Progress<'_>,
+    advice: bool,
+) -> Result<GraspRun, GraspError> {
     let statics = Statics::of(scene, [&tips[0], &tips[1]]);
     let start = start(scene, &statics)?;
     let plant = Plant::of(scene, tips.clone(), &start);
     let Integrator { formulation, baumgarte, rolling, .. } = scene.integrator;
     match formulation {
-        Formulation::Minimal => run(scene, Minimal(plant), &statics, start, progress),
+        Formulation::Minimal if !plant.branches.is_empty() => {
+            run(scene, Relaxing(plant), &statics, start, progress, advice)
+        }
+        Formulation::Minimal => run(scene, Minimal(plant), &statics, start, progress, advice),
         Formulation::Multipliers => {
-            run(scene, Multipliers { plant, gain: baumgarte, rolling }, &statics, start, progress)
+            run(scene, Multipliers { plant, gain: baumgarte, rolling }, &statics, start, progress, advice)
         }
     }
 }
@@ -91,8 +108,7 @@ pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspE
                 "the pinch is not stable (smallest eigenvalue of the Hessian {:.3e} N/m)",
                 start.smallest_eigenvalue
             ),
-            hint: "widen object.width, stiffen fingertip.youngs_modulus or press more (initial.normal_displacement)"
-                .into(),
+            hint: remedies(scene),
         });
     }
     if scene.initial.joints == [0.0; 2] {
@@ -107,6 +123,68 @@ pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspE
         ),
         hint: "choose other angles in initial.theta".into(),
     })
+}
+
+/// Steps that a trial of an advised step takes at most.
+const TRIED: f64 = 3e5;
+
+/// A step (s) that is stable at the start, at the postures of the motions, and, where that is soon
+/// tried, all the way.
+fn advised(scene: &Scene, start: Equilibrium) -> f64 {
+    let Integrator { method, formulation, .. } = scene.integrator;
+    let postures = stability::postures(scene, scene.fingertip.model).into_iter();
+    let at: Vec<Equilibrium> = std::iter::once(start).chain(postures.filter_map(|p| p.2.ok())).collect();
+    // What is found is true to 1 %.
+    let mut step = 0.98 * stepping::stable_step(scene, method, formulation, &at);
+    let mut trial = scene.clone();
+    while scene.duration() / step < TRIED {
+        trial.integrator.step = step;
+        trial.integrator.output_every = trial.integrator.output_every.max(step);
+        let blames = |run: &GraspRun| run.events.iter().any(|e| e.kind == EventKind::BadStep);
+        match attempt(&trial, &|_| {}, false) {
+            Ok(run) if blames(&run) => step *= 0.8,
+            Err(GraspError::BadStep { .. }) => step *= 0.8,
+            _ => break,
+        }
+    }
+    step
+}
+
+/// What makes a pinch stable that is not, in words: each found by trying.
+fn remedies(scene: &Scene) -> String {
+    let tips = |scene: &Scene| models::tips(scene);
+    let stable = |scene: &Scene| {
+        let tips = tips(scene);
+        let statics = Statics::of(scene, [tips[0].as_ref(), tips[1].as_ref()]);
+        let pinch = statics.pinch(scene);
+        pinch.smallest_eigenvalue > 0.0 && statics.out_of_range(&pinch.q).is_none()
+    };
+    // From a factor at which it holds, by a tenth more than is needed.
+    let least = |with: &dyn Fn(f64) -> Scene| {
+        let factor = (1..=80).map(|k| 1.1f64.powi(k)).find(|f| stable(&with(*f)))?;
+        Some(1.1 * factor).filter(|f| stable(&with(*f)))
+    };
+    let depth = scene.initial.normal_displacement;
+    let deeper = |factor: f64| {
+        let mut scene = scene.clone();
+        let more = (factor - 1.0) * depth;
+        scene.initial.normal_displacement += more;
+        scene.finger.half_span -= more;
+        if let Some(second) = &mut scene.second {
+            second.finger.half_span -= more;
+        }
+        scene
+    };
+    let mut ways = Vec::new();
+    if let Some(factor) = least(&|f| scene.with_moduli(f)) {
+        ways.push(format!("raise fingertip.youngs_modulus to {:.3e} Pa", factor * scene.fingertip.youngs_modulus));
+    }
+    if let Some(factor) = least(&deeper) {
+        let wanted = factor * depth;
+        ways.push(format!("press more: initial.normal_displacement to {wanted:.3e} m, with finger.half_span left out"));
+    }
+    ways.push("widen object.width, or take a lighter object".into());
+    ways.join(", or ")
 }
 
 /// What a look at the contacts comes to.
@@ -135,6 +213,10 @@ struct Run<'a, const N: usize, S: Form<N>> {
     fold: Option<usize>,
     /// Whether the tips have slid since the branch was told.
     moved: bool,
+    /// The equilibrium of the start, and whether a step that is too long is answered with one that
+    /// is not.
+    start: Equilibrium,
+    advice: bool,
 }
 
 impl<const N: usize, S: Form<N>> Run<'_, N, S> {
@@ -222,7 +304,11 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
     }
 
     /// Records what ends the run at `t`, with the state of the step before.
-    fn end(&mut self, phase: &Phase, kind: EventKind, t: f64, finger: Option<usize>, what: String) {
+    fn end(&mut self, phase: &Phase, kind: EventKind, t: f64, finger: Option<usize>, mut what: String) {
+        if kind == EventKind::BadStep && self.advice && self.scene.integrator.method != Method::Adaptive {
+            let stable = below(advised(self.scene, self.start));
+            what += &format!("; take integrator.step at or under {stable} s");
+        }
         let (before, time) = self.before;
         let (last_valid, _) = self.sample(phase, time, &before);
         self.push(Event { kind, time: t, until: None, finger, what, last_valid });
@@ -403,6 +489,7 @@ fn run<const N: usize, S: Form<N>>(
     statics: &Statics<'_>,
     start: Equilibrium,
     progress: Progress<'_>,
+    advice: bool,
 ) -> Result<GraspRun, GraspError> {
     let Integrator { method, step, formulation, baumgarte, .. } = scene.integrator;
     let state = system.start(&start);
@@ -431,6 +518,8 @@ fn run<const N: usize, S: Form<N>>(
         open: [[None; 2]; 2],
         fold: None,
         moved: false,
+        start,
+        advice,
     };
     if step_growth > LIMIT {
         let gain_to_blame = run.cause(&at_rest, &state) == Some(EventKind::BadGain);
@@ -439,8 +528,12 @@ fn run<const N: usize, S: Form<N>>(
             GraspError::BadGain { gain: baumgarte, step, growth: step_growth, stable }
         } else {
             let method_name = format!("{}, {}", method.name(), formulation.name());
-            let stable = stepping::stable_step(scene, method, formulation, &[start]);
-            GraspError::BadStep { step, growth: step_growth, method: method_name, stable }
+            GraspError::BadStep {
+                step,
+                growth: step_growth,
+                method: method_name,
+                stable: if advice { advised(scene, start) } else { 0.0 },
+            }
         });
     }
 

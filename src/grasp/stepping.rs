@@ -7,6 +7,7 @@ use crate::grasp::minimal::Minimal;
 use crate::grasp::models::{Tip, tips};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::Plant;
+use crate::grasp::relaxing::Relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::numerics::dense::spectral_radius;
 use crate::types::Scene;
@@ -143,6 +144,10 @@ pub fn growth_at(
     let plant = Plant::of(scene, tips, at);
     let phase = Phase::hold([at.q[3], at.q[4]]);
     match formulation {
+        Formulation::Minimal if !plant.branches.is_empty() => {
+            let system = Relaxing(plant);
+            growth_of(method, &system, &phase, h, &system.start(at))
+        }
         Formulation::Minimal => {
             let system = Minimal(plant);
             growth_of(method, &system, &phase, h, &system.start(at))

@@ -48,6 +48,9 @@ impl FromStr for FingertipModel {
     }
 }
 
+/// Maxwell branches of a fingertip at most.
+pub const MOST_BRANCHES: usize = 3;
+
 /// Least Young's modulus of a fingertip (Pa): brain and fat, the softest tissues, have about 1 kPa.
 pub const SOFTEST: f64 = 1e3;
 
@@ -62,6 +65,14 @@ pub struct Fingertip {
     pub damping: [f64; 2],
     /// How it answers.
     pub model: FingertipModel,
+    /// Maxwell branches beside the springs: modulus (Pa) and dashpot (Pa s) of each, as in layered
+    /// skin; none for a tip that does not relax.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub maxwell: Vec<[f64; 2]>,
+    /// Depth (m) by which the modulus of springs grows e-fold, of tabulated tips; none where it
+    /// does not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stiffening: Option<f64>,
     /// Standard deviation of its moduli, over them (1); 0 where it is not known.
     #[serde(skip_serializing_if = "is_zero")]
     pub deviation: f64,
@@ -83,7 +94,17 @@ impl Fingertip {
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn new(radius: f64, youngs_modulus: f64, damping: [f64; 2], model: FingertipModel) -> Result<Self, ParamError> {
-        let tip = Self { radius, youngs_modulus, damping, model, deviation: 0.0, bounds: None, profile: Vec::new() };
+        let tip = Self {
+            radius,
+            youngs_modulus,
+            damping,
+            model,
+            maxwell: Vec::new(),
+            stiffening: None,
+            deviation: 0.0,
+            bounds: None,
+            profile: Vec::new(),
+        };
         tip.check()?;
         Ok(tip)
     }
@@ -99,6 +120,25 @@ impl Fingertip {
             return Err(ParamError { name: "fingertip.youngs_modulus", value: self.youngs_modulus, range });
         }
         self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))?;
+        if self.maxwell.len() > MOST_BRANCHES {
+            let range = "up to 3 pairs [Pa, Pa s]";
+            return Err(ParamError {
+                name: "fingertip.maxwell, number of pairs",
+                value: self.maxwell.len() as f64,
+                range,
+            });
+        }
+        self.maxwell
+            .iter()
+            .flatten()
+            .try_for_each(|v| positive("fingertip.maxwell", *v, 1e15, "pairs of numbers above 0 (Pa, Pa s)"))?;
+        if let Some(depth) = self.stiffening {
+            // Over the radius the modulus would grow by e^20 and more.
+            let range = "at least a twentieth of fingertip.radius";
+            if !(depth >= 0.05 * self.radius && depth.is_finite()) {
+                return Err(ParamError { name: "fingertip.stiffening", value: depth, range });
+            }
+        }
         at_least_zero("fingertip.youngs_modulus_sd", self.deviation, "0 or more Pa")?;
         if let Some([low, high]) = self.bounds
             && !(low > 0.0 && low <= 1.0 && high >= 1.0 && high.is_finite())
@@ -122,11 +162,29 @@ impl Fingertip {
     /// The same with all moduli times `factor`, which are then known.
     pub fn scaled(&self, factor: f64) -> Self {
         let profile = self.profile.iter().map(|[d, e]| [*d, e * factor]).collect();
-        Self { youngs_modulus: self.youngs_modulus * factor, deviation: 0.0, bounds: None, profile, ..self.clone() }
+        let maxwell = self.maxwell.iter().map(|b| b.map(|v| v * factor)).collect();
+        Self {
+            maxwell,
+            youngs_modulus: self.youngs_modulus * factor,
+            deviation: 0.0,
+            bounds: None,
+            profile,
+            ..self.clone()
+        }
+    }
+
+    /// Each Maxwell branch: its modulus over the springs' (1) and its time (s).
+    pub fn branches(&self) -> Vec<[f64; 2]> {
+        self.maxwell.iter().map(|[e, c]| [e / self.youngs_modulus, c / e]).collect()
     }
 
     /// Young's modulus (Pa) of the springs that a face coming straight on reaches at `depth` (m).
     pub fn modulus_at(&self, depth: f64) -> f64 {
+        self.stiffening.map_or(1.0, |by| (depth / by).exp()) * self.measured_at(depth)
+    }
+
+    /// The same as the profile has it.
+    fn measured_at(&self, depth: f64) -> f64 {
         let after = self.profile.partition_point(|p| p[0] < depth);
         match (after.checked_sub(1).map(|i| self.profile[i]), self.profile.get(after)) {
             (Some([d0, e0]), Some([d1, e1])) => e0 + (e1 - e0) * (depth - d0) / (d1 - d0),

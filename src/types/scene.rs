@@ -328,6 +328,8 @@ impl Scene {
                 youngs_modulus: 2.0e5,
                 damping: [20.0, 20.0],
                 model: FingertipModel::Parallel,
+                maxwell: Vec::new(),
+                stiffening: None,
                 deviation: 0.0,
                 bounds: None,
                 profile: Vec::new(),
@@ -449,6 +451,13 @@ impl Scene {
         let fixed = one.fixed && two.fixed;
         if fixed && !self.motions.is_empty() {
             return Err(SceneError::FixedMotion);
+        }
+        let relaxes = self.fingertips().iter().any(|t| !t.maxwell.is_empty());
+        if relaxes && (integrator.formulation == Formulation::Multipliers || fingertip.model == FingertipModel::Rigid) {
+            return Err(SceneError::Relaxing);
+        }
+        if self.fingertips().iter().any(|t| t.stiffening.is_some()) && fingertip.model != FingertipModel::Tabulated {
+            return Err(SceneError::Stiffening { model: fingertip.model.name() });
         }
         if fingertip.model == FingertipModel::Rigid {
             if fixed {
