@@ -364,6 +364,9 @@ pub fn page(report: &GraspReport<'_>) -> String {
         let items: String = notes.iter().take(40).map(|w| format!("<li>{}</li>", escape(w))).collect();
         let _ = write!(body, "<article class=\"warnings\"><h3>Events and warnings</h3><ul>{items}</ul></article>");
     }
+    if !report.sweep.is_empty() {
+        body.push_str(&ensemble(report.sweep));
+    }
     let _ = write!(
         body,
         "<section><h2>The grasp</h2><p class=\"lead\">Arrows are the contact forces on the object; the line is the way of \
@@ -403,9 +406,6 @@ pub fn page(report: &GraspReport<'_>) -> String {
         time_plots(report),
         motions(run)
     );
-    if !report.sweep.is_empty() {
-        let _ = write!(body, "<article class=\"wide\"><h3>Ensemble</h3>{}</article>", ensemble(report.sweep));
-    }
     let _ = write!(
         body,
         "<article><h3>Scene</h3>{}</article><article><h3>Stable steps</h3><p>At the start and at all postures of the scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
@@ -421,37 +421,132 @@ pub fn page(report: &GraspReport<'_>) -> String {
     document(&format!("{} grasp", escape(report.name)), &body)
 }
 
-/// Cases of an ensemble: how each ended, and the last posture.
-fn ensemble(sweep: &[(SweepCase, Result<GraspRun, String>)]) -> String {
-    let mut head: Vec<String> = vec!["Case".into()];
-    head.extend(sweep.first().map_or(Vec::new(), |(c, _)| c.values.iter().map(|v| escape(&v.0)).collect()));
-    head.extend(["Outcome", "Motions", "theta, deg", "largest f_n at rest, N"].map(String::from));
-    let rows: Vec<Vec<String>> = sweep
+/// One case of an ensemble with its result.
+type Case = (SweepCase, Result<GraspRun, String>);
+
+/// Cases that the table shows at most.
+const SHOWN: usize = 200;
+/// Bars of a histogram.
+const BARS: usize = 30;
+
+/// How bad a case went: what has no result first, then what ended early by its time, then the least
+/// friction left.
+fn badness((_, result): &Case) -> (u8, f64) {
+    match result {
+        Err(_) => (0, 0.0),
+        Ok(run) => match run.flaw() {
+            Some(e) if e.kind.ends_run() => (1, e.time),
+            Some(e) => (if e.kind == EventKind::Slip { 2 } else { 3 }, -run.required_friction),
+            None => (4, -run.required_friction),
+        },
+    }
+}
+
+/// How a case went, in words.
+fn outcome_words(result: &Result<GraspRun, String>) -> String {
+    match result {
+        Ok(run) => run.flaw().map_or("held".into(), event_line),
+        Err(error) => error.clone(),
+    }
+}
+
+/// The values of a case, in words.
+fn values_words(case: &SweepCase) -> String {
+    case.values.iter().map(|(k, v)| format!("{k} = {v}")).collect::<Vec<_>>().join(", ")
+}
+
+/// How many cases went each way, the most frequent first.
+pub fn counts(sweep: &[Case]) -> Vec<(String, usize)> {
+    let mut out: Vec<(String, usize)> = Vec::new();
+    for (_, result) in sweep {
+        let name = result.as_ref().map_or("refused", GraspRun::outcome);
+        match out.iter_mut().find(|c| c.0 == name) {
+            Some(c) => c.1 += 1,
+            None => out.push((name.into(), 1)),
+        }
+    }
+    out.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+    out
+}
+
+/// A histogram of `value`, of the cases that held and of those that did not.
+fn histogram(title: &str, across: &str, sweep: &[Case], value: impl Fn(&GraspRun) -> Option<f64>) -> String {
+    let all: Vec<(f64, bool)> = sweep
         .iter()
-        .take(500)
-        .enumerate()
-        .map(|(i, (case, result))| {
-            let mut row = vec![(i + 1).to_string()];
-            row.extend(case.values.iter().map(|v| escape(&v.1)));
-            match result {
-                Ok(run) => {
-                    row.push(run.flaw().map_or("completed".into(), |e| escape(&event_line(e))));
-                    row.push(run.motions.iter().filter(|m| m.step > 0).count().to_string());
-                    let last = run.motions.last().map(|m| m.reached);
-                    row.push(last.map_or("-".into(), |s| fixed2(s.pose[2].to_degrees())));
-                    let most = run.motions.iter().flat_map(|m| m.reached.normal_force).fold(0.0, f64::max);
-                    row.push(fixed2(most));
-                }
-                Err(error) => {
-                    row.push(escape(error));
-                    row.extend(["0", "-", "-"].map(String::from));
-                }
-            }
+        .filter_map(|(_, r)| r.as_ref().ok())
+        .filter_map(|run| Some((value(run).filter(|v| v.is_finite())?, run.flaw().is_none())))
+        .collect();
+    let [low, high] = all.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v.0), r[1].max(v.0)]);
+    if all.is_empty() {
+        return String::new();
+    }
+    let room = if high > low { 0.0 } else { 0.5 * high.abs().max(1e-9) };
+    let (low, high) = (low - room, high + room);
+    let wide = (high - low) / BARS as f64;
+    let mut lines = Vec::new();
+    for (name, colour, held) in [("held", 2, true), ("did not hold", 1, false)] {
+        let mut bars = [0usize; BARS];
+        for (v, _) in all.iter().filter(|v| v.1 == held) {
+            bars[(((v - low) / wide) as usize).min(BARS - 1)] += 1;
+        }
+        if bars.iter().all(|n| *n == 0) {
+            continue;
+        }
+        let steps =
+            bars.iter().enumerate().flat_map(|(i, n)| [i, i + 1].map(|k| [low + k as f64 * wide, 0.0, *n as f64]));
+        lines.push(Line::band(name, colour, &steps.collect::<Vec<_>>()));
+    }
+    Plot { title, across, marks: &[] }.draw(&lines)
+}
+
+/// The ensemble: what share holds, how the results lie, and the worst case.
+fn ensemble(sweep: &[Case]) -> String {
+    let all = sweep.len();
+    let held = sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.flaw().is_none())).count();
+    let most = |run: &GraspRun| run.samples.last().map(|s| 0.5 * (s.normal_force[0] + s.normal_force[1]));
+    let mut order: Vec<&Case> = sweep.iter().collect();
+    order.sort_by(|a, b| badness(a).partial_cmp(&badness(b)).unwrap_or(std::cmp::Ordering::Equal));
+    let worst = order.first().map_or(String::new(), |(case, result)| {
+        format!("The worst: {}: {}.", escape(&values_words(case)), escape(&outcome_words(result)))
+    });
+    let tiles: String = counts(sweep)
+        .iter()
+        .take(5)
+        .map(|(name, n)| tile(&format!("{:.1}", 100.0 * *n as f64 / all as f64), "%", name))
+        .collect();
+    let mut head: Vec<String> =
+        sweep.first().map_or(Vec::new(), |(c, _)| c.values.iter().map(|v| escape(&v.0)).collect());
+    head.extend(["Outcome", "Motions", "theta, deg", "f_n, N", "f_t, N", "Friction needed"].map(String::from));
+    let rows: Vec<Vec<String>> = order
+        .iter()
+        .take(SHOWN)
+        .map(|(case, result)| {
+            let mut row: Vec<String> = case.values.iter().map(|v| escape(&v.1)).collect();
+            row.push(escape(&outcome_words(result)));
+            let run = result.as_ref().ok();
+            let last = run.and_then(|r| r.samples.last());
+            let cell = |v: Option<f64>| v.map_or("-".into(), fixed2);
+            row.push(run.map_or("0".into(), |r| r.motions.iter().filter(|m| m.step > 0).count().to_string()));
+            row.push(cell(last.map(|s| s.pose[2].to_degrees())));
+            row.push(cell(last.map(|s| s.normal_force[0].max(s.normal_force[1]))));
+            row.push(cell(last.map(|s| s.tangential_force[0].abs().max(s.tangential_force[1].abs()))));
+            row.push(cell(run.map(|r| r.required_friction)));
             row
         })
         .collect();
     let head: Vec<&str> = head.iter().map(String::as_str).collect();
-    table(&head, &rows)
+    format!(
+        "<section><h2>Ensemble</h2><p class=\"lead\">{held} of {all} runs held throughout. {worst}</p><div class=\"tiles\">{tiles}</div>\
+         <div class=\"plots\">{}{}{}</div><details><summary>The worst {} of {all} runs (all are in sweep.csv)</summary>{}</details></section>",
+        histogram("Object's angle at the end, runs", "degrees", sweep, |r| r
+            .samples
+            .last()
+            .map(|s| s.pose[2].to_degrees())),
+        histogram("Grip at the end, runs", "N", sweep, most),
+        histogram("Friction needed, runs", "coefficient", sweep, |r| Some(r.required_friction)),
+        rows.len(),
+        table(&head, &rows)
+    )
 }
 
 /// What the scene says.

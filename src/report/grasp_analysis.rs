@@ -300,6 +300,45 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
     ))
 }
 
+/// The pinch and the scene's motions, with their joint angles (rad).
+fn postures(scene: &Scene) -> Vec<(usize, [f64; 2])> {
+    let motions = scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target));
+    std::iter::once((0, [0.0; 2])).chain(motions).collect()
+}
+
+/// The first screen: the push with joints fixed, the energy of both models at one posture, rigid against soft tips, and the pinch map.
+fn at_a_glance(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
+    let a = report.analysis;
+    let samples = &a.push.samples;
+    let first = samples.first().map_or(0.0, |s| s.pose[2]);
+    let turn = samples.iter().map(|s| [s.time, (s.pose[2] - first).to_degrees()]).collect();
+    let marks: Vec<(f64, bool)> =
+        report.pushed.pushes.iter().flat_map(|p| [(p.start, false), (p.start + p.duration, false)]).collect();
+    let push = Plot { title: "Turn under the push, degrees", across: "s", marks: &marks }
+        .draw(&[Line::new("theta", 0, false, turn)]);
+    // Where both models have the most of their range in view, of two that have the same the later.
+    let seen = |step: usize| {
+        let of = a.surfaces.iter().filter(|s| s.step == step && s.axis == "y");
+        of.flat_map(|s| &s.energy).filter(|e| e.is_finite()).count()
+    };
+    let step = a.surfaces.iter().map(|s| s.step).max_by_key(|step| seen(*step)).unwrap_or(0);
+    let both: Vec<_> = a.surfaces.iter().filter(|s| s.step == step && s.axis == "y").collect();
+    let largest = both.iter().flat_map(|s| &s.energy).filter(|e| e.is_finite()).fold(1e-12, |l: f64, e| l.max(e.abs()));
+    let mut surfaces = String::new();
+    for s in both {
+        let _ = write!(surfaces, "<div>{}<span>{}</span></div>", surface(s, largest)?, s.model.name());
+    }
+    let name = if step == 0 { "the pinch".into() } else { format!("motion {step}") };
+    Ok(format!(
+        "<section><div class=\"glance\"><article><h3>A push with both joints fixed</h3>{push}<p>The object {}.</p></article>\
+         <article><h3>Energy about {name}</h3><div class=\"surfaces\">{surfaces}</div></article>\
+         <article><h3>Rigid and soft tips</h3>{}</article><article><h3>Which joint angles hold</h3>{}</article></div></section>",
+        escape(&push_words(a, report.scene.object.friction.is_some())),
+        short_freedom_table(&a.freedom),
+        pinch_map(&a.pinch, &postures(report.scene))
+    ))
+}
+
 /// The page.
 ///
 /// # Errors
@@ -324,6 +363,7 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         let _ =
             write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
     }
+    body.push_str(&at_a_glance(report)?);
     if let Some((measurements, fit)) = report.measured {
         body.push_str(&measured(measurements, fit));
     }
@@ -337,16 +377,15 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         body,
         "<section><h2>Energy about the postures</h2><p class=\"lead\">Joints fixed, tips and gravity, less the energy at the \
          posture (the cross). Red is more, blue is less, bands are even in the root; gray is out of the model's range. \
-         Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><h3>Hessians</h3>{}</article>",
+         Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><details><summary>Stationary poses and Hessians of both models, with \
+         friction and without</summary>{}</details></article>",
         stability_table(&a.stability)
     );
     let steps: Vec<usize> = of(a, FingertipModel::Parallel, Hold::Friction).map(|r| r.step).collect();
     for &step in &steps {
         body.push_str(&surface_card(a, step)?);
     }
-    let postures: Vec<(usize, [f64; 2])> = std::iter::once((0, [0.0; 2]))
-        .chain(report.scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target)))
-        .collect();
+    let postures = postures(report.scene);
     let legend: String = PinchState::ALL
         .iter()
         .map(|s| {
