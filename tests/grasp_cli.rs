@@ -258,6 +258,61 @@ fn the_analysis_writes_what_is_promised() {
     assert!(err.contains("not empty"), "{err}");
 }
 
+#[test]
+fn fingers_that_differ_are_read_and_drawn() {
+    let folder = TempDir::new().unwrap();
+    let scene = include_str!("../examples/thumb_and_index.toml");
+    fs::write(folder.path().join("scene.toml"), scene).unwrap();
+    let (out, err) = run(folder.path(), &["grasp", "scene.toml", "-o", "r"], 0);
+    assert!(out.contains("held throughout") && err.is_empty(), "{out}{err}");
+    let summary = json(&folder.path().join("r"), "summary.json");
+    assert_eq!(summary["scene"]["fingertip"]["radius"], 0.013);
+    assert_eq!(summary["scene"]["second"]["fingertip"]["radius"], 0.009);
+    let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
+    assert!(page.contains("13 mm and 9 mm") && page.contains("data-bases=\"[[-26.200,-10.000],[22.200,0.000]]\""));
+    run(folder.path(), &["grasp-analysis", "scene.toml", "-o", "a"], 0);
+    // The same in pairs, as far as they go.
+    let pairs = SCENE.replacen("radius = 0.020", "radius = [0.020, 0.022]", 1).replace("half_span = 0.0485\n", "");
+    fs::write(folder.path().join("pairs.toml"), pairs).unwrap();
+    run(folder.path(), &["grasp", "pairs.toml", "-o", "p"], 0);
+    assert_eq!(json(&folder.path().join("p"), "summary.json")["scene"]["second"]["fingertip"]["radius"], 0.022);
+    // Two joints are for the analysis.
+    let two = scene.replacen("link = 0.045", "links = [0.025, 0.020]", 1);
+    fs::write(folder.path().join("two.toml"), two).unwrap();
+    let (_, err) = run(folder.path(), &["grasp", "two.toml", "-o", "t"], 1);
+    assert!(err.contains("fingers of two joints are not simulated"), "{err}");
+    run(folder.path(), &["grasp-analysis", "two.toml", "-o", "t"], 0);
+    let rows = json(&folder.path().join("t"), "summary.json")["freedom"].as_array().unwrap().clone();
+    assert!(rows.iter().any(|r| r["joints"] == serde_json::json!([2, 1])), "{rows:?}");
+    let refused = |text: String, part: &str| {
+        fs::write(folder.path().join("bad.toml"), text).unwrap();
+        let (_, err) = run(folder.path(), &["grasp", "bad.toml", "-o", "b"], 1);
+        assert!(err.contains("bad.toml") && err.contains(part), "{err}");
+    };
+    refused(scene.replacen("inertia = 2.0e-4\n", "", 1), "one [[finger]] has inertia, the other has not");
+    refused(scene.replacen("link = 0.045", "lnik = 0.045", 1), "did you mean 'link'");
+    refused(format!("{scene}\n[[finger]]\nlink = 0.05\n"), "3 [[finger]] tables");
+    refused(SCENE.replacen("radius = 0.020", "radius = [0.020, 0.022, 0.024]", 1), "[left, right]");
+    refused(SCENE.replacen("youngs_modulus = 2.0e5", "youngs_modulus = 200", 1), "is it in kPa?");
+    refused(SCENE.replacen("radius = 0.020", "radius = 20", 1), "is it in mm?");
+    refused(
+        SCENE.replacen("model = \"parallel\"", "stiffening = 0.002", 1),
+        "fingertip.stiffening is of tabulated tips",
+    );
+}
+
+#[test]
+fn what_is_known_of_the_modulus_is_drawn_as_bands() {
+    let folder = folder(|s| s.replacen("model = ", "youngs_modulus_sd = 2.0e4\nmodel = ", 1));
+    let (out, _) = run(folder.path(), &["grasp", "scene.toml", "-o", "r"], 0);
+    assert!(out.contains("moduli       -10 to +11 %: at the end the object stands at"), "{out}");
+    let bands = fs::read_to_string(folder.path().join("r/bands.csv")).unwrap();
+    assert!(bands.starts_with("time,x_low,x_high,y_low,y_high,theta_low,theta_high,"), "{bands:.100}");
+    assert_eq!(bands.lines().count(), 1252);
+    let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
+    assert!(page.contains("class=\"band c0\"") && page.contains("Shaded: moduli of the tips"));
+}
+
 /// The headline said "held", the page "slipped" and the sweep "completed" of one run.
 #[test]
 fn headline_page_and_summary_of_a_run_agree() {

@@ -551,19 +551,24 @@ fn ensemble(sweep: &[Case]) -> String {
 
 /// What the scene says.
 pub(super) fn scene_table(scene: &Scene) -> String {
-    let (tip, finger, object, i) = (&scene.fingertip, &scene.finger, &scene.object, &scene.integrator);
+    let (tip, gains, object, i) = (&scene.fingertip, &scene.finger.gains, &scene.object, &scene.integrator);
     let mm = |v: f64| format!("{} mm", short(1e3 * v));
+    // One value for fingers that are alike, both for others.
+    let each = |pair: &[String; 2]| if pair[0] == pair[1] { pair[0].clone() } else { pair.join(" and ") };
+    let radii = scene.fingertips().map(|t| mm(t.radius));
+    let moduli = scene.fingertips().map(|t| format!("{} kPa", short(t.youngs_modulus / 1e3)));
+    let links = scene.fingers().map(|f| mm(f.upper.unwrap_or(0.0) + f.link));
+    let times: Vec<String> = tip.branches().iter().map(|b| format!("{} in {} s", short(b[0]), short(b[1]))).collect();
+    let relaxation = if times.is_empty() { "none".into() } else { format!("parts of E: {}", times.join(", ")) };
     let rows = [
-        (
-            "Fingertip",
-            format!("{}, radius {}, E {} kPa", tip.model.name(), mm(tip.radius), short(tip.youngs_modulus / 1e3)),
-        ),
+        ("Fingertip", format!("{}, radius {}, E {}", tip.model.name(), each(&radii), each(&moduli))),
         ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
-        ("Link, half span", format!("{}, {}", mm(finger.link), mm(scene.half_span()))),
+        ("Relaxation", relaxation),
+        ("Link, half span", format!("{}, {}", each(&links), mm(scene.half_span()))),
         ("Object", format!("{} x {}, {} kg", mm(object.width), mm(object.height), short(object.mass))),
         ("Friction", object.friction.map_or("without limit".into(), short)),
         ("First displacement", mm(scene.initial.normal_displacement)),
-        ("Gains", format!("{}, {}, {}", short(finger.gains.kp), short(finger.gains.kd), short(finger.gains.ki))),
+        ("Gains", format!("{}, {}, {}", short(gains.kp), short(gains.kd), short(gains.ki))),
         ("Integrator", format!("{}, {} form, step {} ms", i.method.name(), i.formulation.name(), short(1e3 * i.step))),
     ];
     table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
