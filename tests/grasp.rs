@@ -623,7 +623,6 @@ fn slip_is_found_and_the_run_goes_on() {
     let result = run(&scene);
     assert!(result.completed && result.motions.len() == 9 && result.outcome() == "slip", "{:?}", result.events);
     assert!(result.events.iter().all(|e| e.kind == EventKind::Slip));
-    println!("{:?}", result.events.iter().map(|e| (e.kind, e.finger, e.time, e.until, &e.what)).collect::<Vec<_>>());
     assert!(result.events.iter().any(|e| e.time > 2.0 && e.time < 2.5));
     assert!(result.samples.iter().all(|s| s.required_friction <= 0.5 + 1e-12 && s.friction_margin >= -1e-12));
     scene.object.friction = Some(0.3);
@@ -674,7 +673,6 @@ fn a_fold_that_is_passed_quickly_does_not_end_a_run() {
     let motion = |t: f64, duration: f64, hold: f64| Motion { target: [t.to_radians(); 2], duration, hold };
     scene.motions = vec![motion(-1.0, 0.04, 0.0), motion(3.0, 0.1, 1.0)];
     let result = run(&scene);
-    println!("{:?}", result.events.iter().map(|e| (e.kind, e.time, e.until, &e.what)).collect::<Vec<_>>());
     let least = result.samples.iter().flat_map(|s| s.normal).fold(f64::INFINITY, f64::min);
     assert!(result.completed && result.motions.len() == 3, "{:?}", result.events);
     assert!(least > 1e-4, "{least}");
@@ -1099,9 +1097,6 @@ fn energies_are_minima_for_parallel_tips_and_neutral_or_saddles_for_radial_ones(
     for (step, _, found) in stability::postures(&scene, FingertipModel::Parallel) {
         let at = found.unwrap();
         let rows = stability::rows(&scene, step, &at);
-        for r in &rows {
-            println!("{step} {} {:?} {:?} {:?} {:?}", r.model.name(), r.hold, r.class, r.eigenvalues, r.distance);
-        }
         let row = |model, hold| rows.iter().find(|r| r.model == model && r.hold == hold).unwrap();
         let parallel = row(FingertipModel::Parallel, Hold::Friction);
         assert!(parallel.class == Stability::Minimum && parallel.distance.unwrap() < 1e-9);
@@ -1141,9 +1136,6 @@ fn a_finger_of_two_joints_gives_rigid_tips_what_soft_ones_have_with_one() {
     let table = freedom::table(&Scene::reference());
     let row = |model, joints| table.iter().find(|f| f.model == model && f.joints == joints).unwrap();
     let (rigid, soft) = (FingertipModel::Rigid, FingertipModel::Parallel);
-    for f in &table {
-        println!("{f:?} {} {}", f.controls(), f.torque_controls());
-    }
     // One more joint is one more freedom, whatever the tips.
     for (_, model) in FingertipModel::ALL {
         assert_eq!(row(model, [1, 2]).freedom, row(model, [1, 1]).freedom + 1, "{}", model.name());

@@ -71,9 +71,14 @@ fn own_growth<const N: usize, S: Form<N>>(system: &S, phase: &Phase, h: f64, sta
     None
 }
 
+/// Largest part of the motion's own exponent, up to 1 in a step, by which a step's may differ and
+/// still follow it: both methods are at least of first order, so that they differ by less than half
+/// of it.
+const FOLLOWS: f64 = 0.5;
+
 /// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp
-/// itself is unstable (by its control, say) and the step follows that growth to 2 %, the step is
-/// not to blame, and 1 is given back.
+/// itself is unstable (an object that falls, or by its control) and the step follows that growth,
+/// the step is not to blame, and 1 is given back.
 pub fn growth_of<const N: usize, S: Form<N>>(
     method: Method,
     system: &S,
@@ -90,7 +95,8 @@ pub fn growth_of<const N: usize, S: Form<N>>(
         return found;
     }
     match own_growth(system, phase, h, state) {
-        Some(own) if found <= 1.02 * own && own.is_finite() => 1.0,
+        Some(own) if own.is_finite() && found <= 1.02 * own => 1.0,
+        Some(own) if own.ln() <= 1.0 && (found.ln() - own.ln()).abs() <= FOLLOWS * own.ln() => 1.0,
         _ => found,
     }
 }
