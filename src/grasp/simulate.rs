@@ -209,6 +209,8 @@ struct Run<'a, const N: usize, S: Form<N>> {
     origin: [f64; 2],
     /// Events that go on, by place in [`LASTING`] and tip, with the origin of d_t when they began.
     open: [[Option<(usize, f64)>; 2]; 2],
+    /// The last that was over of each, with the length of its words before their end was added.
+    over: [[Option<(usize, f64, usize)>; 2]; 2],
     /// The fold that goes on.
     fold: Option<usize>,
     /// Whether the tips have slid since the branch was told.
@@ -252,6 +254,16 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
     fn look_closely(&mut self, phase: &Phase, t: f64, reading: &Reading, state: &[f64; N]) -> Verdict {
         let found = self.watch.findings(reading);
         for (k, i, what) in found.begins {
+            // After less than a sample's time it is the same one that goes on: a tip that creeps to
+            // rest sticks and slides with each swing of the object.
+            let pause = self.scene.integrator.output_every;
+            let last = self.over[k][i].filter(|o| self.result.events[o.0].until.is_some_and(|u| t - u <= pause));
+            if let Some((at, origin, words)) = last {
+                self.result.events[at].until = None;
+                self.result.events[at].what.truncate(words);
+                self.open[k][i] = Some((at, origin));
+                continue;
+            }
             if self.result.events.len() < MOST_EVENTS {
                 let origin = self.system.plant().geometry.origin[i];
                 self.open[k][i] = Some((self.result.events.len(), origin));
@@ -279,6 +291,7 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
         let Some((at, origin)) = self.open[k][i].take() else { return };
         let event = &mut self.result.events[at];
         event.until = until;
+        self.over[k][i] = Some((at, origin, event.what.len()));
         if event.kind == EventKind::Slip {
             event.what += &if self.watch.friction.slides {
                 format!("; slides by {:.3} mm", 1e3 * (self.system.plant().geometry.origin[i] - origin).abs())
@@ -516,6 +529,7 @@ fn run<const N: usize, S: Form<N>>(
         result,
         trial: step,
         open: [[None; 2]; 2],
+        over: [[None; 2]; 2],
         fold: None,
         moved: false,
         start,
