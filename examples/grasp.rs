@@ -36,6 +36,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         run: &outcome.run,
         without_tangential: without.as_ref(),
         stable_steps: &outcome.stable_steps,
+        bands: outcome.bands.as_ref(),
         sweep: &[],
         seconds: &outcome.seconds,
         warnings: &[],

@@ -198,6 +198,12 @@ pub enum IoError {
     },
 }
 
+/// A number above 0 to three digits, rounded down: advice must hold when it is followed.
+pub fn below(v: f64) -> String {
+    let unit = 10f64.powi(v.log10().floor() as i32 - 2);
+    format!("{:.2e}", (v / unit).floor() * unit)
+}
+
 /// What to try when the operating system refuses.
 fn os_hint(error: &std::io::Error) -> &'static str {
     use std::io::ErrorKind;
@@ -515,6 +521,26 @@ pub enum SceneError {
     /// Motions of joints that are locked.
     #[error("finger.fixed is true, but there are motions; remove the [[motion]] tables or set fixed = false")]
     FixedMotion,
+    /// Maxwell branches where there is no spring beside them, or in the multiplier form.
+    #[error(
+        "fingertip.maxwell needs soft tips and the minimal form; leave it out, or change fingertip.model or \
+         integrator.formulation"
+    )]
+    Relaxing,
+    /// Stiffening of tips of one modulus.
+    #[error(
+        "fingertip.stiffening is of tabulated tips, and these are {model}; give model = \"tabulated\" or leave it out"
+    )]
+    Stiffening {
+        /// The model of the scene.
+        model: &'static str,
+    },
+    /// Fingers of two joints that should move.
+    #[error(
+        "fingers of two joints are not simulated; leave finger.links out and give finger.link, or look at them with \
+         `palpate grasp-analysis`"
+    )]
+    TwoJoints,
     /// Rigid tips and locked joints.
     #[error("rigid tips and fixed joints leave nothing to move; choose another fingertip.model or set fixed = false")]
     NothingMoves,
@@ -583,7 +609,7 @@ pub enum GraspError {
     /// The step is too long from the start.
     #[error(
         "at time 0, a step of {step} s grows {growth:.3}-fold each time it is taken ({method}); \
-         take integrator.step at or under {stable:.2e} s"
+         take integrator.step at or under {} s", below(*stable)
     )]
     BadStep {
         /// The step (s).
@@ -598,7 +624,7 @@ pub enum GraspError {
     /// The gain of the constraint stabilisation is too high for the step.
     #[error(
         "at time 0, a Baumgarte gain of {gain} 1/s is too high for a step of {step} s (growth {growth:.3} a step); \
-         take integrator.baumgarte at or under {stable:.0} 1/s, or a shorter step"
+         take integrator.baumgarte at or under {} 1/s, or a shorter step", stable.floor()
     )]
     BadGain {
         /// The gain (1/s).

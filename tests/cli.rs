@@ -530,8 +530,10 @@ fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     assert!((-softer..stiffer).contains(&row("finite elements")[2]), "{:?}", row("finite elements"));
     let [turn, exact, _] = row("turn");
     assert!((turn - exact).abs() < 0.5, "{turn} degrees, not {exact}");
-    assert_eq!(row("held to the end")[0], 1.0);
-    assert_eq!(fs::read_to_string(demo.join("chain.csv")).unwrap().lines().count(), 9);
+    assert_eq!(row("held throughout")[0], 1.0);
+    // Of the map alone, without the force of the press, which is the truth's: as far off as that.
+    assert!(row("grip force")[2].abs() < 0.4, "{:?}", row("grip force"));
+    assert_eq!(fs::read_to_string(demo.join("chain.csv")).unwrap().lines().count(), 11);
     let page = fs::read_to_string(demo.join("report.html")).unwrap();
     assert!(page.matches("srcdoc").count() == 3 && page.contains("<svg"));
     // Again into the same folder it may; into one that holds something else it may not.

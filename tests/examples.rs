@@ -30,11 +30,23 @@ fn every_example_has_a_test() {
         .map(|e| e.unwrap().path().file_stem().unwrap().to_string_lossy().into_owned())
         .collect();
     names.sort();
-    // The cohort is run by tests/python/test_cohort.py.
-    assert_eq!(
-        names,
-        ["cohort", "eight_motions", "finger_pad", "grasp", "own_pair", "seed", "sequence", "skin", "stability_map"]
-    );
+    // The cohort is run by tests/python/test_cohort.py, scenes and tables of the grasp by
+    // tests/grasp.rs, grasp_cli.rs and grasp_measured.rs.
+    let known = [
+        "cohort",
+        "eight_motions",
+        "finger_pad",
+        "grasp",
+        "human_fingertip",
+        "own_pair",
+        "seed",
+        "sequence",
+        "skin",
+        "stability_map",
+        "synthetic_presses",
+        "thumb_and_index",
+    ];
+    assert_eq!(names, known);
 }
 
 #[test]

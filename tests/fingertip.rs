@@ -108,6 +108,59 @@ fn unlike_springs_on_a_hemisphere_give_the_pads_force() {
     assert!(out.profile[0][1] > 3.0 * out.profile.last().unwrap()[1], "{:?}", out.profile);
 }
 
+/// Springs at the first contact were as stiff or as soft as the surface's steps of a voxel made the
+/// first forces.
+#[test]
+fn the_profile_of_a_uniform_hemisphere_is_level_from_the_first_contact() {
+    // What is left is half a voxel at the foremost place: of a press of 3 mm a twelfth, a twentieth
+    // and a thirtieth.
+    for (spacing, most) in [(0.5, 0.7), (0.3, 0.2), (0.2, 0.3)] {
+        let (radius, n) = (10.0, (24.0 / spacing) as usize);
+        let inside =
+            |p: [f64; 3]| (p[0] - 12.0).powi(2) + (p[1] - 12.0).powi(2) + (p[2] - 11.0).powi(2) < radius * radius;
+        let map = pad([n, n, n / 2], spacing, 11.0, |p| if inside(p) { 40.0 } else { 0.0 });
+        let profile = run(&map, bone(&map), [0.0, 0.0, -1.0], Some(3.0)).unwrap().pad.profile;
+        assert!(profile.iter().all(|p| (p[1] / 40.0 - 1.0).abs() < most), "{spacing}: {profile:?}");
+        assert_eq!(profile[0][1], profile[1][1]);
+    }
+}
+
+#[test]
+fn deviations_of_tissue_reach_the_tip() {
+    // Skin of 80 kPa over pulp of 20: in series, so that the pulp decides.
+    let map = pad([20, 20, 20], 0.5, 8.0, |p| if p[2] < 2.0 { 80.0 } else { 20.0 });
+    let known = |name: &str, youngs_modulus: f64, sd: f64| StiffnessRegion {
+        name: name.into(),
+        youngs_modulus,
+        bound: None,
+        sd,
+    };
+    let mut folder = StiffnessFolder {
+        map,
+        absolute: true,
+        poisson: 0.49,
+        regions: vec![known("skin", 80.0, 0.0), known("pulp", 20.0, 2.0), known("bone", 15_000.0, 0.0)],
+        load: "z-".into(),
+        held: "z+".into(),
+        force_n: None,
+        travel_mm: Some(1.0),
+        translation: [[0.0; 3]; 2],
+    };
+    let tip = |folder: &StiffnessFolder| of_map(folder, 0, &|_, _| ()).unwrap().pad;
+    // Compliance 2 / 80 + 6 / 20: ten per cent of the pulp's are 0.3 / 0.325 of that.
+    let found = tip(&folder).deviation;
+    assert!((found - 0.1 * 0.3 / 0.325).abs() < 0.003, "{found}");
+    // Scaled to a measured force, what is left is that of the press.
+    folder.force_n = Some(0.5);
+    let found = tip(&folder).deviation;
+    assert!((found - 0.03).abs() < 0.005, "{found}");
+    // Of skin that is only a bound the tip has bounds: at most as if the skin were rigid.
+    folder.force_n = None;
+    folder.regions[0].bound = Some("lower".into());
+    let [low, high] = tip(&folder).bounds.unwrap();
+    assert!((low - 1.0).abs() < 1e-9 && (high - 0.325 / 0.3).abs() < 0.01, "{low} {high}");
+}
+
 #[test]
 fn what_is_no_pad_is_refused() {
     let map = pad([20, 20, 20], 0.5, 100.0, |_| 20.0);
@@ -173,8 +226,13 @@ fn a_pad_becomes_a_tip_that_a_grasp_reads() {
 /// A map as `palpate stiffness` leaves it: tissue of `modulus` by position (mm) under bone from z =
 /// `top` up, pressed from z-.
 fn pad_folder(map: Volume, poisson: f64, travel: f64, force: Option<f64>) -> StiffnessFolder {
-    let known =
-        |name: &str, youngs_modulus| StiffnessRegion { name: name.into(), youngs_modulus, bound: None, poisson: None };
+    let known = |name: &str, youngs_modulus| StiffnessRegion {
+        name: name.into(),
+        youngs_modulus,
+        bound: None,
+        sd: 0.0,
+        poisson: None,
+    };
     StiffnessFolder {
         map,
         absolute: true,
@@ -224,7 +282,7 @@ fn elements_of_a_finger_pad_press_as_the_phantom_does() {
     let half = 0.5 * body.initial.grid().least_spacing();
     let mut folder = pad_folder(map, told.poisson, 1.5 + half, Some(told.force_n));
     folder.regions =
-        vec![StiffnessRegion { name: "bone".into(), youngs_modulus: 15_000.0, bound: None, poisson: None }];
+        vec![StiffnessRegion { name: "bone".into(), youngs_modulus: 15_000.0, bound: None, sd: 0.0, poisson: None }];
     let out = of_map(&folder, 2000, &|_, _| ()).unwrap();
     let plate = out.pad.plate.as_ref().unwrap();
     let [low, high] = [1.5 - half, 1.5 + half].map(|d| plate.at(d).unwrap());
@@ -234,8 +292,13 @@ fn elements_of_a_finger_pad_press_as_the_phantom_does() {
     // Bone that is known by a low bound only is a back plate all the same.
     let soft = Volume::from_voxels(*body.initial.grid(), |o, _| if values[o] > 1000.0 { 23.0 } else { values[o] });
     folder.map = soft;
-    folder.regions[0] =
-        StiffnessRegion { name: "bone".into(), youngs_modulus: 23.0, bound: Some("lower".into()), poisson: None };
+    folder.regions[0] = StiffnessRegion {
+        name: "bone".into(),
+        youngs_modulus: 23.0,
+        bound: Some("lower".into()),
+        sd: 0.0,
+        poisson: None,
+    };
     let again = of_map(&folder, 2000, &|_, _| ()).unwrap();
     assert_eq!(again.pad.plate.unwrap().curve, plate.curve);
 }

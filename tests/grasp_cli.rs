@@ -43,15 +43,18 @@ fn the_reference_scene_writes_what_is_promised() {
     let results = folder.path().join("results");
     let trajectory = fs::read_to_string(results.join("trajectory.csv")).unwrap();
     let mut lines = trajectory.lines();
-    assert_eq!(lines.next().unwrap(), "time,x,y,theta,theta1,theta2,dn1,dn2,dt1,dt2,fn1,fn2,ft1,ft2");
+    assert_eq!(
+        lines.next().unwrap(),
+        "time,x,y,theta,theta1,theta2,dn1,dn2,dt1,dt2,fn1,fn2,ft1,ft2,required_friction,friction_margin,slip1,slip2"
+    );
     assert_eq!(lines.clone().count(), 1251);
     assert!(lines.all(|l| l.split(',').all(|v| v.parse::<f64>().unwrap().is_finite())));
     let motions = fs::read_to_string(results.join("motions.csv")).unwrap();
-    assert!(motions.starts_with("step,theta1_deg,theta2_deg,x,y,theta_deg,dn1,dn2,dt1,dt2,fn1,fn2\n0,0,0,"));
+    assert!(motions.starts_with("step,theta1_deg,theta2_deg,x,y,theta_deg,dn1,dn2,dt1,dt2,fn1,fn2,ft1,ft2,required_friction,friction_margin\n0,0,0,"));
     assert_eq!(motions.lines().count(), 10);
     assert!(motions.lines().nth(3).unwrap().starts_with("2,20,-10,"), "{motions}");
     let summary = json(&results, "summary.json");
-    assert_eq!(summary["completed"], true);
+    assert_eq!((&summary["completed"], &summary["outcome"]), (&true.into(), &"held".into()));
     assert_eq!(summary["events"], serde_json::json!([]));
     assert_eq!(summary["constraint_drift"]["normal"], 0.0);
     assert!(summary["energy_drift"].as_f64().unwrap() < 1e-6);
@@ -84,10 +87,10 @@ fn flags_replace_what_the_scene_says() {
     let event = &summary["events"][0];
     assert_eq!((&event["kind"], &event["finger"]), (&"validity-range".into(), &2.into()));
     assert!(event["time"].as_f64().unwrap() > 9.5);
-    assert_eq!(summary["completed"], false);
-    assert_eq!(summary["motions_finished"], 6);
+    assert_eq!((&summary["completed"], &summary["outcome"]), (&true.into(), &"validity-range".into()));
+    assert_eq!(summary["motions_finished"], 8);
     let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
-    assert!(page.contains("ended early") && page.contains("validity-range of finger 2"));
+    assert!(page.contains("out of range") && page.contains("validity-range of finger 2"));
 }
 
 #[test]
@@ -163,7 +166,7 @@ fn the_fold_of_a_narrow_object_is_named() {
     let narrow = |s: &str| s.replace("width = 0.060", "width = 0.050").replace("half_span = 0.0485\n", "");
     let folder = folder(narrow);
     let (out, err) = run(folder.path(), &["grasp", "scene.toml", "-o", "r"], 0);
-    assert!(out.contains("6 of 8 motions") && out.contains("fold: the branch of equilibria ends at"), "{out}");
+    assert!(out.contains("fold: the branch of equilibria ends at"), "{out}");
     assert!(err.contains("warning: scene.toml:") && err.contains("fold"), "{err}");
     let summary = json(&folder.path().join("r"), "summary.json");
     assert_eq!(summary["events"][0]["kind"], "fold");
@@ -207,7 +210,7 @@ fn an_ensemble_runs_every_combination_and_is_the_same_for_any_number_of_threads(
                  values = [\"parallel\", \"radial\"]\n\n[[sweep]]\nkey = \"motion.1.theta\"\nvalues = [[20, -10], [10, -5], [0, 0]]\n";
     let folder = folder(|s| format!("{s}{sweep}"));
     let (out, _) = run(folder.path(), &["grasp", "scene.toml", "-o", "one", "--threads", "1", "--quiet"], 0);
-    assert!(out.contains("12 scenes, 6 ran to their end"), "{out}");
+    assert!(out.contains("12 scenes, 12 ran to their end"), "{out}");
     run(folder.path(), &["grasp", "scene.toml", "-o", "two", "--threads", "2", "--quiet"], 0);
     for name in ["trajectory.csv", "motions.csv", "sweep.csv"] {
         let read = |r: &str| fs::read_to_string(folder.path().join(r).join(name)).unwrap();
@@ -235,7 +238,7 @@ fn the_analysis_writes_what_is_promised() {
     let results = folder.path().join("r");
     let rows = |name: &str| fs::read_to_string(results.join(name)).unwrap();
     assert_eq!(rows("pinch_map.csv").lines().count(), 61 * 61 + 1);
-    assert_eq!(rows("stability.csv").lines().count(), 2 * 9 + 1);
+    assert_eq!(rows("stability.csv").lines().count(), 6 * 9 + 1);
     assert_eq!(rows("energy.csv").lines().count(), 9 * 4 * 41 * 41 + 1);
     assert!(rows("posture_force.csv").starts_with("d,tilt_deg,parallel_n,radial_n\n0,-40,0,0\n"));
     assert!(rows("push.csv").starts_with("time,x,y,theta,"));
@@ -256,6 +259,105 @@ fn the_analysis_writes_what_is_promised() {
 }
 
 #[test]
+fn fingers_that_differ_are_read_and_drawn() {
+    let folder = TempDir::new().unwrap();
+    let scene = include_str!("../examples/thumb_and_index.toml");
+    fs::write(folder.path().join("scene.toml"), scene).unwrap();
+    let (out, err) = run(folder.path(), &["grasp", "scene.toml", "-o", "r"], 0);
+    assert!(out.contains("held throughout") && err.is_empty(), "{out}{err}");
+    let summary = json(&folder.path().join("r"), "summary.json");
+    assert_eq!(summary["scene"]["fingertip"]["radius"], 0.013);
+    assert_eq!(summary["scene"]["second"]["fingertip"]["radius"], 0.009);
+    let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
+    assert!(page.contains("13 mm and 9 mm") && page.contains("data-bases=\"[[-26.200,-10.000],[22.200,0.000]]\""));
+    run(folder.path(), &["grasp-analysis", "scene.toml", "-o", "a"], 0);
+    // The same in pairs, as far as they go.
+    let pairs = SCENE.replacen("radius = 0.020", "radius = [0.020, 0.022]", 1).replace("half_span = 0.0485\n", "");
+    fs::write(folder.path().join("pairs.toml"), pairs).unwrap();
+    run(folder.path(), &["grasp", "pairs.toml", "-o", "p"], 0);
+    assert_eq!(json(&folder.path().join("p"), "summary.json")["scene"]["second"]["fingertip"]["radius"], 0.022);
+    // Two joints are for the analysis.
+    let two = scene.replacen("link = 0.045", "links = [0.025, 0.020]", 1);
+    fs::write(folder.path().join("two.toml"), two).unwrap();
+    let (_, err) = run(folder.path(), &["grasp", "two.toml", "-o", "t"], 1);
+    assert!(err.contains("fingers of two joints are not simulated"), "{err}");
+    run(folder.path(), &["grasp-analysis", "two.toml", "-o", "t"], 0);
+    let rows = json(&folder.path().join("t"), "summary.json")["freedom"].as_array().unwrap().clone();
+    assert!(rows.iter().any(|r| r["joints"] == serde_json::json!([2, 1])), "{rows:?}");
+    let refused = |text: String, part: &str| {
+        fs::write(folder.path().join("bad.toml"), text).unwrap();
+        let (_, err) = run(folder.path(), &["grasp", "bad.toml", "-o", "b"], 1);
+        assert!(err.contains("bad.toml") && err.contains(part), "{err}");
+    };
+    refused(scene.replacen("inertia = 2.0e-4\n", "", 1), "one [[finger]] has inertia, the other has not");
+    refused(scene.replacen("link = 0.045", "lnik = 0.045", 1), "did you mean 'link'");
+    refused(format!("{scene}\n[[finger]]\nlink = 0.05\n"), "3 [[finger]] tables");
+    refused(SCENE.replacen("radius = 0.020", "radius = [0.020, 0.022, 0.024]", 1), "[left, right]");
+    refused(SCENE.replacen("youngs_modulus = 2.0e5", "youngs_modulus = 200", 1), "is it in kPa?");
+    refused(SCENE.replacen("radius = 0.020", "radius = 20", 1), "is it in mm?");
+    refused(
+        SCENE.replacen("model = \"parallel\"", "stiffening = 0.002", 1),
+        "fingertip.stiffening is of tabulated tips",
+    );
+}
+
+#[test]
+fn what_is_known_of_the_modulus_is_drawn_as_bands() {
+    let folder = folder(|s| s.replacen("model = ", "youngs_modulus_sd = 2.0e4\nmodel = ", 1));
+    let (out, _) = run(folder.path(), &["grasp", "scene.toml", "-o", "r"], 0);
+    assert!(out.contains("moduli       -10 to +11 %: at the end the object stands at"), "{out}");
+    let bands = fs::read_to_string(folder.path().join("r/bands.csv")).unwrap();
+    assert!(bands.starts_with("time,x_low,x_high,y_low,y_high,theta_low,theta_high,"), "{bands:.100}");
+    assert_eq!(bands.lines().count(), 1252);
+    let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
+    assert!(page.contains("class=\"band c0\"") && page.contains("Shaded: moduli of the tips"));
+}
+
+/// The headline said "held", the page "slipped" and the sweep "completed" of one run.
+#[test]
+fn headline_page_and_summary_of_a_run_agree() {
+    for (friction, outcome, words) in [
+        ("0.5", "slip", "the grasp slipped: tips slid"),
+        ("0.2", "contact-loss", "then the run ended"),
+        ("5.0", "held", "held throughout"),
+    ] {
+        let folder = folder(|s| s.replace("friction = 1.0", &format!("friction = {friction}")));
+        let (out, _) = run(folder.path(), &["grasp", "scene.toml", "-o", "r", "--quiet"], 0);
+        assert!(out.lines().next().unwrap().contains(words), "{out}");
+        let summary = json(&folder.path().join("r"), "summary.json");
+        assert_eq!(summary["outcome"], outcome);
+        assert_eq!(summary["completed"], outcome != "contact-loss");
+        let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
+        let chip = match outcome {
+            "slip" => "<b>slipped</b>",
+            "held" => "<b>held</b>",
+            _ => "<b>ended early</b>",
+        };
+        assert!(page.contains(chip) && page.contains(words), "{outcome}");
+    }
+}
+
+#[test]
+fn measurements_are_weighed_between_the_models() {
+    let folder = folder(str::to_string);
+    fs::write(folder.path().join("m.csv"), include_str!("../examples/synthetic_presses.csv")).unwrap();
+    let (out, _) = run(folder.path(), &["grasp-analysis", "scene.toml", "--measured", "m.csv", "-o", "r"], 0);
+    assert!(out.contains("the measurements are for parallel over"), "{out}");
+    let summary = json(&folder.path().join("r"), "summary.json");
+    let best = &summary["measured"]["models"][0];
+    assert_eq!(best["model"], "parallel");
+    assert!((best["youngs_modulus"]["value"].as_f64().unwrap() - 2e5).abs() < 1e4);
+    let table = fs::read_to_string(folder.path().join("r/measured.csv")).unwrap();
+    assert!(table.starts_with("d,tilt_deg,force,force_parallel,"), "{table:.100}");
+    assert_eq!(table.lines().count(), 85);
+    let page = fs::read_to_string(folder.path().join("r/report.html")).unwrap();
+    assert!(page.contains("<h2>Measured</h2>") && !page.contains("NaN"));
+    fs::write(folder.path().join("m.csv"), "d,force\n1,2\n").unwrap();
+    let (_, err) = run(folder.path(), &["grasp-analysis", "scene.toml", "--measured", "m.csv", "-o", "q"], 1);
+    assert!(err.contains("m.csv") && err.contains("no column \"tilt_deg\""), "{err}");
+}
+
+#[test]
 fn a_scene_that_would_be_overwritten() {
     let folder = folder(str::to_string);
     fs::rename(folder.path().join("scene.toml"), folder.path().join("report.html")).unwrap();
@@ -269,13 +371,14 @@ fn a_scene_that_would_be_overwritten() {
 fn a_sweep_says_what_slipped_and_does_not_fight_with_flags() {
     let folder = folder(|s| format!("{s}\n[[sweep]]\nkey = \"object.friction\"\nvalues = [0.1, 5.0]\n"));
     let (out, _) = run(folder.path(), &["grasp", "scene.toml", "-o", "one"], 0);
-    assert!(out.contains("2 scenes, 2 ran to their end, 1 of them with slip"), "{out}");
+    assert!(out.contains("2 scenes, 1 ran to their end, 0 of them with slip; 1 held throughout"), "{out}");
     let table = fs::read_to_string(folder.path().join("one/sweep.csv")).unwrap();
     let outcome = |case: &str| {
         let mut rows = table.lines().filter(|l| l.starts_with(case));
         rows.next().unwrap().split(',').nth(2).unwrap().to_string()
     };
-    assert_eq!([outcome("1,"), outcome("2,")], ["slip", "completed"]);
+    assert_eq!([outcome("1,"), outcome("2,")], ["contact-loss", "completed"]);
+    assert!(table.lines().next().unwrap().ends_with(",friction_margin,largest_required_friction"), "{table}");
     let models = "\n[[sweep]]\nkey = \"fingertip.model\"\nvalues = [\"parallel\", \"radial\"]\n";
     fs::write(folder.path().join("scene.toml"), format!("{SCENE}{models}")).unwrap();
     let (_, err) = run(folder.path(), &["grasp", "scene.toml", "-o", "two", "--model", "radial"], 1);

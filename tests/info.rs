@@ -133,6 +133,7 @@ fn each_file_of_the_whole_chain_is_named() {
         ("d/stiffness/summary.json", "summary of palpate stiffness"),
         ("d/stiffness/report.html", "page, for a browser"),
         ("d/grasp/trajectory.csv", "trajectory of a grasp"),
+        ("d/grasp/bands.csv", "bands of a grasp"),
         ("d/grasp/motions.csv", "motions of a grasp"),
         ("d/grasp/summary.json", "summary of palpate grasp"),
         ("d/grasp/report.html", "page, for a browser"),
@@ -152,7 +153,8 @@ fn each_file_of_the_other_commands_is_named() {
     let scenes = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples");
     let scene = |name: &str| scenes.join(name).to_str().unwrap().to_string();
     run(folder, &["skin", &scene("skin.toml"), "-o", "skin"], 0);
-    run(folder, &["grasp-analysis", &scene("eight_motions.toml"), "-o", "a"], 0);
+    let presses = scene("synthetic_presses.csv");
+    run(folder, &["grasp-analysis", &scene("eight_motions.toml"), "--measured", &presses, "-o", "a"], 0);
     run(folder, &["stress", "--quick", "--part", "field", "--axis", "no-overlap", "-o", "stress"], 0);
     run(folder, &["chart", "--quick", "--part", "grasp", "-o", "chart"], 0);
     run(folder, &["phantom", "pinch", "--size", "24", "--frames", "3", "-o", "pinch"], 0);
@@ -173,6 +175,7 @@ fn each_file_of_the_other_commands_is_named() {
         ("a/stability.csv", "stability of a grasp"),
         ("a/pinch_map.csv", "pinch map of a grasp"),
         ("a/push.csv", "trajectory of a grasp"),
+        ("a/measured.csv", "measurements beside tip models"),
         ("a/summary.json", "summary of palpate grasp-analysis"),
         ("a/report.html", "page, for a browser"),
         ("stress", "results of palpate stress"),

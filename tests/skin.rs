@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::io;
+use palpate::pipeline;
 use palpate::skin::{block, column};
 use palpate::types::skin::{ElementKind, Layer, SkinBlock, SkinLoad, SkinSample, SkinScene};
 use std::fs;
@@ -229,6 +230,61 @@ fn the_block_does_not_lock() {
     };
     let (soft, firm) = (stress(0.49), stress(0.4999));
     assert!(firm > soft && firm < 1.15 * soft, "{soft} {firm}");
+}
+
+/// Stacks of unlike elements had no layer to stand beside.
+#[test]
+fn every_mix_of_elements_has_one_layer_beside_it() {
+    let kinds = [
+        layer(ElementKind::KelvinVoigt, 1e-3, 2e4, 5e3, &[]),
+        layer(ElementKind::StandardLinearSolid, 1.5e-3, 3e4, 0.0, &[[5e4, 2e4]]),
+        layer(ElementKind::StandardLinearSolid, 1e-3, 1e4, 400.0, &[[2e4, 4e3]]),
+        layer(ElementKind::ThreeElement, 2e-3, 0.0, 2e3, &[[4e4, 2e5]]),
+        layer(ElementKind::FiveElement, 1e-3, 0.0, 3e3, &[[2e5, 3e3], [3e4, 3e5]]),
+    ];
+    for a in 0..kinds.len() {
+        for b in 0..kinds.len() {
+            let mut layers = vec![kinds[a].clone(), kinds[b].clone()];
+            layers[1].name = "b".into();
+            let s = scene(layers);
+            let outcome = pipeline::skin::run(&s);
+            let (one, response) = outcome.single.as_ref().unwrap();
+            one.check().unwrap();
+            assert_eq!(response.len(), outcome.column.len());
+            let top = outcome.column.iter().map(|p| p.stress).fold(0.0, f64::max);
+            let last = |r: &[SkinSample]| r.last().unwrap().displacement / s.load.displacement;
+            let off = (last(response) - last(&outcome.column)).abs();
+            let stress = response.iter().zip(&outcome.column).map(|(p, q)| (p.stress - q.stress).abs() / top);
+            println!("{a} {b}: depth {off:.3}, stress {:.3}", stress.clone().fold(0.0, f64::max));
+            // Fitted ones come near; means of parts do where layers are alike.
+            if s.without_layers().is_none() {
+                assert!(off < 0.1, "{a} {b}: {off}");
+            }
+            // A layer that flows lets the stack flow.
+            let flows = s.layers.iter().any(|l| l.e0 == 0.0);
+            assert_eq!(one.layers[0].e0 == 0.0, flows);
+        }
+    }
+}
+
+/// Numbers that are none were printed.
+#[test]
+fn nothing_that_is_no_number_is_printed() {
+    for change in [
+        ("c0 = 200.0", "c0 = 1.0e-6"),
+        ("end = 41.0", "end = 1.0e9"),
+        ("c0 = 400.0", "c0 = 1.0e12"),
+        ("hold = 10.0", "hold = 0.0"),
+    ] {
+        assert!(SCENE.contains(change.0));
+        let (out, err, folder) = run(&SCENE.replacen(change.0, change.1, 1), 0);
+        let results = folder.path().join("out");
+        let files =
+            ["response.csv", "summary.json", "report.html"].map(|f| fs::read_to_string(results.join(f)).unwrap());
+        for text in files.iter().chain([&out, &err]) {
+            assert!(!text.contains("NaN") && !text.contains("inf "), "{change:?}: {out}{err}");
+        }
+    }
 }
 
 fn run(text: &str, code: i32) -> (String, String, TempDir) {

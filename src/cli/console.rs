@@ -7,7 +7,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
-
 /// What was typed, and how much to say. What is said cannot steer a terminal, whatever names and
 /// files hold.
 #[derive(Debug, Clone)]

@@ -60,7 +60,7 @@ pub fn check_inputs(path: &Path, file: &SceneFile, target: &Target, names: &[&st
 pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { scene: path, target, choices } = options;
     let file = choices.read(path)?;
-    let names = ["trajectory.csv", "motions.csv", "sweep.csv", "summary.json", "report.html"];
+    let names = ["trajectory.csv", "bands.csv", "motions.csv", "sweep.csv", "summary.json", "report.html"];
     check_inputs(path, &file, target, &names)?;
     let mut folder = target.create()?;
     let inputs = record::inputs(&[("scene", Some(path)), ("fingertip", file.fingertip_file.as_ref())]);
@@ -84,6 +84,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let events = run.events.iter().take(8).map(grasp::event_line);
     let warnings: Vec<String> = events.chain(notes.iter().cloned()).map(|w| format!("{name}: {w}")).collect();
     folder.write("trajectory.csv", |p| io::write_trajectory(p, &run.samples))?;
+    if let Some(bands) = &outcome.bands {
+        folder.write("bands.csv", |p| io::write_bands(p, bands))?;
+    }
     folder.write("motions.csv", |p| io::write_motions(p, &run.motions))?;
     if !file.sweep.is_empty() {
         folder.write("sweep.csv", |p| io::write_sweep(p, &file.sweep, &results))?;
@@ -97,6 +100,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         run,
         without_tangential: without.as_ref(),
         stable_steps: &outcome.stable_steps,
+        bands: outcome.bands.as_ref(),
         sweep: &sweep,
         seconds: &seconds,
         warnings: &notes,

@@ -35,7 +35,7 @@ pub fn image(description: &str) -> Option<&'static str> {
 }
 
 /// What a table is, columns that no other kind has all of, and a command that takes it.
-const TABLES: [(&str, &[&str], &str); 21] = [
+const TABLES: [(&str, &[&str], &str); 26] = [
     ("trajectories of tracked points", &["point", "frame", "x", "y", "z", "sigma"], ""),
     ("strain of regions over time", &["frame", "label", "mean_e1", "volume_change"], ""),
     ("strain of regions", &["label", "component", "mean", "mean_sd"], ""),
@@ -49,6 +49,19 @@ const TABLES: [(&str, &[&str], &str); 21] = [
     ("runs of palpate chart", &["part", "varied", "method", "cpu_s"], ""),
     ("runs of palpate stress", &["part", "axis", "severity", "broken"], ""),
     ("errors of palpate demo", &["stage", "quantity", "found", "truth"], ""),
+    ("bands of a grasp", &["time", "x_low", "x_high", "theta_low"], ""),
+    ("measurements beside tip models", &["d", "tilt_deg", "force", "force_parallel-normal"], ""),
+    ("measurements beside tip models", &["time", "theta1_deg", "theta_deg", "theta_deg_parallel"], ""),
+    (
+        "presses of a fingertip",
+        &["d", "tilt_deg", "force"],
+        "palpate grasp-analysis SCENE.toml --measured FILE -o analysis",
+    ),
+    (
+        "course of a grasp",
+        &["time", "theta1_deg", "theta2_deg", "x", "y", "theta_deg"],
+        "palpate grasp-analysis SCENE.toml --measured FILE -o analysis",
+    ),
     ("sweep of a grasp", &["case", "outcome", "time"], ""),
     ("stability of a grasp", &["step", "model", "lambda1", "class"], ""),
     ("energy of a grasp", &["step", "model", "axis", "energy"], ""),

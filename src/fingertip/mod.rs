@@ -117,17 +117,20 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
         [_, r, _] if r <= ENOUGH => PadModel::Layered,
         _ => PadModel::Map,
     };
-    let tip = tip(&depths, &map);
+    let radius_mm = radius(columns, deepest);
+    let tip = tip(&depths, &map, radius_mm.is_finite());
     PadReduction {
         model,
         effective_kpa: effective,
         hemisphere_kpa: tip.hemisphere_kpa,
         hemisphere_residual: tip.hemisphere_residual,
-        radius_mm: radius(columns, deepest),
+        radius_mm,
         thickness_mm: columns.iter().filter(|c| c.gap == 0.0).map(|c| c.length).fold(0.0, f64::max),
         residuals,
         curve: depths.iter().zip(&map).zip(&uniform).map(|((d, m), u)| [*d, *m, *u]).collect(),
         columns: columns.len(),
+        deviation: 0.0,
+        bounds: None,
         profile: tip.profile,
         profile_residual: tip.profile_residual,
         plate: None,
@@ -153,10 +156,10 @@ struct Tip {
     profile_residual: f64,
 }
 
-fn tip(depths: &[f64], force: &[f64]) -> Tip {
+fn tip(depths: &[f64], force: &[f64], curved: bool) -> Tip {
     let square: Vec<f64> = depths.iter().map(|d| 1e-3 * std::f64::consts::PI * d * d).collect();
     let hemisphere_kpa = dot(&square, force) / dot(&square, &square).max(f64::MIN_POSITIVE);
-    let profile = profile(depths, force, hemisphere_kpa);
+    let profile = profile(depths, force, hemisphere_kpa, curved);
     let unlike: Vec<f64> = depths.iter().map(|&d| profile_force(&profile, d)).collect();
     Tip {
         hemisphere_kpa,
@@ -173,7 +176,8 @@ pub fn against_plate(mut pad: PadReduction, columns: &[Column], curve: Vec<[f64;
     let springs: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
     let factor = dot(&springs, &forces) / dot(&springs, &springs).max(f64::MIN_POSITIVE);
     let scaled: Vec<f64> = springs.iter().map(|f| factor * f).collect();
-    let Tip { hemisphere_kpa, hemisphere_residual, profile, profile_residual } = tip(&depths, &forces);
+    let Tip { hemisphere_kpa, hemisphere_residual, profile, profile_residual } =
+        tip(&depths, &forces, pad.radius_mm.is_finite());
     pad.plate = Some(PlateCurve { residual: distance(&scaled, &forces), factor, nodes, curve });
     PadReduction { hemisphere_kpa, hemisphere_residual, profile, profile_residual, ..pad }
 }
@@ -208,8 +212,10 @@ fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
 }
 
 /// The moduli above [`LEAST`] whose forces are nearest to `force` at `depths`: least squares with a
-/// small weight on bends, by coordinate descent.
-fn profile(depths: &[f64], force: &[f64], mean: f64) -> Vec<[f64; 2]> {
+/// small weight on bends, by coordinate descent. The first two are one where the pad is `curved`:
+/// a face touches it in a point, and what forces say of the springs there is the surface's step of
+/// a voxel. A flat pad is touched all over, and its first springs are the stiffest.
+fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 2]> {
     let deepest = depths.last().copied().unwrap_or(1.0);
     let mut out: Vec<[f64; 2]> = (0..KNOTS).map(|k| [deepest * k as f64 / (KNOTS - 1) as f64, mean]).collect();
     let rows: Vec<Vec<f64>> = depths.iter().map(|&d| (0..KNOTS).map(|k| hat_force(&out, k, d)).collect()).collect();
@@ -227,12 +233,25 @@ fn profile(depths: &[f64], force: &[f64], mean: f64) -> Vec<[f64; 2]> {
             bend.iter().for_each(|&(s, y)| a[r][s] += weight * x * y);
         }
     }
-    for _ in 0..2000 {
+    let first = usize::from(curved);
+    if curved {
+        // Both share their rows and columns, kept in the second place.
+        b[1] += b[0];
         for i in 0..KNOTS {
+            a[i][1] += a[i][0];
+        }
+        for j in 0..KNOTS {
+            a[1][j] += a[0][j];
+        }
+        (0..KNOTS).for_each(|i| (a[i][0], a[0][i]) = (0.0, 0.0));
+    }
+    for _ in 0..2000 {
+        for i in first..KNOTS {
             let rest: f64 = (0..KNOTS).filter(|&j| j != i).map(|j| a[i][j] * out[j][1]).sum();
             out[i][1] = ((b[i] - rest) / a[i][i].max(f64::MIN_POSITIVE)).max(LEAST * mean);
         }
     }
+    out[0][1] = out[first][1];
     out
 }
 

@@ -1,9 +1,13 @@
 //! Degrees of freedom of rigid and of soft tips by the rank of the constraints' Jacobian, and what
-//! one or two 1-DOF fingers can set with their joint angles.
+//! fingers of one or two joints can set with their joint angles and with their torques.
+//!
+//! A finger acts on the contact by the place O of its tip and by the turn phi of its back plate, so
+//! one of two joints is, at given angles, one of one joint whose base stands where that puts its
+//! tip. Two links hang with the knuckle bent outwards: straight ones could not lift the tip.
 
 use crate::grasp::constraints::Coordinates;
-use crate::grasp::models::tip_of;
-use crate::grasp::statics::Statics;
+use crate::grasp::models::tips_of;
+use crate::grasp::statics::{Equilibrium, Statics};
 use crate::numerics::dense::rank;
 use crate::types::grasp::Freedom;
 use crate::types::{FingertipModel, Scene};
@@ -12,91 +16,178 @@ use crate::types::{FingertipModel, Scene};
 const TOLERANCE: f64 = 1e-9;
 /// Turn of a joint for the derivative of an equilibrium (rad).
 const TURN: f64 = 1e-5;
+/// Derivatives below this part of a grip a radian, or of a turn, do not count (1).
+const LEAST: f64 = 1e-6;
+/// Bend of the knuckle of a finger of two joints at the pinch (rad): 20 degrees.
+const KNUCKLE: f64 = 20.0 * std::f64::consts::PI / 180.0;
 
-/// The table for all models, at the pinch of a scene: two moving fingers, then one with the other
-/// locked.
+/// Joints of a left and a right finger that move, at most.
+const MOST: usize = 4;
+
+/// The table for all models, at the pinch of a scene: both fingers, one with the other locked, and
+/// a right finger of two joints, whose link is cut in half where the scene has it in one.
 pub fn table(scene: &Scene) -> Vec<Freedom> {
-    let cases = FingertipModel::ALL.iter().flat_map(|(_, model)| [2, 1].map(|fingers| (*model, fingers)));
-    cases.map(|(model, fingers)| freedom(scene, model, fingers)).collect()
-}
-
-/// Constraints C = D(q) - d = 0 as rows over (q, d): pose, the first `fingers` joints, and the
-/// displacements that the model allows.
-fn freedom(scene: &Scene, model: FingertipModel, fingers: usize) -> Freedom {
-    let tip = tip_of(&scene.fingertip, model);
-    let scene = Scene { fingertip: crate::types::Fingertip { model, ..scene.fingertip.clone() }, ..scene.clone() };
-    let statics = Statics::new(&scene, tip.as_ref());
-    let pinch = statics.pinch(&scene);
-    let rows = statics.geometry.contact(&pinch.q).jacobian();
-    let soft = [!tip.holds_normal(), !tip.holds_normal(), !tip.holds_tangent(), !tip.holds_tangent()];
-    let over = |joints: usize| -> Vec<[f64; 9]> {
-        (0..4)
-            .map(|k| {
-                let mut row = [0.0; 9];
-                row[..3 + joints].copy_from_slice(&rows[k][..3 + joints]);
-                row[5 + k] = if soft[k] { -1.0 } else { 0.0 };
-                // Lengths over the radius, so that all columns are of one size.
-                row[2] /= statics.geometry.radius;
-                (row[3], row[4]) = (row[3] / statics.geometry.radius, row[4] / statics.geometry.radius);
-                row
-            })
-            .collect()
-    };
-    let displacements = soft.iter().filter(|s| **s).count();
-    let (all, locked) = (rank(&over(fingers), TOLERANCE), rank(&over(0), TOLERANCE));
-    let derivatives = if tip.holds_normal() {
-        // Without compliance no force follows from joint angles, and angles only move along the
-        // null space.
-        let turns = null_turn(&rows, fingers).map_or(Vec::new(), |t| vec![[t, 0.0]]);
-        transposed(&turns)
-    } else {
-        let columns = (0..fingers).filter_map(|i| {
-            let turned = |sign: f64| {
-                let mut joints = [0.0; 2];
-                joints[i] = sign * TURN;
-                statics.equilibrium(joints, &pinch)
-            };
-            let (up, down) = (turned(1.0)?, turned(-1.0)?);
-            let grip = |f: &[f64; 4]| 0.5 * (f[0] + f[1]) / pinch.forces[0];
-            Some([(up.q[2] - down.q[2]) / (2.0 * TURN), (grip(&up.forces) - grip(&down.forces)) / (2.0 * TURN)])
-        });
-        transposed(&columns.collect::<Vec<_>>())
-    };
-    let significant = |row: &[f64; 2]| usize::from(row.iter().any(|v| v.abs() > 1e-6));
-    let unit = |row: &[f64; 2]| {
-        let length = row[0].hypot(row[1]);
-        if length > 1e-6 { [row[0] / length, row[1] / length] } else { [0.0; 2] }
-    };
-    Freedom {
-        model,
-        fingers,
-        coordinates: 3 + fingers + displacements,
-        rank: all,
-        freedom: 3 + fingers + displacements - all,
-        object_freedom: 3 + displacements - locked.min(3 + displacements),
-        posture_rank: significant(&derivatives[0]),
-        grasp_rank: significant(&derivatives[1]),
-        both_rank: rank(&derivatives.map(|r| unit(&r)), 1e-6),
+    let own = scene.fingers().map(|f| if f.upper.is_some() { 2 } else { 1 });
+    let mut cases = vec![[1, 1], [1, 0], [1, 2]];
+    if !cases.contains(&own) {
+        cases.push(own);
     }
+    let all = FingertipModel::ALL.iter().flat_map(|(_, model)| cases.iter().map(|joints| (*model, *joints)));
+    all.map(|(model, joints)| freedom(scene, model, joints)).collect()
 }
 
-/// From one (theta, grip) a joint to a row of theta and a row of grip over the joints.
-fn transposed(columns: &[[f64; 2]]) -> [[f64; 2]; 2] {
-    let mut out = [[0.0; 2]; 2];
-    for (i, column) in columns.iter().enumerate().take(2) {
-        (out[0][i], out[1][i]) = (column[0], column[1]);
+/// One joint: of which finger, and how it moves that finger's tip (m/rad) and turns its plate (1).
+#[derive(Debug, Clone, Copy)]
+struct Joint {
+    finger: usize,
+    tip: [f64; 2],
+}
+
+/// The joints of both fingers where the tips stand as at the pinch of fingers of one joint.
+fn joints(scene: &Scene, counts: [usize; 2]) -> Vec<Joint> {
+    let mut out = Vec::new();
+    for (finger, count) in counts.into_iter().enumerate() {
+        let of = scene.fingers()[finger];
+        let whole = of.upper.unwrap_or(0.0) + of.link;
+        let side = if finger == 0 { 1.0 } else { -1.0 };
+        if count == 1 {
+            out.push(Joint { finger, tip: [side * whole, 0.0] });
+        } else if count == 2 {
+            let upper = of.upper.unwrap_or(0.5 * whole);
+            let lower = whole - upper;
+            // The upper link points outwards by the knuckle's bend, the lower one down.
+            let (sin, cos) = KNUCKLE.sin_cos();
+            out.push(Joint { finger, tip: [side * (upper * cos + lower), -upper * sin] });
+            out.push(Joint { finger, tip: [side * lower, 0.0] });
+        }
     }
     out
 }
 
-/// Turn of the object along the one direction that four held rows leave of pose and joints, for a
-/// unit turn of joint 1; none where nothing is left, as with one finger.
-fn null_turn(rows: &[Coordinates; 4], fingers: usize) -> Option<f64> {
-    if fingers < 2 {
-        return None;
+/// Rows of the constraints over the object's pose (as they are), and over a joint: through the
+/// tip's place and the plate's turn.
+fn over(rows: &[Coordinates; 4], joint: &Joint, scene: &Scene) -> [f64; 4] {
+    let of = scene.fingers()[joint.finger];
+    let whole = of.upper.unwrap_or(0.0) + of.link;
+    let side = if joint.finger == 0 { 1.0 } else { -1.0 };
+    std::array::from_fn(|k| {
+        // Displacements depend on the object's place less the tip's. A joint of one link moves the
+        // tip across by that link; what is left of its row is the plate's turn.
+        let own = k % 2 == joint.finger;
+        let turn = if own { rows[k][3 + joint.finger] + side * whole * rows[k][0] } else { 0.0 };
+        let tip = if own { -rows[k][0] * joint.tip[0] - rows[k][1] * joint.tip[1] } else { 0.0 };
+        turn + tip
+    })
+}
+
+/// Constraints C = D(q) - d = 0 as rows over (q, d): pose, joints, and the displacements that the
+/// model allows.
+fn freedom(scene: &Scene, model: FingertipModel, counts: [usize; 2]) -> Freedom {
+    let scene = scene.with_model(model);
+    let tips = tips_of(&scene, model);
+    let statics = Statics::of(&scene, [tips[0].as_ref(), tips[1].as_ref()]);
+    let (normal, tangent) = (statics.holds_normal(), statics.holds_tangent());
+    let pinch = statics.pinch(&scene);
+    let rows = statics.geometry.contact(&pinch.q).jacobian();
+    let a = statics.geometry.scale();
+    let moving = joints(&scene, counts);
+    let columns: Vec<[f64; 4]> = moving.iter().map(|j| over(&rows, j, &scene).map(|v| v / a)).collect();
+    let soft = [!normal, !normal, !tangent, !tangent];
+    let with = |count: usize| -> Vec<[f64; 3 + MOST + 4]> {
+        (0..4)
+            .map(|k| {
+                let mut row = [0.0; 3 + MOST + 4];
+                // Lengths over the radius, so that all columns are of one size.
+                (row[0], row[1], row[2]) = (rows[k][0], rows[k][1], rows[k][2] / a);
+                columns.iter().take(count).enumerate().for_each(|(j, c)| row[3 + j] = c[k]);
+                row[3 + MOST + k] = if soft[k] { -1.0 } else { 0.0 };
+                row
+            })
+            .collect()
+    };
+    let count = moving.len();
+    let displacements = soft.iter().filter(|s| **s).count();
+    let (all, locked) = (rank(&with(count), TOLERANCE), rank(&with(0), TOLERANCE));
+    let coordinates = 3 + count + displacements;
+    // Rigid tips answer to angles along their null space alone, and to torques also by their grip.
+    let angles: Vec<[f64; 2]> = if normal {
+        null_turns(&with(count), count).into_iter().map(|turn| [turn, 0.0]).collect()
+    } else {
+        moving.iter().filter_map(|j| response(&statics, &pinch, j, &scene)).collect()
+    };
+    let by_torque = if normal {
+        let mut ways = angles.clone();
+        if count > coordinates - all {
+            ways.push([0.0, 1.0]);
+        }
+        ways
+    } else {
+        angles.clone()
+    };
+    let unit = |v: &[f64; 2]| {
+        let length = v[0].hypot(v[1]);
+        if length > LEAST { [v[0] / length, v[1] / length] } else { [0.0; 2] }
+    };
+    let significant = |k: usize, ways: &[[f64; 2]]| usize::from(ways.iter().any(|v| v[k].abs() > LEAST));
+    let both = |ways: &[[f64; 2]]| rank(&ways.iter().map(unit).collect::<Vec<_>>(), LEAST);
+    // A tip of springs also carries a moment on its plate.
+    let carried = if normal || model == FingertipModel::Radial { 2 } else { 3 };
+    Freedom {
+        model,
+        fingers: counts.iter().filter(|c| **c > 0).count(),
+        joints: counts,
+        contact_forces: 2 * carried,
+        coordinates,
+        rank: all,
+        freedom: coordinates - all,
+        object_freedom: 3 + displacements - locked.min(3 + displacements),
+        posture_rank: significant(0, &angles),
+        grasp_rank: significant(1, &angles),
+        both_rank: both(&angles),
+        torque_rank: both(&by_torque),
+        stable: if normal { 3 + displacements == locked || locked >= 3 } else { pinch.smallest_eigenvalue > 0.0 },
     }
-    // J_rest z = -J_1: unknowns x, y, theta, theta_2 for theta_1 = 1.
-    let matrix = rows.map(|r| [r[0], r[1], r[2], r[4]]);
-    let right = rows.map(|r| -r[3]);
-    crate::numerics::dense::solve(&matrix, &right).map(|z| z[2])
+}
+
+/// Turn of the object (1) and change of the grip, over itself, for a unit turn of a joint.
+fn response(statics: &Statics<'_>, pinch: &Equilibrium, joint: &Joint, scene: &Scene) -> Option<[f64; 2]> {
+    let of = scene.fingers()[joint.finger];
+    let whole = of.upper.unwrap_or(0.0) + of.link;
+    let side = if joint.finger == 0 { 1.0 } else { -1.0 };
+    let turned = |sign: f64| {
+        let turn = sign * TURN;
+        let mut moved = *statics;
+        // The plate turns with the angle of one joint; the base makes up for where that puts the
+        // tip.
+        let base = &mut moved.geometry.base[joint.finger];
+        let (sin, cos) = turn.sin_cos();
+        base[0] += turn * joint.tip[0] - side * whole * sin;
+        base[1] += turn * joint.tip[1] - whole * (1.0 - cos);
+        let mut angles = [0.0; 2];
+        angles[joint.finger] = turn;
+        // Where d_t is counted from belongs to the face and stays.
+        moved.equilibrium(angles, pinch)
+    };
+    let (up, down) = (turned(1.0)?, turned(-1.0)?);
+    let grip = |e: &Equilibrium| 0.5 * (e.forces[0] + e.forces[1]) / pinch.forces[0];
+    Some([(up.q[2] - down.q[2]) / (2.0 * TURN), (grip(&up) - grip(&down)) / (2.0 * TURN)])
+}
+
+/// Turns of the object along the directions that the rows leave, a unit turn of one joint each.
+fn null_turns(rows: &[[f64; 3 + MOST + 4]], count: usize) -> Vec<f64> {
+    // Each joint that the others leave free: pose and the other joints answer to it.
+    let mut out = Vec::new();
+    for free in 0..count {
+        let mut order: Vec<usize> = (0..3).chain((0..count).filter(|j| *j != free).map(|j| 3 + j)).collect();
+        order.truncate(4);
+        if order.len() < 4 {
+            continue;
+        }
+        let matrix: [[f64; 4]; 4] = std::array::from_fn(|k| std::array::from_fn(|c| rows[k][order[c]]));
+        let right = std::array::from_fn(|k| -rows[k][3 + free]);
+        if let Some(z) = crate::numerics::dense::solve(&matrix, &right) {
+            out.push(z[2]);
+        }
+    }
+    out
 }

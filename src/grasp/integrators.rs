@@ -5,24 +5,45 @@
 //! II.4, II.5); E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (I.1.2).
 
 use crate::grasp::control::{Inputs, Phase};
-use crate::grasp::plant::Reading;
+use crate::grasp::models::Tip;
+use crate::grasp::multipliers;
+use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
 /// Equations of motion of first order. The first five entries of a state are positions, the next
-/// five their rates; from 13 on, four more positions and four more rates may follow.
+/// five their rates; from 13 on follow what branches of the tips follow, slides, or in the
+/// multiplier form four more positions and four more rates.
 pub trait System<const N: usize> {
-    /// The entry that holds the work done on the grasp; nothing depends on it.
-    const WORK: usize;
-
-    /// The state at rest in an equilibrium.
-    fn start(&self, equilibrium: &Equilibrium) -> [f64; N];
-
     /// Rates of a state, and what its contacts show.
     fn rate(&self, inputs: &Inputs, state: &[f64; N]) -> ([f64; N], Reading);
 
     /// Brings a state back onto constraints, where there are any to be left.
     fn settle(&self, _state: &mut [f64; N]) {}
+}
+
+/// A way to write a grasp whose tips stick.
+pub trait Form<const N: usize>: System<N> {
+    /// The entry that holds the work done on the grasp; nothing depends on it.
+    const WORK: usize;
+    /// The tips' model.
+    type Tip: Tip;
+
+    /// Forces on the grasp.
+    fn plant(&self) -> &Plant<Self::Tip>;
+
+    /// Counts d_t from `origin` (m) from now on.
+    fn set_origin(&mut self, origin: [f64; 2]);
+
+    /// The state in minimal coordinates, with what branches of its tips follow.
+    fn core(&self, state: &[f64; N]) -> [f64; relaxing::STATE];
+
+    /// The state of such coordinates.
+    fn with_core(&self, core: &[f64; relaxing::STATE]) -> [f64; N];
+
+    /// The state at rest in an equilibrium.
+    fn start(&self, equilibrium: &Equilibrium) -> [f64; N];
 
     /// Whole energy, and its elastic and kinetic part (J).
     fn energy(&self, state: &[f64; N]) -> (f64, f64);
@@ -98,7 +119,7 @@ impl Stepper for SemiImplicitEuler {
         for k in 0..5 {
             next[k] = state[k] + h * next[5 + k];
         }
-        if N > 20 {
+        if N == multipliers::STATE {
             for k in 13..17 {
                 next[k] = state[k] + h * next[4 + k];
             }
@@ -126,8 +147,8 @@ const FLOOR: f64 = 1e-3;
 /// Shortest step that is tried (s).
 pub const SHORTEST: f64 = 1e-8;
 
-/// A step with control: the state, the contacts before it, the step taken and the one to try next
-/// (s). None where no step down to [`SHORTEST`] meets the tolerance.
+/// A step with control from `state`, whose rates are `first`: the state, the step taken and the one
+/// to try next (s). None where no step down to [`SHORTEST`] meets the tolerance.
 pub fn dormand_prince<const N: usize, S: System<N>>(
     system: &S,
     phase: &Phase,
@@ -135,9 +156,9 @@ pub fn dormand_prince<const N: usize, S: System<N>>(
     trial: f64,
     tolerance: f64,
     state: &[f64; N],
-) -> Option<([f64; N], Reading, f64, f64)> {
+    first: [f64; N],
+) -> Option<([f64; N], f64, f64)> {
     let mut h = trial;
-    let (first, reading) = system.rate(&phase.inputs(t), state);
     loop {
         let mut rates = [first; 7];
         let mut next = *state;
@@ -157,7 +178,7 @@ pub fn dormand_prince<const N: usize, S: System<N>>(
         let factor = if error.is_finite() { (0.9 * error.powf(-0.2)).clamp(0.2, 5.0) } else { 0.1 };
         if error <= 1.0 {
             system.settle(&mut next);
-            return Some((next, reading, h, h * factor));
+            return Some((next, h, h * factor));
         }
         h *= factor.min(0.9);
         if h < SHORTEST {

@@ -5,9 +5,10 @@
 //! brought back onto them after each step.
 
 use crate::grasp::control::Inputs;
-use crate::grasp::integrators::System;
+use crate::grasp::integrators::{Form, System};
 use crate::grasp::models::Tip;
 use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
@@ -19,14 +20,6 @@ pub const STATE: usize = 13;
 pub struct Minimal<T>(pub Plant<T>);
 
 impl<T: Tip> System<STATE> for Minimal<T> {
-    const WORK: usize = 12;
-
-    fn start(&self, e: &Equilibrium) -> [f64; STATE] {
-        let mut s = [0.0; STATE];
-        s[..5].copy_from_slice(&e.q);
-        s
-    }
-
     #[inline(always)]
     fn rate(&self, inputs: &Inputs, s: &[f64; STATE]) -> ([f64; STATE], Reading) {
         let plant = &self.0;
@@ -40,7 +33,7 @@ impl<T: Tip> System<STATE> for Minimal<T> {
         let errors = [q[3] - inputs.desired[0], q[4] - inputs.desired[1]];
         let rate = [v[0], v[1], v[2], v[3], v[4], a[0], a[1], a[2], a[3], a[4], errors[0], errors[1], power];
         let sin_tilt = [contact.tilt(0).sin, contact.tilt(1).sin];
-        (rate, Reading { displacements: d, forces: f, sin_tilt })
+        (rate, Reading { displacements: d, forces: f, sin_tilt, places: contact.places() })
     }
 
     #[inline(always)]
@@ -52,6 +45,35 @@ impl<T: Tip> System<STATE> for Minimal<T> {
             s[5..10].copy_from_slice(&v);
         }
     }
+}
+
+impl<T: Tip> Form<STATE> for Minimal<T> {
+    const WORK: usize = 12;
+    type Tip = T;
+
+    fn plant(&self) -> &Plant<T> {
+        &self.0
+    }
+
+    fn set_origin(&mut self, origin: [f64; 2]) {
+        self.0.geometry.origin = origin;
+    }
+
+    fn core(&self, s: &[f64; STATE]) -> [f64; relaxing::STATE] {
+        let mut core = [0.0; relaxing::STATE];
+        core[..STATE].copy_from_slice(s);
+        core
+    }
+
+    fn with_core(&self, core: &[f64; relaxing::STATE]) -> [f64; STATE] {
+        std::array::from_fn(|k| core[k])
+    }
+
+    fn start(&self, e: &Equilibrium) -> [f64; STATE] {
+        let mut s = [0.0; STATE];
+        s[..5].copy_from_slice(&e.q);
+        s
+    }
 
     fn energy(&self, s: &[f64; STATE]) -> (f64, f64) {
         let (q, v) = ([s[0], s[1], s[2], s[3], s[4]], [s[5], s[6], s[7], s[8], s[9]]);
@@ -62,8 +84,6 @@ impl<T: Tip> System<STATE> for Minimal<T> {
     fn drift(&self, s: &[f64; STATE]) -> ConstraintDrift {
         let (q, v) = ([s[0], s[1], s[2], s[3], s[4]], [s[5], s[6], s[7], s[8], s[9]]);
         let contact = self.0.geometry.contact(&q);
-        let (d, w) = (contact.displacements(), contact.rates(&v));
-        let held = |a: usize, x: &[f64; 4]| if self.0.holds(a) { x[a].abs().max(x[a + 1].abs()) } else { 0.0 };
-        ConstraintDrift { normal: held(0, &d), rolling_velocity: held(2, &w), rolling: held(2, &d) }
+        self.0.drift(&contact.displacements(), &contact.rates(&v))
     }
 }

@@ -4,14 +4,15 @@
 //! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue); docs/reference/grasp.md has every
 //! equation and two signs of the slides that had to be settled. Order: [`models`] (fingertips), [`constraints`] (where
 //! they touch), [`statics`] (equilibria), [`control`], [`plant`] (forces), [`minimal`] and [`multipliers`] (equations of
-//! motion), [`integrators`], [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail),
+//! motion), [`relaxing`] (tips that relax), [`friction`] and [`sliding`] (tips that
+//! slide), [`integrators`], [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail),
 //! [`simulate`] (the loop), then the
-//! analyses: [`stability`], [`freedom`], [`pinch`], [`posture`].
+//! analyses: [`stability`], [`freedom`], [`pinch`], [`posture`], [`measured`].
 //!
 //! Promises: SI units and radians everywhere; the same bits for the same scene; the object's pose
 //! is never fed back. Needs a scene that passes [`crate::types::Scene::check`]. Fails by name:
-//! every [`crate::types::grasp::EventKind`] is detected in the step where it happens, and a run
-//! ends there instead of going on without a meaning.
+//! every [`crate::types::grasp::EventKind`] is detected in the step where it happens. A run ends
+//! where contact is lost, a step is too long, or the state is not finite; else it goes on.
 
 pub mod models;
 
@@ -26,6 +27,12 @@ pub mod control;
 pub mod plant;
 
 pub mod minimal;
+
+pub mod relaxing;
+
+pub mod friction;
+
+pub mod sliding;
 
 pub mod multipliers;
 
@@ -46,3 +53,5 @@ pub mod freedom;
 pub mod pinch;
 
 pub mod posture;
+
+pub mod measured;

@@ -7,7 +7,7 @@
 //! throughout.
 
 use crate::grasp::tabulated::Tabulated;
-use crate::types::{Fingertip, FingertipModel};
+use crate::types::{Fingertip, FingertipModel, Scene};
 use std::f64::consts::PI;
 
 /// Sine and cosine of a tilt.
@@ -227,6 +227,16 @@ impl MapEntries for Curvature {
 /// The model that a fingertip names.
 pub fn tip(fingertip: &Fingertip) -> Box<dyn Tip> {
     tip_of(fingertip, fingertip.model)
+}
+
+/// The tips of a scene.
+pub fn tips(scene: &Scene) -> [Box<dyn Tip>; 2] {
+    tips_of(scene, scene.fingertip.model)
+}
+
+/// The tips of a scene with another model.
+pub fn tips_of(scene: &Scene, model: FingertipModel) -> [Box<dyn Tip>; 2] {
+    scene.fingertips().map(|tip| tip_of(tip, model))
 }
 
 /// Another model of the same fingertip.

@@ -8,9 +8,11 @@
 //! solved by substitution.
 
 use crate::grasp::control::Inputs;
-use crate::grasp::integrators::System;
+use crate::grasp::integrators::{Form, System};
+use crate::grasp::minimal;
 use crate::grasp::models::Tip;
 use crate::grasp::plant::{Plant, Reading};
+use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 use crate::types::scene::Rolling;
@@ -42,17 +44,6 @@ fn parts(s: &[f64; STATE]) -> ([f64; 5], [f64; 5], [f64; 4], [f64; 4]) {
 }
 
 impl<T: Tip> System<STATE> for Multipliers<T> {
-    const WORK: usize = 12;
-
-    fn start(&self, e: &Equilibrium) -> [f64; STATE] {
-        let mut s = [0.0; STATE];
-        s[..5].copy_from_slice(&e.q);
-        for k in (0..4).filter(|&k| !self.plant.holds(k)) {
-            s[13 + k] = e.displacements[k];
-        }
-        s
-    }
-
     #[inline(always)]
     fn rate(&self, inputs: &Inputs, s: &[f64; STATE]) -> ([f64; STATE], Reading) {
         let (plant, g) = (&self.plant, self.gain);
@@ -76,7 +67,48 @@ impl<T: Tip> System<STATE> for Multipliers<T> {
                 rate[17 + k] = second[k] + bias[k] + 2.0 * g * (speed[k] - w[k]) + position * (whole[k] - d[k]);
             }
         }
-        (rate, Reading { displacements: d, forces: f, sin_tilt: [contact.tilt(0).sin, contact.tilt(1).sin] })
+        let sin_tilt = [contact.tilt(0).sin, contact.tilt(1).sin];
+        (rate, Reading { displacements: d, forces: f, sin_tilt, places: contact.places() })
+    }
+}
+
+impl<T: Tip> Form<STATE> for Multipliers<T> {
+    const WORK: usize = 12;
+    type Tip = T;
+
+    fn plant(&self) -> &Plant<T> {
+        &self.plant
+    }
+
+    fn set_origin(&mut self, origin: [f64; 2]) {
+        self.plant.geometry.origin = origin;
+    }
+
+    fn core(&self, s: &[f64; STATE]) -> [f64; relaxing::STATE] {
+        let mut core = [0.0; relaxing::STATE];
+        core[..minimal::STATE].copy_from_slice(&s[..minimal::STATE]);
+        core
+    }
+
+    fn with_core(&self, core: &[f64; relaxing::STATE]) -> [f64; STATE] {
+        let (q, v) = (std::array::from_fn(|k| core[k]), std::array::from_fn(|k| core[5 + k]));
+        let contact = self.plant.geometry.contact(&q);
+        let (d, w) = (contact.displacements(), contact.rates(&v));
+        let mut s = [0.0; STATE];
+        s[..minimal::STATE].copy_from_slice(&core[..minimal::STATE]);
+        for k in (0..4).filter(|&k| !self.plant.holds(k)) {
+            (s[13 + k], s[17 + k]) = (d[k], w[k]);
+        }
+        s
+    }
+
+    fn start(&self, e: &Equilibrium) -> [f64; STATE] {
+        let mut s = [0.0; STATE];
+        s[..5].copy_from_slice(&e.q);
+        for k in (0..4).filter(|&k| !self.plant.holds(k)) {
+            s[13 + k] = e.displacements[k];
+        }
+        s
     }
 
     fn energy(&self, s: &[f64; STATE]) -> (f64, f64) {

@@ -1,7 +1,8 @@
 //! The pinch map: over both joint angles, which postures can be reached from the pinch, are stable,
 //! hold without slip and lie in the model's range.
 
-use crate::grasp::models::tip_of;
+use crate::grasp::friction::Friction;
+use crate::grasp::models::tips_of;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
 use crate::types::grasp::{PinchCell, PinchMap, PinchState, Sample};
 use crate::types::{FingertipModel, Scene};
@@ -15,11 +16,11 @@ pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 /// starting at the pinch, through such as hold.
 pub fn map(scene: &Scene, model: FingertipModel, most: f64, side: usize, progress: Progress<'_>) -> PinchMap {
     let side = side.max(3) | 1;
-    let tip = tip_of(&scene.fingertip, model);
-    let statics = Statics::new(scene, tip.as_ref());
+    let tips = tips_of(scene, model);
+    let statics = Statics::of(scene, [tips[0].as_ref(), tips[1].as_ref()]);
     let angles: Vec<f64> = (0..side).map(|i| most * (2.0 * i as f64 / (side - 1) as f64 - 1.0)).collect();
     let stride = 2.0 * most / (side - 1) as f64;
-    let friction = scene.object.friction.unwrap_or(f64::INFINITY);
+    let friction = Friction::of(scene);
     let nothing = |i: usize, j: usize| PinchCell {
         state: PinchState::Unreached,
         sample: Sample { joints: [angles[i], angles[j]], ..Sample::default() },
@@ -28,7 +29,7 @@ pub fn map(scene: &Scene, model: FingertipModel, most: f64, side: usize, progres
     let mut cells: Vec<PinchCell> = (0..side * side).map(|n| nothing(n % side, n / side)).collect();
     let mut found: Vec<Option<Equilibrium>> = vec![None; side * side];
     let holds = |e: &Equilibrium| {
-        let slips = (0..2).any(|i| e.forces[2 + i].abs() > friction * e.forces[i]);
+        let slips = friction.required(&e.forces, &e.displacements) > friction.coefficient;
         let state = if slips { PinchState::Slip } else { PinchState::Good };
         PinchCell { state, sample: e.sample(0.0), smallest_eigenvalue: e.smallest_eigenvalue }
     };

@@ -6,7 +6,7 @@ use crate::grasp::models::{Gradient, Tip};
 use crate::grasp::statics::Equilibrium;
 use crate::numerics::dense;
 use crate::types::Scene;
-use crate::types::grasp::Sample;
+use crate::types::grasp::{ConstraintDrift, Sample};
 use crate::types::scene::Gains;
 
 /// Fingers, tips and object of a scene, with tips of one model.
@@ -14,16 +14,19 @@ use crate::types::scene::Gains;
 pub struct Plant<T> {
     /// Lengths.
     pub geometry: Geometry,
-    /// Model of the tips.
-    pub tip: T,
+    /// The tips, of one model.
+    pub tips: [T; 2],
     /// Diagonal of the mass matrix (kg, kg m^2).
     pub mass: Coordinates,
     /// Its inverse; 0 for locked joints.
     pub inverse_mass: Coordinates,
     /// Gravity on the object along y (N).
     weight: f64,
-    damping: [f64; 2],
-    gains: Gains,
+    /// c_n and c_t of each tip (N s/m); 0 where the model holds the row.
+    pub damping: [[f64; 2]; 2],
+    gains: [Gains; 2],
+    /// Maxwell branches of both tips: modulus over the springs' (1) and time (s).
+    pub branches: Vec<[f64; 2]>,
     /// Torque that holds the first equilibrium: the preload of each controller's integral (N m).
     preload: [f64; 2],
 }
@@ -37,10 +40,12 @@ pub struct Reading {
     pub forces: [f64; 4],
     /// Sines of the tilts.
     pub sin_tilt: [f64; 2],
+    /// Where the tips touch along the face (m), from the middle of the object's side.
+    pub places: [f64; 2],
 }
 
 impl Reading {
-    /// As a sample at `time` with the coordinates `q`.
+    /// As a sample at `time` with the coordinates `q`, of a grasp that has not slipped.
     pub fn sample(&self, time: f64, q: &Coordinates) -> Sample {
         let ([d1, d2, t1, t2], [f1, f2, g1, g2]) = (self.displacements, self.forces);
         Sample {
@@ -51,25 +56,36 @@ impl Reading {
             tangential: [t1, t2],
             normal_force: [f1, f2],
             tangential_force: [g1, g2],
+            ..Sample::default()
         }
+    }
+}
+
+impl<T: Tip + Clone> Plant<T> {
+    /// Of a scene that starts at `start`, with tips that are alike.
+    pub fn new(scene: &Scene, tip: T, start: &Equilibrium) -> Self {
+        Self::of(scene, [tip.clone(), tip], start)
     }
 }
 
 impl<T: Tip> Plant<T> {
     /// Of a scene that starts at `start`.
-    pub fn new(scene: &Scene, tip: T, start: &Equilibrium) -> Self {
+    pub fn of(scene: &Scene, tips: [T; 2], start: &Equilibrium) -> Self {
         let object = &scene.object;
-        let inertia = scene.finger.inertia;
-        let mass = [object.mass, object.mass, object.inertia, inertia, inertia];
-        let free = if scene.finger.fixed { 0.0 } else { 1.0 / inertia };
+        let [one, two] = scene.fingers();
+        let mass = [object.mass, object.mass, object.inertia, one.inertia, two.inertia];
+        let free = [one, two].map(|f| if f.fixed { 0.0 } else { 1.0 / f.inertia });
+        let [n, t] = [tips[0].holds_normal(), tips[0].holds_tangent()];
+        let kept = |[c_n, c_t]: [f64; 2]| [if n { 0.0 } else { c_n }, if t { 0.0 } else { c_t }];
         Self {
             geometry: Geometry::of(scene),
-            tip,
+            tips,
             mass,
-            inverse_mass: [1.0 / object.mass, 1.0 / object.mass, 1.0 / object.inertia, free, free],
+            inverse_mass: [1.0 / object.mass, 1.0 / object.mass, 1.0 / object.inertia, free[0], free[1]],
             weight: object.mass * scene.gravity,
-            damping: scene.fingertip.damping,
-            gains: scene.finger.gains,
+            damping: scene.fingertips().map(|tip| kept(tip.damping)),
+            gains: [one.gains, two.gains],
+            branches: scene.fingertip.branches(),
             preload: start.torques,
         }
     }
@@ -77,26 +93,23 @@ impl<T: Tip> Plant<T> {
     /// Whether row `k` (d_n1, d_n2, d_t1, d_t2) is held at 0 by the model.
     #[inline(always)]
     pub fn holds(&self, k: usize) -> bool {
-        if k < 2 { self.tip.holds_normal() } else { self.tip.holds_tangent() }
+        if k < 2 { self.tips[0].holds_normal() } else { self.tips[0].holds_tangent() }
     }
 
     /// Whether any row is.
     #[inline(always)]
     pub fn holds_any(&self) -> bool {
-        self.tip.holds_normal() || self.tip.holds_tangent()
+        self.tips[0].holds_normal() || self.tips[0].holds_tangent()
     }
 
     /// Forces of the displacements `d` at the rates `w` (N), and moments on the tilts (N m); held
     /// rows give none.
     #[inline(always)]
     pub fn contact_forces(&self, contact: &Contact, d: &[f64; 4], w: &[f64; 4]) -> ([f64; 4], [f64; 2]) {
-        let gradient = |i: usize| -> Gradient { self.tip.gradient(d[i], d[2 + i], contact.tilt(i)) };
+        let gradient = |i: usize| -> Gradient { self.tips[i].gradient(d[i], d[2 + i], contact.tilt(i)) };
         let (a, b) = (gradient(0), gradient(1));
-        let [c_n, c_t] = self.damping;
-        let c_n = if self.tip.holds_normal() { 0.0 } else { c_n };
-        let c_t = if self.tip.holds_tangent() { 0.0 } else { c_t };
-        let forces =
-            [a.normal + c_n * w[0], b.normal + c_n * w[1], a.tangential + c_t * w[2], b.tangential + c_t * w[3]];
+        let [[n1, t1], [n2, t2]] = self.damping;
+        let forces = [a.normal + n1 * w[0], b.normal + n2 * w[1], a.tangential + t1 * w[2], b.tangential + t2 * w[3]];
         (forces, [a.moment, b.moment])
     }
 
@@ -116,7 +129,7 @@ impl<T: Tip> Plant<T> {
         gain: f64,
     ) -> (Coordinates, [f64; 2]) {
         let torques: [f64; 2] = [0, 1].map(|i| {
-            let Gains { kp, kd, ki } = self.gains;
+            let Gains { kp, kd, ki } = self.gains[i];
             let error = q[3 + i] - inputs.desired[i];
             self.preload[i] - kp * error - kd * (v[3 + i] - inputs.rates[i]) - ki * integral[i]
         });
@@ -197,19 +210,23 @@ impl<T: Tip> Plant<T> {
     /// Work per time that motors and pushes do, less what the tips' damping takes (W).
     #[inline(always)]
     pub fn power(&self, inputs: &Inputs, contact: &Contact, v: &Coordinates, torques: &[f64; 2], w: &[f64; 4]) -> f64 {
-        let [c_n, c_t] = self.damping;
-        let c_n = if self.tip.holds_normal() { 0.0 } else { c_n };
-        let c_t = if self.tip.holds_tangent() { 0.0 } else { c_t };
-        let lost = c_n * (w[0] * w[0] + w[1] * w[1]) + c_t * (w[2] * w[2] + w[3] * w[3]);
+        let [[n1, t1], [n2, t2]] = self.damping;
+        let lost = n1 * w[0] * w[0] + n2 * w[1] * w[1] + t1 * w[2] * w[2] + t2 * w[3] * w[3];
         let pushed = inputs.force[0] * v[0] + inputs.force[1] * v[1] + contact.turn(inputs.moment) * v[2];
         pushed + torques[0] * v[3] + torques[1] * v[4] - lost
+    }
+
+    /// Violations of the held rows at the displacements `d` (m) and their rates `w` (m/s).
+    pub fn drift(&self, d: &[f64; 4], w: &[f64; 4]) -> ConstraintDrift {
+        let held = |a: usize, x: &[f64; 4]| if self.holds(a) { x[a].abs().max(x[a + 1].abs()) } else { 0.0 };
+        ConstraintDrift { normal: held(0, d), rolling_velocity: held(2, w), rolling: held(2, d) }
     }
 
     /// Kinetic and potential energy (J) with the displacements `d`; and the elastic and kinetic
     /// part alone.
     pub fn energy(&self, contact: &Contact, q: &Coordinates, v: &Coordinates, d: &[f64; 4]) -> (f64, f64) {
         let kinetic: f64 = (0..5).map(|k| 0.5 * self.mass[k] * v[k] * v[k]).sum();
-        let elastic: f64 = (0..2).map(|i| self.tip.energy(d[i], d[2 + i], contact.tilt(i))).sum();
+        let elastic: f64 = (0..2).map(|i| self.tips[i].energy(d[i], d[2 + i], contact.tilt(i))).sum();
         (kinetic + elastic - self.weight * q[1], kinetic + elastic)
     }
 }

@@ -12,8 +12,8 @@ use std::f64::consts::PI;
 pub struct Statics<'a> {
     /// Lengths.
     pub geometry: Geometry,
-    /// Model of the tips.
-    pub tip: &'a dyn Tip,
+    /// The tips, of one model.
+    pub tips: [&'a dyn Tip; 2],
     /// Gravity on the object along y (N).
     pub weight: f64,
 }
@@ -45,6 +45,7 @@ impl Equilibrium {
             tangential: [t1, t2],
             normal_force: [f1, f2],
             tangential_force: [g1, g2],
+            ..Sample::default()
         }
     }
 }
@@ -72,26 +73,41 @@ impl Lost {
 }
 
 impl<'a> Statics<'a> {
-    /// Of a scene, with tips of the model `tip`.
+    /// Of a scene, with tips that are alike.
     pub fn new(scene: &Scene, tip: &'a dyn Tip) -> Self {
-        Self { geometry: Geometry::of(scene), tip, weight: scene.object.mass * scene.gravity }
+        Self::of(scene, [tip; 2])
+    }
+
+    /// Of a scene, with a tip for each finger.
+    pub fn of(scene: &Scene, tips: [&'a dyn Tip; 2]) -> Self {
+        Self { geometry: Geometry::of(scene), tips, weight: scene.object.mass * scene.gravity }
+    }
+
+    /// Whether the tips hold d_n at 0.
+    pub fn holds_normal(&self) -> bool {
+        self.tips[0].holds_normal()
+    }
+
+    /// Whether the tips hold d_t at 0.
+    pub fn holds_tangent(&self) -> bool {
+        self.tips[0].holds_tangent()
     }
 
     /// Energy of tips and gravity (J) at `q`.
     pub fn energy(&self, q: &Coordinates) -> f64 {
         let contact = self.geometry.contact(q);
         let d = self.taken(&contact);
-        let elastic: f64 = (0..2).map(|i| self.tip.energy(d[i], d[2 + i], contact.tilt(i))).sum();
+        let elastic: f64 = (0..2).map(|i| self.tips[i].energy(d[i], d[2 + i], contact.tilt(i))).sum();
         elastic - self.weight * q[1]
     }
 
     /// Displacements that the model knows: held ones are 0.
     fn taken(&self, contact: &Contact) -> [f64; 4] {
         let mut d = contact.displacements();
-        if self.tip.holds_normal() {
+        if self.holds_normal() {
             (d[0], d[1]) = (0.0, 0.0);
         }
-        if self.tip.holds_tangent() {
+        if self.holds_tangent() {
             (d[2], d[3]) = (0.0, 0.0);
         }
         d
@@ -100,7 +116,7 @@ impl<'a> Statics<'a> {
     /// Forces (without multipliers) and moments at a contact.
     fn forces(&self, contact: &Contact) -> ([f64; 4], [f64; 2]) {
         let d = self.taken(contact);
-        let [a, b] = [0, 1].map(|i| self.tip.gradient(d[i], d[2 + i], contact.tilt(i)));
+        let [a, b] = [0, 1].map(|i| self.tips[i].gradient(d[i], d[2 + i], contact.tilt(i)));
         ([a.normal, b.normal, a.tangential, b.tangential], [a.moment, b.moment])
     }
 
@@ -114,7 +130,7 @@ impl<'a> Statics<'a> {
         let contact = self.geometry.contact(q);
         let (f, moments) = self.forces(&contact);
         let pull = contact.pull(&f, &moments);
-        [pull[0], pull[1] - self.weight, pull[2] / self.geometry.radius]
+        [pull[0], pull[1] - self.weight, pull[2] / self.geometry.scale()]
     }
 
     /// Hessian of the energy in (x, y, a theta) (N/m), joints fixed; `f` are the contact forces,
@@ -125,7 +141,7 @@ impl<'a> Statics<'a> {
         let rows = contact.jacobian();
         let mut h = contact.curvature(f);
         for i in 0..2 {
-            let k = self.tip.curvature(d[i], d[2 + i], contact.tilt(i));
+            let k = self.tips[i].curvature(d[i], d[2 + i], contact.tilt(i));
             let sign = if i == 0 { 1.0 } else { -1.0 };
             let first = |r: &Coordinates| [r[0], r[1], r[2]];
             let local = [first(&rows[i]), first(&rows[2 + i]), [0.0, 0.0, sign]];
@@ -145,8 +161,8 @@ impl<'a> Statics<'a> {
     /// From (x, y, theta) to (x, y, a theta).
     fn scaled(&self, mut h: Square<3>) -> Square<3> {
         for k in 0..3 {
-            h[2][k] /= self.geometry.radius;
-            h[k][2] /= self.geometry.radius;
+            h[2][k] /= self.geometry.scale();
+            h[k][2] /= self.geometry.scale();
         }
         h
     }
@@ -154,25 +170,39 @@ impl<'a> Statics<'a> {
     /// Smallest eigenvalue of the Hessian along what the held constraints leave free (N/m). Without
     /// freedom: infinite.
     pub fn smallest_eigenvalue(&self, q: &Coordinates, f: &[f64; 4]) -> f64 {
-        let h = self.hessian(q, f);
-        if self.tip.holds_normal() {
-            return f64::INFINITY;
+        self.free_eigenvalues(q, f).first().copied().unwrap_or(f64::INFINITY)
+    }
+
+    /// Eigenvalues of the Hessian along what the held constraints leave free, rising (N/m).
+    pub fn free_eigenvalues(&self, q: &Coordinates, f: &[f64; 4]) -> Vec<f64> {
+        if self.holds_normal() {
+            return Vec::new();
         }
-        if !self.tip.holds_tangent() {
-            return symmetric_eigen(&h)[0].0;
+        let h = self.hessian(q, f);
+        if !self.holds_tangent() {
+            return symmetric_eigen(&h).map(|pair| pair.0).to_vec();
         }
         // Two held rows leave one direction: their cross product.
         let rows = self.geometry.contact(q).jacobian();
-        let [a, b] = [rows[2], rows[3]].map(|r| [r[0], r[1], r[2] / self.geometry.radius]);
+        let [a, b] = [rows[2], rows[3]].map(|r| [r[0], r[1], r[2] / self.geometry.scale()]);
         let z = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
         let form: f64 = (0..3).map(|i| (0..3).map(|j| z[i] * h[i][j] * z[j]).sum::<f64>()).sum();
-        form / z.iter().map(|v| v * v).sum::<f64>()
+        vec![form / z.iter().map(|v| v * v).sum::<f64>()]
+    }
+
+    /// Length of the force that is left in (x, y, a theta) (N) under the contact forces `f`,
+    /// multipliers included.
+    pub fn residual(&self, q: &Coordinates, f: &[f64; 4]) -> f64 {
+        let contact = self.geometry.contact(q);
+        let pull = contact.pull(f, &self.forces(&contact).1);
+        let left = [pull[0], pull[1] - self.weight, pull[2] / self.geometry.scale()];
+        left.iter().map(|v| v * v).sum::<f64>().sqrt()
     }
 
     /// Whether the smallest eigenvalue is above `limit` (N/m), by the leading minors: much quicker
     /// than the value.
     pub fn stiffer_than(&self, limit: f64, q: &Coordinates, f: &[f64; 4]) -> bool {
-        if self.tip.holds_normal() || self.tip.holds_tangent() {
+        if self.holds_normal() || self.holds_tangent() {
             return self.smallest_eigenvalue(q, f) > limit;
         }
         let h = self.hessian(q, f);
@@ -183,23 +213,53 @@ impl<'a> Statics<'a> {
 
     /// The closed form at joint angles 0 (docs/reference/grasp.md): x = theta = 0, and for tips that deform
     /// along the face y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the
-    /// force that soft ones have at d_0. That of tabulated tips is found next to it; its eigenvalue
-    /// is not a number where there is none.
+    /// force that soft ones have at d_0. That of tabulated tips, and of fingers that differ, is
+    /// found next to it; its eigenvalue is not a number where there is none.
     pub fn pinch(&self, scene: &Scene) -> Equilibrium {
         let d = scene.initial.normal_displacement;
         let stiffness = PI * scene.fingertip.youngs_modulus;
-        let sag = if self.tip.holds_tangent() { 0.0 } else { self.weight / (4.0 * stiffness * d) };
+        let sag = if self.holds_tangent() { 0.0 } else { self.weight / (4.0 * stiffness * d) };
         let (grip, half) = (stiffness * d * d, 0.5 * self.weight);
         let forces = [grip, grip, half, half];
-        if scene.fingertip.model != FingertipModel::Tabulated {
-            return self.at([0.0, sag - self.geometry.link, 0.0, 0.0, 0.0], forces);
+        let level = self.geometry.level();
+        if scene.fingertip.model != FingertipModel::Tabulated && scene.second.is_none() {
+            return self.at([0.0, sag + level, 0.0, 0.0, 0.0], forces);
         }
-        // Springs that are not alike have no closed form, but the same at the stiffness that they
-        // have along the face there.
-        let level = [0.0, -self.geometry.link, 0.0, 0.0, 0.0];
-        let along = self.tip.curvature(d, 0.0, self.geometry.contact(&level).tilt(0))[1][1];
-        let guess = self.at([0.0, self.weight / (2.0 * along) - self.geometry.link, 0.0, 0.0, 0.0], forces);
+        if self.holds_normal() {
+            let middle = self.at([self.middle(), level, 0.0, 0.0, 0.0], forces);
+            return self
+                .equilibrium([0.0; 2], &middle)
+                .unwrap_or(Equilibrium { smallest_eigenvalue: f64::NAN, ..middle });
+        }
+        // Without a closed form: shared so that both tips press alike, and hung from the stiffness
+        // along the face that they have there.
+        let mut q = [self.middle(), level, 0.0, 0.0, 0.0];
+        let reach = 0.99 * d;
+        let (mut low, mut high) = (q[0] - reach, q[0] + reach);
+        for _ in 0..60 {
+            let f = self.elastic_forces(&q);
+            if f[0] > f[1] {
+                low = q[0]
+            } else {
+                high = q[0]
+            }
+            q[0] = 0.5 * (low + high);
+        }
+        let contact = self.geometry.contact(&q);
+        let c = self.taken(&contact);
+        let along: f64 = (0..2).map(|i| self.tips[i].curvature(c[i], 0.0, contact.tilt(i))[1][1]).sum();
+        if along > 0.0 {
+            q[1] += self.weight / along;
+        }
+        let f = self.elastic_forces(&q);
+        let guess = self.at(q, [f[0], f[1], half, half]);
         self.equilibrium([0.0; 2], &guess).unwrap_or(Equilibrium { smallest_eigenvalue: f64::NAN, ..guess })
+    }
+
+    /// The place of the object at joint angles 0 at which both tips are pressed in by as much (m).
+    fn middle(&self) -> f64 {
+        let Geometry { base, radius, .. } = self.geometry;
+        0.5 * (base[0][0] + radius[0] + base[1][0] - radius[1])
     }
 
     /// All that belongs to an equilibrium at `q`; `multipliers` are the forces of held rows.
@@ -222,14 +282,14 @@ impl<'a> Statics<'a> {
     }
 
     fn holds(&self, k: usize) -> bool {
-        if k < 2 { self.tip.holds_normal() } else { self.tip.holds_tangent() }
+        if k < 2 { self.holds_normal() } else { self.holds_tangent() }
     }
 
     /// The equilibrium at `joints` (rad) next to the pose and forces of `guess`: Newton's method on
     /// the energy with multipliers for held rows. None where it does not settle within a quarter of
     /// the radius.
     pub fn equilibrium(&self, joints: [f64; 2], guess: &Equilibrium) -> Option<Equilibrium> {
-        let a = self.geometry.radius;
+        let a = self.geometry.scale();
         let mut q = guess.q;
         [q[3], q[4]] = joints;
         let mut f = guess.forces;
@@ -300,7 +360,7 @@ impl<'a> Statics<'a> {
         let at = |done: f64| [0, 1].map(|i| from[i] + done * (joints[i] - from[i]));
         // Way of the pose (x, y, a theta) from one equilibrium to the next.
         let way = |from: &Equilibrium, to: &Equilibrium| {
-            let turn = self.geometry.radius * (to.q[2] - from.q[2]);
+            let turn = self.geometry.scale() * (to.q[2] - from.q[2]);
             [to.q[0] - from.q[0], to.q[1] - from.q[1], turn]
         };
         let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
@@ -325,7 +385,7 @@ impl<'a> Statics<'a> {
             let same = found.filter(|e| {
                 let moved = way(&here, e);
                 let off = std::array::from_fn(|k| moved[k] - speed[k] * step);
-                length(off) <= 0.5 * step * (length(speed) + self.geometry.link * whole)
+                length(off) <= 0.5 * step * (length(speed) + self.geometry.link[0] * whole)
             });
             let Some(equilibrium) = same else {
                 if !of_here {
@@ -352,12 +412,12 @@ impl<'a> Statics<'a> {
 
     /// The first tip that has left the object or the model's range at `q`.
     pub fn out_of_range(&self, q: &Coordinates) -> Option<Lost> {
-        if self.tip.holds_normal() {
+        if self.holds_normal() {
             return None;
         }
         let contact = self.geometry.contact(q);
         (0..2).find_map(|i| match contact.normal[i] {
-            d if in_range(self.geometry.radius, d, contact.tilt(i).sin) => None,
+            d if in_range(self.geometry.radius[i], d, contact.tilt(i).sin) => None,
             d if d > 0.0 => Some(Lost::Range(i)),
             _ => Some(Lost::Contact(i)),
         })

@@ -2,11 +2,12 @@
 //! keeps it at 1.
 
 use crate::grasp::control::Phase;
-use crate::grasp::integrators::{Rk4, SemiImplicitEuler, Stepper, System};
+use crate::grasp::integrators::{Form, Rk4, SemiImplicitEuler, Stepper};
 use crate::grasp::minimal::Minimal;
-use crate::grasp::models::{Tip, tip};
+use crate::grasp::models::{Tip, tips};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::plant::Plant;
+use crate::grasp::relaxing::Relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::numerics::dense::spectral_radius;
 use crate::types::Scene;
@@ -19,7 +20,7 @@ pub const LIMIT: f64 = 1.0 + 1e-5;
 
 /// Spectral radius of one step of `h` seconds about `state`, from central differences of the step
 /// itself.
-pub fn growth<P: Stepper, const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> f64 {
+pub fn growth<P: Stepper, const N: usize, S: Form<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> f64 {
     let mut matrix = [[0.0; N]; N];
     for k in 0..N {
         if k == S::WORK {
@@ -54,7 +55,7 @@ const SETTLED: f64 = 0.005;
 /// By how much the motion itself grows in `h` seconds about `state`, from parts so short that
 /// halving them changes nothing; None where it does not. Longer parts would blow up by themselves,
 /// and what blows up in parts excused the step that blew up as a whole.
-fn own_growth<const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> Option<f64> {
+fn own_growth<const N: usize, S: Form<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> Option<f64> {
     let mut parts = PARTS;
     let mut before = f64::NAN;
     for _ in 0..HALVINGS {
@@ -70,10 +71,15 @@ fn own_growth<const N: usize, S: System<N>>(system: &S, phase: &Phase, h: f64, s
     None
 }
 
+/// Largest part of the motion's own exponent, up to 1 in a step, by which a step's may differ and
+/// still follow it: both methods are at least of first order, so that they differ by less than half
+/// of it.
+const FOLLOWS: f64 = 0.5;
+
 /// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp
-/// itself is unstable (by its control, say) and the step follows that growth to 2 %, the step is
-/// not to blame, and 1 is given back.
-pub fn growth_of<const N: usize, S: System<N>>(
+/// itself is unstable (an object that falls, or by its control) and the step follows that growth,
+/// the step is not to blame, and 1 is given back.
+pub fn growth_of<const N: usize, S: Form<N>>(
     method: Method,
     system: &S,
     phase: &Phase,
@@ -89,7 +95,8 @@ pub fn growth_of<const N: usize, S: System<N>>(
         return found;
     }
     match own_growth(system, phase, h, state) {
-        Some(own) if found <= 1.02 * own && own.is_finite() => 1.0,
+        Some(own) if own.is_finite() && found <= 1.02 * own => 1.0,
+        Some(own) if own.ln() <= 1.0 && (found.ln() - own.ln()).abs() <= FOLLOWS * own.ln() => 1.0,
         _ => found,
     }
 }
@@ -116,31 +123,37 @@ pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
 
 /// Largest stable step (s) at all of the equilibria `at`, to 1 %, with the scene's gains.
 pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: &[Equilibrium]) -> f64 {
-    let (gain, tip) = (scene.integrator.baumgarte, tip(&scene.fingertip));
-    let stable = |h, e| growth_at(scene, tip.as_ref(), method, formulation, [h, gain], e) <= LIMIT;
+    let (gain, tips) = (scene.integrator.baumgarte, tips(scene));
+    let tips = [tips[0].as_ref(), tips[1].as_ref()];
+    let stable = |h, e| growth_at(scene, tips, method, formulation, [h, gain], e) <= LIMIT;
     largest(1e-7, 1.0, |h| at.iter().all(|e| stable(h, e)))
 }
 
 /// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's
 /// step, to 1 %.
 pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
-    let (method, step, tip) = (scene.integrator.method, scene.integrator.step, tip(&scene.fingertip));
-    largest(1e-3, 1e9, |g| growth_at(scene, tip.as_ref(), method, Formulation::Multipliers, [step, g], at) <= LIMIT)
+    let (method, step, tips) = (scene.integrator.method, scene.integrator.step, tips(scene));
+    let tips = [tips[0].as_ref(), tips[1].as_ref()];
+    largest(1e-3, 1e9, |g| growth_at(scene, tips, method, Formulation::Multipliers, [step, g], at) <= LIMIT)
 }
 
-/// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tip`, with the
+/// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tips`, with the
 /// gain `gain` (1/s) in the multiplier form.
 pub fn growth_at(
     scene: &Scene,
-    tip: &dyn Tip,
+    tips: [&dyn Tip; 2],
     method: Method,
     formulation: Formulation,
     [h, gain]: [f64; 2],
     at: &Equilibrium,
 ) -> f64 {
-    let plant = Plant::new(scene, tip, at);
+    let plant = Plant::of(scene, tips, at);
     let phase = Phase::hold([at.q[3], at.q[4]]);
     match formulation {
+        Formulation::Minimal if !plant.branches.is_empty() => {
+            let system = Relaxing(plant);
+            growth_of(method, &system, &phase, h, &system.start(at))
+        }
         Formulation::Minimal => {
             let system = Minimal(plant);
             growth_of(method, &system, &phase, h, &system.start(at))

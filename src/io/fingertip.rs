@@ -137,10 +137,18 @@ pub fn write_fingertip(
     } else {
         "model = \"parallel\"".into()
     };
+    let modulus = 1e3 * calibration * pad.hemisphere_kpa;
+    let mut known = String::new();
+    if pad.deviation > 0.0 {
+        known += &format!("youngs_modulus_sd = {:.6e}\n", modulus * pad.deviation);
+    }
+    if let Some([low, high]) = pad.bounds {
+        known += &format!("youngs_modulus_bounds = [{:.6e}, {:.6e}]\n", modulus * low, modulus * high);
+    }
     let text = format!(
         "# A fingertip for the grasp simulator, from {from}: [fingertip] file = \"this file\"\n\
          # The hemisphere, of one modulus or of unlike springs, whose force is nearest to the pad's. SI units above, mm, kPa and N under [pad].\n\
-         radius = {:.6e}\nyoungs_modulus = {:.6e}\n{springs}\n\n\
+         radius = {:.6e}\nyoungs_modulus = {:.6e}\n{known}{springs}\n\n\
          [pad]\n\
          model = \"{name}\"          # the smallest of uniform, layered and map whose forces are the map's to 2 %\n\
          calibration = {calibration:.6}        # measured force over the model's, which is the finite elements' where they are below\n\
@@ -149,7 +157,7 @@ pub fn write_fingertip(
          surface_radius_mm = {}\nthickness_mm = {:.6}\ncolumns = {}\n\
          indentation_mm = [{}]\nforce_n = [{}]\nforce_one_modulus_n = [{}]\n",
         1e-3 * radius_mm,
-        1e3 * calibration * pad.hemisphere_kpa,
+        modulus,
         pad.effective_kpa,
         pad.hemisphere_residual,
         pad.profile_residual,

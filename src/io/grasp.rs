@@ -2,7 +2,7 @@
 
 use super::csv::write_table;
 use crate::error::{GraspError, IoError};
-use crate::types::grasp::{GraspAnalysis, GraspRun, MotionRow, Sample};
+use crate::types::grasp::{Bands, GraspAnalysis, GraspRun, MotionRow, Sample};
 use crate::types::scene::SweepCase;
 use std::path::Path;
 
@@ -57,6 +57,22 @@ pub fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<()
     write_table(path.as_ref(), &Sample::COLUMNS, rows)
 }
 
+/// Writes the time (s) and the least and largest of each other column of [`Sample::COLUMNS`].
+///
+/// # Errors
+/// [`IoError`] when the file cannot be written.
+pub fn write_bands(path: impl AsRef<Path>, bands: &Bands) -> Result<(), IoError> {
+    let names = Sample::COLUMNS[1..].iter().flat_map(|c| [format!("{c}_low"), format!("{c}_high")]);
+    let header: Vec<String> = std::iter::once("time".to_string()).chain(names).collect();
+    let header: Vec<&str> = header.iter().map(String::as_str).collect();
+    let rows = bands.low.iter().zip(&bands.high).map(|(low, high)| {
+        let ([time, low @ ..], [_, high @ ..]) = (stored_sample(low), stored_sample(high));
+        let pairs = low.into_iter().zip(high).flat_map(|(a, b)| [number(a), number(b)]);
+        std::iter::once(seconds(time)).chain(pairs).collect()
+    });
+    write_table(path.as_ref(), &header, rows)
+}
+
 fn motion_row(m: &MotionRow) -> Vec<String> {
     std::iter::once(m.step.to_string()).chain(stored_motion(m).map(number)).collect()
 }
@@ -69,9 +85,9 @@ pub fn write_motions(path: impl AsRef<Path>, motions: &[MotionRow]) -> Result<()
     write_table(path.as_ref(), &MotionRow::COLUMNS, motions.iter().map(motion_row))
 }
 
-/// Writes an ensemble: case, its keys, how it ended (`completed`, the event that ended it, `slip` where a tip slipped on the way, or the
-/// error), when (s), then
-/// [`MotionRow::COLUMNS`], a row a motion; a case without motions has one row with empty places.
+/// Writes an ensemble: case, its keys, how it ended (`completed`, or the kind of [`GraspRun::flaw`], or the
+/// error), when (s), then [`MotionRow::COLUMNS`], a row a motion, and the largest friction that the run needed; a case without motions has
+/// one row with empty places.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -85,6 +101,7 @@ pub fn write_sweep(
     header.extend(keys);
     header.extend(strings(&["outcome", "time"]));
     header.extend(strings(&MotionRow::COLUMNS));
+    header.push("largest_required_friction".into());
     let header: Vec<&str> = header.iter().map(String::as_str).collect();
     let mut rows = Vec::new();
     for (i, (case, result)) in cases.iter().zip(results).enumerate() {
@@ -100,11 +117,12 @@ pub fn write_sweep(
             Err(error) => (error.to_string(), 0.0, &[][..]),
         };
         start.extend([outcome, seconds(time)]);
+        let needed = vec![result.as_ref().map_or(String::new(), |run| number(run.required_friction))];
         if motions.is_empty() {
-            start.resize(header.len(), String::new());
-            rows.push(start);
+            start.resize(header.len() - 1, String::new());
+            rows.push([start, needed].concat());
         } else {
-            rows.extend(motions.iter().map(|m| [start.clone(), motion_row(m)].concat()));
+            rows.extend(motions.iter().map(|m| [start.clone(), motion_row(m), needed.clone()].concat()));
         }
     }
     write_table(path.as_ref(), &header, rows.into_iter())
@@ -139,7 +157,8 @@ pub fn write_energy(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<
     write_table(path.as_ref(), &["step", "model", "axis", "theta_deg", "value", "energy"], rows)
 }
 
-/// Writes step, joint angles, model, pose, displacements, eigenvalues (N/m), residual (N), class.
+/// Writes step, joint angles, model, the stationary pose, displacements there, eigenvalues (N/m), residual (N), class, what holds the
+/// object along its faces, and the distance from the parallel model's equilibrium (m); places of what does not exist are empty.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -159,14 +178,18 @@ pub fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Resu
         "lambda3",
         "residual",
         "class",
+        "hold",
+        "distance",
     ];
+    let cell = |v: Option<f64>| v.map_or(String::new(), number);
     let rows = analysis.stability.iter().map(|r| {
         let mut row = vec![r.step.to_string()];
         row.extend(r.joints.map(|v| number(v.to_degrees())));
         row.push(r.model.name().into());
-        let ([x, y, theta], [d1, d2], [l1, l2, l3]) = (r.pose, r.normal, r.eigenvalues);
-        row.extend([x, y, theta.to_degrees(), d1, d2, l1, l2, l3, r.residual].map(number));
-        row.push(r.class.name().into());
+        row.extend([0, 1, 2].map(|k| cell(r.pose.map(|p| if k == 2 { p[k].to_degrees() } else { p[k] }))));
+        row.extend([0, 1].map(|k| cell(r.normal.map(|d| d[k]))));
+        row.extend([0, 1, 2].map(|k| cell(r.eigenvalues.get(k).copied())));
+        row.extend([cell(r.residual), r.class.name().into(), r.hold.name().into(), cell(r.distance)]);
         row
     });
     write_table(path.as_ref(), &columns, rows)
@@ -204,7 +227,7 @@ pub fn write_pinch_map(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Resu
         } else {
             let [_, x, y, theta, _, _, rest @ ..] = s.row();
             row.extend([x, y, theta.to_degrees()].map(number));
-            row.extend(rest.map(number));
+            row.extend(rest[..8].iter().copied().map(number));
             row.push(number(c.smallest_eigenvalue));
         }
         row

@@ -41,6 +41,8 @@ pub mod config;
 
 pub mod grasp;
 
+pub mod measured;
+
 pub mod fingertip;
 
 pub mod skin;
@@ -97,8 +99,8 @@ pub use digest::{digest, files_of};
 pub use field::{FieldConvention, read_field, read_field_as, read_samples};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
-    stored_motion, stored_sample, write_energy, write_motions, write_pinch_map, write_posture_force, write_stability,
-    write_sweep, write_trajectory,
+    stored_motion, stored_sample, write_bands, write_energy, write_motions, write_pinch_map, write_posture_force,
+    write_stability, write_sweep, write_trajectory,
 };
 pub use image::{
     ImageKind, Stored, WHOLE, count_non_finite, labels_of, read_header, read_integers, read_labels, read_mask,
@@ -107,6 +109,7 @@ pub use image::{
 pub use live::{Hold, abandon};
 pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
+pub use measured::{read_measured, write_measured};
 pub use memory::memory_left;
 pub use mujoco::{write_mjcf, write_msh};
 pub use nifti::{

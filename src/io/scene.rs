@@ -7,7 +7,7 @@ use crate::types::Fingertip;
 use crate::types::fingertip::FingertipModel;
 use crate::types::names;
 use crate::types::scene::{
-    Finger, Formulation, Gains, Initial, Integrator, Method, Motion, Object, Push, Rolling, Scene, SweepCase,
+    Finger, Formulation, Gains, Initial, Integrator, Method, Motion, Object, Push, Rolling, Scene, Second, SweepCase,
     rectangle_inertia,
 };
 use serde::Deserialize;
@@ -52,9 +52,24 @@ pub struct SceneFile {
 /// Keys of each table; a test holds them against what is deserialised.
 const KEYS: [(&str, &[&str]); 10] = [
     ("", &["fingertip", "finger", "object", "initial", "gravity", "integrator", "motion", "push", "sweep"]),
-    ("fingertip", &["file", "radius", "youngs_modulus", "damping", "model", "profile_depth", "profile_modulus"]),
-    ("finger", &["link", "half_span", "inertia", "gains", "fixed"]),
-    ("object", &["width", "height", "mass", "inertia", "friction"]),
+    (
+        "fingertip",
+        &[
+            "file",
+            "radius",
+            "youngs_modulus",
+            "youngs_modulus_sd",
+            "youngs_modulus_bounds",
+            "damping",
+            "maxwell",
+            "stiffening",
+            "model",
+            "profile_depth",
+            "profile_modulus",
+        ],
+    ),
+    ("finger", &["link", "links", "half_span", "base", "inertia", "gains", "fixed"]),
+    ("object", &["width", "height", "mass", "inertia", "friction", "offset"]),
     ("initial", &["normal_displacement", "theta", "rest"]),
     ("gravity", &["y"]),
     ("integrator", &["method", "step", "output_every", "formulation", "baumgarte", "rolling", "tolerance"]),
@@ -63,6 +78,9 @@ const KEYS: [(&str, &[&str]); 10] = [
     ("sweep", &["key", "values"]),
 ];
 const GAINS: [&str; 3] = ["kp", "kd", "ki"];
+/// Keys of each of two `[[finger]]` tables: those of a finger, then those of its tip.
+const FINGER: [&str; 6] = ["link", "links", "base", "inertia", "gains", "fixed"];
+const TIP: [&str; 3] = ["radius", "youngs_modulus", "damping"];
 /// Most cases of an ensemble.
 const MOST_CASES: usize = 100_000;
 
@@ -76,6 +94,7 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
     let mut table = read_table(path)?;
     check_keys(path, &table)?;
     let fingertip_file = merge_fingertip(path, &mut table)?;
+    pair_fingers(path, &mut table)?;
     let sweeps = take_sweeps(path, &mut table)?;
     if let Some((key, _)) = sweeps.iter().find(|(key, _)| overrides.replace(key)) {
         let what = format!("[[sweep]] changes {key}, which is set from outside for all scenes");
@@ -121,6 +140,9 @@ fn check_keys(path: &Path, table: &Table) -> Result<(), IoError> {
     known(path, "the scene", table, KEYS[0].1)?;
     for (name, keys) in &KEYS[1..] {
         let Some(value) = table.get(*name) else { continue };
+        if *name == "finger" && value.is_array() {
+            continue;
+        }
         let many = matches!(*name, "motion" | "push" | "sweep");
         let parts: Vec<&Table> = match value {
             Value::Table(part) if !many => vec![part],
@@ -184,6 +206,86 @@ fn merge_fingertip(path: &Path, table: &mut Table) -> Result<Option<PathBuf>, Io
         tip.entry(key).or_insert(value);
     }
     Ok(Some(file))
+}
+
+/// Two `[[finger]]` tables become the pairs of `[finger]` and of `[fingertip]`.
+fn pair_fingers(path: &Path, table: &mut Table) -> Result<(), IoError> {
+    let Some(Value::Array(list)) = table.get("finger") else { return Ok(()) };
+    let all: Option<Vec<Table>> = list.iter().map(|v| v.as_table().cloned()).collect();
+    let Some([left, right]) = all.as_deref().and_then(|l| <&[Table; 2]>::try_from(l).ok()) else {
+        let what = format!("has {} [[finger]] tables, and a grasp has two fingers", list.len());
+        return Err(format(path, what, "give two, the left one first, or one [finger] for fingers that are alike"));
+    };
+    // A finger of one joint beside one of two has a list of one link.
+    let mut pair = [left.clone(), right.clone()];
+    if pair.iter().any(|f| f.contains_key("links")) {
+        for finger in &mut pair {
+            if let (Some(link), false) = (finger.remove("link"), finger.contains_key("links")) {
+                finger.insert("links".into(), Value::Array(vec![link]));
+            }
+        }
+    }
+    let [left, right] = &pair;
+    let (mut fingers, mut tips) = (Table::new(), Table::new());
+    for keys in [&FINGER[..], &TIP] {
+        for finger in [left, right] {
+            known(path, "[[finger]]", finger, &[&FINGER[..], &TIP].concat())?;
+            if let Some(gains) = finger.get("gains").and_then(Value::as_table) {
+                known(path, "[[finger]] gains", gains, &GAINS)?;
+            }
+        }
+        for key in keys {
+            let pair = match [left, right].map(|f| f.get(*key).cloned()) {
+                [None, None] => continue,
+                [Some(a), Some(b)] => Value::Array(vec![a, b]),
+                _ => {
+                    let what = format!("one [[finger]] has {key}, the other has not");
+                    return Err(format(path, what, "give it for both"));
+                }
+            };
+            let into = if TIP.contains(key) { &mut tips } else { &mut fingers };
+            into.insert((*key).to_string(), pair);
+        }
+    }
+    table.insert("finger".into(), Value::Table(fingers));
+    let tip = table.entry("fingertip").or_insert_with(|| Value::Table(Table::new()));
+    if let Some(tip) = tip.as_table_mut() {
+        tip.extend(tips);
+    }
+    Ok(())
+}
+
+/// One value for both fingers, or one for each, the left one first.
+#[derive(Debug, Clone)]
+enum Each<T> {
+    Both(T),
+    Two([T; 2]),
+}
+
+impl<T: Clone> Each<T> {
+    fn pair(self) -> [T; 2] {
+        match self {
+            Self::Both(v) => [v.clone(), v],
+            Self::Two(pair) => pair,
+        }
+    }
+}
+
+impl<'de, T: serde::de::DeserializeOwned> Deserialize<'de> for Each<T> {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        let value = Value::deserialize(from)?;
+        if let Value::Array(list) = &value
+            && list.len() == 2
+            && let Ok(pair) = value.clone().try_into::<[T; 2]>()
+        {
+            return Ok(Self::Two(pair));
+        }
+        let one = value.try_into::<T>().map(Self::Both);
+        one.map_err(|e| {
+            let message = e.message().trim_end().to_string();
+            serde::de::Error::custom(format!("{message} (one value for both fingers, or [left, right])"))
+        })
+    }
 }
 
 /// Keys and values of the `[[sweep]]` tables, which are removed.
@@ -263,9 +365,13 @@ struct RawScene {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawFingertip {
-    radius: f64,
-    youngs_modulus: f64,
-    damping: Option<[f64; 2]>,
+    radius: Each<f64>,
+    youngs_modulus: Each<f64>,
+    youngs_modulus_sd: Option<f64>,
+    youngs_modulus_bounds: Option<[f64; 2]>,
+    maxwell: Option<Vec<[f64; 2]>>,
+    stiffening: Option<f64>,
+    damping: Option<Each<[f64; 2]>>,
     model: Option<String>,
     profile_depth: Option<Vec<f64>>,
     profile_modulus: Option<Vec<f64>>,
@@ -274,11 +380,13 @@ struct RawFingertip {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawFinger {
-    link: f64,
+    link: Option<Each<f64>>,
+    links: Option<Each<Vec<f64>>>,
     half_span: Option<f64>,
-    inertia: f64,
-    gains: Option<Gains>,
-    fixed: Option<bool>,
+    base: Option<[[f64; 2]; 2]>,
+    inertia: Each<f64>,
+    gains: Option<Each<Gains>>,
+    fixed: Option<Each<bool>>,
 }
 
 #[derive(Deserialize)]
@@ -289,6 +397,7 @@ struct RawObject {
     mass: f64,
     inertia: Option<f64>,
     friction: Option<f64>,
+    offset: Option<f64>,
 }
 
 #[derive(Deserialize, Default)]
@@ -345,6 +454,37 @@ fn profile(path: &Path, depths: Option<Vec<f64>>, moduli: Option<Vec<f64>>) -> R
     Ok(depths.into_iter().zip(moduli).map(|(d, e)| [d, e]).collect())
 }
 
+/// Lengths of an upper link, where a finger has two, and of the last one (m).
+fn links(path: &Path, finger: &RawFinger) -> Result<([Option<f64>; 2], [f64; 2]), IoError> {
+    match (finger.link.clone(), finger.links.clone()) {
+        (Some(link), None) => Ok(([None; 2], link.pair())),
+        (None, Some(links)) => {
+            let (mut upper, mut last) = ([None; 2], [0.0; 2]);
+            for (i, list) in links.pair().iter().enumerate() {
+                (upper[i], last[i]) = match list[..] {
+                    [one] => (None, one),
+                    [one, two] => (Some(one), two),
+                    _ => {
+                        let what = format!("finger.links has {} lengths", list.len());
+                        return Err(format(path, what, "give one length for each joint, from the base: one or two"));
+                    }
+                };
+            }
+            Ok((upper, last))
+        }
+        (Some(_), Some(_)) => Err(format(path, "finger has link and links", "leave one of them out")),
+        (None, None) => {
+            Err(format(path, "finger has no link", "give link in m, or links = [upper, lower] for two joints"))
+        }
+    }
+}
+
+/// Heights of the joints at which tips hang level at joint angles 0, the left joint at 0 (m).
+fn level(upper: [Option<f64>; 2], link: [f64; 2]) -> [f64; 2] {
+    let [left, right] = [0, 1].map(|i| upper[i].unwrap_or(0.0) + link[i]);
+    [0.0, right - left]
+}
+
 /// A checked scene from its table; what the file leaves out is as in [`Scene::reference`].
 fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene, IoError> {
     let raw: RawScene = Value::Table(table).try_into().map_err(|error: toml::de::Error| {
@@ -357,13 +497,22 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
     let (tip, finger, object) = (raw.fingertip, raw.finger, raw.object);
     let (initial, integrator) = (raw.initial.unwrap_or_default(), raw.integrator.unwrap_or_default());
 
-    let depth_by = |half_span: f64| tip.radius + 0.5 * object.width - half_span;
-    let (half_span, depth) = match (finger.half_span, initial.normal_displacement) {
-        (Some(half_span), Some(depth)) => (half_span, depth),
-        (Some(half_span), None) => (half_span, depth_by(half_span)),
+    let radius = tip.radius.pair();
+    let (upper, link) = links(path, &finger)?;
+    let depth_of = |spans: [f64; 2]| 0.5 * (radius[0] + radius[1] + object.width - spans[0] - spans[1]);
+    let placed = match (finger.base, finger.half_span) {
+        (Some(_), Some(_)) => {
+            return Err(format(path, "finger has base and half_span", "leave one of them out"));
+        }
+        (Some([left, right]), None) => Some(([-left[0], right[0]], [left[1], right[1]])),
+        (None, Some(half_span)) => Some(([half_span; 2], level(upper, link))),
+        (None, None) => None,
+    };
+    let (spans, lifts, depth) = match (placed, initial.normal_displacement) {
+        (Some((spans, lifts)), depth) => (spans, lifts, depth.unwrap_or_else(|| depth_of(spans))),
         (None, depth) => {
             let depth = depth.unwrap_or(default.initial.normal_displacement);
-            (depth_by(depth), depth)
+            (radius.map(|a| a + 0.5 * object.width - depth), level(upper, link), depth)
         }
     };
     let profile = profile(path, tip.profile_depth, tip.profile_modulus)?;
@@ -374,6 +523,35 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
     let rolling = integrator.rolling.as_deref().map(str::parse::<Rolling>).transpose();
     let step = overrides.step.or(integrator.step).unwrap_or(default.integrator.step);
     let every = integrator.output_every.unwrap_or(default.integrator.output_every);
+    let (moduli, inertia) = (tip.youngs_modulus.pair(), finger.inertia.pair());
+    let damping = tip.damping.map_or([default.fingertip.damping; 2], Each::pair);
+    let gains = finger.gains.map_or([default.finger.gains; 2], Each::pair);
+    let fixed = finger.fixed.map_or([false; 2], Each::pair);
+    let model = overrides.model.unwrap_or(model);
+    let [left, right] = [0, 1].map(|i| {
+        let fingertip = Fingertip {
+            radius: radius[i],
+            youngs_modulus: moduli[i],
+            damping: damping[i],
+            model,
+            maxwell: tip.maxwell.clone().unwrap_or_default(),
+            stiffening: tip.stiffening,
+            deviation: tip.youngs_modulus_sd.unwrap_or(0.0) / moduli[0],
+            bounds: tip.youngs_modulus_bounds.map(|b| b.map(|v| v / moduli[0])),
+            profile: profile.clone(),
+        };
+        let finger = Finger {
+            link: link[i],
+            upper: upper[i],
+            half_span: spans[i],
+            lift: lifts[i],
+            inertia: inertia[i],
+            gains: gains[i],
+            fixed: fixed[i],
+        };
+        Second { fingertip, finger }
+    });
+    let differ = left != right;
     let motion = |m: RawMotion| Motion {
         target: m.theta.map(f64::to_radians),
         duration: m.duration.unwrap_or(0.5),
@@ -381,26 +559,16 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
     };
     let push = |p: RawPush| Push { start: p.start, duration: p.duration, force: p.force, at: p.at.unwrap_or_default() };
     let scene = Scene {
-        fingertip: Fingertip {
-            radius: tip.radius,
-            youngs_modulus: tip.youngs_modulus,
-            damping: tip.damping.unwrap_or(default.fingertip.damping),
-            model: overrides.model.unwrap_or(model),
-            profile,
-        },
-        finger: Finger {
-            link: finger.link,
-            half_span,
-            inertia: finger.inertia,
-            gains: finger.gains.unwrap_or(default.finger.gains),
-            fixed: finger.fixed.unwrap_or(false),
-        },
+        fingertip: left.fingertip,
+        finger: left.finger,
+        second: differ.then_some(right),
         object: Object {
             width: object.width,
             height: object.height,
             mass: object.mass,
             inertia: object.inertia.unwrap_or(rectangle_inertia(object.mass, object.width, object.height)),
             friction: object.friction,
+            offset: object.offset.unwrap_or(0.0),
         },
         initial: Initial {
             normal_displacement: depth,

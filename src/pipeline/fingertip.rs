@@ -237,6 +237,51 @@ fn vague(folder: &StiffnessFolder) -> Vec<&str> {
     tissue.map(|r| r.name.as_str()).collect()
 }
 
+/// Deviation of the force that a press of known travel gives (1): forces of the elements at the
+/// travel that `palpate stiffness` measures are the phantom's to 3 % (docs/reference/fingertip.md).
+const TRAVEL: f64 = 0.03;
+
+/// Modulus of a tissue of which only a bound is known, at the far end, over the bound: so stiff or
+/// soft that its springs no longer count.
+const FAR: f64 = 1e3;
+
+/// The deviation of the tip's modulus and its bounds, both over it: each tissue's modulus is moved
+/// by its deviation, or to the far end of its bound, and the columns reduced again by `reduced`.
+/// Where the force of the press was measured, all are scaled to it.
+fn deviation(
+    folder: &StiffnessFolder,
+    out: &PadOutcome,
+    reduced: &dyn Fn(&Volume) -> Option<PadOutcome>,
+) -> (f64, Option<[f64; 2]>) {
+    let bones: Vec<&str> = hard(folder).iter().map(|r| r.name.as_str()).collect();
+    let tip = |out: &PadOutcome| out.pad.hemisphere_kpa * out.calibration(folder.force_n);
+    let own = tip(out);
+    let with = |region: &StiffnessRegion, factor: f64| {
+        let near = |v: f32| (f64::from(v) / region.youngs_modulus - 1.0).abs() < 1e-4;
+        let values = folder.map.as_slice().iter().map(|v| if near(*v) { v * factor as f32 } else { *v }).collect();
+        let moved = Volume::from_vec(*folder.map.grid(), values).ok()?;
+        reduced(&moved).map(|o| tip(&o) / own)
+    };
+    let known = out.at_press.is_some() && folder.force_n.is_some();
+    let mut square = if known { TRAVEL * TRAVEL } else { 0.0 };
+    let mut bounds: Option<[f64; 2]> = None;
+    for region in folder.regions.iter().filter(|r| !bones.contains(&r.name.as_str()) && r.youngs_modulus > 0.0) {
+        if let Some(bound) = region.bound.as_deref() {
+            let far = if bound == "lower" { FAR } else { 1.0 / FAR };
+            if let Some(part) = with(region, far) {
+                let [low, high] = bounds.unwrap_or([1.0; 2]);
+                bounds = Some([low * part.min(1.0), high * part.max(1.0)]);
+            }
+        } else if region.sd > 0.0 {
+            let factor = (region.sd / region.youngs_modulus).min(1.0).exp();
+            if let (Some(up), Some(down)) = (with(region, factor), with(region, 1.0 / factor)) {
+                square += (0.5 * (up - down)).powi(2);
+            }
+        }
+    }
+    (square.sqrt(), bounds)
+}
+
 /// Reduces what `palpate stiffness` found to a fingertip, bone and pressed side as it names them.
 /// Its hemispheres press as the map's finite elements do, on about `nodes` nodes; as the columns do
 /// where that is 0.
@@ -256,7 +301,8 @@ pub fn of_map(folder: &StiffnessFolder, nodes: usize, progress: Progress<'_>) ->
     let along = |u: [f64; 3]| (0..3).map(|a| u[a] * side[a]).sum::<f64>();
     // Of a curved pad that is pressed flat the middle goes less far than the plate.
     let indentation = folder.travel_mm.unwrap_or(-along(moved)) + along(held);
-    let out = run(&folder.map, bone, side, Some(indentation))?;
+    let mut out = run(&folder.map, bone, side, Some(indentation))?;
+    (out.pad.deviation, out.pad.bounds) = deviation(folder, &out, &|map| run(map, bone, side, Some(indentation)).ok());
     if nodes == 0 {
         return Ok(out);
     }

@@ -1,11 +1,12 @@
 //! A scene to a run, an ensemble of runs, or an analysis.
 
 use crate::error::GraspError;
-use crate::grasp::models::tip;
+use crate::grasp::models;
 use crate::grasp::simulate::{self, simulate};
 use crate::grasp::statics::Statics;
-use crate::grasp::{freedom, pinch, posture, stability, stepping};
-use crate::types::grasp::{GraspAnalysis, GraspRun, MotionRow, StableStep};
+use crate::grasp::{freedom, measured, pinch, posture, stability, stepping};
+use crate::types::grasp::{Bands, GraspAnalysis, GraspRun, MotionRow, Sample, StableStep};
+use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::scene::{Push, SweepCase};
 use crate::types::{FingertipModel, Scene};
 use rayon::prelude::*;
@@ -28,6 +29,8 @@ pub struct GraspOutcome {
     pub without_tangential: Option<Result<GraspRun, GraspError>>,
     /// Largest stable steps at the start and at each motion's target.
     pub stable_steps: Vec<StableStep>,
+    /// What the run may be, where the tips' moduli have a deviation or bounds.
+    pub bands: Option<Bands>,
     /// Stage names and wall seconds.
     pub seconds: Vec<(String, f64)>,
 }
@@ -43,17 +46,51 @@ pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspE
     let started = Instant::now();
     progress("compare", 0.7);
     let without_tangential = (scene.fingertip.model == FingertipModel::Parallel)
-        .then(|| simulate(&with_model(scene, FingertipModel::ParallelNormal), &|_| {}));
+        .then(|| simulate(&scene.with_model(FingertipModel::ParallelNormal), &|_| {}));
     seconds.push(("compare".into(), started.elapsed().as_secs_f64()));
+    let started = Instant::now();
+    progress("bands", 0.8);
+    let bands = bands(scene, &run)?;
+    if bands.is_some() {
+        seconds.push(("bands".into(), started.elapsed().as_secs_f64()));
+    }
     let started = Instant::now();
     progress("stable steps", 0.9);
     let stable_steps = stable_steps(scene);
     seconds.push(("stable steps".into(), started.elapsed().as_secs_f64()));
-    Ok(GraspOutcome { run, without_tangential, stable_steps, seconds })
+    Ok(GraspOutcome { run, without_tangential, stable_steps, bands, seconds })
+}
+
+/// The run with moduli a deviation up and down, and at their bounds: the least and the largest of
+/// each quantity. None where neither is known.
+///
+/// # Errors
+/// [`GraspError`] where the scene has no start with one of these moduli.
+fn bands(scene: &Scene, run: &GraspRun) -> Result<Option<Bands>, GraspError> {
+    let tip = &scene.fingertip;
+    let mut factors = Vec::new();
+    if tip.deviation > 0.0 {
+        factors.extend([(-tip.deviation).exp(), tip.deviation.exp()]);
+    }
+    factors.extend(tip.bounds.into_iter().flatten().filter(|f| *f != 1.0));
+    if factors.is_empty() {
+        return Ok(None);
+    }
+    let runs: Vec<GraspRun> =
+        factors.par_iter().map(|f| simulate(&scene.with_moduli(*f), &|_| {})).collect::<Result<_, _>>()?;
+    let among = |pick: fn(f64, f64) -> f64| -> Vec<Sample> {
+        let at = |k: usize, s: &Sample| {
+            let others = runs.iter().filter_map(|r| r.samples.get(k)).filter(|o| (o.time - s.time).abs() < 1e-9);
+            others.fold(*s, |all, o| all.each(o, pick))
+        };
+        run.samples.iter().enumerate().map(|(k, s)| at(k, s)).collect()
+    };
+    let outcomes = runs.iter().map(GraspRun::outcome).collect();
+    Ok(Some(Bands { low: among(f64::min), high: among(f64::max), factors, outcomes }))
 }
 
 /// How far a joint may be from its target when a hold ends (rad).
-const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
+pub const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
 /// How far past the end of a tabulated tip's profile it may be pressed.
 const PAST: f64 = 1.02;
@@ -125,8 +162,9 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
         clock.1 = Instant::now();
         progress(stage, fraction);
     };
-    let soft = with_model(scene, FingertipModel::Parallel);
-    simulate::start(&soft, &Statics::new(&soft, tip(&soft.fingertip).as_ref()))?;
+    let soft = scene.with_model(FingertipModel::Parallel);
+    let tips = models::tips(&soft);
+    simulate::start(&soft, &Statics::of(&soft, [tips[0].as_ref(), tips[1].as_ref()]))?;
     let force = posture::force(&soft.fingertip);
     let (mut stability, mut surfaces, mut lost) = (Vec::new(), Vec::new(), Vec::new());
     for (step, _, found) in stability::postures(&soft, FingertipModel::Parallel) {
@@ -151,11 +189,9 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
     Ok((GraspAnalysis { force, surfaces, stability, lost, freedom, pinch, push, stable_steps }, clock.0))
 }
 
-/// `scene` with tips of another model.
-fn with_model(scene: &Scene, model: FingertipModel) -> Scene {
-    let mut scene = scene.clone();
-    scene.fingertip.model = model;
-    scene
+/// The tip models fitted to measurements on the scene's tip or of its motions.
+pub fn against(scene: &Scene, measured: &Measurements) -> MeasuredFit {
+    measured::fit(scene, measured)
 }
 
 /// The scene's pushes, or one of 10 N below the object's centre, with both joints fixed at the
@@ -163,6 +199,9 @@ fn with_model(scene: &Scene, model: FingertipModel) -> Scene {
 pub fn pushed(scene: &Scene) -> Scene {
     let mut scene = scene.clone();
     scene.finger.fixed = true;
+    if let Some(second) = &mut scene.second {
+        second.finger.fixed = true;
+    }
     scene.initial.joints = scene.motions.first().map_or(scene.initial.joints, |m| m.target);
     scene.motions.clear();
     if scene.pushes.is_empty() {

@@ -2,7 +2,7 @@
 //! layers.
 
 use crate::error::SceneError;
-use crate::skin::{block, column};
+use crate::skin::{block, column, single};
 use crate::types::skin::{BlockRun, SkinSample, SkinScene};
 use std::time::Instant;
 
@@ -11,7 +11,8 @@ use std::time::Instant;
 pub struct SkinOutcome {
     /// The column of layers.
     pub column: Vec<SkinSample>,
-    /// One layer in place of all, where their elements are alike: its scene and response.
+    /// One layer in place of all, of the mean of each part where elements are alike, else fitted: its
+    /// scene and response. None of a scene of one layer.
     pub single: Option<(SkinScene, Vec<SkinSample>)>,
     /// The block of layers; none when a step has no solution.
     pub block: Option<BlockRun>,
@@ -71,7 +72,8 @@ pub fn run(scene: &SkinScene) -> SkinOutcome {
     let mut timed = |name: &str, from: Instant| seconds.push((name.to_string(), from.elapsed().as_secs_f64()));
     let started = Instant::now();
     let column = column::respond(scene);
-    let single = scene.without_layers().map(|one| {
+    let several = scene.layers.len() > 1;
+    let single = several.then(|| scene.without_layers().unwrap_or_else(|| single::fitted(scene))).map(|one| {
         let response = column::respond(&one);
         (one, response)
     });

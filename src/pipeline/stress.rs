@@ -363,11 +363,12 @@ fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
                 .take(3)
                 .collect();
             if friction {
-                let share = |i: usize| {
-                    let used = run.samples.iter().map(move |s| (s.tangential_force[i] / s.normal_force[i]).abs());
-                    used.fold(0.0, f64::max)
-                };
-                error = share(0).max(share(1)) / scene.object.friction.unwrap_or(f64::INFINITY);
+                // A tip that slides asks for no more than there is: what it would ask for without a
+                // limit is the error.
+                let mut free = scene.clone();
+                free.object.friction = None;
+                let asked = simulate(&free, &|_| {}).map_or(f64::NAN, |free| free.required_friction);
+                error = asked / scene.object.friction.unwrap_or(f64::INFINITY);
             } else if run.completed {
                 error = simulate(&exact(scene), &|_| {}).map_or(f64::NAN, |e| posture_error(&run, &e));
             }

@@ -44,6 +44,7 @@ pub fn grasp<'py>(
         run,
         without_tangential: without.as_ref(),
         stable_steps: &outcome.stable_steps,
+        bands: outcome.bands.as_ref(),
         sweep: &sweep,
         seconds: &outcome.seconds,
         warnings: &notes,

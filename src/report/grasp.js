@@ -1,6 +1,6 @@
 (() => {
   const root = document.currentScript.previousElementSibling;
-  const frames = JSON.parse(root.dataset.frames), span = +root.dataset.span;
+  const frames = JSON.parse(root.dataset.frames), bases = JSON.parse(root.dataset.bases);
   const find = (name) => root.querySelector(name);
   const [button, slider, clock] = ["button", "input", "output"].map(find);
   const [left, right, object, one, two] = [".f1", ".f2", ".object", ".a1", ".a2"].map(find);
@@ -14,8 +14,8 @@
   };
   const show = (k) => {
     const [t, x, y, turn, a, b, ...f] = frames[k];
-    left.setAttribute("transform", `translate(${-span},0) rotate(${a})`);
-    right.setAttribute("transform", `translate(${span},0) rotate(${b})`);
+    left.setAttribute("transform", `translate(${bases[0]}) rotate(${a})`);
+    right.setAttribute("transform", `translate(${bases[1]}) rotate(${b})`);
     object.setAttribute("transform", `translate(${x},${y}) rotate(${turn})`);
     one.setAttribute("d", arrow(...f.slice(0, 4)));
     two.setAttribute("d", arrow(...f.slice(4)));

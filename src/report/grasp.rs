@@ -6,7 +6,7 @@ use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
 use crate::types::Scene;
-use crate::types::grasp::{Event, GraspRun, Sample, StableStep};
+use crate::types::grasp::{Bands, Event, EventKind, GraspRun, Sample, StableStep};
 use crate::types::scene::{Method, SweepCase};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -24,6 +24,8 @@ pub struct GraspReport<'a> {
     pub without_tangential: Option<&'a Result<GraspRun, String>>,
     /// Largest stable steps at the postures of the scene.
     pub stable_steps: &'a [StableStep],
+    /// What the run may be, by what is known of the tips' moduli.
+    pub bands: Option<&'a Bands>,
     /// The ensemble, with the error where a case has no result.
     pub sweep: &'a [(SweepCase, Result<GraspRun, String>)],
     /// Stage names and wall seconds.
@@ -35,7 +37,8 @@ pub struct GraspReport<'a> {
 /// An event in one line: time, kind, finger, what.
 pub fn event_line(e: &Event) -> String {
     let finger = e.finger.map_or(String::new(), |f| format!(" of finger {f}"));
-    format!("{:.3} s: {}{finger}: {}", e.time, e.kind.name(), e.what)
+    let until = e.until.filter(|u| *u > e.time).map_or(String::new(), |u| format!(" to {u:.3}"));
+    format!("{:.3}{until} s: {}{finger}: {}", e.time, e.kind.name(), e.what)
 }
 
 /// What happened, in one sentence.
@@ -47,10 +50,21 @@ fn headline(report: &GraspReport<'_>) -> String {
         0 => format!("{} s", short(last)),
         _ => format!("{done} of {all} motions in {} s", short(last)),
     };
-    match run.events.iter().find(|e| e.kind.ends_run()) {
-        Some(event) => format!("{motions}, then the run ended: {}.", event_line(event)),
-        None if run.events.is_empty() => format!("{motions}; the grasp held throughout."),
-        None => format!("{motions}; tips slipped {} times.", run.events.len()),
+    let Some(flaw) = run.flaw() else { return format!("{motions}; the grasp held throughout.") };
+    let of_kind = run.events.iter().filter(|e| e.kind == flaw.kind).count();
+    let times = if of_kind == 1 { "once".into() } else { format!("{of_kind} times") };
+    match flaw.kind {
+        kind if kind.ends_run() => format!("{motions}, then the run ended: {}.", event_line(flaw)),
+        EventKind::Slip => {
+            let far = run.samples.iter().flat_map(|s| s.slip).fold(0.0, |m: f64, v| m.max(v.abs()));
+            format!("{motions}; the grasp slipped: tips slid {times}, by up to {:.2} mm.", 1e3 * far)
+        }
+        EventKind::ValidityRange => format!(
+            "{motions}; a tip was pressed out of the model's range {times}, first at {} s: forces from there on are \
+             extrapolated.",
+            short(flaw.time)
+        ),
+        _ => format!("{motions}; the object left its branch of equilibria {times}, first at {} s.", short(flaw.time)),
     }
 }
 
@@ -64,6 +78,27 @@ fn own_stable_step(report: &GraspReport<'_>) -> Option<f64> {
 /// Least and largest of a quantity over samples.
 fn range(samples: &[Sample], value: impl Fn(&Sample) -> f64) -> [f64; 2] {
     samples.iter().map(value).fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v), r[1].max(v)])
+}
+
+/// What the deviation and the bounds of the moduli come to at the end, in words.
+fn bands_words(report: &GraspReport<'_>) -> Option<String> {
+    let bands = report.bands?;
+    let (low, high) = (bands.low.last()?, bands.high.last()?);
+    let [least, most] = bands.factors.iter().fold([1.0f64; 2], |r, f| [r[0].min(*f), r[1].max(*f)]);
+    let lost = bands.outcomes.iter().filter(|o| **o != "held").count();
+    let lost = match lost {
+        0 => String::new(),
+        n => format!("; {n} of {} runs with such moduli do not hold", bands.outcomes.len()),
+    };
+    Some(format!(
+        "{:+.0} to {:+.0} %: at the end the object stands at {:.2} to {:.2} degrees, gripped by {:.2} to {:.2} N{lost}",
+        100.0 * (least - 1.0),
+        100.0 * (most - 1.0),
+        low.pose[2].to_degrees(),
+        high.pose[2].to_degrees(),
+        0.5 * (low.normal_force[0] + low.normal_force[1]),
+        0.5 * (high.normal_force[0] + high.normal_force[1])
+    ))
 }
 
 /// A few lines for a terminal.
@@ -86,6 +121,9 @@ pub fn text(report: &GraspReport<'_>) -> String {
     let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
     let _ = writeln!(out, "  object       turned {low:.2} to {high:.2} degrees");
     let _ = writeln!(out, "  force        up to {:.2} N at a contact", largest_force(&run.samples));
+    if let Some(words) = bands_words(report) {
+        let _ = writeln!(out, "  moduli       {words}");
+    }
     let drift = run.constraint_drift;
     let _ = writeln!(
         out,
@@ -98,10 +136,14 @@ pub fn text(report: &GraspReport<'_>) -> String {
     }
     if !report.sweep.is_empty() {
         let done = report.sweep.iter().filter_map(|(_, r)| r.as_ref().ok()).filter(|r| r.completed);
-        let (all, slipped) =
-            done.fold((0, 0), |(all, slipped), r| (all + 1, slipped + usize::from(r.flaw().is_some())));
+        let slips = |r: &GraspRun| r.flaw().is_some_and(|e| e.kind == EventKind::Slip);
+        let (all, slipped) = done.fold((0, 0), |(all, slipped), r| (all + 1, slipped + usize::from(slips(r))));
+        let held = report.sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.flaw().is_none())).count();
         let scenes = report.sweep.len();
-        let _ = writeln!(out, "  sweep        {scenes} scenes, {all} ran to their end, {slipped} of them with slip");
+        let _ = writeln!(
+            out,
+            "  sweep        {scenes} scenes, {all} ran to their end, {slipped} of them with slip; {held} held throughout"
+        );
     }
     let _ = writeln!(out, "  time         {:.3} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
     out
@@ -122,7 +164,10 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
         .map(|(case, result)| {
             let values: Map<String, Value> = case.values.iter().map(|(k, v)| (k.clone(), json!(v))).collect();
             match result {
-                Ok(run) => json!({ "values": values, "completed": run.completed, "events": events(run) }),
+                Ok(run) => json!({
+                    "values": values, "completed": run.completed, "outcome": run.outcome(),
+                    "required_friction": run.required_friction, "events": events(run),
+                }),
                 Err(error) => json!({ "values": values, "completed": false, "error": error }),
             }
         })
@@ -136,6 +181,11 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
         "method": scene.integrator.method,
         "step": scene.integrator.step,
         "completed": run.completed,
+        "outcome": run.outcome(),
+        "required_friction": run.required_friction,
+        "moduli": report.bands.map(|b| json!({
+            "factors": b.factors, "outcomes": b.outcomes, "end_low": b.low.last(), "end_high": b.high.last(),
+        })),
         "simulated_seconds": run.samples.last().map_or(0.0, |s| s.time),
         "steps": run.steps,
         "motions_finished": run.motions.iter().filter(|m| m.step > 0).count(),
@@ -155,6 +205,14 @@ pub fn summary(report: &GraspReport<'_>) -> Value {
 /// Lines of one quantity of both fingers, and of the run without tangential deformation dashed.
 fn both(report: &GraspReport<'_>, values: &[(&str, &dyn Fn(&Sample) -> f64)]) -> Vec<Line> {
     let mut lines = Vec::new();
+    if let Some(bands) = report.bands {
+        let step = bands.low.len().div_ceil(400).max(1);
+        for (colour, (_, value)) in values.iter().enumerate() {
+            let both = bands.low.iter().zip(&bands.high).step_by(step);
+            let between: Vec<[f64; 3]> = both.map(|(l, h)| [l.time, value(l), value(h)]).collect();
+            lines.push(Line::band("", colour, &between));
+        }
+    }
     let other = report.without_tangential.and_then(|r| r.as_ref().ok());
     for (dashed, run) in [(true, other), (false, Some(report.run))] {
         let Some(run) = run else { continue };
@@ -175,6 +233,12 @@ pub fn time_plots(report: &GraspReport<'_>) -> String {
         Plot { title, across: "s", marks: &marks }.draw(&both(report, values))
     };
     let mm = |v: f64| 1e3 * v;
+    let slid = report.run.samples.iter().any(|s| s.slip != [0.0; 2]);
+    let mut lines = both(report, &[("needed", &|s| s.required_friction)]);
+    if let (Some(given), Some(last)) = (report.scene.object.friction, report.run.samples.last()) {
+        lines.push(Line::new("given", 1, false, vec![[0.0, given], [last.time, given]]));
+    }
+    let friction = Plot { title: "Coefficient of friction", across: "s", marks: &marks }.draw(&lines);
     [
         plot("Object's angle, degrees", &[("theta", &|s| s.pose[2].to_degrees())]),
         plot(
@@ -195,13 +259,12 @@ pub fn time_plots(report: &GraspReport<'_>) -> String {
             "Tangential force, N",
             &[("finger 1", &|s| s.tangential_force[0]), ("finger 2", &|s| s.tangential_force[1])],
         ),
-        plot(
-            "|f_t / f_n|, to be under the friction",
-            &[
-                ("finger 1", &|s| (s.tangential_force[0] / s.normal_force[0]).abs()),
-                ("finger 2", &|s| (s.tangential_force[1] / s.normal_force[1]).abs()),
-            ],
-        ),
+        friction,
+        if slid {
+            plot("Slip along the face, mm", &[("finger 1", &|s| mm(s.slip[0])), ("finger 2", &|s| mm(s.slip[1]))])
+        } else {
+            String::new()
+        },
     ]
     .concat()
 }
@@ -274,11 +337,12 @@ pub(super) fn steps_table(steps: &[StableStep]) -> String {
 /// The page.
 pub fn page(report: &GraspReport<'_>) -> String {
     let (scene, run) = (report.scene, report.run);
-    let bad = run.events.iter().any(|e| e.kind.ends_run());
-    let (class, word) = match (bad, run.events.is_empty()) {
-        (true, _) => ("low", "ended early"),
-        (false, true) => ("high", "held"),
-        (false, false) => ("moderate", "slipped"),
+    let (class, word) = match run.flaw().map(|e| e.kind) {
+        None => ("high", "held"),
+        Some(kind) if kind.ends_run() => ("low", "ended early"),
+        Some(EventKind::Slip) => ("low", "slipped"),
+        Some(EventKind::ValidityRange) => ("moderate", "out of range"),
+        Some(_) => ("moderate", "off its branch"),
     };
     let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
     let simulated = run.samples.last().map_or(0.0, |s| s.time);
@@ -300,6 +364,9 @@ pub fn page(report: &GraspReport<'_>) -> String {
         let items: String = notes.iter().take(40).map(|w| format!("<li>{}</li>", escape(w))).collect();
         let _ = write!(body, "<article class=\"warnings\"><h3>Events and warnings</h3><ul>{items}</ul></article>");
     }
+    if !report.sweep.is_empty() {
+        body.push_str(&ensemble(report.sweep));
+    }
     let _ = write!(
         body,
         "<section><h2>The grasp</h2><p class=\"lead\">Arrows are the contact forces on the object; the line is the way of \
@@ -320,6 +387,7 @@ pub fn page(report: &GraspReport<'_>) -> String {
         body,
         "<article><h3>Postures reached</h3><p>At the end of each hold, with the desired joint angles.</p><div class=\"postures\">{postures}</div></article></div></section>"
     );
+    let shaded = bands_words(report).map_or(String::new(), |w| format!(" Shaded: moduli of the tips {}.", escape(&w)));
     let beside = match report.without_tangential {
         Some(Ok(other)) => match other.events.iter().find(|e| e.kind.ends_run()) {
             Some(e) => format!(
@@ -333,14 +401,11 @@ pub fn page(report: &GraspReport<'_>) -> String {
     };
     let _ = write!(
         body,
-        "<section><h2>Over time</h2><p class=\"lead\">{beside} Upright lines: ends of motions; red: events.</p><div class=\"plots\">{}</div></section>\
+        "<section><h2>Over time</h2><p class=\"lead\">{beside}{shaded} Upright lines: ends of motions; red: events.</p><div class=\"plots\">{}</div></section>\
          <section><h2>Numbers</h2><div class=\"grid\"><article class=\"wide\"><h3>Motions</h3>{}</article>",
         time_plots(report),
         motions(run)
     );
-    if !report.sweep.is_empty() {
-        let _ = write!(body, "<article class=\"wide\"><h3>Ensemble</h3>{}</article>", ensemble(report.sweep));
-    }
     let _ = write!(
         body,
         "<article><h3>Scene</h3>{}</article><article><h3>Stable steps</h3><p>At the start and at all postures of the scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
@@ -356,54 +421,154 @@ pub fn page(report: &GraspReport<'_>) -> String {
     document(&format!("{} grasp", escape(report.name)), &body)
 }
 
-/// Cases of an ensemble: how each ended, and the last posture.
-fn ensemble(sweep: &[(SweepCase, Result<GraspRun, String>)]) -> String {
-    let mut head: Vec<String> = vec!["Case".into()];
-    head.extend(sweep.first().map_or(Vec::new(), |(c, _)| c.values.iter().map(|v| escape(&v.0)).collect()));
-    head.extend(["Outcome", "Motions", "theta, deg", "largest f_n at rest, N"].map(String::from));
-    let rows: Vec<Vec<String>> = sweep
+/// One case of an ensemble with its result.
+type Case = (SweepCase, Result<GraspRun, String>);
+
+/// Cases that the table shows at most.
+const SHOWN: usize = 200;
+/// Bars of a histogram.
+const BARS: usize = 30;
+
+/// How bad a case went: what has no result first, then what ended early by its time, then the least
+/// friction left.
+fn badness((_, result): &Case) -> (u8, f64) {
+    match result {
+        Err(_) => (0, 0.0),
+        Ok(run) => match run.flaw() {
+            Some(e) if e.kind.ends_run() => (1, e.time),
+            Some(e) => (if e.kind == EventKind::Slip { 2 } else { 3 }, -run.required_friction),
+            None => (4, -run.required_friction),
+        },
+    }
+}
+
+/// How a case went, in words.
+fn outcome_words(result: &Result<GraspRun, String>) -> String {
+    match result {
+        Ok(run) => run.flaw().map_or("held".into(), event_line),
+        Err(error) => error.clone(),
+    }
+}
+
+/// The values of a case, in words.
+fn values_words(case: &SweepCase) -> String {
+    case.values.iter().map(|(k, v)| format!("{k} = {v}")).collect::<Vec<_>>().join(", ")
+}
+
+/// How many cases went each way, the most frequent first.
+pub fn counts(sweep: &[Case]) -> Vec<(String, usize)> {
+    let mut out: Vec<(String, usize)> = Vec::new();
+    for (_, result) in sweep {
+        let name = result.as_ref().map_or("refused", GraspRun::outcome);
+        match out.iter_mut().find(|c| c.0 == name) {
+            Some(c) => c.1 += 1,
+            None => out.push((name.into(), 1)),
+        }
+    }
+    out.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+    out
+}
+
+/// A histogram of `value`, of the cases that held and of those that did not.
+fn histogram(title: &str, across: &str, sweep: &[Case], value: impl Fn(&GraspRun) -> Option<f64>) -> String {
+    let all: Vec<(f64, bool)> = sweep
         .iter()
-        .take(500)
-        .enumerate()
-        .map(|(i, (case, result))| {
-            let mut row = vec![(i + 1).to_string()];
-            row.extend(case.values.iter().map(|v| escape(&v.1)));
-            match result {
-                Ok(run) => {
-                    row.push(run.flaw().map_or("completed".into(), |e| escape(&event_line(e))));
-                    row.push(run.motions.iter().filter(|m| m.step > 0).count().to_string());
-                    let last = run.motions.last().map(|m| m.reached);
-                    row.push(last.map_or("-".into(), |s| fixed2(s.pose[2].to_degrees())));
-                    let most = run.motions.iter().flat_map(|m| m.reached.normal_force).fold(0.0, f64::max);
-                    row.push(fixed2(most));
-                }
-                Err(error) => {
-                    row.push(escape(error));
-                    row.extend(["0", "-", "-"].map(String::from));
-                }
-            }
+        .filter_map(|(_, r)| r.as_ref().ok())
+        .filter_map(|run| Some((value(run).filter(|v| v.is_finite())?, run.flaw().is_none())))
+        .collect();
+    let [low, high] = all.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v.0), r[1].max(v.0)]);
+    if all.is_empty() {
+        return String::new();
+    }
+    let room = if high > low { 0.0 } else { 0.5 * high.abs().max(1e-9) };
+    let (low, high) = (low - room, high + room);
+    let wide = (high - low) / BARS as f64;
+    let mut lines = Vec::new();
+    for (name, colour, held) in [("held", 2, true), ("did not hold", 1, false)] {
+        let mut bars = [0usize; BARS];
+        for (v, _) in all.iter().filter(|v| v.1 == held) {
+            bars[(((v - low) / wide) as usize).min(BARS - 1)] += 1;
+        }
+        if bars.iter().all(|n| *n == 0) {
+            continue;
+        }
+        let steps =
+            bars.iter().enumerate().flat_map(|(i, n)| [i, i + 1].map(|k| [low + k as f64 * wide, 0.0, *n as f64]));
+        lines.push(Line::band(name, colour, &steps.collect::<Vec<_>>()));
+    }
+    Plot { title, across, marks: &[] }.draw(&lines)
+}
+
+/// The ensemble: what share holds, how the results lie, and the worst case.
+fn ensemble(sweep: &[Case]) -> String {
+    let all = sweep.len();
+    let held = sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.flaw().is_none())).count();
+    let most = |run: &GraspRun| run.samples.last().map(|s| 0.5 * (s.normal_force[0] + s.normal_force[1]));
+    let mut order: Vec<&Case> = sweep.iter().collect();
+    order.sort_by(|a, b| badness(a).partial_cmp(&badness(b)).unwrap_or(std::cmp::Ordering::Equal));
+    let worst = order.first().map_or(String::new(), |(case, result)| {
+        format!("The worst: {}: {}.", escape(&values_words(case)), escape(&outcome_words(result)))
+    });
+    let tiles: String = counts(sweep)
+        .iter()
+        .take(5)
+        .map(|(name, n)| tile(&format!("{:.1}", 100.0 * *n as f64 / all as f64), "%", name))
+        .collect();
+    let mut head: Vec<String> =
+        sweep.first().map_or(Vec::new(), |(c, _)| c.values.iter().map(|v| escape(&v.0)).collect());
+    head.extend(["Outcome", "Motions", "theta, deg", "f_n, N", "f_t, N", "Friction needed"].map(String::from));
+    let rows: Vec<Vec<String>> = order
+        .iter()
+        .take(SHOWN)
+        .map(|(case, result)| {
+            let mut row: Vec<String> = case.values.iter().map(|v| escape(&v.1)).collect();
+            row.push(escape(&outcome_words(result)));
+            let run = result.as_ref().ok();
+            let last = run.and_then(|r| r.samples.last());
+            let cell = |v: Option<f64>| v.map_or("-".into(), fixed2);
+            row.push(run.map_or("0".into(), |r| r.motions.iter().filter(|m| m.step > 0).count().to_string()));
+            row.push(cell(last.map(|s| s.pose[2].to_degrees())));
+            row.push(cell(last.map(|s| s.normal_force[0].max(s.normal_force[1]))));
+            row.push(cell(last.map(|s| s.tangential_force[0].abs().max(s.tangential_force[1].abs()))));
+            row.push(cell(run.map(|r| r.required_friction)));
             row
         })
         .collect();
     let head: Vec<&str> = head.iter().map(String::as_str).collect();
-    table(&head, &rows)
+    format!(
+        "<section><h2>Ensemble</h2><p class=\"lead\">{held} of {all} runs held throughout. {worst}</p><div class=\"tiles\">{tiles}</div>\
+         <div class=\"plots\">{}{}{}</div><details><summary>The worst {} of {all} runs (all are in sweep.csv)</summary>{}</details></section>",
+        histogram("Object's angle at the end, runs", "degrees", sweep, |r| r
+            .samples
+            .last()
+            .map(|s| s.pose[2].to_degrees())),
+        histogram("Grip at the end, runs", "N", sweep, most),
+        histogram("Friction needed, runs", "coefficient", sweep, |r| Some(r.required_friction)),
+        rows.len(),
+        table(&head, &rows)
+    )
 }
 
 /// What the scene says.
 pub(super) fn scene_table(scene: &Scene) -> String {
-    let (tip, finger, object, i) = (&scene.fingertip, &scene.finger, &scene.object, &scene.integrator);
+    let (tip, gains, object, i) = (&scene.fingertip, &scene.finger.gains, &scene.object, &scene.integrator);
     let mm = |v: f64| format!("{} mm", short(1e3 * v));
+    // One value for fingers that are alike, both for others.
+    let each = |pair: &[String; 2]| if pair[0] == pair[1] { pair[0].clone() } else { pair.join(" and ") };
+    let radii = scene.fingertips().map(|t| mm(t.radius));
+    let moduli = scene.fingertips().map(|t| format!("{} kPa", short(t.youngs_modulus / 1e3)));
+    let links = scene.fingers().map(|f| mm(f.upper.unwrap_or(0.0) + f.link));
+    let times: Vec<String> = tip.branches().iter().map(|b| format!("{} in {} s", short(b[0]), short(b[1]))).collect();
+    let relaxation = if times.is_empty() { "none".into() } else { format!("parts of E: {}", times.join(", ")) };
     let rows = [
-        (
-            "Fingertip",
-            format!("{}, radius {}, E {} kPa", tip.model.name(), mm(tip.radius), short(tip.youngs_modulus / 1e3)),
-        ),
+        ("Fingertip", format!("{}, radius {}, E {}", tip.model.name(), each(&radii), each(&moduli))),
         ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
-        ("Link, half span", format!("{}, {}", mm(finger.link), mm(scene.half_span()))),
+        ("Relaxation", relaxation),
+        ("Link, half span", format!("{}, {}", each(&links), mm(scene.half_span()))),
         ("Object", format!("{} x {}, {} kg", mm(object.width), mm(object.height), short(object.mass))),
-        ("Friction", object.friction.map_or("not checked".into(), short)),
+        ("Friction", object.friction.map_or("without limit".into(), short)),
         ("First displacement", mm(scene.initial.normal_displacement)),
-        ("Gains", format!("{}, {}, {}", short(finger.gains.kp), short(finger.gains.kd), short(finger.gains.ki))),
+        ("Gains", format!("{}, {}, {}", short(gains.kp), short(gains.kd), short(gains.ki))),
         ("Integrator", format!("{}, {} form, step {} ms", i.method.name(), i.formulation.name(), short(1e3 * i.step))),
     ];
     table(&[], &rows.map(|(name, value)| vec![name.into(), value]))

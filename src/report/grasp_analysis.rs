@@ -2,13 +2,15 @@
 
 use crate::error::ReportError;
 use crate::report::grasp::{GraspReport, event_line, fixed2, scene_table, steps_table, tile, time_plots};
+use crate::report::grasp_measured::{fitted_words, measured};
 use crate::report::grasp_scene::animation;
 use crate::report::grasp_surface::{pinch_map, state_colour, state_words, surface};
 use crate::report::html::{document, escape};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
-use crate::types::grasp::{Freedom, GraspAnalysis, PinchState, PostureForce, Stability, StabilityRow};
+use crate::types::grasp::{Freedom, GraspAnalysis, Hold, PinchState, PostureForce, Stability, StabilityRow};
+use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::{FingertipModel, Scene};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
@@ -24,18 +26,35 @@ pub struct AnalysisReport<'a> {
     pub pushed: &'a Scene,
     /// What was found.
     pub analysis: &'a GraspAnalysis,
+    /// Measurements with the models fitted to them.
+    pub measured: Option<(&'a Measurements, &'a MeasuredFit)>,
     /// Stage names and wall seconds.
     pub seconds: &'a [(String, f64)],
 }
 
-/// Rows of one model.
-fn of(analysis: &GraspAnalysis, model: FingertipModel) -> impl Iterator<Item = &StabilityRow> {
-    analysis.stability.iter().filter(move |r| r.model == model)
+/// Rows of one model with one hold.
+fn of(analysis: &GraspAnalysis, model: FingertipModel, hold: Hold) -> impl Iterator<Item = &StabilityRow> {
+    analysis.stability.iter().filter(move |r| r.model == model && r.hold == hold)
 }
 
-/// How many rows of a model are of a class.
-fn count(analysis: &GraspAnalysis, model: FingertipModel, class: Stability) -> usize {
-    of(analysis, model).filter(|r| r.class == class).count()
+/// How many rows of a model with a hold are of a class.
+fn count(analysis: &GraspAnalysis, model: FingertipModel, hold: Hold, class: Stability) -> usize {
+    of(analysis, model, hold).filter(|r| r.class == class).count()
+}
+
+/// What the stationary poses of a model with a hold are, in words.
+fn classes(analysis: &GraspAnalysis, model: FingertipModel, hold: Hold) -> String {
+    let words = [
+        (Stability::Minimum, "a minimum"),
+        (Stability::Neutral, "neutral"),
+        (Stability::Saddle, "a saddle"),
+        (Stability::Maximum, "a maximum"),
+        (Stability::None, "not to be found nearby"),
+    ];
+    let all = of(analysis, model, hold).count();
+    let some = words.into_iter().map(|(class, word)| (count(analysis, model, hold, class), word)).filter(|w| w.0 > 0);
+    let parts: Vec<String> = some.map(|(n, word)| format!("{word} at {n}")).collect();
+    format!("{} of {all}", parts.join(", "))
 }
 
 /// Cells of the pinch map in a state, as a part of all.
@@ -47,14 +66,15 @@ fn share(analysis: &GraspAnalysis, state: PinchState) -> f64 {
 /// In one sentence.
 fn headline(report: &AnalysisReport<'_>) -> String {
     let a = report.analysis;
-    let all = of(a, FingertipModel::Parallel).count();
-    let radial = FingertipModel::Radial;
+    let [parallel, radial] = [FingertipModel::Parallel, FingertipModel::Radial];
+    let all = of(a, parallel, Hold::Friction).count();
     format!(
-        "The parallel model has a minimum of energy at {} of {} postures; the radial one is a saddle at {} and neutral at {} of them.",
-        count(a, FingertipModel::Parallel, Stability::Minimum),
+        "The parallel model has a minimum of energy at {} of {} postures; the radial one, held by friction, is {}, and without \
+         friction and weight {}.",
+        count(a, parallel, Hold::Friction, Stability::Minimum),
         all + a.lost.len(),
-        count(a, radial, Stability::Saddle),
-        count(a, radial, Stability::Neutral)
+        classes(a, radial, Hold::Friction),
+        classes(a, radial, Hold::Weightless)
     )
 }
 
@@ -85,7 +105,7 @@ pub fn text(report: &AnalysisReport<'_>) -> String {
     for (step, reason) in &a.lost {
         let _ = writeln!(out, "  motion {step}     cannot be reached: {reason}");
     }
-    for f in a.freedom.iter().filter(|f| f.fingers == 2) {
+    for f in a.freedom.iter().filter(|f| f.joints == [1, 1]) {
         let _ = writeln!(
             out,
             "  {:<15} {} degrees of freedom; two joint angles set {}",
@@ -101,6 +121,12 @@ pub fn text(report: &AnalysisReport<'_>) -> String {
         100.0 * share(a, PinchState::Good),
         a.pinch.angles.last().map_or(0.0, |v| v.to_degrees())
     );
+    if let Some((_, fit)) = report.measured {
+        let _ = writeln!(out, "  measured     {}", fit.verdict());
+        for model in &fit.models {
+            let _ = writeln!(out, "    {:<15} {}", model.model, fitted_words(model));
+        }
+    }
     let _ = writeln!(out, "  time         {:.2} s", report.seconds.iter().map(|s| s.1).sum::<f64>());
     out
 }
@@ -117,6 +143,7 @@ pub fn summary(report: &AnalysisReport<'_>) -> Value {
         .map(|f| {
             let mut value = json!(f);
             value["controls"] = json!(f.controls());
+            value["torque_controls"] = json!(f.torque_controls());
             value
         })
         .collect();
@@ -131,6 +158,7 @@ pub fn summary(report: &AnalysisReport<'_>) -> Value {
         "freedom": freedom,
         "pinch_map": states,
         "push": { "events": a.push.events, "turn_deg": most, "left_deg": left, "energy_drift": a.push.energy_drift },
+        "measured": report.measured.map(|m| m.1),
         "stable_steps": a.stable_steps,
         "seconds": seconds,
         "scene": report.scene,
@@ -167,19 +195,30 @@ fn force_plots(f: &PostureForce) -> String {
         + &plot("Force against tilt, N", "tilt, degrees", &against_tilt)
 }
 
-/// Hessians as a table.
+/// Stationary poses and Hessians as a table.
 fn stability_table(rows: &[StabilityRow]) -> String {
-    let head = ["Posture", "theta 1, 2, deg", "Model", "Eigenvalues, N/m", "Gradient, N", "The pose is a"];
+    let head = [
+        "Posture",
+        "theta 1, 2, deg",
+        "Along the face",
+        "Model",
+        "Stationary pose, mm from the parallel equilibrium",
+        "Eigenvalues, N/m",
+        "Force left, N",
+        "It is",
+    ];
     let cells = |r: &StabilityRow| {
         let [a, b] = r.joints.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
         let eigenvalues: Vec<String> = r.eigenvalues.iter().map(|v| short((v * 10.0).round() / 10.0)).collect();
         vec![
             if r.step == 0 { "pinch".into() } else { r.step.to_string() },
             format!("{a}, {b}"),
+            r.hold.name().replace("-weightless", ", weightless"),
             r.model.name().into(),
+            r.distance.map_or("none within a radius".into(), |d| fixed2(1e3 * d)),
             eigenvalues.join(", "),
-            format!("{:.1e}", r.residual),
-            r.class.name().into(),
+            r.residual.map_or("-".into(), |v| format!("{v:.0e}")),
+            if r.class == Stability::None { "-".into() } else { r.class.name().into() },
         ]
     };
     table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
@@ -188,21 +227,38 @@ fn stability_table(rows: &[StabilityRow]) -> String {
 fn freedom_table(rows: &[Freedom]) -> String {
     let head = [
         "Tips",
-        "Moving fingers",
+        "Joints that move",
         "Coordinates",
         "Rank",
         "Degrees of freedom",
         "of the object, joints locked",
+        "Contact forces",
+        "Stays at locked joints",
         "Joint angles set",
+        "Joint torques set",
     ];
     let cells = |f: &Freedom| {
-        let numbers = [f.fingers, f.coordinates, f.rank, f.freedom, f.object_freedom];
-        let mut row = vec![f.model.name().to_string()];
+        let numbers = [f.coordinates, f.rank, f.freedom, f.object_freedom, f.contact_forces];
+        let mut row = vec![f.model.name().to_string(), f.hand()];
         row.extend(numbers.map(|n| n.to_string()));
-        row.push(f.controls().into());
+        row.extend([if f.stable { "yes" } else { "no" }, f.controls(), f.torque_controls()].map(String::from));
         row
     };
     table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+}
+
+/// The table of the source: rigid against soft tips on fingers of 1+1 and 1+2 joints.
+fn short_freedom_table(rows: &[Freedom]) -> String {
+    let head = ["Tips, joints", "Grasp stable", "Posture and grasp by angles", "by torques"];
+    let yes = |v: bool| if v { "yes" } else { "no" }.to_string();
+    let shown = [FingertipModel::Rigid, FingertipModel::Parallel]
+        .into_iter()
+        .flat_map(|m| rows.iter().filter(move |f| f.model == m && f.fingers == 2));
+    let cells = |f: &Freedom| {
+        let name = if f.model == FingertipModel::Rigid { "rigid" } else { "soft" };
+        vec![format!("{name}, {}", f.hand()), yes(f.stable), yes(f.both_rank == 2), yes(f.torque_rank == 2)]
+    };
+    table(&head, &shown.map(cells).collect::<Vec<_>>())
 }
 
 /// The surfaces of one posture: parallel and radial side by side.
@@ -232,12 +288,54 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
     let classes: Vec<String> = a
         .stability
         .iter()
-        .filter(|r| r.step == step)
-        .map(|r| format!("{}: {} ({} N/m)", r.model.name(), r.class.name(), fixed2(r.eigenvalues[0])))
+        .filter(|r| r.step == step && r.hold == Hold::Friction)
+        .map(|r| {
+            let lowest = r.eigenvalues.first().map_or("none".into(), |v| format!("{} N/m", fixed2(*v)));
+            format!("{}: {} ({lowest})", r.model.name(), r.class.name())
+        })
         .collect();
     Ok(format!(
-        "<article><h3>{title}</h3><p>Smallest eigenvalue: {}.</p><div class=\"surfaces\">{pictures}</div></article>",
+        "<article><h3>{title}</h3><p>With friction, smallest eigenvalue at the own equilibrium: {}.</p><div class=\"surfaces\">{pictures}</div></article>",
         classes.join("; ")
+    ))
+}
+
+/// The pinch and the scene's motions, with their joint angles (rad).
+fn postures(scene: &Scene) -> Vec<(usize, [f64; 2])> {
+    let motions = scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target));
+    std::iter::once((0, [0.0; 2])).chain(motions).collect()
+}
+
+/// The first screen: the push with joints fixed, the energy of both models at one posture, rigid against soft tips, and the pinch map.
+fn at_a_glance(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
+    let a = report.analysis;
+    let samples = &a.push.samples;
+    let first = samples.first().map_or(0.0, |s| s.pose[2]);
+    let turn = samples.iter().map(|s| [s.time, (s.pose[2] - first).to_degrees()]).collect();
+    let marks: Vec<(f64, bool)> =
+        report.pushed.pushes.iter().flat_map(|p| [(p.start, false), (p.start + p.duration, false)]).collect();
+    let push = Plot { title: "Turn under the push, degrees", across: "s", marks: &marks }
+        .draw(&[Line::new("theta", 0, false, turn)]);
+    // Where both models have the most of their range in view, of two that have the same the later.
+    let seen = |step: usize| {
+        let of = a.surfaces.iter().filter(|s| s.step == step && s.axis == "y");
+        of.flat_map(|s| &s.energy).filter(|e| e.is_finite()).count()
+    };
+    let step = a.surfaces.iter().map(|s| s.step).max_by_key(|step| seen(*step)).unwrap_or(0);
+    let both: Vec<_> = a.surfaces.iter().filter(|s| s.step == step && s.axis == "y").collect();
+    let largest = both.iter().flat_map(|s| &s.energy).filter(|e| e.is_finite()).fold(1e-12, |l: f64, e| l.max(e.abs()));
+    let mut surfaces = String::new();
+    for s in both {
+        let _ = write!(surfaces, "<div>{}<span>{}</span></div>", surface(s, largest)?, s.model.name());
+    }
+    let name = if step == 0 { "the pinch".into() } else { format!("motion {step}") };
+    Ok(format!(
+        "<section><div class=\"glance\"><article><h3>A push with both joints fixed</h3>{push}<p>The object {}.</p></article>\
+         <article><h3>Energy about {name}</h3><div class=\"surfaces\">{surfaces}</div></article>\
+         <article><h3>Rigid and soft tips</h3>{}</article><article><h3>Which joint angles hold</h3>{}</article></div></section>",
+        escape(&push_words(a, report.scene.object.friction.is_some())),
+        short_freedom_table(&a.freedom),
+        pinch_map(&a.pinch, &postures(report.scene))
     ))
 }
 
@@ -248,7 +346,7 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
 pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     let a = report.analysis;
     let (most, left) = push_turn(a);
-    let minima = count(a, FingertipModel::Parallel, Stability::Minimum);
+    let minima = count(a, FingertipModel::Parallel, Hold::Friction, Stability::Minimum);
     let mut body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>{} <span>grasp analysis</span></h1><p class=\"verdict\">{}</p></header>\
          <div class=\"tiles\">{}{}{}{}</div>",
@@ -265,6 +363,10 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         let _ =
             write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
     }
+    body.push_str(&at_a_glance(report)?);
+    if let Some((measurements, fit)) = report.measured {
+        body.push_str(&measured(measurements, fit));
+    }
     let _ = write!(
         body,
         "<section><h2>Force depends on posture</h2><p class=\"lead\">Along the back plate's normal. Lines: springs in \
@@ -275,16 +377,15 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         body,
         "<section><h2>Energy about the postures</h2><p class=\"lead\">Joints fixed, tips and gravity, less the energy at the \
          posture (the cross). Red is more, blue is less, bands are even in the root; gray is out of the model's range. \
-         Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><h3>Hessians</h3>{}</article>",
+         Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><details><summary>Stationary poses and Hessians of both models, with \
+         friction and without</summary>{}</details></article>",
         stability_table(&a.stability)
     );
-    let steps: Vec<usize> = of(a, FingertipModel::Parallel).map(|r| r.step).collect();
+    let steps: Vec<usize> = of(a, FingertipModel::Parallel, Hold::Friction).map(|r| r.step).collect();
     for &step in &steps {
         body.push_str(&surface_card(a, step)?);
     }
-    let postures: Vec<(usize, [f64; 2])> = std::iter::once((0, [0.0; 2]))
-        .chain(report.scene.motions.iter().enumerate().map(|(i, m)| (i + 1, m.target)))
-        .collect();
+    let postures = postures(report.scene);
     let legend: String = PinchState::ALL
         .iter()
         .map(|s| {
@@ -307,6 +408,7 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         run: &a.push,
         without_tangential: None,
         stable_steps: &a.stable_steps,
+        bands: None,
         sweep: &[],
         seconds: report.seconds,
         warnings: &[],
@@ -325,8 +427,8 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         crate::report::chart::stage_times(report.seconds)
     );
     body.push_str(
-        "<footer><p>The parallel model is judged at its own equilibria, the radial one at the same poses: without tangential \
-         springs nothing holds the object up, and its gradient says so.</p></footer>",
+        "<footer><p>Each model is judged at its own stationary pose next to the parallel model's equilibrium. Without friction \
+         nothing carries the weight: both faces push along one line, so there is no such pose unless the weight is left out too.</p></footer>",
     );
     Ok(document(&format!("{} grasp analysis", escape(report.name)), &body))
 }

@@ -14,10 +14,24 @@ const FRAMES: usize = 500;
 const ARROW: f64 = 26.0;
 const SCRIPT: &str = include_str!("grasp.js");
 
-/// Lengths of a scene in mm: radius, link, half span, object's width and height.
-fn lengths(scene: &Scene) -> [f64; 5] {
-    let object = &scene.object;
-    [scene.fingertip.radius, scene.finger.link, scene.half_span(), object.width, object.height].map(|v| 1e3 * v)
+/// Lengths of a scene in mm; index 0 is the left finger.
+struct Lengths {
+    radius: [f64; 2],
+    link: [f64; 2],
+    base: [[f64; 2]; 2],
+    width: f64,
+    height: f64,
+}
+
+fn lengths(scene: &Scene) -> Lengths {
+    let mm = |v: f64| 1e3 * v;
+    Lengths {
+        radius: scene.fingertips().map(|tip| mm(tip.radius)),
+        link: scene.fingers().map(|f| mm(f.upper.unwrap_or(0.0) + f.link)),
+        base: scene.bases().map(|b| b.map(mm)),
+        width: mm(scene.object.width),
+        height: mm(scene.object.height),
+    }
 }
 
 /// The largest contact force over samples (N), at least 1e-9.
@@ -28,13 +42,13 @@ pub fn largest_force(samples: &[Sample]) -> f64 {
 
 /// Forces on the object as arrows from the contacts (mm), the largest over the run `largest` (N).
 fn arrows(scene: &Scene, s: &Sample, largest: f64) -> [[f64; 4]; 2] {
-    let [a, l, span, ..] = lengths(scene);
+    let Lengths { radius, link, base, .. } = lengths(scene);
     let (sin, cos) = s.pose[2].sin_cos();
     [0, 1].map(|i| {
         let side = if i == 0 { 1.0 } else { -1.0 };
         let (js, jc) = s.joints[i].sin_cos();
-        let (ox, oy) = (side * (l * js - span), -l * jc);
-        let reach = side * (a - 1e3 * s.normal[i]);
+        let (ox, oy) = (base[i][0] + side * link[i] * js, base[i][1] - link[i] * jc);
+        let reach = side * (radius[i] - 1e3 * s.normal[i]);
         let (n, t) = (side * s.normal_force[i] * ARROW / largest, -s.tangential_force[i] * ARROW / largest);
         [ox + reach * cos, oy + reach * sin, n * cos - t * sin, n * sin + t * cos]
     })
@@ -61,10 +75,13 @@ fn arrow([x, y, dx, dy]: [f64; 4]) -> String {
 
 /// The drawing of one moment; `trail` are places (m) that the object's centre went through.
 pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> String {
-    let [a, l, span, w, h] = lengths(scene);
+    let Lengths { radius, link, base, width: w, height: h } = lengths(scene);
     let [x, y, theta] = [1e3 * s.pose[0], 1e3 * s.pose[1], s.pose[2].to_degrees()];
-    let (left, wide) = (-span - a - 12.0, 2.0 * (span + a + 12.0));
-    let (top, tall) = (-12.0, l + 0.5 * (w * w + h * h).sqrt() + 14.0 + 12.0);
+    let (left, right) = (base[0][0] - radius[0] - 12.0, base[1][0] + radius[1] + 12.0);
+    let highest = base[0][1].max(base[1][1]);
+    let deepest = (0..2).map(|i| link[i] - base[i][1]).fold(0.0, f64::max);
+    let (wide, top) = (right - left, -highest - 12.0);
+    let tall = highest + deepest + 0.5 * (w * w + h * h).sqrt() + 14.0 + 12.0;
     let mut svg = format!(
         r#"<svg class="grasp" viewBox="{left:.1} {top:.1} {wide:.1} {tall:.1}" role="img" aria-label="the grasp"><g transform="scale(1,-1)">"#
     );
@@ -73,11 +90,13 @@ pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> Stri
         let turn = side * s.joints[i].to_degrees();
         let sweep = if i == 0 { 0 } else { 1 };
         let plate = if i == 0 { -3.0 } else { 0.0 };
+        let (a, l) = (radius[i], link[i]);
         let _ = write!(
             svg,
-            r#"<g class="f{n}" transform="translate({jx:.2},0) rotate({turn:.3})"><path class="tip" d="M0 {lo:.2}A{a} {a} 0 0 {arc} 0 {hi:.2}Z"/><rect class="plate" x="{plate}" y="{lo:.2}" width="3" height="{two:.2}"/><path class="link" d="M0 0V{down:.2}"/><circle class="joint" r="3.4"/></g>"#,
+            r#"<g class="f{n}" transform="translate({jx:.2},{jy:.2}) rotate({turn:.3})"><path class="tip" d="M0 {lo:.2}A{a} {a} 0 0 {arc} 0 {hi:.2}Z"/><rect class="plate" x="{plate}" y="{lo:.2}" width="3" height="{two:.2}"/><path class="link" d="M0 0V{down:.2}"/><circle class="joint" r="3.4"/></g>"#,
             n = i + 1,
-            jx = -side * span,
+            jx = base[i][0],
+            jy = base[i][1],
             lo = -l - a,
             hi = -l + a,
             two = 2.0 * a,
@@ -132,9 +151,9 @@ pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
         let forces: Vec<String> = p.iter().chain(&q).map(|v| format!("{v:.1}")).collect();
         let _ = write!(frames, "{}],", forces.join(","));
     }
-    let span = 1e3 * scene.half_span();
+    let [[ax, ay], [bx, by]] = lengths(scene).base;
     format!(
-        r#"<div class="animation" data-span="{span:.3}" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">Play</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
+        r#"<div class="animation" data-bases="[[{ax:.3},{ay:.3}],[{bx:.3},{by:.3}]]" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">Play</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
         frames.trim_end_matches(','),
         moment(scene, first, largest, samples),
         samples.iter().step_by(step).count() - 1,

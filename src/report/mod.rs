@@ -57,6 +57,8 @@ pub mod film;
 
 pub mod track;
 
+pub mod grasp_measured;
+
 pub mod grasp_scene;
 
 pub mod grasp;

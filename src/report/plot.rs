@@ -27,14 +27,51 @@ pub struct Line {
     pub colour: usize,
     /// Whether it is dashed.
     pub dashed: bool,
+    /// How its places are drawn.
+    pub shape: Shape,
     /// Places; a value that is not finite interrupts the line.
     pub points: Vec<[f64; 2]>,
+}
+
+/// How places are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Shape {
+    /// A line through them.
+    #[default]
+    Line,
+    /// A dot at each.
+    Dots,
+    /// The area that they go around.
+    Band,
 }
 
 impl Line {
     /// A line called `name`.
     pub fn new(name: &str, colour: usize, dashed: bool, points: Vec<[f64; 2]>) -> Self {
-        Self { name: name.into(), colour, dashed, points }
+        Self { name: name.into(), colour, dashed, shape: Shape::Line, points }
+    }
+
+    /// Dots called `name`.
+    pub fn dots(name: &str, colour: usize, points: Vec<[f64; 2]>) -> Self {
+        Self { shape: Shape::Dots, ..Self::new(name, colour, false, points) }
+    }
+
+    /// The area between `low` and `high` at each place of the horizontal axis, as (place, low,
+    /// high).
+    pub fn band(name: &str, colour: usize, between: &[[f64; 3]]) -> Self {
+        let back = between.iter().rev().map(|p| [p[0], p[1]]);
+        let around = between.iter().map(|p| [p[0], p[2]]).chain(back).filter(|p| p[1].is_finite()).collect();
+        Self { shape: Shape::Band, ..Self::new(name, colour, false, around) }
+    }
+
+    /// Its class in the page's style.
+    fn class(&self) -> String {
+        let kind = match self.shape {
+            Shape::Line => "line",
+            Shape::Dots => "dots",
+            Shape::Band => "band",
+        };
+        format!("{kind} c{}{}", self.colour % 4, if self.dashed { " dashed" } else { "" })
     }
 }
 
@@ -160,7 +197,7 @@ impl Plot<'_> {
             escape(self.across)
         );
         for line in lines {
-            let class = format!("line c{}{}", line.colour % 4, if line.dashed { " dashed" } else { "" });
+            let class = line.class();
             let mut path = String::new();
             let mut pen = false;
             for p in &line.points {
@@ -168,7 +205,7 @@ impl Plot<'_> {
                     let _ = write!(path, "{}{:.1} {:.1}", if pen { "L" } else { "M" }, x(p[0]), y(p[1]));
                     // A place alone between two gaps is a dot.
                     path.push_str(if pen { "" } else { "h0" });
-                    pen = true;
+                    pen = line.shape != Shape::Dots;
                 } else {
                     pen = false;
                 }
@@ -176,12 +213,16 @@ impl Plot<'_> {
             let _ = write!(svg, r#"<path class="{class}" d="{path}"/>"#);
         }
         for (line, [left, row]) in named.iter().zip(&entries) {
-            let class = format!("line c{}{}", line.colour % 4, if line.dashed { " dashed" } else { "" });
+            let class = line.class();
             let under = HEIGHT - 4.0 + ROW * row;
+            let stroke = match line.shape {
+                Shape::Line => format!("M{left:.0} {:.0}h16", under - 4.0),
+                Shape::Dots => format!("M{:.0} {:.0}h0", left + 8.0, under - 4.0),
+                Shape::Band => format!("M{left:.0} {:.0}h16v8h-16Z", under - 8.0),
+            };
             let _ = write!(
                 svg,
-                r#"<path class="{class}" d="M{left:.0} {:.0}h16"/><text x="{:.0}" y="{under:.0}">{}</text>"#,
-                under - 4.0,
+                r#"<path class="{class}" d="{stroke}"/><text x="{:.0}" y="{under:.0}">{}</text>"#,
                 left + STROKE,
                 escape(&line.name)
             );

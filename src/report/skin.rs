@@ -90,6 +90,16 @@ fn headline(report: &SkinReport<'_>) -> String {
 pub fn text(report: &SkinReport<'_>) -> String {
     let mut out = format!("{}\n", headline(report));
     let end = report.column.last();
+    if let Some(single) = report.single {
+        let [peak, held, left] = figures(single, report.scene);
+        let _ = writeln!(
+            out,
+            "  one layer    stress up to {} kPa, {} kPa at the end of the hold; {} mm left at the end",
+            short(peak / 1e3),
+            short(held / 1e3),
+            short(1e3 * left)
+        );
+    }
     for (at, layer) in report.scene.layers.iter().enumerate() {
         let strain = end.map_or(0.0, |s| s.strain[at]);
         let stays = report.residual[at].map_or(String::new(), |r| format!(", {} for ever", short(r)));
@@ -116,9 +126,9 @@ pub fn page(report: &SkinReport<'_>) -> String {
     body.push_str(&warned(report.warnings));
     let _ = write!(
         body,
-        "<section><h2>Over time</h2><p class=\"lead\">The column is exact; the block has a punch and free skin beside it. One layer has \
-         the mean compliance of all.</p><div class=\"grid\">{}</div></section>",
-        curves(report)
+        "<section><h2>Over time</h2><p class=\"lead\">The column is exact; the block has a punch and free skin beside it. {one}</p><div class=\"grid\">{}</div></section>",
+        curves(report),
+        one = one_layer(report)
     );
     body.push_str(&shapes(report));
     let rows: Vec<Vec<String>> = scene
@@ -142,6 +152,15 @@ pub fn page(report: &SkinReport<'_>) -> String {
     let head = ["Layer", "Thickness, mm", "Element", "Strain after the ramp", "Strain at the end", "Stays for ever"];
     let _ = write!(body, "<section><h2>Layers</h2><article class=\"wide\">{}</article></section>", table(&head, &rows));
     document(&escape(report.name), &body)
+}
+
+/// What the one layer is, in words.
+fn one_layer(report: &SkinReport<'_>) -> &'static str {
+    match (report.single, report.scene.without_layers()) {
+        (None, _) => "",
+        (_, Some(_)) => "One layer has the mean compliance of all.",
+        _ => "One layer is of the element that comes nearest to all of them under this load.",
+    }
 }
 
 fn curves(report: &SkinReport<'_>) -> String {

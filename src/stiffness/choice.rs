@@ -356,7 +356,7 @@ pub fn settle(
         let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SETTLED)) else { break };
         let variance = setup.variance(&estimate);
         let misfit = |level: &Level, e: &Estimate| {
-            e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.price()
+            e.raw * e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.price()
         };
         let (before, least) = (level.offsets(), misfit(level, &estimate));
         let better = [1.0, 0.5].into_iter().find_map(|part| {

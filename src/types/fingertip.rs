@@ -48,7 +48,13 @@ impl FromStr for FingertipModel {
     }
 }
 
-/// A hemispherical soft fingertip; both fingers have the same.
+/// Maxwell branches of a fingertip at most.
+pub const MOST_BRANCHES: usize = 3;
+
+/// Least Young's modulus of a fingertip (Pa): brain and fat, the softest tissues, have about 1 kPa.
+pub const SOFTEST: f64 = 1e3;
+
+/// A hemispherical soft fingertip.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Fingertip {
     /// Radius a (m).
@@ -59,6 +65,21 @@ pub struct Fingertip {
     pub damping: [f64; 2],
     /// How it answers.
     pub model: FingertipModel,
+    /// Maxwell branches beside the springs: modulus (Pa) and dashpot (Pa s) of each, as in layered
+    /// skin; none for a tip that does not relax.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub maxwell: Vec<[f64; 2]>,
+    /// Depth (m) by which the modulus of springs grows e-fold, of tabulated tips; none where it
+    /// does not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stiffening: Option<f64>,
+    /// Standard deviation of its moduli, over them (1); 0 where it is not known.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub deviation: f64,
+    /// Least and largest value that its moduli may have, over them (1), where only bounds of a
+    /// tissue are known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bounds: Option<[f64; 2]>,
     /// Depth (m) at which a face that comes straight on reaches springs, and their modulus (Pa), by
     /// rising depth; linear between, constant beyond. Of tabulated tips only; empty is
     /// `youngs_modulus` everywhere.
@@ -73,7 +94,17 @@ impl Fingertip {
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn new(radius: f64, youngs_modulus: f64, damping: [f64; 2], model: FingertipModel) -> Result<Self, ParamError> {
-        let tip = Self { radius, youngs_modulus, damping, model, profile: Vec::new() };
+        let tip = Self {
+            radius,
+            youngs_modulus,
+            damping,
+            model,
+            maxwell: Vec::new(),
+            stiffening: None,
+            deviation: 0.0,
+            bounds: None,
+            profile: Vec::new(),
+        };
         tip.check()?;
         Ok(tip)
     }
@@ -83,9 +114,42 @@ impl Fingertip {
     /// # Errors
     /// [`ParamError`] names the first value out of range.
     pub fn check(&self) -> Result<(), ParamError> {
-        positive("fingertip.radius", self.radius, 1.0, "above 0 and at most 1 m")?;
-        positive("fingertip.youngs_modulus", self.youngs_modulus, 1e12, "above 0 and at most 1e12 Pa")?;
+        positive("fingertip.radius", self.radius, 1.0, "above 0 and at most 1 m (SI units: is it in mm?)")?;
+        if !(self.youngs_modulus >= SOFTEST && self.youngs_modulus <= 1e12) {
+            let range = "1000 to 1e12 Pa, from the softest tissues up (SI units: is it in kPa?)";
+            return Err(ParamError { name: "fingertip.youngs_modulus", value: self.youngs_modulus, range });
+        }
         self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))?;
+        if self.maxwell.len() > MOST_BRANCHES {
+            let range = "up to 3 pairs [Pa, Pa s]";
+            return Err(ParamError {
+                name: "fingertip.maxwell, number of pairs",
+                value: self.maxwell.len() as f64,
+                range,
+            });
+        }
+        self.maxwell
+            .iter()
+            .flatten()
+            .try_for_each(|v| positive("fingertip.maxwell", *v, 1e15, "pairs of numbers above 0 (Pa, Pa s)"))?;
+        if let Some(depth) = self.stiffening {
+            // Over the radius the modulus would grow by e^20 and more.
+            let range = "at least a twentieth of fingertip.radius";
+            if !(depth >= 0.05 * self.radius && depth.is_finite()) {
+                return Err(ParamError { name: "fingertip.stiffening", value: depth, range });
+            }
+        }
+        at_least_zero("fingertip.youngs_modulus_sd", self.deviation, "0 or more Pa")?;
+        if let Some([low, high]) = self.bounds
+            && !(low > 0.0 && low <= 1.0 && high >= 1.0 && high.is_finite())
+        {
+            let range = "[low, high] in Pa, around youngs_modulus";
+            return Err(ParamError {
+                name: "fingertip.youngs_modulus_bounds",
+                value: low * self.youngs_modulus,
+                range,
+            });
+        }
         for pair in self.profile.windows(2) {
             positive("fingertip.profile_depth", pair[1][0] - pair[0][0], 1.0, "rising depths in m")?;
         }
@@ -95,8 +159,32 @@ impl Fingertip {
         })
     }
 
+    /// The same with all moduli times `factor`, which are then known.
+    pub fn scaled(&self, factor: f64) -> Self {
+        let profile = self.profile.iter().map(|[d, e]| [*d, e * factor]).collect();
+        let maxwell = self.maxwell.iter().map(|b| b.map(|v| v * factor)).collect();
+        Self {
+            maxwell,
+            youngs_modulus: self.youngs_modulus * factor,
+            deviation: 0.0,
+            bounds: None,
+            profile,
+            ..self.clone()
+        }
+    }
+
+    /// Each Maxwell branch: its modulus over the springs' (1) and its time (s).
+    pub fn branches(&self) -> Vec<[f64; 2]> {
+        self.maxwell.iter().map(|[e, c]| [e / self.youngs_modulus, c / e]).collect()
+    }
+
     /// Young's modulus (Pa) of the springs that a face coming straight on reaches at `depth` (m).
     pub fn modulus_at(&self, depth: f64) -> f64 {
+        self.stiffening.map_or(1.0, |by| (depth / by).exp()) * self.measured_at(depth)
+    }
+
+    /// The same as the profile has it.
+    fn measured_at(&self, depth: f64) -> f64 {
         let after = self.profile.partition_point(|p| p[0] < depth);
         match (after.checked_sub(1).map(|i| self.profile[i]), self.profile.get(after)) {
             (Some([d0, e0]), Some([d1, e1])) => e0 + (e1 - e0) * (depth - d0) / (d1 - d0),
@@ -142,6 +230,13 @@ pub struct StiffnessRegion {
     /// Poisson's ratio; that of the folder where none is said.
     #[serde(default)]
     pub poisson: Option<f64>,
+    /// Its standard deviation, in the unit of the modulus; NaN or 0 where it is unknown.
+    #[serde(default, deserialize_with = "or_nan")]
+    pub sd: f64,
+}
+
+fn is_zero(v: &f64) -> bool {
+    *v == 0.0
 }
 
 /// A number, or NaN for null.
@@ -202,6 +297,12 @@ pub struct PadReduction {
     pub profile_residual: f64,
     /// Columns.
     pub columns: usize,
+    /// Standard deviation of the hemisphere's modulus, over it (1): what those of the tissue and of
+    /// the press come to; 0 where none is known.
+    pub deviation: f64,
+    /// Least and largest modulus of the hemisphere over its own (1), where only a bound of a tissue
+    /// is known.
+    pub bounds: Option<[f64; 2]>,
     /// The forces of the map's finite elements, where they were solved; the hemispheres are then
     /// fitted to these.
     pub plate: Option<PlateCurve>,

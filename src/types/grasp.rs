@@ -21,20 +21,78 @@ pub struct Sample {
     pub normal_force: [f64; 2],
     /// Contact force f_t along the face's tangent (N).
     pub tangential_force: [f64; 2],
+    /// Least coefficient of friction that keeps both tips from sliding (1).
+    pub required_friction: f64,
+    /// Part of the friction that is not needed: 1 - required / given; 1 where none is given.
+    pub friction_margin: f64,
+    /// How far each tip has slid along its face (m), along +t of the object.
+    pub slip: [f64; 2],
 }
 
 impl Sample {
     /// Columns of trajectory.csv.
-    pub const COLUMNS: [&str; 14] =
-        ["time", "x", "y", "theta", "theta1", "theta2", "dn1", "dn2", "dt1", "dt2", "fn1", "fn2", "ft1", "ft2"];
+    pub const COLUMNS: [&str; 18] = [
+        "time",
+        "x",
+        "y",
+        "theta",
+        "theta1",
+        "theta2",
+        "dn1",
+        "dn2",
+        "dt1",
+        "dt2",
+        "fn1",
+        "fn2",
+        "ft1",
+        "ft2",
+        "required_friction",
+        "friction_margin",
+        "slip1",
+        "slip2",
+    ];
 
     /// One row of trajectory.csv.
-    pub fn row(&self) -> [f64; 14] {
+    pub fn row(&self) -> [f64; 18] {
         let ([x, y, theta], [a, b]) = (self.pose, self.joints);
         let ([n1, n2], [t1, t2]) = (self.normal, self.tangential);
-        let ([p1, p2], [q1, q2]) = (self.normal_force, self.tangential_force);
-        [self.time, x, y, theta, a, b, n1, n2, t1, t2, p1, p2, q1, q2]
+        let ([p1, p2], [q1, q2], [s1, s2]) = (self.normal_force, self.tangential_force, self.slip);
+        let (required, margin) = (self.required_friction, self.friction_margin);
+        [self.time, x, y, theta, a, b, n1, n2, t1, t2, p1, p2, q1, q2, required, margin, s1, s2]
     }
+}
+
+impl Sample {
+    /// The smaller, or the larger, of each quantity by `pick`; the time stays.
+    pub fn each(&self, other: &Self, pick: fn(f64, f64) -> f64) -> Self {
+        let two = |a: [f64; 2], b: [f64; 2]| [pick(a[0], b[0]), pick(a[1], b[1])];
+        let [a, b] = [self.pose, other.pose];
+        Self {
+            time: self.time,
+            pose: [pick(a[0], b[0]), pick(a[1], b[1]), pick(a[2], b[2])],
+            joints: two(self.joints, other.joints),
+            normal: two(self.normal, other.normal),
+            tangential: two(self.tangential, other.tangential),
+            normal_force: two(self.normal_force, other.normal_force),
+            tangential_force: two(self.tangential_force, other.tangential_force),
+            required_friction: pick(self.required_friction, other.required_friction),
+            friction_margin: pick(self.friction_margin, other.friction_margin),
+            slip: two(self.slip, other.slip),
+        }
+    }
+}
+
+/// What the samples of a run may be, where the tips' moduli are known to a deviation or by bounds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bands {
+    /// Factors of the moduli that were run beside 1.
+    pub factors: Vec<f64>,
+    /// Least of each quantity at each time.
+    pub low: Vec<Sample>,
+    /// Largest.
+    pub high: Vec<Sample>,
+    /// How each of the runs went.
+    pub outcomes: Vec<&'static str>,
 }
 
 /// The grasp at the end of a motion's hold.
@@ -50,15 +108,32 @@ pub struct MotionRow {
 
 impl MotionRow {
     /// Columns of motions.csv.
-    pub const COLUMNS: [&str; 12] =
-        ["step", "theta1_deg", "theta2_deg", "x", "y", "theta_deg", "dn1", "dn2", "dt1", "dt2", "fn1", "fn2"];
+    pub const COLUMNS: [&str; 16] = [
+        "step",
+        "theta1_deg",
+        "theta2_deg",
+        "x",
+        "y",
+        "theta_deg",
+        "dn1",
+        "dn2",
+        "dt1",
+        "dt2",
+        "fn1",
+        "fn2",
+        "ft1",
+        "ft2",
+        "required_friction",
+        "friction_margin",
+    ];
 
     /// One row of motions.csv, without the step.
-    pub fn row(&self) -> [f64; 11] {
+    pub fn row(&self) -> [f64; 15] {
         let s = &self.reached;
         let [a, b] = self.target.map(f64::to_degrees);
         let ([x, y, theta], [n1, n2], [t1, t2], [p1, p2]) = (s.pose, s.normal, s.tangential, s.normal_force);
-        [a, b, x, y, theta.to_degrees(), n1, n2, t1, t2, p1, p2]
+        let ([q1, q2], required, margin) = (s.tangential_force, s.required_friction, s.friction_margin);
+        [a, b, x, y, theta.to_degrees(), n1, n2, t1, t2, p1, p2, q1, q2, required, margin]
     }
 }
 
@@ -66,19 +141,22 @@ impl MotionRow {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EventKind {
-    /// A tip left the object: d_n at or below 0 (rigid tips: f_n at or below 0).
+    /// A tip left the object: d_n at or below 0 (rigid tips: f_n at or below 0), or past an end of
+    /// its face.
     ContactLoss,
     /// d_n at or above a (1 - |sin tilt|): the back plate's rim would touch.
     ValidityRange,
-    /// |f_t / f_n| above the coefficient of friction.
+    /// A tip slides: more is asked along the face than friction holds.
     Slip,
-    /// The smallest eigenvalue of the Hessian at fixed joints is no longer positive: the branch of
-    /// equilibria ends.
+    /// The branch of equilibria that a run came along ends before its joint angles, or the object
+    /// rests on another one.
     Fold,
     /// The step is too long for the stiffness and damping.
     BadStep,
     /// The gain of the constraint stabilisation is too high for the step.
     BadGain,
+    /// The state is no longer finite, with a step that is short enough.
+    NotFinite,
 }
 
 impl EventKind {
@@ -91,12 +169,13 @@ impl EventKind {
             Self::Fold => "fold",
             Self::BadStep => "bad-step",
             Self::BadGain => "bad-gain",
+            Self::NotFinite => "not-finite",
         }
     }
 
     /// Whether nothing after it is worth having, so that the run ends there.
     pub fn ends_run(self) -> bool {
-        self != Self::Slip
+        matches!(self, Self::ContactLoss | Self::BadStep | Self::BadGain | Self::NotFinite)
     }
 }
 
@@ -105,8 +184,10 @@ impl EventKind {
 pub struct Event {
     /// What.
     pub kind: EventKind,
-    /// When (s).
+    /// When it begins (s).
     pub time: f64,
+    /// When it is over (s); none where it lasts, or is of a moment.
+    pub until: Option<f64>,
     /// Which finger: 1 left, 2 right; none where both take part.
     pub finger: Option<usize>,
     /// In words, with numbers.
@@ -155,15 +236,28 @@ pub struct GraspRun {
     pub step_growth: f64,
     /// Steps taken.
     pub steps: u64,
+    /// Largest coefficient of friction that was needed (1).
+    pub required_friction: f64,
     /// Whether the run came to its end.
     pub completed: bool,
 }
 
 impl GraspRun {
-    /// What ended the run, or else the first slip: what comes after that the model knows nothing
-    /// of. None where it came to its end and nothing slipped.
+    /// The worst that happened: what ended the run, or else the first slip, or else the first time
+    /// out of the model's range, or else the first fold. None where the grasp held throughout.
     pub fn flaw(&self) -> Option<&Event> {
-        self.events.iter().find(|e| e.kind.ends_run()).or(self.events.first())
+        let worst = |e: &&Event| match e.kind {
+            kind if kind.ends_run() => 0,
+            EventKind::Slip => 1,
+            EventKind::ValidityRange => 2,
+            _ => 3,
+        };
+        self.events.iter().min_by_key(worst)
+    }
+
+    /// `held`, or the name of [`GraspRun::flaw`]'s kind.
+    pub fn outcome(&self) -> &'static str {
+        self.flaw().map_or("held", |e| e.kind.name())
     }
 }
 
@@ -179,6 +273,8 @@ pub enum Stability {
     Neutral,
     /// All negative.
     Maximum,
+    /// There is no stationary pose nearby.
+    None,
 }
 
 impl Stability {
@@ -189,12 +285,39 @@ impl Stability {
             Self::Saddle => "saddle",
             Self::Neutral => "neutral",
             Self::Maximum => "maximum",
+            Self::None => "none",
         }
     }
 }
 
-/// The Hessian of one model at one posture.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+/// What holds the object along its faces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Hold {
+    /// Friction that never gives: tips deform along the face, or roll where they cannot.
+    Friction,
+    /// Nothing: tips slide.
+    Frictionless,
+    /// Nothing, and the object has no weight.
+    Weightless,
+}
+
+impl Hold {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Friction, Self::Frictionless, Self::Weightless];
+
+    /// As in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Friction => "friction",
+            Self::Frictionless => "frictionless",
+            Self::Weightless => "frictionless-weightless",
+        }
+    }
+}
+
+/// The stationary pose of one model with one hold next to a posture, and its Hessian.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StabilityRow {
     /// Number of the motion, 0 for the pinch.
     pub step: usize,
@@ -202,15 +325,20 @@ pub struct StabilityRow {
     pub joints: [f64; 2],
     /// The model.
     pub model: FingertipModel,
-    /// Pose x, y (m), theta (rad): the equilibrium of the parallel model.
-    pub pose: [f64; 3],
-    /// Normal displacements (m).
-    pub normal: [f64; 2],
-    /// Eigenvalues of the Hessian in (x, y, a theta), rising (N/m).
-    pub eigenvalues: [f64; 3],
-    /// Length of the energy's gradient in (x, y, a theta) (N): 0 where this pose is the model's
-    /// equilibrium.
-    pub residual: f64,
+    /// What holds the object along its faces.
+    pub hold: Hold,
+    /// Pose x, y (m), theta (rad) at which the energy is stationary; none where there is no such
+    /// pose within a radius of the parallel model's equilibrium.
+    pub pose: Option<[f64; 3]>,
+    /// Normal displacements there (m).
+    pub normal: Option<[f64; 2]>,
+    /// Distance from the parallel model's equilibrium in (x, y, a theta) (m).
+    pub distance: Option<f64>,
+    /// Eigenvalues of the Hessian in (x, y, a theta) along what the contact leaves free, rising
+    /// (N/m).
+    pub eigenvalues: Vec<f64>,
+    /// Length of the force that is left there in (x, y, a theta) (N).
+    pub residual: Option<f64>,
     /// What they mean.
     pub class: Stability,
 }
@@ -250,8 +378,13 @@ pub struct PostureForce {
 pub struct Freedom {
     /// The model of the tips.
     pub model: FingertipModel,
-    /// Fingers whose joint moves; with one, the other is locked.
+    /// Fingers that move; with one, the other is locked.
     pub fingers: usize,
+    /// Joints of the left and of the right finger that move.
+    pub joints: [usize; 2],
+    /// Components of force and moment that both contacts carry; three of them are balanced by the
+    /// object.
+    pub contact_forces: usize,
     /// Coordinates: pose, joints, and the displacements that the tips allow.
     pub coordinates: usize,
     /// Rank of the constraints' Jacobian.
@@ -266,6 +399,12 @@ pub struct Freedom {
     pub grasp_rank: usize,
     /// Rank of d(theta, grip force)/d(joint angles): 2 when both can be set at once.
     pub both_rank: usize,
+    /// The same for joint torques: rigid tips answer to them by their grip where to angles they
+    /// cannot.
+    pub torque_rank: usize,
+    /// Whether the object stays where it is with the joints locked, held by constraints or in a
+    /// minimum of energy.
+    pub stable: bool,
 }
 
 impl Freedom {
@@ -278,6 +417,20 @@ impl Freedom {
             (0, 1.., _) => "grasp",
             _ => "neither",
         }
+    }
+
+    /// What the joint torques can set, in words.
+    pub fn torque_controls(&self) -> &'static str {
+        match (self.torque_rank, self.posture_rank, self.grasp_rank) {
+            (2.., ..) => "grasp and posture",
+            (1, 0, 0) => "grasp",
+            _ => self.controls(),
+        }
+    }
+
+    /// The joints as they are written, such as `1+2`; a locked finger has 0.
+    pub fn hand(&self) -> String {
+        format!("{}+{}", self.joints[0], self.joints[1])
     }
 }
 

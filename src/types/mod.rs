@@ -49,6 +49,8 @@ pub mod scene;
 
 pub mod grasp;
 
+pub mod measured;
+
 pub mod skin;
 
 pub mod trial;

@@ -32,19 +32,34 @@ pub struct Gains {
     pub ki: f64,
 }
 
-/// Both fingers.
+/// A finger; both, where they are alike.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Finger {
-    /// Length l from the joint to the centre of the tip (m).
+    /// Length l from the last joint to the centre of the tip (m).
     pub link: f64,
-    /// Half the distance L_b between the joints (m).
+    /// Length of a first link, from the base to a second joint (m); none for a finger of one joint.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub upper: Option<f64>,
+    /// Distance L_b of the joint from the middle between fingers that are alike (m): its place is
+    /// (-L_b, lift) for the left finger, (L_b, lift) for the right one.
     pub half_span: f64,
+    /// Height of the joint (m).
+    pub lift: f64,
     /// Moment of inertia about the joint (kg m^2).
     pub inertia: f64,
     /// Joint control.
     pub gains: Gains,
-    /// Whether both joints are locked at their first angle; then nothing is controlled.
+    /// Whether the joint is locked at its first angle; then nothing is controlled.
     pub fixed: bool,
+}
+
+/// A right finger that is not like the left one.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Second {
+    /// Its tip, of the same model.
+    pub fingertip: Fingertip,
+    /// Its link and joint.
+    pub finger: Finger,
 }
 
 /// The object: a rigid rectangle.
@@ -58,8 +73,11 @@ pub struct Object {
     pub mass: f64,
     /// Moment of inertia about the centre (kg m^2).
     pub inertia: f64,
-    /// Coefficient of friction, for the slip check; none = not checked.
+    /// Coefficient of friction of the tips; none = they never slide.
     pub friction: Option<f64>,
+    /// Distance of the centre of mass from the fingers' plane (m): its moment about the face's
+    /// normal takes a part of the friction.
+    pub offset: f64,
 }
 
 /// The start: at rest in an equilibrium.
@@ -201,10 +219,13 @@ pub struct Push {
 /// Everything that a run needs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scene {
-    /// Both tips.
+    /// Both tips, or the left one.
     pub fingertip: Fingertip,
-    /// Both fingers.
+    /// Both fingers, or the left one.
     pub finger: Finger,
+    /// The right finger, where it is not like the left one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub second: Option<Second>,
     /// What they hold.
     pub object: Object,
     /// The start.
@@ -219,6 +240,27 @@ pub struct Scene {
     pub pushes: Vec<Push>,
 }
 
+impl Finger {
+    /// Checks every range.
+    ///
+    /// # Errors
+    /// [`ParamError`] names the first value out of range.
+    pub fn check(&self) -> Result<(), ParamError> {
+        positive("finger.link", self.link, 10.0, "above 0 and at most 10 m (SI units: is it in mm?)")?;
+        if let Some(upper) = self.upper {
+            positive("finger.links", upper, 10.0, "above 0 and at most 10 m (SI units: is it in mm?)")?;
+        }
+        positive("finger.half_span", self.half_span, 10.0, "above 0 and at most 10 m")?;
+        if self.lift.is_nan() || self.lift.abs() > 10.0 {
+            return Err(ParamError { name: "finger.base", value: self.lift, range: "-10 to 10 m" });
+        }
+        positive("finger.inertia", self.inertia, 1e6, "above 0 kg m^2")?;
+        at_least_zero("finger.gains.kp", self.gains.kp, "0 or more N m/rad")?;
+        at_least_zero("finger.gains.kd", self.gains.kd, "0 or more N m s/rad")?;
+        at_least_zero("finger.gains.ki", self.gains.ki, "0 or more N m/(rad s)")
+    }
+}
+
 /// The eight motions of the source (degrees).
 pub const EIGHT_MOTIONS: [[f64; 2]; 8] =
     [[6.0, 6.0], [20.0, -10.0], [-2.0, 13.0], [-10.0, 20.0], [-7.0, 17.0], [17.0, -7.0], [-15.0, 25.0], [5.0, 5.0]];
@@ -229,13 +271,51 @@ const MOST_STEPS: f64 = 2e9;
 const MOST_SAMPLES: f64 = 2e6;
 
 impl Scene {
-    /// Half the distance between the joints (m). Rigid tips cannot be pressed in, so theirs stand
-    /// apart until they just touch.
+    /// Half the distance between the joints (m).
     pub fn half_span(&self) -> f64 {
-        match self.fingertip.model {
-            FingertipModel::Rigid => self.fingertip.radius + 0.5 * self.object.width,
-            _ => self.finger.half_span,
+        let [left, right] = self.bases();
+        0.5 * (right[0] - left[0])
+    }
+
+    /// Both fingers, the left one first.
+    pub fn fingers(&self) -> [&Finger; 2] {
+        [&self.finger, self.second.as_ref().map_or(&self.finger, |s| &s.finger)]
+    }
+
+    /// Both tips, the left one first.
+    pub fn fingertips(&self) -> [&Fingertip; 2] {
+        [&self.fingertip, self.second.as_ref().map_or(&self.fingertip, |s| &s.fingertip)]
+    }
+
+    /// Places of both joints (m). Rigid tips cannot be pressed in, so their joints stand apart
+    /// until they just touch.
+    pub fn bases(&self) -> [[f64; 2]; 2] {
+        let ([one, two], [a, b]) = (self.fingers(), self.fingertips());
+        let span = |finger: &Finger, tip: &Fingertip| match tip.model {
+            FingertipModel::Rigid => tip.radius + 0.5 * self.object.width,
+            _ => finger.half_span,
+        };
+        [[-span(one, a), one.lift], [span(two, b), two.lift]]
+    }
+
+    /// The same with all moduli of the tips times `factor`.
+    pub fn with_moduli(&self, factor: f64) -> Self {
+        let mut scene = self.clone();
+        scene.fingertip = scene.fingertip.scaled(factor);
+        if let Some(second) = &mut scene.second {
+            second.fingertip = second.fingertip.scaled(factor);
         }
+        scene
+    }
+
+    /// The same with tips of another model.
+    pub fn with_model(&self, model: FingertipModel) -> Self {
+        let mut scene = self.clone();
+        scene.fingertip.model = model;
+        if let Some(second) = &mut scene.second {
+            second.fingertip.model = model;
+        }
+        scene
     }
 
     /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest
@@ -248,11 +328,17 @@ impl Scene {
                 youngs_modulus: 2.0e5,
                 damping: [20.0, 20.0],
                 model: FingertipModel::Parallel,
+                maxwell: Vec::new(),
+                stiffening: None,
+                deviation: 0.0,
+                bounds: None,
                 profile: Vec::new(),
             },
             finger: Finger {
                 link: 0.060,
+                upper: None,
                 half_span: 0.0485,
+                lift: 0.0,
                 inertia: 1.0e-3,
                 gains: Gains { kp: 100.0, kd: 1.0, ki: 2000.0 },
                 fixed: false,
@@ -263,7 +349,9 @@ impl Scene {
                 mass: 0.10,
                 inertia: rectangle_inertia(0.10, 0.060, 0.060),
                 friction: Some(1.0),
+                offset: 0.0,
             },
+            second: None,
             initial: Initial { normal_displacement: 0.0015, joints: [0.0; 2], rest: 0.5 },
             gravity: -9.81,
             integrator: Integrator {
@@ -301,20 +389,18 @@ impl Scene {
     /// # Errors
     /// [`SceneError`] names the first value out of range, or those that do not go together.
     pub fn check(&self) -> Result<(), SceneError> {
-        let Self { fingertip, finger, object, initial, integrator, .. } = self;
-        fingertip.check()?;
-        positive("finger.link", finger.link, 10.0, "above 0 and at most 10 m")?;
-        positive("finger.half_span", finger.half_span, 10.0, "above 0 and at most 10 m")?;
-        positive("finger.inertia", finger.inertia, 1e6, "above 0 kg m^2")?;
-        at_least_zero("finger.gains.kp", finger.gains.kp, "0 or more N m/rad")?;
-        at_least_zero("finger.gains.kd", finger.gains.kd, "0 or more N m s/rad")?;
-        at_least_zero("finger.gains.ki", finger.gains.ki, "0 or more N m/(rad s)")?;
+        let Self { fingertip, object, initial, integrator, .. } = self;
+        self.fingertips().into_iter().try_for_each(Fingertip::check)?;
+        self.fingers().into_iter().try_for_each(Finger::check)?;
         positive("object.width", object.width, 10.0, "above 0 and at most 10 m")?;
         positive("object.height", object.height, 10.0, "above 0 and at most 10 m")?;
         positive("object.mass", object.mass, 1e6, "above 0 kg")?;
         positive("object.inertia", object.inertia, 1e6, "above 0 kg m^2")?;
         if let Some(friction) = object.friction {
-            positive("object.friction", friction, f64::MAX, "above 0; leave it out for no slip check")?;
+            positive("object.friction", friction, f64::MAX, "above 0; leave it out for tips that never slide")?;
+        }
+        if !(0.0..=10.0).contains(&object.offset) {
+            return Err(ParamError { name: "object.offset", value: object.offset, range: "0 to 10 m" }.into());
         }
         let depth = initial.normal_displacement;
         if !(depth > 0.0 && depth < fingertip.radius) {
@@ -356,15 +442,25 @@ impl Scene {
                 }
             }
         }
-        let by_geometry = fingertip.radius + 0.5 * object.width - finger.half_span;
+        let ([a, b], [one, two]) = (self.fingertips(), self.fingers());
+        let half_span = 0.5 * (one.half_span + two.half_span);
+        let by_geometry = 0.5 * (a.radius + b.radius + object.width) - half_span;
         if (by_geometry - depth).abs() > 1e-9 {
-            return Err(SceneError::Geometry { half_span: finger.half_span, depth, by_geometry });
+            return Err(SceneError::Geometry { half_span, depth, by_geometry });
         }
-        if self.finger.fixed && !self.motions.is_empty() {
+        let fixed = one.fixed && two.fixed;
+        if fixed && !self.motions.is_empty() {
             return Err(SceneError::FixedMotion);
         }
+        let relaxes = self.fingertips().iter().any(|t| !t.maxwell.is_empty());
+        if relaxes && (integrator.formulation == Formulation::Multipliers || fingertip.model == FingertipModel::Rigid) {
+            return Err(SceneError::Relaxing);
+        }
+        if self.fingertips().iter().any(|t| t.stiffening.is_some()) && fingertip.model != FingertipModel::Tabulated {
+            return Err(SceneError::Stiffening { model: fingertip.model.name() });
+        }
         if fingertip.model == FingertipModel::Rigid {
-            if self.finger.fixed {
+            if fixed {
                 return Err(SceneError::NothingMoves);
             }
             if initial.joints != [0.0; 2] {
