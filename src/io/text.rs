@@ -64,7 +64,7 @@ pub fn write_text(path: impl AsRef<Path>, text: &str) -> Result<(), IoError> {
 /// [`IoError`] when one cannot be read, or the other not written.
 pub fn copy(from: impl AsRef<Path>, to: impl AsRef<Path>) -> Result<(), IoError> {
     let from = from.as_ref();
-    let mut file = File::open(from).map_err(os(from, "read"))?;
+    let mut file = source::open(from)?;
     write_atomic(to.as_ref(), |w| std::io::copy(&mut file, w).map(drop))
 }
 
