@@ -504,7 +504,7 @@ fn bodies_are_given_as_labels_or_refused_by_name() {
 #[test]
 fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     let folder = TempDir::new().unwrap();
-    let command = ["demo", "--preset", "fast", "--size", "48", "--nodes", "4000", "--quiet"];
+    let command = ["demo", "--chain", "--preset", "fast", "--size", "48", "--nodes", "4000", "--quiet"];
     let (out, _) = run(folder.path(), &command, 0);
     println!("{out}");
     let demo = folder.path().join("palpate-demo");
@@ -540,6 +540,22 @@ fn the_demo_takes_a_finger_pad_from_two_volumes_to_a_grasp() {
     fs::remove_file(demo.join("summary.json")).unwrap();
     let (_, err) = run(folder.path(), &command, 1);
     assert!(err.contains("palpate-demo") && err.contains("--overwrite"), "{err}");
+}
+
+#[test]
+fn the_first_demo_scores_displacement_and_strain() {
+    let folder = TempDir::new().unwrap();
+    run(folder.path(), &["demo", "--size", "44", "--quiet"], 0);
+    let demo = folder.path().join("palpate-demo");
+    let summary: Value = serde_json::from_str(&fs::read_to_string(demo.join("summary.json")).unwrap()).unwrap();
+    let rows = summary["chain"].as_array().unwrap();
+    let of = |k: usize| ["found", "truth"].map(|key| rows[k][key].as_f64().unwrap());
+    assert_eq!([rows[0]["stage"].as_str(), rows[1]["stage"].as_str()], [Some("field"), Some("strain")]);
+    for [error, nothing] in [of(0), of(1)] {
+        assert!(error < 0.6 * nothing, "{error} of {nothing}");
+    }
+    let page = fs::read_to_string(demo.join("report.html")).unwrap();
+    assert!(page.matches("srcdoc").count() == 2 && page.contains("Displacement and strain of a calf"));
 }
 
 #[test]

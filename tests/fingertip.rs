@@ -134,6 +134,7 @@ fn deviations_of_tissue_reach_the_tip() {
         youngs_modulus,
         bound: None,
         sd,
+        poisson: None,
     };
     let mut folder = StiffnessFolder {
         map,

@@ -101,7 +101,7 @@ fn each_file_of_a_field_a_strain_a_track_and_a_certificate_is_named() {
 fn each_file_of_the_whole_chain_is_named() {
     let folder = TempDir::new().unwrap();
     let folder = folder.path();
-    run(folder, &["demo", "--preset", "fast", "--size", "36", "--nodes", "2000", "--quiet", "-o", "d"], 0);
+    run(folder, &["demo", "--chain", "--preset", "fast", "--size", "36", "--nodes", "2000", "--quiet", "-o", "d"], 0);
     let expected = [
         ("d", "results of palpate demo"),
         ("d/phantom", "phantom of palpate"),

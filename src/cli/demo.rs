@@ -1,5 +1,5 @@
-//! `palpate demo`: the whole chain on a synthetic finger pad, every stage scored against its truth,
-//! on one page.
+//! `palpate demo`: displacement and strain of a synthetic calf, or the whole chain on a synthetic
+//! finger pad. Every stage is scored against its truth, on one page.
 
 use super::Cli;
 use super::console::Console;
@@ -15,8 +15,8 @@ use palpate::io::{self, OutputFolder, SceneOverrides};
 use palpate::pipeline::fingertip;
 use palpate::report::chain::{Part, Row, page, text};
 use palpate::report::record::{in_summary, on_page};
-use palpate::types::Volume;
 use palpate::types::fingertip::{StiffnessFolder, StiffnessRegion};
+use palpate::types::{Metrics, Volume};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -35,6 +35,8 @@ const FILES: [&str; 10] = [
     "chain.csv",
     "report.html",
 ];
+/// The same without --chain.
+const FIRST_FILES: [&str; 6] = ["phantom", "field", "strain", "exact-strain", "chain.csv", "report.html"];
 /// How far the plate goes in (mm).
 const AMPLITUDE: &str = "1.5";
 
@@ -43,13 +45,16 @@ pub struct Options {
     /// Folder for the results; those of an earlier demo are replaced
     #[arg(short, long, value_name = "DIR", default_value = "palpate-demo")]
     output: PathBuf,
+    /// Every command in turn, from two volumes of a finger pad to a grasp (about 90 CPU seconds)
+    #[arg(long)]
+    chain: bool,
     /// Write into a folder that is not empty
     #[arg(long, alias = "force")]
     overwrite: bool,
     /// Voxels of the phantom along x; the field of view stays
     #[arg(long, value_name = "N")]
     size: Option<usize>,
-    /// Nodes of the stiffness mesh, about
+    /// With --chain: nodes of the stiffness mesh, about
     #[arg(long, value_name = "N", default_value_t = 8000)]
     nodes: usize,
     #[command(flatten)]
@@ -57,8 +62,8 @@ pub struct Options {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { output, overwrite, size, nodes, tuning } = options;
-    let params = tuning.params()?;
+    let Options { output, overwrite, tuning, .. } = options;
+    tuning.params()?;
     let earlier = ["phantom", "summary.json"].iter().all(|f| output.join(f).exists());
     let used = io::list(output).is_ok_and(|files| !files.is_empty());
     if used && !earlier && !overwrite {
@@ -66,21 +71,106 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     // Held from here on: no other run comes between the steps.
     let mut folder = OutputFolder::create(output, true)?;
-    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
     let record = Recording::start(console, record::inputs(&[("config", tuning.config())]));
-    let step = |words: &[&str]| -> Result<()> {
-        console.say(&format!("\n$ palpate {}", words.join(" ")));
-        let Cli { command, .. } = Cli::try_parse_from([&["palpate"], words].concat())?;
-        super::dispatch(&command, &console.for_command(words))
-    };
-    let (seed, cells, nodes) = (params.seed.to_string(), size.map(|n| n.to_string()), nodes.to_string());
-    let mut make = vec!["phantom", "fingertip", "--amplitude", AMPLITUDE, "--seed", &seed, "--overwrite", "-o"];
+    let Scored { title, about, rows, metrics, parts, files } =
+        if options.chain { chain(options, console)? } else { first(options, console)? };
+    let parts = parts
+        .iter()
+        .map(|&(title, file)| io::read_text(output.join(file)).map(|content| Part { title, file, content }));
+    let parts = parts.collect::<Result<Vec<_>, _>>()?;
+    let summary = json!({
+        "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": files,
+    });
+    let record = record.finish();
+    folder.write("chain.csv", |p| io::write_chain(p, &rows))?;
+    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
+    folder.write("report.html", |p| io::write_text(p, &on_page(page(title, about, &rows, &parts), &record)))?;
+    folder.commit()?;
+    console.say(&format!("\n{}\nLook at {}", text(&rows), output.join("report.html").shown()));
+    Ok(())
+}
+
+/// What a demo came to.
+struct Scored {
+    title: &'static str,
+    about: &'static str,
+    rows: Vec<Row>,
+    metrics: Metrics,
+    /// Title and file of each part of the page.
+    parts: &'static [(&'static str, &'static str)],
+    files: &'static [&'static str],
+}
+
+/// Runs one command of the program, and says which.
+fn step(words: &[&str], console: &Console) -> Result<()> {
+    console.say(&format!("\n$ palpate {}", words.join(" ")));
+    let Cli { command, .. } = Cli::try_parse_from([&["palpate"], words].concat())?;
+    super::dispatch(&command, &console.for_command(words))
+}
+
+/// Makes a phantom, and measures its displacement.
+fn measured(kind: &[&str], options: &Options, console: &Console) -> Result<()> {
+    let Options { output, size, tuning, .. } = options;
+    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
+    let (seed, cells) = (tuning.params()?.seed.to_string(), size.map(|n| n.to_string()));
     let phantom = at("phantom");
-    make.push(&phantom);
+    let mut make = [&["phantom"], kind, &["--seed", &seed, "--overwrite", "-o", &phantom]].concat();
     if let Some(cells) = &cells {
         make.extend(["--size", cells]);
     }
-    step(&make)?;
+    step(&make, console)?;
+    let [initial, deformed, mask, field] =
+        ["phantom/initial.nii.gz", "phantom/deformed.nii.gz", "phantom/mask.nii.gz", "field"].map(at);
+    let mut measure = vec!["field", &initial, &deformed, "--mask", &mask, "--overwrite", "-o", &field];
+    let tuned = tuning.arguments();
+    measure.extend(tuned.iter().map(String::as_str));
+    step(&measure, console)
+}
+
+/// Displacement and strain of a calf under a blunt indenter.
+fn first(options: &Options, console: &Console) -> Result<Scored> {
+    let output = &options.output;
+    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
+    measured(&["calf", "--motion", "press"], options, console)?;
+    let (field, strain) = (at("field"), at("strain"));
+    step(&["strain", &field, "--overwrite", "-o", &strain], console)?;
+    let gauge = io::read_json(output.join("strain/summary.json"))?["gauge_mm"].to_string();
+    let (truth, mask, exact) = (at("phantom/truth.nii.gz"), at("phantom/mask.nii.gz"), at("exact-strain"));
+    step(&["strain", &truth, "--mask", &mask, "--gauge", &gauge, "--overwrite", "-o", &exact], console)?;
+    let (mut rows, metrics) = field_rows(output)?;
+    rows.push(strain_row(output)?);
+    Ok(Scored {
+        title: "Displacement and strain of a calf",
+        about: "A synthetic calf before and after a blunt indenter pressed it. The displacement and the strain are compared with \
+                the exact truth.",
+        rows,
+        metrics,
+        parts: &[("Field", "field/report.html"), ("Strain", "strain/report.html")],
+        files: &FIRST_FILES,
+    })
+}
+
+/// The largest shear strain against that of the exact displacement over the same gauge.
+fn strain_row(output: &Path) -> Result<Row> {
+    let read = |name: &str| io::read_volume(output.join(name).join("shear.nii.gz"));
+    let (found, exact) = (read("strain")?, read("exact-strain")?);
+    let pairs = found.as_slice().iter().zip(exact.as_slice()).map(|(a, b)| [f64::from(*a), f64::from(*b)]);
+    let seen: Vec<[f64; 2]> = pairs.filter(|p| p.iter().all(|v| v.is_finite()) && p[1] > 0.0).collect();
+    let mean = |of: &dyn Fn(&[f64; 2]) -> f64| 100.0 * seen.iter().map(of).sum::<f64>() / seen.len().max(1) as f64;
+    Ok(Row::error(
+        "strain",
+        "mean error of the largest shear strain",
+        "%",
+        mean(&|p| (p[0] - p[1]).abs()),
+        mean(&|p| p[1]),
+    ))
+}
+
+/// Every command in turn on a finger pad.
+fn chain(options: &Options, console: &Console) -> Result<Scored> {
+    let output = &options.output;
+    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
+    measured(&["fingertip", "--amplitude", AMPLITUDE], options, console)?;
     let told = io::read_json(output.join("phantom/phantom.json"))?;
     let elastic = &told["elastic"];
     let word = |key: &str| elastic[key].as_str().unwrap_or_default().to_string();
@@ -88,69 +178,39 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let regions = elastic["regions"].as_array().cloned().unwrap_or_default();
     let names: Vec<String> =
         regions.iter().map(|r| format!("{}={}", r["label"], r["name"].as_str().unwrap_or_default())).collect();
-
-    let file = |name: &str| at(&format!("phantom/{name}"));
-    let (initial, deformed, mask, labels) =
-        (file("initial.nii.gz"), file("deformed.nii.gz"), file("mask.nii.gz"), file("labels.nii.gz"));
-    let (field, stiffness, tip, scene, grasp) =
-        (at("field"), at("stiffness"), at("fingertip.toml"), at("scene.toml"), at("grasp"));
-    let mut measure = vec!["field", &initial, &deformed, "--mask", &mask, "--overwrite", "-o", &field];
-    let tuned = tuning.arguments();
-    measure.extend(tuned.iter().map(String::as_str));
-    step(&measure)?;
-    let names = names.join(",");
-    step(&[
-        "stiffness",
-        "--field",
-        &field,
-        "--labels",
-        &labels,
-        "--names",
-        &names,
-        "--held",
-        &held,
-        "--load",
-        &load,
-        "--total-force",
-        &newton,
-        "--nodes",
-        &nodes,
-        "--overwrite",
-        "-o",
-        &stiffness,
-    ])?;
-    step(&["fingertip", &stiffness, "-o", &tip])?;
+    let (names, nodes) = (names.join(","), options.nodes.to_string());
+    let [field, labels, stiffness, tip, scene, grasp] =
+        ["field", "phantom/labels.nii.gz", "stiffness", "fingertip.toml", "scene.toml", "grasp"].map(at);
+    let known = ["--labels", &labels, "--names", &names, "--held", &held, "--load", &load, "--total-force", &newton];
+    let rest = ["--nodes", &nodes, "--overwrite", "-o", &stiffness];
+    step(&[&["stiffness", "--field", &field][..], &known, &rest].concat(), console)?;
+    step(&["fingertip", &stiffness, "-o", &tip], console)?;
     io::write_text(output.join("scene.toml"), SCENE)?;
-    step(&["grasp", &scene, "--overwrite", "-o", &grasp])?;
+    step(&["grasp", &scene, "--overwrite", "-o", &grasp], console)?;
 
     let (mut rows, metrics) = field_rows(output)?;
     rows.extend(stiffness_rows(output, &regions)?);
     rows.extend(press_row(output, &told)?);
     exact_fingertip(output, &told, &regions)?;
     rows.extend(grasp_rows(output)?);
-    let parts = [
-        ("Field", "field/report.html"),
-        ("Stiffness", "stiffness/report.html"),
-        ("Fingertip", "fingertip.svg"),
-        ("Grasp", "grasp/report.html"),
-    ];
-    let parts =
-        parts.map(|(title, file)| io::read_text(output.join(file)).map(|content| Part { title, file, content }));
-    let parts = parts.into_iter().collect::<Result<Vec<_>, _>>()?;
-    let summary = json!({
-        "version": env!("CARGO_PKG_VERSION"), "command": "demo", "metrics": metrics, "chain": rows, "parts": FILES,
-    });
-    let record = record.finish();
-    folder.write("chain.csv", |p| io::write_chain(p, &rows))?;
-    folder.write("summary.json", |p| io::write_json(p, &in_summary(summary, &record)))?;
-    folder.write("report.html", |p| io::write_text(p, &on_page(page(&rows, &parts), &record)))?;
-    folder.commit()?;
-    console.say(&format!("\n{}\nLook at {}", text(&rows), output.join("report.html").shown()));
-    Ok(())
+    Ok(Scored {
+        title: "From two volumes to a grasp",
+        about: "A synthetic finger pad, pressed on a plate. Every command measured it in turn, and each result is compared with the \
+                exact truth.",
+        rows,
+        metrics,
+        parts: &[
+            ("Field", "field/report.html"),
+            ("Stiffness", "stiffness/report.html"),
+            ("Fingertip", "fingertip.svg"),
+            ("Grasp", "grasp/report.html"),
+        ],
+        files: &FILES,
+    })
 }
 
 /// The field against the exact displacement.
-fn field_rows(output: &Path) -> Result<(Vec<Row>, palpate::types::Metrics)> {
+fn field_rows(output: &Path) -> Result<(Vec<Row>, Metrics)> {
     let truth = io::read_field(output.join("phantom/truth.nii.gz"))?;
     let found = io::read_field(output.join("field/displacement.nii.gz"))?;
     let mask = io::read_mask(output.join("phantom/mask.nii.gz"))?;

@@ -149,7 +149,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
             ("inverse consistency", "evaluate results --inverse back"),
         ],
     ),
-    ("demo", &[("everything on synthetic data", "demo")]),
+    ("demo", &[("displacement and strain with a known answer", "demo"), ("every command, to a grasp", "demo --chain")]),
     (
         "markups",
         &[

@@ -112,12 +112,12 @@ pub fn text(rows: &[Row]) -> String {
     all.iter().map(line).collect()
 }
 
-/// The page; parts are embedded whole, so it needs no other file.
-pub fn page(rows: &[Row], parts: &[Part]) -> String {
+/// The page under a title, with what it is about; parts are embedded whole, so it needs no other
+/// file.
+pub fn page(title: &str, about: &str, rows: &[Row], parts: &[Part]) -> String {
     let cells: Vec<Vec<String>> = rows.iter().map(|r| r.cells().iter().map(|c| escape(c)).collect()).collect();
     let mut out = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>From two volumes to a grasp</h1><p class=\"verdict\">A synthetic finger pad, \
-         pressed on a plate, measured by every command in turn and scored against its exact truth.</p></header>\
+        "<header><p class=\"brand\">palpate {}</p><h1>{title}</h1><p class=\"verdict\">{about}</p></header>\
          <section><h2>Errors</h2><div class=\"grid\"><article class=\"wide\">{}</article></div></section>",
         env!("CARGO_PKG_VERSION"),
         table(&HEAD, &cells)
@@ -133,5 +133,5 @@ pub fn page(rows: &[Row], parts: &[Part]) -> String {
         };
         let _ = write!(out, "<section><h2>{title}</h2>{inside}<p><small>{file}</small></p></section>");
     }
-    document("From two volumes to a grasp", &out)
+    document(title, &out)
 }
