@@ -1,5 +1,6 @@
 //! The largest stable step of each integrator and formulation over the stiffness of the tips, the
-//! object's mass, the damping, and the gain of the stabilisation: the map of docs/reference/grasp.md.
+//! object's mass, the damping, and the gain of the stabilisation: the map of
+//! docs/reference/grasp.md.
 //!
 //! `cargo run --release --example stability_map [-- --quick]` prints a table and writes
 //! `out/stability-map.svg`.

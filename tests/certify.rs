@@ -121,7 +121,8 @@ fn the_command_writes_a_certificate_and_refuses_other_grids() {
     assert!(!folder.path().join("d").exists());
 }
 
-/// A slice is certified in its plane, where its rows are short; noise alone is said to measure nothing.
+/// A slice is certified in its plane, where its rows are short; noise alone is said to measure
+/// nothing.
 #[test]
 fn a_slice_is_certified_and_noise_is_not() {
     let (grid, deep) = (Grid::new([48, 44, 1], Affine::scaled([0.5; 3], [0.0; 3]).unwrap()).unwrap(), texture(false));

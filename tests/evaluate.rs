@@ -220,7 +220,8 @@ fn surface_distances_are_those_of_the_definition() {
 
 #[test]
 fn balls_and_boxes_are_as_far_apart_as_geometry_has_it() {
-    // Two balls about one centre: every distance is the difference of the radii, to a third of a voxel.
+    // Two balls about one centre: every distance is the difference of the radii, to a third of a
+    // voxel.
     let g = grid([60, 40, 48], [0.5, 0.75, 0.625]);
     let centre = [14.75, 14.625, 14.6875];
     let ball = |r: f64| -> Vec<u8> {

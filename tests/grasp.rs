@@ -1449,7 +1449,8 @@ fn a_stiffening_tip_has_its_closed_form_and_what_is_published_of_fingertips() {
         forces.push(f);
         drags.push(k);
     }
-    // Exponential from 0.5 N on (Pawluk and Howe 1999): the slope of ln F changes by a fifth up to 5 N.
+    // Exponential from 0.5 N on (Pawluk and Howe 1999): the slope of ln F changes by a fifth up to
+    // 5 N.
     let slope = |a: f64, b: f64| (closed(b) / closed(a)).ln() / (b - a);
     let depth = |force: f64| {
         let (mut low, mut high) = (0.0, scene.fingertip.radius);

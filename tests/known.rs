@@ -57,8 +57,8 @@ impl Scene {
             let edge = 1.0 / (1.0 + (12.0 * (inside(p) - 1.0)).exp());
             edge * 500.0 * (1.0 + 0.3 * texture(p) * waves.at(p)).max(0.2)
         };
-        // The content is fixed to the initial volume, so the deformed one asks where its tissue came
-        // from.
+        // The content is fixed to the initial volume, so the deformed one asks where its tissue
+        // came from.
         let origin = |y: [f64; 3]| {
             let mut x = y;
             for _ in 0..40 {

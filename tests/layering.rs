@@ -183,8 +183,8 @@ fn violations(part: &str, source: &str) -> Vec<String> {
     wrong
 }
 
-/// What is done in one place for all: files are opened to read where pipes are refused, and names of
-/// others shown where what would steer a terminal is escaped.
+/// What is done in one place for all: files are opened to read where pipes are refused, and names
+/// of others shown where what would steer a terminal is escaped.
 fn elsewhere(inside: &str, source: &str) -> Vec<String> {
     let code = without_tests(&code_only(source));
     // Locks, a file that is being written, and what the system tells of itself.

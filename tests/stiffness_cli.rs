@@ -453,7 +453,8 @@ fn a_modulus_that_is_given_sets_the_scale() {
     assert!(summary["absolute"] == true && summary["unit"] == "kPa" && summary["trust"] != "low", "{text}");
 }
 
-/// A wave that no elastic body makes: no number, low trust, and exit code 1 where that is asked for.
+/// A wave that no elastic body makes: no number, low trust, and exit code 1 where that is asked
+/// for.
 #[test]
 fn a_field_that_no_body_makes_gives_no_number() {
     let folder = folder();

@@ -116,8 +116,8 @@ fn strain_of(field: &DenseField, params: &StrainParams) -> Result<StrainResult, 
     pipeline::strain::run(input, params, &|_, _| {})
 }
 
-/// White noise on a wave: the deviation is that of the slopes, and the gauge that is chosen is about
-/// as good as the best of those that are tried.
+/// White noise on a wave: the deviation is that of the slopes, and the gauge that is chosen is
+/// about as good as the best of those that are tried.
 #[test]
 fn white_noise_chooses_the_gauge_and_gives_the_deviation() {
     let grid = grid([48, 40, 32]);

@@ -116,8 +116,8 @@ fn no_part_needs_a_newer_compiler_than_we_say() {
     }
 }
 
-/// Advisories of RustSec as they were when `fixtures/advisories.tsv` was made: a version with a known
-/// vulnerability, or with code that is not sound, is no part of it.
+/// Advisories of RustSec as they were when `fixtures/advisories.tsv` was made: a version with a
+/// known vulnerability, or with code that is not sound, is no part of it.
 #[test]
 fn no_part_has_a_known_flaw() {
     let snapshot = include_str!("fixtures/advisories.tsv");

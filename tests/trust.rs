@@ -1,5 +1,5 @@
-//! What docs/explanation/trust.md promises of files, limits and repeated runs: killed, stopped, out of time,
-//! memory and permission.
+//! What docs/explanation/trust.md promises of files, limits and repeated runs: killed, stopped, out
+//! of time, memory and permission.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used)]
 

@@ -72,8 +72,8 @@ pub struct Tuning {
     /// [default: full]
     #[arg(long, value_parser = method)]
     method: Option<Method>,
-    /// Motion model of each body: identity, rigid, affine, free, or auto, the smallest that explains
-    /// the volumes [default: auto]
+    /// Motion model of each body: identity, rigid, affine, free, or auto, the smallest that
+    /// explains the volumes [default: auto]
     #[arg(long, value_parser = model)]
     model: Option<ModelSource>,
     /// Feature points in the initial volume, 20 to 2,000,000 [default: by size and texture]
@@ -122,7 +122,8 @@ impl Tuning {
         mask.map(said).into_iter().collect()
     }
 
-    /// Says so where the run that --config names had one of these and this one, with `known`, has not.
+    /// Says so where the run that --config names had one of these and this one, with `known`, has
+    /// not.
     pub fn known_left_out(&self, known: &Knowledge) -> Option<String> {
         let file = self.config.as_ref()?;
         let summary = io::read_json(file).unwrap_or_default();

@@ -19,8 +19,9 @@ use std::path::PathBuf;
 pub struct Options {
     /// Scene file (.toml); its motions are the postures that are looked at
     scene: PathBuf,
-    /// Table (.csv) of presses (d, tilt_deg, force) or of the grasp's course (time, theta1_deg, theta2_deg, x, y, theta_deg): fits
-    /// modulus and damping of each tip model to it and weighs the models
+    /// Table (.csv) of presses (d, tilt_deg, force) or of the grasp's course (time, theta1_deg,
+    /// theta2_deg, x, y, theta_deg): fits modulus and damping of each tip model to it and weighs
+    /// the models
     #[arg(long, value_name = "FILE")]
     measured: Option<PathBuf>,
     #[command(flatten)]

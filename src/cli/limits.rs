@@ -36,13 +36,14 @@ fn longest(grid: &Grid) -> f64 {
     (0..3).map(|a| size[a] * grid.shape()[a] as f64).fold(0.0, f64::max)
 }
 
-/// How far the logarithm (to base 10) of a ratio of sides may be under one, that of a factor of ten.
+/// How far the logarithm (to base 10) of a ratio of sides may be under one, that of a factor of
+/// ten.
 const ABOUT: f64 = 0.1;
 /// Ratio of the numbers of voxels along a side up to which two volumes may show the same part.
 const ALIKE: f64 = 2.5;
 
-/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10 or
-/// more: their units differ, or one has lost its header.
+/// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10
+/// or more: their units differ, or one has lost its header.
 pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
     let (small, large) =
         if longest(a) < longest(b) { ((initial, a), (deformed, b)) } else { ((deformed, b), (initial, a)) };
@@ -73,8 +74,8 @@ pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) ->
     );
 }
 
-/// Caps the search at the longest side of the volume at `path`, on `grid`: tissue that moves farther
-/// is nowhere in it. Says so where that is less than was asked for.
+/// Caps the search at the longest side of the volume at `path`, on `grid`: tissue that moves
+/// farther is nowhere in it. Says so where that is less than was asked for.
 pub fn cap_search(params: &mut FieldParams, grid: &Grid, path: &Path) -> Option<String> {
     let (asked, most) = (params.search_mm, longest(grid));
     (asked > most).then(|| {

@@ -120,8 +120,8 @@ struct Common {
     /// Stop after so many seconds, with nothing half-written left [default: no limit]
     #[arg(long, global = true, value_name = "SECONDS", value_parser = seconds)]
     timeout: Option<Duration>,
-    /// Which series of a DICOM folder is meant, by its UID; of several, each folder takes one that it
-    /// holds, in order
+    /// Which series of a DICOM folder is meant, by its UID; of several, each folder takes one that
+    /// it holds, in order
     #[arg(long, global = true, value_name = "UID", value_delimiter = ',')]
     series: Vec<String>,
     /// No progress and no warnings on stderr
@@ -277,8 +277,8 @@ fn named_for_command(typed: &mut Vec<OsString>) {
     }
 }
 
-/// Says what is wrong with the command line, or the help: of words that would steer a terminal, what
-/// would be wrong with them escaped.
+/// Says what is wrong with the command line, or the help: of words that would steer a terminal,
+/// what would be wrong with them escaped.
 fn complain(error: &clap::Error, words: &[String]) -> ! {
     let safe: Vec<String> = words.iter().map(|word| plain(word)).collect();
     if safe == words {

@@ -1,5 +1,5 @@
-//! `--series UID`: which series of a DICOM folder is meant. A file of a series stands for all of it,
-//! so the folder's name is replaced by that of such a file before anything else is done.
+//! `--series UID`: which series of a DICOM folder is meant. A file of a series stands for all of
+//! it, so the folder's name is replaced by that of such a file before anything else is done.
 
 use super::Usage;
 use anyhow::{Result, bail};

@@ -110,8 +110,9 @@ pub struct Options {
     /// Regions to try at most without labels, 1 to 8 [default: 4]
     #[arg(long, value_name = "N")]
     regions: Option<usize>,
-    /// Volume to show behind the maps in report.html; may be given several times
-    /// [default: warped.nii.gz of the same results of palpate field, if any: the deformed volume drawn back to where the initial one lies]
+    /// Volume to show behind the maps in report.html; may be given several times [default:
+    /// warped.nii.gz of the same results of palpate field, if any: the deformed volume drawn back
+    /// to where the initial one lies]
     #[arg(long = "image", value_name = "FILE")]
     pub(super) images: Vec<PathBuf>,
     /// Folder for the results

@@ -40,7 +40,8 @@ pub struct Options {
     /// Regions whose strain is summed up: a label map on the field's grid [default: the bodies]
     #[arg(long, value_name = "L", value_parser = standing_for(Part::Labels))]
     labels: Option<PathBuf>,
-    /// Fibres: vectors on the field's grid (5-D NIfTI, LPS), or LABEL=X,Y,Z (RAS), once for each label
+    /// Fibres: vectors on the field's grid (5-D NIfTI, LPS), or LABEL=X,Y,Z (RAS), once for each
+    /// label
     #[arg(long, value_name = "F")]
     fibres: Vec<String>,
     /// A label that is a tube: its radial, circumferential and axial strain

@@ -2,9 +2,9 @@
 //!
 //! A surface is the centres of the voxels of a label that have a face to another label, to the
 //! background or to the outside of the grid; an axis of one voxel has no such faces. Distances are
-//! Euclidean in world mm, from each surface voxel to the nearest of the other map, both ways pooled:
-//! their mean is the symmetric mean surface distance (Heimann et al. 2009), their 95th percentile
-//! the 95th percentile Hausdorff distance.
+//! Euclidean in world mm, from each surface voxel to the nearest of the other map, both ways
+//! pooled: their mean is the symmetric mean surface distance (Heimann et al. 2009), their 95th
+//! percentile the 95th percentile Hausdorff distance.
 
 use crate::error::FieldError;
 use crate::numerics::neighbours::Neighbours;

@@ -37,8 +37,8 @@ const STILL_VOXELS: usize = 1000;
 /// when empty).
 ///
 /// # Errors
-/// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when the mask is empty, or
-/// the truth or the field has voxels in it that are no number.
+/// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when
+/// the mask is empty, or the truth or the field has voxels in it that are no number.
 pub fn metrics(
     field: &DenseField,
     truth: &DenseField,

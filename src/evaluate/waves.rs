@@ -19,8 +19,8 @@ const SPANS: f64 = 0.75;
 /// Voxels of a row that tell its amplitude, at least.
 const LEAST: usize = 30;
 
-/// The rows of voxel axis `grow`, within `mask`, of a motion along voxel axis `moves` in waves along
-/// `wave`. `fields` are averaged; `wavelength` gives that of a row (mm).
+/// The rows of voxel axis `grow`, within `mask`, of a motion along voxel axis `moves` in waves
+/// along `wave`. `fields` are averaged; `wavelength` gives that of a row (mm).
 pub fn rows(
     fields: &[&DenseField],
     truth: &DenseField,

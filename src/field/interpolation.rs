@@ -55,7 +55,8 @@ pub fn interpolate_tetrahedra(
 /// The same for triangles on a grid of one slice; nodes are taken to their foot on the slice.
 ///
 /// # Errors
-/// [`MeshError::Length`] as above; [`MeshError::NotOneSlice`] when the grid is thicker than one voxel along every axis.
+/// [`MeshError::Length`] as above; [`MeshError::NotOneSlice`] when the grid is thicker than one
+/// voxel along every axis.
 pub fn interpolate_triangles(
     mesh: &TriMesh,
     displacement: &[[f64; 3]],

@@ -34,8 +34,8 @@ const MOST_EVENTS: usize = 1000;
 /// back.
 ///
 /// # Errors
-/// [`GraspError`] where nothing can be simulated: a scene out of range, no stable equilibrium at the start, or a step or
-/// stabilisation gain that is unstable from the start.
+/// [`GraspError`] where nothing can be simulated: a scene out of range, no stable equilibrium at
+/// the start, or a step or stabilisation gain that is unstable from the start.
 pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
     attempt(scene, progress, true)
 }
@@ -87,7 +87,8 @@ fn with_tips<T: Tip + Clone>(
 /// The equilibrium that a run starts in: the pinch, followed to the first joint angles.
 ///
 /// # Errors
-/// [`GraspError::NoStart`] where the pinch is not stable or not in the model's range, or the branch does not reach so far.
+/// [`GraspError::NoStart`] where the pinch is not stable or not in the model's range, or the branch
+/// does not reach so far.
 pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspError> {
     let start = statics.pinch(scene);
     let depth = scene.initial.normal_displacement * 1e3;

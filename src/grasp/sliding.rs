@@ -1,9 +1,9 @@
 //! The minimal form with tips that slide where friction does not hold them.
 //!
 //! A tip has no mass, so its own equation says how it slides. Where the force along the face of a
-//! tip that sticks, dU/dd_t + c_t d_t' and what its branches carry, would be over the limit of [`Friction`], the force is that
-//! limit, and the rest of it moves the tip's surface along the face: c_t s' = excess. So s' is
-//! continuous, sticking is s' = 0, and nothing has to be switched.
+//! tip that sticks, dU/dd_t + c_t d_t' and what its branches carry, would be over the limit of
+//! [`Friction`], the force is that limit, and the rest of it moves the tip's surface along the
+//! face: c_t s' = excess. So s' is continuous, sticking is s' = 0, and nothing has to be switched.
 
 use crate::grasp::constraints::{Coordinates, Geometry};
 use crate::grasp::control::Inputs;

@@ -211,10 +211,10 @@ impl<'a> Statics<'a> {
         a > 0.0 && a * b - d * d > 0.0 && a * (b * c - g * g) - d * (d * c - g * e) + e * (d * g - b * e) > 0.0
     }
 
-    /// The closed form at joint angles 0 (docs/reference/grasp.md): x = theta = 0, and for tips that deform
-    /// along the face y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip with the
-    /// force that soft ones have at d_0. That of tabulated tips, and of fingers that differ, is
-    /// found next to it; its eigenvalue is not a number where there is none.
+    /// The closed form at joint angles 0 (docs/reference/grasp.md): x = theta = 0, and for tips
+    /// that deform along the face y = -l - m g / (4 pi E d_0); for others y = -l. Rigid tips grip
+    /// with the force that soft ones have at d_0. That of tabulated tips, and of fingers that
+    /// differ, is found next to it; its eigenvalue is not a number where there is none.
     pub fn pinch(&self, scene: &Scene) -> Equilibrium {
         let d = scene.initial.normal_displacement;
         let stiffness = PI * scene.fingertip.youngs_modulus;
@@ -343,8 +343,8 @@ impl<'a> Statics<'a> {
     /// Follows the branch from `start` to `joints` (rad) in steps of at most `stride` (rad).
     ///
     /// # Errors
-    /// [`Lost`] with the last equilibrium that holds, where the branch folds, or a tip leaves the object or the model's
-    /// range; it never goes on to another branch.
+    /// [`Lost`] with the last equilibrium that holds, where the branch folds, or a tip leaves the
+    /// object or the model's range; it never goes on to another branch.
     pub fn follow(
         &self,
         start: &Equilibrium,

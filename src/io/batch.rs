@@ -42,8 +42,9 @@ const MOST_PAIRS: usize = 100_000;
 /// `pair-<line>` without a subject. Whether the files are there is not looked at.
 ///
 /// # Errors
-/// [`IoError`] names the line: an unknown column (with the nearest known one), no initial or deformed volume, a force that is
-/// no number, a name that two pairs have or that cannot name a folder; also when there is no pair.
+/// [`IoError`] names the line: an unknown column (with the nearest known one), no initial or
+/// deformed volume, a force that is no number, a name that two pairs have or that cannot name a
+/// folder; also when there is no pair.
 pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     let path = path.as_ref();
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -126,8 +127,8 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     }
 }
 
-/// A start of a pair: the name of an alignment stays as it is, a file counts from the table, whatever
-/// stands before its name.
+/// A start of a pair: the name of an alignment stays as it is, a file counts from the table,
+/// whatever stands before its name.
 fn start(folder: &Path, text: &str) -> String {
     let (source, path) = text.split_once(':').map_or(("", text), |(source, path)| (source, path));
     match (source, path) {

@@ -16,8 +16,8 @@ const LONGEST: u64 = 1 << 24;
 /// of a JSON or TOML file. Keys that are left out keep the preset's value (`balanced` without one).
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read or is neither, a key is unknown (with the nearest known one), or a value is of
-/// a wrong type or out of range.
+/// [`IoError`] when the file cannot be read or is neither, a key is unknown (with the nearest known
+/// one), or a value is of a wrong type or out of range.
 pub fn read_config(path: impl AsRef<Path>) -> Result<FieldParams, IoError> {
     let path = path.as_ref();
     let text = source::keyed(path, LONGEST, source::MOST_VALUES)?;

@@ -86,7 +86,8 @@ pub fn write_matches(path: impl AsRef<Path>, field: &SparseField) -> Result<(), 
 /// each axis.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number or kept neither 0 nor 1.
+/// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number or
+/// kept neither 0 nor 1.
 pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
     let path = path.as_ref();
     let matches = read_table(path, MATCH_COLUMNS)?.numbers;
@@ -256,8 +257,8 @@ pub(super) fn open_table(path: &Path) -> Result<(StringRecord, Reader<Cursor<Vec
     Ok((header, reader))
 }
 
-/// Refuses quotes that could make one cell of the rest of a table (RFC 4180, 2.5 to 2.7): one that is
-/// not closed, and text after a closed one. Also a first line that is no header.
+/// Refuses quotes that could make one cell of the rest of a table (RFC 4180, 2.5 to 2.7): one that
+/// is not closed, and text after a closed one. Also a first line that is no header.
 fn check_quotes(bytes: &[u8]) -> Result<(), Flaw> {
     let (mut line, mut opened, mut columns) = (1, None, Some(1));
     let mut at = if bytes.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };

@@ -21,8 +21,8 @@ const LONGEST_RUN: usize = 64;
 const LENGTH_BASE: [usize; 28] =
     [3, 4, 5, 6, 7, 8, 9, 10, 11, 13, 15, 17, 19, 23, 27, 31, 35, 43, 51, 59, 67, 83, 99, 115, 131, 163, 195, 227];
 
-/// Packs `data` as DEFLATE blocks that end on a whole byte and are not final, so that packed chunks can be joined;
-/// [`FINISH`] ends the stream. Nothing refers to bytes before `data`.
+/// Packs `data` as DEFLATE blocks that end on a whole byte and are not final, so that packed chunks
+/// can be joined; [`FINISH`] ends the stream. Nothing refers to bytes before `data`.
 pub(super) fn deflate(data: &[u8]) -> Vec<u8> {
     let mut out = BitWriter { bytes: Vec::new(), length: 0, held: 0, count: 0 };
     for block in data.chunks(BLOCK) {

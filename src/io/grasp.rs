@@ -37,8 +37,8 @@ pub fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
     row
 }
 
-/// [`MotionRow::COLUMNS`] behind the step as motions.csv keeps them: desired angles as they were written, without the rounding
-/// of degrees to radians and back.
+/// [`MotionRow::COLUMNS`] behind the step as motions.csv keeps them: desired angles as they were
+/// written, without the rounding of degrees to radians and back.
 pub fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] {
     let mut row = motion.row();
     row[..2].iter_mut().for_each(|v| *v = nano(*v));
@@ -85,9 +85,9 @@ pub fn write_motions(path: impl AsRef<Path>, motions: &[MotionRow]) -> Result<()
     write_table(path.as_ref(), &MotionRow::COLUMNS, motions.iter().map(motion_row))
 }
 
-/// Writes an ensemble: case, its keys, how it ended (`completed`, or the kind of [`GraspRun::flaw`], or the
-/// error), when (s), then [`MotionRow::COLUMNS`], a row a motion, and the largest friction that the run needed; a case without motions has
-/// one row with empty places.
+/// Writes an ensemble: case, its keys, how it ended (`completed`, or the kind of
+/// [`GraspRun::flaw`], or the error), when (s), then [`MotionRow::COLUMNS`], a row a motion, and
+/// the largest friction that the run needed; a case without motions has one row with empty places.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
@@ -157,8 +157,9 @@ pub fn write_energy(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<
     write_table(path.as_ref(), &["step", "model", "axis", "theta_deg", "value", "energy"], rows)
 }
 
-/// Writes step, joint angles, model, the stationary pose, displacements there, eigenvalues (N/m), residual (N), class, what holds the
-/// object along its faces, and the distance from the parallel model's equilibrium (m); places of what does not exist are empty.
+/// Writes step, joint angles, model, the stationary pose, displacements there, eigenvalues (N/m),
+/// residual (N), class, what holds the object along its faces, and the distance from the parallel
+/// model's equilibrium (m); places of what does not exist are empty.
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.

@@ -130,8 +130,8 @@ pub fn read_header(path: impl AsRef<Path>) -> Result<(Stored, ImageKind), IoErro
 /// Reads only the header of a scalar volume: a file, or a DICOM series.
 ///
 /// # Errors
-/// [`IoError`] where [`read_volume`] would refuse by the header and the file's size: no file, no scalar volume, or more voxels than
-/// the file can hold.
+/// [`IoError`] where [`read_volume`] would refuse by the header and the file's size: no file, no
+/// scalar volume, or more voxels than the file can hold.
 pub fn read_volume_header(path: impl AsRef<Path>) -> Result<Stored, IoError> {
     let path = path.as_ref();
     match Format::of(path)? {
@@ -159,9 +159,9 @@ fn raw(path: &Path, format: Format) -> Result<RawImage, IoError> {
     }
 }
 
-/// Other files that reading the image at `path` reads: the voxels that a `.nhdr` or `.mhd` names, the
-/// other one of a `.hdr`/`.img` pair, the other slices of a DICOM file; none of a folder, or where the
-/// header cannot be read.
+/// Other files that reading the image at `path` reads: the voxels that a `.nhdr` or `.mhd` names,
+/// the other one of a `.hdr`/`.img` pair, the other slices of a DICOM file; none of a folder, or
+/// where the header cannot be read.
 pub(super) fn others(path: &Path) -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> = match Format::of(path) {
         _ if path.is_dir() => Vec::new(),
@@ -184,7 +184,8 @@ pub(super) fn others(path: &Path) -> Vec<PathBuf> {
 /// [`count_non_finite`]); float64 beyond float32 becomes infinite.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read, is cut short or damaged, or is not a scalar volume of numbers.
+/// [`IoError`] when the file cannot be read, is cut short or damaged, or is not a scalar volume of
+/// numbers.
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
     let path = path.as_ref();
     let (grid, values) = match Format::of(path)? {

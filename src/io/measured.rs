@@ -17,8 +17,8 @@ const FEWEST: usize = 5;
 /// course of a grasp (time, theta1_deg, theta2_deg, x, y, theta_deg).
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read, has neither set of columns, a value is not a finite number, rows are too
-/// few, or times do not rise.
+/// [`IoError`] when the file cannot be read, has neither set of columns, a value is not a finite
+/// number, rows are too few, or times do not rise.
 pub fn read_measured(path: impl AsRef<Path>) -> Result<Measurements, IoError> {
     let path = path.as_ref();
     let found = match read_table(path, COURSE) {

@@ -39,7 +39,8 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         })?;
         fields.push((key.trim().to_lowercase(), value.trim().into()));
     }
-    // Of several names for one thing MetaIO takes the first one here, and of several lines the last.
+    // Of several names for one thing MetaIO takes the first one here, and of several lines the
+    // last.
     let find = |names: &[&str]| names.iter().find_map(|n| fields.iter().rfind(|f| f.0 == *n)).map(|f| f.1.as_str());
     let odd = |name: &str, value: &str| {
         let shown: String = value.chars().take(60).collect();

@@ -31,7 +31,8 @@ impl OutputFolder {
     /// where needed.
     ///
     /// # Errors
-    /// [`IoError`] when `path` is a file, cannot be created or written, or holds files and `force` is not set.
+    /// [`IoError`] when `path` is a file, cannot be created or written, or holds files and `force`
+    /// is not set.
     pub fn create(path: impl AsRef<Path>, force: bool) -> Result<Self, IoError> {
         let path = path.as_ref();
         Self::check(path, force)?;

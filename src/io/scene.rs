@@ -87,8 +87,9 @@ const MOST_CASES: usize = 100_000;
 /// Reads a scene file.
 ///
 /// # Errors
-/// [`IoError`] when the file or its fingertip file cannot be read or is no TOML, a key is unknown (with the nearest known
-/// one), missing or of a wrong type, or a value of any case is out of range.
+/// [`IoError`] when the file or its fingertip file cannot be read or is no TOML, a key is unknown
+/// (with the nearest known one), missing or of a wrong type, or a value of any case is out of
+/// range.
 pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<SceneFile, IoError> {
     let path = path.as_ref();
     let mut table = read_table(path)?;

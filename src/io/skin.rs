@@ -50,8 +50,8 @@ struct RawBlock {
 /// times, and Poisson's ratio 0.45.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read or is no TOML, a key is unknown (with the nearest known one), missing or of a
-/// wrong type, or a value is out of range.
+/// [`IoError`] when the file cannot be read or is no TOML, a key is unknown (with the nearest known
+/// one), missing or of a wrong type, or a value is out of range.
 pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
     let path = path.as_ref();
     let table = read_table(path)?;

@@ -68,8 +68,8 @@ fn state(w: &mut impl Write, result: &StiffnessResult) -> io::Result<()> {
     writeln!(w, "\"/>")
 }
 
-/// A node for each Poisson's ratio, with the tetrahedra that have it: older versions of SOFA know one
-/// ratio a force field.
+/// A node for each Poisson's ratio, with the tetrahedra that have it: older versions of SOFA know
+/// one ratio a force field.
 fn material(w: &mut impl Write, result: &StiffnessResult, tetrahedra: &[[u32; 4]]) -> io::Result<()> {
     let method = if result.law == Law::Linear { "small" } else { "large" };
     let ratio = |e: usize| result.poisson_of(result.mesh.labels()[e]);

@@ -52,8 +52,8 @@ pub(super) fn text(path: &Path, most: u64) -> Result<String, IoError> {
     })
 }
 
-/// All of a text of at most `most` bytes with keys and values, before it is parsed: each value takes
-/// some hundred bytes of memory, whatever it takes of the text.
+/// All of a text of at most `most` bytes with keys and values, before it is parsed: each value
+/// takes some hundred bytes of memory, whatever it takes of the text.
 pub(super) fn keyed(path: &Path, most: u64, values: usize) -> Result<String, IoError> {
     let text = text(path, most)?;
     let found = text.bytes().filter(|b| b",=[{".contains(b)).count();

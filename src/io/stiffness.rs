@@ -109,8 +109,8 @@ pub struct KnownMaterial {
     pub youngs_modulus: Option<f64>,
 }
 
-/// Reads a table by label: the columns `label`, and `poisson` or `youngs_modulus_kpa` or both, where
-/// an empty field is open; other columns are left alone.
+/// Reads a table by label: the columns `label`, and `poisson` or `youngs_modulus_kpa` or both,
+/// where an empty field is open; other columns are left alone.
 ///
 /// # Errors
 /// [`IoError`] names the line that cannot be read, and a table without these columns.

@@ -42,7 +42,8 @@ pub fn list(folder: impl AsRef<Path>) -> Result<Vec<PathBuf>, IoError> {
 /// `null`.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be written or the value cannot be put in JSON (a map with keys that are not text).
+/// [`IoError`] when the file cannot be written or the value cannot be put in JSON (a map with keys
+/// that are not text).
 pub fn write_json(path: impl AsRef<Path>, value: &impl Serialize) -> Result<(), IoError> {
     write_atomic(path.as_ref(), |w| {
         serde_json::to_writer_pretty(&mut *w, value)?;

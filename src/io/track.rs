@@ -31,7 +31,8 @@ pub fn write_trajectories(
 /// Reads the points that were measured in each frame, as matches from the reference frame's places.
 ///
 /// # Errors
-/// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number, or a point or frame no whole one.
+/// [`IoError`] when the file cannot be read, a column is missing, a value is not a finite number,
+/// or a point or frame no whole one.
 pub fn read_trajectories(path: impl AsRef<Path>, reference: usize) -> Result<BTreeMap<usize, SparseField>, IoError> {
     let path = path.as_ref();
     let table = read_table(path, ["point", "frame", "x", "y", "z", "sigma"])?;

@@ -1,9 +1,10 @@
 //! Correspondence: which place of the deformed volume shows the tissue of a place of the initial
 //! one.
 //!
-//! [`correlation`] searches by normalised cross-correlation, [`candidates`] joins searches and feature pairs into
-//! many-to-many candidates, [`lsm`] brings a candidate to sub-voxel precision with a covariance, and [`residual`] turns
-//! the whole remaining difference of the two volumes into normal equations for a spline field.
+//! [`correlation`] searches by normalised cross-correlation, [`candidates`] joins searches and
+//! feature pairs into many-to-many candidates, [`lsm`] brings a candidate to sub-voxel precision
+//! with a covariance, and [`residual`] turns the whole remaining difference of the two volumes into
+//! normal equations for a spline field.
 //!
 //! Positions are voxels of one common lattice (the initial volume's axes on the level at hand);
 //! displacements are millimetres along those axes unless a name says voxels. Fails quietly where

@@ -273,8 +273,8 @@ pub fn excess(pair: &Pair<'_>, a: &[f32], b: &Baseline) -> f64 {
     rows.iter().sum()
 }
 
-/// [`excess`] by place: of each voxel times each basis function of `windows`. The functions add up to one, so the places add up to
-/// the whole.
+/// [`excess`] by place: of each voxel times each basis function of `windows`. The functions add up
+/// to one, so the places add up to the whole.
 pub fn excess_by_place(pair: &Pair<'_>, a: &[f32], b: &Baseline, windows: &Lattice) -> Vec<f32> {
     let compared = Compared::new(pair, a, b);
     windows.accumulate::<1>(|j, k, [row]| {

@@ -31,7 +31,8 @@ impl HasPosition for Site {
 /// The Delaunay triangulation of coplanar `points` (world mm, RAS), by the crate `spade`.
 ///
 /// # Errors
-/// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points; [`MeshError::Collinear`].
+/// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points;
+/// [`MeshError::Collinear`].
 pub fn delaunay2(points: &[WorldPoint]) -> Result<Delaunay<TriMesh, 3>, MeshError> {
     let plane = Plane::through(points)?;
     let feet: Vec<WorldPoint> = points

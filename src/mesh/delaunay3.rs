@@ -18,8 +18,9 @@ use crate::types::{TetMesh, WorldPoint};
 /// The Delaunay tetrahedralisation of `points` (world mm, RAS).
 ///
 /// # Errors
-/// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under four distinct points; [`MeshError::Collinear`] and
-/// [`MeshError::Coplanar`] (exactly so; then see [`delaunay2`](super::delaunay2::delaunay2)).
+/// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under four distinct points;
+/// [`MeshError::Collinear`] and [`MeshError::Coplanar`] (exactly so; then see
+/// [`delaunay2`](super::delaunay2::delaunay2)).
 ///
 /// Source: Bowyer (1981) and Watson (1981) with exact predicates and biased random insertion.
 pub fn delaunay3(points: &[WorldPoint]) -> Result<Delaunay<TetMesh, 4>, MeshError> {

@@ -86,7 +86,8 @@ impl<'a> TriangleLocator<'a> {
     /// Over a Delaunay mesh.
     ///
     /// # Errors
-    /// As [`Plane::through`], on a mesh that was not made by [`delaunay2`](super::delaunay2::delaunay2).
+    /// As [`Plane::through`], on a mesh that was not made by
+    /// [`delaunay2`](super::delaunay2::delaunay2).
     pub fn new(delaunay: &'a Delaunay<TriMesh, 3>) -> Result<Self, MeshError> {
         let nodes = delaunay.mesh.nodes();
         let plane = Plane::through(nodes)?;

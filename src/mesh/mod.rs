@@ -1,9 +1,10 @@
 //! Simplicial meshes through scattered points: exact Delaunay in space and in a plane, location,
 //! quality.
 //!
-//! Promises: every decision is taken by an exact predicate, so lattices, repeated points, thin slices and points on
-//! one sphere give a valid mesh that tiles the convex hull. Needs finite coordinates. Fails with a
-//! [`MeshError`](crate::error::MeshError) that says whether the points are too few, on one line or in one plane.
+//! Promises: every decision is taken by an exact predicate, so lattices, repeated points, thin
+//! slices and points on one sphere give a valid mesh that tiles the convex hull. Needs finite
+//! coordinates. Fails with a [`MeshError`](crate::error::MeshError) that says whether the points
+//! are too few, on one line or in one plane.
 
 pub mod predicates;
 

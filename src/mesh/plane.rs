@@ -22,7 +22,8 @@ impl Plane {
     /// positive.
     ///
     /// # Errors
-    /// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points; [`MeshError::Collinear`].
+    /// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points;
+    /// [`MeshError::Collinear`].
     pub fn through(points: &[WorldPoint]) -> Result<Self, MeshError> {
         if let Some(node) = points.iter().position(|p| p.0.iter().any(|v| !v.is_finite())) {
             return Err(MeshError::NotFinite { node });

@@ -70,8 +70,8 @@ struct Pairs<'a> {
 impl Pairs<'_> {
     /// A pair whose displacement is `motion`; `draw` (0 or 1) gives it other noise.
     ///
-    /// Of two scans one shows the motion and the other none, and the other way round: their noise is
-    /// real. Of one scan both have noise added.
+    /// Of two scans one shows the motion and the other none, and the other way round: their noise
+    /// is real. Of one scan both have noise added.
     fn of(&self, motion: &DenseField, draw: u64) -> [Volume; 2] {
         let initial = self.input.initial;
         match self.input.second {
@@ -93,8 +93,8 @@ impl Pairs<'_> {
     }
 }
 
-/// Makes a certificate with the settings of a run; the motion model is always free, so that what the
-/// scan cannot tell is not hidden by a smaller one.
+/// Makes a certificate with the settings of a run; the motion model is always free, so that what
+/// the scan cannot tell is not hidden by a smaller one.
 ///
 /// # Errors
 /// [`StrainError`] as [`field::run`] and [`crate::pipeline::strain::run`], or when grids differ.
@@ -226,8 +226,8 @@ fn image_noise(initial: &Voxels<'_>, second: Option<&Voxels<'_>>, tissue: &Mask)
     robust_deviation(apart.filter(|d| d.is_finite())) / 2f64.sqrt()
 }
 
-/// Waves along one axis that grow along the next and move along the third, for each thick axis; in a
-/// slice they move along the axis that they grow along.
+/// Waves along one axis that grow along the next and move along the third, for each thick axis; in
+/// a slice they move along the axis that they grow along.
 fn stars(tissue: &Mask) -> Vec<Star> {
     let grid = tissue.grid();
     let amplitude = AMPLITUDE * grid.least_spacing();

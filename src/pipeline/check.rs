@@ -50,7 +50,8 @@ pub struct LostSlice {
 /// spread is another than the initial one's.
 ///
 /// # Errors
-/// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is empty or on another grid.
+/// [`FieldError`] when a volume is constant or not finite, is a line of voxels, or the mask is
+/// empty or on another grid.
 pub fn inputs<'a>(
     initial: &'a Voxels<'a>,
     deformed: &'a Voxels<'a>,

@@ -1,8 +1,8 @@
 //! Two volumes in different contrasts brought to one, where the volumes show that they differ.
 //!
-//! In one contrast the mean of one volume's intensity is a rising line over the other's, however little
-//! the two agree at rest. Where it is not, that mean itself serves as the volume in the other's
-//! contrast: it is taken at rest, then under the motion that it leads to, coarse to fine.
+//! In one contrast the mean of one volume's intensity is a rising line over the other's, however
+//! little the two agree at rest. Where it is not, that mean itself serves as the volume in the
+//! other's contrast: it is taken at rest, then under the motion that it leads to, coarse to fine.
 
 use crate::error::FieldError;
 use crate::matching::contrast::{Relation, Side};

@@ -136,8 +136,8 @@ impl Clock {
 /// inside it. The volumes may lie on different grids. Results lie on the initial grid.
 ///
 /// # Errors
-/// [`FieldError`] when a volume is constant or not finite, the mask is empty or on another grid, the two volumes do not
-/// overlap, or fewer than 20 matches survive.
+/// [`FieldError`] when a volume is constant or not finite, the mask is empty or on another grid,
+/// the two volumes do not overlap, or fewer than 20 matches survive.
 pub fn run(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
@@ -859,8 +859,8 @@ fn in_doubt(counts: Counts) -> String {
 /// Part of the tissue without texture from which that is why few matches survive.
 const MOSTLY: f64 = 0.5;
 
-/// Part of the variance that the volumes explain of each other at rest under which they show nothing
-/// of the same.
+/// Part of the variance that the volumes explain of each other at rest under which they show
+/// nothing of the same.
 const STRANGERS: f64 = 0.1;
 
 /// Refuses a run with too few matches, with what was measured of the volumes and the one thing to

@@ -174,7 +174,8 @@ fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f6
 /// side, RAS), by `indentation` mm where that is known.
 ///
 /// # Errors
-/// [`FingertipError`] when the grid is askew, no bone lies under the pad, or there is hardly any tissue.
+/// [`FingertipError`] when the grid is askew, no bone lies under the pad, or there is hardly any
+/// tissue.
 pub fn run(
     map: &Volume,
     bone: impl Fn(usize) -> bool,

@@ -1,5 +1,5 @@
-//! What is known of a pair beside its volumes: where to look, what counts, where to begin, and places
-//! that were marked in both.
+//! What is known of a pair beside its volumes: where to look, what counts, where to begin, and
+//! places that were marked in both.
 
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::check::drawn_on;

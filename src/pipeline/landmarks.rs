@@ -1,7 +1,7 @@
 //! Landmarks: matches of known deviation in the same fit as the voxels.
 //!
-//! Each pulls the field by its distance from it over its variance, with Cauchy's weight, so that one
-//! that most others and the volumes speak against hardly pulls.
+//! Each pulls the field by its distance from it over its variance, with Cauchy's weight, so that
+//! one that most others and the volumes speak against hardly pulls.
 
 use crate::consistency::energy::distance;
 use crate::consistency::models::AffineMotion;
@@ -161,8 +161,8 @@ pub(super) fn report(
     })
 }
 
-/// The variance along an axis (mm^2) of the field's error that landmarks show, where at least half of
-/// them contradict it.
+/// The variance along an axis (mm^2) of the field's error that landmarks show, where at least half
+/// of them contradict it.
 pub(super) fn against(report: &LandmarkReport) -> Option<f64> {
     let squares = report.wrong.iter().map(|n| report.distances_mm[n - 1].powi(2)).sum::<f64>();
     let most = 2 * report.wrong.len() >= report.count && !report.wrong.is_empty();

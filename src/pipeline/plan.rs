@@ -25,8 +25,8 @@ pub struct FieldPlan {
     pub memory: u64,
 }
 
-/// Memory that a command holds for strain on a grid (bytes): 174 a voxel were measured from 80 to 120
-/// voxels a side, and 12 MB besides.
+/// Memory that a command holds for strain on a grid (bytes): 174 a voxel were measured from 80 to
+/// 120 voxels a side, and 12 MB besides.
 pub fn strain_memory(grid: &Grid) -> u64 {
     180 * grid.len() as u64 + 12_000_000
 }

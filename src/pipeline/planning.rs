@@ -405,8 +405,8 @@ impl Solved {
     }
 
     /// Relative standard deviation of each region's modulus and its scatter by noise alone, at
-    /// `press` mm, voxels `voxel` times those of the labels, `noise` mm in each, and `surface` mm in
-    /// the motion of a surface node.
+    /// `press` mm, voxels `voxel` times those of the labels, `noise` mm in each, and `surface` mm
+    /// in the motion of a surface node.
     fn expected(&self, press: f64, voxel: f64, [noise, surface]: [f64; 2], ratios: bool) -> Option<Vec<[f64; 2]>> {
         let p = self.prior.len();
         let [moduli, plates] = self.counts;

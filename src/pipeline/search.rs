@@ -93,8 +93,8 @@ impl Search<'_> {
         self.candidate(labels, (&old.level, &old.estimate.state)).map(Some)
     }
 
-    /// From which contrast on balls would be seen. The strain in a ball of contrast C is 5 / (2 C + 3)
-    /// of that around it (Eshelby 1957, incompressible), so that it disturbs the displacement by
+    /// From which contrast on balls would be seen. The strain in a ball of contrast C is 5 / (2 C +
+    /// 3) of that around it (Eshelby 1957, incompressible), so that it disturbs the displacement by
     /// 5 (C - 1) / (2 C + 3) of what a unit of ln C does at C = 1.
     fn detectable(&self, one: &Candidate, support: &Support) -> Result<Vec<Detectable>, StiffnessError> {
         let setup = one.level.setup(self.law, self.params, one.level.largest());

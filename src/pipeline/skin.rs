@@ -11,8 +11,8 @@ use std::time::Instant;
 pub struct SkinOutcome {
     /// The column of layers.
     pub column: Vec<SkinSample>,
-    /// One layer in place of all, of the mean of each part where elements are alike, else fitted: its
-    /// scene and response. None of a scene of one layer.
+    /// One layer in place of all, of the mean of each part where elements are alike, else fitted:
+    /// its scene and response. None of a scene of one layer.
     pub single: Option<(SkinScene, Vec<SkinSample>)>,
     /// The block of layers; none when a step has no solution.
     pub block: Option<BlockRun>,

@@ -199,8 +199,8 @@ impl Compared {
         Self(some.map(|&at| (grid.centre(at), initial.as_slice()[at])).collect())
     }
 
-    /// How well a deformed volume agrees under a map, whatever its contrast (0 to 1): the part of one's
-    /// variance that the other explains, less where less of the tissue is seen.
+    /// How well a deformed volume agrees under a map, whatever its contrast (0 to 1): the part of
+    /// one's variance that the other explains, less where less of the tissue is seen.
     pub fn agreement(&self, deformed: &Voxels<'_>, map: impl Fn(WorldPoint) -> WorldPoint) -> f64 {
         let grid = deformed.grid();
         let seen = |x: WorldPoint| {

@@ -435,8 +435,8 @@ fn without_large_strain(mut evidence: Vec<Evidence>) -> Vec<Evidence> {
     evidence
 }
 
-/// Contact, law, shape and moduli on the coarse mesh; regions that the data do not show are left out
-/// one after the other, and added to `hidden`.
+/// Contact, law, shape and moduli on the coarse mesh; regions that the data do not show are left
+/// out one after the other, and added to `hidden`.
 fn chosen(
     coarse: &mut Level,
     params: &StiffnessParams,

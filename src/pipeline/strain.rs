@@ -76,8 +76,8 @@ const SAMPLED: usize = 25_000;
 /// The strain of a displacement field.
 ///
 /// # Errors
-/// [`StrainError`] when the field is not finite or folds in the tissue, grids differ, the gauge does
-/// not fit or directions are missing.
+/// [`StrainError`] when the field is not finite or folds in the tissue, grids differ, the gauge
+/// does not fit or directions are missing.
 pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>) -> Result<StrainResult, StrainError> {
     progress("check", 0.0);
     let mut clock = Clock::start();

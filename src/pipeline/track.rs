@@ -83,10 +83,10 @@ pub struct Frame<'a> {
 /// backward to the first.
 ///
 /// `read` gives a volume by its number, twice each; `keep` gets each result once all are measured.
-/// Where `together` holds, each field is what all frames say of it, unless a start is `known`. `labels` (on the reference's
-/// grid; 0 is left out) name the regions whose strain is worked out, the mask alone without them,
-/// and what stands out of the background without either. A frame that cannot be measured is
-/// reported as lost, and the next one starts from the frames before it.
+/// Where `together` holds, each field is what all frames say of it, unless a start is `known`.
+/// `labels` (on the reference's grid; 0 is left out) name the regions whose strain is worked out,
+/// the mask alone without them, and what stands out of the background without either. A frame that
+/// cannot be measured is reported as lost, and the next one starts from the frames before it.
 ///
 /// # Errors
 /// Those of `read` and `keep`, and [`FieldError`] when no frame at all can be measured.

@@ -138,7 +138,8 @@ impl Case {
     /// The trial of a field that some method has measured in `cpu_s` seconds.
     ///
     /// # Errors
-    /// [`FieldError`] when the field is on another grid than the truth, or no number where errors count.
+    /// [`FieldError`] when the field is on another grid than the truth, or no number where errors
+    /// count.
     pub fn score(&self, variant: &Variant, measured: &DenseField, cpu_s: f64) -> Result<Trial, FieldError> {
         let mut trial = self.trial(variant, cpu_s);
         if let Some(truth) = &self.truth {

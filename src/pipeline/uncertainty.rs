@@ -157,8 +157,8 @@ impl Variances {
         self
     }
 
-    /// Widens all where the volumes have different contrasts, of whose variance their relation leaves
-    /// this part.
+    /// Widens all where the volumes have different contrasts, of whose variance their relation
+    /// leaves this part.
     pub fn with_contrast(mut self, left: f64) -> Self {
         let more = ((1.0 + CONTRAST * left).powi(2) - 1.0) as f32;
         for m in 0..self.lattice.len() {
@@ -261,8 +261,8 @@ impl Variances {
     }
 }
 
-/// The variance along an axis (mm^2) of the fields of these coefficients, at the nodes. Neighbours are
-/// left out: beyond the tissue they are far more uncertain.
+/// The variance along an axis (mm^2) of the fields of these coefficients, at the nodes. Neighbours
+/// are left out: beyond the tissue they are far more uncertain.
 fn variance_of(lattice: &Lattice, draws: &[Vec<f32>]) -> Vec<f32> {
     let seen = (0..3).filter(|&a| lattice.shape[a] > 1).count().max(1);
     let square = |m: usize| {
@@ -303,7 +303,8 @@ pub(super) fn by_label(deviation: &ScalarSpline, field: &DenseField, mask: &Mask
     sums.iter().enumerate().filter(|(_, s)| s.0 > 0).map(of).collect()
 }
 
-/// Gives each body the error of its label; one too small to be sampled has that of the `whole` (mm).
+/// Gives each body the error of its label; one too small to be sampled has that of the `whole`
+/// (mm).
 pub(super) fn tell_bodies(bodies: &mut [BodyReport], labels: &[LabelError], whole: f64) {
     for body in bodies {
         let own = labels.iter().find(|l| l.label == body.label);
@@ -359,7 +360,8 @@ pub(super) fn median_inside(values: &ScalarSpline, mask: &Mask) -> f64 {
 mod tests {
     use super::*;
 
-    /// A body that no sampled voxel lies in takes the error of the whole, not that of the next body.
+    /// A body that no sampled voxel lies in takes the error of the whole, not that of the next
+    /// body.
     #[test]
     fn a_body_has_the_error_of_its_own_label() {
         let body =

@@ -79,8 +79,8 @@ pub fn displacement<'a>(array: &'a PyReadonlyArray4<'_, f32>, rows: Rows) -> PyR
     Displacement::lent(grid(array.shape(), rows)?, values(array)?).map_err(told)
 }
 
-/// Errors that a field may have, (nx, ny, nz, n, 3), and the affine of their nodes, as the file keeps
-/// them.
+/// Errors that a field may have, (nx, ny, nz, n, 3), and the affine of their nodes, as the file
+/// keeps them.
 pub fn samples<'py>(py: Python<'py>, samples: &ErrorSamples) -> PyResult<(Bound<'py, PyArray5<f32>>, Rows)> {
     let ([x, y, z], n) = (samples.nodes().shape(), samples.nodes().len());
     let parts = (0..3).flat_map(|c| samples.values().iter().map(move |s| &s[c * n..(c + 1) * n]));

@@ -306,7 +306,8 @@ fn postures(scene: &Scene) -> Vec<(usize, [f64; 2])> {
     std::iter::once((0, [0.0; 2])).chain(motions).collect()
 }
 
-/// The first screen: the push with joints fixed, the energy of both models at one posture, rigid against soft tips, and the pinch map.
+/// The first screen: the push with joints fixed, the energy of both models at one posture, rigid
+/// against soft tips, and the pinch map.
 fn at_a_glance(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     let a = report.analysis;
     let samples = &a.push.samples;

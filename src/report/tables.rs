@@ -75,8 +75,8 @@ pub fn bodies(report: &FieldReport<'_>) -> String {
 const LANDMARKS: usize = 20;
 const BAR: f64 = 10.0;
 
-/// How far the deformed place of each landmark is from where the field leads, as bars; red where the
-/// field contradicts it.
+/// How far the deformed place of each landmark is from where the field leads, as bars; red where
+/// the field contradicts it.
 pub fn landmarks(report: &FieldReport<'_>) -> Option<String> {
     let l = report.summary.landmarks.as_ref()?;
     let mut order: Vec<usize> = (0..l.distances_mm.len()).collect();

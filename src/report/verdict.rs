@@ -25,8 +25,8 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
     judge(report.bodies, report.uncertainty, report.summary)
 }
 
-/// As [`verdict`], from the bodies (0 where nothing was measured), the uncertainty by voxel (mm) and
-/// the summary alone.
+/// As [`verdict`], from the bodies (0 where nothing was measured), the uncertainty by voxel (mm)
+/// and the summary alone.
 pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
     let edge = bodies.grid().spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {

@@ -1,9 +1,10 @@
-//! One layer in place of several whose elements are not alike: the element of the richest kind among
-//! them whose response to the scene's load is nearest to the column's.
+//! One layer in place of several whose elements are not alike: the element of the richest kind
+//! among them whose response to the scene's load is nearest to the column's.
 //!
-//! Layers that are alike have a mean of each part ([`SkinScene::without_layers`]); for a mix there is
-//! none. Least squares (Levenberg and Marquardt) over the logarithms of the element's parts, of the
-//! stress while the load is on, over its largest, and of the depth after it, over the indentation.
+//! Layers that are alike have a mean of each part ([`SkinScene::without_layers`]); for a mix there
+//! is none. Least squares (Levenberg and Marquardt) over the logarithms of the element's parts, of
+//! the stress while the load is on, over its largest, and of the depth after it, over the
+//! indentation.
 
 use crate::numerics::dense::solve;
 use crate::skin::column;

@@ -231,7 +231,8 @@ impl Chooser<'_> {
         let setup = self.level.setup(Law::Linear, self.params, self.reference);
         let small = Tried::new(self.level, &setup, small)?;
         let large = self.large_strain_from(&small).or_else(|_| {
-            // A shape that was moved far may bear no large strain; what it changes stays to first order.
+            // A shape that was moved far may bear no large strain; what it changes stays to first
+            // order.
             self.level.move_back();
             self.large_strain_from(&small)
         });

@@ -1,5 +1,5 @@
-//! Errors that are everywhere at once, which no block of one body shows: of a model that is not quite
-//! right, and of the measured field.
+//! Errors that are everywhere at once, which no block of one body shows: of a model that is not
+//! quite right, and of the measured field.
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::Cholesky;
@@ -10,8 +10,8 @@ use crate::types::space::dot;
 /// bodies of an independent solver, with shapes, patches and laws that the model does not have.
 const ALIGNED: f64 = 0.15;
 
-/// By how much less data tell whose error `share` (of its squares) is everywhere at once, of so many
-/// samples.
+/// By how much less data tell whose error `share` (of its squares) is everywhere at once, of so
+/// many samples.
 pub fn dilution(share: f64, samples: f64) -> f64 {
     ALIGNED * ALIGNED * samples * share
 }

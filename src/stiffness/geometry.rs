@@ -247,8 +247,8 @@ fn columns(
     Ok((rows, force_slope))
 }
 
-/// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh is
-/// off by in each, however well the data tell the place: all else follows it as it would another
+/// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh
+/// is off by in each, however well the data tell the place: all else follows it as it would another
 /// place. `voxel` is that of the image over the one that offsets count in.
 pub fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f64> {
     let mut out = by_data.clone();

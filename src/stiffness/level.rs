@@ -218,8 +218,8 @@ impl Level {
         self.open = edge.chain(borders).map(|part| (part, 0.0)).collect();
     }
 
-    /// Takes over how the body touches the plates from another mesh, where it has moved its borders,
-    /// and, as facets end elsewhere, an edge of the punch that makes the patch as large.
+    /// Takes over how the body touches the plates from another mesh, where it has moved its
+    /// borders, and, as facets end elsewhere, an edge of the punch that makes the patch as large.
     ///
     /// # Errors
     /// As [`Body::new`].

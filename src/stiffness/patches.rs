@@ -175,8 +175,8 @@ impl Patch {
         if k < 3 { e } else { cross(e, r) }
     }
 
-    /// The ties for plate parameters `change` from the fitted motion: where the patch is curved, what holds it along the
-    /// [plate](Self::plate) only.
+    /// The ties for plate parameters `change` from the fitted motion: where the patch is curved,
+    /// what holds it along the [plate](Self::plate) only.
     pub fn ties(&self, body: &Body, change: &[f64]) -> Vec<Tie> {
         let directions: &[Option<[f64; 3]>] = match (self.contact, self.curved()) {
             (Contact::Sticking | Contact::Measured, _) | (Contact::Guided, false) => &[None],
@@ -230,8 +230,8 @@ impl Patch {
         self.facets.iter().map(|&f| value(body.surface[f].element as usize) * body.surface[f].area).sum()
     }
 
-    /// By how much the measured motion, smoothed, misses that of a rigid plate along its normal (mm,
-    /// root mean square).
+    /// By how much the measured motion, smoothed, misses that of a rigid plate along its normal
+    /// (mm, root mean square).
     pub fn bulge(&self) -> f64 {
         let all = self.measured.values.iter().map(|v| dot(*v, self.normal).powi(2));
         (all.sum::<f64>() / self.nodes.len().max(1) as f64).sqrt()
@@ -326,7 +326,8 @@ pub fn least_travel(error: f64, voxel: f64) -> f64 {
 /// is that of a punch on the loaded side, where it is known.
 ///
 /// # Errors
-/// [`StiffnessError::Patch`] for a patch without surface, [`StiffnessError::NoLoad`] when they do not move against each other.
+/// [`StiffnessError::Patch`] for a patch without surface, [`StiffnessError::NoLoad`] when they do
+/// not move against each other.
 pub fn find(
     body: &Body,
     motion: &SurfaceMotion,
@@ -405,8 +406,8 @@ pub fn find(
     Ok(out)
 }
 
-/// The surface of the body on the volume's border that no patch holds: tissue goes on beyond it, and
-/// it moves as measured.
+/// The surface of the body on the volume's border that no patch holds: tissue goes on beyond it,
+/// and it moves as measured.
 fn cut(body: &Body, motion: &SurfaceMotion, patches: &[Patch], grid: &Grid) -> Option<Patch> {
     let taken: HashSet<usize> = patches.iter().flat_map(|p| p.facets.iter().copied()).collect();
     let beyond = |f: &usize| !taken.contains(f) && border_of(grid, body.surface[*f].centre).is_some();

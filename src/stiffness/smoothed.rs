@@ -24,7 +24,8 @@ pub struct Smoothed {
 
 impl Smoothed {
     /// From what was read at the nodes (mm, RAS; none where nothing was), with the least and the
-    /// typical error of a reading (mm, one component), and how many of the readings are independent.
+    /// typical error of a reading (mm, one component), and how many of the readings are
+    /// independent.
     pub fn new(places: &[[f64; 3]], read: &[Option<[f64; 3]>], [least, error]: [f64; 2], independent: f64) -> Self {
         let seen = read.iter().flatten().count();
         let independent = independent.clamp(1.0, seen.max(1) as f64);

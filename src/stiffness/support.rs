@@ -69,7 +69,8 @@ fn too_little(gain: f64) -> String {
 }
 
 impl Support {
-    /// From the identification of one region; `rms` is what it leaves over (mm) with the surface where the data put it.
+    /// From the identification of one region; `rms` is what it leaves over (mm) with the surface
+    /// where the data put it.
     pub fn new(level: &Level, e: &Estimate, rms: f64) -> Self {
         let (held, load) = (&level.patches[0], &level.patches[1]);
         let travel = travel(&level.patches);
@@ -177,8 +178,8 @@ impl Support {
         [stands_out, TRACE.sqrt() * voxel, self.geometry, by_criterion].into_iter().fold(0.0, f64::max)
     }
 
-    /// Judges the estimate with `count` regions, which leaves over `rms` (mm) with the surface where
-    /// the data put it; true makes it the model that stands.
+    /// Judges the estimate with `count` regions, which leaves over `rms` (mm) with the surface
+    /// where the data put it; true makes it the model that stands.
     pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize, rms: f64) -> bool {
         let misfit = (rms * rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
         let parameters = e.parameters + SHAPES * (count - 1);

@@ -29,8 +29,8 @@ const SMOOTH: f64 = 0.05;
 const ITERATIONS: usize = 9;
 /// Standard deviation of the Gaussian that rounds regions (lattice steps).
 const ROUND: f64 = 0.4;
-/// Percentile of the map that counts as its furthest value: a hundredth of the body may be the map's
-/// own corners.
+/// Percentile of the map that counts as its furthest value: a hundredth of the body may be the
+/// map's own corners.
 const FURTHEST: f64 = 99.0;
 /// Pieces of the map that are tried as the next region.
 const TRIED: usize = 3;

@@ -21,8 +21,8 @@ pub struct Draws {
     errors: Vec<DenseField>,
 }
 
-/// Draws of a field's error (mm, RAS), on a grid half as wide as the nodes of the samples; `full` is
-/// the field's own.
+/// Draws of a field's error (mm, RAS), on a grid half as wide as the nodes of the samples; `full`
+/// is the field's own.
 ///
 /// # Errors
 /// [`SpaceError`] when the places have no grid.
@@ -207,8 +207,8 @@ impl StrainDeviation {
     }
 }
 
-/// Mean square of the normal strains of `gradients` less those of `others`, over the places of a body
-/// (1).
+/// Mean square of the normal strains of `gradients` less those of `others`, over the places of a
+/// body (1).
 pub fn apart(gradients: &[Option<Matrix3>], others: &[Option<Matrix3>]) -> f64 {
     let square = |(a, b): (&Option<Matrix3>, &Option<Matrix3>)| {
         a.zip(*b).map(|(a, b)| (0..3).map(|c| (a[c][c] - b[c][c]).powi(2)).sum::<f64>())

@@ -30,8 +30,8 @@ pub struct Tube {
 }
 
 impl Tube {
-    /// The tube of a label: its axis runs through the centre of its voxels, the way that they extend
-    /// most. None when it has no voxels or extends nowhere.
+    /// The tube of a label: its axis runs through the centre of its voxels, the way that they
+    /// extend most. None when it has no voxels or extends nowhere.
     pub fn of(label: u8, labels: &Mask) -> Option<Self> {
         let grid = labels.grid();
         let own: Vec<[f64; 3]> =

@@ -69,9 +69,9 @@ const IN_CUBE: usize = 22;
 const PLANES: usize = 8;
 
 /// What `f` makes of the displacement gradient at each voxel (rows: components of u, columns: world
-/// axes; 1), x fastest. `bodies` holds a label for each voxel; it is the default value where that is
-/// 0, and one body everywhere when empty. Along an axis that a body has one voxel of, the gradient
-/// is 0.
+/// axes; 1), x fastest. `bodies` holds a label for each voxel; it is the default value where that
+/// is 0, and one body everywhere when empty. Along an axis that a body has one voxel of, the
+/// gradient is 0.
 pub fn map_gradients<T: Clone + Default + Send + Sync>(
     field: &Displacement<'_>,
     bodies: &[u8],

@@ -10,8 +10,8 @@ use crate::types::Grid;
 
 const INFINITE: f64 = f64::INFINITY;
 
-/// The body of a kind, sized to the grid's field of view. (Those of known stiffness have a form of their own, see
-/// [`crate::synth::elastic`]; here they are blocks.)
+/// The body of a kind, sized to the grid's field of view. (Those of known stiffness have a form of
+/// their own, see [`crate::synth::elastic`]; here they are blocks.)
 pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Body {
     let half = extent(grid).map(|e| e / 2.0);
     let radius = 0.84 * half[0].min(half[1]);

@@ -18,8 +18,8 @@ pub struct Chain(pub Vec<Transform>);
 impl Chain {
     /// Where the point `p` of the initial volume lies in the deformed one (world mm).
     ///
-    /// A field says nothing outside its grid or where it is not finite, its inverse nothing where no
-    /// point of the grid leads: there it is `None`. (ITK leaves such points where they are.)
+    /// A field says nothing outside its grid or where it is not finite, its inverse nothing where
+    /// no point of the grid leads: there it is `None`. (ITK leaves such points where they are.)
     pub fn at(&self, p: WorldPoint) -> Option<WorldPoint> {
         self.0.iter().try_fold(p, step)
     }

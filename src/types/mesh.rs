@@ -15,7 +15,8 @@ impl TetMesh {
     /// From nodes (mm, RAS) and tetrahedra.
     ///
     /// # Errors
-    /// [`MeshError`] when an index is out of range or a coordinate is not finite. Orientation is the maker's duty.
+    /// [`MeshError`] when an index is out of range or a coordinate is not finite. Orientation is
+    /// the maker's duty.
     pub fn new(nodes: Vec<WorldPoint>, tetrahedra: Vec<[u32; 4]>) -> Result<Self, MeshError> {
         check(&nodes, tetrahedra.iter().flatten())?;
         Ok(Self { nodes, tetrahedra })

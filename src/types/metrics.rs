@@ -90,8 +90,8 @@ pub struct TargetError {
 pub struct Overlap {
     /// Dice coefficient: twice the shared volume over the sum of both (1).
     pub dice: f64,
-    /// Mean distance from each surface voxel of one map to the nearest of the other, both ways (mm);
-    /// none where one map lacks the label.
+    /// Mean distance from each surface voxel of one map to the nearest of the other, both ways
+    /// (mm); none where one map lacks the label.
     pub surface_mean_mm: Option<f64>,
     /// 95th percentile of the same distances, the 95th percentile Hausdorff distance (mm).
     pub hausdorff95_mm: Option<f64>,

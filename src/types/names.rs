@@ -6,7 +6,8 @@ use crate::error::UnknownName;
 /// part.
 ///
 /// # Errors
-/// [`UnknownName`] lists the known names and suggests the nearest one (at most a third of its letters wrong).
+/// [`UnknownName`] lists the known names and suggests the nearest one (at most a third of its
+/// letters wrong).
 pub fn choose<T: Copy>(what: &'static str, found: &str, known: &[(&'static str, T)]) -> Result<T, UnknownName> {
     let (wanted, long) = (found.to_lowercase(), found.len() > LONGEST);
     if let Some((_, value)) = known.iter().find(|(name, _)| *name == wanted) {

@@ -45,7 +45,8 @@ impl PlanParams {
     /// Presses that are tried, over the body's extent along the load (1): from what shows at all to
     /// what the linear law bears.
     pub const PRESS: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
-    /// Noise that is tried, over the edge of a voxel (1): of correlation on good images to poor ones.
+    /// Noise that is tried, over the edge of a voxel (1): of correlation on good images to poor
+    /// ones.
     pub const NOISE: [f64; 3] = [0.05, 0.1, 0.2];
     /// Largest number of presses, voxel sizes or noises.
     pub const MOST: usize = 20;

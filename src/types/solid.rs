@@ -81,7 +81,8 @@ impl SolidMesh {
     /// From nodes (mm, RAS) with their numbers in the file, elements, and named sets of nodes.
     ///
     /// # Errors
-    /// [`MeshError`] when a coordinate is not finite, an index is out of range, or there are not as many numbers as nodes.
+    /// [`MeshError`] when a coordinate is not finite, an index is out of range, or there are not as
+    /// many numbers as nodes.
     pub fn new(
         nodes: Vec<WorldPoint>,
         numbers: Vec<u64>,
@@ -159,7 +160,8 @@ pub struct MeasuredNode {
     pub patch: String,
     /// The displacement (mm, RAS).
     pub displacement: [f64; 3],
-    /// Covariance of its error (mm^2, RAS): xx, xy, xz, yy, yz, zz; none where the field tells none.
+    /// Covariance of its error (mm^2, RAS): xx, xy, xz, yy, yz, zz; none where the field tells
+    /// none.
     pub covariance: Option<[f64; 6]>,
 }
 

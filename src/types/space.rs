@@ -80,7 +80,8 @@ impl Affine {
     /// From the upper three rows of the homogeneous 4 x 4 matrix (mm a voxel, mm).
     ///
     /// # Errors
-    /// [`SpaceError`] when an entry is not finite or the linear part is singular (relative determinant under 1e-9).
+    /// [`SpaceError`] when an entry is not finite or the linear part is singular (relative
+    /// determinant under 1e-9).
     pub fn new(rows: [[f64; 4]; 3]) -> Result<Self, SpaceError> {
         if rows.iter().flatten().any(|v| !v.is_finite()) {
             return Err(SpaceError::NotFinite);

@@ -277,7 +277,8 @@ pub struct Evidence {
 pub struct Detectable {
     /// Its diameter (mm).
     pub diameter_mm: f64,
-    /// Its modulus over that around it, where it is stiffer; none where not even a rigid one is seen.
+    /// Its modulus over that around it, where it is stiffer; none where not even a rigid one is
+    /// seen.
     pub stiffer: Option<f64>,
     /// The same where it is softer; none where not even a hole is seen.
     pub softer: Option<f64>,

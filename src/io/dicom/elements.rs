@@ -1,7 +1,7 @@
 //! The elements of a DICOM file (PS3.5 section 7, PS3.10): where each value of one level stands.
 //!
-//! Values are never copied, sequences are stepped over until they are asked for, and every length is
-//! checked against the file's: no length in a file makes it allocate. (The crate `dicom-object`
+//! Values are never copied, sequences are stepped over until they are asked for, and every length
+//! is checked against the file's: no length in a file makes it allocate. (The crate `dicom-object`
 //! allocates what a length says before it reads the value, up to 4 GB for a file of 200 bytes.)
 
 use std::collections::BTreeMap;

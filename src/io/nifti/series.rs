@@ -40,7 +40,8 @@ impl Series {
     /// Opens a file and checks its header against its size.
     ///
     /// # Errors
-    /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of these.
+    /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of
+    /// these.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, IoError> {
         let path = path.as_ref();
         let opened = open(path)?;

@@ -40,8 +40,8 @@ const COARSE: f64 = 0.25;
 /// 65,536 are exact), so that they pack.
 ///
 /// # Errors
-/// [`IoError`] when the name ends in none of `.nii`, `.nii.gz`, `.nrrd` and `.mha`, an axis of NIfTI has more than
-/// 32,767 voxels or the file cannot be written.
+/// [`IoError`] when the name ends in none of `.nii`, `.nii.gz`, `.nrrd` and `.mha`, an axis of
+/// NIfTI has more than 32,767 voxels or the file cannot be written.
 pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) -> Result<(), IoError> {
     let form = Form { description, ..Form::FLOATS };
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| stored(v).to_le_bytes()).map(drop)

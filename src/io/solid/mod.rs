@@ -169,7 +169,8 @@ pub fn write_element_moduli(path: impl AsRef<Path>, mesh: &SolidMesh, measured: 
     write_table(path.as_ref(), &ELEMENT_COLUMNS, rows)
 }
 
-/// What is made of the parts of a mesh; `hint` says what to try with one that does not fit together.
+/// What is made of the parts of a mesh; `hint` says what to try with one that does not fit
+/// together.
 fn assembled(made: Result<SolidMesh, crate::error::MeshError>) -> Result<SolidMesh, Flaw> {
     made.map_err(|e| Flaw::new(e.to_string(), "export the mesh again"))
 }

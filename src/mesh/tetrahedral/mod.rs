@@ -100,7 +100,8 @@ pub fn pieces(labels: &Mask) -> Vec<usize> {
 /// Meshes the voxels of `labels` that are not 0; each label becomes a region of elements.
 ///
 /// # Errors
-/// [`MeshError::TooFew`] when no element fits into the body, [`MeshError::PartLost`] when none fits into a part.
+/// [`MeshError::TooFew`] when no element fits into the body, [`MeshError::PartLost`] when none fits
+/// into a part.
 pub fn mesh_labels(labels: &Mask, fineness: &Fineness) -> Result<QuadraticMesh, MeshError> {
     Mesher::new(labels)?.mesh(fineness)
 }
