@@ -13,7 +13,7 @@ use serde_json::json;
 /// Frames in the picture.
 const SHOWN: usize = 4;
 
-/// Stages frame_<t>.nii.gz, truth_<t>.nii.gz, mask, labels, description and picture; gives the
+/// Stages `frame_<t>.nii.gz`, `truth_<t>.nii.gz`, mask, labels, description and picture; gives the
 /// summary back.
 pub fn write(folder: &mut OutputFolder, params: &SequenceParams, console: &Console) -> Result<String> {
     let progress = console.progress();

@@ -104,7 +104,7 @@ fn xml(command: &Command, returns: &[[&str; 3]]) -> String {
         )
     };
     let needed = |a: &Arg| a.is_required_set() || a.get_id() == "output";
-    let returned: String = returns.iter().map(|r| returned(r)).collect();
+    let returned: String = returns.iter().map(returned).collect();
     format!(
         "<?xml version=\"1.0\" encoding=\"utf-8\"?>\n<executable>\n  <category>Palpate</category>\n  <title>palpate {}</title>\n  \
          <description>{}</description>\n  <version>{}</version>\n  <license>MIT OR Apache-2.0</license>\n{}{}  <parameters \

@@ -4,7 +4,7 @@ use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::{displacement, nearest};
 use crate::pipeline::search;
-use crate::stiffness::choice::{Choice, choose, known_moduli, settle};
+use crate::stiffness::choice::{Choice, as_meshed, choose, known_moduli, settle};
 use crate::stiffness::coherent::Fit;
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::Inclusion;
@@ -288,25 +288,28 @@ fn labelled(
     clock.book("coarse");
 
     progress("fine", 0.4);
-    let estimate = match identified(&coarse, &mut fine, &choice, params, reference) {
-        Ok(estimate) => estimate,
-        // What the coarse mesh bears the fine one need not.
-        Err(StiffnessError::NoEquilibrium | StiffnessError::InsideOut)
-            if params.model == LawChoice::Auto && choice.law == Law::NeoHookean =>
-        {
-            [&mut coarse, &mut fine].into_iter().for_each(Level::move_back);
-            let linear = StiffnessParams { model: LawChoice::Linear, ..params.clone() };
-            let again = chosen(&mut coarse, &linear, reference, &mut hidden)?;
-            choice = Choice { evidence: without_large_strain(choice.evidence), ..again };
-            choice.warnings.push(
-                "the neo-Hookean law found no equilibrium on the fine mesh, and the linear one is taken, which is an approximation: \
-                 check the field, the labels and the patches"
-                    .into(),
-            );
-            identified(&coarse, &mut fine, &choice, &linear, reference)?
-        }
-        Err(error) => return Err(error),
-    };
+    let mut estimate = identified(&coarse, &mut fine, &choice, params, reference, FINE_MOVES);
+    if is_unsolved(&estimate) {
+        // What the shape changes stays to first order then.
+        fine.move_back();
+        estimate = as_meshed(&mut coarse, choice.law, params, reference, &choice.estimate).and_then(|again| {
+            choice.estimate = again;
+            identified(&coarse, &mut fine, &choice, params, reference, 0)
+        });
+    }
+    if is_unsolved(&estimate) && params.model == LawChoice::Auto && choice.law == Law::NeoHookean {
+        [&mut coarse, &mut fine].into_iter().for_each(Level::move_back);
+        let linear = StiffnessParams { model: LawChoice::Linear, ..params.clone() };
+        let again = chosen(&mut coarse, &linear, reference, &mut hidden)?;
+        choice = Choice { evidence: without_large_strain(choice.evidence), ..again };
+        choice.warnings.push(
+            "the neo-Hookean law found no equilibrium on the fine mesh, and the linear one is taken, which is an approximation: check \
+             the field, the labels and the patches"
+                .into(),
+        );
+        estimate = identified(&coarse, &mut fine, &choice, &linear, reference, FINE_MOVES);
+    }
+    let estimate = estimate?;
     clock.book("fine");
 
     progress("uncertainty", 0.9);
@@ -453,19 +456,24 @@ fn chosen(
     Ok(choice)
 }
 
-/// The moduli on the fine mesh, from those on the coarse one.
+fn is_unsolved(found: &Result<Estimate, StiffnessError>) -> bool {
+    matches!(found, Err(StiffnessError::NoEquilibrium | StiffnessError::InsideOut))
+}
+
+/// The moduli on the fine mesh, from those on the coarse one, with so many moves of the shape more.
 fn identified(
     coarse: &Level,
     fine: &mut Level,
     choice: &Choice,
     params: &StiffnessParams,
     reference: usize,
+    moves: usize,
 ) -> Result<Estimate, StiffnessError> {
     (fine.hidden, fine.known) = (coarse.hidden.clone(), coarse.known.clone());
     fine.touch_like(coarse)?;
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params, reference).run(start, 3, PRECISION)?;
-    settle(fine, choice.law, params, reference, estimate, (FINE_MOVES, PRECISION))
+    settle(fine, choice.law, params, reference, estimate, (moves, PRECISION))
 }
 
 /// Draws of the field's error at the observations (mm, RAS); none where matches are taken in its

@@ -377,6 +377,22 @@ pub fn settle(
     Ok(estimate)
 }
 
+/// Identifies again with the shape as it was meshed.
+///
+/// # Errors
+/// As [`crate::stiffness::identify::Setup::run`].
+pub fn as_meshed(
+    level: &mut Level,
+    law: Law,
+    params: &StiffnessParams,
+    reference: usize,
+    estimate: &Estimate,
+) -> Result<Estimate, StiffnessError> {
+    level.move_back();
+    level.settled = false;
+    level.setup(law, params, reference).run(estimate.state.clone(), ITERATIONS, COARSE)
+}
+
 /// Runs on which given moduli are settled at most: the scale moves little with what they change.
 const KNOWN_RUNS: usize = 3;
 /// Change of ln E under which they are settled.
