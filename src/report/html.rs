@@ -189,8 +189,8 @@ fn head(report: &FieldReport<'_>) -> String {
 fn score(report: &FieldReport<'_>, views: &Views) -> String {
     let (Some((_, m)), Some(error)) = (report.truth, &views.error) else { return String::new() };
     format!(
-        "<div class=\"grid\"><article class=\"score\"><h3>Against exact truth</h3><p>Mean error <b>{:.3} mm</b>; doing nothing \
-         would give {:.3} mm.</p>{}</article>{}</div>",
+        "<div class=\"grid\"><article class=\"score\"><h3>Against exact truth</h3><p>Mean error <b>{:.3} mm</b>; {:.3} mm before \
+         registration.</p>{}</article>{}</div>",
         m.mean_mm,
         m.identity_mm,
         tables::metrics(m),

@@ -164,7 +164,7 @@ pub fn metrics(m: &Metrics) -> String {
     let mm = |v: f64| format!("{v:.3} mm");
     let mut rows = vec![
         ("Mean error", mm(m.mean_mm)),
-        ("Mean error of doing nothing", mm(m.identity_mm)),
+        ("Mean error before registration", mm(m.identity_mm)),
         ("Median error", mm(m.median_mm)),
         ("95th percentile", mm(m.p95_mm)),
         ("Largest error", mm(m.max_mm)),

@@ -72,7 +72,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
 /// A score against truth, a few lines.
 pub fn metrics(m: &Metrics) -> String {
     let mut out = format!(
-        "Mean error {:.3} mm over {} voxels, where doing nothing gives {:.3} mm.\n",
+        "Mean error {:.3} mm over {} voxels, {:.3} mm before registration.\n",
         m.mean_mm,
         thousands(m.voxels),
         m.identity_mm
@@ -177,7 +177,7 @@ mod tests {
     #[test]
     fn a_score_names_what_doing_nothing_gives() {
         let text = metrics(&Metrics { mean_mm: 0.25, identity_mm: 2.0, voxels: 1000, ..Metrics::default() });
-        assert!(text.starts_with("Mean error 0.250 mm over 1,000 voxels, where doing nothing gives 2.000 mm."));
+        assert!(text.starts_with("Mean error 0.250 mm over 1,000 voxels, 2.000 mm before registration."));
         assert!(!text.contains("landmarks"));
     }
 }
