@@ -68,7 +68,8 @@ impl Row {
             Some(_) => format!("below {}", short(self.found)),
             None => short(self.found),
         };
-        let truth = if self.is_error { format!("0 (before registration {})", short(self.truth)) } else { short(self.truth) };
+        let truth =
+            if self.is_error { format!("0 (before registration {})", short(self.truth)) } else { short(self.truth) };
         let error = match (&self.bound, self.is_error) {
             (Some(_), _) => "a bound".into(),
             (None, true) => format!("{} {}", short(self.error), self.unit),
