@@ -122,4 +122,7 @@ fn a_caller_runs_a_module_by_its_description_alone() {
     flags.extend(["--force".into(), "--return-nothing".into(), "n.nii.gz".into()]);
     let lost = call(&flags);
     assert!(!lost.status.success() && text(&lost.stderr).contains("nothing.nii.gz"), "{}", text(&lost.stderr));
+    assert_eq!(lost.status.code(), Some(2), "it is refused before any work");
+    let (_, err) = run(folder.path(), &["field", "a.nii.gz", "b.nii.gz", "-o", "r", "--return-warped"], 2);
+    assert!(err.contains("--return-warped needs a file"), "{err}");
 }

@@ -222,13 +222,13 @@ fn whole() -> clap::Command {
 pub fn run(mut typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
     own::remember(own);
     named_for_command(&mut typed);
-    if let Some(description) = slicer::description(&typed, whole()) {
+    if let Some(description) = slicer::description(&typed, whole) {
         Console::new(false, false, &[]).say(&description);
         return 0;
     }
-    let asked = slicer::Asked::taken(&mut typed);
-    let typed = match series::chosen(typed) {
-        Ok(typed) => typed,
+    let prepared = slicer::Asked::taken(&mut typed).and_then(|asked| Ok((asked, series::chosen(typed)?)));
+    let (asked, typed) = match prepared {
+        Ok(prepared) => prepared,
         Err(error) => return failed(&Console::new(false, false, &[]), &error),
     };
     let words: Vec<String> = typed.iter().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();

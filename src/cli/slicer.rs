@@ -5,7 +5,8 @@
 //! A caller of that kind may add `--filter-progress` (progress as lines of XML on stdout) and
 //! `--return-NAME FILE` (a copy of the result NAME.nii.gz).
 
-use anyhow::{Context, Result};
+use super::Usage;
+use anyhow::{Context, Result, bail};
 use clap::{Arg, ArgAction, Command};
 use palpate::io;
 use std::any::TypeId;
@@ -47,21 +48,28 @@ pub struct Asked {
 
 impl Asked {
     /// Takes what belongs here out of the words of a command line.
-    pub fn taken(typed: &mut Vec<OsString>) -> Self {
+    ///
+    /// # Errors
+    /// When a result is asked for that the command does not have, or without a file for it.
+    pub fn taken(typed: &mut Vec<OsString>) -> Result<Self> {
         let mut out = Self::default();
+        let command = typed.get(1).map(|word| word.to_string_lossy().into_owned()).unwrap_or_default();
         let mut rest = Vec::with_capacity(typed.len());
         let mut words = std::mem::take(typed).into_iter();
         while let Some(word) = words.next() {
             let text = word.to_string_lossy().into_owned();
             match text.strip_prefix(RETURN).map(|name| name.split_once('=').unwrap_or((name, ""))) {
-                Some((name, "")) => out.returns.extend(words.next().map(|file| (name.into(), file.into()))),
-                Some((name, file)) => out.returns.push((name.into(), file.into())),
+                Some((name, "")) => {
+                    let Some(file) = words.next() else { bail!(Usage(format!("{RETURN}{name} needs a file"))) };
+                    out.returns.push((returned_by(&command, name)?, file.into()));
+                }
+                Some((name, file)) => out.returns.push((returned_by(&command, name)?, file.into())),
                 None if text == PROGRESS => out.progress = true,
                 None => rest.push(word),
             }
         }
         *typed = rest;
-        out
+        Ok(out)
     }
 
     /// Copies results out of the folder that the command wrote.
@@ -77,13 +85,25 @@ impl Asked {
     }
 }
 
-/// The description that a command line asks for, if it does.
-pub fn description(typed: &[OsString], mut program: Command) -> Option<String> {
+/// The name of a result, if the command has it.
+fn returned_by(command: &str, name: &str) -> Result<String> {
+    let all = MODULES.iter().find(|m| m.0 == command).map(|m| m.1).unwrap_or_default();
+    if all.iter().any(|r| r[0] == name) {
+        return Ok(name.into());
+    }
+    let names: Vec<&str> = all.iter().map(|r| r[0]).collect();
+    let has = if names.is_empty() { "none".into() } else { names.join(", ") };
+    bail!(Usage(format!("{RETURN}{name}: palpate {command} does not return {name}.nii.gz; it returns {has}")))
+}
+
+/// The description that a command line asks for, if it does, of the whole `program`.
+pub fn description(typed: &[OsString], program: impl FnOnce() -> Command) -> Option<String> {
     let [_, name, flag] = typed else { return None };
     if flag != "--xml" {
         return None;
     }
     let (name, returns) = MODULES.iter().find(|m| name == m.0)?;
+    let mut program = program();
     // Places of arguments are numbered then.
     program.build();
     Some(xml(program.find_subcommand(name)?, returns))
