@@ -184,6 +184,18 @@ def by_itk(path):
     return (values[..., None] if n == 2 else values), RAS @ affine
 
 
+def rewritten(folder, names, spacing):
+    """Volumes that ITK writes under these names, plain and packed, are read as ITK reads them; returns how many."""
+    cases = list(itertools.product((sitk.sitkInt16, sitk.sitkFloat32), names, (False, True)))
+    for kind, name, packed in cases:
+        image = sitk.Cast(sitk.GetImageFromArray(np.arange(24, dtype=np.int16).reshape(2, 3, 4)), kind)
+        image.SetSpacing(spacing)
+        path = os.path.join(folder, name)
+        sitk.WriteImage(image, path, packed)
+        same(path, *by_itk(path))
+    return len(cases)
+
+
 def metaimage():
     """What the documentation of MetaIO lists: types, byte orders, names of the places, packed, beside, in two dimensions."""
     types = {"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
@@ -218,13 +230,7 @@ def metaimage():
         for place in places:
             case(f"{start}{place}DimSize = 4 3 2\nElementType = MET_SHORT\nElementDataFile = LOCAL\n", voxels)
         case("NDims = 2\nElementSpacing = 2 3\nOffset = 1 2\nDimSize = 4 6\nElementType = MET_SHORT\nElementDataFile = LOCAL\n", voxels)
-        for kind in (sitk.sitkInt16, sitk.sitkFloat32):
-            image = sitk.Cast(sitk.GetImageFromArray(np.arange(24, dtype=np.int16).reshape(2, 3, 4)), kind)
-            for name, packed in itertools.product(("b.mha", "b.mhd"), (False, True)):
-                path = os.path.join(own, name)
-                sitk.WriteImage(image, path, packed)
-                same(path, *by_itk(path))
-                count += 1
+        count += rewritten(own, ("b.mha", "b.mhd"), [1, 1, 1])
     print(f"MetaImage: {count} variants as ITK reads them")
 
 
@@ -259,14 +265,7 @@ def nrrd():
         for magic, space in itertools.product(("NRRD0001", "NRRD0004", "NRRD0005"), spaces):
             case(f"{magic}\ntype: short\ndimension: 3\nspace: {space}\nsizes: 4 3 2\n{place}endian: little\nencoding: raw\n", voxels)
         case("NRRD0001\ntype: short\ndimension: 3\nsizes: 4 3 2\nspacings: 2 3 4\nendian: little\nencoding: raw\n", voxels)
-        for kind in (sitk.sitkInt16, sitk.sitkFloat32):
-            image = sitk.Cast(sitk.GetImageFromArray(np.arange(24, dtype=np.int16).reshape(2, 3, 4)), kind)
-            image.SetSpacing([2, 3, 4])
-            for name, packed in itertools.product(("b.nrrd", "b.nhdr"), (False, True)):
-                path = os.path.join(own, name)
-                sitk.WriteImage(image, path, packed)
-                same(path, *by_itk(path))
-                count += 1
+        count += rewritten(own, ("b.nrrd", "b.nhdr"), [2, 3, 4])
     print(f"NRRD: {count} variants as ITK reads them")
 
 

@@ -392,14 +392,19 @@ fn squeezed(strain: f64, nu: f64) -> DenseField {
 }
 
 fn identify(map: &Mask, field: &DenseField, params: &StiffnessParams) -> StiffnessResult {
-    let (held, load) = (Place::Side(Side::parse("z-").unwrap()), Place::Side(Side::parse("z+").unwrap()));
+    identify_held(&Place::Side(Side::parse("z-").unwrap()), map, field, params)
+}
+
+/// Pressed from z+.
+fn identify_held(held: &Place, map: &Mask, field: &DenseField, params: &StiffnessParams) -> StiffnessResult {
+    let load = Place::Side(Side::parse("z+").unwrap());
     let names = |l: u8| format!("region {l}");
     let inputs = Inputs {
         field,
         matches: None,
         labels: map,
         labelled: true,
-        held: &held,
+        held,
         load: &load,
         names: &names,
         quality: FieldQuality::default(),
@@ -674,19 +679,7 @@ fn held_where(
     params: &StiffnessParams,
 ) -> StiffnessResult {
     let mask = Mask::from_voxels(*map.grid(), |_, p| u8::from(held(p.0)));
-    let (held, load) = (Place::Mask(Box::new(mask), "held.nii.gz".into()), Place::Side(Side::parse("z+").unwrap()));
-    let names = |l: u8| format!("region {l}");
-    let inputs = Inputs {
-        field,
-        matches: None,
-        labels: map,
-        labelled: true,
-        held: &held,
-        load: &load,
-        names: &names,
-        quality: FieldQuality::default(),
-    };
-    run(&inputs, params, &|_, _| {}).unwrap()
+    identify_held(&Place::Mask(Box::new(mask), "held.nii.gz".into()), map, field, params)
 }
 
 /// A mask of the held side that leaves out a quarter of it made moduli 20 % too high without a

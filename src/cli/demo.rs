@@ -101,6 +101,11 @@ struct Scored {
     files: &'static [&'static str],
 }
 
+/// A part of the demo as an argument of a command.
+fn path(output: &Path, part: &str) -> String {
+    output.join(part).to_string_lossy().into_owned()
+}
+
 /// Runs one command of the program, and says which.
 fn step(words: &[&str], console: &Console) -> Result<()> {
     console.say(&format!("\n$ palpate {}", words.join(" ")));
@@ -111,7 +116,7 @@ fn step(words: &[&str], console: &Console) -> Result<()> {
 /// Makes a phantom, and measures its displacement.
 fn measured(kind: &[&str], options: &Options, console: &Console) -> Result<()> {
     let Options { output, size, tuning, .. } = options;
-    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
+    let at = |part: &str| path(output, part);
     let (seed, cells) = (tuning.params()?.seed.to_string(), size.map(|n| n.to_string()));
     let phantom = at("phantom");
     let mut make = [&["phantom"], kind, &["--seed", &seed, "--overwrite", "-o", &phantom]].concat();
@@ -130,7 +135,7 @@ fn measured(kind: &[&str], options: &Options, console: &Console) -> Result<()> {
 /// Displacement and strain of a calf under a blunt indenter.
 fn first(options: &Options, console: &Console) -> Result<Scored> {
     let output = &options.output;
-    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
+    let at = |part: &str| path(output, part);
     measured(&["calf", "--motion", "press"], options, console)?;
     let (field, strain) = (at("field"), at("strain"));
     step(&["strain", &field, "--overwrite", "-o", &strain], console)?;
@@ -169,7 +174,7 @@ fn strain_row(output: &Path) -> Result<Row> {
 /// Every command in turn on a finger pad.
 fn chain(options: &Options, console: &Console) -> Result<Scored> {
     let output = &options.output;
-    let at = |part: &str| output.join(part).to_string_lossy().into_owned();
+    let at = |part: &str| path(output, part);
     measured(&["fingertip", "--amplitude", AMPLITUDE], options, console)?;
     let told = io::read_json(output.join("phantom/phantom.json"))?;
     let elastic = &told["elastic"];

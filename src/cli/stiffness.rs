@@ -256,7 +256,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let progress = console.progress();
     progress.set("read", 0.0);
     let field = options.convention.read(&source.field)?;
-    let setting = Setting::read(options, body, field.grid(), &source.field)?;
+    let setting = Setting::read(options, params, body, field.grid(), &source.field)?;
     let mut matches = source.matches.as_ref().map(io::read_matches).transpose()?;
     if options.matches.is_none() && matches.as_ref().is_some_and(|m| !setting.holds_enough(m)) {
         console.detail(&format!("fewer than {ENOUGH} matches in the body: the field itself is taken"));
@@ -400,7 +400,13 @@ impl Setting {
         inside(matches, &self.labels) >= ENOUGH
     }
 
-    pub(super) fn read(options: &Options, body: &Path, grid: &Grid, reference: &Path) -> Result<Self> {
+    pub(super) fn read(
+        options: &Options,
+        params: &StiffnessParams,
+        body: &Path,
+        grid: &Grid,
+        reference: &Path,
+    ) -> Result<Self> {
         let labels = match &options.labels {
             Some(labels) => read_labels(labels, grid, reference)?,
             None => {
@@ -412,9 +418,7 @@ impl Setting {
         let held = place(&options.held, grid, reference, "--held")?;
         let load = place(&options.load, grid, reference, "--load")?;
         let names = names(options.names.as_deref(), &labels)?;
-        let known = Materials::of(options)?;
-        let mut given = known.poisson_of.iter().chain(&known.fixed).map(|k| k.0);
-        if let Some(label) = given.find(|l| !labels.as_slice().contains(l)).filter(|_| options.materials.is_none()) {
+        if let Some(label) = params.label_not_in(&labels).filter(|_| options.materials.is_none()) {
             bail!(Usage(format!("--poisson and --fixed: the label map holds no label {label}")));
         }
         Ok(Self { labels, labelled: options.labels.is_some(), held, load, names })

@@ -33,7 +33,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     // What is damaged is told before any work; a frame's matches are read again in its turn.
     frames.iter().try_for_each(|(_, path, _)| matches_beside(path).map(drop))?;
     let grid = *io::read_field(&frames[0].1)?.grid();
-    let setting = Setting::read(options, body, &grid, &frames[0].1)?;
+    let setting = Setting::read(options, params, body, &grid, &frames[0].1)?;
     let images = images(options, None, &grid)?;
     if options.dry_run {
         // Frames at rest are left out: one that can be used is enough.

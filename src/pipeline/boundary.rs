@@ -5,7 +5,7 @@
 //! size of the covariance, and the draws of `posterior.nii.gz` its directions.
 
 use crate::numerics::sampling::{Stencil, nearest};
-use crate::stiffness::observations::at_surface;
+use crate::stiffness::observations::{REACH, at_surface};
 use crate::strain::deviation::errors_at;
 use crate::types::{
     DenseField, ElementModulus, ErrorSamples, Mask, MeasuredNode, SolidMesh, StiffnessResult, Volume, VoxelPoint,
@@ -13,8 +13,6 @@ use crate::types::{
 };
 use rayon::prelude::*;
 
-/// Voxels around a node that are read for it.
-const REACH: f64 = 3.0;
 /// Width over which the directions of a few draws are averaged (nodes of the draws, one standard
 /// deviation of a Gaussian).
 const AVERAGED: f64 = 1.5;

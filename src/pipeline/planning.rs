@@ -6,22 +6,22 @@
 //! the covariance that `stiffness` would state. All is under the linear law.
 
 use crate::error::{ParamError, StiffnessError};
-use crate::mesh::tetrahedral::{Fineness, Mesher};
+use crate::mesh::tetrahedral::Mesher;
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::random::Random;
 use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::field::{Clock, Progress};
-use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, whole};
+use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, evenly_meshed, whole};
 use crate::stiffness::body::Body;
 use crate::stiffness::coherent::dilution;
 use crate::stiffness::elements::Mapping;
 use crate::stiffness::geometry::{self, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::level::{Level, plate_prior};
+use crate::stiffness::level::{Level, NEEDED, plate_prior};
 use crate::stiffness::maps;
-use crate::stiffness::observations::{block_for, find, read};
+use crate::stiffness::observations::{REACH, block_for, find, read};
 use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
 use crate::stiffness::verdict::mesh_error;
@@ -62,12 +62,6 @@ const FLAT: f64 = 0.6;
 const FACING: f64 = 0.7;
 /// Largest press over the body's extent along the load: beyond, a linear law says nothing.
 const DEEPEST: f64 = 0.5;
-/// Fewest samples of a body that `stiffness` takes.
-const NEEDED: f64 = 100.0;
-/// Voxels around a surface node that are read for its motion.
-const REACH: f64 = 3.0;
-/// Nodes over what is asked for from which a coarser mesh is made.
-const OVER: f64 = 1.15;
 
 /// The body with its plates, before it is pressed.
 struct Bench<'a> {
@@ -93,12 +87,7 @@ impl<'a> Bench<'a> {
         }
         let mesher = Mesher::new(inputs.labels)?;
         let (volume, nodes) = (maps::volume(inputs.labels), params.stiffness.nodes as f64);
-        let mut mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
-        let count = mesh.nodes().len() as f64;
-        if count > OVER * nodes {
-            // Thin layers take more nodes than a block does.
-            mesh = mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?;
-        }
+        let mesh = evenly_meshed(&mesher, volume, nodes)?;
         let body = Body::new(&mesh)?;
         let mut out = Self { inputs, params, body, outward: [0.0; 3], flat: None, extent: 0.0 };
         out.place_plate()?;
@@ -419,7 +408,7 @@ impl Solved {
         let voxels = inside as f64 / voxel.powi(3);
         let wide = block_for(voxels as usize) as f64;
         let count = samples * (block as f64 / (voxel * wide)).powi(3);
-        if count < NEEDED {
+        if count < NEEDED as f64 {
             return None;
         }
         let model = (deeper * self.rest).max(voxel * self.floor);

@@ -224,6 +224,17 @@ impl Meshed {
     }
 }
 
+/// A mesh of about so many nodes, as fine everywhere; `volume` of the body in mm^3.
+pub(super) fn evenly_meshed(mesher: &Mesher, volume: f64, nodes: f64) -> Result<QuadraticMesh, StiffnessError> {
+    let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
+    let count = mesh.nodes().len() as f64;
+    // Thin layers and a rough surface take more than a block does.
+    match count <= OVER * nodes {
+        true => Ok(mesh),
+        false => Ok(mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?),
+    }
+}
+
 /// A mesh of about so many nodes, finer along the rim of a punch: cubes of `size` voxels there.
 fn meshed(
     mesher: &Mesher,
@@ -234,13 +245,7 @@ fn meshed(
     size: f64,
 ) -> Result<QuadraticMesh, StiffnessError> {
     if rim.places.is_empty() {
-        let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
-        let count = mesh.nodes().len() as f64;
-        // Thin layers and a rough surface take more than a block does.
-        return match count <= OVER * nodes {
-            true => Ok(mesh),
-            false => Ok(mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?),
-        };
+        return evenly_meshed(mesher, volume, nodes);
     }
     let within = rim.outline.as_ref().map(|o| |p| o.within(p));
     let wall = within.as_ref().map(|w| w as Wall<'_>);

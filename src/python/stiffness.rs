@@ -86,8 +86,7 @@ pub fn stiffness<'py>(
     if let Some(label) = names.keys().find(|l| !labels.as_slice().contains(l)) {
         return Err(told(format!("names: the label map holds no label {label}")));
     }
-    let mut known = params.poisson_of.iter().chain(&params.fixed).map(|k| k.0);
-    if let Some(label) = known.find(|l| !labels.as_slice().contains(l)) {
+    if let Some(label) = params.label_not_in(&labels) {
         return Err(told(format!("poisson and fixed: the label map holds no label {label}")));
     }
     let of_field: serde_json::Value = serde_json::from_str(field_summary).map_err(told)?;

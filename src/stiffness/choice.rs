@@ -337,7 +337,7 @@ fn shown(question: &'static str, model: String, e: &Estimate, bic: f64, chosen: 
 
 /// Moves the open parts of the shape to where the data put them, and identifies again, until they
 /// stay, or have moved `moves` times. A move stands if it explains the data better, as told by the
-/// squares and by what was known of the offsets; else half of it is tried. `precision`: of the
+/// squares and the penalty of the offsets; else half of it is tried. `precision`: of the
 /// forward solutions (mm).
 ///
 /// # Errors
@@ -357,7 +357,7 @@ pub fn settle(
         let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SETTLED)) else { break };
         let variance = setup.variance(&estimate);
         let misfit = |level: &Level, e: &Estimate| {
-            e.raw * e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.price()
+            e.raw * e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.penalty()
         };
         let (before, least) = (level.offsets(), misfit(level, &estimate));
         let better = [1.0, 0.5].into_iter().find_map(|part| {

@@ -113,8 +113,8 @@ impl Part {
         Self { name, sigma, most: MOST, movement: body.places.iter().map(one).collect() }
     }
 
-    /// What an offset (voxels) is off from what was known of it (squared standard deviations).
-    pub fn price(&self, offset: f64) -> f64 {
+    /// The penalty of an offset (voxels) under its prior: squared standard deviations.
+    pub fn penalty(&self, offset: f64) -> f64 {
         (offset / self.sigma).powi(2)
     }
 
@@ -284,9 +284,11 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
     // What would go far beyond what is open stops there.
     let first = p - parts.len();
     let free = std::iter::repeat_n([f64::NEG_INFINITY, f64::INFINITY], first);
-    let limited = parts.iter().map(|(part, moved)| {
+    // The open parts come last.
+    let fixed = parts.len() - setup.open.len();
+    let limited = parts.iter().enumerate().map(|(k, (part, moved))| {
         let most = part.most * part.sigma;
-        let stays = setup.settled && setup.open.iter().any(|(open, _)| std::ptr::eq(open, *part));
+        let stays = setup.settled && k >= fixed;
         if stays { [0.0; 2] } else { [(-most - moved).min(0.0), (most - moved).max(0.0)] }
     });
     let room: Vec<[f64; 2]> = free.chain(limited).collect();

@@ -19,8 +19,8 @@ use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPo
 
 /// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
 pub(super) const FLOOR: f64 = 0.005;
-/// Observations needed for each parameter, at least.
-const NEEDED: usize = 100;
+/// Fewest observations of a body that are taken.
+pub const NEEDED: usize = 100;
 
 /// One standard deviation of a plate's motion about the fitted one (mm), where that of a surface
 /// node is known to `error` mm and voxels are `voxel` mm wide.
@@ -137,9 +137,9 @@ impl Level {
         self.open.iter().map(|o| o.1).collect()
     }
 
-    /// What their offsets are off from what was known of them (squared standard deviations).
-    pub fn price(&self) -> f64 {
-        self.open.iter().map(|(part, offset)| part.price(*offset)).sum()
+    /// The penalty of all offsets under their prior: squared standard deviations.
+    pub fn penalty(&self) -> f64 {
+        self.open.iter().map(|(part, offset)| part.penalty(*offset)).sum()
     }
 
     /// Moves the open parts, each so many voxels outwards from where the voxels put it.

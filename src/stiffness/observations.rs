@@ -281,6 +281,9 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
     patches.filter_map(one).collect()
 }
 
+/// Voxels around a place of the surface that are read for its motion.
+pub const REACH: f64 = 3.0;
+
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to
 /// the voxels of the mask within `reach` voxels, so that nothing outside the body is read and noise
 /// is averaged.

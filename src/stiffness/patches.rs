@@ -14,7 +14,7 @@ use crate::numerics::dense::{solve, symmetric_eigen};
 use crate::numerics::statistics::percentile;
 use crate::stiffness::body::{Body, Facet, sorted};
 use crate::stiffness::forward::Tie;
-use crate::stiffness::observations::at_surface;
+use crate::stiffness::observations::{REACH, at_surface};
 use crate::stiffness::plate;
 use crate::stiffness::rim::Outline;
 use crate::stiffness::smoothed::Smoothed;
@@ -24,8 +24,6 @@ use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Voxels around a surface node that are read for its motion.
-const REACH: f64 = 3.0;
 /// Voxels that are read to tell whether a node touches the plate: fewer, as the edge of a punch is
 /// sharp.
 const NEAR: f64 = 1.8;

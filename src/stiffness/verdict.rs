@@ -260,7 +260,7 @@ impl Verdict {
             reasons.push("no modulus is determined".into());
         }
         if flat {
-            reasons.push("the field is one affine map, as of a registration that shows no contrast".into());
+            reasons.push("the field is one affine map, which shows no contrast between regions".into());
         }
         let trust = [Some(misfit.trust()), field, Some(own)].into_iter().flatten().max().unwrap_or(own);
         Self { trust, reasons }

@@ -163,6 +163,12 @@ impl StiffnessParams {
         self.poisson_of.iter().find(|p| p.0 == label).map_or(self.poisson, |p| p.1)
     }
 
+    /// The first label with a ratio or a modulus of its own that no voxel of `labels` has.
+    pub fn label_not_in(&self, labels: &Mask) -> Option<u8> {
+        let mut given = self.poisson_of.iter().chain(&self.fixed).map(|known| known.0);
+        given.find(|label| !labels.as_slice().contains(label))
+    }
+
     /// Checks every range.
     ///
     /// # Errors
