@@ -12,6 +12,7 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Barrier;
 use tempfile::{TempDir, tempdir};
 
 fn put(folder: &TempDir, name: &str, bytes: &[u8]) -> PathBuf {
@@ -282,6 +283,27 @@ fn a_failed_run_leaves_nothing() {
     std::fs::write(target.join("c/theirs"), "x").unwrap();
     drop(output);
     assert_eq!(names(&target.join("c")), ["theirs"]);
+}
+
+#[test]
+fn of_runs_that_make_one_folder_at_once_one_gets_it_and_the_others_say_why() {
+    let folder = tempdir().unwrap();
+    for turn in 0..200 {
+        let target = folder.path().join(format!("{turn}/a/b"));
+        let together = Barrier::new(4);
+        let made: Vec<_> = std::thread::scope(|scope| {
+            let create = || {
+                together.wait();
+                OutputFolder::create(&target, false)
+            };
+            let threads: Vec<_> = (0..4).map(|_| scope.spawn(create)).collect();
+            threads.into_iter().map(|t| t.join().unwrap()).collect()
+        });
+        assert_eq!(made.iter().filter(|m| m.is_ok()).count(), 1, "turn {turn}: {made:?}");
+        for other in made.into_iter().filter(Result::is_err) {
+            refused(other, &["another run", "--output"]);
+        }
+    }
 }
 
 #[test]

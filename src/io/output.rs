@@ -47,10 +47,14 @@ impl OutputFolder {
         };
         let mut to_create: Vec<&Path> = path.ancestors().take_while(missing).collect();
         while let Some(next) = to_create.pop() {
-            let live = Live::folder(next).map_err(os(next, "create the folder"))?;
-            folder.created.push((next.into(), live));
+            match Live::folder(next) {
+                Ok(live) => folder.created.push((next.into(), live)),
+                // Another run has made it meanwhile: it is not ours to remove.
+                Err(_) if next.is_dir() => {}
+                Err(error) => return Err(os(next, "create the folder")(error)),
+            }
         }
-        folder.held = Some(hold(path)?);
+        folder.held = Some(hold(path).inspect_err(|_| folder.created.clear())?);
         // What another run has written meanwhile counts.
         Self::check(path, force)?;
         sweep(path);
