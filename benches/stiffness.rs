@@ -9,9 +9,9 @@
 //! process, so runs are one after the other.
 
 use palpate::numerics::random::Random;
-use palpate::pipeline::pressed::Pressed;
+use palpate::pipeline::compression_phantoms::Pressed;
 use palpate::pipeline::{cpu, field};
-use palpate::synth::severity::{disturbed, shifted_labels};
+use palpate::synth::degradation::{disturbed, shifted_labels};
 use palpate::synth::{PhantomKind, PhantomParams};
 use palpate::types::stiffness::Law;
 use palpate::types::{DenseField, FieldParams, Mask, SparseField, StiffnessParams};

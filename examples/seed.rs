@@ -9,7 +9,7 @@
 
 use palpate::pipeline::field::FieldResult;
 use palpate::report::colormap::ColorMap;
-use palpate::report::nodes;
+use palpate::report::node_plot;
 use palpate::report::scale::Scale;
 use palpate::synth::{PhantomKind, PhantomParams, phantom};
 use palpate::types::params::{Interpolation, Method};
@@ -108,5 +108,5 @@ fn picture(result: &FieldResult) -> String {
     let length = |d: &[f64; 3]| d.iter().map(|v| v * v).sum::<f64>().sqrt();
     let most = result.node_displacement.iter().map(length).fold(0.0, f64::max);
     let title = format!("{} nodes, {elements} {name}: displacement magnitude", places.len());
-    nodes::figure(&title, places, &result.node_displacement, &Scale::from_zero(most, "mm", ColorMap::Viridis))
+    node_plot::figure(&title, places, &result.node_displacement, &Scale::from_zero(most, "mm", ColorMap::Viridis))
 }

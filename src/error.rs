@@ -1,4 +1,4 @@
-//! One small error enum an operation. Each message says what is wrong and, where it can be said,
+//! One small error enum an operation. Each message says what is wrong and, where it is known,
 //! what to try.
 //!
 //! Errors about a file carry its path (added in `io`); the command line joins context with

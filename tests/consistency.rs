@@ -10,11 +10,11 @@ use palpate::consistency::models::{AffineMotion, CHANCE, Excess, PLACE, choose};
 use palpate::consistency::pruning::{Measured, prune};
 use palpate::consistency::relaxation::relax;
 use palpate::numerics::bending::{Coupled, Smoothness};
-use palpate::numerics::blocks::Blocks;
+use palpate::numerics::block_diagonal::Blocks;
 use palpate::numerics::bspline::Lattice;
 use palpate::numerics::filters;
 use palpate::numerics::random::Random;
-use palpate::numerics::small::quadratic;
+use palpate::numerics::symmetric3::quadratic;
 use palpate::types::{Candidate, MotionModel};
 use truth::{Dense, dense, entry, invert, normals, random_blocks, with_threads};
 

@@ -5,8 +5,8 @@ use palpate::error::FieldError;
 use palpate::evaluate;
 use palpate::numerics::random::Random;
 use palpate::numerics::sampling::displacement;
+use palpate::pipeline::dry_run;
 use palpate::pipeline::field::{FieldResult, run};
-use palpate::pipeline::plan;
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, Trouble, phantom, phantom_on, troubled};
 use palpate::types::params::{Interpolation, Preset};
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, Mesh, Metrics, MotionModel, Volume};
@@ -183,10 +183,10 @@ fn a_wave_comes_back_with_its_amplitude() {
     }
 }
 
-/// A spine whose core slid by 18 mm in a volume 90 mm wide was 6 mm off: 13.5 mm were looked over.
+/// A spine whose core slid by 18 mm in a volume 90 mm wide was 6 mm off: the range was 13.5 mm.
 #[test]
 fn motion_that_reaches_the_search_range_is_looked_for_farther() {
-    // A core that slides by 13 voxels where 6 are looked over.
+    // A core that slides by 13 voxels where 6 are searched.
     let slid = |[x, y, z]: [f64; 3]| {
         let inside = ((x - 20.0) / 13.0).powi(2) + ((z - 24.0) / 15.0).powi(2) < 1.0;
         [0.0, if inside { 13.0 * (-((y - 45.0) / 40.0).powi(2)).exp() } else { 0.0 }, 0.0]
@@ -213,7 +213,7 @@ fn where_few_features_agree_motion_is_looked_for_farther() {
     let (initial, deformed, truth) = carried([40, 90, 48], slid, 4.0);
     let result = run(&initial, &deformed, None, &FieldParams::default(), &|_, _| {}).unwrap();
     let m = evaluate::metrics(&result.displacement, &truth, None, &[]).unwrap();
-    let asked = |e: &String| e.contains("where few agree") && e.ends_with("taken");
+    let asked = |e: &String| e.contains("few features agree") && e.ends_with("taken");
     assert!(result.summary.evidence.iter().any(asked) && m.mean_mm < 2.0, "{m:?} {:?}", result.summary.evidence);
 }
 
@@ -354,7 +354,7 @@ fn a_pressed_fingertip_is_measured_and_its_far_side_stays_still() {
 }
 
 /// Beside a local press in noisy volumes what stayed at rest followed the noise by 0.1 to 0.7 mm,
-/// more than doing nothing would have been off.
+/// more than before registration.
 #[test]
 fn what_a_press_leaves_at_rest_is_held_there_and_smooth_motion_is_not() {
     let press = |[x, y, z]: [f64; 3]| {
@@ -661,7 +661,7 @@ fn passes_on_the_next_finer_level_find_what_averages_of_voxels_hide() {
     let bent = phantom(&block(48, MotionKind::Smooth, 3.0)).unwrap();
     assert!(!said(&measure_with(&bent, &full).0));
     // A dry run names the level.
-    let levels = |passes| plan::field(&bent.initial, &bent.deformed, None, &averages(passes)).unwrap().levels;
+    let levels = |passes| dry_run::field(&bent.initial, &bent.deformed, None, &averages(passes)).unwrap().levels;
     assert_eq!(levels(3), [levels(0), vec![[48; 3]]].concat());
 }
 
@@ -900,7 +900,7 @@ fn what_cannot_be_measured_is_refused_with_a_reason() {
         let cut = |v: &Volume| Volume::from_vec(thin, v.as_slice()[..thin.len()].to_vec()).unwrap();
         let message = said(&cut(a), &cut(b), None);
         assert!(message.contains("a patch needs 5"), "{message}");
-        assert_eq!(plan::field(&cut(a), &cut(b), None, &params).unwrap_err().to_string(), message);
+        assert_eq!(dry_run::field(&cut(a), &cut(b), None, &params).unwrap_err().to_string(), message);
     }
     // A slope has no corner.
     let slope = Volume::from_voxels(g, |_, x| x.0[0] as f32 + 100.0);

@@ -5,14 +5,14 @@
 use palpate::error::GraspError;
 use palpate::grasp::constraints::Geometry;
 use palpate::grasp::control::{Inputs, Phase};
+use palpate::grasp::dynamics::Plant;
 use palpate::grasp::integrators::{Form, Rk4, SemiImplicitEuler, Stepper, System};
 use palpate::grasp::minimal::Minimal;
 use palpate::grasp::models::{Parallel, Tilt, Tip, exact_radial_energy, tip_of};
 use palpate::grasp::multipliers::Multipliers;
-use palpate::grasp::plant::Plant;
 use palpate::grasp::simulate::simulate;
 use palpate::grasp::statics::{Lost, Statics};
-use palpate::grasp::{freedom, pinch, stability, stepping};
+use palpate::grasp::{degrees_of_freedom, pinch, stability, stepping};
 use palpate::pipeline;
 use palpate::types::grasp::{EventKind, GraspRun, Hold, PinchState, Sample, Stability};
 use palpate::types::scene::{Formulation, Integrator, Method, Motion, Push, Rolling, Second, SweepCase};
@@ -1117,7 +1117,7 @@ fn energies_are_minima_for_parallel_tips_and_neutral_or_saddles_for_radial_ones(
 
 #[test]
 fn degrees_of_freedom_by_rank() {
-    let table = freedom::table(&Scene::reference());
+    let table = degrees_of_freedom::table(&Scene::reference());
     let row = |model, fingers| table.iter().find(|f| f.model == model && f.fingers == fingers).unwrap();
     let found = |model, fingers| {
         let f = row(model, fingers);
@@ -1133,7 +1133,7 @@ fn degrees_of_freedom_by_rank() {
 /// The source's cases: rigid and soft tips on fingers of 1+1 and 1+2 joints.
 #[test]
 fn a_finger_of_two_joints_gives_rigid_tips_what_soft_ones_have_with_one() {
-    let table = freedom::table(&Scene::reference());
+    let table = degrees_of_freedom::table(&Scene::reference());
     let row = |model, joints| table.iter().find(|f| f.model == model && f.joints == joints).unwrap();
     let (rigid, soft) = (FingertipModel::Rigid, FingertipModel::Parallel);
     // One more joint is one more freedom, whatever the tips.

@@ -75,7 +75,7 @@ fn each_file_of_a_field_a_strain_a_track_and_a_certificate_is_named() {
         ("t/report.html", "page, for a browser"),
         ("c", "results of palpate certify"),
         ("c/certificate.json", "summary of palpate certify"),
-        ("c/detectable.nii.gz", "smallest displacement that is told from noise, mm"),
+        ("c/detectable.nii.gz", "smallest displacement above noise, mm"),
         ("c/report.html", "page, for a browser"),
         ("w.nii.gz", "volume, warped"),
         ("l.nii.gz", "label map, warped"),

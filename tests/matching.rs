@@ -10,14 +10,14 @@ use palpate::matching::brightness::Brightness;
 use palpate::matching::candidates::{CandidateParams, Side, candidates};
 use palpate::matching::correlation::Searchable;
 use palpate::matching::gain::GainField;
+use palpate::matching::least_squares_matching::{self, Template};
 use palpate::matching::levels::{Aligned, factors, from_level, to_level};
-use palpate::matching::lsm::{self, Template};
 use palpate::matching::pair::{Pair, Spans, dilate, row_step};
 use palpate::matching::residual::{normal_equations, residual_sigma};
-use palpate::numerics::blocks::Blocks;
+use palpate::numerics::block_diagonal::Blocks;
 use palpate::numerics::bspline::{Lattice, SmoothSampler};
 use palpate::numerics::filters;
-use palpate::numerics::small::{inverse, quadratic};
+use palpate::numerics::symmetric3::{inverse, quadratic};
 use palpate::types::{Affine, Candidate, Grid, Mask, Volume, VoxelPoint, WorldPoint};
 use truth::{Waves, entry, normals, sampled, voxels, with_threads};
 
@@ -316,7 +316,14 @@ fn least_squares_matching_is_sub_voxel() {
     let template = Template { data: &smooth, shape, spacing, radius: [3; 3], noise: 0.0 };
     for centre in voxels([3, 3, 3]).map(|p| p.map(|v| 8 + 4 * v)) {
         let sample = |o: [f32; 3]| sampler.at(std::array::from_fn(|a| centre[a] as f32 + o[a]));
-        let found = lsm::refine(&template, centre, lsm::pointwise([3; 3], sample), 12, 2.0).unwrap();
+        let found = least_squares_matching::refine(
+            &template,
+            centre,
+            least_squares_matching::pointwise([3; 3], sample),
+            12,
+            2.0,
+        )
+        .unwrap();
         for a in 0..3 {
             let error = found.shift[a] / spacing[a] - D[a];
             assert!(error.abs() < 0.02, "{centre:?} axis {a}: {error} voxels");
@@ -334,7 +341,7 @@ fn least_squares_matching_refuses_what_it_cannot_measure() {
     let refine = |data: &[f32], centre: [usize; 3], limit: f64| {
         let template = Template { data, shape, spacing: [1.0; 3], radius: [3; 3], noise: 1.0 };
         let sample = |o: [f32; 3]| sampler.at(std::array::from_fn(|a| centre[a] as f32 + o[a]));
-        lsm::refine(&template, centre, lsm::pointwise([3; 3], sample), 6, limit)
+        least_squares_matching::refine(&template, centre, least_squares_matching::pointwise([3; 3], sample), 6, limit)
     };
     assert!(refine(&smooth, [10; 3], 2.0).is_some());
     assert!(refine(&smooth, [10; 3], 0.1).is_none(), "further than the limit");
@@ -354,7 +361,14 @@ fn one_slice_is_matched_in_its_plane() {
     let sampler = SmoothSampler { data: &moving, shape };
     let template = Template { data: &smooth, shape, spacing: [1.0, 1.0, 6.0], radius: [4; 3], noise: 1.0 };
     let sample = |o: [f32; 3]| sampler.at([20.0 + o[0], 20.0 + o[1], o[2]]);
-    let found = lsm::refine(&template, [20, 20, 0], lsm::pointwise([4, 4, 0], sample), 12, 2.0).unwrap();
+    let found = least_squares_matching::refine(
+        &template,
+        [20, 20, 0],
+        least_squares_matching::pointwise([4, 4, 0], sample),
+        12,
+        2.0,
+    )
+    .unwrap();
     assert!((found.shift[0] - D[0]).abs() < 0.02 && (found.shift[1] - D[1]).abs() < 0.02, "{found:?}");
     assert_eq!((found.shift[2], found.covariance[2], found.covariance[4], found.covariance[5]), (0.0, 0.0, 0.0, 0.0));
 }
@@ -373,7 +387,15 @@ fn the_covariance_of_a_match_is_calibrated() {
     let (mut sum, mut count) = (0.0, 0);
     for centre in voxels([6, 6, 6]).map(|p| p.map(|v| 9 + 8 * v)) {
         let sample = |o: [f32; 3]| sampler.at(std::array::from_fn(|a| centre[a] as f32 + o[a]));
-        let Some(found) = lsm::refine(&template, centre, lsm::pointwise([3; 3], sample), 12, 2.0) else { continue };
+        let Some(found) = least_squares_matching::refine(
+            &template,
+            centre,
+            least_squares_matching::pointwise([3; 3], sample),
+            12,
+            2.0,
+        ) else {
+            continue;
+        };
         let e = std::array::from_fn(|a| found.shift[a] - D[a]);
         sum += quadratic(&inverse(&found.covariance).unwrap(), e);
         count += 1;

@@ -6,12 +6,12 @@
 mod truth;
 
 use palpate::numerics::bending::{Coupled, Smoothness};
-use palpate::numerics::blocks::Blocks;
+use palpate::numerics::block_diagonal::Blocks;
 use palpate::numerics::bspline::{Lattice, SmoothSampler, weights};
 use palpate::numerics::dense::symmetric_eigen;
 use palpate::numerics::neighbours::Neighbours;
 use palpate::numerics::random::Random;
-use palpate::numerics::{filters, pyramid, small, statistics};
+use palpate::numerics::{filters, pyramid, statistics, symmetric3};
 use truth::{Dense, dense, entry, invert, normals, random_blocks, sampled, voxels, with_threads};
 
 /// Shapes and steps: step dividing the shape or not, larger than it, one slice, a line.
@@ -626,19 +626,19 @@ fn reduction_averages_blocks_and_what_is_left_of_them() {
 #[test]
 fn three_by_three_inverses_invert() {
     for m in random_blocks(200, 31).iter().map(|m| m.map(f64::from)) {
-        let inverse = small::inverse(&m).unwrap();
+        let inverse = symmetric3::inverse(&m).unwrap();
         for c in 0..3 {
             let unit: [f64; 3] = std::array::from_fn(|a| f64::from(u8::from(a == c)));
-            let back = small::multiply(&m, small::multiply(&inverse, unit));
+            let back = symmetric3::multiply(&m, symmetric3::multiply(&inverse, unit));
             for a in 0..3 {
                 assert!((back[a] - unit[a]).abs() < 1e-9, "{m:?}: {back:?}");
             }
-            assert!((small::quadratic(&m, unit) - m[c]).abs() < 1e-12);
+            assert!((symmetric3::quadratic(&m, unit) - m[c]).abs() < 1e-12);
         }
     }
-    assert_eq!(small::inverse(&[1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), None);
-    assert_eq!(small::inverse(&[1.0, 1.0, -1.0, 0.0, 0.0, 0.0]), None);
-    assert_eq!(small::inverse(&[f64::NAN, 1.0, 1.0, 0.0, 0.0, 0.0]), None);
+    assert_eq!(symmetric3::inverse(&[1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), None);
+    assert_eq!(symmetric3::inverse(&[1.0, 1.0, -1.0, 0.0, 0.0, 0.0]), None);
+    assert_eq!(symmetric3::inverse(&[f64::NAN, 1.0, 1.0, 0.0, 0.0, 0.0]), None);
 }
 
 #[test]
@@ -651,10 +651,10 @@ fn cholesky_solves_and_refuses_what_is_not_positive() {
     });
     let x = [1.0, -2.0, 0.5, 3.0, -0.25];
     let b = std::array::from_fn(|r| (0..5).map(|c| a[r][c] * x[c]).sum());
-    let found = small::cholesky_solve(a, b).unwrap();
+    let found = symmetric3::cholesky_solve(a, b).unwrap();
     assert!((0..5).all(|i| (found[i] - x[i]).abs() < 1e-10), "{found:?}");
-    assert_eq!(small::cholesky_solve([[1.0, 2.0], [2.0, 1.0]], [1.0, 1.0]), None);
-    assert_eq!(small::cholesky_solve([[0.0]], [1.0]), None);
+    assert_eq!(symmetric3::cholesky_solve([[1.0, 2.0], [2.0, 1.0]], [1.0, 1.0]), None);
+    assert_eq!(symmetric3::cholesky_solve([[0.0]], [1.0]), None);
 }
 
 #[test]
@@ -764,23 +764,23 @@ fn eigenvalues_agree_with_jacobi_rotations() {
     for (size, m) in symmetric_matrices() {
         let full = [[m[0], m[3], m[4]], [m[3], m[1], m[5]], [m[4], m[5], m[2]]];
         let truth = symmetric_eigen(&full).map(|p| p.0);
-        let found = small::eigenvalues(&m);
+        let found = symmetric3::eigenvalues(&m);
         for k in 0..3 {
             assert!((found[k] - truth[2 - k]).abs() < 2e-7 * size, "{m:?}: {found:?} is not {truth:?}");
         }
     }
-    assert_eq!(small::eigenvalues(&[2.0, 2.0, 2.0, 0.0, 0.0, 0.0]), [2.0; 3]);
-    assert_eq!(small::eigenvalues(&[0.0; 6]), [0.0; 3]);
+    assert_eq!(symmetric3::eigenvalues(&[2.0, 2.0, 2.0, 0.0, 0.0, 0.0]), [2.0; 3]);
+    assert_eq!(symmetric3::eigenvalues(&[0.0; 6]), [0.0; 3]);
 }
 
 #[test]
 fn the_principal_vector_is_that_of_the_largest_eigenvalue() {
     for (size, m) in symmetric_matrices() {
-        let v = small::principal(&m);
+        let v = symmetric3::principal(&m);
         let norm = v.iter().map(|v| v * v).sum::<f64>();
         assert!((norm - 1.0).abs() < 1e-12, "{m:?}: {v:?}");
         // No unit vector has a larger quadratic form.
-        let (most, found) = (small::eigenvalues(&m)[0], small::quadratic(&m, v));
+        let (most, found) = (symmetric3::eigenvalues(&m)[0], symmetric3::quadratic(&m, v));
         assert!((found - most).abs() < 2e-7 * size, "{m:?}: {found} is not {most}");
     }
 }

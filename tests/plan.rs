@@ -4,10 +4,10 @@
 mod fixtures;
 
 use palpate::numerics::random::Random;
-use palpate::pipeline::planning::{self, PlanInputs};
+use palpate::pipeline::experimental_design::{self, PlanInputs};
 use palpate::pipeline::stiffness::{self, FieldQuality, Inputs};
 use palpate::report::plan::sentences;
-use palpate::stiffness::patches::Place;
+use palpate::stiffness::boundary_conditions::Place;
 use palpate::types::plan::{Plan, PlanParams};
 use palpate::types::stiffness::{Contact, LawChoice, Side};
 use palpate::types::{Affine, DenseField, Grid, Mask, StiffnessParams, StiffnessResult};
@@ -31,7 +31,7 @@ fn side(text: &str) -> Place {
 fn planned(labels: &Mask, params: &PlanParams, sides: [&Place; 2]) -> Plan {
     let [held, load] = sides;
     let inputs = PlanInputs { labels, held, load, names: &|l| format!("region {l}") };
-    planning::run(&inputs, params, &|_, _| {}).unwrap()
+    experimental_design::run(&inputs, params, &|_, _| {}).unwrap()
 }
 
 fn params(moduli: &[(u8, f64)]) -> PlanParams {
@@ -76,7 +76,7 @@ fn compared(
     let plan = planned(labels, &params, sides);
     let [held, load] = sides;
     let inputs = PlanInputs { labels, held, load, names: &|l| format!("region {l}") };
-    let truth = planning::simulate(&inputs, &params, press).unwrap();
+    let truth = experimental_design::simulate(&inputs, &params, press).unwrap();
     let runs: Vec<StiffnessResult> = (0..seeds)
         .map(|s| measured(&noisy(&truth.field, labels, noise, s), labels, truth.force_n, &params, sides))
         .collect();
@@ -188,7 +188,7 @@ fn a_press_within_the_noise_is_said_to_be_lost() {
     // So it is: the same field is refused.
     let [held, load] = [&sides[0], &sides[1]];
     let inputs = PlanInputs { labels: &labels, held, load, names: &|l| format!("region {l}") };
-    let truth = planning::simulate(&inputs, &asked, 0.4).unwrap();
+    let truth = experimental_design::simulate(&inputs, &asked, 0.4).unwrap();
     let field = noisy(&truth.field, &labels, 0.1, 3);
     let names = |l: u8| format!("region {l}");
     let quality = FieldQuality::default();

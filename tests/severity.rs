@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 use palpate::numerics::differences::{deformation_gradient, displacement_gradient};
-use palpate::synth::severity::{disturbed, shifted_labels};
+use palpate::synth::degradation::{disturbed, shifted_labels};
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, Trouble, phantom, troubled};
 use palpate::types::space::{Matrix3, determinant, length};
 use palpate::types::{DenseField, Grid, Mask, VoxelPoint, WorldPoint};

@@ -6,8 +6,8 @@ mod fixtures;
 use fixtures::{run as command, small_pair};
 use palpate::evaluate;
 use palpate::numerics::sampling::displacement;
+use palpate::pipeline::dry_run;
 use palpate::pipeline::field::{FieldResult, run};
-use palpate::pipeline::plan;
 use palpate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom};
 use palpate::types::params::{Interpolation, Method};
 use palpate::types::{FieldParams, Match, MotionModel};
@@ -69,7 +69,7 @@ fn points_set_the_number_of_matches() {
     let p = block(48, MotionKind::Smooth, 4.0, 0.01);
     let at = |points| {
         let params = FieldParams { points, ..sparse() };
-        let planned = plan::field(&p.initial, &p.deformed, Some(&p.mask), &params).unwrap().points;
+        let planned = dry_run::field(&p.initial, &p.deformed, Some(&p.mask), &params).unwrap().points;
         let (result, share) = measure(&p, &params);
         assert_eq!(planned, points);
         (result.summary.counts.kept, share)

@@ -5,8 +5,8 @@
 mod fixtures;
 
 use fixtures::{palpate, text};
-use palpate::pipeline::stress::{Effort, GraspAxis, field_curves, field_run, grasp_curves};
-use palpate::pipeline::trials::{Case, Variant, posture_error};
+use palpate::pipeline::robustness::{Effort, GraspAxis, field_curves, field_run, grasp_curves};
+use palpate::pipeline::speed_accuracy::{Case, Variant, posture_error};
 use palpate::synth::{PhantomKind, PhantomParams, Trouble};
 use palpate::types::{Part, StressRun};
 use rayon::prelude::*;

@@ -4,15 +4,15 @@
 
 use palpate::mesh::tetrahedral::{Detail, Fineness, Mesher, mesh_labels};
 use palpate::numerics::random::Random;
-use palpate::pipeline::pressed::Pressed;
+use palpate::pipeline::compression_phantoms::Pressed;
 use palpate::pipeline::stiffness::{FieldQuality, Inputs, check, run};
-use palpate::stiffness::body::Body;
+use palpate::stiffness::boundary_conditions::Place;
+use palpate::stiffness::fem_body::Body;
 use palpate::stiffness::forward::{Problem, Tie};
 use palpate::stiffness::identify::State;
 use palpate::stiffness::law::Material;
-use palpate::stiffness::level::Level;
+use palpate::stiffness::mesh_problem::Level;
 use palpate::stiffness::observations::{find, from_field, from_matches, read};
-use palpate::stiffness::patches::Place;
 use palpate::synth::{PhantomKind, PhantomParams};
 use palpate::types::stiffness::{Contact, Evidence, Law, LawChoice, Side};
 use palpate::types::{
@@ -308,7 +308,7 @@ fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
     let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
     let body = Pressed::new(&params).unwrap();
     let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
-    let volume = palpate::stiffness::maps::volume(&map);
+    let volume = palpate::stiffness::fields::volume(&map);
     let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, 2500)).unwrap();
     let [held, load] = ["z+", "z-"].map(|side| Place::Side(Side::parse(side).unwrap()));
     let mut level = Level::new(&mesh, &body.phantom.truth, None, &map, &held, &load, None).unwrap();
@@ -356,7 +356,7 @@ fn meshes_of_a_body_agree_on_what_is_curved_as_the_finer_sees_it() {
     let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
     let body = Pressed::new(&params).unwrap();
     let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
-    let volume = palpate::stiffness::maps::volume(&map);
+    let volume = palpate::stiffness::fields::volume(&map);
     let [held, load] = ["z+", "z-"].map(|side| Place::Side(Side::parse(side).unwrap()));
     let level = |nodes: usize, part: f32| {
         let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, nodes)).unwrap();

@@ -8,7 +8,7 @@ use fixtures::{run, small_pair};
 use palpate::error::StrainError;
 use palpate::io;
 use palpate::numerics::random::Random;
-use palpate::numerics::small::cholesky_solve;
+use palpate::numerics::symmetric3::cholesky_solve;
 use palpate::pipeline;
 use palpate::pipeline::strain::{StrainInput, StrainParams, StrainResult};
 use palpate::strain::StrainField;

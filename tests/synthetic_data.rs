@@ -62,7 +62,7 @@ fn the_commands_of_the_readme_make_the_data_again() {
 
 #[test]
 fn the_data_can_be_measured() {
-    // Folder, largest mean error as a share of doing nothing.
+    // Folder, largest mean error as a share of that before registration.
     for (name, share) in [("calf-press", 0.5), ("slice-smooth", 0.33), ("block-press", 0.5), ("fingertip-press", 0.5)] {
         let file = |f: &str| data().join(name).join(f);
         let [initial, deformed] = ["initial.nii.gz", "deformed.nii.gz"].map(|f| io::read_volume(file(f)).unwrap());

@@ -4,7 +4,7 @@
 use palpate::error::FieldError;
 use palpate::evaluate::metrics;
 use palpate::field::composition::compose;
-use palpate::numerics::small::eigenvalues;
+use palpate::numerics::symmetric3::eigenvalues;
 use palpate::pipeline::field::run as pair;
 use palpate::pipeline::known::Known;
 use palpate::pipeline::track::{Tracker, run};

@@ -7,7 +7,7 @@ mod fixtures;
 use fixtures::{palpate, run, small_pair, text};
 use palpate::field::warp::warp_points;
 use palpate::io::{self, AffineFormat, FieldFormat, TransformSource};
-use palpate::numerics::labels::is_label_map;
+use palpate::numerics::label_detection::is_label_map;
 use palpate::numerics::random::Random;
 use palpate::numerics::sampling::{Interpolation, displacement};
 use palpate::transforms::Chain;

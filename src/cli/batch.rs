@@ -16,7 +16,7 @@ use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::Shown;
 use palpate::io::{self, read_header};
-use palpate::pipeline::plan;
+use palpate::pipeline::dry_run;
 use palpate::report::batch as report;
 use palpate::report::record::{in_summary, on_page};
 use palpate::types::batch::{Pair, PairOutcome, Status};
@@ -314,7 +314,7 @@ impl Batch<'_> {
             if state.waiting.is_empty() {
                 return None;
             }
-            // What cannot run is told at once and takes nothing.
+            // What cannot run is reported at once and costs nothing.
             let need = |i: usize| needs[i].as_ref().ok().copied().filter(|n| *n <= self.budget).unwrap_or(0);
             if let Some(at) = state.waiting.iter().position(|&i| need(i) <= state.memory) {
                 let index = state.waiting.remove(at);
@@ -340,8 +340,8 @@ impl Batch<'_> {
         if let Some(scene) = &pair.scene {
             io::read_text(scene)?;
         }
-        let field = plan::memory(&initial, &deformed);
-        Ok(field.max(if pair.labels.is_some() { plan::stiffness_memory(self.options.nodes) } else { 0 }))
+        let field = dry_run::memory(&initial, &deformed);
+        Ok(field.max(if pair.labels.is_some() { dry_run::stiffness_memory(self.options.nodes) } else { 0 }))
     }
 
     /// One pair from start to end.

@@ -89,7 +89,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     };
     let record = record.finish();
     folder.write("certificate.json", |p| io::write_json(p, &in_summary(summary(&report), &record)))?;
-    let said = "palpate: smallest displacement told from noise, mm";
+    let said = "palpate: smallest displacement above noise, mm";
     folder.write("detectable.nii.gz", |p| io::write_volume(p, &found.detectable, said))?;
     let html = page(&report)?;
     folder.write("report.html", |p| io::write_text(p, &on_page(html, &record)))?;

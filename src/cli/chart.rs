@@ -15,8 +15,8 @@ use palpate::evaluate;
 use palpate::evaluate::frontier::{is_relative, standings};
 use palpate::grasp::simulate::simulate;
 use palpate::io;
-use palpate::pipeline::pressed;
-use palpate::pipeline::trials::{self, Case, Variant};
+use palpate::pipeline::compression_phantoms;
+use palpate::pipeline::speed_accuracy::{self, Case, Variant};
 use palpate::report::frontier::{self as report, Group};
 use palpate::report::record::{in_summary, on_page};
 use palpate::types::{DenseField, Part, Scene, Trial};
@@ -153,7 +153,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (mut trials, mut groups) = (Vec::new(), Vec::new());
     if wanted(Part::Field) {
         let variants = Variant::all(*quick);
-        let spread = if case.is_empty() { trials::spread(*quick, seed.unwrap_or(1)) } else { Vec::new() };
+        let spread = if case.is_empty() { speed_accuracy::spread(*quick, seed.unwrap_or(1)) } else { Vec::new() };
         let count = (spread.len() + case.len()) as f64;
         let given = case.iter().zip(&names).map(|(c, name)| read_case(c, name, &mut Vec::new()));
         let cases = spread.iter().map(|p| Ok(Case::embedded(p)?)).chain(given);
@@ -180,12 +180,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         }
         if case.is_empty() {
             let sides = if *quick { &SIDES[..2] } else { &SIDES[..] };
-            trials.extend(trials::sizes(sides, &|f| progress.set("size", f))?);
+            trials.extend(speed_accuracy::sizes(sides, &|f| progress.set("size", f))?);
         }
     }
     if wanted(Part::Stiffness) {
         let nodes = if *quick { &NODES[..2] } else { &NODES[..] };
-        let found = pressed::stiffness_trials(PRESSED, nodes, &|f| progress.set("stiffness", f))?;
+        let found = compression_phantoms::stiffness_trials(PRESSED, nodes, &|f| progress.set("stiffness", f))?;
         groups.push(Group {
             part: Part::Stiffness,
             title: "Stiffness".into(),
@@ -195,9 +195,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         trials.extend(found);
     }
     if wanted(Part::Grasp) {
-        let mut runs = trials::grasp_trials(if *quick { 0.01 } else { 0.3 }, &|f| progress.set("grasp", f))?;
+        let mut runs = speed_accuracy::grasp_trials(if *quick { 0.01 } else { 0.3 }, &|f| progress.set("grasp", f))?;
         if let Some(peers) = &found {
-            match peers.mujoco(&simulate(&trials::exact(&Scene::reference()), &|_| {})?) {
+            match peers.mujoco(&simulate(&speed_accuracy::exact(&Scene::reference()), &|_| {})?) {
                 Ok(nearest) => runs.extend(nearest),
                 Err(e) => console.warn(&format!("left out: {e:#}")),
             }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
-/// What was typed, and how much to say. What is said cannot steer a terminal, whatever names and
+/// What was typed, and how much to print. Output cannot steer a terminal, whatever names and
 /// files hold.
 #[derive(Debug, Clone)]
 pub struct Console {
@@ -42,7 +42,7 @@ impl Console {
         &self.arguments
     }
 
-    /// Results, on stdout. What it does not take is told by [`Console::lost`] at the end: the work
+    /// Results, on stdout. What it does not take is reported by [`Console::lost`] at the end: the work
     /// goes on.
     pub fn say(&self, text: &str) {
         let lines: Vec<String> = text.trim_end().split('\n').map(plain_cells).collect();

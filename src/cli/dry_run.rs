@@ -5,7 +5,7 @@ use super::limits::bytes;
 use super::outputs::Target;
 use anyhow::Result;
 use palpate::error::Shown;
-use palpate::pipeline::plan::{FieldPlan, stiffness_memory};
+use palpate::pipeline::dry_run::{FieldPlan, stiffness_memory};
 use palpate::report::scale::{short, thousands};
 use palpate::types::{FieldParams, Grid, Mask, StiffnessParams};
 use std::path::{Path, PathBuf};

@@ -245,7 +245,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let known = knowledge.read((&fixed, &moving), [initial, deformed], inside, console, &mut warnings)?;
     if *dry_run {
         drop(progress);
-        let plan = pipeline::plan::field(&fixed, &moving, known.mask(), &params)?;
+        let plan = pipeline::dry_run::field(&fixed, &moving, known.mask(), &params)?;
         warn_all(console, &warnings);
         let volumes = [(initial, fixed.grid()), (deformed, moving.grid())];
         console.say(&dry_run::field(&volumes, &plan, &params, target, &files)?);

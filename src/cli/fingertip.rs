@@ -79,7 +79,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     text += &match pad.tabulated() {
         true => format!(
-            "  grasp        springs of unlike modulus, a table (forces off by {:.1} %)\n",
+            "  grasp        springs of different moduli, a table (forces off by {:.1} %)\n",
             100.0 * pad.profile_residual
         ),
         false => "  grasp        the hemisphere of one modulus\n".into(),

@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::Shown;
 use palpate::io::{self, Form, ImageKind, SceneOverrides, Series, TableKind};
-use palpate::pipeline::plan::memory;
+use palpate::pipeline::dry_run::memory;
 use palpate::report::info::{self, Facts};
 use palpate::report::record::command_line;
 use palpate::report::scale::{significant, thousands};
@@ -36,7 +36,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             Err(error) => unread.push(error),
         }
     }
-    // What can be read is told, whatever stands beside it.
+    // What can be read is shown, whatever stands beside it.
     if !all.is_empty() {
         let said = match options.json {
             true => serde_json::to_string_pretty(&all.iter().map(Facts::json).collect::<Vec<Value>>())?,

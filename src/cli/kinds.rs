@@ -22,7 +22,7 @@ const IMAGES: [(&str, &str); 24] = [
     ("palpate: sd of Young's modulus", "standard deviation of Young's modulus"),
     ("palpate: length of the residual", "residual of a stiffness map, mm"),
     ("palpate: regions found", "regions that stiffness has found"),
-    ("palpate: smallest displacement", "smallest displacement that is told from noise, mm"),
+    ("palpate: smallest displacement", "smallest displacement above noise, mm"),
     ("palpate: labels, warped", "label map, warped"),
     ("palpate: warped", "volume, warped"),
     ("palpate phantom: Young's modulus", "exact Young's modulus of a phantom, kPa"),

@@ -6,7 +6,7 @@ use super::inputs::name;
 use anyhow::{Result, bail};
 use palpate::error::Shown;
 use palpate::io;
-use palpate::pipeline::plan::{memory, stiffness_memory, strain_memory};
+use palpate::pipeline::dry_run::{memory, stiffness_memory, strain_memory};
 use palpate::report::scale::short;
 use palpate::types::{FieldParams, Grid};
 use std::path::Path;

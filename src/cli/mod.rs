@@ -117,7 +117,7 @@ struct Common {
     /// Threads to use [default: all cores]
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Stop after so many seconds, with nothing half-written left [default: no limit]
+    /// Stop after this many seconds, with nothing half-written left [default: no limit]
     #[arg(long, global = true, value_name = "SECONDS", value_parser = seconds)]
     timeout: Option<Duration>,
     /// Which series of a DICOM folder is meant, by its UID; of several, each folder takes one that

@@ -5,7 +5,7 @@ use super::own;
 use anyhow::{Context, Result, bail};
 use palpate::error::Shown;
 use palpate::io;
-use palpate::pipeline::trials::{Case, Variant};
+use palpate::pipeline::speed_accuracy::{Case, Variant};
 use palpate::types::grasp::GraspRun;
 use palpate::types::{FieldParams, Part, Trial};
 use std::ffi::OsString;

@@ -11,7 +11,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use palpate::error::Shown;
 use palpate::io;
-use palpate::pipeline::planning::{self, PlanInputs};
+use palpate::pipeline::experimental_design::{self, PlanInputs};
 use palpate::report::plan::{PlanReport, page, summary, text};
 use palpate::report::record::{in_summary, on_page};
 use palpate::types::plan::PlanParams;
@@ -160,7 +160,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let record = Recording::start(console, inputs);
     let names = |label: u8| named[label as usize].clone();
     let inputs = PlanInputs { labels: &labels, held: &held, load: &load, names: &names };
-    let plan = planning::run(&inputs, &params, &|stage, part| progress.set(stage, part)).with_context(|| name(path))?;
+    let plan = experimental_design::run(&inputs, &params, &|stage, part| progress.set(stage, part))
+        .with_context(|| name(path))?;
 
     progress.set("write", 1.0);
     let file = name(path);

@@ -28,7 +28,7 @@ struct Again {
     common: Common,
 }
 
-/// Flags that are not those of the run: what is said.
+/// Flags that are not those of the run: the message.
 const SAID: [&str; 4] = ["--quiet", "--verbose", "-v", "--dry-run"];
 
 /// The flag with which a command writes into a folder that is not empty.

@@ -17,7 +17,7 @@ use palpate::pipeline;
 use palpate::pipeline::stiffness::{ENOUGH, FieldQuality, Inputs, inside};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
-use palpate::stiffness::patches::Place;
+use palpate::stiffness::boundary_conditions::Place;
 use palpate::types::stiffness::{LawChoice, Side};
 use palpate::types::{
     DenseField, ErrorSamples, Grid, Mask, MotionModel, SparseField, StiffnessParams, StiffnessResult, Trust, Volume,

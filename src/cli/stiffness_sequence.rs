@@ -30,7 +30,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
 
     let progress = console.progress();
     progress.set("read", 0.0);
-    // What is damaged is told before any work; a frame's matches are read again in its turn.
+    // Damaged files are reported before any work; a frame's matches are read again in its turn.
     frames.iter().try_for_each(|(_, path, _)| matches_beside(path).map(drop))?;
     let grid = *io::read_field(&frames[0].1)?.grid();
     let setting = Setting::read(options, params, body, &grid, &frames[0].1)?;

@@ -10,9 +10,9 @@ use palpate::error::Shown;
 use palpate::error::UnknownName;
 use palpate::evaluate::stated::stated;
 use palpate::io;
-use palpate::pipeline::stress::{self, Effort, GraspAxis, StiffnessAxis};
+use palpate::pipeline::robustness::{self, Effort, GraspAxis, StiffnessAxis};
 use palpate::report::record::{in_summary, on_page};
-use palpate::report::stress as report;
+use palpate::report::robustness as report;
 use palpate::synth::Trouble;
 use palpate::types::{Part, names};
 use std::time::Instant;
@@ -98,15 +98,15 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut curves = Vec::new();
     let troubles = picked(axis, &field_axes());
     if wanted(Part::Field) && !troubles.is_empty() {
-        curves.extend(stress::field_curves(&effort, &troubles, &|f| progress.set("field", f)));
+        curves.extend(robustness::field_curves(&effort, &troubles, &|f| progress.set("field", f)));
     }
     let axes = picked(axis, &StiffnessAxis::ALL);
     if wanted(Part::Stiffness) && !axes.is_empty() {
-        curves.extend(stress::stiffness_curves(&effort, *quick, &axes, &|f| progress.set("stiffness", f))?);
+        curves.extend(robustness::stiffness_curves(&effort, *quick, &axes, &|f| progress.set("stiffness", f))?);
     }
     let axes = picked(axis, &GraspAxis::ALL);
     if wanted(Part::Grasp) && !axes.is_empty() {
-        curves.extend(stress::grasp_curves(&effort, &axes, &|f| progress.set("grasp", f)));
+        curves.extend(robustness::grasp_curves(&effort, &axes, &|f| progress.set("grasp", f)));
     }
     let of_field = || curves.iter().filter(|c| c.part == Part::Field).flat_map(|c| &c.runs);
     let field = of_field().next().map(|_| stated(of_field()));

@@ -22,10 +22,10 @@ use palpate::io::{self, PackedField, Series, Stored};
 use palpate::numerics::sampling::Interpolation;
 use palpate::pipeline::{
     self,
-    plan::FieldPlan,
+    dry_run::FieldPlan,
     track::{self, Frame},
 };
-use palpate::report::film::Film;
+use palpate::report::animation::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as all_warnings};
@@ -71,7 +71,7 @@ enum Source<'a> {
 impl<'a> Source<'a> {
     fn open(volumes: &'a [PathBuf]) -> Result<Self> {
         let [one] = volumes else {
-            // What is not there, or no single volume, is told before any work.
+            // A missing file, or no single volume, is reported before any work.
             let headers = volumes.iter().map(io::read_volume_header).collect::<Result<_, _>>()?;
             return Ok(Self::Files(volumes, headers));
         };
@@ -353,7 +353,7 @@ fn numbers(name: &str) -> Vec<(String, u64)> {
     parts
 }
 
-/// Part of a label outside the mask from which it is said.
+/// Part of a label outside the mask that earns a warning.
 const OUTSIDE: f64 = 0.1;
 
 /// Names the labels of which much lies outside the mask, where nothing is measured.
@@ -392,11 +392,11 @@ fn plan(
 ) -> Result<FieldPlan> {
     let (mut plan, mut refused) = (None, None);
     for frame in order(source.frames(), origin) {
-        let met = pipeline::plan::grids(reference.grid(), source.grid(frame), params);
+        let met = pipeline::dry_run::grids(reference.grid(), source.grid(frame), params);
         let tried = match met {
             Ok(()) if plan.is_none() => {
                 let volume = source.read_frame(frame, warnings)?;
-                pipeline::plan::field(reference, &volume, mask, params).map(|found| plan = Some(found))
+                pipeline::dry_run::field(reference, &volume, mask, params).map(|found| plan = Some(found))
             }
             met => met,
         };

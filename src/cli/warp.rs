@@ -10,7 +10,7 @@ use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::Shown;
 use palpate::io;
-use palpate::numerics::labels::is_label_map;
+use palpate::numerics::label_detection::is_label_map;
 use palpate::numerics::sampling::Interpolation;
 use palpate::transforms::Chain;
 use palpate::transforms::resample::{Resampled, resample};
@@ -167,12 +167,12 @@ fn ranked(path: &Path, volume: Volume) -> Result<(Volume, Vec<i64>)> {
     Ok((Volume::from_vec(*volume.grid(), ranks)?, codes))
 }
 
-/// Refuses numbers that cannot be told apart where no new one may appear, and fractions as labels.
+/// Refuses numbers that cannot be distinguished where no new one may appear, and fractions as labels.
 fn check_labels(path: &Path, volume: &Volume, interpolation: Interpolation) -> Result<()> {
     let exact = matches!(interpolation, Interpolation::Nearest | Interpolation::Label);
     if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > io::WHOLE) {
         bail!(
-            "{}: holds {v}, and numbers beyond {} cannot be told apart in single precision; give labels smaller numbers",
+            "{}: holds {v}, and numbers beyond {} are not distinct in single precision; give labels smaller numbers",
             path.shown(),
             io::WHOLE
         );

@@ -3,11 +3,11 @@
 
 use crate::numerics::ablation;
 use crate::numerics::bending::{Coupled, Smoothness, SolveReport};
-use crate::numerics::blocks::Blocks;
+use crate::numerics::block_diagonal::Blocks;
 use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
-use crate::numerics::small::{Symmetric3, cholesky_solve, multiply, quadratic};
+use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, multiply, quadratic};
 use rayon::prelude::*;
 
 /// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises

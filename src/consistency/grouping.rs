@@ -9,7 +9,7 @@
 use crate::consistency::energy::distance;
 use crate::consistency::pruning::{GATE, Measured};
 use crate::numerics::neighbours::Neighbours;
-use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, quadratic};
+use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, quadratic};
 use rayon::prelude::*;
 
 /// Neighbours about a match from which a motion is fitted.

@@ -11,8 +11,8 @@
 use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
 use crate::numerics::ablation;
-use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
 use crate::numerics::statistics::median;
+use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
 use crate::types::MotionModel;
 use crate::types::space::Matrix3;
 

@@ -2,7 +2,7 @@
 //! neighbours.
 
 use crate::numerics::neighbours::Neighbours;
-use crate::numerics::small::{Symmetric3, cholesky_solve, inverse, quadratic};
+use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, quadratic};
 use rayon::prelude::*;
 
 /// A match as pruning sees it.

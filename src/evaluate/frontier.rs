@@ -6,7 +6,7 @@ use crate::types::{Standing, Trial};
 /// Motion below this is none (mm).
 const NONE_MM: f64 = 1e-3;
 
-/// Whether errors are told as what is left of the motion: where every case has one. Else they are
+/// Whether errors are given as a part of the motion: where every case has one. Else they are
 /// means as they are.
 pub fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
     trials.into_iter().all(|t| t.nothing.is_some_and(|n| n > NONE_MM))
@@ -16,7 +16,7 @@ pub fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
 /// is set.
 ///
 /// All errors are of one kind, by [`is_relative`] over all trials. Where that holds, a case without
-/// a result counts as doing nothing; else it is left out. CPU time is that of the runs with a
+/// a result counts as no registration; else it is left out. CPU time is that of the runs with a
 /// result: what ends early was not faster. A method that has failed on some case is not on the
 /// front, since it stands there for other cases than the rest do, and one that has failed on all
 /// has neither error nor time (NaN).
@@ -49,7 +49,7 @@ fn standing(group: &[&Trial], relative: bool) -> Option<Standing> {
     let left = |t: &&&Trial| (t.error / t.nothing.unwrap_or(f64::NAN)).max(1e-6).ln();
     let error = match (done.is_empty(), relative) {
         (true, _) => f64::NAN,
-        // The logarithm of doing nothing is 0.
+        // The logarithm of no registration is 0.
         (false, true) => 100.0 * (done.iter().map(left).sum::<f64>() / group.len() as f64).exp(),
         (false, false) => mean(&done.iter().map(|t| t.error).collect::<Vec<_>>()),
     };

@@ -15,7 +15,7 @@ use crate::types::{DenseField, Grid, LabelScore, LabelScores, Mask, Overlap, Wor
 use rayon::prelude::*;
 
 /// Compares `initial` with `deformed`, warped by `field` to the grid of `initial` by nearest
-/// neighbour, and with `deformed` as it lies. All three may lie on grids of their own; beyond its
+/// neighbour, and with `deformed` as stored. All three may lie on grids of their own; beyond its
 /// grid the field's edge value counts.
 ///
 /// # Errors

@@ -54,7 +54,7 @@ pub fn rows(
     by_row.iter().enumerate().filter_map(row).collect()
 }
 
-/// Wavelengths in an octave at which a gain is told.
+/// Wavelengths in an octave at which a gain is given.
 const AN_OCTAVE: f64 = 4.0;
 
 /// The gain at evenly spaced wavelengths (mm, on a logarithmic scale): the share of the true

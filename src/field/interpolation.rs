@@ -22,7 +22,7 @@ const TOLERANCE: f64 = 1e-9;
 /// Rounding of a determinant, per unit of the coordinates that it is made of.
 const ROUNDING: f64 = 1e-15;
 
-/// Up to so many rows, cutting each with the faces costs less than finding those that an element
+/// Up to this number of rows, cutting each with the faces costs less than finding those that an element
 /// reaches in a slice.
 const FEW_ROWS: usize = 6;
 

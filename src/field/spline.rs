@@ -222,7 +222,7 @@ impl ScalarSpline {
         Self { stored: Some((stored, orientation)), ..self }
     }
 
-    /// The same, so many times as large.
+    /// The same, times a factor.
     #[must_use]
     pub(crate) fn scaled(mut self, factor: f32) -> Self {
         self.values.iter_mut().for_each(|v| *v *= factor);

@@ -5,9 +5,9 @@
 //! II.4, II.5); E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration (I.1.2).
 
 use crate::grasp::control::{Inputs, Phase};
+use crate::grasp::dynamics::{Plant, Reading};
 use crate::grasp::models::Tip;
 use crate::grasp::multipliers;
-use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;

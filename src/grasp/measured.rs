@@ -12,11 +12,11 @@ use crate::types::grasp::{GraspRun, Sample};
 use crate::types::measured::{CoursePoint, Estimate, ForcePoint, MeasuredFit, Measurements, ModelFit};
 use crate::types::{FingertipModel, Scene};
 
-/// Models that are held against measurements: with tangential deformation, without, and radial.
+/// Models that are compared with measurements: with tangential deformation, without, and radial.
 const MODELS: [FingertipModel; 3] = [FingertipModel::Parallel, FingertipModel::ParallelNormal, FingertipModel::Radial];
 /// Largest correlation of neighbours that is believed: beyond it a table says next to nothing.
 const MOST_ALIKE: f64 = 0.98;
-/// Time between samples of a run that is held against measurements (s).
+/// Time between samples of a run that is compared with measurements (s).
 const EVERY: f64 = 0.002;
 /// Steps of a fit, and the change of a logarithm at which it has settled.
 const STEPS: usize = 30;

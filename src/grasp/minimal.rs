@@ -5,9 +5,9 @@
 //! brought back onto them after each step.
 
 use crate::grasp::control::Inputs;
+use crate::grasp::dynamics::{Plant, Reading};
 use crate::grasp::integrators::{Form, System};
 use crate::grasp::models::Tip;
-use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;

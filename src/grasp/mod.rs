@@ -24,7 +24,7 @@ pub mod statics;
 
 pub mod control;
 
-pub mod plant;
+pub mod dynamics;
 
 pub mod minimal;
 
@@ -40,15 +40,15 @@ pub mod integrators;
 
 pub mod stepping;
 
-pub mod watch;
+pub mod run_checks;
 
-pub mod branch;
+pub mod equilibrium_branch;
 
 pub mod simulate;
 
 pub mod stability;
 
-pub mod freedom;
+pub mod degrees_of_freedom;
 
 pub mod pinch;
 

@@ -8,10 +8,10 @@
 //! solved by substitution.
 
 use crate::grasp::control::Inputs;
+use crate::grasp::dynamics::{Plant, Reading};
 use crate::grasp::integrators::{Form, System};
 use crate::grasp::minimal;
 use crate::grasp::models::Tip;
-use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;

@@ -2,21 +2,21 @@
 //! that can fail.
 
 use crate::error::{GraspError, SceneError, below};
-use crate::grasp::branch::{Branch, Look, STRIDE};
 use crate::grasp::control::{Phase, SAME, Schedule};
+use crate::grasp::dynamics::{Plant, Reading};
+use crate::grasp::equilibrium_branch::{Branch, Look, STRIDE};
 use crate::grasp::friction::Friction;
 use crate::grasp::integrators::{Form, Rk4, SemiImplicitEuler, Stepper, System, dormand_prince};
 use crate::grasp::minimal::Minimal;
 use crate::grasp::models::{self, Tip};
 use crate::grasp::multipliers::Multipliers;
-use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::relaxing::Relaxing;
+use crate::grasp::run_checks::{LASTING, Watch};
 use crate::grasp::sliding::{self, Sliding};
 use crate::grasp::stability;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
 use crate::grasp::stepping::{self, LIMIT};
 use crate::grasp::tabulated::Tabulated;
-use crate::grasp::watch::{LASTING, Watch};
 use crate::types::grasp::{ConstraintDrift, Event, EventKind, GraspRun, MotionRow, Sample};
 use crate::types::scene::{Formulation, Integrator, Method};
 use crate::types::{FingertipModel, Scene};

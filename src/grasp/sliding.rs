@@ -7,11 +7,11 @@
 
 use crate::grasp::constraints::{Coordinates, Geometry};
 use crate::grasp::control::Inputs;
+use crate::grasp::dynamics::{Plant, Reading};
 use crate::grasp::friction::Friction;
 use crate::grasp::integrators::System;
 use crate::grasp::minimal;
 use crate::grasp::models::Tip;
-use crate::grasp::plant::{Plant, Reading};
 use crate::grasp::relaxing;
 
 /// Entries of a state: those of the form with branches, then the places from which d_t is counted

@@ -3,7 +3,7 @@
 //!
 //! Each model is judged at its own stationary pose next to the parallel model's equilibrium: with
 //! friction that holds, without friction, and without friction and weight. Where there is none
-//! within a radius, that is said.
+//! within a radius, the result says so.
 
 use crate::grasp::models::{Curvature, Gradient, Tilt, Tip, in_range, tips_of};
 use crate::grasp::statics::{Equilibrium, Statics};

@@ -2,11 +2,11 @@
 //! keeps it at 1.
 
 use crate::grasp::control::Phase;
+use crate::grasp::dynamics::Plant;
 use crate::grasp::integrators::{Form, Rk4, SemiImplicitEuler, Stepper};
 use crate::grasp::minimal::Minimal;
 use crate::grasp::models::{Tip, tips};
 use crate::grasp::multipliers::Multipliers;
-use crate::grasp::plant::Plant;
 use crate::grasp::relaxing::Relaxing;
 use crate::grasp::statics::Equilibrium;
 use crate::numerics::dense::spectral_radius;

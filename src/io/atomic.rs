@@ -4,7 +4,7 @@
 //! is removed when anything fails. There is no fsync: a power cut may lose the file, a full disk or
 //! a crash cannot tear it.
 
-use super::live::{Live, as_a_whole, prefix, sweep};
+use super::temporary_files::{Live, as_a_whole, prefix, sweep};
 use super::{format, os};
 use crate::error::IoError;
 use std::io::{self, BufWriter, Write};

@@ -3,7 +3,7 @@
 //! Columns are found by name, in any order and case. Every error names the file and the line.
 
 use super::atomic::write_atomic;
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::{format, markups, os, source};
 use crate::error::IoError;
 use crate::error::Shown;

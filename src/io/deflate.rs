@@ -84,7 +84,7 @@ fn deflate_block(block: &[u8], out: &mut BitWriter) {
 enum Token<'a> {
     /// At most four.
     Literals(&'a [u8]),
-    /// So many words more that equal the one before.
+    /// Number of further words that equal the one before.
     Run(usize),
 }
 
@@ -173,7 +173,7 @@ struct BitWriter {
 }
 
 impl BitWriter {
-    /// Makes room for so many bytes more.
+    /// Makes room for `bytes` more bytes.
     fn reserve(&mut self, bytes: usize) {
         self.bytes.resize(self.length + bytes, 0);
     }

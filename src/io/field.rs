@@ -10,7 +10,7 @@
 //! FSL's coordinates are voxels times the voxel size, with x counted from the far end where the
 //! affine has a positive determinant.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::image::{Format, raw_field};
 use super::nifti;
 use crate::error::{IoError, UnknownName};

@@ -5,7 +5,7 @@
 //! the first member accept.
 
 use super::deflate::{FINISH, deflate};
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use flate2::Crc;
 use flate2::bufread::GzDecoder;
 use std::io::{self, BufRead, Read, Seek, SeekFrom, Write};
@@ -106,7 +106,7 @@ pub(super) fn peek(packed: impl BufRead, length: usize) -> Vec<u8> {
     head
 }
 
-/// Unpacks at least `needed` bytes where there are so many, and checks the checksums on the way;
+/// Unpacks at least `needed` bytes where there are that many, and checks the checksums on the way;
 /// what follows the last member (padding) is ignored. Never holds more than `needed` and 1 MiB.
 pub(super) fn unpack(packed: &[u8], needed: usize) -> io::Result<Vec<u8>> {
     if let Some(data) = unpack_single(packed, needed) {

@@ -4,7 +4,7 @@
 //! The format is known by the first bytes, and by the name only for MetaImage, which has no magic.
 //! Everything comes to RAS: NRRD says which space it is in, MetaImage and DICOM are LPS.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::raw::RawImage;
 use super::{dicom, format, metaimage, nifti, nrrd, source};
 use crate::error::IoError;

@@ -1,6 +1,6 @@
 //! How much memory this process may still take.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use std::fs;
 use std::path::Path;
 

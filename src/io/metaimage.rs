@@ -2,7 +2,7 @@
 //! Coordinates are LPS, as ITK has them; each row of `TransformMatrix` is the direction of one
 //! axis. Lengths are mm.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::raw::{Packing, RawImage, Start, grid_from_lps, head, line, numbers};
 use super::voxels::Kind;
 use crate::error::IoError;

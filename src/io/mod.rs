@@ -11,7 +11,7 @@ pub mod field;
 
 pub mod nifti;
 
-mod chain;
+mod chain_errors;
 
 mod nrrd;
 
@@ -27,7 +27,7 @@ mod raw_write;
 
 mod voxels;
 
-mod flaw;
+mod format_error;
 
 pub mod csv;
 
@@ -63,7 +63,7 @@ pub mod mujoco;
 
 pub mod solid;
 
-pub mod trials;
+pub mod speed_accuracy;
 
 pub mod batch;
 
@@ -73,9 +73,9 @@ pub mod output;
 
 pub mod scratch;
 
-mod live;
+mod temporary_files;
 
-mod look;
+mod file_kind;
 
 pub mod memory;
 
@@ -88,7 +88,7 @@ mod digest;
 mod gzip;
 
 pub use batch::{make_folder, read_pairs, stamp, write_rows};
-pub use chain::write_chain;
+pub use chain_errors::write_chain;
 pub use config::read_config;
 pub use csv::{
     PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches, table_kind,
@@ -97,6 +97,7 @@ pub use csv::{
 pub use dicom::{Series as DicomSeries, series_in};
 pub use digest::{digest, files_of};
 pub use field::{FieldConvention, read_field, read_field_as, read_samples};
+pub use file_kind::{Form, columns_of, form_of};
 pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
 pub use grasp::{
     stored_motion, stored_sample, write_bands, write_energy, write_motions, write_pinch_map, write_posture_force,
@@ -106,8 +107,6 @@ pub use image::{
     ImageKind, Stored, WHOLE, count_non_finite, labels_of, read_header, read_integers, read_labels, read_mask,
     read_volume, read_volume_header,
 };
-pub use live::{Hold, abandon};
-pub use look::{Form, columns_of, form_of};
 pub use markups::{is_slicer, write_markups};
 pub use measured::{read_measured, write_measured};
 pub use memory::memory_left;
@@ -123,14 +122,15 @@ pub use scratch::Scratch;
 pub use skin::{read_skin_scene, write_response};
 pub use sofa::write_sofa;
 pub use solid::{SolidFile, write_boundary, write_element_moduli};
+pub use speed_accuracy::{write_stress, write_trials};
 pub use stiffness::{KnownMaterial, read_materials, write_feb, write_frames, write_inp, write_plan, write_regions};
 pub use strain::write_region_strains;
+pub use temporary_files::{Hold, abandon};
 pub use text::{copy, list, read_json, read_text, write_bytes, write_json, write_text};
 pub use track::{read_trajectories, write_strain, write_trajectories};
 pub use transform::{
     AffineFormat, FieldFormat, StoredTransforms, TransformSource, read_transform, write_affine, write_field_as,
 };
-pub use trials::{write_stress, write_trials};
 pub use vtu::{write_match_mesh, write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;

@@ -5,7 +5,7 @@
 //! or gzip. Spaces RAS, LAS and LPS; without any, the axes are taken as LPS, as ITK does. Lists of
 //! files, text, hex and bzip2 are errors.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::raw::{Packing, RawImage, Start, grid_from_lps, head, in_mm, line, numbers};
 use super::voxels::Kind;
 use crate::error::IoError;

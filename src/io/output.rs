@@ -1,6 +1,6 @@
 //! A folder of results that appears as a whole or not at all.
 
-use super::live::{EARLIER, Hold, Live, TEMPORARY, as_a_whole, prefix, sweep};
+use super::temporary_files::{EARLIER, Hold, Live, TEMPORARY, as_a_whole, prefix, sweep};
 use super::{format, os};
 use crate::error::IoError;
 use std::fs;

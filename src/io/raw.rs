@@ -1,6 +1,6 @@
 //! Voxels that a text header describes: in the same file after it, or in one beside it.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::gzip::{self, LARGEST_RATIO};
 use super::image::Stored;
 use super::memory::fits;
@@ -117,7 +117,7 @@ impl RawImage {
         count(&[self.grid.len(), self.components, self.kind.size()]) as u64
     }
 
-    /// The file holds at most so many bytes where all numbers need more.
+    /// The file holds at most `holds` bytes where all numbers need more.
     fn short(&self, holds: u64) -> IoError {
         let (needed, shape) = (self.needed(), self.grid.shape());
         let what = format!("needs {needed} bytes for its {shape:?} voxels but holds at most {holds}");

@@ -1,7 +1,7 @@
 //! A folder for files in between, removed when it is dropped.
 
-use super::live::{Live, prefix, sweep};
 use super::os;
+use super::temporary_files::{Live, prefix, sweep};
 use crate::error::IoError;
 use std::path::Path;
 use tempfile::{Builder, TempDir};

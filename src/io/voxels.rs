@@ -1,6 +1,6 @@
 //! How voxels are stored, in any format.
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use rayon::prelude::*;
 
 /// The type of a stored number.

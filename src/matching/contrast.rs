@@ -8,7 +8,7 @@
 use crate::numerics::filters;
 use crate::numerics::statistics::quantile;
 
-/// Intensities that are told apart.
+/// Number of intensity bins.
 const BINS: usize = 48;
 
 /// Quantiles between which they lie.

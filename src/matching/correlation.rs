@@ -121,7 +121,7 @@ impl<'a> Searchable<'a> {
         }
     }
 
-    /// As [`Searchable::line`], for so many that the sums stay in registers.
+    /// As [`Searchable::line`], for as many as keep the sums in registers.
     #[inline(always)]
     fn sums<const N: usize>(&self, template: &Template, at: [usize; 3], sums: &mut [f32; N]) {
         let [rx, ry, rz] = self.radius;

@@ -121,7 +121,7 @@ impl GainField {
         [0, AGAIN].map(|again| Self::of(pair, &sums, again))
     }
 
-    /// From the sums of the blocks, with what is left put back so many times.
+    /// From the sums of the blocks, with the remainder put back `again` times.
     fn of(pair: &Pair<'_>, sums: &[Sums], again: usize) -> Self {
         let blocks = blocks(pair);
         let centre = pair.centres.map(f64::from);

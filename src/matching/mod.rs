@@ -18,7 +18,7 @@ pub mod correlation;
 
 pub mod candidates;
 
-pub mod lsm;
+pub mod least_squares_matching;
 
 pub mod brightness;
 

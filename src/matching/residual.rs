@@ -12,11 +12,11 @@
 
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, row_step};
-use crate::numerics::blocks::Blocks;
+use crate::numerics::block_diagonal::Blocks;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::eigenvalues;
 use crate::numerics::statistics::median;
+use crate::numerics::symmetric3::eigenvalues;
 use crate::numerics::{ablation, filters, pyramid};
 use rayon::prelude::*;
 

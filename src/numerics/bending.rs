@@ -4,11 +4,11 @@
 //! derivatives (a P-spline penalty, Eilers & Marx 1996; bending energy of Rueckert et al. 1999). An
 //! affine field costs nothing.
 
-use crate::numerics::blocks::Blocks;
+use crate::numerics::block_diagonal::Blocks;
 use crate::numerics::multilevel::Coarse;
 use crate::numerics::random::Random;
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::inverse;
+use crate::numerics::symmetric3::inverse;
 use rayon::prelude::*;
 use std::ops::Range;
 

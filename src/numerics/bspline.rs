@@ -11,7 +11,7 @@ use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Sums of cells of a lattice along z that are held at a time: so many values, where that is no
+/// Sums of cells of a lattice along z that are held at a time: the number of values, where that is no
 /// fewer cells than keep the threads busy. Those of 128 cells of a lattice of 131 x 152 nodes a
 /// plane were 0.4 GB.
 const HELD: usize = 1 << 22;
@@ -246,7 +246,7 @@ impl Lattice {
         self.evaluate_planes(coefficients, 0..self.shape[2])
     }
 
-    /// The same for some planes: three planar components of so many.
+    /// The same for some planes: three planar components.
     pub fn evaluate_planes(&self, coefficients: &[f32], planes: Range<usize>) -> Vec<f32> {
         let [nx, ny, _] = self.shape;
         let total = nx * ny * planes.len();

@@ -18,7 +18,7 @@ pub mod orientation;
 
 pub mod pyramid;
 
-pub mod small;
+pub mod symmetric3;
 
 pub mod eigen;
 
@@ -30,7 +30,7 @@ pub mod ablation;
 
 pub mod banded;
 
-pub mod blocks;
+pub mod block_diagonal;
 
 pub mod bending;
 
@@ -46,13 +46,13 @@ pub mod neighbours;
 
 pub mod dense;
 
+mod partial_refactorisation;
 pub mod sparse;
-mod tail;
 
 pub mod cholesky;
 
 pub mod exponential;
+pub mod fold_removal;
 pub mod inversion;
-pub mod labels;
+pub mod label_detection;
 pub mod trig;
-pub mod unfold;

@@ -7,7 +7,7 @@
 //! eighths along each axis), so the inverse blocks of all lattices are added up.
 
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::inverse;
+use crate::numerics::symmetric3::inverse;
 use rayon::prelude::*;
 
 /// Two-scale weights of the cubic B-spline: coarse node `m` stands on fine node `2 m - 1`.

@@ -16,7 +16,7 @@
 //! Some nodes may be eliminated after all others: where a matrix changes at these alone, its factor
 //! is renewed there alone ([`Factor::renewed`]).
 
-use crate::numerics::tail::Tail;
+use crate::numerics::partial_refactorisation::Tail;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::ldlt::factor::LdltRegularization;
 use faer::perm::PermRef;

@@ -62,7 +62,7 @@ pub fn empty(volume: &Voxels<'_>, least: f32) -> Option<f32> {
     filled_with(volume.as_slice(), value).then_some(value)
 }
 
-/// Whether so many voxels hold a value that they are a background.
+/// Whether enough voxels hold a value to be a background.
 pub fn filled_with(values: &[f32], value: f32) -> bool {
     held(values, value) as f64 >= BACKGROUND * values.len() as f64
 }

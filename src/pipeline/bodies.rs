@@ -533,7 +533,7 @@ impl Trial {
     }
 }
 
-/// Voxels along an axis that a Gaussian of so many stands for: those of a box of the same noise.
+/// Voxels along an axis that a Gaussian of this width stands for: those of a box of the same noise.
 fn window(width: f64) -> f64 {
     2.0 * std::f64::consts::PI.sqrt() * width
 }

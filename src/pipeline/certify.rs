@@ -7,8 +7,8 @@ use crate::evaluate::waves::{Row, cut_off, gains, rows};
 use crate::field::jacobian::count_folds;
 use crate::matching::levels::foreground;
 use crate::numerics::statistics::{noise_sigma, robust_deviation};
-use crate::pipeline::check;
 use crate::pipeline::field::{self, Clock, FieldResult, Progress};
+use crate::pipeline::input_checks;
 use crate::pipeline::strain::{self, StrainInput, StrainParams};
 use crate::strain::StrainField;
 use crate::strain::gauge::Gauge;
@@ -33,12 +33,12 @@ pub struct CertifyInput<'a> {
     pub like: Option<&'a DenseField>,
 }
 
-/// A certificate, with the smallest displacement that is told from noise at each voxel (mm).
+/// A certificate, with the smallest displacement above noise at each voxel (mm).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Certified {
     /// The numbers.
     pub certificate: Certificate,
-    /// Smallest displacement along an axis that is told from noise, 95 % of the time (mm).
+    /// Smallest displacement along an axis detected above noise, 95 % of the time (mm).
     pub detectable: Volume,
     /// Where there is tissue.
     pub tissue: Mask,
@@ -53,10 +53,10 @@ const STRETCH: f64 = 0.02;
 /// Normal deviations that 95 % of the errors lie within.
 const NORMAL_95: f64 = 1.96;
 
-/// Gauges whose noise is told, in units of the shortest.
+/// Gauges whose noise is given, in units of the shortest.
 const GAUGES: [usize; 7] = [1, 2, 3, 4, 6, 8, 12];
 
-/// Of a wavelength, the gauge over which strain is told: a mean over a quarter of a wave keeps 90 %
+/// Of a wavelength, the gauge over which strain is taken: a mean over a quarter of a wave keeps 90 %
 /// of its amplitude.
 const GAUGE_OF_WAVE: f64 = 0.25;
 
@@ -101,7 +101,7 @@ impl Pairs<'_> {
 pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>) -> Result<Certified, StrainError> {
     let CertifyInput { initial, second, mask, like } = input;
     let grid = *initial.grid();
-    check::mask_grid(initial, mask)?;
+    input_checks::mask_grid(initial, mask)?;
     for (what, other) in
         [("the second scan", second.map(|s| s.grid())), ("the measured motion", like.map(|l| l.grid()))]
     {
@@ -330,7 +330,7 @@ fn warnings(gains: &[[f64; 2]], cut: Option<f64>, moved: Option<&FieldSummary>) 
         (Some(first), _, Some(cut)) if cut <= first[0] => out.push(format!(
             "even the shortest wave, {cut:.1} mm, came back to 90 %: the true limit is shorter"
         )),
-        (None, ..) => out.push("the tissue is too small for any wave: no resolution can be told".into()),
+        (None, ..) => out.push("the tissue is too small for any wave: the resolution is unknown".into()),
         _ => {}
     }
     if let Some(moved) = moved {

@@ -12,18 +12,18 @@ use crate::numerics::orientation::Orientation;
 use crate::numerics::statistics::quantile;
 use crate::pipeline::background;
 use crate::pipeline::bodies::{Bodies, Given};
-use crate::pipeline::check::{self, Checked};
-use crate::pipeline::conclusion::{Concluded, labelled};
+use crate::pipeline::body_models::{Concluded, labelled};
+use crate::pipeline::brightness::Light;
 use crate::pipeline::contrast::{self, Common};
-use crate::pipeline::finer::{self, Explained, finer, uneven, unlike};
 pub use crate::pipeline::hypotheses::Start;
 use crate::pipeline::hypotheses::{Begun, NEAR, Search};
+use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::known::{Known, StartMap, Turned};
 use crate::pipeline::landmarks;
+use crate::pipeline::last_passes;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
-use crate::pipeline::light::Light;
-use crate::pipeline::polish;
-use crate::pipeline::rest::Rest;
+use crate::pipeline::local_model::Rest;
+use crate::pipeline::refinement::{self, Explained, finer, uneven, unlike};
 use crate::pipeline::sparse;
 use crate::pipeline::stages::{self, Left, Stage};
 use crate::pipeline::start::{self, Begin};
@@ -78,7 +78,7 @@ impl FieldResult {
         self.node_matches.iter().map(|&i| kept[i as usize]).collect()
     }
 
-    /// The displacement once more, from what it is worked out from.
+    /// The displacement, evaluated again from its coefficients.
     pub(super) fn dense(&self, interpolation: Interpolation) -> Result<DenseField, FieldError> {
         interpolated(interpolation, self.coefficients.dense()?, (&self.mesh, &self.node_displacement))
     }
@@ -161,7 +161,7 @@ pub fn run_from(
     starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    check::known(initial, deformed, known, params)?;
+    input_checks::known(initial, deformed, known, params)?;
     let begun = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
     let moved = deformed.view().placed(begun.grid(deformed.grid())?)?;
     let orientations = [initial, &moved].map(|v| Orientation::of(v.grid()));
@@ -184,7 +184,7 @@ pub fn run_lent(
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<(FieldResult, [Volume; 2]), FieldError> {
-    check::known(&initial, &deformed, known, params)?;
+    input_checks::known(&initial, &deformed, known, params)?;
     let begun = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
     let placed = *deformed.grid();
     let deformed = deformed.placed(begun.grid(&placed)?)?;
@@ -240,11 +240,11 @@ fn canonical(
     let mut clock = Clock::start();
     let masked = known.mask.is_some();
     let [initial, deformed] = match ablation::is_on("robust-range") {
-        true => [&initial, &deformed].map(check::tamed),
+        true => [&initial, &deformed].map(input_checks::tamed),
         false => [&initial, &deformed].map(Voxels::view),
     };
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
-        check::inputs(&initial, &deformed, known.mask)?;
+        input_checks::inputs(&initial, &deformed, known.mask)?;
     let not_finite = known.not_finite(not_finite, [&initial, &deformed]);
     let mask = known.counted(mask);
     let grid = *initial.grid();
@@ -342,18 +342,18 @@ fn canonical(
         bodies.twice(&pair, params.seed);
         clock.book("residual");
     }
-    let next = polish::next_finer(&grid, finest, params).filter(|&next| any_free && next != factor);
+    let next = last_passes::next_finer(&grid, finest, params).filter(|&next| any_free && next != factor);
     if let Some(next) = next {
         pair = light.level(&aligned, next);
         clock.book("pyramid");
         let tick = |p: usize| progress("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-        let nodes = polish::WIDEST.min(2 * apart);
-        bodies = polish::polish((&pair, next, nodes), (&bodies, factor), params, tick);
+        let nodes = last_passes::WIDEST.min(2 * apart);
+        bodies = last_passes::polish((&pair, next, nodes), (&bodies, factor), params, tick);
         if let Some(given) = &given {
             bodies.relabel(given.on(pair.shape, next));
         }
         factor = next;
-        evidence.push(polish::why(&pair, nodes, params));
+        evidence.push(last_passes::why(&pair, nodes, params));
         clock.book("residual");
     }
     let rejected = concluded.iter().any(|c| c.choice.rejected);
@@ -380,7 +380,7 @@ fn canonical(
     drop(aligned);
     clock.book("uncertainty");
 
-    // Given borders are not in doubt.
+    // Given borders are certain.
     let jumps = if given.is_some() { Vec::new() } else { coefficients.jumps(&mask) };
     let mut variances = variances.with_borders(jumps, factor);
     let doubted = begun.doubted();
@@ -455,8 +455,8 @@ fn canonical(
             .chain(common.as_ref().map(Common::said))
             .chain(said_of_landmarks)
             .chain(said_of_model(rejected))
-            .chain(check::said_of(&lost))
-            .chain(check::squeezed(&displacement, &mask))
+            .chain(input_checks::said_of(&lost))
+            .chain(input_checks::squeezed(&displacement, &mask))
             .chain(doubted.map(in_doubt))
             .chain(unlike)
             .chain(uneven(gain))
@@ -482,7 +482,7 @@ fn canonical(
     })
 }
 
-/// Refuses what few features bear out: where few of the features `seen` agreed in the search of the
+/// Refuses what few features support: if few of the features `seen` agreed in the search of the
 /// whole and few of the matches survive, `kept` of `found`; past the range of the search (`far`)
 /// either will do, the first one where the volumes stay `unlike`.
 fn no_measurement((kept, found): (usize, usize), seen: Counts, (far, unlike): (bool, bool)) -> Result<(), FieldError> {
@@ -605,7 +605,7 @@ impl<'a> CoarseToFine<'a, '_> {
             let mut pair = light.level(aligned, factor);
             clock.book("pyramid");
             let done = |part: f64| (l as f64 + part) / (self.factors.len() as f64 + 1.0);
-            let apart = if last { finer::apart(params.node_spacing, pair.inside) } else { COARSE };
+            let apart = if last { refinement::apart(params.node_spacing, pair.inside) } else { COARSE };
             let lattice = level::lattice(&pair, apart);
             let passes = if last { params.passes } else { params.coarse_passes };
             let tick = |p: usize| progress("residual", done(0.1 + 0.8 * (p + 1) as f64 / passes as f64));
@@ -746,7 +746,7 @@ impl<'a> CoarseToFine<'a, '_> {
     }
 
     /// Where the passes of the coarsest level begin: inside the mask, with all tissue `around` it
-    /// where few features agree there, and twice as far where the motion reaches the range or few
+    /// if few features agree there, and twice as far if the motion reaches the range or few
     /// agree.
     fn begin(
         &self,
@@ -775,14 +775,14 @@ impl<'a> CoarseToFine<'a, '_> {
     }
 }
 
-/// How far is searched where few features agree or the motion reaches the range, in ranges.
+/// How far is searched if few features agree or the motion reaches the range, in ranges.
 const TWICE: f64 = 2.0;
 
 /// What a search twice as far gave, in words.
 fn why_farther(range: f64, own: &Begun, wide: &Begun, taken: bool) -> String {
-    let open = if own.agrees_on_few() { "where few agree" } else { "which the motion reaches" };
+    let open = if own.agrees_on_few() { "few features agree" } else { "the motion reaches its end" };
     format!(
-        "search range: {range:.1} mm was looked over, {open} ({:.0} % of the features agree); over {:.1} mm: {:.0} % of the features agree, {}",
+        "search range: within {range:.1} mm {open} ({:.0} % of the features agree); within {:.1} mm {:.0} % agree, {}",
         100.0 * own.share(),
         TWICE * range,
         100.0 * wide.share(),
@@ -890,9 +890,9 @@ pub(super) fn too_few(
             100.0 * agreement
         ),
         _ if params.search_mm == 0.0 => {
-            format!("{search} mm were looked over: if the tissue moved further, widen --search")
+            format!("the search range was {search} mm: if the tissue moved further, widen --search")
         }
-        _ => format!("{search} mm were looked over: give --landmarks, or a start with --initial"),
+        _ => format!("the search range was {search} mm: give --landmarks, or a start with --initial"),
     };
     no_match(found, hint)
 }
@@ -1052,7 +1052,7 @@ pub(super) fn lengths(field: &DenseField, mask: &Mask) -> (f64, f64, usize) {
     (sum / n.max(1) as f64, f64::from(top), n)
 }
 
-/// Tissue without texture from which it is said: pairs made from scans of heads, legs and a spine
+/// Part of the tissue without texture that earns a warning: pairs made from scans of heads, legs and a spine
 /// have 0 to 8 %, legs in slices four times as thick as their voxels are wide 10.
 const PLAIN: f64 = 0.1;
 
@@ -1067,7 +1067,7 @@ pub(super) fn without_texture(share: f64) -> Option<String> {
     })
 }
 
-/// Tissue outside the deformed volume from which it is said.
+/// Part of the tissue outside the deformed volume that earns a warning.
 const OUT_OF_VIEW: f64 = 0.05;
 
 /// Says so where much of the tissue is not in the deformed volume.

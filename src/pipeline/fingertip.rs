@@ -4,9 +4,9 @@ use crate::error::{FingertipError, ParamError, StiffnessError};
 use crate::fingertip::{against_plate, columns, force, reduce};
 use crate::mesh::tetrahedral::{Fineness, mesh_labels};
 use crate::pipeline::stiffness::Progress;
-use crate::stiffness::body::Body;
-use crate::stiffness::maps;
-use crate::stiffness::plate::{Press, base};
+use crate::stiffness::contact::{Press, base};
+use crate::stiffness::fem_body::Body;
+use crate::stiffness::fields;
 use crate::types::fingertip::{Column, PadReduction, StiffnessFolder, StiffnessRegion};
 use crate::types::stiffness::Side;
 use crate::types::{Mask, Volume};
@@ -72,7 +72,7 @@ impl PadOutcome {
         self.at_press.map(|[depth, _]| force(&self.columns, depth))
     }
 
-    /// What is to be said of it: tissue of `folder` that is known by a bound alone, and elements
+    /// Warnings about it: tissue of `folder` that is known by a bound alone, and elements
     /// that could not be solved.
     pub fn warnings(&self, folder: &StiffnessFolder) -> Vec<String> {
         let vague = vague(folder).into_iter().map(|name| {
@@ -94,7 +94,7 @@ impl PadOutcome {
                 let pad = against_plate(self.pad.clone(), &self.columns, curve, nodes);
                 let press = self.at_press.map(|[depth, _]| (depth, pad.plate.as_ref().and_then(|p| p.at(depth))));
                 match press {
-                    // What ends before the press cannot be held against the force that was measured
+                    // What ends before the press cannot be compared with the force that was measured
                     // there.
                     Some((_, None)) => self.failure = Some(StiffnessError::NoEquilibrium),
                     Some((depth, Some(force))) => (self.at_press, self.pad) = (Some([depth, force]), pad),
@@ -124,7 +124,7 @@ impl Elements<'_> {
     fn forces(&self, depths: &[f64], progress: Progress<'_>) -> Result<(Vec<[f64; 2]>, usize), StiffnessError> {
         progress("mesh", 0.0);
         let (labels, moduli) = classes(self.map, self.bone);
-        let mesh = mesh_labels(&labels, &Fineness::for_nodes(maps::volume(&labels), self.nodes))?;
+        let mesh = mesh_labels(&labels, &Fineness::for_nodes(fields::volume(&labels), self.nodes))?;
         let body = Body::new(&mesh)?;
         let of_class: Vec<f64> = body.labels.iter().map(|&l| moduli[l as usize - 1]).collect();
         let side = self.held.map(|side| base(&body, side, self.map.grid().least_spacing()));
@@ -196,7 +196,7 @@ pub fn run(
     Ok(PadOutcome { at_press: known.map(|d| [d, force(&columns, d)]), pad, failure: None, columns })
 }
 
-/// A region that is so many times stiffer than the softest holds as a back plate.
+/// A region that is this many times stiffer than the softest holds as a back plate.
 const HARD: f64 = 20.0;
 
 /// Names of hard parts.

@@ -4,7 +4,7 @@ use crate::error::GraspError;
 use crate::grasp::models;
 use crate::grasp::simulate::{self, simulate};
 use crate::grasp::statics::Statics;
-use crate::grasp::{freedom, measured, pinch, posture, stability, stepping};
+use crate::grasp::{degrees_of_freedom, measured, pinch, posture, stability, stepping};
 use crate::types::grasp::{Bands, GraspAnalysis, GraspRun, MotionRow, Sample, StableStep};
 use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::scene::{Push, SweepCase};
@@ -177,7 +177,7 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
         }
     }
     book("stability", 0.2);
-    let freedom = freedom::table(&soft);
+    let freedom = degrees_of_freedom::table(&soft);
     book("freedom", 0.25);
     let push = simulate(&pushed(&soft), &|_| {})?;
     book("push", 0.3);

@@ -50,7 +50,7 @@ impl Start {
     }
 }
 
-/// All is searched again after so many frames, whatever confirms the field.
+/// Frames after which all is searched again, whatever confirms the field.
 const FOLLOWED: usize = 5;
 
 /// Voxels of a level's mask for each feature, where a whole volume is searched; a quarter of it in
@@ -209,7 +209,7 @@ impl Search<'_> {
     ///
     /// A known field that the features confirm is enough, but all is searched again every few
     /// frames. Else the field of the matches (stillness, where there are none) and, where these are
-    /// in doubt, the known fields compete, and the one that ends at the better agreement goes on. A
+    /// unsure, the known fields compete, and the one that ends at the better agreement goes on. A
     /// known field that goes on is refined twice: it begins with the noise of another frame.
     pub fn begin(
         &self,
@@ -242,7 +242,7 @@ impl Search<'_> {
         let own = refined(own.into());
         let in_doubt = counts.kept_share() < LOOSE || counts.kept < ENOUGH;
         let given = known.iter().any(Start::is_given);
-        // Where few features agree, landmarks decide.
+        // If few features agree, landmarks decide.
         let marked = counts.kept_share() < BORNE_OUT && !pair.anchors.is_empty();
         let beats = |known: &Bodies| match marked {
             true => landmarks::gained(pair, &own, known) > 0.0,
@@ -253,7 +253,7 @@ impl Search<'_> {
         Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }
 
-    /// The field of the matches of a whole volume; none where these are too few. Where few features
+    /// The field of the matches of a whole volume; none where these are too few. If few features
     /// agree they are sought again about the rigid motion that most agree on, for as long as no
     /// fewer agree there: patches that turned by much are hardly alike.
     fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {

@@ -2,7 +2,7 @@
 //! places that were marked in both.
 
 use crate::numerics::orientation::Orientation;
-use crate::pipeline::check::drawn_on;
+use crate::pipeline::input_checks::drawn_on;
 use crate::types::{Landmark, Mask, Voxels, WorldPoint};
 
 /// A map from the initial to the deformed volume (world mm, RAS); none where it has no value.
@@ -67,7 +67,7 @@ impl<'a> Known<'a> {
     }
 }
 
-/// The masks of [`Known`], turned as the volumes are; none where one is right as it lies.
+/// The masks of [`Known`], turned as the volumes are; none where one is right as stored.
 pub(super) struct Turned {
     masks: [Option<Mask>; 3],
 }

@@ -52,7 +52,7 @@ fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
 }
 
-/// The scale of the weights with so many passes to come after this one: it falls by [`FALLS`] from
+/// The scale of the weights, by the passes `to_come` after this one: it falls by [`FALLS`] from
 /// pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and Zisserman
 /// 1987), and holds in the last [`SETTLING`].
 fn scale(to_come: usize) -> f64 {
@@ -66,12 +66,12 @@ pub(super) fn reach(pair: &Pair<'_>, field: &SplineField) -> f64 {
     if all.is_empty() { 0.0 } else { 2.0 * f64::from(median(&mut all)) }
 }
 
-/// Whether the passes may end with so many to come: the weights are final.
+/// Whether the passes may end with `to_come` left: the weights are final.
 pub(super) fn are_settled(pair: &Pair<'_>, to_come: usize) -> bool {
     pair.anchors.is_empty() || to_come < SETTLING
 }
 
-/// Adds what the landmarks pull with to a pass with so many to come after it.
+/// Adds what the landmarks pull with to a pass with `to_come` passes after it.
 pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalEquations, to_come: usize) {
     let at = |p| field.lattice.at(&field.coefficients, p);
     let scale = scale(to_come);

@@ -10,18 +10,18 @@ use crate::features::{self, Corner, HarrisParams};
 use crate::matching::candidates::{CandidateParams, Side, candidates};
 use crate::matching::correlation::Searchable;
 use crate::matching::gain::GainField;
+use crate::matching::least_squares_matching::{self, Refined, Template};
 use crate::matching::levels::from_level;
-use crate::matching::lsm::{self, Refined, Template};
 use crate::matching::pair::Pair;
 use crate::matching::residual::{self, Baseline, normal_equations};
 use crate::numerics::bending::{Coupled, Smoothness};
-use crate::numerics::blocks::Blocks;
+use crate::numerics::block_diagonal::Blocks;
 use crate::numerics::bspline::Lattice;
+use crate::numerics::fold_removal::unfold;
 use crate::numerics::sampling::nearest;
 use crate::numerics::simd::dispatch;
-use crate::numerics::small::{Symmetric3, inverse};
 use crate::numerics::statistics::median;
-use crate::numerics::unfold::unfold;
+use crate::numerics::symmetric3::{Symmetric3, inverse};
 use crate::numerics::{ablation, filters, pyramid};
 use crate::pipeline::landmarks;
 use crate::types::{Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
@@ -93,7 +93,7 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each
 /// axis).
 pub(super) fn independent(pair: &Pair<'_>) -> f32 {
-    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / lsm::CORRELATION as f32)
+    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / least_squares_matching::CORRELATION as f32)
 }
 
 /// How much of the last step is carried into the next where that goes on the same way (heavy ball,
@@ -246,12 +246,12 @@ pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
     coupling::determined(&matrix, seed, 30).iter().sum::<f64>().max(12.0)
 }
 
-/// Voxels of the finest axis between the places about which a map is held against the free field,
+/// Voxels of the finest axis between the places about which a map is compared with the free field,
 /// and a field against stillness. Errors of 24 pairs were the same at 8, 12 and 16 within a
 /// hundredth.
 const WINDOW: usize = 12;
 
-/// The places about which a map is held against the free field.
+/// The places about which a map is compared with the free field.
 pub fn windows(pair: &Pair<'_>) -> Lattice {
     lattice(pair, WINDOW)
 }
@@ -368,7 +368,7 @@ fn resampled(from: &Lattice, values: &[f32], to: &Lattice, place: impl Fn([f64; 
 pub struct MatchParams {
     /// Features wanted in the initial volume; up to five times as many in the deformed one.
     pub points: usize,
-    /// Whether just so many were asked for: then corners are sought voxel by voxel even where there
+    /// Whether the number was asked for: then corners are sought voxel by voxel even where there
     /// is room for blocks.
     pub thorough: bool,
     /// Reach of the search about the known field (mm).
@@ -489,11 +489,11 @@ pub fn matches(
             let mut found = match &warped {
                 Some(w) => {
                     let patch = |shift, out: &mut [f32]| trilinear_patch(w, shape, place(shift), radius, out);
-                    lsm::refine(&template, initial[i].centre, patch, 3, 2.0)
+                    least_squares_matching::refine(&template, initial[i].centre, patch, 3, 2.0)
                 }
                 None => {
                     let patch = |shift, out: &mut [f32]| pair.sampler().patch(place(shift), radius, out);
-                    lsm::refine(&template, initial[i].centre, patch, 6, 2.0)
+                    least_squares_matching::refine(&template, initial[i].centre, patch, 6, 2.0)
                 }
             }?;
             if !params.sub_voxel {
@@ -568,7 +568,7 @@ pub(super) fn follow(
         let centre = std::array::from_fn(|a| (voxel[a].round().max(0.0) as usize).min(pair.shape[a] - 1));
         let place = |o: [f32; 3]| std::array::from_fn(|a| centre[a] as f32 + o[a]);
         let patch = |shift, out: &mut [f32]| trilinear_patch(&warped, pair.shape, place(shift), radius, out);
-        let found = lsm::refine(&template, centre, patch, 3, 2.0)?;
+        let found = least_squares_matching::refine(&template, centre, patch, 3, 2.0)?;
         let field = known.lattice.at(&known.coefficients, voxel);
         let measured = Measured {
             place: std::array::from_fn(|a| voxel[a] * pair.spacing[a]),
@@ -631,7 +631,7 @@ pub(super) fn calibrate(measured: &mut [Measured], kept: &[bool]) {
         .filter(|(_, k)| **k)
         .filter_map(|(m, _)| {
             let e = std::array::from_fn(|a| m.displacement[a] - m.field[a]);
-            Some(crate::numerics::small::quadratic(&in_plane(&m.covariance)?, e) as f32)
+            Some(crate::numerics::symmetric3::quadratic(&in_plane(&m.covariance)?, e) as f32)
         })
         .collect();
     if q.len() < 20 {

@@ -8,7 +8,7 @@ pub mod field;
 
 pub mod level;
 
-pub mod check;
+pub mod input_checks;
 
 pub mod known;
 
@@ -16,7 +16,7 @@ pub mod start;
 
 pub mod stages;
 
-pub mod plan;
+pub mod dry_run;
 
 pub mod grasp;
 
@@ -36,28 +36,28 @@ pub mod stiffness_sequence;
 
 pub mod boundary;
 
-pub mod planning;
+pub mod experimental_design;
 
 pub mod cpu;
 
-pub mod trials;
+pub mod speed_accuracy;
 
-pub mod pressed;
+pub mod compression_phantoms;
 
-pub mod stress;
+pub mod robustness;
 
 mod background;
 mod bodies;
-mod conclusion;
+mod body_models;
+mod brightness;
 mod contrast;
-mod course;
-mod finer;
 mod hypotheses;
 mod landmarks;
-mod light;
-mod modes;
-mod polish;
-mod rest;
-mod search;
+mod last_passes;
+mod local_model;
+mod refinement;
 mod sparse;
+mod stiffness_regions;
+mod temporal_outliers;
+mod temporal_pca;
 mod uncertainty;

@@ -24,7 +24,7 @@ pub struct SkinOutcome {
     pub seconds: Vec<(String, f64)>,
 }
 
-/// Precision of the column beyond which it is said.
+/// Error of the column that earns a warning.
 const ROUGH: f64 = 1e-6;
 
 /// Refuses a scene of whose response rounding would leave no digit.

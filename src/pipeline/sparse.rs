@@ -18,20 +18,20 @@ use crate::field::spline::FieldSpline;
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::matching::residual;
-use crate::numerics::blocks::Blocks;
+use crate::numerics::block_diagonal::Blocks;
+use crate::numerics::fold_removal::unfold;
 use crate::numerics::pyramid;
-use crate::numerics::small::{inverse, quadratic};
 use crate::numerics::statistics::median;
-use crate::numerics::unfold::unfold;
+use crate::numerics::symmetric3::{inverse, quadratic};
 use crate::pipeline::background;
-use crate::pipeline::check::{self, Checked};
-use crate::pipeline::conclusion;
+use crate::pipeline::body_models;
 use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
-use crate::pipeline::finer;
 use crate::pipeline::hypotheses::{AGREED, Search};
+use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
-use crate::pipeline::rest;
+use crate::pipeline::local_model;
+use crate::pipeline::refinement;
 use crate::pipeline::stages::{self, Left};
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::*;
@@ -96,7 +96,7 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, params: &FieldParams) -> us
         .unwrap_or(params.finest.max(1))
 }
 
-/// Points wanted on a finest level with so many voxels of tissue.
+/// Points wanted on a finest level with `inside` voxels of tissue.
 pub(super) fn points(params: &FieldParams, inside: usize) -> usize {
     match params.points {
         0 => ((MORE * inside as f64 / params.voxels_per_point as f64) as usize).max(200),
@@ -126,9 +126,9 @@ pub(super) fn measure(
 ) -> Result<FieldResult, FieldError> {
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
-    let [initial, deformed] = [initial, deformed].map(check::tamed);
+    let [initial, deformed] = [initial, deformed].map(input_checks::tamed);
     let Checked { mask, initial: clean, deformed: seen, not_finite, lost, cut } =
-        check::inputs(&initial, &deformed, known.mask)?;
+        input_checks::inputs(&initial, &deformed, known.mask)?;
     let not_finite = known.not_finite(not_finite, [&initial, &deformed]);
     let mask = known.counted(mask);
     let grid = *initial.grid();
@@ -168,7 +168,7 @@ pub(super) fn measure(
     progress("model", 0.9);
     let mut choice = smallest(&matches, &pair, &field, params.seed);
     if let Some(model) = params.model.asked() {
-        choice = choice.asked(model, &rest::shown(&pair, &field, |_| true));
+        choice = choice.asked(model, &local_model::shown(&pair, &field, |_| true));
     }
     choice.evidence.insert(0, MADE_BY.into());
     choice.evidence.extend(background::why_unseen(cut));
@@ -179,17 +179,17 @@ pub(super) fn measure(
     let posterior = level::posterior(&field, pair.spacing, params.seed);
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
     let misfit = residual::misfit_by_place(&pair, &warped, &field.lattice);
-    let hidden = conclusion::hidden(&pair, &field);
+    let hidden = body_models::hidden(&pair, &field);
     clock.book("uncertainty");
 
-    let full = conclusion::full_lattice(&grid, &field, factor, (&choice, factor));
-    let departure = conclusion::departure(&full, &field, factor, choice.rejected);
+    let full = body_models::full_lattice(&grid, &field, factor, (&choice, factor));
+    let departure = body_models::departure(&full, &field, factor, choice.rejected);
     let narrowed = vec![1.0; departure.len()];
     let nodes =
         AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
     let mut variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
     let searched = reports.first().map_or(1.0, |r| r.counts.kept_share());
-    let unlike = finer::unlike(&pair, level::misfit(&pair, &warped)[0]);
+    let unlike = refinement::unlike(&pair, level::misfit(&pair, &warped)[0]);
     if searched < AGREED && unlike.is_some() {
         variances = variances.with_other_motions(searched, search);
     }
@@ -246,8 +246,8 @@ pub(super) fn measure(
         warnings: field::warnings(counts, folds, not_finite, max_mm, search)
             .into_iter()
             .chain(field::said_of_model(choice.rejected))
-            .chain(check::said_of(&lost))
-            .chain(check::squeezed(&displacement, &mask))
+            .chain(input_checks::said_of(&lost))
+            .chain(input_checks::squeezed(&displacement, &mask))
             .chain(unlike)
             .chain(field::without_texture(pair.plain()))
             .chain(field::out_of_view(unseen))
@@ -262,7 +262,7 @@ pub(super) fn measure(
         spline: Start { motion: field.into(), factor, followed: None },
         uncertainty,
         samples,
-        bodies: conclusion::labelled(&mask, &[], |_| 1),
+        bodies: body_models::labelled(&mask, &[], |_| 1),
         matches: sparse,
         mesh,
         node_displacement,

@@ -5,7 +5,7 @@ use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::SmoothSampler;
 use crate::pipeline::bodies::Bodies;
-use crate::pipeline::conclusion::on_full_grid;
+use crate::pipeline::body_models::on_full_grid;
 use crate::pipeline::uncertainty::evenly;
 use crate::types::{DenseField, Grid, Mask, StageReport};
 use rayon::prelude::*;

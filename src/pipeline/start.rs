@@ -12,8 +12,8 @@ use crate::matching::levels::foreground;
 use crate::matching::residual::UNSURE;
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::sampling::nearest;
-use crate::numerics::small::{full, inverse};
 use crate::numerics::statistics::median;
+use crate::numerics::symmetric3::{full, inverse};
 use crate::pipeline::field::{FieldResult, lengths};
 use crate::pipeline::known::{Known, StartMap};
 use crate::pipeline::landmarks::FEWEST;
@@ -38,7 +38,7 @@ pub enum Alignment {
 /// Places at which a start is looked at, about.
 const PLACES: usize = 4000;
 
-/// Every so many voxels of `grid` at which `mask` is not 0, in world mm.
+/// At a step in voxels of `grid`, places at which `mask` is not 0, in world mm.
 fn places(grid: &Grid, mask: Option<&Mask>) -> Vec<WorldPoint> {
     let inside: Vec<usize> = (0..grid.len()).filter(|&at| mask.is_none_or(|m| m.as_slice()[at] != 0)).collect();
     inside.iter().step_by(inside.len().div_ceil(PLACES).max(1)).map(|&at| grid.centre(at)).collect()
@@ -97,7 +97,7 @@ fn about(linear: Matrix3, from: [f64; 3], to: [f64; 3]) -> Result<AffineMap, Spa
     AffineMap::new([row(0), row(1), row(2)])
 }
 
-/// Landmarks with the deformed places taken back by `map`.
+/// Landmarks with the deformed places mapped by `map`.
 fn landmarks_before(map: &AffineMap, landmarks: &[Landmark]) -> Vec<Landmark> {
     let back = map.inverse();
     landmarks.iter().map(|l| Landmark { deformed: back.at(l.deformed), ..*l }).collect()
@@ -190,7 +190,7 @@ impl Moments {
 pub struct Compared(Vec<(WorldPoint, f32)>);
 
 impl Compared {
-    /// From every so many voxels of the foreground.
+    /// From foreground voxels at a fixed step.
     pub fn of(initial: &Voxels<'_>) -> Self {
         let grid = initial.grid();
         let tissue = foreground(initial);

@@ -3,20 +3,20 @@
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::{displacement, nearest};
-use crate::pipeline::search;
-use crate::stiffness::choice::{Choice, as_meshed, choose, known_moduli, settle};
-use crate::stiffness::coherent::Fit;
+use crate::pipeline::stiffness_regions;
+use crate::stiffness::boundary_conditions::{Patch, Place};
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::Inclusion;
+use crate::stiffness::indenter_outline::{Outline, Rim, rim};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::level::Level;
+use crate::stiffness::mesh_problem::Level;
+use crate::stiffness::model_selection::{Choice, as_meshed, choose, known_moduli, settle};
 use crate::stiffness::observations::Observation;
-use crate::stiffness::patches::{Patch, Place};
-use crate::stiffness::rim::{Outline, Rim, rim};
+use crate::stiffness::rigid_rotation::{Affinity, Turn};
 use crate::stiffness::summary::{Hidden, Scale};
-use crate::stiffness::turn::{Affinity, Turn};
+use crate::stiffness::systematic_error::Fit;
 use crate::stiffness::verdict::{Found, Shape, Verdict};
-use crate::stiffness::{geometry, maps, summary};
+use crate::stiffness::{fields, geometry, summary};
 use crate::strain::deviation::error_draws;
 use crate::types::stiffness::{
     Determined, Evidence, Law, LawChoice, PatchReport, RegionStiffness, StiffnessParams, StiffnessResult,
@@ -90,7 +90,7 @@ const COARSE: f64 = 0.3;
 const RIM: f64 = 2.0;
 /// Parts of the nodes that are tried for the rest of the body then.
 const ELSEWHERE: [f64; 5] = [0.7, 0.4, 0.25, 0.15, 0.08];
-/// Times that side, where so many nodes are not to be had.
+/// Times that side, if the nodes do not suffice for it.
 const COARSER: [f64; 3] = [1.0, 1.5, 2.5];
 /// Nodes over the limit at most, where a mesh can be had.
 const OVER: f64 = 1.15;
@@ -138,7 +138,7 @@ fn unturned(
     if inputs.labelled {
         return labelled(inputs, params, Vec::new(), progress);
     }
-    let found = search::regions(inputs, params, &|s, f| progress(s, 0.5 * f))?;
+    let found = stiffness_regions::regions(inputs, params, &|s, f| progress(s, 0.5 * f))?;
     let (mut labels, mut evidence) = (found.labels, found.evidence);
     let mut result = loop {
         let inputs = Inputs { labels: &labels, ..*inputs };
@@ -146,7 +146,7 @@ fn unturned(
         let Some(like) = result.regions.iter().find(|r| is_like_the_first(r)) else { break result };
         (labels, evidence) = without(&labels, like.label, evidence);
     };
-    result.warnings.extend(found.left_over.and_then(maps::left_over));
+    result.warnings.extend(found.left_over.and_then(fields::left_over));
     result.left_over = found.left_over;
     result.detectable = found.detectable;
     result.found = Some(labels);
@@ -175,7 +175,7 @@ fn without(labels: &Mask, label: u8, mut evidence: Vec<Evidence>) -> (Mask, Vec<
 
 /// How fine the mesh is on which all is chosen.
 pub(super) fn coarse_fineness(labels: &Mask, params: &StiffnessParams) -> Fineness {
-    Fineness::for_nodes(maps::volume(labels), (COARSE * params.nodes as f64) as usize)
+    Fineness::for_nodes(fields::volume(labels), (COARSE * params.nodes as f64) as usize)
 }
 
 /// What [`run`] would refuse before it looks for moduli: told from a coarse mesh.
@@ -207,7 +207,7 @@ impl Meshed {
         };
         let mut coarse = level(&mesher.mesh(&coarse_fineness(inputs.labels, params))?, None)?;
         let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
-        let volume = maps::volume(inputs.labels);
+        let volume = fields::volume(inputs.labels);
         let mesh = meshed(&mesher, volume, &rim, coarse.voxel, params.nodes as f64, RIM)?;
         let outline = rim.outline.as_ref();
         if !rim.places.is_empty() {
@@ -224,7 +224,7 @@ impl Meshed {
     }
 }
 
-/// A mesh of about so many nodes, as fine everywhere; `volume` of the body in mm^3.
+/// A mesh of about `nodes` nodes, as fine everywhere; `volume` of the body in mm^3.
 pub(super) fn evenly_meshed(mesher: &Mesher, volume: f64, nodes: f64) -> Result<QuadraticMesh, StiffnessError> {
     let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
     let count = mesh.nodes().len() as f64;
@@ -235,7 +235,7 @@ pub(super) fn evenly_meshed(mesher: &Mesher, volume: f64, nodes: f64) -> Result<
     }
 }
 
-/// A mesh of about so many nodes, finer along the rim of a punch: cubes of `size` voxels there.
+/// A mesh of about `nodes` nodes, finer along the rim of a punch: cubes of `size` voxels there.
 fn meshed(
     mesher: &Mesher,
     volume: f64,
@@ -364,10 +364,10 @@ fn labelled(
     let regions = found.regions(&fine.body, inputs.names);
     clock.book("uncertainty");
 
-    let of_region = |f: &dyn Fn(usize) -> f64| maps::by_label(inputs.labels, &fine.body.labels, f);
+    let of_region = |f: &dyn Fn(usize) -> f64| fields::by_label(inputs.labels, &fine.body.labels, f);
     let map = of_region(&|r| regions[r].youngs_modulus);
     let map_sd = of_region(&|r| regions[r].sd);
-    let residual = maps::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
+    let residual = fields::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
     let touching = [None, setup.touching(&state)];
     let area = |i: usize| match touching.get(i) {
         Some(Some(touched)) => touched.1,
@@ -375,12 +375,12 @@ fn labelled(
     };
     let is_affine = Affinity::of(inputs.field, inputs.labels).is_some_and(|a| a.is_all_of(inputs.field, inputs.labels));
     let verdict = Verdict::of(&misfit, inputs.quality.trust, is_affine, &regions);
-    let mut warnings = maps::unfit(inputs.field, inputs.labels, &misfit);
-    warnings.extend(maps::one_map(is_affine, regions.len()));
+    let mut warnings = fields::unfit(inputs.field, inputs.labels, &misfit);
+    warnings.extend(fields::one_map(is_affine, regions.len()));
     warnings.extend(choice.warnings);
-    warnings.extend(maps::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
-    warnings.extend(params.force_n.and_then(|force| maps::leaning(force, estimate.leaning)));
-    warnings.extend(maps::not_shown(&hidden, &regions, reference));
+    warnings.extend(fields::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
+    warnings.extend(params.force_n.and_then(|force| fields::leaning(force, estimate.leaning)));
+    warnings.extend(fields::not_shown(&hidden, &regions, reference));
     warnings.extend(found.no_contrast());
     warnings.dedup();
     let patch = |(i, p): (usize, &Patch)| PatchReport {
@@ -414,8 +414,12 @@ fn labelled(
         map_sd,
         residual,
         element_modulus,
-        displacement: maps::node_displacement(&fine.body, &state),
-        prescribed: maps::prescribed(&setup, &state, &touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice()))),
+        displacement: fields::node_displacement(&fine.body, &state),
+        prescribed: fields::prescribed(
+            &setup,
+            &state,
+            &touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice())),
+        ),
         faces: geometry.map(|g| g.faces).unwrap_or_default(),
         model_force: estimate.force[0] * estimate.leaning * kpa / 1000.0,
         mesh_change,
@@ -465,7 +469,7 @@ fn is_unsolved(found: &Result<Estimate, StiffnessError>) -> bool {
     matches!(found, Err(StiffnessError::NoEquilibrium | StiffnessError::InsideOut))
 }
 
-/// The moduli on the fine mesh, from those on the coarse one, with so many moves of the shape more.
+/// The moduli on the fine mesh, from those on the coarse one, with more moves of the shape.
 fn identified(
     coarse: &Level,
     fine: &mut Level,

@@ -1,7 +1,7 @@
 //! The fields of a sequence to one stiffness map.
 
 use crate::error::StiffnessError;
-use crate::stiffness::maps;
+use crate::stiffness::fields;
 use crate::stiffness::sequence::{Said, combine};
 use crate::types::stiffness::{
     Determined, FrameStiffness, Gain, Law, LawChoice, RegionStiffness, SharedStiffness, StiffnessParams,
@@ -74,14 +74,14 @@ impl Sequence {
         }
         // What one frame does not determine another may.
         let determined = |w: &String| {
-            let said = |r: &&RegionStiffness| r.identifiable && w.starts_with(&maps::not_determined(&r.name));
+            let said = |r: &&RegionStiffness| r.identifiable && w.starts_with(&fields::not_determined(&r.name));
             result.regions.iter().any(|r| said(&r))
         };
         let warnings = result.warnings.iter().filter(|w| !determined(w)).map(|w| format!("frame {shown}: {w}"));
         result.warnings = warnings.collect();
         let names: Vec<u8> = result.regions.iter().map(|r| r.label).collect();
-        result.map = maps::by_label(labels, &names, &|r| result.regions[r].youngs_modulus);
-        result.map_sd = maps::by_label(labels, &names, &|r| result.regions[r].sd);
+        result.map = fields::by_label(labels, &names, &|r| result.regions[r].youngs_modulus);
+        result.map_sd = fields::by_label(labels, &names, &|r| result.regions[r].sd);
         let lost = self.frames.iter().filter(|f| f.regions.is_err()).count();
         if lost > 0 {
             result.warnings.push(format!("{lost} frames tell nothing; frames.csv says why"));
@@ -104,7 +104,7 @@ impl Sequence {
     }
 }
 
-/// Mean length of the displacement in the body (mm), where it is finite; NaN where it is nowhere.
+/// Mean displacement magnitude in the body (mm), where it is finite; NaN where it is nowhere.
 pub fn motion(field: &Displacement<'_>, labels: &Mask) -> f64 {
     let inside = labels.as_slice();
     let (mut sum, mut count) = (0.0, 0.0);

@@ -252,7 +252,7 @@ fn tried(tissue: &Mask) -> Vec<Gauge> {
     lengths.filter(|&l| l == least || l < width / 2.0).map(|l| Gauge::of_length(grid, l)).collect()
 }
 
-/// Draws from which the noise of a gauge is told that is not taken.
+/// Draws that give the noise of a gauge that is not taken.
 const FEW: usize = 2;
 
 /// What each gauge would give, by draws of the field's error; `shortest` are the gradients of the

@@ -3,7 +3,7 @@
 //! Every frame is measured against the reference itself, so that errors do not add up; the search
 //! starts from where the tissue was in the frame before and where steady motion would take it,
 //! beside the starts that a pair of volumes has. Then what all frames say together takes from each
-//! what is its own noise and the reference's (`pipeline::modes`). Of volumes only the reference,
+//! what is its own noise and the reference's (`pipeline::temporal_pca`). Of volumes only the reference,
 //! the frame at hand and the one before are held, and of fields one; the others as their
 //! coefficients.
 
@@ -11,10 +11,10 @@ use crate::error::FieldError;
 use crate::matching::levels::foreground;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{displacement, inside};
-use crate::pipeline::course::{Course, OutOfLine};
 use crate::pipeline::field::{FieldResult, Progress, Start, run_from};
 use crate::pipeline::known::Known;
-use crate::pipeline::modes::{self, Modes};
+use crate::pipeline::temporal_outliers::{Course, OutOfLine};
+use crate::pipeline::temporal_pca::{self, Modes};
 use crate::strain::StrainField;
 use crate::strain::gauge::Gauge;
 use crate::strain::statistics::StrainStatistics;
@@ -197,9 +197,13 @@ fn one_voxel(grid: &Grid) -> Result<Grid, FieldError> {
 
 /// Takes from each frame what is noise by all of them, and says how.
 fn take_together(held: &mut [Held], origin: usize, tissue: &Mask) -> Together {
-    let frames: Vec<modes::Frame<'_>> = held
+    let frames: Vec<temporal_pca::Frame<'_>> = held
         .iter()
-        .map(|h| modes::Frame { number: h.number, field: &h.result.coefficients, uncertainty: &h.result.uncertainty })
+        .map(|h| temporal_pca::Frame {
+            number: h.number,
+            field: &h.result.coefficients,
+            uncertainty: &h.result.uncertainty,
+        })
         .collect();
     let turned = Orientation::of(tissue.grid()).turned(tissue);
     let found = Modes::find(&frames, origin, |[i, j, k]| turned.as_slice()[turned.grid().index(i, j, k)] != 0);
@@ -223,7 +227,7 @@ fn regions(reference: &Voxels<'_>, mask: Option<&Mask>, labels: Option<&Mask>) -
     by_label.into_iter().skip(1).filter(|(_, offsets)| !offsets.is_empty()).collect()
 }
 
-/// Part of a label out of view from which it is said.
+/// Part of a label out of view that earns a warning.
 const OUT_OF_VIEW: f64 = 0.2;
 
 /// Names the labels of which much lies outside a frame: their strain there is what tissue in view

@@ -130,7 +130,7 @@ impl Variances {
         &mut self.parts[source as usize]
     }
 
-    /// Adds what is in doubt beside borders between bodies: voxels of the full-resolution grid with
+    /// Adds the doubt beside borders between bodies: voxels of the full-resolution grid with
     /// the jump there (mm). The lattice lies on a level of `factor`.
     pub fn with_borders(mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) -> Self {
         let lattice = self.lattice.clone();
@@ -200,7 +200,7 @@ impl Variances {
     /// widened to all that it is uncertain by.
     ///
     /// # Errors
-    /// [`SpaceError`] when the lattice's place cannot be told.
+    /// [`SpaceError`] when the lattice has no place in space.
     pub fn samples(&self, grid: &Grid, factor: [usize; 3]) -> Result<ErrorSamples, SpaceError> {
         let n = self.lattice.len();
         let wider: Vec<f32> =

@@ -5,7 +5,7 @@ use super::field::kept;
 use crate::io;
 use crate::pipeline::stiffness::{ENOUGH, FieldQuality, Inputs, inside, run};
 use crate::report::stiffness::{InputNames, summary};
-use crate::stiffness::patches::Place;
+use crate::stiffness::boundary_conditions::Place;
 use crate::types::stiffness::{LawChoice, Side};
 use crate::types::{Grid, StiffnessParams};
 use numpy::{PyReadonlyArray2, PyReadonlyArray4};

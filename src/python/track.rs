@@ -5,7 +5,7 @@ use super::field::{kept_field, params};
 use crate::error::FieldError;
 use crate::pipeline::known::Known;
 use crate::pipeline::track::{Frame, run};
-use crate::report::film::Film;
+use crate::report::animation::Film;
 use crate::report::track::{TrackReport, summary};
 use crate::types::{DenseField, Voxels};
 use pyo3::prelude::*;

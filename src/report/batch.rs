@@ -208,7 +208,7 @@ fn strips(spreads: &[&Spread]) -> String {
         let y = step * row as f64 + 20.0;
         let _ = write!(svg, r#"<text x="0" y="{:.1}">{}</text>"#, y + 4.0, escape(&s.region));
         for (i, &(value, determined)) in s.values.iter().enumerate() {
-            // Spread over a few heights so that equal values can be told apart.
+            // Spread over a few heights so that equal values stay visible.
             let dy = (i % 5) as f64 * 4.0 - 8.0;
             let fill = if determined { "#3b6fb6" } else { "none" };
             let _ = write!(

@@ -27,7 +27,7 @@ pub struct CertifyReport<'a> {
     pub tissue: &'a Mask,
     /// What was asked for.
     pub params: &'a FieldParams,
-    /// Smallest displacement that is told from noise (mm).
+    /// Smallest displacement detected above noise (mm).
     pub detectable: Values<'a>,
     /// The numbers.
     pub certificate: &'a Certificate,
@@ -103,7 +103,7 @@ pub fn text(report: &CertifyReport<'_>) -> String {
     let _ = writeln!(out, "  strain       {}", gauges.join(", "));
     let _ = writeln!(
         out,
-        "  blind        {:.1} % of the tissue: a motion of {} mm is not told from noise there",
+        "  blind        {:.1} % of the tissue: a motion of {} mm does not rise above noise there",
         100.0 * c.blind_share,
         significant(c.amplitude_mm)
     );
@@ -210,7 +210,7 @@ fn settings(report: &CertifyReport<'_>) -> String {
     table(&[], &rows.into_iter().chain(at_rest).collect::<Vec<_>>())
 }
 
-/// The picture of what is told from noise where.
+/// The map of the smallest displacement above noise.
 fn blind(report: &CertifyReport<'_>) -> Result<String, ReportError> {
     let grid = report.initial.grid();
     let inside = sample(grid.len(), Some(report.tissue));
@@ -224,7 +224,7 @@ fn blind(report: &CertifyReport<'_>) -> Result<String, ReportError> {
     let scale = Scale::from_zero(most, "mm", ColorMap::Magma);
     let base = (report.initial, gray_range(report.initial));
     let panel = Panel::coloured(
-        "Smallest displacement that is told from noise",
+        "Smallest displacement above noise",
         &sections,
         base,
         Some(report.tissue),

@@ -16,7 +16,7 @@ pub struct Row {
     pub unit: &'static str,
     /// What was found.
     pub found: f64,
-    /// The truth; for an error, what doing nothing gives.
+    /// The truth; for an error, that before registration.
     pub truth: f64,
     /// Found over truth less 1 for a value; the error itself for an error.
     pub error: f64,
@@ -47,7 +47,7 @@ impl Row {
         Self { bound, ..self }
     }
 
-    /// An error, 0 at best, with that of doing nothing.
+    /// An error, 0 at best, with that before registration.
     pub fn error(stage: &'static str, quantity: &str, unit: &'static str, found: f64, nothing: f64) -> Self {
         Self {
             stage,

@@ -257,7 +257,7 @@ pub fn page(groups: &[Group], trials: &[Trial]) -> String {
         "<header><p class=\"brand\">palpate {}</p><h1>Speed against accuracy</h1><p class=\"verdict\">The line joins the \
          settings that no other beats in both. Point at a place to see its settings. Hollow places are whole commands, with \
          their start and their files; all others are the work alone. A method that has no result on some case is not on the line: \
-         there it counts as doing nothing, and its time is that of the others.</p></header><article class=\"wide\">{}</article>",
+         there it counts as no registration, and its time is that of the others.</p></header><article class=\"wide\">{}</article>",
         env!("CARGO_PKG_VERSION"),
         svg(groups, trials)
     );

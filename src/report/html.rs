@@ -3,7 +3,7 @@
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::{FieldReport, Values};
-use crate::report::nodes;
+use crate::report::node_plot;
 use crate::report::panels::{Panel, length};
 use crate::report::picture::Picture;
 use crate::report::scale::{Scale, short, thousands};
@@ -59,7 +59,7 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
             Mesh::Triangles(m) => m.nodes(),
         };
         let note = format!("Length at the {} mesh nodes.", thousands(mesh_nodes.len()));
-        let drawing = nodes::scatter(mesh_nodes, report.node_displacement, scale);
+        let drawing = node_plot::scatter(mesh_nodes, report.node_displacement, scale);
         let _ = write!(body, "<article><h3>Mesh nodes</h3><p>{note}</p>{drawing}{}</article>", legend(Some(scale)));
     }
     body.push_str(&card(&views.jacobian));
@@ -178,7 +178,7 @@ fn head(report: &FieldReport<'_>) -> String {
         tile(format!("{:.2}", s.max_mm), "mm", "largest motion"),
         tile(thousands(s.counts.kept), "", "matches kept"),
         tile(thousands(s.folds), "", "voxels folded"),
-        tile(format!("{seconds:.1}"), "s", "in all stages"),
+        tile(format!("{seconds:.1}"), "s", "total runtime"),
         trust = v.trust.name()
     );
     out.push_str(&warned(&s.warnings));

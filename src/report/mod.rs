@@ -17,7 +17,7 @@ pub mod picture;
 
 pub mod drawing;
 
-pub mod nodes;
+pub mod node_plot;
 
 pub mod batch;
 
@@ -53,7 +53,7 @@ pub mod skin;
 
 pub mod info;
 
-pub mod film;
+pub mod animation;
 
 pub mod track;
 
@@ -79,7 +79,7 @@ pub mod axes;
 
 pub mod frontier;
 
-pub mod stress;
+pub mod robustness;
 
 pub use field::FieldReport;
 pub use grasp::GraspReport;

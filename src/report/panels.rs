@@ -72,7 +72,7 @@ pub fn gray_range(volume: &Voxels<'_>) -> [f64; 2] {
     [low, if high > low { high } else { low + 1.0 }]
 }
 
-/// Length of the displacement at a voxel offset (mm).
+/// Displacement magnitude at a voxel offset (mm).
 pub fn length(field: &DenseField, offset: usize) -> f32 {
     field.at(offset).iter().map(|v| v * v).sum::<f32>().sqrt()
 }

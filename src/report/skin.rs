@@ -149,7 +149,7 @@ pub fn page(report: &SkinReport<'_>) -> String {
             ]
         })
         .collect();
-    let head = ["Layer", "Thickness, mm", "Element", "Strain after the ramp", "Strain at the end", "Stays for ever"];
+    let head = ["Layer", "Thickness, mm", "Element", "Strain after the ramp", "Strain at the end", "Permanent strain"];
     let _ = write!(body, "<section><h2>Layers</h2><article class=\"wide\">{}</article></section>", table(&head, &rows));
     document(&escape(report.name), &body)
 }

@@ -143,7 +143,7 @@ pub fn text(result: &StiffnessResult) -> String {
     }
     let _ = writeln!(
         out,
-        "  residual     {:.4} mm, roughness of the field {:.4} mm, {} samples worth {:.0}",
+        "  residual     {:.4} mm, roughness of the field {:.4} mm, {} samples, effective sample size {:.0}",
         result.residual_mm,
         result.noise_mm,
         thousands(result.samples[0] as usize),
@@ -351,7 +351,7 @@ fn page_with(
         tile(format!("{:.4}", result.residual_mm), "mm", "residual"),
         tile(format!("{:.1}", 100.0 * result.strain), "%", "strain, 95th percentile"),
         tile(thousands(result.mesh.nodes().len()), "", "mesh nodes"),
-        tile(format!("{total:.1}"), "s", "in all stages"),
+        tile(format!("{total:.1}"), "s", "total runtime"),
     );
     out.push_str(&warned(&result.warnings));
     let _ = write!(

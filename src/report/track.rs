@@ -1,9 +1,9 @@
 //! report.html, summary.json and the short summary of `palpate track`.
 
+use crate::report::animation::Film;
 use crate::report::chart;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::film::Film;
 use crate::report::grasp::tile;
 use crate::report::html::{document, escape, warned};
 use crate::report::json::{grid, seconds};
@@ -95,7 +95,7 @@ impl TrackReport<'_> {
     }
 }
 
-/// A frame is looked at anew when it moves so many times further than the one before.
+/// A frame is looked at anew when it moves this many times further than the one before.
 const WORTH_A_LOOK: f64 = 1.1;
 
 /// The frames that the viewer holds: as many as the page has room for, evenly spread, and the one
@@ -141,7 +141,7 @@ pub struct Seen<'a> {
 }
 
 impl Looks {
-    /// None yet of so many `frames` on the reference's grid.
+    /// None yet of `frames` frames on the reference's grid.
     pub fn new(frames: usize, grid: &Grid) -> Self {
         Self { frames, room: Moment::room(grid, 2, 3), held: Vec::new() }
     }
@@ -269,7 +269,7 @@ fn of_frames(tracked: &Tracked) -> impl Iterator<Item = (usize, &str)> {
 }
 
 /// All that a reader is to be warned of: what the volumes gave rise to, then frame by frame, where
-/// what differs in its numbers alone is said once, for the first of the frames.
+/// what differs in its numbers alone appears once, for the first of the frames.
 pub fn warnings(report: &TrackReport<'_>) -> Vec<String> {
     let wording = |text: &str| -> String { text.chars().filter(|c| !c.is_ascii_digit()).collect() };
     let mut kinds: Vec<(String, &str, Vec<usize>)> = Vec::new();
@@ -306,7 +306,7 @@ pub fn page(report: &TrackReport<'_>) -> String {
         tile(&short2(t.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max)), "mm", "largest motion"),
         tile(&short2(largest(&|s| s.peak[0])), "", "peak principal strain"),
         tile(&thousands(t.trajectories.len()), "", "points followed"),
-        tile(&format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "in all stages"),
+        tile(&format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "total runtime"),
         trust = trust.name(),
     );
     let warnings = warnings(report);

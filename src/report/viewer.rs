@@ -101,7 +101,7 @@ fn pack(bytes: &[u8]) -> String {
     STANDARD.encode(&packed[..length])
 }
 
-/// Every so many voxels along each canonical axis.
+/// Step in voxels along each canonical axis.
 struct Thinned<'a> {
     canonical: &'a Canonical,
     steps: [usize; 3],
@@ -217,7 +217,7 @@ impl Moment<'_> {
         let mut maps: Vec<ColorMap> = Vec::new();
         if let Some((_, scale)) = &self.displacement {
             maps.push(scale.map);
-            overlays.push(json!({ "name": "Length of the displacement", "vector": true, "low": scale.low,
+            overlays.push(json!({ "name": "Displacement magnitude", "vector": true, "low": scale.low,
                 "high": scale.high, "unit": scale.unit, "map": map_name(scale.map) }));
         }
         maps.extend(self.overlays.iter().map(|l| l.scale.map));
@@ -249,7 +249,7 @@ impl Moment<'_> {
         PackedMoment { data, maps }
     }
 
-    /// How many moments of so many images and overlays (with a field) a page has room for; at least
+    /// How many moments of this number of images and overlays (with a field) a page has room for; at least
     /// one.
     pub fn room(grid: &Grid, images: usize, overlays: usize) -> usize {
         let canonical = Canonical::of(grid);

@@ -20,7 +20,7 @@ pub struct Views {
     pub volumes: Vec<Panel>,
     /// Absolute difference to the initial volume before and after warping.
     pub differences: Vec<Panel>,
-    /// Length of the displacement.
+    /// Displacement magnitude.
     pub magnitude: Panel,
     /// Jacobian determinant.
     pub jacobian: Panel,
@@ -127,7 +127,7 @@ impl Views {
                 difference("|initial − deformed|, before", deformed, before)?,
                 difference("|initial − warped|, after", warped, after)?,
             ],
-            magnitude: Panel::coloured("Length of the displacement", &sections, base, mask, lengths, motion)?,
+            magnitude: Panel::coloured("Displacement magnitude", &sections, base, mask, lengths, motion)?,
             bodies: bodies_of(report, &sections, base)?,
             jacobian: Panel::coloured("Jacobian determinant", &sections, base, mask, change, jacobian)?
                 .with_note("Blue: the tissue shrinks. Red: it grows. White: its volume stays."),
@@ -159,7 +159,7 @@ const SEEN: f64 = 2.8;
 
 /// Range and colours of what is measured: the same in pictures, viewers and distributions.
 pub(super) struct Scales {
-    /// Length of the displacement (mm).
+    /// Displacement magnitude (mm).
     pub length: Scale,
     /// Jacobian determinant.
     pub jacobian: Scale,

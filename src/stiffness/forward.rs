@@ -8,9 +8,9 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::sparse::Factor;
-use crate::stiffness::body::{Body, SIDE};
+use crate::stiffness::contact::Plate;
+use crate::stiffness::fem_body::{Body, SIDE};
 use crate::stiffness::law::{Material, residual, residual_by_modulus, tangent};
-use crate::stiffness::plate::Plate;
 use crate::types::stiffness::Law;
 use rayon::prelude::*;
 

@@ -14,14 +14,14 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::within;
-use crate::stiffness::body::Body;
 use crate::stiffness::border::Border;
-use crate::stiffness::coherent::Fit;
-use crate::stiffness::edge::Edge;
+use crate::stiffness::fem_body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
 use crate::stiffness::inclusion::{Inclusion, SHAPES};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::observations::{find, read};
+use crate::stiffness::punch_edge::Edge;
+use crate::stiffness::systematic_error::Fit;
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
 /// One standard deviation of a flat face (voxels): uniform over one voxel.
@@ -239,7 +239,7 @@ fn columns(
             let force = moved.forces(&problem, &estimate.state, &y)[0];
             Some((column.collect(), (force / estimate.force[0]).ln() / by))
         });
-        // Of a shape that has no equilibrium nothing is told.
+        // A shape without equilibrium gives nothing.
         let (row, slope) = column.unwrap_or_else(|| (vec![[0.0; 3]; places.len()], 0.0));
         rows.push(row);
         force_slope.push(slope);

@@ -9,12 +9,12 @@ use crate::error::StiffnessError;
 use crate::numerics::cholesky::{Cholesky, within};
 use crate::numerics::sparse::Factor;
 use crate::numerics::statistics::percentile;
-use crate::stiffness::body::Body;
+use crate::stiffness::boundary_conditions::{Patch, travel};
+use crate::stiffness::fem_body::Body;
 use crate::stiffness::forward::{Problem, Solution, Tie};
 use crate::stiffness::geometry::Part;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
-use crate::stiffness::patches::{Patch, travel};
 use crate::types::space::{dot, length};
 use crate::types::stiffness::{Contact, Law};
 

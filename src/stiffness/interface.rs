@@ -17,7 +17,7 @@ const FLAT: f64 = 0.04;
 const STANDS_OUT: usize = 4;
 /// Faces between voxels that are fewer say nothing.
 const FEWEST: usize = 16;
-/// So many planes, the largest ones, are looked at: each takes a solution.
+/// Planes that are examined, the largest ones: each takes a solution.
 const MOST: usize = 12;
 
 /// A part of the border between two regions, or between one and a hole (label 0), that lies in one

@@ -12,8 +12,8 @@
 //! (Bonet and Wood, Nonlinear Continuum Mechanics, 2008, eq. 6.27).
 
 use crate::numerics::dense::symmetric_eigen;
-use crate::stiffness::body::SIDE;
 use crate::stiffness::elements::Point;
+use crate::stiffness::fem_body::SIDE;
 use crate::types::space::{Matrix3, determinant};
 use crate::types::stiffness::Law;
 

@@ -2,7 +2,7 @@
 //! of model.
 //!
 //! Promises: exact sensitivities; results that do not depend on the number of threads; a region
-//! that the data cannot see is said to be so. Needs a mesh whose elements lie in one region each, a
+//! that the data cannot see is marked. Needs a mesh whose elements lie in one region each, a
 //! field that covers it, and two patches of the surface that move against each other. Fails with a
 //! [`StiffnessError`](crate::error::StiffnessError).
 
@@ -10,31 +10,31 @@ pub mod elements;
 
 pub mod law;
 
-pub mod body;
+pub mod fem_body;
 
 pub mod forward;
 
 pub mod observations;
 
-pub mod patches;
+pub mod boundary_conditions;
 
-pub mod plate;
+pub mod contact;
 
-pub mod smoothed;
+pub mod patch_motion;
 
-pub mod rim;
+pub mod indenter_outline;
 
 pub mod identify;
 
-pub mod level;
+pub mod mesh_problem;
 
-pub mod choice;
+pub mod model_selection;
 
 pub mod summary;
 
 pub mod verdict;
 
-pub mod maps;
+pub mod fields;
 
 pub mod sequence;
 
@@ -44,9 +44,9 @@ pub mod support;
 
 pub mod geometry;
 
-pub mod coherent;
+pub mod systematic_error;
 
-pub mod edge;
+pub mod punch_edge;
 
 pub mod border;
 
@@ -54,4 +54,4 @@ pub mod inclusion;
 
 pub mod interface;
 
-pub mod turn;
+pub mod rigid_rotation;

@@ -2,8 +2,8 @@
 
 use crate::numerics::sampling::displacement;
 use crate::numerics::tetrahedron::shapes;
-use crate::stiffness::body::Body;
 use crate::stiffness::elements::Mapping;
+use crate::stiffness::fem_body::Body;
 use crate::types::{Displacement, Mask, Match, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
@@ -172,7 +172,7 @@ fn spread(block: usize) -> f64 {
     ((block * block - 1) as f64 / 12.0).sqrt()
 }
 
-/// Voxels along the edge of the blocks that a body of so many voxels is averaged over.
+/// Voxels along the edge of the blocks that a body of `voxels` voxels is averaged over.
 pub fn block_for(voxels: usize) -> usize {
     (1..6).find(|b| voxels / (b * b * b) <= SAMPLES).unwrap_or(6)
 }
@@ -230,7 +230,7 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
 /// A match is sought in the deformed volume warped by the field, so it is the field at its place
 /// and the mean over its patch of what the field is short of. With the field's mean over the patch
 /// in place of the field at its place it is the mean of the displacement, which a model's mean is
-/// held against. Of a patch that reaches past the body only what lies in it counts.
+/// compared with. Of a patch that reaches past the body only what lies in it counts.
 pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField) -> Vec<Observation> {
     let grid = field.grid();
     let finest = grid.least_spacing();

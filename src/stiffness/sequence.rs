@@ -35,7 +35,7 @@ pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
 }
 
 /// Puts what the common parts are by the frames' motion in the place of what each frame claims: a
-/// power of it from -1 (errors of so many mm) to 0 (of so many per cent) by least squares of
+/// power of it from -1 (errors in mm) to 0 (errors in per cent) by least squares of
 /// logarithms, and the same for frames that differ by [`ALIKE`].
 fn even_out(frames: &mut [Frame]) {
     let is_known = |v: f64| v.is_finite() && v > 0.0;

@@ -3,11 +3,11 @@
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::statistics::percentile;
-use crate::stiffness::body::Body;
-use crate::stiffness::choice::bic;
+use crate::stiffness::fem_body::Body;
 use crate::stiffness::geometry::Geometry;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::law::largest_principal_strain;
+use crate::stiffness::model_selection::bic;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, StiffnessParams};
 

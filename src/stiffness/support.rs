@@ -9,12 +9,12 @@
 //! fifth, and the new region's modulus must differ from the first one's by two standard deviations and by a quarter.
 
 use crate::error::StiffnessError;
-use crate::stiffness::choice::{MARGIN, bic};
-use crate::stiffness::coherent::Fit;
+use crate::stiffness::boundary_conditions::travel;
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::SHAPES;
-use crate::stiffness::level::{FLOOR, Level};
-use crate::stiffness::patches::travel;
+use crate::stiffness::mesh_problem::{FLOOR, Level};
+use crate::stiffness::model_selection::{MARGIN, bic};
+use crate::stiffness::systematic_error::Fit;
 use crate::types::space::dot;
 use crate::types::stiffness::{Evidence, Law, LeftOver, StiffnessParams};
 
@@ -154,7 +154,7 @@ impl Support {
         self.noise[1].hypot(0.5 * self.geometry)
     }
 
-    /// There is no estimate with so many regions: neither a residual nor a criterion.
+    /// There is no estimate with this number of regions: neither a residual nor a criterion.
     pub fn none(&mut self, count: usize, why: &str) {
         self.evidence.push(Evidence {
             question: "regions",

@@ -11,9 +11,9 @@ use crate::error::StiffnessError;
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::filters::gaussian;
 use crate::numerics::statistics::percentile;
+use crate::stiffness::boundary_conditions::Patch;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::observations::Observation;
-use crate::stiffness::patches::Patch;
 use crate::types::Mask;
 use crate::types::space::dot;
 use rayon::prelude::*;
@@ -192,7 +192,7 @@ impl Basis {
     }
 }
 
-/// Parts of the body's least extent that are the diameters of balls whose limit is told.
+/// Parts of the body's least extent that are the diameters of balls whose limit is given.
 const DIAMETERS: [f64; 3] = [0.25, 0.35, 0.5];
 /// Places in a ball over which the lattice's functions are averaged.
 const WITHIN: usize = 200;

@@ -1,6 +1,6 @@
-//! What is said of the regions, and of the result as a whole.
+//! The verdict on each region, and on the result as a whole.
 
-use crate::stiffness::body::Body;
+use crate::stiffness::fem_body::Body;
 use crate::stiffness::summary::{BEARS, Hidden, Moduli, Scale, VAGUE};
 use crate::types::stiffness::{Determined, RegionStiffness};
 use crate::types::{MotionModel, Trust};
@@ -85,7 +85,7 @@ pub struct Found<'a> {
     pub known: &'a [(u8, f64)],
     /// The motion model of the field, where it is one that shows no difference between regions.
     pub flat_model: Option<MotionModel>,
-    /// Whether the model leaves over so much that nothing can be said.
+    /// Whether the residual is too large for any verdict.
     pub misfits: bool,
     /// What sets the scale.
     pub scale: Scale,

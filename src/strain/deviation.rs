@@ -6,12 +6,12 @@ use crate::error::SpaceError;
 use crate::numerics::bspline::weights;
 use crate::numerics::filters::gaussian;
 use crate::numerics::sampling::Stencil;
-use crate::numerics::small::{Symmetric3, eigenvalues, quadratic};
+use crate::numerics::symmetric3::{Symmetric3, eigenvalues, quadratic};
 use crate::types::space::Matrix3;
 use crate::types::{Affine, DenseField, ErrorSamples, Grid, StrainMeasure, WorldPoint};
 use rayon::prelude::*;
 
-/// The places of every so many voxels of a field, with random draws of its error there.
+/// Places at a fixed step in voxels of a field, with random draws of its error there.
 #[derive(Debug, Clone)]
 pub struct Draws {
     step: [usize; 3],
@@ -34,7 +34,7 @@ fn errors_on(grid: &Grid, samples: &ErrorSamples) -> Result<Vec<DenseField>, Spa
     drawn(grid, samples).map(|values| DenseField::from_vec(*grid, values)).collect()
 }
 
-/// Every so many voxels of a grid: places half as far apart as the nodes of the samples.
+/// Step in voxels of a grid: places half as far apart as the nodes of the samples.
 fn thinned(full: &Grid, samples: &ErrorSamples) -> Result<([usize; 3], Grid), SpaceError> {
     let (shape, spacing) = (full.shape(), full.spacing());
     // The nodes may run along other axes: the closest along any counts for all.

@@ -7,7 +7,7 @@
 //! Sums over the cube run along one axis after the other, so that a long gauge costs no more than a
 //! short one.
 
-use crate::numerics::small::cholesky_solve;
+use crate::numerics::symmetric3::cholesky_solve;
 use crate::types::Displacement;
 use crate::types::space::{Grid, Matrix3};
 use rayon::prelude::*;

@@ -1,7 +1,7 @@
 //! Strain measures of a displacement gradient.
 
 use crate::numerics::dense::symmetric_eigen;
-use crate::numerics::small::{Symmetric3, eigenvalues, full};
+use crate::numerics::symmetric3::{Symmetric3, eigenvalues, full};
 use crate::types::StrainMeasure;
 use crate::types::space::{Matrix3, cross};
 

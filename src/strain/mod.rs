@@ -15,7 +15,7 @@ pub mod measure;
 
 pub mod statistics;
 
-use crate::numerics::small::eigenvalues;
+use crate::numerics::symmetric3::eigenvalues;
 use crate::types::space::{Grid, Matrix3};
 use crate::types::{DenseField, StrainMeasure};
 

@@ -145,7 +145,7 @@ impl Body {
 
     /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1; exactly 0 far outside.
     fn cover(&self, shape: &Superellipsoid, q: [f64; 3]) -> f64 {
-        /// Beyond so many voxels outside, the logistic is under 1e-9.
+        /// Beyond this number of voxels outside, the logistic is under 1e-9.
         const FAR: f64 = 9.5;
         let d: [f64; 3] = std::array::from_fn(|a| q[a] - shape.centre[a]);
         // The voxel's extent in the plane is all that counts for a tube.

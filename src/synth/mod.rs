@@ -7,7 +7,7 @@
 
 mod anatomy;
 
-mod artefacts;
+mod volume_faults;
 
 mod body;
 
@@ -17,7 +17,7 @@ pub mod imposed;
 
 mod landmarks;
 
-mod looks;
+mod appearance;
 
 mod motion;
 
@@ -31,9 +31,9 @@ mod scenes;
 
 pub mod sequence;
 
-pub mod severity;
+pub mod degradation;
 
+pub use degradation::{Trouble, troubled};
 pub use params::{ElasticParams, MotionKind, PhantomKind, PhantomParams};
 pub use phantom::{Description, MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
 pub use sequence::{Sequence, SequenceKind, SequenceParams};
-pub use severity::{Trouble, troubled};

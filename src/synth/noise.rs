@@ -8,7 +8,7 @@ use crate::types::{Grid, WorldPoint};
 /// function's deviation for independent coefficients of deviation 1.
 const DEVIATION: f64 = 0.331_893;
 
-/// Coefficients along each axis of a texture: it repeats after so many cells.
+/// Coefficients along each axis of a texture: it repeats after that many cells.
 const FINE: usize = 64;
 
 /// Coefficients along each axis of a function with at most a dozen cells in the field of view.

@@ -7,8 +7,8 @@
 use crate::error::{ParamError, SynthError};
 use crate::numerics::random::Random;
 use crate::synth::anatomy::body;
+use crate::synth::appearance::{PATTERN, distance};
 use crate::synth::body::{BORDER, centre, cover, extent, rotation};
-use crate::synth::looks::{PATTERN, distance};
 use crate::synth::motion::{Motion, add};
 use crate::synth::noise::Texture;
 use crate::synth::params::{MotionKind, PhantomParams};

@@ -18,7 +18,7 @@ pub struct GaugeNoise {
     pub gauge_mm: f64,
     /// Standard deviation of a normal strain (1).
     pub noise: f64,
-    /// The smallest normal strain that is told from noise, 95 % of the time (1).
+    /// The smallest normal strain detected above noise, 95 % of the time (1).
     pub detectable: f64,
 }
 

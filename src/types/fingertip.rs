@@ -227,7 +227,7 @@ pub struct StiffnessRegion {
     pub youngs_modulus: f64,
     /// `lower` or `upper` where it is not identifiable.
     pub bound: Option<String>,
-    /// Poisson's ratio; that of the folder where none is said.
+    /// Poisson's ratio; that of the folder where none is given.
     #[serde(default)]
     pub poisson: Option<f64>,
     /// Its standard deviation, in the unit of the modulus; NaN or 0 where it is unknown.

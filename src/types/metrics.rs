@@ -15,7 +15,7 @@ pub struct Metrics {
     pub p95_mm: f64,
     /// Largest end-point error.
     pub max_mm: f64,
-    /// Mean error of doing nothing, that is the mean length of the true displacement.
+    /// Mean error before registration: the mean magnitude of the true displacement.
     pub identity_mm: f64,
     /// Mean error where the truth moves less than 0.1 mm; none with fewer than 1,000 such voxels.
     pub still_mm: Option<f64>,

@@ -4,7 +4,7 @@ use crate::error::ParamError;
 use crate::types::stiffness::{Contact, StiffnessParams};
 use serde::Serialize;
 
-/// Parameters of [`crate::pipeline::planning`].
+/// Parameters of [`crate::pipeline::experimental_design`].
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PlanParams {
     /// Assumed Young's modulus of each label (kPa).

@@ -63,7 +63,7 @@ pub struct Agreement {
 pub struct StartReport {
     /// Rows of the affine part (world mm, RAS, initial to deformed).
     pub affine_ras: [[f64; 4]; 3],
-    /// The model of the motion beyond it, which the expected error is held against.
+    /// The model of the motion beyond it, which the expected error is compared with.
     pub model_beyond: MotionModel,
 }
 
@@ -198,7 +198,7 @@ pub struct FieldSummary {
     pub folds: usize,
     /// Voxels of the mask.
     pub mask_voxels: usize,
-    /// Mean and largest length of the displacement over the mask (mm).
+    /// Mean and largest displacement magnitude over the mask (mm).
     pub mean_mm: f64,
     /// Largest length over the mask (mm).
     pub max_mm: f64,

@@ -120,7 +120,7 @@ pub struct FrameSummary {
 /// What the frames of a sequence say together.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Together {
-    /// Courses over time that the motion of all frames is made of; none where each frame's field is
+    /// Temporal modes that the motion of all frames is made of; none where each frame's field is
     /// its own.
     pub modes: Option<usize>,
     /// Why, in words.

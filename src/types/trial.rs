@@ -46,7 +46,7 @@ pub struct Trial {
     pub error_p95: Option<f64>,
     /// Median error of the displacement's gradient (1).
     pub gradient_error: Option<f64>,
-    /// Error of doing nothing, where that means something.
+    /// Error before registration, where that means something.
     pub nothing: Option<f64>,
     /// Voxels, nodes or steps.
     pub size: usize,
@@ -67,7 +67,7 @@ pub struct Standing {
     pub method: String,
     /// All that sets it apart.
     pub settings: String,
-    /// Per cent that is left of the error of doing nothing (geometric mean) where all cases have
+    /// Per cent that is left of the error before registration (geometric mean) where all cases have
     /// that, else the mean error; NaN without any result.
     pub error: f64,
     /// Mean CPU seconds of the runs with a result; NaN without any.
@@ -113,7 +113,7 @@ impl StressRun {
         self.refused.is_some() || !self.said.is_empty()
     }
 
-    /// Broken without a word.
+    /// Broken silently: no warning and no error.
     pub fn silent(&self) -> bool {
         self.broken() && !self.told()
     }
@@ -176,7 +176,7 @@ pub struct StressCurve {
 }
 
 impl StressCurve {
-    /// Runs that broke without a word.
+    /// Runs that broke silently.
     pub fn silent(&self) -> impl Iterator<Item = &StressRun> {
         self.runs.iter().filter(|r| r.silent())
     }

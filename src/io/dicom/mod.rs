@@ -6,13 +6,13 @@
 //! one place, gaps and tilted stacks are errors that name the files. Which transfer syntaxes are
 //! read says [`pixels`].
 
-mod elements;
+mod data_elements;
 
 mod mosaic;
 
 mod pixels;
 
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::image::Stored;
 use super::memory::fits;
 use super::raw::grid_from_lps;
@@ -20,7 +20,7 @@ use super::{os, source};
 use crate::error::{IoError, Shown};
 use crate::types::names::cut;
 use crate::types::space::{cross, dot, length};
-use elements::{Elements, Tag};
+use data_elements::{Elements, Tag};
 use mosaic::Mosaic;
 use pixels::{CONVERT, Pixels, Source, text};
 use std::fs;
@@ -90,7 +90,7 @@ fn numbers<const N: usize>(elements: &Elements<'_>, tag: Tag) -> Option<[f64; N]
     values?.try_into().ok()
 }
 
-/// What is said of a frame: in its functional groups, in those of all frames, or of the whole file.
+/// The attributes of a frame: in its functional groups, in those of all frames, or of the whole file.
 struct Said<'e> {
     groups: Vec<&'e Elements<'e>>,
     object: &'e Elements<'e>,

@@ -4,9 +4,9 @@
 //! The header (CSA, "SV10") and where the tiles lie: nibabel's documentation, "Siemens format DICOM
 //! with CSA header" and "DICOM mosaic".
 
-use super::elements::{Elements, Tag};
+use super::data_elements::{Elements, Tag};
 use super::pixels::{CONVERT, text};
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 
 const IMAGE_TYPE: Tag = (0x0008, 0x0008);
 const CREATOR: Tag = (0x0029, 0x0010);

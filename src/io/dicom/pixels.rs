@@ -1,7 +1,7 @@
 //! The numbers of the frames of a DICOM file, unpacked (PS3.5 section 8 and annex A).
 
-use super::elements::{Elements, Form, Tag};
-use crate::io::flaw::Flaw;
+use super::data_elements::{Elements, Form, Tag};
+use crate::io::format_error::Flaw;
 use crate::io::voxels::{Kind, decode};
 use std::borrow::Cow;
 use std::io::Read;
@@ -21,7 +21,7 @@ pub(super) const CONVERT: &str = "convert it with dcm2niix";
 const UNPACK: &str = "unpack it with `gdcmconv --raw IN OUT`, or convert it with dcm2niix";
 /// What no file unpacks to more than (bytes).
 const LARGEST: u64 = 1 << 30;
-/// A byte of a JPEG stream stands for at most so many pixels: two bits for a block of 8 x 8.
+/// A byte of a JPEG stream stands for at most this number of pixels: two bits for a block of 8 x 8.
 const JPEG_RATIO: usize = 256;
 /// Two bytes of RLE stand for at most 128.
 const RLE_RATIO: usize = 64;

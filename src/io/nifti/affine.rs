@@ -4,7 +4,7 @@
 //! `nifti_quatern_to_mat44`, `nifti_mat44_to_quatern` in nifti1_io.c.
 
 use super::header::Header;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::types::space::Matrix3;
 use crate::types::{Affine, VoxelPoint};
 

@@ -1,6 +1,6 @@
 //! The part of a NIfTI header that is used, from version 1 (parsed by the `nifti` crate) or 2.
 
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use nifti::{Endianness, NiftiHeader};
 
 /// Bytes of the longest header, NIfTI-2's; more than NIfTI-1's 348.

@@ -3,7 +3,7 @@
 use super::affine::{affine, disagreement};
 use super::header::{Header, LONGEST};
 use crate::error::IoError;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::image::Stored;
 use crate::io::memory::fits;
 use crate::io::voxels::{self, Kind, count};

@@ -3,7 +3,7 @@
 use super::header::Header;
 use super::read::{Opened, Plan, decode, open};
 use crate::error::IoError;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::gzip::{self, Members};
 use crate::io::voxels::count;
 use crate::io::{os, source};
@@ -81,7 +81,7 @@ impl Series {
     /// from its start.
     ///
     /// # Errors
-    /// [`IoError`] when there are not so many, or the file cannot be read, is damaged or cut short.
+    /// [`IoError`] when there are fewer, or the file cannot be read, is damaged or cut short.
     pub fn read(&mut self, at: usize) -> Result<Volume, IoError> {
         let path = &self.path;
         if at >= self.frames {

@@ -4,7 +4,7 @@ use super::affine::quaternion;
 use super::header::NIFTYREG;
 use crate::error::IoError;
 use crate::io::atomic::write_atomic;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::gzip::{Chunk, Member, Run};
 use crate::io::raw_write::{TextFormat, TextImage};
 use crate::io::voxels::Kind;
@@ -487,7 +487,7 @@ fn header(grid: &Grid, form: &Form<'_>) -> Result<[u8; 352], Flaw> {
     put(&mut h, 0, &348i32.to_le_bytes());
     put(&mut h, 40, &dim.map(i16::to_le_bytes).concat());
     if form.intent == SYMMETRIC {
-        put_floats(&mut h, 56, &[3.0]); // intent_p1: the matrix has so many rows
+        put_floats(&mut h, 56, &[3.0]); // intent_p1: rows of the matrix
     }
     if form.niftyreg {
         put_floats(&mut h, 56, &[1.0]); // intent_p1: a displacement (_reg_maths.h)

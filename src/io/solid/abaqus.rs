@@ -1,7 +1,7 @@
 //! Meshes of Abaqus and CalculiX (`.inp`): `*NODE`, `*ELEMENT`, `*NSET`, one part at most.
 
 use super::edit::Edit;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::types::{ElementModulus, Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write;

@@ -1,7 +1,7 @@
 //! Meshes of FEBio 3 and 4 (`.feb`): `Nodes`, `Elements` and `NodeSet` of the section `Mesh`.
 
 use super::edit::Edit;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::types::{Measured, MeasuredNode, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::collections::HashMap;

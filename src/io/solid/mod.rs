@@ -10,7 +10,7 @@ mod vtu;
 
 use super::atomic::write_atomic;
 use super::csv::write_table;
-use super::flaw::Flaw;
+use super::format_error::Flaw;
 use super::memory::fits;
 use super::{format, os, source};
 use crate::error::IoError;

@@ -2,7 +2,7 @@
 //! base64, or appended as base64 or raw; plain or packed with zlib; one piece.
 
 use super::edit::Edit;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::types::{Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use libdeflater::Decompressor;

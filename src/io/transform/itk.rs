@@ -5,7 +5,7 @@
 //! last block is the first that a point meets (itkCompositeTransform.h).
 
 use crate::error::IoError;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::raw::grid_from_lps;
 use crate::io::read_text;
 use crate::types::space::Matrix3;

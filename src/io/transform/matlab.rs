@@ -6,7 +6,7 @@
 
 use super::itk::{Block, chain};
 use crate::error::IoError;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::source;
 use crate::types::Transform;
 use std::path::Path;

@@ -2,7 +2,7 @@
 
 use crate::error::{IoError, SpaceError};
 use crate::io::field::Scaled;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::{format, read_text};
 use crate::types::{AffineMap, Grid, WorldPoint};
 use std::path::Path;

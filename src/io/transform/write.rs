@@ -3,7 +3,7 @@
 use super::matrix::to_flirt;
 use crate::error::IoError;
 use crate::io::field::Scaled;
-use crate::io::flaw::Flaw;
+use crate::io::format_error::Flaw;
 use crate::io::nifti::{ForeignField, write_field, write_foreign_field};
 use crate::io::{write_bytes, write_text};
 use crate::types::{AffineMap, DenseField, Grid};

@@ -53,7 +53,7 @@ impl Fineness {
 /// A level function of the place (grid mm: voxel index times spacing).
 pub type Wall<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
 
-/// What of a mesh is told in more detail than the rest.
+/// The part of a mesh that is finer than the rest.
 #[derive(Clone, Copy, Default)]
 pub struct Detail<'a> {
     /// Places (grid mm) around which cubes are smaller.

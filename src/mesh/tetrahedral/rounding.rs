@@ -12,12 +12,12 @@
 //! Visual Reconstruction, 1987).
 
 use crate::numerics::filters::gaussian;
-use crate::numerics::small::eigenvalues;
+use crate::numerics::symmetric3::eigenvalues;
 use rayon::prelude::*;
 
 /// Half width of the band (voxels).
 const BAND: f32 = 4.0;
-/// Furthest distance that is told (voxels).
+/// Largest distance that is resolved (voxels).
 const FURTHEST: i32 = 6;
 /// Steps of the projected gradient.
 const STEPS: usize = 60;

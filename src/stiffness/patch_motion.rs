@@ -95,7 +95,7 @@ fn degrees(places: &[[f64; 3]]) -> Vec<Vec<Vec<f64>>> {
     let from: Vec<[f64; 3]> = places.iter().map(|p| std::array::from_fn(|a| p[a] - middle[a])).collect();
     let moment = |a: usize, b: usize| from.iter().map(|d| d[a] * d[b]).sum::<f64>() / n;
     let axes = symmetric_eigen(&std::array::from_fn(|a| std::array::from_fn(|b| moment(a, b)))).map(|e| e.1);
-    // One scale for all axes: what is all but flat shall not be told by its thickness.
+    // One scale for all axes: the thickness of an almost flat patch shall not decide.
     let reach = from.iter().map(|d| dot(*d, *d)).fold(0.0, f64::max).sqrt().max(f64::MIN_POSITIVE);
     let tables: [Vec<[f64; DEGREE + 1]>; 3] =
         axes.map(|axis| from.iter().map(|d| legendre(dot(*d, axis) / reach)).collect());

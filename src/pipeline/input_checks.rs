@@ -111,7 +111,7 @@ pub fn inputs<'a>(
     Ok(Checked { mask, initial, deformed, not_finite, lost, cut })
 }
 
-/// So many slices in a row may be lost: more of one value lie between two bodies.
+/// Largest number of slices in a row that may be lost: more of one value lie between two bodies.
 const IN_A_ROW: usize = 4;
 
 /// The voxels of slice `at` across an axis, in the order of memory.
@@ -184,7 +184,7 @@ fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
 }
 
 /// Soft tissue keeps its volume: that it came out as this part of what it was or less, or as its
-/// inverse or more, is told.
+/// inverse or more, is reported.
 const KEPT: f64 = 0.75;
 
 /// Voxels that are looked at for it.
@@ -330,7 +330,7 @@ fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
 /// How far past its robust range a volume's intensities may lie, in widths of it.
 const PAST: f32 = 3.0;
 
-/// The most extreme neighbours that do not count when a voxel is held against them: hot voxels come
+/// The most extreme neighbours that do not count when a voxel is compared with them: hot voxels come
 /// in short runs.
 const RUN: usize = 3;
 

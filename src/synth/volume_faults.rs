@@ -7,7 +7,7 @@ use crate::error::SynthError;
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::synth::anatomy::body;
-use crate::synth::looks::{BRIGHTEST, PATTERN, unchanged};
+use crate::synth::appearance::{BRIGHTEST, PATTERN, unchanged};
 use crate::synth::noise::Texture;
 use crate::synth::params::PhantomParams;
 use crate::synth::phantom::{Phantom, painted, phantom, phantom_on, rician};

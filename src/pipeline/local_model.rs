@@ -3,7 +3,7 @@
 //!
 //! Smoothness that varies by place still leaves what stays at rest free to follow the noise. About
 //! every place the excess misfit of stillness, or of one rigid motion, against the free field is
-//! held against the degrees of freedom that the data determine there, as
+//! compared with the degrees of freedom that the data determine there, as
 //! [`crate::consistency::models`] does for the whole.
 
 use crate::consistency::coupling::Posterior;
@@ -13,7 +13,7 @@ use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::numerics::filters;
 use crate::numerics::sampling::nearest;
-use crate::numerics::small::inverse;
+use crate::numerics::symmetric3::inverse;
 use crate::pipeline::level::SplineField;
 use crate::types::{MotionModel, VoxelPoint};
 
@@ -29,7 +29,7 @@ const NARROW: f32 = 1.7;
 const NARROWEST: f32 = 1.0 / 3.0;
 
 /// What places about it add to the misfit and the degrees of freedom of a place, with a Gaussian of
-/// so many windows: where little is determined (no texture, nothing in view) they decide.
+/// this number of windows: where little is determined (no texture, nothing in view) they decide.
 const LENT: (f32, f64) = (0.02, 3.0);
 
 /// Part of the tissue that must be at rest for any to be held there. Of 37 pairs that moved
@@ -43,7 +43,7 @@ const WORTH: f64 = 1.25;
 /// Times that a rigid motion is fitted to the tissue that is at rest under the one before.
 const FITS: usize = 2;
 
-/// A map that was held against the free field.
+/// A map that was compared with the free field.
 pub(super) struct Tried {
     pub model: MotionModel,
     pub motion: AffineMotion,

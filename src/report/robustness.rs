@@ -146,7 +146,7 @@ fn told(c: &StressCurve) -> String {
     }
 }
 
-/// Share of the runs with a result of use whose 95 % band holds at least `share` of the errors.
+/// Share of the runs with a usable result whose 95 % band holds at least `share` of the errors.
 pub fn bands_that_hold(curves: &[StressCurve], part: Part, share: f64) -> Option<f64> {
     let sound = curves.iter().filter(|c| c.part == part).flat_map(|c| &c.runs).filter(|r| !r.broken());
     let (good, all) = sound
@@ -189,7 +189,7 @@ pub fn page(curves: &[StressCurve], stated: Option<&Stated>) -> String {
     let body = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>Where it breaks</h1><p class=\"verdict\">{broken} of {} runs have no result \
          or one of no use; {silent} of these without a word.</p></header><p class=\"lead\">Severity grows to the right. The dotted \
-         line is the limit of use. On the axis, an upright stroke marks where at least half of the runs break, a dashed one where \
+         line is the limit. On the axis, an upright stroke marks where at least half of the runs break, a dashed one where \
          at least half say that something is wrong. Hollow: refused. Red crosses: broken and silent. Errors below a thousandth of the limit are drawn at \
          that, runs without a result at the top.</p><article \
          class=\"wide\">{}</article><section><h2>Table</h2>{stated}<div class=\"four\">{}</div></section>",
@@ -253,7 +253,7 @@ pub fn text(curves: &[StressCurve], stated: Option<&Stated>) -> String {
     if let Some(share) = bands_that_hold(curves, Part::Field, 0.9) {
         let _ = writeln!(
             out,
-            "The 95 % region holds 90 % of the errors or more in {:.0} % of the field runs that are of use.",
+            "The 95 % region holds 90 % of the errors or more in {:.0} % of the usable field runs.",
             100.0 * share
         );
     }

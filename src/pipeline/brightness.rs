@@ -1,4 +1,4 @@
-//! Whether a difference in brightness between the volumes is taken out, and what is said of it.
+//! Whether a difference in brightness between the volumes is taken out, and the sentence about it.
 
 use crate::matching::brightness::Brightness;
 use crate::matching::levels::Aligned;

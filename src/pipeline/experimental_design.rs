@@ -13,17 +13,17 @@ use crate::numerics::random::Random;
 use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::field::{Clock, Progress};
 use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, evenly_meshed, whole};
-use crate::stiffness::body::Body;
-use crate::stiffness::coherent::dilution;
+use crate::stiffness::boundary_conditions::{self, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::elements::Mapping;
+use crate::stiffness::fem_body::Body;
+use crate::stiffness::fields;
 use crate::stiffness::geometry::{self, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::level::{Level, NEEDED, plate_prior};
-use crate::stiffness::maps;
+use crate::stiffness::mesh_problem::{Level, NEEDED, plate_prior};
 use crate::stiffness::observations::{REACH, block_for, find, read};
-use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
+use crate::stiffness::systematic_error::dilution;
 use crate::stiffness::verdict::mesh_error;
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion, Press};
 use crate::types::space::dot;
@@ -86,7 +86,7 @@ impl<'a> Bench<'a> {
             return Err(ParamError { name: "modulus: label", value: f64::from(label), range }.into());
         }
         let mesher = Mesher::new(inputs.labels)?;
-        let (volume, nodes) = (maps::volume(inputs.labels), params.stiffness.nodes as f64);
+        let (volume, nodes) = (fields::volume(inputs.labels), params.stiffness.nodes as f64);
         let mesh = evenly_meshed(&mesher, volume, nodes)?;
         let body = Body::new(&mesh)?;
         let mut out = Self { inputs, params, body, outward: [0.0; 3], flat: None, extent: 0.0 };
@@ -109,7 +109,7 @@ impl<'a> Bench<'a> {
 
     fn find(&self, motion: &SurfaceMotion) -> Result<Vec<Patch>, StiffnessError> {
         let PlanInputs { labels, held, load, .. } = *self.inputs;
-        let mut found = patches::find(&self.body, motion, held, load, None, labels.grid())?;
+        let mut found = boundary_conditions::find(&self.body, motion, held, load, None, labels.grid())?;
         // Where the body ends with the volume it is left free.
         found.truncate(2);
         Ok(found)
@@ -186,7 +186,7 @@ impl<'a> Bench<'a> {
         body.labels.iter().map(|&l| (mu(l) / mu(body.labels[reference])).ln()).collect()
     }
 
-    /// The field of a press of so many mm.
+    /// The field of a press of `press` mm.
     fn simulate(&self, press: f64) -> Result<Simulated, StiffnessError> {
         if press > DEEPEST * self.extent {
             let range = "half of the body's extent along the load at most; press less";
@@ -344,7 +344,7 @@ impl Solved {
         let mut setup = level.setup(Law::Linear, params, reference);
         let theta = bench.theta(&level.body, reference);
         let mut estimate = true_state(&setup, &theta)?;
-        // Of a region that nothing is seen of the others are told as if it were known.
+        // A region that the data do not show counts as known for the others.
         let (mut hidden, mut borne) = (vec![false; theta.len()], 0.0);
         while let Some(found) = summary::least_seen(&setup, &estimate) {
             let Some(r) = level.body.labels.iter().position(|l| *l == found.label) else { break };
@@ -416,7 +416,7 @@ impl Solved {
         let weight = count / samples / variance;
         let information: Vec<f64> =
             (0..p * p).map(|i| self.information[i] * factor(i / p) * factor(i % p) * weight).collect();
-        // Offsets are so many voxels; plates are known to a part of one, and to the noise.
+        // Offsets are in voxels; plates are known to a part of one, and to the noise.
         let looser = (voxel * self.plate_prior + plate_prior(0.0, surface)) / self.plate_prior;
         let prior = |k: usize| match k {
             _ if k < moduli => self.prior[k],

@@ -3,16 +3,16 @@
 use crate::error::StiffnessError;
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::tetrahedron::shapes;
-use crate::stiffness::body::Body;
 use crate::stiffness::border;
-use crate::stiffness::edge::Edge;
+use crate::stiffness::boundary_conditions::{self, Patch, Place, SurfaceMotion, deformation};
 use crate::stiffness::elements::Mapping;
+use crate::stiffness::fem_body::Body;
+use crate::stiffness::fields;
 use crate::stiffness::geometry::Part;
 use crate::stiffness::identify::{Estimate, Setup, State};
-use crate::stiffness::maps;
+use crate::stiffness::indenter_outline::Outline;
 use crate::stiffness::observations::{Observation, find, from_field, from_matches, readings};
-use crate::stiffness::patches::{self, Patch, Place, SurfaceMotion, deformation};
-use crate::stiffness::rim::Outline;
+use crate::stiffness::punch_edge::Edge;
 use crate::stiffness::verdict::Misfit;
 use crate::types::stiffness::{Law, StiffnessParams};
 use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
@@ -89,7 +89,7 @@ impl Level {
         let body = Body::new(mesh)?;
         let voxel = field.grid().least_spacing();
         let motion = SurfaceMotion::new(&body, field, labels);
-        let patches = patches::find(&body, &motion, held, load, outline, field.grid())?;
+        let patches = boundary_conditions::find(&body, &motion, held, load, outline, field.grid())?;
         let (observations, block) = match matches {
             Some(m) => (from_matches(&body, field, m), 0),
             None => from_field(&body, field, labels),
@@ -114,7 +114,7 @@ impl Level {
             surface_error: motion.error,
             sharp_error: motion.sharp_error,
             near: motion.near,
-            noise: maps::noise(field, labels) / (block.max(1) as f64).powf(1.5),
+            noise: fields::noise(field, labels) / (block.max(1) as f64).powf(1.5),
             voxel,
         };
         out.open_parts();
@@ -123,7 +123,7 @@ impl Level {
 
     /// How near to a plate's plane counts as on it (mm).
     pub fn tolerance(&self) -> f64 {
-        patches::on_plane(self.voxel, self.sharp_error)
+        boundary_conditions::on_plane(self.voxel, self.sharp_error)
     }
 
     /// Opens the borders between labels, known to one standard deviation of `sd` voxels.
@@ -142,7 +142,7 @@ impl Level {
         self.open.iter().map(|(part, offset)| part.penalty(*offset)).sum()
     }
 
-    /// Moves the open parts, each so many voxels outwards from where the voxels put it.
+    /// Moves the open parts, each by its offset in voxels outwards from where the voxels put it.
     pub fn move_to(&mut self, offsets: &[f64]) {
         if self.offsets() == offsets {
             return;

@@ -1,12 +1,12 @@
 //! Results back on voxels and nodes.
 
 use crate::numerics::statistics::noise_sigma;
-use crate::stiffness::body::{Body, sorted};
+use crate::stiffness::boundary_conditions::border_of;
+use crate::stiffness::fem_body::{Body, sorted};
 use crate::stiffness::forward::Tie;
 use crate::stiffness::identify::{Setup, State};
-use crate::stiffness::level::Level;
+use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::observations::Observation;
-use crate::stiffness::patches::border_of;
 use crate::stiffness::summary::{BEARS, Hidden};
 use crate::stiffness::verdict::Misfit;
 use crate::types::stiffness::{Contact, LeftOver, Prescribed, RegionStiffness, StiffnessParams};
@@ -89,7 +89,7 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: &[Option<&[u32]>])
     out
 }
 
-/// Excess of the whole force over its part across the plate from which it is said.
+/// Excess of the whole force over its part across the plate that earns a warning.
 const LEANING: f64 = 0.01;
 
 /// Says so where the plate also pushes the body sideways, so that it matters which force is known;
@@ -146,7 +146,7 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, misfit: &Misfit) -> Vec<St
     out
 }
 
-/// Says so where the field is one affine map and there are regions to be told apart.
+/// Says so where the field is one affine map and there are regions to distinguish.
 pub fn one_map(is_affine: bool, regions: usize) -> Option<String> {
     (is_affine && regions > 1).then(|| {
         "the displacement field is one affine map: either all regions are equally stiff, or the registration was limited to affine maps \
@@ -155,7 +155,7 @@ pub fn one_map(is_affine: bool, regions: usize) -> Option<String> {
     })
 }
 
-/// Part of the surface that may lie on the volume's border without a word.
+/// Part of the surface that may lie on the volume's border without a warning.
 const CUT_OFF: f64 = 0.02;
 
 /// Says so where the body ends with the volume, away from the held and the loaded patch.
@@ -179,7 +179,7 @@ fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
 /// The borders of a volume.
 const SIDES: [[&str; 2]; 3] = [["first x", "last x"], ["first y", "last y"], ["first z", "last z"]];
 
-/// How what is said of a region begins whose modulus is open.
+/// How the sentence on a region without a modulus begins.
 pub fn not_determined(name: &str) -> String {
     format!("the data do not determine the modulus of {name}:")
 }
@@ -271,7 +271,7 @@ pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usiz
 
 /// Held over loaded area below which it is asked whether they were mistaken for each other.
 const SMALL: f64 = 0.1;
-/// Part of a patch's area that may move with it beside it without a word: its rim is known to a
+/// Part of a patch's area that may move with it beside it without a warning: its rim is known to a
 /// voxel.
 const BESIDE: f64 = 0.07;
 /// Thickness (voxels) from which a field measured from images resolves a region: two of its

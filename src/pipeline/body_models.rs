@@ -14,7 +14,7 @@ use crate::numerics::{ablation, pyramid};
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, SplineField};
-use crate::pipeline::rest::{self, Places, Rest, Tried};
+use crate::pipeline::local_model::{self, Places, Rest, Tried};
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::{Grid, Mask, MotionModel};
 use rayon::prelude::*;
@@ -56,7 +56,7 @@ impl Concluded {
         let places_of = Places::new(&pair, &windows, &field.lattice, &posterior);
         let (mut choice, tried) = smallest(&measured, &pair, field, &by_place, &places_of, seed);
         if let Some(model) = asked {
-            choice = choice.asked(model, &rest::shown(&pair, field, |_| true));
+            choice = choice.asked(model, &local_model::shown(&pair, field, |_| true));
         }
         let free = choice.motion.is_none() && asked.is_none() && ablation::is_on("rest");
         let rest = free.then(|| Rest::find((&pair, field), &windows, &places_of, &tried, &by_place)).flatten();

@@ -3,7 +3,7 @@
 use crate::error::{StiffnessError, SynthError};
 use crate::evaluate::mean;
 use crate::pipeline::{cpu, stiffness};
-use crate::stiffness::patches::Place;
+use crate::stiffness::boundary_conditions::Place;
 use crate::synth::{Phantom, PhantomKind, PhantomParams, phantom};
 use crate::types::stiffness::{RegionStiffness, Side};
 use crate::types::{DenseField, Mask, Part, SparseField, StiffnessParams, StiffnessResult, Trial};

@@ -5,7 +5,7 @@
 //! the affine motion nearest to the field over the body (polar decomposition by Newton's iteration,
 //! Higham, SIAM J. Sci. Stat. Comput. 7, 1986).
 
-use crate::numerics::small::cholesky_solve;
+use crate::numerics::symmetric3::cholesky_solve;
 use crate::types::space::{Matrix3, cross, determinant, dot};
 use crate::types::{DenseField, Displacement, Mask, SparseField, WorldPoint};
 

@@ -6,10 +6,10 @@ use crate::evaluate;
 use crate::evaluate::breaking::{Breaking, Spread, breaking_point};
 use crate::evaluate::coverage::{BAND, coverage};
 use crate::grasp::simulate::simulate;
+use crate::pipeline::compression_phantoms::Pressed;
 use crate::pipeline::field::{self, FieldResult};
-use crate::pipeline::pressed::Pressed;
-use crate::pipeline::trials::{exact, posture_error};
-use crate::synth::severity::{disturbed, shifted_labels};
+use crate::pipeline::speed_accuracy::{exact, posture_error};
+use crate::synth::degradation::{disturbed, shifted_labels};
 use crate::synth::{ElasticParams, PhantomKind, PhantomParams, Trouble, troubled};
 use crate::types::scene::{Formulation, Method};
 use crate::types::{FieldParams, Mask, Part, Scene, StiffnessParams, StiffnessResult, StressCurve, StressRun, Trust};
@@ -129,7 +129,7 @@ pub fn field_run(body: &PhantomParams, trouble: Trouble, severity: f64) -> Resul
     })
 }
 
-/// What is said against a field of low trust.
+/// The warning about a field of low trust.
 fn distrusted(result: &FieldResult) -> Option<String> {
     let expected = &result.summary.expected;
     let low = expected.trust() == Trust::Low;

@@ -115,7 +115,7 @@ impl Film {
             out,
             "],\"colours\":{},\"clock\":{names}}}</script></div><script>{}</script>",
             text(&colours),
-            include_str!("film.js")
+            include_str!("animation.js")
         );
         out
     }

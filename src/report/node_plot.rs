@@ -1,4 +1,4 @@
-//! The source's picture: the length of the displacement at every mesh node, in space.
+//! The source's picture: the displacement magnitude at every mesh node, in space.
 
 use crate::report::figure::{colour_bar, stand_alone};
 use crate::report::html::escape;

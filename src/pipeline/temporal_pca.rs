@@ -1,9 +1,9 @@
-//! What the frames of a sequence say together: the few courses over time that their motion is made
+//! What the frames of a sequence say together: the few temporal modes that their motion is made
 //! of.
 //!
 //! Each frame's field has its own noise, and all of them have that of the reference. Motion has far
 //! fewer courses than there are frames: in displacements u_t(x) = sum_k (a_k(t) - a_k(0)) m_k(x) a
-//! frame's noise is that of the few numbers a_k(t), and the reference's is told from motion as
+//! frame's noise is that of the few numbers a_k(t), and the reference's differs from motion as
 //! well, for it is one frame among the others, whose displacement is known to be 0. The courses are
 //! the principal components of the coefficients of all frames' splines (Jolliffe, Principal
 //! Component Analysis, 2002), each coefficient in units of its noise; as few are taken as leave
@@ -22,7 +22,7 @@ use std::borrow::Cow;
 /// themselves.
 const FEWEST: usize = 5;
 
-/// A course counts whose variance is so many times the mean of those after it. Noise alone has up
+/// A mode counts whose variance is this many times the mean of those after it. Noise alone has up
 /// to 3 (5 of 24 frames that follow each other).
 const STANDS_OUT: f64 = 4.0;
 
@@ -34,8 +34,8 @@ const WHITE: f64 = 0.75;
 /// takes as well: noise has 0.01 to 0.05 of it.
 const UNCERTAIN: f64 = 0.08;
 
-/// A block of two nodes along each axis keeps a frame's own field where more than so many times the
-/// noise there is left; a block that has more than so many times the median of all in all frames
+/// A block of two nodes along each axis keeps a frame's own field where more than this many times the
+/// noise there is left; a block that has more than this many times the median of all in all frames
 /// does in each of them.
 const OWN: f32 = 4.0;
 const ALWAYS: f32 = 6.0;
@@ -59,7 +59,7 @@ pub(super) struct Frame<'a> {
 pub(super) struct Modes {
     /// How many there are.
     pub count: usize,
-    /// Why so many, in words.
+    /// Why this number, in words.
     pub why: String,
     lattice: Lattice,
     /// What is to be taken from each frame's coefficients, on `lattice`.
@@ -107,7 +107,7 @@ impl Modes {
             last = Some(tried);
         }
         let said = last.map_or_else(String::new, |t| t.said());
-        Err(format!("each frame by itself: beyond {most} courses over time more than noise is left ({said})"))
+        Err(format!("each frame by itself: beyond {most} temporal modes more than noise is left ({said})"))
     }
 
     /// The field of frame `at` of those that were given, by all of them.

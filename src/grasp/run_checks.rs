@@ -1,8 +1,8 @@
 //! What is looked at in every step: contact, the model's range, slip.
 
+use crate::grasp::dynamics::Reading;
 use crate::grasp::friction::Friction;
 use crate::grasp::models::in_range;
-use crate::grasp::plant::Reading;
 use crate::types::grasp::EventKind;
 use crate::types::{FingertipModel, Scene};
 

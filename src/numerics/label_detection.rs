@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 /// Labels beyond this are not looked for.
 const LARGEST: f32 = 1_048_576.0;
-/// A region three voxels across, the smallest that counts, has so many voxels.
+/// A region three voxels across, the smallest that counts, in voxels.
 const REGION: usize = 27;
 
 /// Whether the values are those of a label map: whole numbers that form plateaus.

@@ -1,8 +1,8 @@
 //! The edge of a flat punch, beside which the surface is free.
 
-use crate::stiffness::body::Body;
+use crate::stiffness::boundary_conditions::Patch;
+use crate::stiffness::fem_body::Body;
 use crate::stiffness::interface::fade;
-use crate::stiffness::patches::Patch;
 use crate::types::space::{dot, length};
 
 /// Free surface beside a punch at least (voxels).

@@ -5,19 +5,19 @@
 //! comes to lie on one plane: the surface that is pushed in the furthest gives the plane, by least
 //! squares on its deformed places, and the patch is the surface that ends within a tolerance of it.
 //! On a curved body that is where the contact is looked for first only: a plate that nothing goes
-//! through, and that pulls nothing, finds it with the solution ([`crate::stiffness::plate`]). The
+//! through, and that pulls nothing, finds it with the solution ([`crate::stiffness::contact`]). The
 //! displacement of a patch is that of a plate, six numbers fitted to all its nodes, and these are
 //! fitted again with the moduli: no node's own noise is imposed on the solution.
 
 use crate::error::StiffnessError;
 use crate::numerics::dense::{solve, symmetric_eigen};
 use crate::numerics::statistics::percentile;
-use crate::stiffness::body::{Body, Facet, sorted};
+use crate::stiffness::contact;
+use crate::stiffness::fem_body::{Body, Facet, sorted};
 use crate::stiffness::forward::Tie;
+use crate::stiffness::indenter_outline::Outline;
 use crate::stiffness::observations::{REACH, at_surface};
-use crate::stiffness::plate;
-use crate::stiffness::rim::Outline;
-use crate::stiffness::smoothed::Smoothed;
+use crate::stiffness::patch_motion::Smoothed;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Contact, Side};
 use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
@@ -209,11 +209,11 @@ impl Patch {
     /// The plate that a curved patch slides along, for plate parameters `change` from the fitted
     /// motion; none where the patch is flat or sticks. `modulus` (kPa) is the shear modulus of an
     /// element.
-    pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<plate::Plate> {
+    pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<contact::Plate> {
         let Landing { plane: (q, _), facets } = self.landed().filter(|_| self.slides())?;
-        let stiffness = plate::STIFF * self.backing(body, modulus) / self.area(body);
+        let stiffness = contact::STIFF * self.backing(body, modulus) / self.area(body);
         let facing = facets.iter().map(|&f| &body.surface[f]);
-        let mut out = plate::Plate::touching(body, facing, self.normal, stiffness);
+        let mut out = contact::Plate::touching(body, facing, self.normal, stiffness);
         let height = |p: [f64; 3]| {
             let moved = change.iter().enumerate().map(|(k, c)| c * dot(self.basis(k, p), self.normal));
             dot(*q, self.normal) + moved.sum::<f64>()
@@ -619,7 +619,7 @@ fn pressed_facets(
     chosen.dedup();
     let on = |n: &u32| chosen.binary_search(n).is_ok();
     // On a coarse mesh hardly a facet of a small contact lies on the plane as a whole; what to add
-    // and to let go is told later.
+    // and to let go shows later.
     let with = |least: usize| -> Vec<usize> {
         let enough = |f: &usize| body.surface[*f].nodes.iter().filter(|n| on(n)).count() >= least;
         facing.iter().copied().filter(enough).collect()

@@ -3,12 +3,12 @@
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Fineness, mesh_labels};
 use crate::pipeline::stiffness::{Inputs, Progress, coarse_fineness};
-use crate::stiffness::choice::choose;
 use crate::stiffness::geometry;
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::{Inclusion, SHAPES};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::level::Level;
+use crate::stiffness::mesh_problem::Level;
+use crate::stiffness::model_selection::choose;
 use crate::stiffness::support::{Support, identify};
 use crate::stiffness::unlabelled;
 use crate::types::stiffness::{Detectable, Evidence, Law, LeftOver, StiffnessParams};

@@ -8,7 +8,7 @@
 //! sought.
 
 use crate::numerics::simd::{self, dispatch};
-use crate::numerics::small::{Symmetric3, inverse, multiply};
+use crate::numerics::symmetric3::{Symmetric3, inverse, multiply};
 
 /// Noise of neighbouring voxels after the cubic B-spline is alike; a patch holds that many times
 /// fewer independent voxels: 1 / sum(k^2) of the kernel, 2 along each axis.

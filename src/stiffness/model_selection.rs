@@ -1,10 +1,10 @@
 //! No more model than the data ask for: contact, law and number of regions by evidence.
 
 use crate::error::StiffnessError;
+use crate::stiffness::boundary_conditions::{Patch, travel};
 use crate::stiffness::geometry::{self, open_steps};
 use crate::stiffness::identify::{Estimate, Setup};
-use crate::stiffness::level::Level;
-use crate::stiffness::patches::{Patch, travel};
+use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::summary::{self, Scale};
 use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Evidence, Law, LawChoice, StiffnessParams};

@@ -8,10 +8,10 @@
 //! equilibrium is found.
 
 use crate::error::StiffnessError;
-use crate::stiffness::body::{Body, Facet, SIDE, sorted};
+use crate::stiffness::boundary_conditions::base_facets;
+use crate::stiffness::fem_body::{Body, Facet, SIDE, sorted};
 use crate::stiffness::forward::{Problem, Tie};
 use crate::stiffness::law::Material;
-use crate::stiffness::patches::base_facets;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, Side};
 

@@ -159,7 +159,7 @@ impl Case {
         Ok(trial)
     }
 
-    /// Error of doing nothing (mm): the mean motion where errors count, or the landmarks' mean
+    /// Error before registration (mm): the mean motion where errors count, or the landmarks' mean
     /// distance.
     pub fn nothing(&self) -> f64 {
         let Some(truth) = &self.truth else {

@@ -1,10 +1,10 @@
-//! Whether what a frame of a sequence says is borne out: by the frames before and after it, or by
+//! Whether the field of a frame of a sequence is confirmed: by the frames before and after it, or by
 //! its own image.
 //!
 //! A void, an artefact or a wrong match moves tissue where no frame beside it has it, and the pair
 //! alone cannot tell. A jerk does so too, but then the image agrees better with the frame's own
-//! field than with the middle of its neighbours'. Tissue where neither holds is told of; where
-//! there is no texture nothing can be said.
+//! field than with the middle of its neighbours'. Tissue where neither holds earns a warning; where
+//! there is no texture there is no answer.
 
 use crate::numerics::sampling::{Stencil, inside};
 use crate::numerics::statistics::noise_sigma;
@@ -28,10 +28,10 @@ const APART: f64 = 0.5;
 const DEVIATIONS: f64 = 4.0;
 
 /// Of the misfit (1 - correlation^2) under the neighbours' field, what a frame's own leaves at most
-/// where its image bears it out.
+/// where its image confirms it.
 const BORNE_OUT: f64 = 0.8;
 
-/// Part of the tissue from which it is said, and part of what is out of line.
+/// Part of the tissue that earns a warning, and part of what is out of line.
 const SHARE: f64 = 0.03;
 const OF_THOSE: f64 = 0.2;
 
@@ -42,7 +42,7 @@ struct Seen {
     moved: Vec<([f32; 3], f32)>,
 }
 
-/// What is not borne out in a frame.
+/// What is not confirmed in a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct OutOfLine {
     /// Part of the tissue (1).
@@ -79,7 +79,7 @@ impl<'a, 'v> Course<'a, 'v> {
         Self { reference, blocks, origin, before, last: None }
     }
 
-    /// Takes a frame, and says of the one before it what its number is and what is not borne out
+    /// Takes a frame, and says of the one before it what its number is and what is not confirmed
     /// there.
     pub fn add(
         &mut self,

@@ -7,8 +7,8 @@
 
 use crate::numerics::dense::solve;
 use crate::numerics::statistics::percentile;
+use crate::stiffness::boundary_conditions::Patch;
 use crate::stiffness::observations::at_surface;
-use crate::stiffness::patches::Patch;
 use crate::types::space::dot;
 use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
@@ -21,7 +21,7 @@ const WIDE: usize = 25;
 
 /// Directions in which an outline is looked for.
 const RAYS: usize = 256;
-/// From where to where beside a punch its outline is told by how the surface gives way (voxels).
+/// From where to where beside a punch its outline is found by how the surface gives way (voxels).
 const SEEN: [f64; 2] = [1.0, 6.0];
 /// Half of the arc over which the outline's distance is the median (voxels).
 const ARC: f64 = 1.5;
@@ -30,7 +30,7 @@ const ARC: f64 = 1.5;
 const OFF: f64 = 3.0;
 /// Times that the outline is fitted, each from where the one before put it.
 const ROUNDS: usize = 4;
-/// One standard deviation up to which an edge is told (voxels).
+/// Largest standard deviation of an edge that is given (voxels).
 const SURE: f64 = 0.1;
 /// Part of the area of what moved with the punch by which the outline's may differ.
 const UNLIKE: f64 = 0.15;

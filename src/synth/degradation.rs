@@ -12,7 +12,7 @@ use crate::numerics::filters;
 use crate::numerics::random::Random;
 use crate::synth::params::{MotionKind, PhantomParams};
 use crate::synth::phantom::{Phantom, phantom};
-use crate::synth::{artefacts, looks, scenes};
+use crate::synth::{appearance, scenes, volume_faults};
 use crate::types::{DenseField, Mask};
 use rayon::prelude::*;
 
@@ -140,20 +140,20 @@ pub fn troubled(base: &PhantomParams, trouble: Trouble, severity: f64) -> Result
         Trouble::Rotation => phantom(&with(MotionKind::Rotate, severity)),
         Trouble::Sliding => phantom(&with(MotionKind::Slide, severity)),
         Trouble::Bias => phantom(&PhantomParams { bias: (1.0 + share).ln(), ..base.clone() }),
-        Trouble::SliceThickness => artefacts::thick_slices(base, severity),
-        Trouble::Crop => artefacts::cropped(base, share),
-        Trouble::NoOverlap => artefacts::shifted(base, share),
-        Trouble::HotVoxels => artefacts::hot_voxels(base, severity.round() as usize),
-        Trouble::Background => artefacts::background(base, severity),
-        Trouble::RepetitiveTexture => looks::repetitive(base, share, &|_| [1.0, 1.0]),
+        Trouble::SliceThickness => volume_faults::thick_slices(base, severity),
+        Trouble::Crop => volume_faults::cropped(base, share),
+        Trouble::NoOverlap => volume_faults::shifted(base, share),
+        Trouble::HotVoxels => volume_faults::hot_voxels(base, severity.round() as usize),
+        Trouble::Background => volume_faults::background(base, severity),
+        Trouble::RepetitiveTexture => appearance::repetitive(base, share, &|_| [1.0, 1.0]),
         Trouble::BrightRepetition | Trouble::DarkRepetition => {
-            looks::repetitive_beside(base, share, trouble == Trouble::BrightRepetition)
+            appearance::repetitive_beside(base, share, trouble == Trouble::BrightRepetition)
         }
-        Trouble::NoTexture => looks::even_ball(base, share),
-        Trouble::MissingTissue => looks::missing(base, share),
-        Trouble::ContrastChange => looks::root(base, severity),
-        Trouble::ContrastInversion => looks::inverted(base, &|_| share),
-        Trouble::LocalContrast => looks::inverted_on_the_right(base, share),
+        Trouble::NoTexture => appearance::even_ball(base, share),
+        Trouble::MissingTissue => appearance::missing(base, share),
+        Trouble::ContrastChange => appearance::root(base, severity),
+        Trouble::ContrastInversion => appearance::inverted(base, &|_| share),
+        Trouble::LocalContrast => appearance::inverted_on_the_right(base, share),
         Trouble::StillRing => scenes::still_ring(base, severity),
         Trouble::CurvedSliding => scenes::organ(base, severity),
         Trouble::Joint => scenes::joint(base, severity),

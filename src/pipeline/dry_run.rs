@@ -3,9 +3,9 @@
 use crate::error::FieldError;
 use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
-use crate::pipeline::check::{self, Checked};
 use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
-use crate::pipeline::{polish, sparse};
+use crate::pipeline::input_checks::{self, Checked};
+use crate::pipeline::{last_passes, sparse};
 use crate::types::params::Method;
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
@@ -42,8 +42,8 @@ pub fn field(
     params: &FieldParams,
 ) -> Result<FieldPlan, FieldError> {
     params.check()?;
-    let [initial, deformed] = [check::tamed(initial), check::tamed(deformed)];
-    let Checked { mask, initial: clean, .. } = check::inputs(&initial, &deformed, mask)?;
+    let [initial, deformed] = [input_checks::tamed(initial), input_checks::tamed(deformed)];
+    let Checked { mask, initial: clean, .. } = input_checks::inputs(&initial, &deformed, mask)?;
     let grid = *initial.grid();
     let search = search_mm(&grid, params.search_mm);
     Aligned::new(&clean, &deformed, &mask, search)?;
@@ -65,7 +65,7 @@ pub fn field(
         mask_voxels,
         levels: factors
             .iter()
-            .chain(&polish::next_finer(&grid, finest, params).filter(|_| !matches_alone))
+            .chain(&last_passes::next_finer(&grid, finest, params).filter(|_| !matches_alone))
             .map(|f| std::array::from_fn(|a| shape[a].div_ceil(f[a])))
             .collect(),
         points: if params.points > 0 { params.points } else { automatic },
@@ -80,15 +80,15 @@ pub fn field(
 /// # Errors
 /// [`FieldError::Volume`], [`FieldError::TooFew`] and [`FieldError::NoOverlap`].
 pub fn grids(initial: &Grid, deformed: &Grid, params: &FieldParams) -> Result<(), FieldError> {
-    check::no_line("initial", initial)?;
-    check::no_line("deformed", deformed)?;
+    input_checks::no_line("initial", initial)?;
+    input_checks::no_line("deformed", deformed)?;
     let slice = |grid: &Grid| grid.shape().contains(&1);
     if slice(deformed) && !slice(initial) {
         let (what, hint) =
             ("is one slice, the initial volume is more".into(), "give volumes only, or slices only".into());
         return Err(FieldError::Volume { volume: "deformed", what, hint });
     }
-    check::enough_slices(initial)?;
+    input_checks::enough_slices(initial)?;
     overlap(initial, deformed, search_mm(initial, params.search_mm)).map(drop)
 }
 
@@ -103,7 +103,7 @@ pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
     14_000_000 + 18 * voxels.min(20_000_000) + 13 * voxels.saturating_sub(20_000_000) + copies
 }
 
-/// Memory of a stiffness run on a mesh of so many nodes (bytes), at most: 150 MB and 40 kB a node
+/// Memory of a stiffness run on a mesh of `nodes` nodes (bytes), at most: 150 MB and 40 kB a node
 /// to 20,000, growing with the cube root past them, as the factors of a sparse matrix in space do.
 /// Measured on finger pads with three labels, layers under a punch and inclusions with and without
 /// labels: 0.15 to 0.23 GB at 2,000 nodes, 0.27 to 0.43 at 8,000, 0.69 to 0.85 at 20,000, 1.7 to
