@@ -3,7 +3,7 @@
 use crate::error::FieldError;
 use crate::matching::levels::{Aligned, overlap};
 use crate::numerics::orientation::Orientation;
-use crate::pipeline::field::{finest_level, inside, search_mm, worked_on};
+use crate::pipeline::coarse_to_fine::{finest_level, inside, search_mm, worked_on};
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::{last_passes, sparse};
 use crate::types::params::Method;

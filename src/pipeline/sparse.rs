@@ -14,7 +14,7 @@ use crate::consistency::models::{AffineMotion, Choice, Excess, choose};
 use crate::consistency::pruning::{GATE, Measured, prune};
 use crate::error::FieldError;
 use crate::field::jacobian;
-use crate::field::spline::FieldSpline;
+use crate::field::spline::{FieldSpline, Spline};
 use crate::matching::levels::{Aligned, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::matching::residual;
@@ -25,14 +25,21 @@ use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{inverse, quadratic};
 use crate::pipeline::background;
 use crate::pipeline::body_models;
-use crate::pipeline::field::{self, Clock, FEWEST, FieldResult, Progress, Start};
+use crate::pipeline::clock::Clock;
+use crate::pipeline::coarse_to_fine;
+use crate::pipeline::field::{FEWEST, FieldResult, Progress, Start, lengths};
+use crate::pipeline::field_warnings::{
+    agreement, no_match, out_of_view, said_of_model, too_few, warnings, without_texture,
+};
 use crate::pipeline::hypotheses::{AGREED, Search};
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::local_model;
+use crate::pipeline::match_mesh::{Meshed, estimated, with_mesh, world_match};
 use crate::pipeline::refinement;
 use crate::pipeline::stages::{self, Left};
+use crate::pipeline::start;
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::*;
 use rayon::prelude::*;
@@ -83,10 +90,10 @@ const LEAST_VOLUME: f32 = 0.1;
 /// The finest level worked on: the coarsest with room for the points asked for, or the one with at
 /// most 600,000 voxels of tissue.
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, params: &FieldParams) -> usize {
-    let automatic = field::finest_level(grid, mask, 0).max(params.finest);
-    let tissue = field::inside(mask);
+    let automatic = coarse_to_fine::finest_level(grid, mask, 0).max(params.finest);
+    let tissue = coarse_to_fine::inside(mask);
     let room = |f: usize| {
-        let factor = field::worked_on(grid, mask, f, 0.0);
+        let factor = coarse_to_fine::worked_on(grid, mask, f, 0.0);
         tissue / factor.last().map_or(1, |f| f.iter().product::<usize>()) >= ROOM * params.points
     };
     [8, 4, 2, 1]
@@ -104,6 +111,78 @@ pub(super) fn points(params: &FieldParams, inside: usize) -> usize {
     }
 }
 
+/// The levels of the pyramid, from the coarsest one, and how they are worked on.
+struct Levels<'a> {
+    aligned: &'a Aligned<'a>,
+    /// Voxels that a voxel of each level stands for.
+    factors: &'a [[usize; 3]],
+    /// Whether the volumes are one slice.
+    flat: bool,
+    /// The range (mm) that is searched.
+    search: f64,
+    params: &'a FieldParams,
+    progress: Progress<'a>,
+}
+
+/// What the finest level found, with its pair and factor, and what all levels did.
+struct Finest<'a> {
+    found: Found,
+    pair: Pair<'a>,
+    factor: [usize; 3],
+    reports: Vec<LevelReport>,
+    left: Vec<Left>,
+}
+
+impl<'a> Levels<'a> {
+    /// The matches and the field of each level, from the coarsest to the finest; none without a
+    /// level.
+    fn run(&self, clock: &mut Clock) -> Option<Finest<'a>> {
+        let Self { params, flat, search: range, .. } = *self;
+        let (mut reports, mut left) = (Vec::new(), Vec::new());
+        let mut state: Option<(Found, Pair<'_>, [usize; 3])> = None;
+        for (l, &factor) in self.factors.iter().enumerate() {
+            let pair = self.aligned.level(factor);
+            clock.book("pyramid");
+            (self.progress)("matching", 0.9 * l as f64 / self.factors.len() as f64);
+            let lattice = level::lattice(&pair, APART);
+            let begun = match &state {
+                None => Search { params, range, flat, matching: &|| (), tick: &|_| () }.by_matches(&pair, &lattice),
+                Some((found, _, from)) => {
+                    level::carry(&found.field, lattice, |p| to_level(from_level(p, factor), *from))
+                }
+            };
+            let found = on_level(&pair, begun, l + 1 == self.factors.len(), params);
+            reports.push(found.report.clone());
+            let motion = found.field.without_blocks().into();
+            left.push(Left { name: "matches of a level".into(), motion, factor });
+            state = Some((found, pair, factor));
+            clock.book("matching");
+        }
+        state.map(|(found, pair, factor)| Finest { found, pair, factor, reports, left })
+    }
+}
+
+/// The chosen motion on the full grid, and the variance of its error by source; `warped` is the
+/// deformed volume under the field.
+fn variances(
+    pair: &Pair<'_>,
+    field: &SplineField,
+    warped: &[f32],
+    (choice, factor): (&Choice, [usize; 3]),
+    (grid, seed): (&Grid, u64),
+) -> (Spline, Variances) {
+    let posterior = level::posterior(field, pair.spacing, seed);
+    let misfit = residual::misfit_by_place(pair, warped, &field.lattice);
+    let hidden = body_models::hidden(pair, field);
+    let full = body_models::full_lattice(grid, field, factor, (choice, factor));
+    let departure = body_models::departure(&full, field, factor, choice.rejected);
+    let narrowed = vec![1.0; departure.len()];
+    let nodes =
+        AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
+    let variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
+    (full, variances)
+}
+
 /// What one level found.
 struct Found {
     /// Fitted to the matches, with the information that the kept ones give at each node.
@@ -116,7 +195,7 @@ struct Found {
 /// alone.
 ///
 /// # Errors
-/// As [`field::run`].
+/// As [`crate::pipeline::field::run`].
 pub(super) fn measure(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
@@ -124,6 +203,11 @@ pub(super) fn measure(
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
+    if known.start.is_some_and(|start| start::bends(start::rest(start), initial.grid(), known.mask)) {
+        let what = "the start bends, and --method sparse begins at an affine map".into();
+        let hint = "leave --method out, or give an affine transform".into();
+        return Err(FieldError::Start { what, hint });
+    }
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
     let [initial, deformed] = [initial, deformed].map(input_checks::tamed);
@@ -133,35 +217,18 @@ pub(super) fn measure(
     let mask = known.counted(mask);
     let grid = *initial.grid();
     let flat = grid.is_single_slice();
-    let search = field::search_mm(&grid, params.search_mm);
+    let search = coarse_to_fine::search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
-    let factors = field::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
+    let factors = coarse_to_fine::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
 
-    // Coarse to fine.
-    let (mut reports, mut left) = (Vec::new(), Vec::new());
-    let mut state: Option<(Found, Pair<'_>, [usize; 3])> = None;
-    for (l, &factor) in factors.iter().enumerate() {
-        let pair = aligned.level(factor);
-        clock.book("pyramid");
-        progress("matching", 0.9 * l as f64 / factors.len() as f64);
-        let lattice = level::lattice(&pair, APART);
-        let begun = match &state {
-            None => Search { params, range: search, flat, matching: &|| (), tick: &|_| () }.by_matches(&pair, &lattice),
-            Some((found, _, from)) => level::carry(&found.field, lattice, |p| to_level(from_level(p, factor), *from)),
-        };
-        let found = on_level(&pair, begun, l + 1 == factors.len(), params);
-        reports.push(found.report.clone());
-        let motion = found.field.without_blocks().into();
-        left.push(Left { name: "matches of a level".into(), motion, factor });
-        state = Some((found, pair, factor));
-        clock.book("matching");
-    }
-    let Some((Found { mut field, matches, .. }, pair, factor)) = state else {
-        return Err(field::no_match(0, "check the mask".into()));
+    let levels = Levels { aligned: &aligned, factors: &factors, flat, search, params, progress };
+    let Some(Finest { found, pair, factor, mut reports, left }) = levels.run(&mut clock) else {
+        return Err(no_match(0, "check the mask".into()));
     };
+    let Found { mut field, matches, .. } = found;
     let kept = matches.iter().filter(|m| m.kept).count();
     if kept < FEWEST {
-        return Err(field::too_few(kept, &pair, (search, params), known.start.is_some()));
+        return Err(too_few(kept, &pair, (search, params), known.start.is_some()));
     }
 
     // The smallest motion that explains the matches, and what they leave open.
@@ -176,47 +243,32 @@ pub(super) fn measure(
     choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
     let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
     clock.book("model");
-    let posterior = level::posterior(&field, pair.spacing, params.seed);
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
-    let misfit = residual::misfit_by_place(&pair, &warped, &field.lattice);
-    let hidden = body_models::hidden(&pair, &field);
-    clock.book("uncertainty");
-
-    let full = body_models::full_lattice(&grid, &field, factor, (&choice, factor));
-    let departure = body_models::departure(&full, &field, factor, choice.rejected);
-    let narrowed = vec![1.0; departure.len()];
-    let nodes =
-        AtNodes { posterior: &posterior, misfit: &misfit, departure: &departure, narrowed: &narrowed, hidden: &hidden };
-    let mut variances = Variances::of(field.lattice.clone(), pair.spacing, &nodes);
+    let (full, mut variances) = variances(&pair, &field, &warped, (&choice, factor), (&grid, params.seed));
     let searched = reports.first().map_or(1.0, |r| r.counts.kept_share());
     let unlike = refinement::unlike(&pair, level::misfit(&pair, &warped)[0]);
     if searched < AGREED && unlike.is_some() {
-        variances = variances.with_other_motions(searched, search);
+        variances.set_other_motions(searched, search);
     }
     let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
     let uncertainty = variances.deviation(&grid, factor);
     let samples = variances.samples(&grid, factor)?;
-    let agreement = field::agreement(&pair, &field.without_blocks().into(), choice.model)?;
+    let agreement = agreement(&pair, &field.without_blocks().into(), choice.model)?;
     let stages = stages::account(&grid, (&pair, factor), left, &coefficients);
-    let measured = SparseField { matches: matches.iter().map(|m| field::world_match(&grid, m, factor)).collect() };
-    let sparse = field::estimated(measured, &grid, (&coefficients, &uncertainty));
+    let measured = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
+    let sparse = estimated(measured, &grid, (&coefficients, &uncertainty));
     clock.book("uncertainty");
 
     progress("mesh", 0.92);
-    let (mesh, source) = field::mesh_of(&sparse, flat)?;
-    let at_nodes: Vec<&Match> = sparse.kept().collect();
-    let node_displacement: Vec<[f64; 3]> = source.iter().map(|&i| at_nodes[i as usize].displacement).collect();
-    clock.book("mesh");
-    let smooth = coefficients.dense()?;
-    let displacement = field::interpolated(params.interpolation, smooth, (&mesh, &node_displacement))?;
-    clock.book("interpolation");
-    let (mean_mm, max_mm, mask_voxels) = field::lengths(&displacement, &mask);
-    let folds = jacobian::count_folds(&displacement, Some(&mask))?;
+    let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, flat, &mut clock)?;
+    let displacement = &meshed.displacement;
+    let (mean_mm, max_mm, mask_voxels) = lengths(displacement, &mask);
+    let folds = jacobian::count_folds(displacement, Some(&mask))?;
     clock.book("jacobian");
-    let expected = variances.expected((&uncertainty, factor), (&displacement, &mask), (choice.model, choice.rejected));
+    let expected = variances.expected((&uncertainty, factor), (displacement, &mask), (choice.model, choice.rejected));
     clock.book("uncertainty");
 
-    let counts = field::with_mesh(&mut reports, &mesh);
+    let counts = with_mesh(&mut reports, &meshed.mesh);
     let summary = FieldSummary {
         counts,
         model: choice.model,
@@ -243,19 +295,20 @@ pub(super) fn measure(
         landmarks: None,
         start: None,
         seconds: clock.0,
-        warnings: field::warnings(counts, folds, not_finite, max_mm, search)
+        warnings: warnings(counts, folds, not_finite, max_mm, search)
             .into_iter()
-            .chain(field::said_of_model(choice.rejected))
+            .chain(said_of_model(choice.rejected))
             .chain(input_checks::said_of(&lost))
-            .chain(input_checks::squeezed(&displacement, &mask))
+            .chain(input_checks::squeezed(displacement, &mask))
             .chain(unlike)
-            .chain(field::without_texture(pair.plain()))
-            .chain(field::out_of_view(unseen))
+            .chain(without_texture(pair.plain()))
+            .chain(out_of_view(unseen))
             .collect(),
     };
     progress("done", 1.0);
     // A search that starts from the field needs no information at its nodes.
     field.blocks = Blocks::default();
+    let Meshed { mesh, node_displacement, node_matches, displacement } = meshed;
     Ok(FieldResult {
         displacement,
         coefficients,
@@ -266,7 +319,7 @@ pub(super) fn measure(
         matches: sparse,
         mesh,
         node_displacement,
-        node_matches: source,
+        node_matches,
         stages,
         summary,
     })

@@ -3,7 +3,8 @@
 use crate::error::{FieldError, StrainError};
 use crate::field::jacobian;
 use crate::numerics::statistics::{median, noise_sigma};
-use crate::pipeline::field::{Clock, FieldResult, Progress};
+use crate::pipeline::clock::Clock;
+use crate::pipeline::field::{FieldResult, Progress};
 use crate::pipeline::uncertainty::evenly;
 use crate::strain::StrainField;
 use crate::strain::deviation::{COMPONENTS, Draws, Gradients, StrainDeviation, apart, components};

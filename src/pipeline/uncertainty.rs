@@ -132,7 +132,7 @@ impl Variances {
 
     /// Adds the doubt beside borders between bodies: voxels of the full-resolution grid with
     /// the jump there (mm). The lattice lies on a level of `factor`.
-    pub fn with_borders(mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) -> Self {
+    pub fn add_borders(&mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) {
         let lattice = self.lattice.clone();
         let cell: usize = (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] * factor[a]).product();
         let borders = self.part(ErrorSource::Borders);
@@ -140,32 +140,28 @@ impl Variances {
             let square = (SIDE * jump).powi(2) / cell as f32;
             lattice.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| borders[node] += w * square);
         }
-        self
     }
 
     /// Adds what other motions within the range of the search leave open (mm), where only this part
     /// of the features agree on the one that was found: the rest may be anywhere in that ball.
-    pub fn with_other_motions(mut self, agreeing: f64, range: f64) -> Self {
+    pub fn set_other_motions(&mut self, agreeing: f64, range: f64) {
         let variance = ((1.0 - agreeing) * range * range / 5.0) as f32;
         self.part(ErrorSource::OtherMotions).fill(variance);
-        self
     }
 
     /// Adds the variance along an axis (mm^2) that landmarks show where most contradict the field.
-    pub fn with_landmarks(mut self, variance: f64) -> Self {
+    pub fn add_landmarks(&mut self, variance: f64) {
         self.part(ErrorSource::OtherMotions).iter_mut().for_each(|v| *v += variance as f32);
-        self
     }
 
     /// Widens all where the volumes have different contrasts, of whose variance their relation
     /// leaves this part.
-    pub fn with_contrast(mut self, left: f64) -> Self {
+    pub fn add_contrast(&mut self, left: f64) {
         let more = ((1.0 + CONTRAST * left).powi(2) - 1.0) as f32;
         for m in 0..self.lattice.len() {
             let all: f32 = self.parts.iter().map(|part| part[m]).sum();
             self.part(ErrorSource::Misfit)[m] += more * all;
         }
-        self
     }
 
     /// The standard deviation along an axis (mm) at node `m`.
