@@ -501,108 +501,27 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
     let voxels = sorted(if params.voxel_mm.is_empty() { vec![own] } else { params.voxel_mm.clone() });
     clock.book("mesh");
 
-    // Of a flat patch one solution serves all presses; a curved one touches with more of itself.
     let mut warnings = Vec::new();
-    let mut solved: Vec<(f64, Solved)> = Vec::new();
-    let deepest = presses.len() - 1;
-    let wanted: Vec<f64> = if bench.flat.is_some() { vec![presses[deepest]] } else { presses.clone() };
-    let mut failure = None;
-    for (i, &press) in wanted.iter().enumerate() {
-        progress("press", 0.1 + 0.85 * i as f64 / wanted.len() as f64);
-        match Solved::new(&bench, press) {
-            Ok(found) => solved.push((press, found)),
-            Err(error @ StiffnessError::Param(_)) => return Err(error),
-            Err(error) => {
-                warnings.push(format!("a press of {press:.3} mm is left out: {error}"));
-                failure = Some(error);
-            }
-        }
-    }
+    let solved = Presses::solved(&bench, &presses, &mut warnings, progress)?;
     clock.book("presses");
-    let Some(first) = solved.first() else { return Err(failure.unwrap_or(StiffnessError::NoEquilibrium)) };
-    let of = |press: f64| {
-        if bench.flat.is_some() { Some(&first.1) } else { solved.iter().find(|s| s.0 == press).map(|s| &s.1) }
+    let (body, reference) = (&bench.body, solved.first.reference);
+    let planned = |r: usize| PlannedRegion {
+        label: body.labels[r],
+        name: (inputs.names)(body.labels[r]),
+        youngs_modulus: params.modulus(body.labels[r]).unwrap_or(f64::NAN),
+        volume: body.volumes[r],
+        wanted: !params.ratios || r != reference,
     };
-
-    let body = &bench.body;
-    let reference = first.1.reference;
-    let regions: Vec<PlannedRegion> = (0..body.labels.len())
-        .map(|r| PlannedRegion {
-            label: body.labels[r],
-            name: (inputs.names)(body.labels[r]),
-            youngs_modulus: params.modulus(body.labels[r]).unwrap_or(f64::NAN),
-            volume: body.volumes[r],
-            wanted: !params.ratios || r != reference,
-        })
-        .collect();
-    let reading = bench.reading();
-    let (mut expected, mut least_press, mut unfelt) = (Vec::new(), f64::INFINITY, Vec::new());
-    for &voxel in &voxels {
-        let usual = || PlanParams::NOISE.map(|part| part * voxel).to_vec();
-        let noises = sorted(if params.noise_mm.is_empty() { usual() } else { params.noise_mm.clone() });
-        let before = expected.len();
-        for &noise in &noises {
-            let surface = reading * noise;
-            let least = least_travel(surface, voxel);
-            least_press = least_press.min(least);
-            if presses[0] <= least {
-                unfelt.push(format!("{least:.3} mm at {noise:.3} mm of noise"));
-            }
-            for &press in &presses {
-                let found =
-                    of(press).and_then(|s| Some((s, s.expected(press, voxel / own, [noise, surface], params.ratios)?)));
-                let Some((solved, found)) = found else { continue };
-                let felt = press > least;
-                expected.extend(regions.iter().zip(found).enumerate().map(|(r, (region, [sd, scatter]))| {
-                    let determined = felt && solved.determines(r, sd, params.ratios);
-                    let (label, name) = (region.label, region.name.clone());
-                    let enough = determined && region.wanted && sd <= params.want;
-                    Expected {
-                        press_mm: press,
-                        voxel_mm: voxel,
-                        noise_mm: noise,
-                        label,
-                        name,
-                        sd,
-                        scatter,
-                        felt,
-                        determined,
-                        enough,
-                    }
-                }));
-            }
-        }
-        if expected.len() == before {
-            warnings.push(format!(
-                "voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"
-            ));
-        }
-    }
-    if expected.is_empty() {
-        let value = voxels[0];
-        let range = "small enough that the body holds 100 voxels; take smaller ones";
-        return Err(ParamError { name: "voxel", value, range }.into());
-    }
-    unfelt.dedup();
-    if !unfelt.is_empty() {
-        let all = unfelt.join(", ");
-        warnings.push(format!("`stiffness` refuses a press that does not stand out of the noise: it must pass {all}"));
-    }
+    let regions: Vec<PlannedRegion> = (0..body.labels.len()).map(planned).collect();
+    let options = Options { bench: &bench, params, presses: &presses, solved: &solved, regions: &regions };
+    let (expected, least_press) = options.expected(&voxels, &mut warnings)?;
     let told = |&press: &f64| {
-        let solved = of(press)?;
+        let solved = solved.of(press)?;
         let deeper = press / solved.press;
         Some(Press { press_mm: press, strain: deeper * solved.strain, force_n: deeper * solved.force.abs() })
     };
     let presses: Vec<Press> = presses.iter().filter_map(told).collect();
-    let large: Vec<String> =
-        presses.iter().filter(|p| p.strain > LARGE_STRAIN).map(|p| format!("{:.3}", p.press_mm)).collect();
-    if !large.is_empty() {
-        warnings.push(format!(
-            "strains pass {:.0} % at {} mm: the plan's law is linear, and `stiffness` takes the neo-Hookean one there",
-            100.0 * LARGE_STRAIN,
-            large.join(", ")
-        ));
-    }
+    warnings.extend(large_strain(&presses));
     clock.book("options");
     Ok(Plan {
         want: params.want,
@@ -618,5 +537,141 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
         expected,
         warnings,
         seconds: clock.0,
+    })
+}
+
+/// The solutions of all presses.
+struct Presses {
+    first: Solved,
+    /// Those after the first, with their presses (mm).
+    others: Vec<(f64, Solved)>,
+    /// The press of the first one, where it does not serve all: of a flat patch one solution does,
+    /// a curved one touches with more of itself.
+    own: Option<f64>,
+}
+
+impl Presses {
+    /// # Errors
+    /// Where no press can be solved, or one is out of range.
+    fn solved(
+        bench: &Bench<'_>,
+        presses: &[f64],
+        warnings: &mut Vec<String>,
+        progress: Progress<'_>,
+    ) -> Result<Self, StiffnessError> {
+        let wanted = if bench.flat.is_some() { &presses[presses.len() - 1..] } else { presses };
+        let (mut solved, mut failure) = (Vec::new(), None);
+        for (i, &press) in wanted.iter().enumerate() {
+            progress("press", 0.1 + 0.85 * i as f64 / wanted.len() as f64);
+            match Solved::new(bench, press) {
+                Ok(found) => solved.push((press, found)),
+                Err(error @ StiffnessError::Param(_)) => return Err(error),
+                Err(error) => {
+                    warnings.push(format!("a press of {press:.3} mm is left out: {error}"));
+                    failure = Some(error);
+                }
+            }
+        }
+        let mut solved = solved.into_iter();
+        let Some((press, first)) = solved.next() else {
+            return Err(failure.unwrap_or(StiffnessError::NoEquilibrium));
+        };
+        Ok(Self { first, others: solved.collect(), own: bench.flat.is_none().then_some(press) })
+    }
+
+    fn of(&self, press: f64) -> Option<&Solved> {
+        match self.own {
+            Some(own) if own != press => self.others.iter().find(|s| s.0 == press).map(|s| &s.1),
+            _ => Some(&self.first),
+        }
+    }
+}
+
+/// What is compared: presses by voxel sizes by noises.
+struct Options<'a> {
+    bench: &'a Bench<'a>,
+    params: &'a PlanParams,
+    presses: &'a [f64],
+    solved: &'a Presses,
+    regions: &'a [PlannedRegion],
+}
+
+impl Options<'_> {
+    /// The expected deviations, and the least press (mm) that stands out of the noise.
+    ///
+    /// # Errors
+    /// Where the body holds too few voxels of any size.
+    fn expected(&self, voxels: &[f64], warnings: &mut Vec<String>) -> Result<(Vec<Expected>, f64), StiffnessError> {
+        let reading = self.bench.reading();
+        let (mut expected, mut least_press, mut unfelt) = (Vec::new(), f64::INFINITY, Vec::new());
+        for &voxel in voxels {
+            let given = &self.params.noise_mm;
+            let usual = || PlanParams::NOISE.map(|part| part * voxel).to_vec();
+            let noises = sorted(if given.is_empty() { usual() } else { given.clone() });
+            let before = expected.len();
+            for noise in noises {
+                let least = least_travel(reading * noise, voxel);
+                least_press = least_press.min(least);
+                if self.presses[0] <= least {
+                    unfelt.push(format!("{least:.3} mm at {noise:.3} mm of noise"));
+                }
+                for &press in self.presses {
+                    expected.extend(self.of(press, voxel, [noise, reading * noise], press > least));
+                }
+            }
+            if expected.len() == before {
+                warnings.push(format!(
+                    "voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"
+                ));
+            }
+        }
+        if expected.is_empty() {
+            let range = "small enough that the body holds 100 voxels; take smaller ones";
+            return Err(ParamError { name: "voxel", value: voxels[0], range }.into());
+        }
+        unfelt.dedup();
+        if !unfelt.is_empty() {
+            let all = unfelt.join(", ");
+            warnings
+                .push(format!("`stiffness` refuses a press that does not stand out of the noise: it must pass {all}"));
+        }
+        Ok((expected, least_press))
+    }
+
+    /// Each region under one press (mm), with voxels (mm), noise inside and on the surface (mm);
+    /// `felt` tells whether the press stands out of it.
+    fn of(&self, press: f64, voxel: f64, noise: [f64; 2], felt: bool) -> Vec<Expected> {
+        let ratios = self.params.ratios;
+        let Some(solved) = self.solved.of(press) else { return Vec::new() };
+        let Some(found) = solved.expected(press, voxel / self.bench.voxel(), noise, ratios) else { return Vec::new() };
+        let of = |(r, (region, [sd, scatter])): (usize, (&PlannedRegion, [f64; 2]))| {
+            let determined = felt && solved.determines(r, sd, ratios);
+            Expected {
+                press_mm: press,
+                voxel_mm: voxel,
+                noise_mm: noise[0],
+                label: region.label,
+                name: region.name.clone(),
+                sd,
+                scatter,
+                felt,
+                determined,
+                enough: determined && region.wanted && sd <= self.params.want,
+            }
+        };
+        self.regions.iter().zip(found).enumerate().map(of).collect()
+    }
+}
+
+/// Warns where strains pass those of a linear law.
+fn large_strain(presses: &[Press]) -> Option<String> {
+    let large: Vec<String> =
+        presses.iter().filter(|p| p.strain > LARGE_STRAIN).map(|p| format!("{:.3}", p.press_mm)).collect();
+    (!large.is_empty()).then(|| {
+        format!(
+            "strains pass {:.0} % at {} mm: the plan's law is linear, and `stiffness` takes the neo-Hookean one there",
+            100.0 * LARGE_STRAIN,
+            large.join(", ")
+        )
     })
 }

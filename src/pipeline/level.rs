@@ -24,7 +24,7 @@ use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{Symmetric3, inverse};
 use crate::numerics::{ablation, filters, pyramid};
 use crate::pipeline::landmarks;
-use crate::types::{Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
+use crate::types::{Candidate, Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -423,33 +423,99 @@ pub fn matches(
     params: MatchParams,
 ) -> (Vec<LevelMatch>, Option<SplineField>, LevelReport) {
     let spacing = pair.spacing;
-    let finest = pyramid::finest(pair.shape, spacing);
     let radius = pair.in_voxels(params.patch);
-    let noise = pair.noise;
-    let room = pair.inside as f64 / params.points as f64;
-    // The deformed side: as it is, or warped by the known field, where both volumes' features share
-    // one frame.
     let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &pair.spans.grown(radius[0] + 3)));
-    let smooth;
-    let (data, shape, origin) = match &warped {
-        Some(w) => (w.as_slice(), pair.shape, [0.0; 3]),
-        None => (&pair.moving[..], pair.moving_shape, pair.moving_origin),
+    let Sought { initial, starts, deformed, list, origin } = sought(pair, warped.as_deref(), &params);
+    let mm: Vec<[f64; 3]> = starts.iter().map(|p| std::array::from_fn(|a| p[a] * spacing[a])).collect();
+    let (chosen, [energy_before, energy_after]) = assigned(pair, &mm, &list, &params);
+
+    // Sub-voxel position and covariance of each choice.
+    let template = template(pair, radius);
+    let place = |i: usize| {
+        let start = list[i].get(chosen[i])?.displacement;
+        let centre = initial[i].centre;
+        let at: [f64; 3] = std::array::from_fn(|a| centre[a] as f64 + start[a] / spacing[a] - origin[a]);
+        let mut found = refined(pair, warped.as_deref(), &template, centre, at, radius)?;
+        if !params.sub_voxel {
+            found.shift = [0.0; 3];
+        }
+        Some((i, start, found))
     };
-    let smooth_data = match &warped {
-        Some(w) => w.as_slice(),
+    let refined: Vec<Option<(usize, [f64; 3], Refined)>> = (0..initial.len()).into_par_iter().map(place).collect();
+    let refined: Vec<_> = refined.into_iter().flatten().collect();
+
+    // The coupled field: the known one, or one fitted to all matches with their information.
+    let fitted = known.is_none().then(|| fit(pair, &starts, &refined, &radius));
+    let field = known.or(fitted.as_ref());
+    let measured = |(i, start, r): &(usize, [f64; 3], Refined)| {
+        let u = field.map_or([0.0; 3], |f| f.lattice.at(&f.coefficients, starts[*i]));
+        let base = if known.is_some() { u } else { [0.0; 3] };
+        let displacement = std::array::from_fn(|a| base[a] + (start[a] + r.shift[a]));
+        Measured { place: mm[*i], displacement, covariance: r.covariance, field: u }
+    };
+    let mut measured: Vec<Measured> = refined.iter().map(measured).collect();
+    let floor = 0.2 * pyramid::finest(pair.shape, spacing);
+    let kept = if is_consistent(&params) { prune(&measured, floor, GATE) } else { vec![true; measured.len()] };
+    calibrate(&mut measured, &kept);
+    let distances = measured.iter().zip(&kept).filter(|(_, k)| **k);
+    let mut residual: Vec<f32> = distances.map(|(m, _)| distance(m.displacement, m.field) as f32).collect();
+    let counts = Counts {
+        features_initial: initial.len(),
+        features_deformed: deformed,
+        candidates: list.iter().map(Vec::len).sum(),
+        kept: residual.len(),
+        ..Counts::default()
+    };
+    let residual_mm = if residual.is_empty() { 0.0 } else { f64::from(median(&mut residual)) };
+    let report = LevelReport { spacing_mm: spacing, counts, energy_before, energy_after, residual_mm };
+    let matches = refined.iter().zip(measured).zip(kept).map(|(((i, _, r), measured), kept)| LevelMatch {
+        voxel: starts[*i],
+        measured,
+        ncc: r.ncc,
+        kept,
+    });
+    (matches.collect(), fitted, report)
+}
+
+/// Whether matches must agree with their neighbours.
+fn is_consistent(params: &MatchParams) -> bool {
+    params.consistency && ablation::is_on("consistency")
+}
+
+/// Features of both volumes with their candidate matches.
+struct Sought {
+    initial: Vec<Corner>,
+    /// The places of the initial features (voxels).
+    starts: Vec<[f64; 3]>,
+    /// Number of features in the deformed volume.
+    deformed: usize,
+    list: Vec<Vec<Candidate>>,
+    /// The place of the deformed volume's first voxel (voxels).
+    origin: [f64; 3],
+}
+
+/// Seeks candidates in the deformed volume: as it is, or `warped` by a known field, where the
+/// features of both volumes share one frame.
+fn sought(pair: &Pair<'_>, warped: Option<&[f32]>, params: &MatchParams) -> Sought {
+    let (spacing, noise) = (pair.spacing, pair.noise);
+    let radius = pair.in_voxels(params.patch);
+    let smooth;
+    let (data, smooth_data, shape, origin) = match warped {
+        Some(w) => (w, w, pair.shape, [0.0; 3]),
         None => {
             smooth = filters::bspline(&pair.moving, pair.moving_shape);
-            smooth.as_slice()
+            (&pair.moving[..], smooth.as_slice(), pair.moving_shape, pair.moving_origin)
         }
     };
+    let room = pair.inside as f64 / params.points as f64;
     let quick = !params.thorough && room >= BLOCKS;
     let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, quick, params.points);
-    let within = known.is_some().then_some(&pair.mask[..]);
-    let room = if params.thorough && known.is_some() { room / 5.0 } else { room };
+    let within = warped.is_some().then_some(&pair.mask[..]);
+    let room = if params.thorough && warped.is_some() { room / 5.0 } else { room };
     let deformed = corners(smooth_data, shape, spacing, within, noise, room, quick, 5 * params.points);
     let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
-    let fixed = if known.is_some() { &pair.fixed_smooth[..] } else { &pair.fixed[..] };
-    let searchable = if known.is_some() { Searchable::near } else { Searchable::new };
+    let fixed = if warped.is_some() { &pair.fixed_smooth[..] } else { &pair.fixed[..] };
+    let searchable = if warped.is_some() { Searchable::near } else { Searchable::new };
     let (here, there) = (searchable(fixed, pair.shape, radius), searchable(data, shape, radius));
     let starts: Vec<[f64; 3]> = initial.iter().map(|c| c.voxel).collect();
     let list = candidates(
@@ -458,98 +524,55 @@ pub fn matches(
         spacing,
         CandidateParams {
             reach_mm: params.reach_mm,
-            keep: if known.is_some() { params.candidates.min(3) } else { params.candidates },
+            keep: if warped.is_some() { params.candidates.min(3) } else { params.candidates },
             partners: 16,
             min_ncc: 0.3,
         },
     );
-    let count = list.iter().map(Vec::len).sum();
-    let mm: Vec<[f64; 3]> = starts.iter().map(|p| std::array::from_fn(|a| p[a] * spacing[a])).collect();
-    let energy = EnergyParams { lambda: 1.5, precision_mm: finest, strain: params.strain, neighbours: 16 };
-    let graph = Graph::new(&mm, energy);
-    let consistency = params.consistency && ablation::is_on("consistency");
-    let (chosen, energy_before, energy_after) = if consistency {
-        let relaxed = relax(&graph, &list);
-        (relaxed.chosen, relaxed.energy_before, relaxed.energy_after)
-    } else {
-        let best = vec![0; list.len()];
-        let energy = graph.energy(&list, &best);
-        (best, energy, energy)
-    };
+    Sought { initial, starts, deformed: deformed.len(), list, origin }
+}
 
-    // Sub-voxel position and covariance of each choice.
-    let template = template(pair, radius);
-    let refined: Vec<Option<(usize, [f64; 3], Refined)>> = (0..initial.len())
-        .into_par_iter()
-        .map(|i| {
-            let start = list[i].get(chosen[i])?.displacement;
-            let voxels: [f64; 3] = std::array::from_fn(|a| start[a] / spacing[a]);
-            let at: [f64; 3] = std::array::from_fn(|a| initial[i].centre[a] as f64 + voxels[a] - origin[a]);
-            let place = |o: [f32; 3]| -> [f32; 3] { std::array::from_fn(|a| at[a] as f32 + o[a]) };
-            let mut found = match &warped {
-                Some(w) => {
-                    let patch = |shift, out: &mut [f32]| trilinear_patch(w, shape, place(shift), radius, out);
-                    least_squares_matching::refine(&template, initial[i].centre, patch, 3, 2.0)
-                }
-                None => {
-                    let patch = |shift, out: &mut [f32]| pair.sampler().patch(place(shift), radius, out);
-                    least_squares_matching::refine(&template, initial[i].centre, patch, 6, 2.0)
-                }
-            }?;
-            if !params.sub_voxel {
-                found.shift = [0.0; 3];
-            }
-            Some((i, start, found))
-        })
-        .collect();
-    let refined: Vec<_> = refined.into_iter().flatten().collect();
-    let own = |d: [f64; 3], r: &Refined| -> [f64; 3] { std::array::from_fn(|a| d[a] + r.shift[a]) };
+/// One candidate for each feature (at `places`, mm): by relaxation, or the best-correlated; with the
+/// energy a place of the best-correlated ones and of the choice.
+fn assigned(
+    pair: &Pair<'_>,
+    places: &[[f64; 3]],
+    list: &[Vec<Candidate>],
+    params: &MatchParams,
+) -> (Vec<usize>, [f64; 2]) {
+    let precision_mm = pyramid::finest(pair.shape, pair.spacing);
+    let energy = EnergyParams { lambda: 1.5, precision_mm, strain: params.strain, neighbours: 16 };
+    let graph = Graph::new(places, energy);
+    if is_consistent(params) {
+        let relaxed = relax(&graph, list);
+        return (relaxed.chosen, [relaxed.energy_before, relaxed.energy_after]);
+    }
+    let chosen = vec![0; list.len()];
+    let energy = graph.energy(list, &chosen);
+    (chosen, [energy; 2])
+}
 
-    // The coupled field: the known one, or one fitted to all matches with their information.
-    let fitted = known.is_none().then(|| fit(pair, &starts, &refined, &radius));
-    let field = known.or(fitted.as_ref());
-    let mut measured: Vec<Measured> = refined
-        .iter()
-        .map(|(i, start, r)| {
-            let u = field.map_or([0.0; 3], |f| f.lattice.at(&f.coefficients, starts[*i]));
-            let base = if known.is_some() { u } else { [0.0; 3] };
-            let d = own(*start, r);
-            Measured {
-                place: mm[*i],
-                displacement: std::array::from_fn(|a| base[a] + d[a]),
-                covariance: r.covariance,
-                field: u,
-            }
-        })
-        .collect();
-    let kept = if consistency { prune(&measured, 0.2 * finest, GATE) } else { vec![true; measured.len()] };
-    calibrate(&mut measured, &kept);
-    let mut residual: Vec<f32> = measured
-        .iter()
-        .zip(&kept)
-        .filter(|(_, k)| **k)
-        .map(|(m, _)| distance(m.displacement, m.field) as f32)
-        .collect();
-    let report = LevelReport {
-        spacing_mm: spacing,
-        counts: Counts {
-            features_initial: initial.len(),
-            features_deformed: deformed.len(),
-            candidates: count,
-            kept: residual.len(),
-            ..Counts::default()
-        },
-        energy_before,
-        energy_after,
-        residual_mm: if residual.is_empty() { 0.0 } else { f64::from(median(&mut residual)) },
-    };
-    let matches = refined
-        .iter()
-        .zip(measured)
-        .zip(kept)
-        .map(|(((i, _, r), measured), kept)| LevelMatch { voxel: starts[*i], measured, ncc: r.ncc, kept })
-        .collect();
-    (matches, fitted, report)
+/// Least-squares matching of the patch about `centre`, which begins at `at` (voxels of the deformed
+/// volume).
+fn refined(
+    pair: &Pair<'_>,
+    warped: Option<&[f32]>,
+    template: &Template<'_>,
+    centre: [usize; 3],
+    at: [f64; 3],
+    radius: [usize; 3],
+) -> Option<Refined> {
+    let place = |o: [f32; 3]| -> [f32; 3] { std::array::from_fn(|a| at[a] as f32 + o[a]) };
+    match warped {
+        Some(w) => {
+            let patch = |shift, out: &mut [f32]| trilinear_patch(w, pair.shape, place(shift), radius, out);
+            least_squares_matching::refine(template, centre, patch, 3, 2.0)
+        }
+        None => {
+            let patch = |shift, out: &mut [f32]| pair.sampler().patch(place(shift), radius, out);
+            least_squares_matching::refine(template, centre, patch, 6, 2.0)
+        }
+    }
 }
 
 /// Least-squares matching alone, about a field that has each place within two voxels: what is left

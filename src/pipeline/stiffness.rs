@@ -5,7 +5,8 @@ use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::{displacement, nearest};
 use crate::pipeline::stiffness_regions;
 use crate::stiffness::boundary_conditions::{Patch, Place};
-use crate::stiffness::identify::{Estimate, State};
+use crate::stiffness::geometry::Geometry;
+use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::inclusion::Inclusion;
 use crate::stiffness::indenter_outline::{Outline, Rim, rim};
 use crate::stiffness::interface::Interface;
@@ -13,9 +14,9 @@ use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::model_selection::{Choice, as_meshed, choose, known_moduli, settle};
 use crate::stiffness::observations::Observation;
 use crate::stiffness::rigid_rotation::{Affinity, Turn};
-use crate::stiffness::summary::{Hidden, Scale};
+use crate::stiffness::summary::{Hidden, Moduli, Scale};
 use crate::stiffness::systematic_error::Fit;
-use crate::stiffness::verdict::{Found, Shape, Verdict};
+use crate::stiffness::verdict::{Found, Misfit, Shape, Verdict};
 use crate::stiffness::{fields, geometry, summary};
 use crate::strain::deviation::error_draws;
 use crate::types::stiffness::{
@@ -282,6 +283,93 @@ fn labelled(
     progress: Progress<'_>,
 ) -> Result<StiffnessResult, StiffnessError> {
     let mut clock = Clock { seconds: Vec::new(), since: Instant::now() };
+    let (solved, mesh) = solved(inputs, params, progress, &mut clock)?;
+    progress("uncertainty", 0.9);
+    let setup = solved.fine.setup(solved.choice.law, params, solved.reference);
+    let deviation = Deviation::of(inputs, params, &solved, &setup)?;
+    let (regions, no_contrast) = regions(inputs, &solved, &deviation);
+    clock.book("uncertainty");
+    let touched = setup.touching(&deviation.state);
+    let patches = patch_reports(&solved.fine, touched.as_ref());
+    let is_affine = Affinity::of(inputs.field, inputs.labels).is_some_and(|a| a.is_all_of(inputs.field, inputs.labels));
+    let verdict = Verdict::of(&deviation.misfit, inputs.quality.trust, is_affine, &regions);
+
+    let Solved { fine, choice, estimate, hidden, reference, .. } = &solved;
+    let Deviation { moduli, state, misfit, mesh_change, .. } = &deviation;
+    let mut warnings = fields::unfit(inputs.field, inputs.labels, misfit);
+    warnings.extend(fields::one_map(is_affine, regions.len()));
+    warnings.extend(choice.warnings.iter().cloned());
+    let pressed = patches.get(1).map_or(0.0, |p| p.area);
+    warnings.extend(fields::warnings(fine, inputs.labels, &regions, mesh_change, pressed, params));
+    warnings.extend(params.force_n.and_then(|force| fields::leaning(force, estimate.leaning)));
+    warnings.extend(fields::not_shown(hidden, &regions, *reference));
+    warnings.extend(no_contrast);
+    warnings.dedup();
+    let of_region = |f: &dyn Fn(usize) -> f64| fields::by_label(inputs.labels, &fine.body.labels, f);
+    let (map, map_sd) = (of_region(&|r| regions[r].youngs_modulus), of_region(&|r| regions[r].sd));
+    let residual = fields::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
+    let kpa = moduli.log[*reference].exp() / (2.0 * (1.0 + setup.poisson[*reference]));
+    let touching = [None, touched.as_ref().map(|t| t.0.as_slice())];
+    let displacement = fields::node_displacement(&fine.body, state);
+    let prescribed = fields::prescribed(&setup, state, &touching);
+    let element_modulus = fine.body.region.iter().map(|&r| moduli.log[r as usize].exp()).collect();
+    let strain = summary::strain(&setup, state);
+    clock.book("maps");
+    Ok(StiffnessResult {
+        correlation: summary::correlation(&moduli.covariance, fine.body.labels.len()),
+        absolute: deviation.scale != Scale::Ratio,
+        law: choice.law,
+        poisson: params.poisson,
+        poisson_of: params.poisson_of.clone(),
+        force_n: params.force_n,
+        label_sd: if inputs.labelled { params.label_sd } else { 0.0 },
+        reference: fine.body.labels[*reference],
+        residual_mm: estimate.rms,
+        noise_mm: fine.noise * (fine.block.max(1) as f64).powf(1.5),
+        evidence: tried.into_iter().chain(choice.evidence.iter().cloned()).collect(),
+        patches,
+        map,
+        map_sd,
+        residual,
+        element_modulus,
+        displacement,
+        prescribed,
+        model_force: estimate.force[0] * estimate.leaning * kpa / 1000.0,
+        strain,
+        warnings,
+        seconds: clock.seconds,
+        samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
+        labelled: inputs.labelled,
+        left_over: None,
+        detectable: Vec::new(),
+        found: None,
+        trust: verdict.trust,
+        trust_reasons: verdict.reasons,
+        regions,
+        mesh: fine.moved(mesh)?,
+        faces: deviation.geometry.map(|g| g.faces).unwrap_or_default(),
+        mesh_change: deviation.mesh_change,
+    })
+}
+
+/// Contact, law, shape and moduli, chosen on the coarse mesh and identified on the fine one.
+struct Solved {
+    coarse: Level,
+    fine: Level,
+    choice: Choice,
+    estimate: Estimate,
+    /// Regions that the data do not show.
+    hidden: Vec<Hidden>,
+    /// The region that ratios refer to.
+    reference: usize,
+}
+
+fn solved(
+    inputs: &Inputs<'_>,
+    params: &StiffnessParams,
+    progress: Progress<'_>,
+    clock: &mut Clock,
+) -> Result<(Solved, QuadraticMesh), StiffnessError> {
     progress("mesh", 0.0);
     let Meshed { mut coarse, mut fine, mesh } = Meshed::new(inputs, params)?;
     let reference = fine.largest();
@@ -316,126 +404,104 @@ fn labelled(
     }
     let estimate = estimate?;
     clock.book("fine");
+    Ok((Solved { coarse, fine, choice, estimate, hidden, reference }, mesh))
+}
 
-    progress("uncertainty", 0.9);
-    let setup = fine.setup(choice.law, params, reference);
-    let coarse_setup = coarse.setup(choice.law, params, reference);
-    let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
-    // Of regions that were found the shapes are open as a whole.
-    let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Interface::walls(inputs.labels) };
-    let geometry = geometry::fit(&coarse_setup, &choice.estimate, inputs.labels.grid(), (&interfaces, &inclusions))?;
-    let corrected = |step: &[f64]| {
-        let x = estimate.state.x.as_deref().unwrap_or_default();
-        setup.advanced(&estimate.state, x, &estimate.columns, step)
-    };
-    let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
-    let scale = Scale::of(&fine.body, params);
-    let misfit = fine.misfit(&estimate);
-    let moduli = summary::moduli(&setup, &estimate, geometry.as_ref(), scale);
-    let alone = summary::moduli(&setup, &estimate, None, scale);
-    let fit = geometry.as_ref().map_or_else(|| Fit::of(&coarse_setup, &choice.estimate), |g| g.fit.clone());
-    let more = fit.coherent(&coarse_setup, &choice.estimate, misfit.mm, &errors_drawn(inputs, &coarse))?;
-    let moduli = moduli.widened(&summary::with_covariance(&setup, &estimate, geometry.as_ref(), scale, &more));
-    let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), scale);
-    let count = fine.body.labels.len();
-    let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();
-    let unseen = (0..count)
-        .map(|r| summary::unseen(&coarse_setup, &choice.estimate, r, moduli.ratio_variance[r]))
-        .collect::<Result<Vec<_>, _>>()?;
-    let drawn_anew = |label: &u8| geometry.is_some() && inclusions.iter().any(|i| i.label() == *label);
-    let shape = |label: &u8| match (inputs.labelled || *label == 1, drawn_anew(label)) {
+/// The moduli with their covariance, from noise, shape, mesh and what no block of the data shows.
+struct Deviation {
+    geometry: Option<Geometry>,
+    /// The solution with the shape as it was found.
+    state: State,
+    scale: Scale,
+    misfit: Misfit,
+    moduli: Moduli,
+    /// As if the shape were known.
+    alone: Moduli,
+    /// Change of ln E from the coarse to the fine mesh.
+    mesh_change: Vec<f64>,
+    /// Regions of which the data give a bound alone.
+    unseen: Vec<Option<&'static str>>,
+    /// Labels whose shapes were found.
+    drawn: Vec<u8>,
+}
+
+impl Deviation {
+    fn of(
+        inputs: &Inputs<'_>,
+        params: &StiffnessParams,
+        solved: &Solved,
+        setup: &Setup<'_>,
+    ) -> Result<Self, StiffnessError> {
+        let Solved { coarse, fine, choice, estimate, reference, .. } = solved;
+        let coarse_setup = coarse.setup(choice.law, params, *reference);
+        let inclusions = if inputs.labelled { Vec::new() } else { Inclusion::all(inputs.labels) };
+        // Of regions that were found the shapes are open as a whole.
+        let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Interface::walls(inputs.labels) };
+        let grid = inputs.labels.grid();
+        let geometry = geometry::fit(&coarse_setup, &choice.estimate, grid, (&interfaces, &inclusions))?;
+        let corrected = |step: &[f64]| {
+            let x = estimate.state.x.as_deref().unwrap_or_default();
+            setup.advanced(&estimate.state, x, &estimate.columns, step)
+        };
+        let state = geometry.as_ref().map_or_else(|| estimate.state.clone(), |g| corrected(&g.step));
+        let scale = Scale::of(&fine.body, params);
+        let misfit = fine.misfit(estimate);
+        let moduli = summary::moduli(setup, estimate, geometry.as_ref(), scale);
+        let alone = summary::moduli(setup, estimate, None, scale);
+        let fit = geometry.as_ref().map_or_else(|| Fit::of(&coarse_setup, &choice.estimate), |g| g.fit.clone());
+        let more = fit.coherent(&coarse_setup, &choice.estimate, misfit.mm, &errors_drawn(inputs, coarse))?;
+        let moduli = moduli.widened(&summary::with_covariance(setup, estimate, geometry.as_ref(), scale, &more));
+        let before = summary::moduli(&coarse_setup, &choice.estimate, geometry.as_ref(), scale);
+        let count = fine.body.labels.len();
+        let mesh_change: Vec<f64> = (0..count).map(|r| moduli.log[r] - before.log[r]).collect();
+        let unseen = (0..count)
+            .map(|r| summary::unseen(&coarse_setup, &choice.estimate, r, moduli.ratio_variance[r]))
+            .collect::<Result<Vec<_>, _>>()?;
+        let drawn = if geometry.is_some() { inclusions.iter().map(Inclusion::label).collect() } else { Vec::new() };
+        Ok(Self { geometry, state, scale, misfit, moduli, alone, mesh_change, unseen, drawn })
+    }
+}
+
+/// The regions' moduli with their verdicts, and the warning where none differs.
+fn regions(inputs: &Inputs<'_>, solved: &Solved, deviation: &Deviation) -> (Vec<RegionStiffness>, Option<String>) {
+    let Solved { fine, hidden, reference, .. } = solved;
+    let shape = |label: &u8| match (inputs.labelled || *label == 1, deviation.drawn.contains(label)) {
         (true, _) => Shape::Given,
         (false, true) => Shape::Drawn,
         (false, false) => Shape::Cut,
     };
     let found = Found {
-        moduli: &moduli,
-        alone: &alone,
-        mesh_change: &mesh_change,
-        unseen: &unseen,
+        moduli: &deviation.moduli,
+        alone: &deviation.alone,
+        mesh_change: &deviation.mesh_change,
+        unseen: &deviation.unseen,
         shapes: &fine.body.labels.iter().map(shape).collect::<Vec<_>>(),
-        hidden: &hidden,
+        hidden,
         known: &fine.known,
         flat_model: inputs.quality.flat_model(),
-        misfits: misfit.trust() == Trust::Low,
-        scale,
-        reference,
+        misfits: deviation.misfit.trust() == Trust::Low,
+        scale: deviation.scale,
+        reference: *reference,
     };
-    let regions = found.regions(&fine.body, inputs.names);
-    clock.book("uncertainty");
+    (found.regions(&fine.body, inputs.names), found.no_contrast())
+}
 
-    let of_region = |f: &dyn Fn(usize) -> f64| fields::by_label(inputs.labels, &fine.body.labels, f);
-    let map = of_region(&|r| regions[r].youngs_modulus);
-    let map_sd = of_region(&|r| regions[r].sd);
-    let residual = fields::residual(inputs.labels, &fine.observations, &estimate.residuals, fine.block);
-    let touching = [None, setup.touching(&state)];
-    let area = |i: usize| match touching.get(i) {
-        Some(Some(touched)) => touched.1,
-        _ => fine.patches[i].area(&fine.body),
+/// Where the body is held and pressed; `touched` are the nodes and the area (mm^2) that a plate
+/// without friction touches.
+fn patch_reports(fine: &Level, touched: Option<&(Vec<u32>, f64)>) -> Vec<PatchReport> {
+    let of = |(i, p): (usize, &Patch)| {
+        let touched = touched.filter(|_| i == 1);
+        PatchReport {
+            name: p.name.clone(),
+            area: touched.map_or_else(|| p.area(&fine.body), |t| t.1),
+            nodes: touched.map_or(p.nodes.len(), |t| t.0.len()),
+            contact: p.contact,
+            translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
+            travel_mm: p.travelled(&fine.body),
+            residual_mm: p.residual[0].hypot(p.residual[1]),
+        }
     };
-    let is_affine = Affinity::of(inputs.field, inputs.labels).is_some_and(|a| a.is_all_of(inputs.field, inputs.labels));
-    let verdict = Verdict::of(&misfit, inputs.quality.trust, is_affine, &regions);
-    let mut warnings = fields::unfit(inputs.field, inputs.labels, &misfit);
-    warnings.extend(fields::one_map(is_affine, regions.len()));
-    warnings.extend(choice.warnings);
-    warnings.extend(fields::warnings(&fine, inputs.labels, &regions, &mesh_change, area(1), params));
-    warnings.extend(params.force_n.and_then(|force| fields::leaning(force, estimate.leaning)));
-    warnings.extend(fields::not_shown(&hidden, &regions, reference));
-    warnings.extend(found.no_contrast());
-    warnings.dedup();
-    let patch = |(i, p): (usize, &Patch)| PatchReport {
-        name: p.name.clone(),
-        area: area(i),
-        nodes: touching.get(i).and_then(|t| t.as_ref()).map_or(p.nodes.len(), |t| t.0.len()),
-        contact: p.contact,
-        translation: [p.rigid[0], p.rigid[1], p.rigid[2]],
-        travel_mm: p.travelled(&fine.body),
-        residual_mm: p.residual[0].hypot(p.residual[1]),
-    };
-    let patches = fine.patches.iter().enumerate().map(patch).collect();
-    let element_modulus = fine.body.region.iter().map(|&r| moduli.log[r as usize].exp()).collect();
-    let strain = summary::strain(&setup, &state);
-    let kpa = moduli.log[reference].exp() / (2.0 * (1.0 + setup.poisson[reference]));
-    clock.book("maps");
-    Ok(StiffnessResult {
-        correlation: summary::correlation(&moduli.covariance, count),
-        absolute: scale != Scale::Ratio,
-        law: choice.law,
-        poisson: params.poisson,
-        poisson_of: params.poisson_of.clone(),
-        force_n: params.force_n,
-        label_sd: if inputs.labelled { params.label_sd } else { 0.0 },
-        reference: fine.body.labels[reference],
-        residual_mm: estimate.rms,
-        noise_mm: fine.noise * (fine.block.max(1) as f64).powf(1.5),
-        evidence: tried.into_iter().chain(choice.evidence).collect(),
-        patches,
-        map,
-        map_sd,
-        residual,
-        element_modulus,
-        displacement: fields::node_displacement(&fine.body, &state),
-        prescribed: fields::prescribed(
-            &setup,
-            &state,
-            &touching.each_ref().map(|t| t.as_ref().map(|t| t.0.as_slice())),
-        ),
-        faces: geometry.map(|g| g.faces).unwrap_or_default(),
-        model_force: estimate.force[0] * estimate.leaning * kpa / 1000.0,
-        mesh_change,
-        strain,
-        warnings,
-        seconds: clock.seconds,
-        samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
-        labelled: inputs.labelled,
-        left_over: None,
-        detectable: Vec::new(),
-        found: None,
-        trust: verdict.trust,
-        trust_reasons: verdict.reasons,
-        regions,
-        mesh: fine.moved(mesh)?,
-    })
+    fine.patches.iter().enumerate().map(of).collect()
 }
 
 /// The evidence where the law that was chosen cannot be solved on the fine mesh.
