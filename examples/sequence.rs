@@ -33,9 +33,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             Ok(())
         };
         let read = |t: usize| Ok(sequence.frame(t));
-        let order = (sequence.frames(), 0);
-        let found =
-            track::run(order, &reference, (&Known::mask(mask), None), (&field, together), read, keep, &|_, _| {})?;
+        let volumes = track::Sequence {
+            frames: sequence.frames(),
+            origin: 0,
+            reference: &reference,
+            known: Known::mask(mask),
+            labels: None,
+            params: &field,
+            together,
+        };
+        let found = track::run(&volumes, read, keep, &|_, _| {})?;
         Ok::<_, FieldError>((fields, found.together))
     };
     let ((followed, _), (all, together)) = (measured(false)?, measured(true)?);

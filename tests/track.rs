@@ -7,7 +7,7 @@ use palpate::field::composition::compose;
 use palpate::numerics::symmetric3::eigenvalues;
 use palpate::pipeline::field::run as pair;
 use palpate::pipeline::known::Known;
-use palpate::pipeline::track::{Tracker, run};
+use palpate::pipeline::track::{Sequence as Volumes, Tracker, run};
 use palpate::strain::StrainField;
 use palpate::strain::gauge::Gauge;
 use palpate::strain::measure::green_lagrange;
@@ -17,6 +17,18 @@ use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, PointState, St
 
 fn sequence(kind: SequenceKind, frames: usize) -> Sequence {
     Sequence::new(&SequenceParams { frames, ..SequenceParams::new(kind).sized(40) }).unwrap()
+}
+
+fn volumes<'a>(
+    frames: usize,
+    origin: usize,
+    reference: &'a Volume,
+    known: Known<'a>,
+    labels: Option<&'a Mask>,
+    params: &'a FieldParams,
+    together: bool,
+) -> Volumes<'a> {
+    Volumes { frames, origin, reference, known, labels, params, together }
 }
 
 /// Mean error over the tissue (mm).
@@ -164,10 +176,7 @@ fn a_lost_frame_does_not_stop_the_others() {
         Ok(())
     };
     let found = run(
-        (6, 2),
-        &reference,
-        (&Known::mask(Some(&s.mask)), Some(&s.labels)),
-        (&params, true),
+        &volumes(6, 2, &reference, Known::mask(Some(&s.mask)), Some(&s.labels), &params, true),
         read,
         keep,
         &|_, _| {},
@@ -184,7 +193,8 @@ fn a_lost_frame_does_not_stop_the_others() {
 
     let nothing = |_: usize| -> Result<Volume, FieldError> { Ok(Volume::filled(*reference.grid(), 0.0)) };
     assert!(
-        run((6, 2), &reference, (&Known::default(), None), (&params, true), nothing, |_| Ok(()), &|_, _| {}).is_err()
+        run(&volumes(6, 2, &reference, Known::default(), None, &params, true), nothing, |_| Ok(()), &|_, _| {})
+            .is_err()
     );
 }
 
@@ -195,7 +205,7 @@ fn without_a_mask_strain_is_that_of_tissue() {
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
     let found =
-        run((3, 0), &reference, (&Known::default(), None), (&params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
+        run(&volumes(3, 0, &reference, Known::default(), None, &params, true), read, |_| Ok(()), &|_, _| {}).unwrap();
     // The mask that is made reaches a voxel into the air; all of the volume is three times the
     // tissue.
     let tissue = s.mask.as_slice().iter().filter(|m| **m != 0).count() as f64;
@@ -217,9 +227,13 @@ fn a_jerk_is_not_out_of_line() {
     // There and back in one frame: its image bears it out.
     for order in [[0, 4, 4, 20, 4, 4], [0, 12, 14, 16, 18, 20]] {
         let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(order[t])) };
-        let found =
-            run((6, 0), &reference, (&Known::mask(Some(&s.mask)), None), (&params, true), read, |_| Ok(()), &|_, _| {})
-                .unwrap();
+        let found = run(
+            &volumes(6, 0, &reference, Known::mask(Some(&s.mask)), None, &params, true),
+            read,
+            |_| Ok(()),
+            &|_, _| {},
+        )
+        .unwrap();
         assert!(found.frames.iter().all(|f| f.out_of_line == 0.0), "{order:?}: {:?}", found.frames);
     }
 }
@@ -239,10 +253,7 @@ fn a_label_out_of_a_frames_view_is_named() {
     };
     let params = FieldParams::default();
     let tracked = run(
-        (3, 0),
-        &reference,
-        (&Known::mask(Some(&s.mask)), Some(&labels)),
-        (&params, true),
+        &volumes(3, 0, &reference, Known::mask(Some(&s.mask)), Some(&labels), &params, true),
         read,
         |_| Ok(()),
         &|_, _| {},
@@ -259,7 +270,7 @@ fn trajectories_follow_the_true_motion() {
     let (params, reference) = (FieldParams::default(), s.frame(0));
     let read = |t: usize| -> Result<Volume, FieldError> { Ok(s.frame(t)) };
     let found =
-        run((5, 0), &reference, (&Known::mask(Some(&s.mask)), None), (&params, true), read, |_| Ok(()), &|_, _| {})
+        run(&volumes(5, 0, &reference, Known::mask(Some(&s.mask)), None, &params, true), read, |_| Ok(()), &|_, _| {})
             .unwrap();
     assert!(found.trajectories.len() > 50, "{}", found.trajectories.len());
     for t in 1..5 {
@@ -367,10 +378,7 @@ fn frames_together_are_nearer_to_the_truth_than_alone() {
                 Ok(())
             };
             let found = run(
-                (12, origin),
-                &reference,
-                (&Known::mask(Some(&s.mask)), None),
-                (&params, together),
+                &volumes(12, origin, &reference, Known::mask(Some(&s.mask)), None, &params, together),
                 read,
                 keep,
                 &|_, _| {},
@@ -418,7 +426,8 @@ fn a_frame_that_keeps_its_own_field_is_summed_up_as_a_pair() {
         Ok(())
     };
     let found =
-        run((3, 0), &reference, (&Known::mask(Some(&s.mask)), None), (&params, true), read, keep, &|_, _| {}).unwrap();
+        run(&volumes(3, 0, &reference, Known::mask(Some(&s.mask)), None, &params, true), read, keep, &|_, _| {})
+            .unwrap();
     let (first, own) = (&found.frames[0], &alone.summary);
     assert_eq!((first.mean_mm, first.max_mm, first.folds), (own.mean_mm, own.max_mm, own.folds));
     assert_eq!(found.together.unwrap().modes, None);

@@ -42,8 +42,8 @@ impl Console {
         &self.arguments
     }
 
-    /// Results, on stdout. What it does not take is reported by [`Console::lost`] at the end: the work
-    /// goes on.
+    /// Results, on stdout. What it does not take is reported by [`Console::lost`] at the end: the
+    /// work goes on.
     pub fn say(&self, text: &str) {
         let lines: Vec<String> = text.trim_end().split('\n').map(plain_cells).collect();
         let mut out = stdout().lock();

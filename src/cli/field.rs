@@ -189,22 +189,9 @@ fn model(name: &str) -> Result<ModelSource, UnknownName> {
     names::choose("model", name, &MODELS)
 }
 
-pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options {
-        initial,
-        deformed,
-        target,
-        mask,
-        bodies,
-        rigid,
-        bonded,
-        truth,
-        allow_folds,
-        strain,
-        dry_run,
-        knowledge,
-        tuning,
-    } = options;
+/// The parameters of a run; flags that contradict each other are an error.
+fn parameters(options: &Options) -> Result<FieldParams> {
+    let Options { bodies, bonded, tuning, .. } = options;
     let mut params = tuning.params()?;
     if *bonded {
         params.bodies = BodySource::Bonded;
@@ -216,6 +203,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if bodies.is_some() && params.method == Method::Sparse {
         bail!("--bodies: --method sparse fits one field to the matches; leave --method out");
     }
+    Ok(params)
+}
+
+pub fn run(options: &Options, console: &Console) -> Result<()> {
+    let Options { initial, deformed, target, mask, bodies, rigid, truth, strain, knowledge, tuning, .. } = options;
+    let mut params = parameters(options)?;
     let inputs = inputs(options);
     let given: Vec<&Path> = inputs.iter().map(|(_, path)| path.as_path()).collect();
     let files: Vec<&str> = FIELD_FILES.iter().chain(STRAIN_FILES.iter().filter(|_| *strain)).copied().collect();
@@ -243,7 +236,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let truth = truth.as_ref().map(|path| read_truth(path, fixed.grid(), initial)).transpose()?;
     let known = knowledge.read((&fixed, &moving), [initial, deformed], inside, console, &mut warnings)?;
-    if *dry_run {
+    if options.dry_run {
         drop(progress);
         let plan = pipeline::dry_run::field(&fixed, &moving, known.mask(), &params)?;
         warn_all(console, &warnings);
@@ -260,7 +253,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let set = |stage: &str, part| progress.set(stage, part);
     let (mut result, [fixed, moving]) = pipeline::field::run_lent(fixed, moving, &known.known(), &params, &set)
         .with_context(|| format!("{} to {}", names[0], names[1]))?;
-    if result.summary.folds > 0 && !allow_folds {
+    if result.summary.folds > 0 && !options.allow_folds {
         bail!(
             "{} to {}: the field folds in {} voxels, which tissue cannot do; check that both show the same tissue, give --mask or \
              --bodies, or write it all the same with --allow-folds",

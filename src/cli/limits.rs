@@ -26,8 +26,8 @@ pub fn bytes(n: u64) -> String {
 pub fn field_fits(initial: &Path, deformed: &Path) -> Result<()> {
     // A header that cannot be read is reported by who reads the whole.
     let (Ok((a, _)), Ok((b, _))) = (io::read_header(initial), io::read_header(deformed)) else { return Ok(()) };
-    same_unit((initial, &a.grid), (deformed, &b.grid))?;
-    grids_fit((initial, &a.grid), (deformed, &b.grid))
+    same_unit(initial, &a.grid, deformed, &b.grid)?;
+    grids_fit(initial, &a.grid, deformed, &b.grid)
 }
 
 /// The longest side of a grid (mm).
@@ -44,7 +44,7 @@ const ALIKE: f64 = 2.5;
 
 /// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10
 /// or more: their units differ, or one has lost its header.
-pub fn same_unit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
+pub fn same_unit(initial: &Path, a: &Grid, deformed: &Path, b: &Grid) -> Result<()> {
     let (small, large) =
         if longest(a) < longest(b) { ((initial, a), (deformed, b)) } else { ((deformed, b), (initial, a)) };
     let log = (longest(large.1) / longest(small.1)).log10();
@@ -90,7 +90,7 @@ pub fn cap_search(params: &mut FieldParams, grid: &Grid, path: &Path) -> Option<
 }
 
 /// The same of two volumes whose grids are known.
-pub fn grids_fit((initial, a): (&Path, &Grid), (deformed, b): (&Path, &Grid)) -> Result<()> {
+pub fn grids_fit(initial: &Path, a: &Grid, deformed: &Path, b: &Grid) -> Result<()> {
     let (needed, left) = (memory(a, b), io::memory_left().unwrap_or(u64::MAX));
     if needed <= left {
         return Ok(());

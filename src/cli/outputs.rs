@@ -212,7 +212,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
         node_displacement: &result.node_displacement,
         summary: &summary,
         truth,
-        strain: maps.as_ref().map(|maps| maps.report(names[0], (displacement, &result.bodies), Some(initial))),
+        strain: maps.as_ref().map(|maps| maps.report(names[0], displacement, &result.bodies, Some(initial))),
     };
     let (written, page) = rayon::join(
         || folder.write("warped.nii.gz", |p| warped.write(p, "palpate: deformed at x + u(x)", None)),
@@ -311,7 +311,8 @@ impl<'a> StrainMaps<'a> {
     pub fn report<'b>(
         &'b self,
         name: &'b str,
-        (displacement, bodies): (&'b DenseField, &'b Mask),
+        displacement: &'b DenseField,
+        bodies: &'b Mask,
         image: Option<&'b Volume>,
     ) -> StrainReport<'b> {
         let [largest, smallest, shear, volume, deviation] = &self.maps;

@@ -36,17 +36,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let setting = Setting::read(options, params, body, &grid, &frames[0].1)?;
     let images = images(options, None, &grid)?;
     if options.dry_run {
-        // Frames at rest are left out: one that can be used is enough.
-        let mut refused = Ok(());
-        for (_, path, _) in &frames {
-            refused = setting
-                .check(&io::read_field(path)?, params)
-                .with_context(|| format!("{} with {}", name(path), name(body)));
-            if refused.is_ok() {
-                break;
-            }
-        }
-        refused?;
+        one_is_usable(&frames, &setting, params, body)?;
         drop(progress);
         let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
         return plan(options, params, &frames[0].1, &setting, &forces, console);
@@ -120,6 +110,20 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let frames = report::sequence_text(&shared);
     console.say(&format!("{}{frames}  results      {}", report::text(&shared.result), page.shown()));
     strict(options, &shared.result)
+}
+
+/// Frames at rest are left out: one that can be used is enough.
+fn one_is_usable(frames: &[Frame], setting: &Setting, params: &StiffnessParams, body: &Path) -> Result<()> {
+    let mut refused = Ok(());
+    for (_, path, _) in frames {
+        refused = setting
+            .check(&io::read_field(path)?, params)
+            .with_context(|| format!("{} with {}", name(path), name(body)));
+        if refused.is_ok() {
+            break;
+        }
+    }
+    refused
 }
 
 /// What the summary of a track says.

@@ -167,7 +167,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     let maps = StrainMaps::of(&result);
     let called = name(path);
-    let report = maps.report(&called, (&source.field, &tissue), source.image.as_ref());
+    let report = maps.report(&called, &source.field, &tissue, source.image.as_ref());
     let html = page(&report)?;
     let record = record.finish();
     folder.write("report.html", |p| io::write_text(p, &on_page(html, &record)))?;

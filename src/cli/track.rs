@@ -18,21 +18,21 @@ use palpate::error::FieldError;
 use palpate::error::Shown;
 use palpate::field::jacobian::determinant_at;
 use palpate::field::warp::warp_image;
-use palpate::io::{self, PackedField, Series, Stored};
+use palpate::io::{self, OutputFolder, PackedField, Series, Stored};
 use palpate::numerics::sampling::Interpolation;
 use palpate::pipeline::{
     self,
     dry_run::FieldPlan,
-    track::{self, Frame},
+    track::{self, Frame, Sequence},
 };
 use palpate::report::animation::Film;
 use palpate::report::panels::{centre_of_motion, gray_range};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::track::{Looks, Seen, TrackReport, clock, page, summary, text, warnings as all_warnings};
-use palpate::report::verdict::judge;
-use palpate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
+use palpate::report::verdict::{Verdict, judge};
+use palpate::types::{DenseField, FieldParams, Grid, Mask, Tracked, Volume, Voxels};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -149,31 +149,11 @@ impl<'a> Source<'a> {
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {
-    let Options { volumes, target, reference: origin, mask, labels, frame_by_frame, dry_run, knowledge, tuning } =
-        options;
+    let Options { volumes, target, reference: origin, mask, labels, knowledge, tuning, .. } = options;
     let (mut params, origin) = (tuning.params()?, *origin);
     let mut source = Source::open(volumes)?;
     let frames = source.frames();
-    if origin >= frames {
-        bail!(Usage(format!("--reference is {origin}, but there are {frames} volumes (counted from 0)")));
-    }
-    if knowledge.has_landmarks() && frames > 2 {
-        bail!(Usage("--landmarks belong to one pair; give palpate track two volumes, or take palpate field".into()));
-    }
-    let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
-    inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
-    inputs.extend(knowledge.inputs());
-    let given: Vec<&Path> = inputs.iter().map(|(_, path)| path.as_path()).collect();
-    check_distinct(&given, &target.files(&files(frames, origin)))?;
-
-    for t in order(frames, origin) {
-        same_unit((source.path(origin), source.grid(origin)), (source.path(t), source.grid(t)))?;
-    }
-    // The largest of the others is what has to fit.
-    let others = order(frames, origin).map(|t| (source.path(t), source.grid(t)));
-    if let Some(largest) = others.max_by_key(|o| o.1.len()) {
-        grids_fit((source.path(origin), source.grid(origin)), largest)?;
-    }
+    let inputs = checked(options, &source)?;
 
     let started = Instant::now();
     let progress = console.progress();
@@ -199,26 +179,22 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let inside = known.mask();
     warnings.extend(out_of_order(volumes));
     warnings.extend(inside.zip(regions.as_ref()).and_then(|(mask, labels)| outside_the_mask(mask, labels)));
-    if *dry_run {
+    if options.dry_run {
         drop(progress);
-        let plan = plan(&mut source, (origin, &reference), inside, &params, &mut warnings)?;
+        let plan = plan(&mut source, origin, &reference, inside, &params, &mut warnings)?;
         warn_all(console, &warnings);
-        let plan = dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files(frames, origin))?;
-        console.say(&plan);
+        let files = files(frames, origin);
+        console.say(&dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files)?);
         return Ok(());
     }
     let mut folder = target.create()?;
     let record = Recording::start(console, inputs);
     folder.supersede(of_a_frame)?;
-    let mut packed: Vec<Option<PackedField>> = (0..frames).map(|_| None).collect();
-    let mut film = None;
-    let mut looks = Looks::new(frames, &grid);
-    let mut judged = Vec::new();
     let step_s = source.step_s();
-    let (mut reading, mut writing) = (started.elapsed(), std::time::Duration::ZERO);
-
-    let range = gray_range(&reference);
     let shown = inside.or(regions.as_ref());
+    let mut kept = Kept::new(folder, frames, &reference, shown, step_s);
+    let mut reading = started.elapsed();
+
     let mut seen = vec![false; frames];
     let read = |frame: usize| -> Result<Volume> {
         let started = Instant::now();
@@ -229,74 +205,26 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         reading += started.elapsed();
         volume
     };
-    let keep = |frame: Frame<'_>| -> Result<()> {
-        let started = Instant::now();
-        let Frame { number, volume, result, strain } = frame;
-        let field = &result.displacement;
-        let mut put = |number: usize, field: &DenseField| {
-            folder.write(&format!("displacement_{number:03}.nii.gz"), |p| {
-                packed[number] = Some(io::write_series_field(p, field)?);
-                Ok(())
-            })
-        };
-        put(number, field)?;
-        folder.write(&format!("matches_{number:03}.csv"), |p| io::write_matches(p, &result.matches))?;
-        folder.write(&format!("strain_{number:03}.nii.gz"), |p| {
-            io::write_tensors(p, &grid, strain.tensors(), "palpate: Green-Lagrange strain, LPS axes")
-        })?;
-        let film = film.get_or_insert_with(|| start_film(&reference, field, shown, range));
-        add_to(film, number, volume, field, &|o| strain.principal(o)[0] as f32)?;
-        judged.push((number, judge(&result.bodies, &|o| result.uncertainty.at(o), &result.summary)));
-        let mean = result.summary.mean_mm;
-        if looks.wants(number, mean) {
-            let there = on_grid(volume.view(), &grid);
-            let warped = warp_image(volume, field, None, Interpolation::Linear, 0.0);
-            looks.add(&Seen {
-                frame: number,
-                name: &clock(number, step_s),
-                mean_mm: mean,
-                volumes: [&reference, &there, &warped],
-                mask: shown,
-                displacement: field,
-                matches: &result.matches,
-                mesh: &result.mesh,
-                strain: &|o| strain.principal(o)[0] as f32,
-                jacobian: &|o| determinant_at(field, o),
-                uncertainty: &|o| result.uncertainty.at(o),
-            });
-        }
-        writing += started.elapsed();
-        Ok(())
+    let sequence = Sequence {
+        frames,
+        origin,
+        reference: &reference,
+        known: known.known(),
+        labels: regions.as_ref(),
+        params: &params,
+        together: !options.frame_by_frame,
     };
-    let tracked = track::run(
-        (frames, origin),
-        &reference,
-        (&known.known(), regions.as_ref()),
-        (&params, !frame_by_frame),
-        read,
-        keep,
-        &|s, f| progress.set(s, f),
-    )
-    .map_err(|error| if error.is::<FieldError>() { none_against(error, &source.name(origin)) } else { error })?;
+    let tracked = track::run(&sequence, read, |frame| kept.keep(frame), &|s, f| progress.set(s, f))
+        .map_err(|error| if error.is::<FieldError>() { none_against(error, &source.name(origin)) } else { error })?;
 
     progress.set("write", 1.0);
-    let started = Instant::now();
-    let still = DenseField::zeros(grid);
-    folder.write(&format!("displacement_{origin:03}.nii.gz"), |p| {
-        packed[origin] = Some(io::write_series_field(p, &still)?);
-        Ok(())
-    })?;
-    folder.write("displacement.nii.gz", |p| io::write_field_series(p, &grid, &packed, step_s.unwrap_or(0.0)))?;
-    folder.write("trajectories.csv", |p| io::write_trajectories(p, &tracked.trajectories, origin, step_s))?;
-    folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
-    let mut film = film.unwrap_or_else(|| start_film(&reference, &still, shown, range));
-    add_to(&mut film, origin, &reference, &still, &|_| 0.0)?;
-    writing += started.elapsed();
+    let Kept { mut folder, film, looks, judged, writing, .. } = kept.end(&tracked, origin)?;
     let measuring = tracked.frames.iter().map(|f| f.seconds).sum();
-    let seconds = [("read", reading.as_secs_f64()), ("measure", measuring), ("write", writing.as_secs_f64())]
-        .map(|(stage, s)| (stage.to_string(), s));
+    let seconds = [("read", reading.as_secs_f64()), ("measure", measuring), ("write", writing.as_secs_f64())];
+    let seconds = seconds.map(|(stage, s)| (stage.to_string(), s));
     let names: Vec<String> = (0..frames).map(|f| source.name(f)).collect();
     let called = [mask, labels].map(|p| p.as_deref().map(name).unwrap_or_default());
+    let film = film.unwrap_or_else(|| start_film(&reference, &DenseField::zeros(grid), shown, gray_range(&reference)));
     let report = TrackReport {
         names: &names,
         reference: origin,
@@ -319,6 +247,143 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     warn_all(console, &all_warnings(&report));
     console.say(&format!("{}{}", text(&report), target.look()));
     Ok(())
+}
+
+/// Checks what can be checked without the voxels, and lists everything that is read.
+fn checked(options: &Options, source: &Source<'_>) -> Result<Read> {
+    let Options { volumes, target, reference: origin, mask, labels, knowledge, tuning, .. } = options;
+    let (frames, origin) = (source.frames(), *origin);
+    if origin >= frames {
+        bail!(Usage(format!("--reference is {origin}, but there are {frames} volumes (counted from 0)")));
+    }
+    if knowledge.has_landmarks() && frames > 2 {
+        bail!(Usage("--landmarks belong to one pair; give palpate track two volumes, or take palpate field".into()));
+    }
+    let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
+    inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
+    inputs.extend(knowledge.inputs());
+    let given: Vec<&Path> = inputs.iter().map(|(_, path)| path.as_path()).collect();
+    check_distinct(&given, &target.files(&files(frames, origin)))?;
+
+    for t in order(frames, origin) {
+        same_unit(source.path(origin), source.grid(origin), source.path(t), source.grid(t))?;
+    }
+    // The largest of the others is what has to fit.
+    let others = order(frames, origin).map(|t| (source.path(t), source.grid(t)));
+    if let Some((path, grid)) = others.max_by_key(|o| o.1.len()) {
+        grids_fit(source.path(origin), source.grid(origin), path, grid)?;
+    }
+    Ok(inputs)
+}
+
+/// What is written and shown of the frames, as they come.
+struct Kept<'a> {
+    folder: OutputFolder,
+    packed: Vec<Option<PackedField>>,
+    film: Option<Film>,
+    looks: Looks,
+    judged: Vec<(usize, Verdict)>,
+    writing: Duration,
+    reference: &'a Volume,
+    /// Where the film and the pictures show colour.
+    shown: Option<&'a Mask>,
+    range: [f64; 2],
+    step_s: Option<f64>,
+}
+
+impl<'a> Kept<'a> {
+    fn new(
+        folder: OutputFolder,
+        frames: usize,
+        reference: &'a Volume,
+        shown: Option<&'a Mask>,
+        step_s: Option<f64>,
+    ) -> Self {
+        Self {
+            folder,
+            packed: (0..frames).map(|_| None).collect(),
+            film: None,
+            looks: Looks::new(frames, reference.grid()),
+            judged: Vec::new(),
+            writing: Duration::ZERO,
+            reference,
+            shown,
+            range: gray_range(reference),
+            step_s,
+        }
+    }
+
+    /// Writes the field of a frame, whole and packed for the series of all.
+    fn put(&mut self, number: usize, field: &DenseField) -> Result<()> {
+        let packed = &mut self.packed[number];
+        self.folder.write(&format!("displacement_{number:03}.nii.gz"), |p| {
+            *packed = Some(io::write_series_field(p, field)?);
+            Ok(())
+        })?;
+        Ok(())
+    }
+
+    fn keep(&mut self, frame: Frame<'_>) -> Result<()> {
+        let started = Instant::now();
+        let Frame { number, volume, result, strain } = frame;
+        let (field, grid) = (&result.displacement, self.reference.grid());
+        self.put(number, field)?;
+        self.folder.write(&format!("matches_{number:03}.csv"), |p| io::write_matches(p, &result.matches))?;
+        self.folder.write(&format!("strain_{number:03}.nii.gz"), |p| {
+            io::write_tensors(p, grid, strain.tensors(), "palpate: Green-Lagrange strain, LPS axes")
+        })?;
+        self.film(number, volume, field, &|o| strain.principal(o)[0] as f32)?;
+        self.judged.push((number, judge(&result.bodies, &|o| result.uncertainty.at(o), &result.summary)));
+        let mean = result.summary.mean_mm;
+        if self.looks.wants(number, mean) {
+            let there = on_grid(volume.view(), grid);
+            let warped = warp_image(volume, field, None, Interpolation::Linear, 0.0);
+            self.looks.add(&Seen {
+                frame: number,
+                name: &clock(number, self.step_s),
+                mean_mm: mean,
+                volumes: [self.reference, &there, &warped],
+                mask: self.shown,
+                displacement: field,
+                matches: &result.matches,
+                mesh: &result.mesh,
+                strain: &|o| strain.principal(o)[0] as f32,
+                jacobian: &|o| determinant_at(field, o),
+                uncertainty: &|o| result.uncertainty.at(o),
+            });
+        }
+        self.writing += started.elapsed();
+        Ok(())
+    }
+
+    /// Adds a frame to the film, whose planes cross where the first measured one moves most.
+    fn film(
+        &mut self,
+        number: usize,
+        volume: &Voxels<'_>,
+        field: &DenseField,
+        strain: &(dyn Fn(usize) -> f32 + Sync),
+    ) -> Result<()> {
+        let start = || start_film(self.reference, field, self.shown, self.range);
+        add_to(self.film.get_or_insert_with(start), number, volume, field, strain)
+    }
+
+    /// Writes what is of all frames together.
+    fn end(mut self, tracked: &Tracked, origin: usize) -> Result<Self> {
+        let started = Instant::now();
+        let (reference, step_s) = (self.reference, self.step_s);
+        let grid = *reference.grid();
+        let still = DenseField::zeros(grid);
+        self.put(origin, &still)?;
+        let packed = &self.packed;
+        let step = step_s.unwrap_or(0.0);
+        self.folder.write("displacement.nii.gz", |p| io::write_field_series(p, &grid, packed, step))?;
+        self.folder.write("trajectories.csv", |p| io::write_trajectories(p, &tracked.trajectories, origin, step_s))?;
+        self.folder.write("strain.csv", |p| io::write_strain(p, &tracked.strain, step_s))?;
+        self.film(origin, reference, &still, &|_| 0.0)?;
+        self.writing += started.elapsed();
+        Ok(self)
+    }
 }
 
 /// Says so where files come in the order of their letters but not of their numbers: a shell lists
@@ -385,7 +450,8 @@ fn none_against(error: anyhow::Error, reference: &str) -> anyhow::Error {
 /// number `origin`. Warns of frames that would be lost by what their headers say.
 fn plan(
     source: &mut Source<'_>,
-    (origin, reference): (usize, &Volume),
+    origin: usize,
+    reference: &Volume,
     mask: Option<&Mask>,
     params: &FieldParams,
     warnings: &mut Vec<String>,

@@ -167,7 +167,8 @@ fn ranked(path: &Path, volume: Volume) -> Result<(Volume, Vec<i64>)> {
     Ok((Volume::from_vec(*volume.grid(), ranks)?, codes))
 }
 
-/// Refuses numbers that cannot be distinguished where no new one may appear, and fractions as labels.
+/// Refuses numbers that cannot be distinguished where no new one may appear, and fractions as
+/// labels.
 fn check_labels(path: &Path, volume: &Volume, interpolation: Interpolation) -> Result<()> {
     let exact = matches!(interpolation, Interpolation::Nearest | Interpolation::Label);
     if let Some(v) = volume.as_slice().iter().find(|v| exact && v.is_finite() && v.abs() > io::WHOLE) {

@@ -22,8 +22,8 @@ const TOLERANCE: f64 = 1e-9;
 /// Rounding of a determinant, per unit of the coordinates that it is made of.
 const ROUNDING: f64 = 1e-15;
 
-/// Up to this number of rows, cutting each with the faces costs less than finding those that an element
-/// reaches in a slice.
+/// Up to this number of rows, cutting each with the faces costs less than finding those that an
+/// element reaches in a slice.
 const FEW_ROWS: usize = 6;
 
 /// Slices filled by one task.

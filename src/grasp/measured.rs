@@ -168,6 +168,26 @@ fn at(run: &GraspRun, time: f64) -> Option<Sample> {
     })
 }
 
+/// The states of a scene's run at the times of measurement.
+fn simulated(mut scene: Scene, points: &[CoursePoint]) -> Result<Vec<Sample>, String> {
+    let run = match simulate(&scene, &|_| {}) {
+        // What is tried on the way may be stiffer than the scene's step allows.
+        Err(GraspError::BadStep { stable, .. }) => {
+            scene.integrator.step = 0.5 * stable;
+            simulate(&scene, &|_| {})
+        }
+        other => other,
+    };
+    let run = run.map_err(|e| e.to_string())?;
+    let state = |p: &CoursePoint| {
+        at(&run, p.time).ok_or_else(|| {
+            let ended = run.flaw().map_or(String::new(), |e| format!(": {} at {:.2} s", e.kind.name(), e.time));
+            format!("the run ends before the measurement at {} s{ended}", p.time)
+        })
+    };
+    points.iter().map(state).collect()
+}
+
 /// Least squares of the object's pose over the logarithms of modulus and damping, whose c_t keeps
 /// its part of c_n (Levenberg and Marquardt).
 fn course(scene: &Scene, model: FingertipModel, points: &[CoursePoint]) -> Result<Raw, String> {
@@ -179,26 +199,9 @@ fn course(scene: &Scene, model: FingertipModel, points: &[CoursePoint]) -> Resul
     let damped = start[1] > 0.0;
     let with = |p: [f64; 2]| {
         let mut scene = scene.clone();
-        let factor = p.map(f64::exp);
-        scene.fingertip.youngs_modulus *= factor[0];
-        scene.fingertip.damping = scene.fingertip.damping.map(|c| c * factor[1]);
-        let run = match simulate(&scene, &|_| {}) {
-            // What is tried on the way may be stiffer than the scene's step allows.
-            Err(GraspError::BadStep { stable, .. }) => {
-                scene.integrator.step = 0.5 * stable;
-                simulate(&scene, &|_| {})
-            }
-            other => other,
-        };
-        let run = run.map_err(|e| e.to_string())?;
-        let mut states = Vec::with_capacity(points.len());
-        for p in points {
-            states.push(at(&run, p.time).ok_or_else(|| {
-                let ended = run.flaw().map_or(String::new(), |e| format!(": {} at {:.2} s", e.kind.name(), e.time));
-                format!("the run ends before the measurement at {} s{ended}", p.time)
-            })?);
-        }
-        Ok::<_, String>(states)
+        scene.fingertip.youngs_modulus *= p[0].exp();
+        scene.fingertip.damping = scene.fingertip.damping.map(|c| c * p[1].exp());
+        simulated(scene, points)
     };
     let misfit = |states: &[Sample]| -> Vec<f64> {
         let scale = [1.0, 1.0, a];

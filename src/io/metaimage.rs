@@ -17,7 +17,8 @@ pub(super) fn header(path: &Path) -> Result<RawImage, IoError> {
     parse(path, &bytes).map_err(|flaw| flaw.at(path))
 }
 
-fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
+/// The fields of a header, and where it ends.
+fn fields(bytes: &[u8]) -> Result<(Vec<(String, String)>, usize), Flaw> {
     let (mut fields, mut from): (Vec<(String, String)>, usize) = (Vec::new(), 0);
     let missing = || Flaw::new("its MetaImage header has no ElementDataFile", "copy or export it again");
     // The name of the file with the voxels ends the header.
@@ -39,6 +40,11 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         })?;
         fields.push((key.trim().to_lowercase(), value.trim().into()));
     }
+    Ok((fields, from))
+}
+
+fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
+    let (fields, from) = fields(bytes)?;
     // Of several names for one thing MetaIO takes the first one here, and of several lines the
     // last.
     let find = |names: &[&str]| names.iter().find_map(|n| fields.iter().rfind(|f| f.0 == *n)).map(|f| f.1.as_str());

@@ -19,23 +19,22 @@ pub(super) fn header(path: &Path) -> Result<RawImage, IoError> {
     parse(path, &bytes).map_err(|flaw| flaw.at(path))
 }
 
-fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
-    let cut = || Flaw::new("ends inside its NRRD header", "copy or export it again");
-    let (mut fields, mut end): (Vec<(String, String)>, usize) = (Vec::new(), 0);
+/// The fields of a header, and where the voxels begin if they stand in the same file.
+fn fields(bytes: &[u8]) -> Result<(Vec<(String, String)>, Option<usize>), Flaw> {
+    let mut fields: Vec<(String, String)> = Vec::new();
     let (_, mut from) = line(bytes, 0).ok_or_else(cut)?; // the magic
-    let data_inside = loop {
+    loop {
         // A header that ends with the file names another one for the voxels.
         let Some((text, next)) = line(bytes, from) else {
             let last = String::from_utf8_lossy(&bytes[from.min(bytes.len())..]).trim().to_string();
             if let Some((key, value)) = last.split_once(": ") {
                 fields.push((key.trim().to_lowercase(), value.trim().into()));
             }
-            break false;
+            return Ok((fields, None));
         };
         from = next;
         if text.is_empty() {
-            end = next;
-            break true;
+            return Ok((fields, Some(next)));
         }
         if text.starts_with('#') || text.contains(":=") {
             continue;
@@ -44,7 +43,15 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
             .split_once(':')
             .ok_or_else(|| Flaw::new(format!("its NRRD header has the odd line {:?}", shortened(&text)), EXPORT))?;
         fields.push((key.trim().to_lowercase(), value.trim().into()));
-    };
+    }
+}
+
+fn cut() -> Flaw {
+    Flaw::new("ends inside its NRRD header", "copy or export it again")
+}
+
+fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
+    let (fields, end) = fields(bytes)?;
     let find = |names: &[&str]| fields.iter().find(|f| names.contains(&f.0.as_str())).map(|f| f.1.as_str());
     let need = |name: &'static str| {
         find(&[name]).ok_or_else(|| Flaw::new(format!("its NRRD header has no field '{name}'"), EXPORT))
@@ -110,15 +117,15 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawImage, Flaw> {
         Some(text) => text.parse().ok().filter(|&n| n >= -1).ok_or_else(|| odd("byte skip", text))?,
         None => 0,
     };
-    let file = match (find(&["data file", "datafile"]), data_inside) {
+    let file = match (find(&["data file", "datafile"]), end) {
         (Some(name), _) if name.starts_with("LIST") || name.split_whitespace().count() > 1 && name.contains('%') => {
             return Err(Flaw::new("has its voxels in several files", EXPORT));
         }
         (Some(name), _) => path.parent().unwrap_or(Path::new("")).join(name),
-        (None, true) => path.into(),
-        (None, false) => return Err(cut()),
+        (None, Some(_)) => path.into(),
+        (None, None) => return Err(cut()),
     };
-    let inside = if file == path { end as u64 } else { 0 };
+    let inside = end.filter(|_| file == path).unwrap_or(0) as u64;
     let start = match skip {
         -1 if packing == Packing::None => Start::Last,
         0.. if packing == Packing::None => Start::At(inside + skip as u64),

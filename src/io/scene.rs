@@ -486,6 +486,31 @@ fn level(upper: [Option<f64>; 2], link: [f64; 2]) -> [f64; 2] {
     [0.0, right - left]
 }
 
+/// Where the fingers stand at the start: half spans and heights of their bases, and the depth to
+/// which the tips are pressed (m).
+fn placed(
+    path: &Path,
+    raw: &RawScene,
+    upper: [Option<f64>; 2],
+    link: [f64; 2],
+) -> Result<([f64; 2], [f64; 2], f64), IoError> {
+    let (finger, width, radius) = (&raw.finger, raw.object.width, raw.fingertip.radius.clone().pair());
+    let depth = raw.initial.as_ref().and_then(|initial| initial.normal_displacement);
+    let (spans, lifts) = match (finger.base, finger.half_span) {
+        (Some(_), Some(_)) => {
+            return Err(format(path, "finger has base and half_span", "leave one of them out"));
+        }
+        (Some([left, right]), None) => ([-left[0], right[0]], [left[1], right[1]]),
+        (None, Some(half_span)) => ([half_span; 2], level(upper, link)),
+        (None, None) => {
+            let depth = depth.unwrap_or(Scene::reference().initial.normal_displacement);
+            return Ok((radius.map(|a| a + 0.5 * width - depth), level(upper, link), depth));
+        }
+    };
+    let own = 0.5 * (radius[0] + radius[1] + width - spans[0] - spans[1]);
+    Ok((spans, lifts, depth.unwrap_or(own)))
+}
+
 /// A checked scene from its table; what the file leaves out is as in [`Scene::reference`].
 fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene, IoError> {
     let raw: RawScene = Value::Table(table).try_into().map_err(|error: toml::de::Error| {
@@ -495,27 +520,12 @@ fn scene(path: &Path, table: Table, overrides: &SceneOverrides) -> Result<Scene,
     })?;
     let named = |error: crate::error::UnknownName, key: &str| format(path, error.to_string(), format!("correct {key}"));
     let default = Scene::reference();
+    let (upper, link) = links(path, &raw.finger)?;
+    let (spans, lifts, depth) = placed(path, &raw, upper, link)?;
     let (tip, finger, object) = (raw.fingertip, raw.finger, raw.object);
     let (initial, integrator) = (raw.initial.unwrap_or_default(), raw.integrator.unwrap_or_default());
 
     let radius = tip.radius.pair();
-    let (upper, link) = links(path, &finger)?;
-    let depth_of = |spans: [f64; 2]| 0.5 * (radius[0] + radius[1] + object.width - spans[0] - spans[1]);
-    let placed = match (finger.base, finger.half_span) {
-        (Some(_), Some(_)) => {
-            return Err(format(path, "finger has base and half_span", "leave one of them out"));
-        }
-        (Some([left, right]), None) => Some(([-left[0], right[0]], [left[1], right[1]])),
-        (None, Some(half_span)) => Some(([half_span; 2], level(upper, link))),
-        (None, None) => None,
-    };
-    let (spans, lifts, depth) = match (placed, initial.normal_displacement) {
-        (Some((spans, lifts)), depth) => (spans, lifts, depth.unwrap_or_else(|| depth_of(spans))),
-        (None, depth) => {
-            let depth = depth.unwrap_or(default.initial.normal_displacement);
-            (radius.map(|a| a + 0.5 * object.width - depth), level(upper, link), depth)
-        }
-    };
     let profile = profile(path, tip.profile_depth, tip.profile_modulus)?;
     let model = tip.model.as_deref().map(str::parse::<FingertipModel>).transpose();
     let model = model.map_err(|e| named(e, "fingertip.model"))?.unwrap_or_default();

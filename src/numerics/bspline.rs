@@ -11,8 +11,8 @@ use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Sums of cells of a lattice along z that are held at a time: the number of values, where that is no
-/// fewer cells than keep the threads busy. Those of 128 cells of a lattice of 131 x 152 nodes a
+/// Sums of cells of a lattice along z that are held at a time: the number of values, where that is
+/// no fewer cells than keep the threads busy. Those of 128 cells of a lattice of 131 x 152 nodes a
 /// plane were 0.4 GB.
 const HELD: usize = 1 << 22;
 

@@ -26,8 +26,8 @@ pub(super) struct Tail {
 }
 
 impl Tail {
-    /// The last `columns` columns; none where there are none, or so large a number that the whole factor
-    /// takes hardly more work, or the factor is not made of supernodes.
+    /// The last `columns` columns; none where there are none, or so large a number that the whole
+    /// factor takes hardly more work, or the factor is not made of supernodes.
     pub fn of(symbolic: &SymbolicCholesky<u32>, columns: usize) -> Option<Self> {
         let supernodes = supernodes(symbolic).filter(|_| columns > 0)?;
         let whole: f64 = (0..supernodes.n_supernodes())

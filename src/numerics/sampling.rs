@@ -1,8 +1,9 @@
 //! Values of a volume or field between voxel centres.
 //!
-//! **Inside** means within half a voxel of the outermost centres, that is in a voxel of the grid; there the position
-//! is clamped to the centres' box, so an axis of one voxel is constant over that voxel. Elsewhere a volume has the
-//! background value the caller gives. Positions that are NaN are outside.
+//! **Inside** means within half a voxel of the outermost centres, that is in a voxel of the grid;
+//! there the position is clamped to the centres' box, so an axis of one voxel is constant over that
+//! voxel. Elsewhere a volume has the background value the caller gives. Positions that are NaN are
+//! outside.
 //!
 //! Cubic interpolation is the cubic B-spline with its prefilter (Unser, Aldroubi, Eden 1993; mirror
 //! boundaries). It passes through the samples and was chosen over Catmull-Rom by measurement: on

@@ -285,7 +285,8 @@ impl Bodies {
         &mut self,
         pair: &Pair<'_>,
         matches: &[LevelMatch],
-        (passes, finest): (usize, f64),
+        passes: usize,
+        finest: f64,
         seed: u64,
     ) -> Vec<String> {
         let mut said = Vec::new();

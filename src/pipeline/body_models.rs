@@ -45,7 +45,8 @@ impl Concluded {
         body: usize,
         pair: &Pair<'_>,
         matches: &[LevelMatch],
-        (asked, seed): (Option<MotionModel>, u64),
+        asked: Option<MotionModel>,
+        seed: u64,
     ) -> Self {
         let (pair, field) = (bodies.part(pair, body), &bodies.fields[body]);
         let own = matches.iter().filter(|m| m.kept && bodies.label_near(m.voxel) == body);
@@ -59,7 +60,7 @@ impl Concluded {
             choice = choice.asked(model, &local_model::shown(&pair, field, |_| true));
         }
         let free = choice.motion.is_none() && asked.is_none() && ablation::is_on("rest");
-        let rest = free.then(|| Rest::find((&pair, field), &windows, &places_of, &tried, &by_place)).flatten();
+        let rest = free.then(|| Rest::find(&pair, field, &windows, &places_of, &tried, &by_place)).flatten();
         drop(by_place);
         Self { choice, rest, posterior }
     }

@@ -57,8 +57,8 @@ const NORMAL_95: f64 = 1.96;
 /// Gauges whose noise is given, in units of the shortest.
 const GAUGES: [usize; 7] = [1, 2, 3, 4, 6, 8, 12];
 
-/// Of a wavelength, the gauge over which strain is taken: a mean over a quarter of a wave keeps 90 %
-/// of its amplitude.
+/// Of a wavelength, the gauge over which strain is taken: a mean over a quarter of a wave keeps 90
+/// % of its amplitude.
 const GAUGE_OF_WAVE: f64 = 0.25;
 
 /// Makes the pairs: a volume with a known motion, and a scan with noise of its own.
@@ -102,23 +102,9 @@ impl Pairs<'_> {
 pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>) -> Result<Certified, StrainError> {
     let CertifyInput { initial, second, mask, like } = input;
     let grid = *initial.grid();
-    input_checks::mask_grid(initial, mask)?;
-    for (what, other) in
-        [("the second scan", second.map(|s| s.grid())), ("the measured motion", like.map(|l| l.grid()))]
-    {
-        same_grid(&grid, what, other)?;
-    }
     let mut clock = Clock::start();
     let params = FieldParams { model: ModelSource::Free, ..params.clone() };
-    let tissue = mask.map_or_else(|| foreground(initial), |m| Mask::from_voxels(grid, |at, _| m.as_slice()[at].min(1)));
-    let noise = image_noise(initial, second, &tissue);
-    if second.is_some() && noise == 0.0 {
-        let (what, hint) = ("is the same as the first".into(), "give another scan at rest, or one alone".into());
-        return Err(FieldError::Volume { volume: "second", what, hint }.into());
-    }
-    if let Some(voxels) = like.map(|l| count_folds(l, Some(&tissue))).transpose()?.filter(|folds| *folds > 0) {
-        return Err(StrainError::Folds { voxels });
-    }
+    let (tissue, noise) = checked(&input)?;
     let pairs = Pairs { input, noise, seed: params.seed };
     let stars = stars(&tissue);
     let total = (2 * stars.len() + 2 + usize::from(like.is_some()) + usize::from(second.is_some())) as f64;
@@ -202,6 +188,25 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
         detectable,
         tissue,
     })
+}
+
+/// The tissue and the deviation of the image's noise (intensity), where the input can be used.
+fn checked(input: &CertifyInput<'_>) -> Result<(Mask, f64), StrainError> {
+    let CertifyInput { initial, second, mask, like } = *input;
+    let grid = *initial.grid();
+    input_checks::mask_grid(initial, mask)?;
+    same_grid(&grid, "the second scan", second.map(|s| s.grid()))?;
+    same_grid(&grid, "the measured motion", like.map(|l| l.grid()))?;
+    let tissue = mask.map_or_else(|| foreground(initial), |m| Mask::from_voxels(grid, |at, _| m.as_slice()[at].min(1)));
+    let noise = image_noise(initial, second, &tissue);
+    if second.is_some() && noise == 0.0 {
+        let (what, hint) = ("is the same as the first".into(), "give another scan at rest, or one alone".into());
+        return Err(FieldError::Volume { volume: "second", what, hint }.into());
+    }
+    match like.map(|l| count_folds(l, Some(&tissue))).transpose()?.filter(|folds| *folds > 0) {
+        Some(voxels) => Err(StrainError::Folds { voxels }),
+        None => Ok((tissue, noise)),
+    }
 }
 
 fn same_grid(grid: &Grid, what: &str, other: Option<&Grid>) -> Result<(), FieldError> {

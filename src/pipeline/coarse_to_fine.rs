@@ -226,7 +226,7 @@ impl<'a> CoarseToFine<'a, '_> {
         } else if sought && self.params.bodies == BodySource::Found {
             let edges = pair.spacing.into_iter().zip(*factor).map(|(s, f)| s / f as f64);
             let edge = edges.fold(f64::INFINITY, f64::min);
-            account.asked.extend(bodies.divide(pair, &begun.matches, (*passes, edge), self.params.seed));
+            account.asked.extend(bodies.divide(pair, &begun.matches, *passes, edge, self.params.seed));
         }
     }
 

@@ -332,14 +332,16 @@ impl Solved {
         level.patches[0].contact = Contact::Sticking;
         level.patches[1].contact = bench.contact();
         level.settle_shape()?;
-        Self::of(bench, &level, &params, (press, force_n, strain))
+        Self::of(bench, &level, &params, press, force_n, strain)
     }
 
     fn of(
         bench: &Bench<'_>,
         level: &Level,
         params: &StiffnessParams,
-        (press, force, strain): (f64, f64, f64),
+        press: f64,
+        force: f64,
+        strain: f64,
     ) -> Result<Self, StiffnessError> {
         let reference = level.largest();
         let mut setup = level.setup(Law::Linear, params, reference);

@@ -249,12 +249,12 @@ fn canonical(
         finest,
         progress,
     };
-    let found = task.searched(&aligned, (&clean, &factors), range, starts, &mut clock)?;
+    let found = task.searched(&aligned, &clean, &factors, range, starts, &mut clock)?;
     let mut concluded = task.concluded(&aligned, found, &mut clock)?;
     drop(aligned);
     let estimated = task.estimated(&mut concluded, &mut clock)?;
     let damage = input_checks::said_of(&lost);
-    task.result(concluded, estimated, (not_finite, damage, starts.is_empty()), clock)
+    task.result(concluded, estimated, not_finite, damage, starts.is_empty(), clock)
 }
 
 /// What a run works on, beside the volumes.
@@ -323,7 +323,8 @@ impl Task<'_> {
     fn searched<'b>(
         &self,
         aligned: &'b Aligned<'b>,
-        (initial, factors): (&Voxels<'_>, &[[usize; 3]]),
+        initial: &Voxels<'_>,
+        factors: &[[usize; 3]],
         range: f64,
         starts: &[Start],
         clock: &mut Clock,
@@ -345,7 +346,7 @@ impl Task<'_> {
         let found = chain.run(range, tissue, clock)?;
         let kept = found.matches.iter().filter(|m| m.kept).count();
         if kept < FEWEST {
-            return Err(too_few(kept, &found.pair, (found.search, params), known.start.is_some()));
+            return Err(too_few(kept, &found.pair, found.search, params, known.start.is_some()));
         }
         Ok(found)
     }
@@ -357,7 +358,7 @@ impl Task<'_> {
         let Found { mut bodies, mut factor, mut pair, matches, points, reports, begun, light, search, .. } = found;
         let conclude = |b: usize| {
             let asked = if self.is_rigid(b) { Some(MotionModel::Rigid) } else { params.model.asked() };
-            let mut concluded = Concluded::of(&bodies, b, &pair, &matches, (asked, params.seed));
+            let mut concluded = Concluded::of(&bodies, b, &pair, &matches, asked, params.seed);
             // A bone is known to be rigid.
             concluded.choice.rejected &= !self.is_rigid(b);
             concluded
@@ -457,7 +458,8 @@ impl Task<'_> {
         models.into_iter().enumerate().map(of).collect()
     }
 
-    /// How far off the field may be, with all that puts it in doubt; the matches take the estimate.
+    /// How far off the field may be, with all that puts it uncertain; the matches take the
+    /// estimate.
     fn estimated(&self, concluded: &mut Conclusion, clock: &mut Clock) -> Result<Estimated, FieldError> {
         let Conclusion { coefficients, variances, begun, factor, .. } = concluded;
         let (grid, factor) = (&self.grid, *factor);
@@ -481,7 +483,7 @@ impl Task<'_> {
         }
         let samples = variances.samples(grid, factor)?;
         let sparse = std::mem::take(&mut concluded.sparse);
-        concluded.sparse = estimated(sparse, grid, (coefficients, &uncertainty));
+        concluded.sparse = estimated(sparse, grid, coefficients, &uncertainty);
         clock.book("uncertainty");
         Ok(Estimated { uncertainty, samples, landmarks })
     }
@@ -491,7 +493,9 @@ impl Task<'_> {
         &self,
         concluded: Conclusion,
         estimated: Estimated,
-        (not_finite, damage, is_first): ([usize; 2], Vec<String>, bool),
+        not_finite: [usize; 2],
+        damage: Vec<String>,
+        is_first: bool,
         mut clock: Clock,
     ) -> Result<FieldResult, FieldError> {
         let (params, mask, progress) = (self.params, self.mask, self.progress);
@@ -506,7 +510,7 @@ impl Task<'_> {
         if let Some(seen) = doubted.filter(|_| self.anchors.is_empty()) {
             let far = most_move(displacement, mask) > concluded.search;
             let found = reports.last().map_or(0, |r| r.counts.features_initial);
-            no_measurement((concluded.kept, found), seen, (far, concluded.unlike.is_some()))?;
+            no_measurement(concluded.kept, found, seen, far, concluded.unlike.is_some())?;
         }
         progress("jacobian", 0.94);
         let folds = jacobian::count_folds(displacement, Some(mask))?;

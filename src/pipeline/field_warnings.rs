@@ -14,9 +14,11 @@ use crate::types::*;
 /// whole and few of the matches survive, `kept` of `found`; past the range of the search (`far`)
 /// either will do, the first one where the volumes stay `unlike`.
 pub(super) fn no_measurement(
-    (kept, found): (usize, usize),
+    kept: usize,
+    found: usize,
     seen: Counts,
-    (far, unlike): (bool, bool),
+    far: bool,
+    unlike: bool,
 ) -> Result<(), FieldError> {
     let survived = (kept, "matches survive", found.div_ceil(5));
     let agreed = (
@@ -80,12 +82,7 @@ const STRANGERS: f64 = 0.1;
 
 /// Refuses a run with too few matches, with what was measured of the volumes and the one thing to
 /// try. Nothing is advised that was asked for already.
-pub(super) fn too_few(
-    found: usize,
-    pair: &Pair<'_>,
-    (search, params): (f64, &FieldParams),
-    started: bool,
-) -> FieldError {
+pub(super) fn too_few(found: usize, pair: &Pair<'_>, search: f64, params: &FieldParams, started: bool) -> FieldError {
     let (plain, agreement) = (pair.plain(), contrast::agreement(pair, &Bodies::still(pair)).at_rest);
     // Volumes of cells are under a millimetre.
     let search = format!("{search:.*}", if search < 1.0 { 3 } else { 0 });
@@ -138,8 +135,8 @@ pub(super) fn said_of_model(rejected: bool) -> Option<String> {
     })
 }
 
-/// Part of the tissue without texture that earns a warning: pairs made from scans of heads, legs and a spine
-/// have 0 to 8 %, legs in slices four times as thick as their voxels are wide 10.
+/// Part of the tissue without texture that earns a warning: pairs made from scans of heads, legs
+/// and a spine have 0 to 8 %, legs in slices four times as thick as their voxels are wide 10.
 const PLAIN: f64 = 0.1;
 
 /// Says so where much of the tissue shows nothing that could be seen to move.

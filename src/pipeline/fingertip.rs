@@ -94,8 +94,8 @@ impl PadOutcome {
                 let pad = against_plate(self.pad.clone(), &self.columns, curve, nodes);
                 let press = self.at_press.map(|[depth, _]| (depth, pad.plate.as_ref().and_then(|p| p.at(depth))));
                 match press {
-                    // What ends before the press cannot be compared with the force that was measured
-                    // there.
+                    // What ends before the press cannot be compared with the force that was
+                    // measured there.
                     Some((_, None)) => self.failure = Some(StiffnessError::NoEquilibrium),
                     Some((depth, Some(force))) => (self.at_press, self.pad) = (Some([depth, force]), pad),
                     None => self.pad = pad,

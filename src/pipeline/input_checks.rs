@@ -330,8 +330,8 @@ fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
 /// How far past its robust range a volume's intensities may lie, in widths of it.
 const PAST: f32 = 3.0;
 
-/// The most extreme neighbours that do not count when a voxel is compared with them: hot voxels come
-/// in short runs.
+/// The most extreme neighbours that do not count when a voxel is compared with them: hot voxels
+/// come in short runs.
 const RUN: usize = 3;
 
 /// The volume with padding that lies far from its intensities as the darkest of these, lone far
@@ -411,8 +411,8 @@ pub fn known(
 ) -> Result<(), FieldError> {
     params.check()?;
     mask_grid(initial, known.mask)?;
-    on_grid("the mask of what counts", known.initial_counts, ("the initial volume", initial.grid()))?;
-    on_grid("the deformed mask", known.deformed_counts, ("the deformed volume", deformed.grid()))?;
+    on_grid("the mask of what counts", known.initial_counts, "the initial volume", initial.grid())?;
+    on_grid("the deformed mask", known.deformed_counts, "the deformed volume", deformed.grid())?;
     let refuse = |volume, what: &str, hint: &str| FieldError::Volume { volume, what: what.into(), hint: hint.into() };
     if params.method == Method::Full && params.bodies == BodySource::Given && known.mask.is_none() {
         return Err(refuse("mask", "is missing", "give the label map of the bodies as mask"));
@@ -430,11 +430,11 @@ pub fn known(
 /// # Errors
 /// [`FieldError::GridMismatch`] when it does not.
 pub fn mask_grid(initial: &Voxels<'_>, mask: Option<&Mask>) -> Result<(), FieldError> {
-    on_grid("the mask", mask, ("the initial volume", initial.grid()))
+    on_grid("the mask", mask, "the initial volume", initial.grid())
 }
 
 /// A mask, called `what`, must lie on the grid of a volume.
-fn on_grid(what: &str, mask: Option<&Mask>, (reference, grid): (&str, &Grid)) -> Result<(), FieldError> {
+fn on_grid(what: &str, mask: Option<&Mask>, reference: &str, grid: &Grid) -> Result<(), FieldError> {
     match mask {
         Some(m) if !m.grid().same_as(grid) => Err(FieldError::GridMismatch {
             what: what.into(),

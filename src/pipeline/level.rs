@@ -135,7 +135,7 @@ pub(super) fn refine_from(
     seed: u64,
     tick: impl Fn(usize),
 ) {
-    advance(pair, field, (begun, Held::Whole), passes, seed, tick);
+    advance(pair, field, begun, Held::Whole, passes, seed, tick);
 }
 
 /// Passes of [`twice`]. With one, waves of 20 to 30 voxels stay 1 % lower and twelve pairs have 2 %
@@ -146,7 +146,7 @@ const TWICED: usize = 2;
 /// 1977): what it flattened of long waves comes back, and short ones stay out.
 pub fn twice(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
     let begun = field.coefficients.clone();
-    advance(pair, field, (&begun, Held::Change), TWICED, seed, |_| ());
+    advance(pair, field, &begun, Held::Change, TWICED, seed, |_| ());
 }
 
 /// What the bending energy is counted of.
@@ -162,7 +162,8 @@ enum Held {
 fn advance(
     pair: &Pair<'_>,
     field: &mut SplineField,
-    (begun, held): (&[f32], Held),
+    begun: &[f32],
+    held: Held,
     passes: usize,
     seed: u64,
     tick: impl Fn(usize),
@@ -532,8 +533,8 @@ fn sought(pair: &Pair<'_>, warped: Option<&[f32]>, params: &MatchParams) -> Soug
     Sought { initial, starts, deformed: deformed.len(), list, origin }
 }
 
-/// One candidate for each feature (at `places`, mm): by relaxation, or the best-correlated; with the
-/// energy a place of the best-correlated ones and of the choice.
+/// One candidate for each feature (at `places`, mm): by relaxation, or the best-correlated; with
+/// the energy a place of the best-correlated ones and of the choice.
 fn assigned(
     pair: &Pair<'_>,
     places: &[[f64; 3]],

@@ -118,7 +118,8 @@ impl Rest {
     /// `excess` gives the excess misfit of a map about each of the windows. None where neither map
     /// was tried.
     pub fn find(
-        (pair, field): (&Pair<'_>, &SplineField),
+        pair: &Pair<'_>,
+        field: &SplineField,
         windows: &Lattice,
         places: &Places,
         tried: &[Tried],

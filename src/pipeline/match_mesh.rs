@@ -29,7 +29,8 @@ pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Ma
 pub(super) fn estimated(
     mut sparse: SparseField,
     grid: &Grid,
-    (coefficients, deviation): (&FieldSpline, &ScalarSpline),
+    coefficients: &FieldSpline,
+    deviation: &ScalarSpline,
 ) -> SparseField {
     let of = |m: &mut Match| {
         let VoxelPoint(place) = grid.affine().to_voxel(m.initial);

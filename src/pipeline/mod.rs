@@ -1,8 +1,8 @@
 //! The chains of stages that a library user calls.
 //!
 //! [`field`] is the page to read first: it calls the stages in order and times them. [`level`]
-//! holds what is done on one level of the pyramid, [`input_checks`] what is refused before any work,
-//! [`dry_run`] what a run would do; [`grasp`] is the grasp simulator's page.
+//! holds what is done on one level of the pyramid, [`input_checks`] what is refused before any
+//! work, [`dry_run`] what a run would do; [`grasp`] is the grasp simulator's page.
 
 pub mod field;
 

@@ -134,9 +134,11 @@ struct Finest<'a> {
 }
 
 impl<'a> Levels<'a> {
-    /// The matches and the field of each level, from the coarsest to the finest; none without a
-    /// level.
-    fn run(&self, clock: &mut Clock) -> Option<Finest<'a>> {
+    /// The matches and the field of each level, from the coarsest to the finest.
+    ///
+    /// # Errors
+    /// Where too few matches survive.
+    fn run(&self, known: &Known<'_>, clock: &mut Clock) -> Result<Finest<'a>, FieldError> {
         let Self { params, flat, search: range, .. } = *self;
         let (mut reports, mut left) = (Vec::new(), Vec::new());
         let mut state: Option<(Found, Pair<'_>, [usize; 3])> = None;
@@ -158,8 +160,33 @@ impl<'a> Levels<'a> {
             state = Some((found, pair, factor));
             clock.book("matching");
         }
-        state.map(|(found, pair, factor)| Finest { found, pair, factor, reports, left })
+        let (found, pair, factor) = state.ok_or_else(|| no_match(0, "check the mask".into()))?;
+        let kept = found.matches.iter().filter(|m| m.kept).count();
+        if kept < FEWEST {
+            return Err(too_few(kept, &pair, range, params, known.start.is_some()));
+        }
+        Ok(Finest { found, pair, factor, reports, left })
     }
+}
+
+/// The smallest motion that explains the matches, with the evidence for it.
+fn chosen(
+    pair: &Pair<'_>,
+    field: &SplineField,
+    matches: &[LevelMatch],
+    params: &FieldParams,
+    cut: [Option<background::Cut>; 2],
+    reports: &[LevelReport],
+) -> Choice {
+    let corners = reports.last().map_or(0, |r| r.counts.features_initial);
+    let mut choice = smallest(matches, pair, field, params.seed);
+    if let Some(model) = params.model.asked() {
+        choice = choice.asked(model, &local_model::shown(pair, field, |_| true));
+    }
+    choice.evidence.insert(0, MADE_BY.into());
+    choice.evidence.extend(background::why_unseen(cut));
+    choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
+    choice
 }
 
 /// The chosen motion on the full grid, and the variance of its error by source; `warped` is the
@@ -168,8 +195,10 @@ fn variances(
     pair: &Pair<'_>,
     field: &SplineField,
     warped: &[f32],
-    (choice, factor): (&Choice, [usize; 3]),
-    (grid, seed): (&Grid, u64),
+    choice: &Choice,
+    factor: [usize; 3],
+    grid: &Grid,
+    seed: u64,
 ) -> (Spline, Variances) {
     let posterior = level::posterior(field, pair.spacing, seed);
     let misfit = residual::misfit_by_place(pair, warped, &field.lattice);
@@ -191,6 +220,16 @@ struct Found {
     report: LevelReport,
 }
 
+/// Refuses a start that is no affine map.
+fn refuse_bent(known: &Known<'_>, grid: &Grid) -> Result<(), FieldError> {
+    if known.start.is_some_and(|start| start::bends(start::rest(start), grid, known.mask)) {
+        let what = "the start bends, and --method sparse begins at an affine map".into();
+        let hint = "leave --method out, or give an affine transform".into();
+        return Err(FieldError::Start { what, hint });
+    }
+    Ok(())
+}
+
 /// Measures the displacement of two volumes whose axes run right, anterior and superior, by matches
 /// alone.
 ///
@@ -203,11 +242,7 @@ pub(super) fn measure(
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    if known.start.is_some_and(|start| start::bends(start::rest(start), initial.grid(), known.mask)) {
-        let what = "the start bends, and --method sparse begins at an affine map".into();
-        let hint = "leave --method out, or give an affine transform".into();
-        return Err(FieldError::Start { what, hint });
-    }
+    refuse_bent(known, initial.grid())?;
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
     let [initial, deformed] = [initial, deformed].map(input_checks::tamed);
@@ -216,37 +251,21 @@ pub(super) fn measure(
     let not_finite = known.not_finite(not_finite, [&initial, &deformed]);
     let mask = known.counted(mask);
     let grid = *initial.grid();
-    let flat = grid.is_single_slice();
     let search = coarse_to_fine::search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
     let factors = coarse_to_fine::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
-
-    let levels = Levels { aligned: &aligned, factors: &factors, flat, search, params, progress };
-    let Some(Finest { found, pair, factor, mut reports, left }) = levels.run(&mut clock) else {
-        return Err(no_match(0, "check the mask".into()));
-    };
+    let levels =
+        Levels { aligned: &aligned, factors: &factors, flat: grid.is_single_slice(), search, params, progress };
+    let Finest { found, pair, factor, mut reports, left } = levels.run(known, &mut clock)?;
     let Found { mut field, matches, .. } = found;
-    let kept = matches.iter().filter(|m| m.kept).count();
-    if kept < FEWEST {
-        return Err(too_few(kept, &pair, (search, params), known.start.is_some()));
-    }
-
-    // The smallest motion that explains the matches, and what they leave open.
     progress("model", 0.9);
-    let mut choice = smallest(&matches, &pair, &field, params.seed);
-    if let Some(model) = params.model.asked() {
-        choice = choice.asked(model, &local_model::shown(&pair, &field, |_| true));
-    }
-    choice.evidence.insert(0, MADE_BY.into());
-    choice.evidence.extend(background::why_unseen(cut));
-    let corners = reports.last().map_or(0, |r| r.counts.features_initial);
-    choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
+    let choice = chosen(&pair, &field, &matches, params, cut, &reports);
     let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
     clock.book("model");
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
-    let (full, mut variances) = variances(&pair, &field, &warped, (&choice, factor), (&grid, params.seed));
-    let searched = reports.first().map_or(1.0, |r| r.counts.kept_share());
+    let (full, mut variances) = variances(&pair, &field, &warped, &choice, factor, &grid, params.seed);
     let unlike = refinement::unlike(&pair, level::misfit(&pair, &warped)[0]);
+    let searched = reports.first().map_or(1.0, |r| r.counts.kept_share());
     if searched < AGREED && unlike.is_some() {
         variances.set_other_motions(searched, search);
     }
@@ -256,11 +275,10 @@ pub(super) fn measure(
     let agreement = agreement(&pair, &field.without_blocks().into(), choice.model)?;
     let stages = stages::account(&grid, (&pair, factor), left, &coefficients);
     let measured = SparseField { matches: matches.iter().map(|m| world_match(&grid, m, factor)).collect() };
-    let sparse = estimated(measured, &grid, (&coefficients, &uncertainty));
+    let sparse = estimated(measured, &grid, &coefficients, &uncertainty);
     clock.book("uncertainty");
-
     progress("mesh", 0.92);
-    let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, flat, &mut clock)?;
+    let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, grid.is_single_slice(), &mut clock)?;
     let displacement = &meshed.displacement;
     let (mean_mm, max_mm, mask_voxels) = lengths(displacement, &mask);
     let folds = jacobian::count_folds(displacement, Some(&mask))?;
@@ -269,18 +287,18 @@ pub(super) fn measure(
     clock.book("uncertainty");
 
     let counts = with_mesh(&mut reports, &meshed.mesh);
+    let mut warnings = warnings(counts, folds, not_finite, max_mm, search);
+    warnings.extend(said_of_model(choice.rejected).into_iter().chain(input_checks::said_of(&lost)));
+    warnings.extend(input_checks::squeezed(displacement, &mask).into_iter().chain(unlike));
+    warnings.extend(without_texture(pair.plain()).into_iter().chain(out_of_view(unseen)));
+    let (model, expected_error_mm) = (choice.model, expected.mean_mm);
+    let body = BodyReport { label: 1, voxels: mask_voxels, model, slides_mm: 0.0, expected_error_mm };
     let summary = FieldSummary {
         counts,
-        model: choice.model,
+        model,
         rejected: choice.rejected,
         evidence: choice.evidence,
-        bodies: vec![BodyReport {
-            label: 1,
-            voxels: mask_voxels,
-            model: choice.model,
-            slides_mm: 0.0,
-            expected_error_mm: expected.mean_mm,
-        }],
+        bodies: vec![body],
         levels: reports,
         stages: stages.iter().map(|s| s.report.clone()).collect(),
         folds,
@@ -295,15 +313,7 @@ pub(super) fn measure(
         landmarks: None,
         start: None,
         seconds: clock.0,
-        warnings: warnings(counts, folds, not_finite, max_mm, search)
-            .into_iter()
-            .chain(said_of_model(choice.rejected))
-            .chain(input_checks::said_of(&lost))
-            .chain(input_checks::squeezed(displacement, &mask))
-            .chain(unlike)
-            .chain(without_texture(pair.plain()))
-            .chain(out_of_view(unseen))
-            .collect(),
+        warnings,
     };
     progress("done", 1.0);
     // A search that starts from the field needs no information at its nodes.
@@ -351,12 +361,12 @@ fn on_level(pair: &Pair<'_>, begun: SplineField, last: bool, params: &FieldParam
     };
     let (matches, _, report) = level::matches(pair, Some(&begun), near);
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.voxel).collect();
-    let mut found = coupled(pair, &begun, (matches, report), params);
+    let mut found = coupled(pair, &begun, matches, report, params);
     // Comparisons without sub-voxel matching have no use for it.
     let rounds = if params.sub_voxel { ROUNDS[which] } else { 0 };
     for _ in 0..rounds {
         let matches = level::follow(pair, &found.field, places.par_iter().copied(), PATCH);
-        found = coupled(pair, &found.field, (matches, found.report), params);
+        found = coupled(pair, &found.field, matches, found.report, params);
     }
     found
 }
@@ -366,7 +376,8 @@ fn on_level(pair: &Pair<'_>, begun: SplineField, last: bool, params: &FieldParam
 fn coupled(
     pair: &Pair<'_>,
     known: &SplineField,
-    (mut matches, mut report): (Vec<LevelMatch>, LevelReport),
+    mut matches: Vec<LevelMatch>,
+    mut report: LevelReport,
     params: &FieldParams,
 ) -> Found {
     let radius = pair.in_voxels(PATCH);

@@ -438,7 +438,7 @@ impl Deviation {
         // Of regions that were found the shapes are open as a whole.
         let interfaces = if inputs.labelled { Interface::all(inputs.labels) } else { Interface::walls(inputs.labels) };
         let grid = inputs.labels.grid();
-        let geometry = geometry::fit(&coarse_setup, &choice.estimate, grid, (&interfaces, &inclusions))?;
+        let geometry = geometry::fit(&coarse_setup, &choice.estimate, grid, &interfaces, &inclusions)?;
         let corrected = |step: &[f64]| {
             let x = estimate.state.x.as_deref().unwrap_or_default();
             setup.advanced(&estimate.state, x, &estimate.columns, step)
@@ -548,7 +548,7 @@ fn identified(
     fine.touch_like(coarse)?;
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(coarse, &choice.estimate.state) };
     let estimate = fine.setup(choice.law, params, reference).run(start, 3, PRECISION)?;
-    settle(fine, choice.law, params, reference, estimate, (moves, PRECISION))
+    settle(fine, choice.law, params, reference, estimate, moves, PRECISION)
 }
 
 /// Draws of the field's error at the observations (mm, RAS); none where matches are taken in its

@@ -46,7 +46,7 @@ impl Candidate {
     fn shaped_rms(&self, search: &Search<'_>, grid: &Grid) -> Result<f64, StiffnessError> {
         let setup = self.level.setup(search.law, search.params, self.level.largest());
         let walls = Interface::walls(&self.labels);
-        let shaped = geometry::fit(&setup, &self.estimate, grid, (&walls, &[]))?;
+        let shaped = geometry::fit(&setup, &self.estimate, grid, &walls, &[])?;
         Ok(shaped.map_or(self.estimate.rms, |g| g.fit.rms.min(self.estimate.rms)))
     }
 }
@@ -82,7 +82,7 @@ impl Search<'_> {
             return Ok(None);
         }
         let setup = old.level.setup(self.law, self.params, old.level.largest());
-        let Some(fit) = geometry::fit(&setup, &old.estimate, grid, (&[], &inclusions))? else { return Ok(None) };
+        let Some(fit) = geometry::fit(&setup, &old.estimate, grid, &[], &inclusions)? else { return Ok(None) };
         if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
             return Ok(None);
         }

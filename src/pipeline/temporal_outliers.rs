@@ -1,5 +1,5 @@
-//! Whether the field of a frame of a sequence is confirmed: by the frames before and after it, or by
-//! its own image.
+//! Whether the field of a frame of a sequence is confirmed: by the frames before and after it, or
+//! by its own image.
 //!
 //! A void, an artefact or a wrong match moves tissue where no frame beside it has it, and the pair
 //! alone cannot tell. A jerk does so too, but then the image agrees better with the frame's own
@@ -84,7 +84,8 @@ impl<'a, 'v> Course<'a, 'v> {
     pub fn add(
         &mut self,
         number: usize,
-        (field, uncertainty): (&Displacement<'_>, &dyn Fn(usize) -> f32),
+        field: &Displacement<'_>,
+        uncertainty: &dyn Fn(usize) -> f32,
         volume: Voxels<'v>,
     ) -> Option<(usize, OutOfLine)> {
         let moved = self.blocks.iter().flatten().map(|&at| (field.at(at), uncertainty(at))).collect();
@@ -256,11 +257,11 @@ mod tests {
         let all = Mask::filled(g, 1);
         let mut course = Course::new(&reference, &all, 0);
         let sigma = |_: usize| 0.1;
-        assert_eq!(course.add(2, (&field(2.0, 0.0), &sigma), reference.view()), None);
-        let second = course.add(3, (&field(3.0, 3.0), &sigma), seen.view());
+        assert_eq!(course.add(2, &field(2.0, 0.0), &sigma, reference.view()), None);
+        let second = course.add(3, &field(3.0, 3.0), &sigma, seen.view());
         assert!(second.is_none_or(|s| s.0 == 2));
         let fourth = Volume::from_voxels(g, |_, p| texture(p.moved([-4.0, 0.0, 0.0])) as f32);
-        let said = course.add(4, (&field(4.0, 0.0), &sigma), fourth);
+        let said = course.add(4, &field(4.0, 0.0), &sigma, fourth);
         // The last frame is borne out by its image alone, and the first on the other side begins
         // again.
         assert_eq!(course.end(), None);
@@ -276,7 +277,7 @@ mod tests {
         let all = Mask::filled(g, 1);
         let mut course = Course::new(&reference, &all, 0);
         let field = DenseField::from_fn(g, |_| [3.0, 0.0, 0.0]);
-        assert_eq!(course.add(1, (&field, &|_| 0.1), seen), None);
+        assert_eq!(course.add(1, &field, &|_| 0.1, seen), None);
         assert_eq!(course.end(), None);
     }
 

@@ -34,9 +34,9 @@ const WHITE: f64 = 0.75;
 /// takes as well: noise has 0.01 to 0.05 of it.
 const UNCERTAIN: f64 = 0.08;
 
-/// A block of two nodes along each axis keeps a frame's own field where more than this many times the
-/// noise there is left; a block that has more than this many times the median of all in all frames
-/// does in each of them.
+/// A block of two nodes along each axis keeps a frame's own field where more than this many times
+/// the noise there is left; a block that has more than this many times the median of all in all
+/// frames does in each of them.
 const OWN: f32 = 4.0;
 const ALWAYS: f32 = 6.0;
 
@@ -84,7 +84,7 @@ impl Modes {
         let before = order.iter().filter(|&&f| frames[f].number < origin).count();
         let still = Cow::Owned(vec![0.0; 3 * lattice.len()]);
         let mut rows: Vec<Cow<'_, [f32]>> =
-            order.iter().map(|&f| carried((&fields[f].0, &fields[f].1), lattice)).collect();
+            order.iter().map(|&f| carried(&fields[f].0, &fields[f].1, lattice)).collect();
         rows.insert(before, still);
         let nodes: Vec<usize> =
             (0..lattice.len()).filter(|&m| counts(lattice.within(m).map(|v| v.round() as usize))).collect();
@@ -102,7 +102,7 @@ impl Modes {
         for count in first..=most {
             let tried = data.left_by(count);
             if tried.is_noise() {
-                return Ok(data.modes(count, &tried, (lattice, &order, before), &rows));
+                return Ok(data.modes(count, &tried, lattice, &order, before, &rows));
             }
             last = Some(tried);
         }
@@ -113,13 +113,13 @@ impl Modes {
     /// The field of frame `at` of those that were given, by all of them.
     pub fn apply(&self, at: usize, field: &mut FieldSpline) {
         let Some((lattice, coefficients)) = field.only_mut() else { return };
-        let taken = carried((&self.lattice, &self.corrections[at]), lattice);
+        let taken = carried(&self.lattice, &self.corrections[at], lattice);
         coefficients.iter_mut().zip(taken.iter()).for_each(|(c, t)| *c -= t);
     }
 }
 
 /// Coefficients on another lattice over the same grid.
-fn carried<'a>((from, coefficients): (&Lattice, &'a [f32]), to: &Lattice) -> Cow<'a, [f32]> {
+fn carried<'a>(from: &Lattice, coefficients: &'a [f32], to: &Lattice) -> Cow<'a, [f32]> {
     if from == to {
         return Cow::Borrowed(coefficients);
     }
@@ -284,7 +284,9 @@ impl Data {
         &self,
         count: usize,
         left: &Left,
-        (lattice, order, origin): (&Lattice, &[usize], usize),
+        lattice: &Lattice,
+        order: &[usize],
+        origin: usize,
         rows: &[Cow<'_, [f32]>],
     ) -> Modes {
         let all = lattice.len();

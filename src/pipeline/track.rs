@@ -3,8 +3,8 @@
 //! Every frame is measured against the reference itself, so that errors do not add up; the search
 //! starts from where the tissue was in the frame before and where steady motion would take it,
 //! beside the starts that a pair of volumes has. Then what all frames say together takes from each
-//! what is its own noise and the reference's (`pipeline::temporal_pca`). Of volumes only the reference,
-//! the frame at hand and the one before are held, and of fields one; the others as their
+//! what is its own noise and the reference's (`pipeline::temporal_pca`). Of volumes only the
+//! reference, the frame at hand and the one before are held, and of fields one; the others as their
 //! coefficients.
 
 use crate::error::FieldError;
@@ -79,31 +79,47 @@ pub struct Frame<'a> {
     pub strain: &'a StrainField,
 }
 
-/// Measures `frames` volumes against number `origin` of them: forward from it to the last, then
-/// backward to the first.
+/// A sequence, and how it is measured.
+#[derive(Clone, Copy)]
+pub struct Sequence<'a> {
+    /// Number of volumes.
+    pub frames: usize,
+    /// Number of the volume that the others are measured against, from 0.
+    pub origin: usize,
+    /// That volume.
+    pub reference: &'a Voxels<'a>,
+    /// What is known of the reference and of each frame.
+    pub known: Known<'a>,
+    /// Regions whose strain is worked out (on the reference's grid; 0 is left out). Without them
+    /// the mask is one, and without either what stands out of the background.
+    pub labels: Option<&'a Mask>,
+    /// The parameters of each pair.
+    pub params: &'a FieldParams,
+    /// Whether each field is what all frames say of it; not so where a start is known.
+    pub together: bool,
+}
+
+/// Measures a sequence against its reference: forward from it to the last volume, then backward to
+/// the first.
 ///
 /// `read` gives a volume by its number, twice each; `keep` gets each result once all are measured.
-/// Where `together` holds, each field is what all frames say of it, unless a start is `known`.
-/// `labels` (on the reference's grid; 0 is left out) name the regions whose strain is worked out,
-/// the mask alone without them, and what stands out of the background without either. A frame that
-/// cannot be measured is reported as lost, and the next one starts from the frames before it.
+/// A frame that cannot be measured is reported as lost, and the next one starts from the frames
+/// before it.
 ///
 /// # Errors
 /// Those of `read` and `keep`, and [`FieldError`] when no frame at all can be measured.
 pub fn run<'v, E: From<FieldError>>(
-    (frames, origin): (usize, usize),
-    reference: &Voxels<'_>,
-    (known, labels): (&Known<'_>, Option<&Mask>),
-    (params, together): (&FieldParams, bool),
+    sequence: &Sequence<'_>,
     mut read: impl FnMut(usize) -> Result<Voxels<'v>, E>,
     mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
     progress: Progress<'_>,
 ) -> Result<Tracked, E> {
+    let Sequence { frames, origin, reference, known, labels, params, together } = *sequence;
     let mask = known.mask;
     // Without a mask it is tissue that counts, not air.
     let tissue = mask.map_or_else(|| Cow::Owned(foreground(reference)), Cow::Borrowed);
     let regions = regions(reference, if labels.is_some() { mask } else { Some(&*tissue) }, labels);
-    let mut tracker = Tracker::knowing(reference, *known, params);
+    let mut tracker = Tracker::knowing(reference, known, params);
     let mut tracked = Tracked::default();
     let mut refused = None;
     let mut course = Course::new(reference, &tissue, origin);
@@ -121,7 +137,7 @@ pub fn run<'v, E: From<FieldError>>(
         match tracker.next(&volume, &part) {
             Ok(mut result) => {
                 let sigma = |at| result.uncertainty.at(at);
-                said.extend(course.add(number, (&result.displacement, &sigma), volume));
+                said.extend(course.add(number, &result.displacement, &sigma, volume));
                 // The field takes far more room than what it is worked out from.
                 let one = one_voxel(reference.grid())?;
                 result.displacement = DenseField::zeros(one);

@@ -47,7 +47,8 @@ fn values<'a, D: Dimension>(array: &'a PyReadonlyArray<'_, f32, D>) -> PyResult<
 }
 
 /// A volume on the memory of its array.
-pub fn volume<'a>((array, rows): &'a Image<'_>) -> PyResult<Voxels<'a>> {
+pub fn volume<'a>(image: &'a Image<'_>) -> PyResult<Voxels<'a>> {
+    let (array, rows) = image;
     Voxels::lent(grid(array.shape(), *rows)?, values(array)?).map_err(told)
 }
 
@@ -90,7 +91,8 @@ pub fn samples<'py>(py: Python<'py>, samples: &ErrorSamples) -> PyResult<(Bound<
 }
 
 /// The same the other way.
-pub fn error_samples((array, rows): &Samples<'_>) -> PyResult<ErrorSamples> {
+pub fn error_samples(samples: &Samples<'_>) -> PyResult<ErrorSamples> {
+    let (array, rows) = samples;
     let [.., count, 3] = array.shape()[..] else { return Err(told("samples of an error have three components")) };
     let (nodes, all) = (grid(array.shape(), *rows)?, values(array)?);
     let n = nodes.len();

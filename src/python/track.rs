@@ -4,7 +4,7 @@ use super::arrays::{self, Callback, Image, told};
 use super::field::{kept_field, params};
 use crate::error::FieldError;
 use crate::pipeline::known::Known;
-use crate::pipeline::track::{Frame, run};
+use crate::pipeline::track::{Frame, Sequence, run};
 use crate::report::animation::Film;
 use crate::report::track::{TrackReport, summary};
 use crate::types::{DenseField, Voxels};
@@ -53,15 +53,16 @@ pub fn track<'py>(
             fields[frame.number] = Some(kept_field(frame.result.displacement.clone()));
             Ok(())
         };
-        run(
-            (frames, reference),
-            &all[reference],
-            (&Known::mask(mask.as_ref()), labels.as_ref()),
-            (&params, together),
-            read,
-            keep,
-            tell,
-        )
+        let sequence = Sequence {
+            frames,
+            origin: reference,
+            reference: &all[reference],
+            known: Known::mask(mask.as_ref()),
+            labels: labels.as_ref(),
+            params: &params,
+            together,
+        };
+        run(&sequence, read, keep, tell)
     })?;
     let tracked = tracked.map_err(told)?;
     let out = PyDict::new(py);

@@ -431,7 +431,8 @@ const BARS: usize = 30;
 
 /// How bad a case went: what has no result first, then what ended early by its time, then the least
 /// friction left.
-fn badness((_, result): &Case) -> (u8, f64) {
+fn badness(case: &Case) -> (u8, f64) {
+    let result = &case.1;
     match result {
         Err(_) => (0, 0.0),
         Ok(run) => match run.flaw() {

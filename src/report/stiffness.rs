@@ -284,6 +284,44 @@ pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames, shown: &Show
     page_with(&shared.result, inputs, shown, &sequence_section(shared))
 }
 
+/// The head of the page: what was found, and how far to rely on it.
+fn header(result: &StiffnessResult, body: &str) -> String {
+    let total: f64 = result.seconds.iter().map(|s| s.1).sum();
+    let tile = |value: String, unit: &str, name: &str| {
+        format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
+    };
+    format!(
+        "<header><p class=\"brand\">palpate {}</p><h1>Stiffness of {}</h1><p class=\"verdict\">{}</p></header>\
+         <div class=\"tiles\">{}{}{}{}{}</div>{}",
+        env!("CARGO_PKG_VERSION"),
+        escape(body),
+        escape(&verdict(result)),
+        tile(result.regions.len().to_string(), "", "regions"),
+        tile(format!("{:.4}", result.residual_mm), "mm", "residual"),
+        tile(format!("{:.1}", 100.0 * result.strain), "%", "strain, 95th percentile"),
+        tile(thousands(result.mesh.nodes().len()), "", "mesh nodes"),
+        tile(format!("{total:.1}"), "s", "total runtime"),
+        warned(&result.warnings)
+    )
+}
+
+/// The models that were tried, the patches, the correlations and the time; then what all moduli
+/// assume.
+fn evidence(result: &StiffnessResult) -> String {
+    let force = result.force_n.map_or_else(String::new, |f| format!(" under a total force of {} N", short(f)));
+    format!(
+        "<section><h2>Evidence</h2><div class=\"grid\"><article class=\"wide\"><h3>Models tried</h3>{}</article>\
+         <article><h3>Patches</h3>{}</article><article><h3>Correlation of ln E</h3>{}</article><article><h3>Time</h3>{}</article></div></section>\
+         <footer><p>Moduli hold for a Poisson's ratio of {}, the same in all regions,{force} and for an isotropic elastic body \
+         whose skin is free but for the two patches. Positions are world mm, RAS.</p></footer>",
+        evidence_table(result),
+        patch_table(result),
+        correlation_table(result),
+        chart::stage_times(&result.seconds),
+        result.poisson
+    )
+}
+
 fn page_with(
     result: &StiffnessResult,
     inputs: &InputNames,
@@ -337,23 +375,7 @@ fn page_with(
         "Length of measured less modelled displacement, where one was taken. Structure here means that the model misses \
          something.",
     )?;
-    let total: f64 = result.seconds.iter().map(|s| s.1).sum();
-    let tile = |value: String, unit: &str, name: &str| {
-        format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
-    };
-    let mut out = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>Stiffness of {}</h1><p class=\"verdict\">{}</p></header>\
-         <div class=\"tiles\">{}{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(&inputs.body),
-        escape(&verdict(result)),
-        tile(result.regions.len().to_string(), "", "regions"),
-        tile(format!("{:.4}", result.residual_mm), "mm", "residual"),
-        tile(format!("{:.1}", 100.0 * result.strain), "%", "strain, 95th percentile"),
-        tile(thousands(result.mesh.nodes().len()), "", "mesh nodes"),
-        tile(format!("{total:.1}"), "s", "total runtime"),
-    );
-    out.push_str(&warned(&result.warnings));
+    let mut out = header(result, &inputs.body);
     let _ = write!(
         out,
         "<section><h2>Regions</h2><div class=\"grid\"><article class=\"wide\"><h3>Moduli</h3>{}</article></div></section>",
@@ -376,22 +398,7 @@ fn page_with(
         card(&sd),
         card(&rest)
     );
-    let _ = write!(
-        out,
-        "<section><h2>Evidence</h2><div class=\"grid\"><article class=\"wide\"><h3>Models tried</h3>{}</article>\
-         <article><h3>Patches</h3>{}</article><article><h3>Correlation of ln E</h3>{}</article><article><h3>Time</h3>{}</article></div></section>",
-        evidence_table(result),
-        patch_table(result),
-        correlation_table(result),
-        chart::stage_times(&result.seconds)
-    );
-    let force = result.force_n.map_or_else(String::new, |f| format!(" under a total force of {} N", short(f)));
-    let _ = write!(
-        out,
-        "<footer><p>Moduli hold for a Poisson's ratio of {}, the same in all regions,{force} and for an isotropic elastic body \
-         whose skin is free but for the two patches. Positions are world mm, RAS.</p></footer>",
-        result.poisson
-    );
+    out.push_str(&evidence(result));
     Ok(document(&format!("Stiffness of {}", escape(&inputs.body)), &out))
 }
 

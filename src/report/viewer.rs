@@ -249,8 +249,8 @@ impl Moment<'_> {
         PackedMoment { data, maps }
     }
 
-    /// How many moments of this number of images and overlays (with a field) a page has room for; at least
-    /// one.
+    /// How many moments of this number of images and overlays (with a field) a page has room for;
+    /// at least one.
     pub fn room(grid: &Grid, images: usize, overlays: usize) -> usize {
         let canonical = Canonical::of(grid);
         let voxels = |most| Thinned::new(&canonical, most).shape.iter().product::<usize>();

@@ -742,7 +742,8 @@ fn build(
 }
 
 /// Height (mm) over a plane at which a node ends.
-fn beyond(body: &Body, motion: &SurfaceMotion, (q, normal): Plane, n: u32) -> Option<f64> {
+fn beyond(body: &Body, motion: &SurfaceMotion, plane: Plane, n: u32) -> Option<f64> {
+    let (q, normal) = plane;
     ended(body, motion, n).map(|end| dot(sub(end, q), normal))
 }
 

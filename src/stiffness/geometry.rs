@@ -158,7 +158,8 @@ pub fn fit(
     setup: &Setup<'_>,
     estimate: &Estimate,
     grid: &Grid,
-    (interfaces, inclusions): (&[Interface], &[Inclusion]),
+    interfaces: &[Interface],
+    inclusions: &[Inclusion],
 ) -> Result<Option<Geometry>, StiffnessError> {
     let (body, voxel) = (setup.body, grid.least_spacing());
     let mut fixed = flat_faces(body, grid);

@@ -103,7 +103,7 @@ struct Tried {
 impl Tried {
     /// An estimate on a level as it is.
     fn new(level: &Level, setup: &Setup<'_>, estimate: Estimate) -> Result<Self, StiffnessError> {
-        let shaped = geometry::fit(setup, &estimate, &level.grid, (&[], &[]))?;
+        let shaped = geometry::fit(setup, &estimate, &level.grid, &[], &[])?;
         let squares = shaped.map_or(estimate.squares, |g| g.fit.squares.min(estimate.squares));
         let contact = [level.patches[0].contact, level.patches[1].contact];
         let read = contact.iter().filter(|c| matches!(c, Contact::Guided | Contact::Measured)).count();
@@ -169,7 +169,7 @@ impl Chooser<'_> {
                 reason,
             ));
         }
-        let estimate = settle(self.level, law, self.params, self.reference, chosen.estimate, (MOVES, COARSE))?;
+        let estimate = settle(self.level, law, self.params, self.reference, chosen.estimate, MOVES, COARSE)?;
         Ok(Choice { law, estimate, evidence: self.evidence, warnings: self.warnings })
     }
 
@@ -226,7 +226,7 @@ impl Chooser<'_> {
     /// The law that the data ask for, and the contact that holds under it.
     fn law(&mut self, mut tried: Vec<Tried>, best: usize) -> Result<(Law, Tried), StiffnessError> {
         let small = tried[best].estimate.clone();
-        let small = settle(self.level, Law::Linear, self.params, self.reference, small, (LAW_MOVES, COARSE))?;
+        let small = settle(self.level, Law::Linear, self.params, self.reference, small, LAW_MOVES, COARSE)?;
         let strain = summary::strain(&self.level.setup(Law::Linear, self.params, self.reference), &small.state);
         let setup = self.level.setup(Law::Linear, self.params, self.reference);
         let small = Tried::new(self.level, &setup, small)?;
@@ -289,7 +289,7 @@ impl Chooser<'_> {
     fn large_strain_from(&mut self, from: &Tried) -> Result<Tried, StiffnessError> {
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
         let large = setup.run(from.estimate.state.clone(), ITERATIONS, COARSE)?;
-        let large = settle(self.level, Law::NeoHookean, self.params, self.reference, large, (LAW_MOVES, COARSE))?;
+        let large = settle(self.level, Law::NeoHookean, self.params, self.reference, large, LAW_MOVES, COARSE)?;
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
         Tried::new(self.level, &setup, large)
     }
@@ -348,7 +348,8 @@ pub fn settle(
     params: &StiffnessParams,
     reference: usize,
     mut estimate: Estimate,
-    (moves, precision): (usize, f64),
+    moves: usize,
+    precision: f64,
 ) -> Result<Estimate, StiffnessError> {
     level.settled = false;
     for _ in 0..moves {

@@ -1,12 +1,14 @@
 //! Whether the data support one more region.
 //!
-//! Three things must hold. *Discrepancy*: the present model's misfit beyond the noise must show. Samples are means over voxels;
-//! with their noise n, sqrt(n^2 + misfit^2) > 1.1 n, since the noise of a measured field is not known to better than that.
-//! Nor is it known to be white: with the field's own roughness s (a voxel), misfit^2 > s^2 / 10. A tenth of a voxel's
-//! power that is smooth over a few voxels is not seen in its roughness and does not average out. *Geometry*: the misfit
-//! must exceed what a surface known to half a voxel explains, half a voxel times the strain.
-//! *Evidence*: the Bayesian information criterion, by effective samples, must fall by more than 10 and the misfit by a
-//! fifth, and the new region's modulus must differ from the first one's by two standard deviations and by a quarter.
+//! Three things must hold. *Discrepancy*: the present model's misfit beyond the noise must show.
+//! Samples are means over voxels; with their noise n, sqrt(n^2 + misfit^2) > 1.1 n, since the noise
+//! of a measured field is not known to better than that. Nor is it known to be white: with the
+//! field's own roughness s (a voxel), misfit^2 > s^2 / 10. A tenth of a voxel's power that is
+//! smooth over a few voxels is not seen in its roughness and does not average out. *Geometry*: the
+//! misfit must exceed what a surface known to half a voxel explains, half a voxel times the strain.
+//! *Evidence*: the Bayesian information criterion, by effective samples, must fall by more than 10
+//! and the misfit by a fifth, and the new region's modulus must differ from the first one's by two
+//! standard deviations and by a quarter.
 
 use crate::error::StiffnessError;
 use crate::stiffness::boundary_conditions::travel;

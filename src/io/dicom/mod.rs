@@ -90,7 +90,8 @@ fn numbers<const N: usize>(elements: &Elements<'_>, tag: Tag) -> Option<[f64; N]
     values?.try_into().ok()
 }
 
-/// The attributes of a frame: in its functional groups, in those of all frames, or of the whole file.
+/// The attributes of a frame: in its functional groups, in those of all frames, or of the whole
+/// file.
 struct Said<'e> {
     groups: Vec<&'e Elements<'e>>,
     object: &'e Elements<'e>,

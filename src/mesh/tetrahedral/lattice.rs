@@ -52,7 +52,8 @@ impl Octree {
         }
     }
 
-    fn exists(&self, (level, at): Cube) -> bool {
+    fn exists(&self, cube: Cube) -> bool {
+        let (level, at) = cube;
         let scale = 1 << level;
         let within = (0..3).all(|a| (0..self.count[a] * scale).contains(&at[a]));
         within && (level == 0 || self.divided.contains(&(level - 1, at.map(|v| v >> 1))))
@@ -145,7 +146,8 @@ impl Builder<'_> {
         self.cells.push(cell);
     }
 
-    fn cube(&mut self, (level, at): Cube) {
+    fn cube(&mut self, cube: Cube) {
+        let (level, at) = cube;
         let side = UNIT >> level;
         let half = side / 2;
         let centre = at.map(|v| v * side + half);
