@@ -1468,6 +1468,18 @@ fn a_stiffening_tip_has_its_closed_form_and_what_is_published_of_fingertips() {
     assert!(ratio(8, 16) > 0.8, "{}", ratio(8, 16));
 }
 
+/// The analysis compares models of one scene: each must stand with what the scene says of another.
+#[test]
+fn every_shipped_scene_can_take_every_model() {
+    for name in ["eight_motions", "finger_pad", "human_fingertip", "thumb_and_index"] {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("examples/{name}.toml"));
+        let scene = palpate::io::read_scene(path, &palpate::io::SceneOverrides::default()).unwrap().scene;
+        for model in [FingertipModel::Parallel, FingertipModel::ParallelNormal, FingertipModel::Radial] {
+            scene.with_model(model).check().unwrap_or_else(|error| panic!("{name} as {}: {error}", model.name()));
+        }
+    }
+}
+
 #[test]
 fn the_human_fingertip_holds_and_relaxes() {
     let result = run(&human());

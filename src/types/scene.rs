@@ -308,12 +308,13 @@ impl Scene {
         scene
     }
 
-    /// The same with tips of another model.
+    /// The same with tips of another model; only tabulated ones stiffen.
     pub fn with_model(&self, model: FingertipModel) -> Self {
         let mut scene = self.clone();
-        scene.fingertip.model = model;
-        if let Some(second) = &mut scene.second {
-            second.fingertip.model = model;
+        let tips = std::iter::once(&mut scene.fingertip).chain(scene.second.as_mut().map(|s| &mut s.fingertip));
+        for tip in tips {
+            tip.model = model;
+            tip.stiffening = tip.stiffening.filter(|_| model == FingertipModel::Tabulated);
         }
         scene
     }
