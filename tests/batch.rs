@@ -35,6 +35,49 @@ fn statuses(folder: &Path) -> Vec<String> {
 }
 
 #[test]
+fn a_bids_folder_gives_pairs_by_run_or_session_and_derivatives() {
+    let folder = small_pair();
+    let at = |name: &str| folder.path().join(name);
+    let put = |from: &str, to: &str| {
+        let place = at("bids").join(to);
+        fs::create_dir_all(place.parent().unwrap()).unwrap();
+        fs::copy(at(from), place).unwrap();
+    };
+    // Runs are numbers: 10 comes after 9. A subject seen once has no pair; another kind is one of its own.
+    put("initial.nii.gz", "sub-01/anat/sub-01_run-9_T1w.nii.gz");
+    put("deformed.nii.gz", "sub-01/anat/sub-01_run-10_T1w.nii.gz");
+    put("initial.nii.gz", "sub-01/anat/sub-01_T2w.nii.gz");
+    put("initial.nii.gz", "sub-02/ses-1/anat/sub-02_ses-1_acq-hand_T2w.nii.gz");
+    put("deformed.nii.gz", "sub-02/ses-2/anat/sub-02_ses-2_acq-hand_T2w.nii.gz");
+    let (_, err) = run(folder.path(), &["batch", "bids", "-o", "none"], 1);
+    assert!(err.contains("bids"), "{err}");
+    fs::write(at("bids/dataset_description.json"), r#"{"Name": "hands", "BIDSVersion": "1.8.0"}"#).unwrap();
+    run(folder.path(), &["batch", "bids", "-o", "out", "--preset", "fast"], 0);
+    assert_eq!(statuses(folder.path()), ["sub-01_run-10_T1w done", "sub-02_ses-2_acq-hand_T2w done"]);
+    for (name, pair) in [
+        ("sub-01/anat/sub-01_from-run10_to-run9_mode-image_desc-T1w_xfm", "sub-01_run-10_T1w"),
+        ("sub-02/anat/sub-02_acq-hand_from-ses2_to-ses1_mode-image_desc-T2w_xfm", "sub-02_ses-2_acq-hand_T2w"),
+    ] {
+        let field = fs::read(at(&format!("out/pairs/{pair}/field/displacement.nii.gz"))).unwrap();
+        assert!(fs::read(at(&format!("out/{name}.nii.gz"))).unwrap() == field, "{name}");
+        let sidecar = fs::read_to_string(at(&format!("out/{name}.json"))).unwrap();
+        assert!(sidecar.contains("bids:raw:sub-0"), "{sidecar}");
+    }
+    let description = fs::read_to_string(at("out/dataset_description.json")).unwrap();
+    assert!(description.contains("\"derivative\"") && description.contains("palpate: hands"), "{description}");
+    let page = fs::read_to_string(at("out/report.html")).unwrap();
+    assert!(page.contains("href=\"pairs/sub-01_run-10_T1w/field/report.html\""));
+    run(folder.path(), &["batch", "bids", "-o", "out", "--preset", "fast"], 0);
+    assert_eq!(statuses(folder.path()), ["sub-01_run-10_T1w skipped", "sub-02_ses-2_acq-hand_T2w skipped"]);
+
+    // No subject with two images: said, with what to do.
+    fs::create_dir_all(at("one")).unwrap();
+    fs::copy(at("bids/dataset_description.json"), at("one/dataset_description.json")).unwrap();
+    let (_, err) = run(folder.path(), &["batch", "one", "-o", "o"], 1);
+    assert!(err.contains("no subject has two runs") && err.contains("run-1"), "{err}");
+}
+
+#[test]
 fn a_pair_that_fails_stops_no_other_and_a_second_run_only_does_what_is_left() {
     let folder = folder(&[
         "name,initial,deformed,mask",

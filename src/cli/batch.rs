@@ -38,7 +38,7 @@ const RECORD: &str = "pair.json";
 pub struct Options {
     /// Table of pairs (CSV): initial, deformed, and as wanted mask, start, deformed_mask, ignore,
     /// landmarks, labels, names, held, load, force_n, scene, name, subject, session; paths count
-    /// from the table's folder
+    /// from the table's folder. Or a BIDS data set: runs of each session, else sessions
     table: PathBuf,
     /// Folder for the results; those that are there already are not made again
     #[arg(short, long, value_name = "DIR")]
@@ -79,7 +79,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if memory.is_some_and(|gb| !(gb.is_finite() && gb > 0.0)) {
         bail!(Usage("--memory takes a number of GB above 0".into()));
     }
-    let pairs = io::read_pairs(table)?;
+    let bids = io::is_bids(table);
+    let pairs = if bids { io::read_bids(table)? } else { io::read_pairs(table)? };
     let used = io::list(output).is_ok_and(|files| !files.is_empty());
     if used && !overwrite && !collect && !output.join(TABLE).exists() {
         bail!("{}: holds something that is not a batch; choose another --output, or add --overwrite", output.shown());
@@ -87,9 +88,10 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     io::make_folder(output)?;
     let _held = io::hold(output)?;
     // What each stage has read is in its own summary.
-    let record = Recording::start(console, record::inputs(&[("table", Some(table)), ("config", tuning.config())]));
-    let outcomes: Vec<PairOutcome> = match collect {
-        true => pairs.iter().map(|pair| collected(pair, output, tuning)).collect(),
+    let listed = if bids { table.join("dataset_description.json") } else { table.clone() };
+    let record = Recording::start(console, record::inputs(&[("table", Some(&listed)), ("config", tuning.config())]));
+    let mut outcomes: Vec<PairOutcome> = match collect {
+        true => pairs.iter().map(|pair| collected(pair, &folder_of(options, pair), tuning)).collect(),
         false => {
             let free = io::memory_left();
             let budget = memory.map(|gb| (1e9 * gb) as u64).or(free.map(|b| (SHARE * b as f64) as u64));
@@ -99,7 +101,16 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             batch.run(jobs.min(pairs.len()))?
         }
     };
+    for (outcome, pair) in outcomes.iter_mut().zip(&pairs) {
+        outcome.folder = place(options, pair);
+    }
     write(output, &outcomes, &record.finish())?;
+    if bids {
+        io::describe_derivative(output, table)?;
+        for (pair, _) in pairs.iter().zip(&outcomes).filter(|(_, o)| o.status != Status::Failed) {
+            io::write_derivative(output, table, pair, folder_of(options, pair).join("field"))?;
+        }
+    }
     for o in outcomes.iter().filter(|o| o.status == Status::Failed) {
         console.warn(&format!("{} failed at {}: {}", o.name, o.stage, o.reason));
     }
@@ -119,6 +130,16 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// Where the results of a pair are: of a BIDS data set beside the derivatives.
+fn folder_of(options: &Options, pair: &Pair) -> PathBuf {
+    options.output.join(place(options, pair))
+}
+
+/// The same, from the folder of the batch.
+fn place(options: &Options, pair: &Pair) -> String {
+    if io::is_bids(&options.table) { format!("pairs/{}", pair.name) } else { pair.name.clone() }
 }
 
 /// The tables and the report.
@@ -146,15 +167,14 @@ fn gather(folder: &Path, outcome: &mut PairOutcome) {
 }
 
 /// A pair whose results someone else has made.
-fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
-    let folder = output.join(&pair.name);
+fn collected(pair: &Pair, folder: &Path, tuning: &Tuning) -> PairOutcome {
     let mut outcome = PairOutcome { status: Status::Done, ..PairOutcome::waiting(pair) };
     // Made by a batch, a stage counts where its record stands: one that failed when it was run
     // again has left older results.
     let earlier = io::read_json(folder.join(RECORD)).unwrap_or_default();
     outcome.seconds = took(&earlier);
     let recorded = earlier["stages"].as_array().map(Vec::len);
-    for (k, stage) in stages(pair, &folder, tuning, 0).into_iter().enumerate() {
+    for (k, stage) in stages(pair, folder, tuning, 0).into_iter().enumerate() {
         if !stage.marker.exists() || recorded.is_some_and(|n| n <= k) {
             let log = io::read_text(folder.join(format!("{}.log", stage.name))).unwrap_or_default();
             outcome.status = Status::Failed;
@@ -163,7 +183,7 @@ fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
             break;
         }
     }
-    gather(&folder, &mut outcome);
+    gather(folder, &mut outcome);
     outcome
 }
 
@@ -347,7 +367,7 @@ impl Batch<'_> {
     /// One pair from start to end.
     fn one(&self, index: usize, need: &Result<u64>, threads: usize) -> PairOutcome {
         let (pair, started) = (&self.pairs[index], Instant::now());
-        let folder = self.options.output.join(&pair.name);
+        let folder = folder_of(self.options, pair);
         let mut outcome = PairOutcome::waiting(pair);
         let problem = match need {
             Err(error) => Some(error.to_string()),

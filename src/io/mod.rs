@@ -67,6 +67,8 @@ pub mod speed_accuracy;
 
 pub mod batch;
 
+pub mod bids;
+
 pub mod text;
 
 pub mod output;
@@ -88,6 +90,7 @@ mod digest;
 mod gzip;
 
 pub use batch::{make_folder, read_pairs, stamp, write_rows};
+pub use bids::{describe_derivative, is_bids, read_bids, write_derivative};
 pub use chain_errors::write_chain;
 pub use config::read_config;
 pub use csv::{

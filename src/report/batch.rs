@@ -269,7 +269,7 @@ pub fn page(outcomes: &[PairOutcome]) -> String {
         .iter()
         .map(|o| {
             let mm = |key: &str| o.field[key].as_f64().map_or_else(String::new, |v| format!("{v:.3}"));
-            let mut row = vec![format!("<a href=\"{0}/field/report.html\">{0}</a>", escape(&o.name))];
+            let mut row = vec![format!("<a href=\"{}/field/report.html\">{}</a>", escape(&o.folder), escape(&o.name))];
             row.extend(["displacement_mean_mm", "displacement_max_mm", "expected_error_mm"].map(mm));
             row.push(text(&o.field["trust"]));
             row.push(text(&o.field["counts"]["kept"]));
@@ -292,6 +292,7 @@ mod tests {
             json!({ "label": 1, "name": "pulp <b>", "youngs_modulus": modulus, "sd": 1.0, "identifiable": true });
         PairOutcome {
             name: name.into(),
+            folder: name.into(),
             subject: String::new(),
             session: String::new(),
             status: Status::Done,

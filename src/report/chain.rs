@@ -128,7 +128,8 @@ pub fn page(title: &str, about: &str, rows: &[Row], parts: &[Part]) -> String {
             true => format!("<article class=\"wide\">{content}</article>"),
             false => format!(
                 "<iframe title=\"{title}\" style=\"width:100%;height:46rem;border:1px solid #8884;border-radius:8px\" \
-                 srcdoc=\"{}\"></iframe>",
+                 onload=\"new ResizeObserver(()=>this.style.height=this.contentDocument.documentElement.offsetHeight+9+'px')\
+                 .observe(this.contentDocument.documentElement)\" srcdoc=\"{}\"></iframe>",
                 escape(content)
             ),
         };

@@ -38,7 +38,8 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let _ = write!(
         body,
         "<section><h2>Alignment</h2><p class=\"lead\">Planes through the centre of motion, x {x}, y {y}, z {z} mm. \
-         The right of a picture is the patient's right, or front.</p><div class=\"grid\">"
+         <span class=\"neuro\">The right of a picture is the patient's right</span><span class=\"radio\">The left of a picture is the \
+         patient's right</span>; of a sagittal one the right is the front.</p><div class=\"grid\">"
     );
     views.volumes.iter().for_each(|p| body.push_str(&card(p)));
     body.push_str(&blink(&views.volumes));
@@ -106,10 +107,15 @@ pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     Ok(document(&title, &body))
 }
 
+/// Mirrors the pictures across the patient's left and right, by the style sheet alone.
+const CONVENTION: &str = "<label class=\"convention\"><input type=\"checkbox\" id=\"radiological\"> radiological: \
+                          patient's right on the left</label>";
+
 /// A page around `body`; `title` is HTML already.
 pub(super) fn document(title: &str, body: &str) -> String {
+    let convention = if body.contains("<figure class=\"lr\"") { CONVENTION } else { "" };
     format!(
-        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>\n"
+        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><meta name=\"color-scheme\" content=\"light dark\"><title>{title}</title><style>{STYLE}</style></head><body><main>{convention}{body}</main></body></html>\n"
     )
 }
 
@@ -169,10 +175,11 @@ fn head(report: &FieldReport<'_>) -> String {
     let seconds: f64 = s.seconds.iter().map(|t| t.1).sum();
     let mut out = format!(
         "<header><p class=\"brand\">palpate {}</p><h1>{initial} <span>→</span> {deformed}</h1>\
-         <p class=\"verdict\">{}</p><p class=\"trust {trust}\"><b>Trust is {trust}</b> {}.</p></header><div class=\"tiles\">{}{}{}{}{}{}</div>",
+         <p class=\"verdict\">{}</p><p class=\"trust {trust}\"><b>Trust is {trust}</b> {}.</p><p class=\"next\"><b>Next</b> {}.</p></header><div class=\"tiles\">{}{}{}{}{}{}</div>",
         env!("CARGO_PKG_VERSION"),
         escape(&v.headline),
         escape(&v.reasons.join("; ")),
+        escape(&v.next),
         tile(format!("{:.2}", s.expected.mean_mm), "mm", "expected error"),
         tile(format!("{:.2}", s.mean_mm), "mm", "mean motion"),
         tile(format!("{:.2}", s.max_mm), "mm", "largest motion"),
@@ -201,8 +208,9 @@ fn score(report: &FieldReport<'_>, views: &Views) -> String {
 /// A picture or drawing with its sides named.
 pub(super) fn figure(plane: Plane, size: [f64; 2], content: &str) -> String {
     let [l, r, t, b] = plane.labels();
+    let class = if l == "L" { " class=\"lr\"" } else { "" };
     format!(
-        "<figure style=\"flex:{:.2}\">{content}<i class=\"l\">{l}</i><i class=\"r\">{r}</i><i class=\"t\">{t}</i><i class=\"b\">{b}</i></figure>",
+        "<figure{class} style=\"flex:{:.2}\">{content}<i class=\"l\">{l}</i><i class=\"r\">{r}</i><i class=\"t\">{t}</i><i class=\"b\">{b}</i></figure>",
         size[0]
     )
 }

@@ -54,6 +54,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> Value {
         "start": s.start,
         "trust": judged.trust.name(),
         "trust_reasons": judged.reasons,
+        "next": judged.next,
         "seconds": seconds(&s.seconds),
         "warnings": s.warnings,
         "params": report.params,

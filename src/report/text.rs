@@ -65,6 +65,7 @@ pub fn field_summary(report: &FieldReport<'_>) -> String {
     let _ = writeln!(out, "  mesh         {} nodes, {} elements", thousands(c.nodes), thousands(c.tetrahedra));
     let _ = writeln!(out, "  folds        {}", thousands(s.folds));
     let _ = writeln!(out, "  trust        {}: {}", v.trust.name(), v.reasons.join("; "));
+    let _ = writeln!(out, "  next         {}", v.next);
     let _ = writeln!(out, "  time         {:.1} s", s.seconds.iter().map(|t| t.1).sum::<f64>());
     out
 }

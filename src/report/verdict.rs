@@ -15,7 +15,13 @@ pub struct Verdict {
     pub trust: Trust,
     /// Why, one sentence each; never empty.
     pub reasons: Vec<String>,
+    /// What to do next, in words without a full stop.
+    pub next: String,
 }
+
+/// The uncertainty of the worst tenth over that of the middle from which the place is named: of a
+/// field with one uncertainty everywhere it is 1.
+const UNEVEN: f64 = 1.5;
 
 /// A source of error is named from this share of the expected squared error on.
 const NAMED: f64 = 0.2;
@@ -45,13 +51,12 @@ pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary
     let headline = format!("{motion}; expected error {}.", expected(s));
     let trust = s.expected.trust();
     let mut reasons = vec![format!("the expected error is {}", relative(s))];
-    let named = |(source, share): &(ErrorSource, f64)| match *share {
-        share if share >= NAMED => {
-            Some(format!("{:.0} % of the squared error comes from {}", 100.0 * share, source.words()))
-        }
-        _ => None,
-    };
-    reasons.extend(s.expected.sources.iter().filter_map(named));
+    let named = s.expected.sources.iter().filter(|(_, share)| *share >= NAMED);
+    let named: Vec<String> =
+        named.map(|(source, share)| format!("{} ({:.0} %)", source.words(), 100.0 * share)).collect();
+    if !named.is_empty() {
+        reasons.push(format!("its square comes from {}", named.join(", ")));
+    }
     let (share, side) = uncertain(bodies, uncertainty, edge);
     if share >= 0.01 {
         reasons.push(format!(
@@ -60,6 +65,7 @@ pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary
             short2(edge)
         ));
     }
+    reasons.extend(least_sure(bodies, uncertainty));
     if s.folds > 0 {
         reasons.push(format!("{} voxels fold", thousands(s.folds)));
     }
@@ -68,7 +74,52 @@ pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary
         1 => reasons.push("there is a warning".into()),
         n => reasons.push(format!("there are {n} warnings")),
     }
-    Verdict { headline, trust, reasons }
+    let next = match s.warnings.is_empty() && trust == Trust::High {
+        true => "measure strain (palpate strain) or stiffness (palpate stiffness) from this field".into(),
+        false => advice(s),
+    };
+    Verdict { headline, trust, reasons, next }
+}
+
+/// What would lower the expected error most.
+fn advice(s: &FieldSummary) -> String {
+    let largest = s.expected.sources.iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|s| s.0);
+    let what = match largest {
+        _ if s.rejected => "leave --model out: the model that was asked for does not explain the volumes",
+        Some(ErrorSource::Noise) => {
+            "image finer or with less noise, or leave tissue without texture out with --mask; palpate certify tells what the scan \
+             can show"
+        }
+        Some(ErrorSource::Misfit) => {
+            "watch the initial and the warped volume in turns in the report: where parts slide give --bodies, where tissue changed its look \
+             leave it out with --ignore"
+        }
+        Some(ErrorSource::Model) => "compare with --model free: a small motion model stands for what it leaves out",
+        Some(ErrorSource::OutOfView) => "leave tissue out of view out with --mask, or image a larger field of view",
+        Some(ErrorSource::Borders) => "give the parts that slide as a label map with --bodies",
+        Some(ErrorSource::OtherMotions) => {
+            "check in the report that both volumes show the same tissue; then give --landmarks or --initial"
+        }
+        None => "watch the initial and the warped volume in turns in the report",
+    };
+    what.into()
+}
+
+/// How unsure the worst tenth of the tissue is, and where it lies; nothing where all is alike.
+fn least_sure(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32) -> Option<String> {
+    let picked = sample(bodies.grid().len(), Some(bodies));
+    let mut sorted: Vec<f64> = picked.iter().map(|&o| f64::from(uncertainty(o))).filter(|u| u.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    let at = |part: f64| sorted.get((part * sorted.len() as f64) as usize).copied();
+    let (middle, worst) = (at(0.5)?, at(0.9)?);
+    let (_, side) = uncertain(bodies, uncertainty, worst);
+    (worst > UNEVEN * middle).then(|| {
+        format!(
+            "a tenth of the tissue is uncertain by ± {} mm or more{side}, half by ± {}",
+            short2(worst),
+            short2(middle)
+        )
+    })
 }
 
 /// The expected error with its interval.
@@ -220,7 +271,7 @@ mod tests {
         assert_eq!([high.trust, moderate.trust, low.trust], [Trust::High, Trust::Moderate, Trust::Low]);
         assert!(low.headline.contains("expected error 0.51 mm"), "{}", low.headline);
         assert_eq!(low.reasons[0], "the expected error is 34 % of the motion");
-        assert_eq!(low.reasons[1], "90 % of the squared error comes from noise where texture is weak");
+        assert_eq!(low.reasons[1], "its square comes from noise where texture is weak (90 %)");
         case.summary.folds = 100;
         case.summary.warnings.push("one more".into());
         case.summary.expected.mean_mm = 0.14;
@@ -273,8 +324,17 @@ mod tests {
     #[test]
     fn a_sequence_is_judged_by_its_worst_frames() {
         let mut all = frames(&[[0.03, 0.4], [0.01, 0.11], [0.04, 0.44], [0.1, 1.2]]);
-        let high =
-            |frame| (frame, Verdict { headline: String::new(), trust: Trust::High, reasons: vec!["fine".into()] });
+        let high = |frame| {
+            (
+                frame,
+                Verdict {
+                    headline: String::new(),
+                    trust: Trust::High,
+                    reasons: vec!["fine".into()],
+                    next: String::new(),
+                },
+            )
+        };
         let mut judged: Vec<(usize, Verdict)> = (1..=4).map(high).collect();
         let (trust, reasons) = judge_frames(&all, &judged);
         assert_eq!((trust, reasons.len()), (Trust::High, 1), "{reasons:?}");

@@ -193,13 +193,17 @@
           const u = motion(p), [ax, ay] = point(x, y), [bx, by] = point(x + factor * u[h], y + factor * u[v]);
           const d = Math.hypot(bx - ax, by - ay);
           if (d < 1.5 * fine) continue;
-          const head = Math.min(d * 0.4, 5 * fine), angle = Math.atan2(by - ay, bx - ax);
-          context.strokeStyle = overlay ? colour(overlay, Math.hypot(...u)) : "#ffd666";
-          context.lineWidth = 1.6 * fine;
+          const head = Math.min(d * 0.4, 6 * fine), angle = Math.atan2(by - ay, bx - ax);
           context.beginPath();
           context.moveTo(ax, ay); context.lineTo(bx, by);
           [2.6, -2.6].forEach((turn) => { context.moveTo(bx, by); context.lineTo(bx + head * Math.cos(angle + turn), by + head * Math.sin(angle + turn)); });
-          context.stroke();
+          // A dark edge shows them on any colour; over a coloured map they are white.
+          const own = overlay && !chosen("colour", overlays) ? colour(overlay, Math.hypot(...u)) : "#fff";
+          [["rgba(0,0,0,.75)", 3.6], [own, 1.7]].forEach(([stroke, width]) => {
+            context.strokeStyle = stroke;
+            context.lineWidth = width * fine;
+            context.stroke();
+          });
         }
       }
       if (matches && on("matches")) {
@@ -260,7 +264,8 @@
   const move = (plane, event) => {
     const box = plane.canvas.getBoundingClientRect(), [h, v] = plane.axes;
     const inside = (t, axis) => Math.min(Math.max(t, 0), 1) * extent[axis];
-    cross[h] = inside((event.clientX - box.left) / box.width, h);
+    const mirror = document.getElementById("radiological"), across = (event.clientX - box.left) / box.width;
+    cross[h] = inside(h === 0 && mirror && mirror.checked ? 1 - across : across, h);
     cross[v] = inside(1 - (event.clientY - box.top) / box.height, v);
     draw();
   };
@@ -270,7 +275,14 @@
     blink = false;
     if ($("compare").value === "flicker") timer = setInterval(() => { blink = !blink; draw(); }, 700);
   };
+  // The largest factor at which the longest arrow of the scale still fits between two of them.
+  const fitted = () => {
+    const overlay = overlays.find((o) => o.vector), room = Math.max(...extent) / 22;
+    const fits = factors.filter((f) => overlay && f * overlay.high <= room);
+    $("factor").value = Math.max(0, fits.length - 1);
+  };
   const start = () => {
+    fitted();
     planes.forEach((plane, k) => {
       const n = plane.axes[2];
       plane.slider = root.querySelectorAll("figure + input")[k];

@@ -356,7 +356,7 @@ impl Viewer<'_> {
              <label{}>drawn longer <input type=\"range\" name=\"factor\" min=\"0\" max=\"9\" value=\"0\"><b></b></label>{}{}{}</div>",
             options(&images, 0),
             options(&images, images.len() - 1),
-            options(&names, self.shown.map_or(usize::MAX, |n| n + usize::from(moves))),
+            options(&names, self.shown.map_or(if moves { 0 } else { usize::MAX }, |n| n + usize::from(moves))),
             check("arrows", "arrows", moves, moves),
             check("grid", "grid", moves, false),
             if moves { "" } else { " hidden" },

@@ -4,7 +4,7 @@ use serde_json::Value;
 use std::path::PathBuf;
 
 /// One line of a table of pairs. Paths are as they can be opened.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Pair {
     /// Unique, and fit to name a folder.
     pub name: String,
@@ -70,6 +70,8 @@ impl Status {
 pub struct PairOutcome {
     /// The pair's name.
     pub name: String,
+    /// The folder of its results, from that of the batch.
+    pub folder: String,
     /// Who was measured.
     pub subject: String,
     /// When.
@@ -97,6 +99,7 @@ impl PairOutcome {
     pub fn waiting(pair: &Pair) -> Self {
         Self {
             name: pair.name.clone(),
+            folder: pair.name.clone(),
             subject: pair.subject.clone(),
             session: pair.session.clone(),
             status: Status::Waiting,
