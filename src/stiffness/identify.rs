@@ -7,7 +7,6 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::{Cholesky, within};
-use crate::numerics::sparse::Factor;
 use crate::numerics::statistics::percentile;
 use crate::stiffness::body::Body;
 use crate::stiffness::forward::{Problem, Solution, Tie};
@@ -15,6 +14,7 @@ use crate::stiffness::geometry::Part;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
 use crate::stiffness::patches::{Patch, travel};
+use crate::stiffness::tangent::Tangent;
 use crate::types::space::{dot, length};
 use crate::types::stiffness::{Contact, Law};
 
@@ -414,14 +414,14 @@ impl Setup<'_> {
     fn follow<'a>(
         &'a self,
         state: &State,
-        tangent: Option<Factor<'a>>,
+        tangent: Option<Tangent<'a>>,
         springs: Vec<f64>,
         precision: f64,
     ) -> Result<(Problem<'a>, Solution<'a>), StiffnessError> {
         if let (Some(factor), Some(x)) = (tangent, &state.x) {
             let problem = Problem { springs, ..self.problem(state) };
             if problem.is_linear() {
-                let solution = problem.solve_with(|matrix| Ok(factor.near(matrix)))?;
+                let solution = problem.solve_with(|matrix| factor.near(matrix).map_err(|_| StiffnessError::Unsolvable))?;
                 return Ok((problem, Solution { factorisations: 0, ..solution }));
             }
             if let Some(x) = problem.solve_near(x, &factor, precision) {
