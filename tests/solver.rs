@@ -65,8 +65,15 @@ fn iterations_give_the_factors_solution() {
             let start = std::time::Instant::now();
             let (one, two) = (solved(&direct), solved(&iterated));
             let off = one.1.iter().zip(&two.1).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
-            println!("{law:?} nu {nu} {contrast:.2?} {contact}: {off:.1e} force {:.1e} {:?}", two.0 / one.0 - 1.0, start.elapsed());
-            assert!(off < 1e-5 && (two.0 / one.0 - 1.0).abs() < 1e-5, "nu {nu}, {contrast:?}, contact {contact}: {off}");
+            println!(
+                "{law:?} nu {nu} {contrast:.2?} {contact}: {off:.1e} force {:.1e} {:?}",
+                two.0 / one.0 - 1.0,
+                start.elapsed()
+            );
+            assert!(
+                off < 1e-5 && (two.0 / one.0 - 1.0).abs() < 1e-5,
+                "nu {nu}, {contrast:?}, contact {contact}: {off}"
+            );
         }
     }
 }

@@ -17,7 +17,7 @@ pub const ELEMENT_NODES: usize = 14;
 pub const SIDE: usize = 34;
 
 /// Unknowns up to which a factor takes less time than iterations (docs/lab/2026-11-solver.md).
-const DIRECT: usize = 65_000;
+const DIRECT: usize = 40_000;
 
 /// A triangle of the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,7 +96,8 @@ impl Body {
         }
         let surface = surface(&cells, &places);
         let large = pattern.unknowns() > DIRECT;
-        let out = Self { places, cells, pressures, region, labels, quadrature, pattern, levels: None, surface, volumes };
+        let out =
+            Self { places, cells, pressures, region, labels, quadrature, pattern, levels: None, surface, volumes };
         if large { out.iterated() } else { Ok(out) }
     }
 

@@ -235,25 +235,27 @@ impl<'a> Problem<'a> {
         self.law == Law::Linear && self.plate.is_none()
     }
 
-    /// Solves a linear problem with the factor that is made for its matrix.
+    /// Solves a linear problem with the tangent that is made for its matrix, from `start` where
+    /// that saves iterations.
     ///
     /// # Errors
     /// [`StiffnessError`] when the body can move freely.
     pub fn solve_with(
         &self,
+        start: Option<&[f64]>,
         factor: impl FnOnce(Matrix) -> Result<Tangent<'a>, StiffnessError>,
     ) -> Result<Solution<'a>, StiffnessError> {
         let zero = vec![0.0; self.body.pattern.unknowns()];
         let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
         x.iter_mut().for_each(|v| *v = -*v);
         let factor = factor(self.tangent(&zero).ok_or(StiffnessError::InsideOut)?)?;
-        factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
+        factor.solve(&mut x, start).map_err(|_| StiffnessError::Unsolvable)?;
         Ok(Solution { x, factor, factorisations: 1 })
     }
 
     fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         if self.is_linear() {
-            return self.solve_with(|matrix| self.factor_of(matrix));
+            return self.solve_with(start, |matrix| self.factor_of(matrix));
         }
         if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision, stale).ok()) {
             return Ok(done);

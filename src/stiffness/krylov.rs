@@ -7,7 +7,7 @@
 use crate::numerics::simd::dispatch;
 
 /// Vectors of one space at most: their memory, and the work of keeping them orthogonal.
-const SPACE: usize = 40;
+const SPACE: usize = 30;
 /// Numbers that are summed in single precision before they are added in double precision.
 const RUN: usize = 32;
 
@@ -90,13 +90,13 @@ impl Triangle {
 }
 
 /// What `apply` takes to `right`, to `goals` (norms of what is left, side by side), or as near as
-/// one space comes; and the number of times that it was applied.
+/// one space comes.
 pub fn solve<const L: usize>(
     mut right: Block<L>,
     weights: &[f32],
     goals: [f64; L],
     mut apply: impl FnMut(&[[f32; L]]) -> Block<L>,
-) -> (Block<L>, usize) {
+) -> Block<L> {
     let sizes = norms(weights, &right);
     scale(&mut right, sizes);
     let mut triangles: Vec<Triangle> =
@@ -124,5 +124,5 @@ pub fn solve<const L: usize>(
     for (k, v) in space.iter().enumerate() {
         add(&mut out, std::array::from_fn(|l| parts[l][k]), v);
     }
-    (out, space.len())
+    out
 }

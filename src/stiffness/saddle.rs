@@ -25,6 +25,8 @@ const SIDES: usize = 8;
 const ROUND: f64 = 1e-5;
 /// Strength of a tie beyond which its node hardly moves under the tissue's forces.
 const FIRM: f64 = 1e-3;
+/// Part of the error that is left to be found by a first look at the refined solution.
+const SAFE: f64 = 0.5;
 /// Krylov spaces for one right-hand side at most.
 const ROUNDS: usize = 12;
 
@@ -82,8 +84,7 @@ impl TwoLevel {
         }
         let elements = pressures.iter().flatten().map(|p| p - from).collect();
         let pressure = Pattern::new(elements, 4, &pressure_places, vec![1; count as usize])?;
-        let mut nodes: Vec<_> =
-            (0..places.len()).map(|n| (pattern.first(n as u32) as u32, between[n])).collect();
+        let mut nodes: Vec<_> = (0..places.len()).map(|n| (pattern.first(n as u32) as u32, between[n])).collect();
         nodes.sort_unstable();
         let pressures: Vec<_> =
             (0..count).map(|p| [pattern.first(from + p) as u32, pressure.first(p) as u32]).collect();
@@ -361,17 +362,13 @@ impl<'a> Saddle<'a> {
     }
 
     fn lockstep<const L: usize>(&self, right: &mut [f64], start: &[f64], tolerance: f64) -> Result<(), Singular> {
-        let n = self.pattern.unknowns();
-        let mut x = start.to_vec();
-        let mut rest = right.to_vec();
         let whole = self.goals::<L>(right, tolerance);
-        self.close(&mut x, right);
-        for round in 0..ROUNDS {
-            for ((rest, right), x) in rest.chunks_mut(n).zip(right.chunks(n)).zip(x.chunks(n)) {
-                let product = self.pattern.multiply(&self.values, x);
-                rest.iter_mut().zip(right.iter().zip(product)).for_each(|(s, (r, p))| *s = r - p);
-            }
-            let left = self.precondition(interleaved::<L>(&rest, n));
+        let mut x = start.to_vec();
+        let mut rest = self.rest(right, &x);
+        self.close(&mut x, &mut rest);
+        rest = self.rest(right, &x);
+        for _ in 0..ROUNDS {
+            let left = self.precondition(interleaved::<L>(&rest, self.pattern.unknowns()));
             let sizes = krylov::norms(&self.weights, &left);
             if sizes.iter().any(|v| !v.is_finite()) {
                 return Err(Singular);
@@ -380,18 +377,27 @@ impl<'a> Saddle<'a> {
                 right.copy_from_slice(&x);
                 return Ok(());
             }
-            let goals = std::array::from_fn(|l| (0.3 * whole[l]).max(ROUND * sizes[l]));
+            let goals = std::array::from_fn(|l| (SAFE * whole[l]).max(ROUND * sizes[l]));
             let apply = |v: &[[f32; L]]| self.precondition(self.blocks.multiply(&self.levels.nodes, v));
-            let (change, steps) = krylov::solve(left, &self.weights, goals, apply);
-            if std::env::var("KRYLOV").is_ok() {
-                eprintln!("L {L} round {round}: {steps} steps, {:?} of {:?}", sizes, whole);
-            }
-            for (l, x) in x.chunks_mut(n).enumerate() {
+            let change = krylov::solve(left, &self.weights, goals, apply);
+            for (l, x) in x.chunks_mut(self.pattern.unknowns()).enumerate() {
                 x.iter_mut().zip(&change).for_each(|(x, c)| *x += f64::from(c[l]));
             }
-            self.close(&mut x, right);
+            rest = self.rest(right, &x);
+            self.close(&mut x, &mut rest);
         }
         Err(Singular)
+    }
+
+    /// What solutions leave of right-hand sides.
+    fn rest(&self, right: &[f64], x: &[f64]) -> Vec<f64> {
+        let n = self.pattern.unknowns();
+        let mut out = right.to_vec();
+        for (out, x) in out.chunks_mut(n).zip(x.chunks(n)).filter(|(_, x)| x.iter().any(|v| *v != 0.0)) {
+            let product = self.pattern.multiply(&self.values, x);
+            out.iter_mut().zip(product).for_each(|(out, p)| *out -= p);
+        }
+        out
     }
 
     /// Errors (norms) to which solutions for these right-hand sides are wanted.
@@ -401,12 +407,11 @@ impl<'a> Saddle<'a> {
     }
 
     /// Brings tied nodes to where their ties balance the rest: a residual of a tie is a force, and
-    /// ties are too stiff for one to show as a displacement.
-    fn close(&self, x: &mut [f64], right: &[f64]) {
+    /// ties are too stiff for one to show as a displacement. What that changes in `rest` is worked
+    /// out at these nodes alone.
+    fn close(&self, x: &mut [f64], rest: &mut [f64]) {
         let n = self.pattern.unknowns();
-        for (x, right) in x.chunks_mut(n).zip(right.chunks(n)) {
-            let mut rest = self.pattern.multiply(&self.values, x);
-            rest.iter_mut().zip(right).for_each(|(rest, right)| *rest = right - *rest);
+        for (x, rest) in x.chunks_mut(n).zip(rest.chunks_mut(n)) {
             for (first, tie) in &self.ties {
                 let own = self.own(*first);
                 let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
@@ -468,7 +473,9 @@ impl<'a> Saddle<'a> {
                 }
                 for (i, &(first, _)) in nodes.iter().enumerate() {
                     let mut sum = [[0.0; L]; 3];
-                    blocks.neighbours(i).iter().for_each(|(other, block)| transposed(block, &at(&z, *other), &mut sum));
+                    for (other, block) in blocks.neighbours(i) {
+                        transposed(block, &at(&z, *other), &mut sum);
+                    }
                     put(right, first, sum.map(|v| v.map(|v| -v)));
                 }
             },
@@ -481,8 +488,9 @@ impl<'a> Saddle<'a> {
                 z.iter_mut().zip(&smooth).for_each(|(z, s)| (0..L).for_each(|l| z[l] += s[l]));
                 for (i, &(first, _)) in nodes.iter().enumerate().rev() {
                     let (mut sum, mut own) = ([[0.0; L]; 3], [[0.0; L]; 3]);
-                    let later = blocks.neighbours(i).iter();
-                    later.for_each(|(other, block)| transposed(block, &at(&smooth, *other), &mut sum));
+                    for (other, block) in blocks.neighbours(i) {
+                        transposed(block, &at(&smooth, *other), &mut sum);
+                    }
                     let rest = at(right, first);
                     (0..3).for_each(|r| (0..L).for_each(|l| sum[r][l] = rest[r][l] - sum[r][l]));
                     product(&blocks.own[i][1], &sum, &mut own);

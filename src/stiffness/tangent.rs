@@ -6,8 +6,12 @@ use crate::stiffness::saddle::{Levels, Saddle};
 
 /// Relative error of an iterative solution (weighted 2-norm).
 const SOLVED: f64 = 1e-7;
+/// Relative error of a step of Newton's method, which ends where a step is this much too large.
+const NEWTON: f64 = 1e-3;
+/// Relative error of sensitivities: what they are taken for is good to a few per cent.
+const SENSITIVE: f64 = 1e-3;
 /// Relative error of a step whose residual is worked out anew.
-const STEP: f64 = 1e-3;
+const STEP: f64 = 1e-2;
 
 /// The values of a tangent in a body's pattern, and on both levels of a large body.
 #[derive(Debug)]
@@ -41,14 +45,26 @@ impl<'a> Tangent<'a> {
         })
     }
 
-    /// Solves for right-hand sides one after the other in `x`.
+    /// Solves for a right-hand side; iterations begin at `start`, if one is given.
     ///
     /// # Errors
     /// [`Singular`] where the solution is not finite or not reached.
-    pub fn solve(&self, x: &mut [f64]) -> Result<(), Singular> {
+    pub fn solve(&self, x: &mut [f64], start: Option<&[f64]>) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.solve(x),
-            Self::Iterative(saddle) => saddle.solve(x, None, SOLVED),
+            Self::Iterative(saddle) => saddle.solve(x, start, SOLVED),
+        }
+    }
+
+    /// Solves for the right-hand sides of sensitivities, one after the other in `x`; iterations
+    /// begin at `start`, if one is given.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn sensitivities(&self, x: &mut [f64], start: Option<&[f64]>) -> Result<(), Singular> {
+        match self {
+            Self::Direct(factor) => factor.solve(x),
+            Self::Iterative(saddle) => saddle.solve(x, start, SENSITIVE),
         }
     }
 
@@ -59,7 +75,7 @@ impl<'a> Tangent<'a> {
     pub fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.solve_or_replace(x),
-            Self::Iterative(saddle) => saddle.solve(x, None, SOLVED),
+            Self::Iterative(saddle) => saddle.solve(x, None, NEWTON),
         }
     }
 
@@ -103,14 +119,14 @@ impl<'a> Tangent<'a> {
         }
     }
 
-    /// See [`Factor::whole`].
+    /// As [`Self::sensitivities`], for so many that a factor of the matrix itself is worth it.
     ///
     /// # Errors
-    /// As [`Self::new`].
-    pub fn solve_many(&self, x: &mut [f64]) -> Result<(), Singular> {
+    /// As [`Self::solve`].
+    pub fn many(&self, x: &mut [f64]) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.whole()?.solve(x),
-            Self::Iterative(saddle) => saddle.solve(x, None, SOLVED),
+            Self::Iterative(_) => self.sensitivities(x, None),
         }
     }
 }
