@@ -3,11 +3,17 @@
 
 use palpate::mesh::tetrahedral::{Fineness, mesh_labels};
 use palpate::numerics::random::Random;
+use palpate::pipeline::pressed::Pressed;
 use palpate::stiffness::body::Body;
 use palpate::stiffness::forward::{Problem, Tie};
+use palpate::stiffness::identify::Setup;
 use palpate::stiffness::law::Material;
-use palpate::types::stiffness::Law;
-use palpate::types::{Affine, Grid, Mask};
+use palpate::stiffness::level::Level;
+use palpate::stiffness::maps::volume;
+use palpate::stiffness::patches::Place;
+use palpate::synth::{PhantomKind, PhantomParams};
+use palpate::types::stiffness::{Contact, Law, Side};
+use palpate::types::{Affine, Grid, Mask, StiffnessParams};
 
 /// A block of 16 voxels a side with a ball and a layer in it, of three labels.
 fn body(nodes: usize, random: &mut Random) -> Body {
@@ -62,18 +68,58 @@ fn iterations_give_the_factors_solution() {
                 let u: Vec<f64> = (0..body.places.len()).flat_map(|n| body.displacement(&s.x, n as u32)).collect();
                 (force(&problem, &s.x), u)
             };
-            let start = std::time::Instant::now();
             let (one, two) = (solved(&direct), solved(&iterated));
             let off = one.1.iter().zip(&two.1).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
-            println!(
-                "{law:?} nu {nu} {contrast:.2?} {contact}: {off:.1e} force {:.1e} {:?}",
-                two.0 / one.0 - 1.0,
-                start.elapsed()
-            );
             assert!(
                 off < 1e-5 && (two.0 / one.0 - 1.0).abs() < 1e-5,
                 "nu {nu}, {contrast:?}, contact {contact}: {off}"
             );
         }
     }
+}
+
+#[test]
+fn iterations_give_the_factors_moduli() {
+    let cases = [
+        (PhantomKind::Inclusion, ["z-", "z+"], Contact::Sticking, Law::Linear),
+        (PhantomKind::Inclusion, ["z-", "z+"], Contact::Guided, Law::NeoHookean),
+        (PhantomKind::Fingertip, ["z+", "z-"], Contact::Sliding, Law::NeoHookean),
+    ];
+    for (kind, sides, contact, law) in cases {
+        let pressed = Pressed::new(&PhantomParams { seed: 5, ..PhantomParams::new(kind) }.sized(32)).unwrap();
+        let map = &pressed.phantom.stiffness.as_ref().unwrap().labels;
+        let mesh = mesh_labels(map, &Fineness::for_nodes(volume(map), 2500)).unwrap();
+        let [held, load] = sides.map(|side| Place::Side(Side::parse(side).unwrap()));
+        let mut level = Level::new(&mesh, &pressed.phantom.truth, None, map, &held, &load, None).unwrap();
+        level.patches[1].contact = contact;
+        let setup = level.setup(law, &StiffnessParams::default(), level.largest());
+        let iterated = level.body.clone().iterated().unwrap();
+        let [one, two] = [&level.body, &iterated].map(|body| {
+            let setup = Setup { body, ..setup.clone() };
+            setup.run(setup.start(), 12, 1e-5).unwrap()
+        });
+        let off = one.state.theta.iter().zip(&two.state.theta).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
+        assert!(off < 1e-3, "{kind:?}: {:?} {:?}", one.state.theta, two.state.theta);
+        assert!((one.force[0] / two.force[0] - 1.0).abs() < 1e-3, "{kind:?}: {:?} {:?}", one.force, two.force);
+        let deviation = |e: &palpate::stiffness::identify::Estimate| e.covariance[0].sqrt();
+        assert!((deviation(&one) / deviation(&two) - 1.0).abs() < 0.02, "{kind:?}");
+    }
+}
+
+#[test]
+fn iterations_do_not_depend_on_the_number_of_threads() {
+    let mut random = Random::new(42, 0);
+    let body = body(1500, &mut random).iterated().unwrap();
+    let materials = body.region.iter().map(|r| Material::of_youngs_modulus(1.0 + f64::from(*r), 0.49)).collect();
+    let problem = Problem::new(&body, Law::Linear, materials, ties(&body, 0));
+    let solved = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let s = problem.solve(None, 1e-6).unwrap();
+            let mut sides = problem.residual_by_modulus(&s.x, |e| body.region[e] == 1).unwrap().repeat(11);
+            s.factor.sensitivities(&mut sides, None).unwrap();
+            (s.x, sides)
+        })
+    };
+    assert!(solved(1) == solved(4));
 }
