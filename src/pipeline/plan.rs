@@ -104,7 +104,7 @@ pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
 }
 
 /// Nodes of a mesh up to which its equations are solved with a factor.
-const FACTORISED: usize = 12_500;
+const FACTORISED: usize = 23_000;
 
 /// Memory of a stiffness run on a mesh of so many nodes (bytes): 120 MB and 26 kB a node for a
 /// factor, 150 MB and 10 kB a node for iterations (docs/lab/2026-11-solver.md).
