@@ -293,7 +293,7 @@ fn sensitivities_are_those_of_finite_differences() {
         let s = at.solve(None, 1e-11).unwrap();
         let mut y: Vec<f64> =
             at.residual_by_modulus(&s.x, |e| body.region[e] == 1).unwrap().into_iter().map(|v| -v).collect();
-        at.factorise(&s.x).unwrap().solve(&mut y).unwrap();
+        at.factorise(&s.x).unwrap().solve(&mut y, None).unwrap();
         let [low, high] = [-h, h].map(|d| problem(theta + d).solve(None, 1e-11).unwrap().x);
         let size = y.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
         for i in 0..y.len() {

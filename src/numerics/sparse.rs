@@ -58,7 +58,8 @@ pub struct Pattern {
     blocks: Vec<u32>,
     elements: Vec<u32>,
     nodes_per_element: usize,
-    symbolic: SymbolicCholesky<u32>,
+    /// Made when first needed: a pattern that is never factorised has none.
+    symbolic: OnceLock<Result<SymbolicCholesky<u32>, Singular>>,
     /// The columns of the nodes that come last, if any do.
     tail: Option<Tail>,
     /// Numbers of factors that are no longer needed: fresh memory of this size takes a fifth of a
@@ -73,8 +74,15 @@ impl Pattern {
     /// # Errors
     /// [`Singular`] when the symbolic factorisation does not fit in memory.
     pub fn new(elements: Vec<u32>, per: usize, places: &[[f64; 3]], width: Vec<u8>) -> Result<Self, Singular> {
+        let out = Self::unfactorised(elements, per, places, width);
+        out.symbolic()?;
+        Ok(out)
+    }
+
+    /// The same without a symbolic factorisation until one is needed.
+    pub fn unfactorised(elements: Vec<u32>, per: usize, places: &[[f64; 3]], width: Vec<u8>) -> Self {
         let order = dissection(&elements, per, places, &width);
-        Self::ordered(elements, per, width, &order, &[])
+        Self::ordered(elements, per, width, &order)
     }
 
     /// The same with some nodes eliminated after all others, in an order of their own.
@@ -87,11 +95,14 @@ impl Pattern {
         let mut order: Vec<u32> = (0..late.len() as u32).collect();
         order.sort_unstable_by_key(|&n| (late[n as usize], self.first[n as usize]));
         let early = order.partition_point(|&n| !late[n as usize]);
-        Self::ordered(self.elements.clone(), self.nodes_per_element, self.width.clone(), &order, &order[early..])
+        let mut out = Self::ordered(self.elements.clone(), self.nodes_per_element, self.width.clone(), &order);
+        let columns = order[early..].iter().map(|&node| usize::from(self.width[node as usize])).sum();
+        out.tail = Tail::of(out.symbolic()?, columns);
+        Ok(out)
     }
 
-    /// The pattern with its nodes in an order, of which `last` are the last.
-    fn ordered(elements: Vec<u32>, per: usize, width: Vec<u8>, order: &[u32], last: &[u32]) -> Result<Self, Singular> {
+    /// The pattern with its nodes in an order.
+    fn ordered(elements: Vec<u32>, per: usize, width: Vec<u8>, order: &[u32]) -> Self {
         let mut first = vec![0; width.len()];
         let mut unknowns = 0;
         for &node in order {
@@ -136,29 +147,32 @@ impl Pattern {
                 }
             }
         }
-        let column32: Vec<u32> = column.iter().map(|&c| c as u32).collect();
-        let n = unknowns as usize;
-        let view = SymbolicSparseColMatRef::new_checked(n, n, &column32, None, &row);
-        let params = CholeskySymbolicParams::default();
-        // faer's own identity order reads the upper triangle whatever the side.
-        let same: Vec<u32> = (0..unknowns).collect();
-        let unchanged = SymmetricOrdering::Custom(PermRef::new_checked(&same, &same, n));
-        let symbolic = factorize_symbolic_cholesky(view, Side::Lower, unchanged, params).map_err(|_| Singular)?;
-        let columns = last.iter().map(|&node| usize::from(width[node as usize])).sum();
-        let tail = Tail::of(&symbolic, columns);
-        Ok(Self {
+        Self {
             first,
             width,
-            unknowns: n,
+            unknowns: unknowns as usize,
             column,
             row,
             blocks,
             elements,
             nodes_per_element: per,
-            symbolic,
-            tail,
+            symbolic: OnceLock::new(),
+            tail: None,
             spare: Mutex::default(),
-        })
+        }
+    }
+
+    fn symbolic(&self) -> Result<&SymbolicCholesky<u32>, Singular> {
+        let make = || {
+            let (n, params) = (self.unknowns, CholeskySymbolicParams::default());
+            let column32: Vec<u32> = self.column.iter().map(|&c| c as u32).collect();
+            let view = SymbolicSparseColMatRef::new_checked(n, n, &column32, None, &self.row);
+            // faer's own identity order reads the upper triangle whatever the side.
+            let same: Vec<u32> = (0..n as u32).collect();
+            let unchanged = SymmetricOrdering::Custom(PermRef::new_checked(&same, &same, n));
+            factorize_symbolic_cholesky(view, Side::Lower, unchanged, params).map_err(|_| Singular)
+        };
+        self.symbolic.get_or_init(make).as_ref().map_err(|e| *e)
     }
 
     /// Number of unknowns.
@@ -172,8 +186,17 @@ impl Pattern {
     }
 
     /// Numbers that a factor holds.
-    pub fn fill(&self) -> usize {
-        self.symbolic.len_val()
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn fill(&self) -> Result<usize, Singular> {
+        Ok(self.symbolic()?.len_val())
+    }
+
+    /// The rows of a column, from its own on, and where their values lie.
+    pub fn below(&self, column: usize) -> (&[u32], std::ops::Range<usize>) {
+        let span = self.column[column]..self.column[column + 1];
+        (&self.row[span.clone()], span)
     }
 
     /// The first unknown of a node; its others follow.
@@ -259,7 +282,8 @@ impl Pattern {
             used.fill(0.0);
             used
         };
-        let memory = spare.map_or_else(|| vec![0.0; self.fill()], cleared);
+        let fill = self.fill()?;
+        let memory = spare.map_or_else(|| vec![0.0; fill], cleared);
         let rounded: Vec<f32> = matrix.iter().map(|&v| v as f32).collect();
         match self.numeric(&rounded, memory) {
             Ok(values) => Ok(Factor::new(self, matrix, Values::Single(values))),
@@ -268,7 +292,7 @@ impl Pattern {
     }
 
     fn exact_factor(&self, matrix: Arc<Vec<f64>>) -> Result<Factor<'_>, Singular> {
-        let values = self.numeric(&matrix, vec![0.0; self.fill()])?;
+        let values = self.numeric(&matrix, vec![0.0; self.fill()?])?;
         Ok(Factor::new(self, matrix, Values::Double(values)))
     }
 
@@ -276,11 +300,12 @@ impl Pattern {
     fn numeric<T: RealField>(&self, values: &[T], mut memory: Vec<T>) -> Result<Vec<T>, Singular> {
         let column32: Vec<u32> = self.column.iter().map(|&c| c as u32).collect();
         let n = self.unknowns;
-        let symbolic = SymbolicSparseColMatRef::new_checked(n, n, &column32, None, &self.row);
-        let matrix = SparseColMatRef::new(symbolic, values);
-        let scratch = self.symbolic.factorize_numeric_ldlt_scratch::<T>(Par::Seq, Default::default());
+        let places = SymbolicSparseColMatRef::new_checked(n, n, &column32, None, &self.row);
+        let matrix = SparseColMatRef::new(places, values);
+        let symbolic = self.symbolic()?;
+        let scratch = symbolic.factorize_numeric_ldlt_scratch::<T>(Par::Seq, Default::default());
         let mut stack = MemBuffer::try_new(scratch).map_err(|_| Singular)?;
-        let done = self.symbolic.factorize_numeric_ldlt(
+        let done = symbolic.factorize_numeric_ldlt(
             &mut memory,
             matrix,
             Side::Lower,
@@ -296,9 +321,10 @@ impl Pattern {
     /// Solves with a factor's numbers for right-hand sides one after the other in `x`.
     fn substitute<T: RealField>(&self, factor: &[T], x: &mut [T]) -> Result<(), Singular> {
         let columns = x.len() / self.unknowns.max(1);
-        let scratch = self.symbolic.solve_in_place_scratch::<T>(columns, Par::Seq);
+        let symbolic = self.symbolic()?;
+        let scratch = symbolic.solve_in_place_scratch::<T>(columns, Par::Seq);
         let mut stack = MemBuffer::try_new(scratch).map_err(|_| Singular)?;
-        let ldlt = LdltRef::<u32, T>::new(&self.symbolic, factor);
+        let ldlt = LdltRef::<u32, T>::new(symbolic, factor);
         let right = MatMut::from_column_major_slice_mut(x, self.unknowns, columns);
         ldlt.solve_in_place_with_conj(Conj::No, right, Par::Seq, MemStack::new(&mut stack));
         Ok(())
@@ -383,7 +409,7 @@ impl<'a> Factor<'a> {
             let spans = columns.flat_map(|c| (pattern.column[c]..pattern.column[c + 1]).map(move |at| (at, c)));
             let changes = spans.map(|(at, c)| (pattern.row[at] as usize, c, (matrix[at] - self.of[at]) as f32));
             let changes = changes.filter(|change| change.2 != 0.0);
-            if (same || near) && tail.renew(&pattern.symbolic, values, changes).is_ok() {
+            if (same || near) && tail.renew(pattern.symbolic()?, values, changes).is_ok() {
                 let mut out = self.near(matrix);
                 if same {
                     out.of = Arc::clone(&out.matrix);
@@ -862,7 +888,7 @@ mod tests {
         let mut renewed = single(&pattern.factorise(before.clone()).unwrap());
         let tail = pattern.tail.as_ref().unwrap();
         let at = |n: u32| (pattern.first(n) + 2, pattern.first(n) + 2, 300.0);
-        tail.renew(&pattern.symbolic, &mut renewed, last[20..70].iter().map(|&n| at(n))).unwrap();
+        tail.renew(pattern.symbolic().unwrap(), &mut renewed, last[20..70].iter().map(|&n| at(n))).unwrap();
         let off =
             |a: &[f32], b: &[f32]| a.iter().zip(b).fold(0.0f32, |m, (a, b)| m.max((a - b).abs() / (1.0 + b.abs())));
         assert!(off(&renewed, &whole) < 1e-5, "{}", off(&renewed, &whole));

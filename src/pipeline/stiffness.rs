@@ -87,6 +87,9 @@ pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
 
 /// Nodes of the coarse mesh over those of the fine one.
 const COARSE: f64 = 0.3;
+/// Nodes of the coarse mesh at most: a choice turns on the noise of the data long before, and the
+/// third of a change with the mesh that deviations take over is then too large, not too small.
+const COARSE_MOST: f64 = 12_000.0;
 /// Side of the mesh's cubes at the rim of a punch (voxels); nodes lie at half of it.
 const RIM: f64 = 2.0;
 /// Parts of the nodes that are tried for the rest of the body then.
@@ -176,7 +179,12 @@ fn without(labels: &Mask, label: u8, mut evidence: Vec<Evidence>) -> (Mask, Vec<
 
 /// How fine the mesh is on which all is chosen.
 pub(super) fn coarse_fineness(labels: &Mask, params: &StiffnessParams) -> Fineness {
-    Fineness::for_nodes(fields::volume(labels), (COARSE * params.nodes as f64) as usize)
+    Fineness::for_nodes(fields::volume(labels), coarse_nodes(params) as usize)
+}
+
+/// Nodes of the mesh on which all is chosen.
+fn coarse_nodes(params: &StiffnessParams) -> f64 {
+    (COARSE * params.nodes as f64).min(COARSE_MOST)
 }
 
 /// What [`run`] would refuse before it looks for moduli: told from a coarse mesh.
@@ -212,7 +220,7 @@ impl Meshed {
         let mesh = meshed(&mesher, volume, &rim, coarse.voxel, params.nodes as f64, RIM)?;
         let outline = rim.outline.as_ref();
         if !rim.places.is_empty() {
-            let nodes = COARSE * params.nodes as f64;
+            let nodes = coarse_nodes(params);
             coarse = level(&meshed(&mesher, volume, &rim, coarse.voxel, nodes, 2.0 * RIM)?, outline)?;
         }
         let mut fine = level(&mesh, outline)?;

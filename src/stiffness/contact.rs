@@ -158,8 +158,8 @@ impl Plate {
         });
     }
 
-    /// Adds its derivative to the tangent.
-    pub(super) fn stiffen(&self, body: &Body, x: &[f64], tangent: &mut [f64]) {
+    /// Calls `add` with an element and what the plate adds to its tangent.
+    pub(super) fn stiffen(&self, body: &Body, x: &[f64], mut add: impl FnMut(usize, &[f64])) {
         self.touched(body, x, |spot, shape, [_, _, slope]| {
             let mut out = [0.0; SIDE * SIDE];
             for (k, a) in (0..6).flat_map(|k| (0..3).map(move |a| (k, a))) {
@@ -168,7 +168,7 @@ impl Plate {
                         slope * shape[k] * shape[m] * self.outward[a] * self.outward[b];
                 }
             }
-            body.pattern.add(tangent, spot.element, &out, SIDE);
+            add(spot.element, &out);
         });
     }
 

@@ -4,6 +4,7 @@ use crate::error::StiffnessError;
 use crate::numerics::sparse::Pattern;
 use crate::numerics::tetrahedron::EDGES;
 use crate::stiffness::elements::{Point, points};
+use crate::stiffness::saddle::TwoLevel;
 use crate::types::QuadraticMesh;
 use crate::types::space::cross;
 use rayon::prelude::*;
@@ -14,6 +15,10 @@ use std::sync::Arc;
 pub const ELEMENT_NODES: usize = 14;
 /// Unknowns of an element.
 pub const SIDE: usize = 34;
+
+/// Unknowns up to which a factor is taken: 46,000 nodes, in 1.4 GB. Iterations need less time and
+/// memory, but more time where a plate presses a curved body (docs/lab/2026-11-solver.md).
+const DIRECT: usize = 150_000;
 
 /// A triangle of the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -47,6 +52,8 @@ pub struct Body {
     pub quadrature: Vec<[Point; 4]>,
     /// Places of the unknowns in the matrix.
     pub pattern: Arc<Pattern>,
+    /// Where a factor would be too large, what equations are solved with instead.
+    pub levels: Option<Arc<TwoLevel>>,
     /// The surface.
     pub surface: Vec<Facet>,
     /// Volume of each region (mm^3).
@@ -82,15 +89,26 @@ impl Body {
             flat.extend_from_slice(&p);
             pressures.push(p);
         }
-        let pattern = Pattern::new(flat, ELEMENT_NODES, &all, width).map_err(|_| StiffnessError::Unsolvable)?;
-        let pattern = Arc::new(pattern);
+        let pattern = Arc::new(Pattern::unfactorised(flat, ELEMENT_NODES, &all, width));
         let quadrature: Vec<[Point; 4]> = cells.par_iter().map(|c| points(&c.map(|n| places[n as usize]))).collect();
         let mut volumes = vec![0.0; labels.len()];
         for (q, &r) in quadrature.iter().zip(&region) {
             volumes[r as usize] += q.iter().map(|p| p.weight).sum::<f64>();
         }
         let surface = surface(&cells, &places);
-        Ok(Self { places, cells, pressures, region, labels, quadrature, pattern, surface, volumes })
+        let large = pattern.unknowns() > DIRECT;
+        let out =
+            Self { places, cells, pressures, region, labels, quadrature, pattern, levels: None, surface, volumes };
+        if large { out.iterated() } else { Ok(out) }
+    }
+
+    /// The same, solved by iterations whatever its size.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn iterated(self) -> Result<Self, StiffnessError> {
+        let levels = TwoLevel::new(&self.cells, &self.pressures, &self.places, &self.pattern);
+        Ok(Self { levels: Some(Arc::new(levels.map_err(|_| StiffnessError::Unsolvable)?)), ..self })
     }
 
     /// Has the displacements of some nodes eliminated last, which makes matrices that differ at
@@ -100,6 +118,9 @@ impl Body {
     /// # Errors
     /// As [`Self::new`].
     pub fn eliminate_last(&mut self, nodes: &[u32]) -> Result<(), StiffnessError> {
+        if self.levels.is_some() {
+            return Ok(());
+        }
         let pattern = self.pattern.eliminating_last(nodes).map_err(|_| StiffnessError::Unsolvable)?;
         if pattern.renews() {
             self.pattern = Arc::new(pattern);

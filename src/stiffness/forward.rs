@@ -7,10 +7,10 @@
 //! Newton's method on the mixed residual; the linear law takes one step.
 
 use crate::error::StiffnessError;
-use crate::numerics::sparse::Factor;
 use crate::stiffness::contact::Plate;
 use crate::stiffness::fem_body::{Body, SIDE};
 use crate::stiffness::law::{Material, residual, residual_by_modulus, tangent};
+use crate::stiffness::tangent::{Matrix, Tangent};
 use crate::types::stiffness::Law;
 use rayon::prelude::*;
 
@@ -43,13 +43,20 @@ pub struct Tie {
     pub strength: f64,
 }
 
+impl Tie {
+    /// The part of component `b` of a pull that acts along component `a`.
+    pub fn along(&self, a: usize, b: usize) -> f64 {
+        self.direction.map_or(f64::from(u8::from(a == b)), |n| n[a] * n[b])
+    }
+}
+
 /// A solution: unknowns, and the tangent factorised at (or just before) it.
 #[derive(Debug)]
 pub struct Solution<'a> {
     /// Displacements and pressures (see [`Body::displacement`]).
     pub x: Vec<f64>,
     /// The factorised tangent.
-    pub factor: Factor<'a>,
+    pub factor: Tangent<'a>,
     /// Factorisations that it took.
     pub factorisations: usize,
 }
@@ -151,45 +158,52 @@ impl<'a> Problem<'a> {
     }
 
     /// The tangent at `x`.
-    fn tangent(&self, x: &[f64]) -> Option<Vec<f64>> {
+    fn tangent(&self, x: &[f64]) -> Option<Matrix> {
         let body = self.body;
         let mut values = body.pattern.zeros();
+        let mut levels = body.levels.as_ref().map(|l| (l, l.zeros(self.springs.iter().map(|k| k / TIE).collect())));
         let one = |e: usize| tangent(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e));
         let count = body.cells.len();
         for start in (0..count).step_by(CHUNK) {
             let part: Vec<_> = (start..(start + CHUNK).min(count)).into_par_iter().map(one).collect();
             for (e, k) in part.into_iter().enumerate() {
-                body.pattern.add(&mut values, start + e, &k?[..], SIDE);
+                let (e, k) = (start + e, k?);
+                body.pattern.add(&mut values, e, &k[..], SIDE);
+                if let Some((mesh, levels)) = &mut levels {
+                    mesh.add(levels, e, &k[..], self.materials[e].poisson);
+                }
             }
         }
         for tie in &self.ties {
             let k = self.spring(tie);
-            for r in 0..3 {
-                for c in 0..=r {
-                    let value = match tie.direction {
-                        None => f64::from(u8::from(r == c)),
-                        Some(n) => n[r] * n[c],
-                    };
-                    body.pattern.add_at_node(&mut values, tie.node, r, c, k * value);
-                }
+            for (r, c) in (0..3).flat_map(|r| (0..=r).map(move |c| (r, c))) {
+                body.pattern.add_at_node(&mut values, tie.node, r, c, k * tie.along(r, c));
+            }
+            if let Some((mesh, levels)) = &mut levels {
+                mesh.tie(levels, tie, body.pattern.first(tie.node), k);
             }
         }
         if let Some(plate) = &self.plate {
-            plate.stiffen(body, x, &mut values);
+            plate.stiffen(body, x, |e, k| {
+                body.pattern.add(&mut values, e, k, SIDE);
+                if let Some((mesh, levels)) = &mut levels {
+                    mesh.add(levels, e, k, 0.0);
+                }
+            });
         }
-        Some(values)
+        Some(Matrix { values, levels: levels.map(|l| l.1) })
     }
 
     /// Factorises the tangent at `x`.
     ///
     /// # Errors
     /// [`StiffnessError`] when an element is inside out or the body can move freely.
-    pub fn factorise(&self, x: &[f64]) -> Result<Factor<'a>, StiffnessError> {
+    pub fn factorise(&self, x: &[f64]) -> Result<Tangent<'a>, StiffnessError> {
         self.factor_of(self.tangent(x).ok_or(StiffnessError::InsideOut)?)
     }
 
-    fn factor_of(&self, matrix: Vec<f64>) -> Result<Factor<'a>, StiffnessError> {
-        self.body.pattern.factorise(matrix).map_err(|_| StiffnessError::Unsolvable)
+    fn factor_of(&self, matrix: Matrix) -> Result<Tangent<'a>, StiffnessError> {
+        Tangent::new(self.body, matrix).map_err(|_| StiffnessError::Unsolvable)
     }
 
     /// Solves, from `start` where one is given. `precision` (mm) ends Newton's method.
@@ -221,25 +235,27 @@ impl<'a> Problem<'a> {
         self.law == Law::Linear && self.plate.is_none()
     }
 
-    /// Solves a linear problem with the factor that is made for its matrix.
+    /// Solves a linear problem with the tangent that is made for its matrix, from `start` where
+    /// that saves iterations.
     ///
     /// # Errors
     /// [`StiffnessError`] when the body can move freely.
     pub fn solve_with(
         &self,
-        factor: impl FnOnce(Vec<f64>) -> Result<Factor<'a>, StiffnessError>,
+        start: Option<&[f64]>,
+        factor: impl FnOnce(Matrix) -> Result<Tangent<'a>, StiffnessError>,
     ) -> Result<Solution<'a>, StiffnessError> {
         let zero = vec![0.0; self.body.pattern.unknowns()];
         let mut x = self.residual(&zero).ok_or(StiffnessError::InsideOut)?;
         x.iter_mut().for_each(|v| *v = -*v);
         let factor = factor(self.tangent(&zero).ok_or(StiffnessError::InsideOut)?)?;
-        factor.solve(&mut x).map_err(|_| StiffnessError::Unsolvable)?;
+        factor.solve(&mut x, start).map_err(|_| StiffnessError::Unsolvable)?;
         Ok(Solution { x, factor, factorisations: 1 })
     }
 
     fn reach(&self, start: Option<&[f64]>, precision: f64, stale: f64) -> Result<Solution<'a>, StiffnessError> {
         if self.is_linear() {
-            return self.solve_with(|matrix| self.factor_of(matrix));
+            return self.solve_with(start, |matrix| self.factor_of(matrix));
         }
         if let Some(done) = start.and_then(|s| self.newton(s.to_vec(), precision, stale).ok()) {
             return Ok(done);
@@ -265,7 +281,7 @@ impl<'a> Problem<'a> {
 
     /// Solves from `start` by steps with the factorised tangent of a problem nearby (the chord
     /// method); none where these do not contract. `precision` (mm) ends it.
-    pub fn solve_near(&self, start: &[f64], factor: &Factor<'_>, precision: f64) -> Option<Vec<f64>> {
+    pub fn solve_near(&self, start: &[f64], factor: &Tangent<'_>, precision: f64) -> Option<Vec<f64>> {
         let (mut x, mut last) = (start.to_vec(), f64::INFINITY);
         for _ in 0..STEPS {
             let mut step = self.residual(&x)?;
@@ -330,7 +346,7 @@ impl<'a> Problem<'a> {
                 // Another contact is another matrix, except where it alone is worked out anew.
                 let near = far < NEAR * self.size(&x) && (done || self.body.pattern.renews());
                 let matrix = self.tangent(&x).ok_or(StiffnessError::InsideOut)?;
-                let renewed = factor.map(|f| f.renewed(matrix, near)).transpose();
+                let renewed = factor.map(|f| f.renewed(self.body, matrix, near)).transpose();
                 factor = renewed.map_err(|_| StiffnessError::Unsolvable)?;
                 moved = 0.0;
                 if !near {

@@ -7,7 +7,6 @@
 
 use crate::error::StiffnessError;
 use crate::numerics::cholesky::{Cholesky, within};
-use crate::numerics::sparse::Factor;
 use crate::numerics::statistics::percentile;
 use crate::stiffness::boundary_conditions::{Patch, travel};
 use crate::stiffness::fem_body::Body;
@@ -15,6 +14,7 @@ use crate::stiffness::forward::{Problem, Solution, Tie};
 use crate::stiffness::geometry::Part;
 use crate::stiffness::law::Material;
 use crate::stiffness::observations::Observation;
+use crate::stiffness::tangent::Tangent;
 use crate::types::space::{dot, length};
 use crate::types::stiffness::{Contact, Law};
 
@@ -324,14 +324,14 @@ impl Setup<'_> {
         let (mut problem, mut solution) = self.solve(&state, first)?;
         factorisations += solution.factorisations;
         let mut residuals = self.residuals(&solution.x);
-        let mut iterations = 0;
+        let (mut iterations, mut last) = (0, None);
         // The moduli whose tangent is factorised.
         let mut factorised = state.theta.clone();
         loop {
             iterations += 1;
             let scale = self.scale(&residuals);
             let weights = self.weights(&residuals, scale);
-            let columns = self.sensitivities(&problem, &solution)?;
+            let columns = self.sensitivities(&problem, &solution, last)?;
             let Solution { x, factor: tangent, .. } = solution;
             let mut tangent = Some(tangent);
             let (normal, right) = self.normal(&columns, &residuals, &weights);
@@ -401,10 +401,11 @@ impl Setup<'_> {
             let stalled = after > before * (1.0 - SPENT);
             (state, problem, solution, residuals) = (trial, p, s, rest);
             if stalled {
-                let columns = self.sensitivities(&problem, &solution)?;
+                let columns = self.sensitivities(&problem, &solution, Some(columns))?;
                 state.x = Some(solution.x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             }
+            last = Some(columns);
         }
     }
 
@@ -414,14 +415,15 @@ impl Setup<'_> {
     fn follow<'a>(
         &'a self,
         state: &State,
-        tangent: Option<Factor<'a>>,
+        tangent: Option<Tangent<'a>>,
         springs: Vec<f64>,
         precision: f64,
     ) -> Result<(Problem<'a>, Solution<'a>), StiffnessError> {
         if let (Some(factor), Some(x)) = (tangent, &state.x) {
             let problem = Problem { springs, ..self.problem(state) };
             if problem.is_linear() {
-                let solution = problem.solve_with(|matrix| Ok(factor.near(matrix)))?;
+                let solution = problem
+                    .solve_with(Some(x), |matrix| factor.near(matrix).map_err(|_| StiffnessError::Unsolvable))?;
                 return Ok((problem, Solution { factorisations: 0, ..solution }));
             }
             if let Some(x) = problem.solve_near(x, &factor, precision) {
@@ -431,9 +433,15 @@ impl Setup<'_> {
         self.solve(state, precision)
     }
 
-    fn sensitivities(&self, problem: &Problem<'_>, solution: &Solution<'_>) -> Result<Vec<f64>, StiffnessError> {
+    /// The derivatives of a solution; those of a state nearby are begun with.
+    fn sensitivities(
+        &self,
+        problem: &Problem<'_>,
+        solution: &Solution<'_>,
+        last: Option<Vec<f64>>,
+    ) -> Result<Vec<f64>, StiffnessError> {
         let mut columns = self.right_sides(problem, &solution.x)?;
-        solution.factor.solve(&mut columns).map_err(|_| StiffnessError::Unsolvable)?;
+        solution.factor.sensitivities(&mut columns, last.as_deref()).map_err(|_| StiffnessError::Unsolvable)?;
         Ok(columns)
     }
 

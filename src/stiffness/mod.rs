@@ -14,6 +14,12 @@ pub mod fem_body;
 
 pub mod forward;
 
+pub mod krylov;
+
+pub mod saddle;
+
+pub mod tangent;
+
 pub mod observations;
 
 pub mod boundary_conditions;

@@ -101,9 +101,9 @@ struct Tried {
 }
 
 impl Tried {
-    /// An estimate on a level as it is.
-    fn new(level: &Level, setup: &Setup<'_>, estimate: Estimate) -> Result<Self, StiffnessError> {
-        let shaped = geometry::fit(setup, &estimate, &level.grid, &[], &[])?;
+    /// An estimate on a level as it is; one without a `rival` needs no squares with another shape.
+    fn new(level: &Level, setup: &Setup<'_>, estimate: Estimate, rival: bool) -> Result<Self, StiffnessError> {
+        let shaped = if rival { geometry::fit(setup, &estimate, &level.grid, &[], &[])? } else { None };
         let squares = shaped.map_or(estimate.squares, |g| g.fit.squares.min(estimate.squares));
         let contact = [level.patches[0].contact, level.patches[1].contact];
         let read = contact.iter().filter(|c| matches!(c, Contact::Guided | Contact::Measured)).count();
@@ -176,6 +176,7 @@ impl Chooser<'_> {
     /// Tries every contact under a law, and says which ranks first.
     fn contact(&mut self, law: Law) -> Result<(Vec<Tried>, usize), StiffnessError> {
         let [held, loaded] = [0, 1].map(|i| candidates(self.level, &self.level.patches[i]));
+        let rivals = held.len() * loaded.len() > 1;
         let mut tried: Vec<Tried> = Vec::new();
         let mut failure = None;
         let mut attempt = |tried: &mut Vec<Tried>, contact: [Contact; 2]| {
@@ -185,7 +186,7 @@ impl Chooser<'_> {
             if let Some(last) = tried.last() {
                 (start.theta, start.x) = (last.estimate.state.theta.clone(), last.estimate.state.x.clone());
             }
-            match setup.run(start, ITERATIONS, COARSE).and_then(|e| Tried::new(self.level, &setup, e)) {
+            match setup.run(start, ITERATIONS, COARSE).and_then(|e| Tried::new(self.level, &setup, e, rivals)) {
                 Ok(one) => tried.push(one),
                 Err(e) => failure = Some(e),
             }
@@ -229,7 +230,7 @@ impl Chooser<'_> {
         let small = settle(self.level, Law::Linear, self.params, self.reference, small, LAW_MOVES, COARSE)?;
         let strain = summary::strain(&self.level.setup(Law::Linear, self.params, self.reference), &small.state);
         let setup = self.level.setup(Law::Linear, self.params, self.reference);
-        let small = Tried::new(self.level, &setup, small)?;
+        let small = Tried::new(self.level, &setup, small, true)?;
         let large = self.large_strain_from(&small).or_else(|_| {
             // A shape that was moved far may bear no large strain; what it changes stays to first
             // order.
@@ -291,7 +292,7 @@ impl Chooser<'_> {
         let large = setup.run(from.estimate.state.clone(), ITERATIONS, COARSE)?;
         let large = settle(self.level, Law::NeoHookean, self.params, self.reference, large, LAW_MOVES, COARSE)?;
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
-        Tried::new(self.level, &setup, large)
+        Tried::new(self.level, &setup, large, true)
     }
 
     /// The law by what its criterion gains; where that does not tell, by the strain.

@@ -385,10 +385,9 @@ fn jacobian(
         }
     }
     sides.extend(setup.plate_sides(problem, &solution.x));
-    let factor = solution.factor.whole().map_err(|_| StiffnessError::Unsolvable)?;
     sides
         .par_chunks_mut(32 * n)
-        .map(|part| factor.solve(part).map_err(|_| StiffnessError::Unsolvable))
+        .map(|part| solution.factor.many(part).map_err(|_| StiffnessError::Unsolvable))
         .collect::<Result<(), _>>()?;
     Ok(sides.par_chunks(n).flat_map_iter(|y| picked.iter().flat_map(move |o| o.read(body, y))).collect())
 }

@@ -1,0 +1,132 @@
+//! A tangent ready to be solved with: factorised, or where that is too large by iterations.
+
+use crate::numerics::sparse::{Factor, Singular};
+use crate::stiffness::fem_body::Body;
+use crate::stiffness::saddle::{Levels, Saddle};
+
+/// Relative error of an iterative solution (weighted 2-norm).
+const SOLVED: f64 = 1e-7;
+/// Relative error of a step of Newton's method, which ends where a step is this much too large.
+const NEWTON: f64 = 1e-3;
+/// Relative error of sensitivities: what they are taken for is good to a few per cent.
+const SENSITIVE: f64 = 1e-3;
+/// Relative error of a step whose residual is worked out anew.
+const STEP: f64 = 1e-2;
+
+/// The values of a tangent in a body's pattern, and on both levels of a large body.
+#[derive(Debug)]
+pub struct Matrix {
+    /// See [`crate::numerics::sparse::Pattern::add`].
+    pub values: Vec<f64>,
+    /// On both levels of a body that is solved by iterations.
+    pub levels: Option<Levels>,
+}
+
+/// See [`Factor`], whose methods these are.
+#[derive(Debug)]
+pub enum Tangent<'a> {
+    /// By a factor.
+    Direct(Box<Factor<'a>>),
+    /// By iterations.
+    Iterative(Box<Saddle<'a>>),
+}
+
+impl<'a> Tangent<'a> {
+    /// Of a matrix of the body.
+    ///
+    /// # Errors
+    /// [`Singular`] when the body can move freely.
+    pub fn new(body: &'a Body, matrix: Matrix) -> Result<Self, Singular> {
+        Ok(match (&body.levels, matrix.levels) {
+            (Some(levels), Some(own)) => {
+                Self::Iterative(Box::new(Saddle::new(&body.pattern, levels, matrix.values, own)?))
+            }
+            _ => Self::Direct(Box::new(body.pattern.factorise(matrix.values)?)),
+        })
+    }
+
+    /// Solves for a right-hand side; iterations begin at `start`, if one is given.
+    ///
+    /// # Errors
+    /// [`Singular`] where the solution is not finite or not reached.
+    pub fn solve(&self, x: &mut [f64], start: Option<&[f64]>) -> Result<(), Singular> {
+        match self {
+            Self::Direct(factor) => factor.solve(x),
+            Self::Iterative(saddle) => saddle.solve(x, start, SOLVED),
+        }
+    }
+
+    /// Solves for the right-hand sides of sensitivities, one after the other in `x`; iterations
+    /// begin at `start`, if one is given.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn sensitivities(&self, x: &mut [f64], start: Option<&[f64]>) -> Result<(), Singular> {
+        match self {
+            Self::Direct(factor) => factor.solve(x),
+            Self::Iterative(saddle) => saddle.solve(x, start, SENSITIVE),
+        }
+    }
+
+    /// See [`Factor::solve_or_replace`].
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
+        match self {
+            Self::Direct(factor) => factor.solve_or_replace(x),
+            Self::Iterative(saddle) => saddle.solve(x, None, NEWTON),
+        }
+    }
+
+    /// See [`Factor::step`].
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn step(&self, x: &mut [f64]) -> Result<(), Singular> {
+        match self {
+            Self::Direct(factor) => factor.step(x),
+            Self::Iterative(saddle) => saddle.solve(x, None, STEP),
+        }
+    }
+
+    /// See [`Factor::near`].
+    ///
+    /// # Errors
+    /// [`Singular`] when a node can move freely.
+    pub fn near(self, matrix: Matrix) -> Result<Self, Singular> {
+        Ok(match (self, matrix.levels) {
+            (Self::Direct(factor), _) => Self::Direct(Box::new(factor.near(matrix.values))),
+            (Self::Iterative(saddle), own) => {
+                Self::Iterative(Box::new(saddle.near(matrix.values, own.ok_or(Singular)?)?))
+            }
+        })
+    }
+
+    /// See [`Factor::renewed`].
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn renewed(self, body: &'a Body, matrix: Matrix, near: bool) -> Result<Self, Singular> {
+        match self {
+            Self::Direct(factor) => Ok(Self::Direct(Box::new(factor.renewed(matrix.values, near)?))),
+            Self::Iterative(_) if near => self.near(matrix),
+            Self::Iterative(saddle) => {
+                // Its memory is the next one's.
+                drop(saddle);
+                Self::new(body, matrix)
+            }
+        }
+    }
+
+    /// As [`Self::sensitivities`], for so many that a factor of the matrix itself is worth it.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn many(&self, x: &mut [f64]) -> Result<(), Singular> {
+        match self {
+            Self::Direct(factor) => factor.whole()?.solve(x),
+            Self::Iterative(_) => self.sensitivities(x, None),
+        }
+    }
+}
