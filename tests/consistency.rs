@@ -15,7 +15,7 @@ use palpate::numerics::bspline::Lattice;
 use palpate::numerics::filters;
 use palpate::numerics::random::Random;
 use palpate::numerics::symmetric3::quadratic;
-use palpate::types::{Candidate, MotionModel};
+use palpate::types::{Candidate, GridVector, MotionModel};
 use truth::{Dense, dense, entry, invert, normals, random_blocks, with_threads};
 
 /// An affine displacement (mm): strains of up to 8 %, a shift, a turn.
@@ -43,9 +43,12 @@ fn planted(places: &[[f64; 3]]) -> (Vec<Vec<Candidate>>, Vec<usize>) {
     };
     let lists = places.iter().enumerate().map(|(i, &x)| {
         let fooled = i % 5 < 2;
-        let mut list = vec![(Candidate { displacement: affine(x), ncc: 0.8 }, true)];
-        list.push((Candidate { displacement: wrong(&mut random, x), ncc: if fooled { 0.9 } else { 0.7 } }, false));
-        list.push((Candidate { displacement: wrong(&mut random, x), ncc: 0.6 }, false));
+        let mut list = vec![(Candidate { displacement: GridVector(affine(x)), ncc: 0.8 }, true)];
+        list.push((
+            Candidate { displacement: GridVector(wrong(&mut random, x)), ncc: if fooled { 0.9 } else { 0.7 } },
+            false,
+        ));
+        list.push((Candidate { displacement: GridVector(wrong(&mut random, x)), ncc: 0.6 }, false));
         list.sort_by(|a, b| b.0.ncc.total_cmp(&a.0.ncc));
         let right = list.iter().position(|c| c.1).unwrap();
         (list.into_iter().map(|c| c.0).collect(), right)
@@ -68,7 +71,7 @@ fn the_energy_is_its_definition() {
         others.sort_by(|&a, &b| distance(places[a], places[i]).total_cmp(&distance(places[b], places[i])));
         for &j in others[..6].iter().filter(|&&j| j != 7) {
             let allowed = 1.0 + 0.3 * distance(places[i], places[j]);
-            let apart = distance(c.displacement, candidates[j][chosen[j]].displacement);
+            let apart = distance(c.displacement.0, candidates[j][chosen[j]].displacement.0);
             sum += 1.5 / 6.0 * (apart / allowed).powi(2).min(1.0);
         }
     }
@@ -103,7 +106,7 @@ fn relaxation_never_raises_the_energy() {
             .enumerate()
             .map(|(i, v)| {
                 let candidate = |c: &[f32]| Candidate {
-                    displacement: std::array::from_fn(|a| 3.0 * f64::from(c[a])),
+                    displacement: GridVector(std::array::from_fn(|a| 3.0 * f64::from(c[a]))),
                     ncc: c[3].tanh(),
                 };
                 let mut list: Vec<Candidate> = v.chunks_exact(4).take(i % 4).map(candidate).collect();

@@ -38,8 +38,11 @@ fn every_example_has_a_test() {
         "finger_pad",
         "grasp",
         "human_fingertip",
+        "own_matches",
         "own_pair",
+        "own_similarity",
         "seed",
+        "seed_chain",
         "sequence",
         "skin",
         "stability_map",
@@ -66,6 +69,36 @@ fn seed_meshes_the_matches_and_draws_every_node() {
     assert!(before(&out, " matches kept") >= 20.0, "{out}");
     let picture = std::fs::read_to_string(folder.path().join("out/seed.svg")).unwrap();
     assert_eq!(picture.matches("<circle").count().to_string(), rows[1][5]);
+}
+
+/// The words before and after `word`, as numbers.
+fn beside(text: &str, word: &str) -> [f64; 2] {
+    let after = text.split(word).nth(1).unwrap().split_whitespace().next().unwrap();
+    [before(text, word), after.parse().unwrap()]
+}
+
+#[test]
+fn seed_chain_measures_most_of_the_motion() {
+    let (out, _) = example("seed_chain", &[]);
+    assert!(before(&out, " voxels in the mesh") > 10_000.0, "{out}");
+    let [error, motion] = beside(&out, " mm of a motion of ");
+    assert!(error < 0.5 * motion, "{out}");
+}
+
+#[test]
+fn own_similarity_sees_through_a_contrast_that_is_the_other_way_round() {
+    let (out, _) = example("own_similarity", &[]);
+    let right: Vec<f64> = out.lines().map(|line| before(line, " right of ")).collect();
+    assert!(right[1] > 4.0 * right[0] && right[1] > 100.0, "{out}");
+}
+
+#[test]
+fn own_matches_make_a_field_and_its_strain() {
+    let (out, _) = example("own_matches", &[]);
+    let [error, motion] = beside(&out, " mm of a motion of ");
+    assert!(error < 0.3 * motion, "{out}");
+    let strain: f64 = out.split("principal strain ").nth(1).unwrap().trim().parse().unwrap();
+    assert!((0.01..0.6).contains(&strain), "{out}");
 }
 
 #[test]

@@ -41,10 +41,10 @@ fn the_response_peaks_at_a_corner() {
     // The measure's top lies a little inside the bright octant, where the window holds all three
     // faces.
     for a in 0..3 {
-        assert!((0.0..2.0).contains(&(found[0].voxel[a] - c[a])), "{found:?}");
+        assert!((0.0..2.0).contains(&(found[0].voxel.0[a] - c[a])), "{found:?}");
     }
     // The three axes are alike: the corner is off by the same along each.
-    let off: Vec<f64> = (0..3).map(|a| found[0].voxel[a] - c[a]).collect();
+    let off: Vec<f64> = (0..3).map(|a| found[0].voxel.0[a] - c[a]).collect();
     assert!((off[0] - off[1]).abs() < 0.15 && (off[0] - off[2]).abs() < 0.15, "{off:?}");
 }
 
@@ -143,7 +143,7 @@ fn places_are_sub_voxel() {
         let r = response(&blob(CUBE, MM, c, 1.5), CUBE, MM, HarrisParams::default());
         let found = spread(&r, CUBE, MM, None, 1, 0.0);
         for a in 0..3 {
-            assert!((found[0].voxel[a] - c[a]).abs() < 0.1, "{:?} is not {c:?}", found[0].voxel);
+            assert!((found[0].voxel.0[a] - c[a]).abs() < 0.1, "{:?} is not {c:?}", found[0].voxel);
         }
     }
 }
@@ -210,7 +210,7 @@ fn found_places_are_maxima_and_a_plateau_counts_once() {
     slow.sort_unstable();
     assert_eq!(centres, slow);
     for c in &found {
-        assert!((0..3).all(|a| (c.voxel[a] - c.centre[a] as f64).abs() <= 0.5) && c.response == value(c.centre));
+        assert!((0..3).all(|a| (c.voxel.0[a] - c.centre[a] as f64).abs() <= 0.5) && c.response == value(c.centre));
     }
     let mut flat = vec![0.0; 14 * 13 * 12];
     for i in [500, 501, 514, 515] {

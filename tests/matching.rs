@@ -205,13 +205,13 @@ fn shifted(shape: [usize; 3]) -> (Vec<f32>, Vec<f32>) {
     (cut([4, 4, 4]), cut([1, 6, 3]))
 }
 
-fn corners(data: &[f32], shape: [usize; 3], spacing: [f64; 3], wanted: usize) -> Vec<[f64; 3]> {
+fn corners(data: &[f32], shape: [usize; 3], spacing: [f64; 3], wanted: usize) -> Vec<VoxelPoint> {
     let r = response(data, shape, spacing, HarrisParams::default());
     spread(&r, shape, spacing, None, wanted, 0.0).iter().map(|c| c.voxel).collect()
 }
 
 fn right(c: &Candidate, spacing: [f64; 3]) -> bool {
-    (0..3).all(|a| (c.displacement[a] - [3.0, -2.0, 1.0][a] * spacing[a]).abs() < 0.6 * spacing[a])
+    (0..3).all(|a| (c.displacement.0[a] - [3.0, -2.0, 1.0][a] * spacing[a]).abs() < 0.6 * spacing[a])
 }
 
 #[test]
@@ -235,14 +235,15 @@ fn candidates_hold_the_motion() {
         assert!(list.len() <= 2 * REACH.keep && list.windows(2).all(|w| w[0].ncc >= w[1].ncc));
         assert!(list.iter().all(|c| c.ncc >= REACH.min_ncc));
         // Places whose patch and whose partner's patch lie inside.
-        let q: [f64; 3] = std::array::from_fn(|d| p[d] + [3.0, -2.0, 1.0][d]);
+        let q: [f64; 3] = std::array::from_fn(|d| p.0[d] + [3.0, -2.0, 1.0][d]);
         let fits = |p: &[f64; 3]| (0..3).all(|d| p[d] >= 4.0 && p[d] <= shape[d] as f64 - 5.0);
-        if fits(p) && fits(&q) {
+        if fits(&p.0) && fits(&q) {
             seen += 1;
             assert!(right(&list[0], spacing) && list[0].ncc > 0.99, "{p:?}: {:?}", list[0]);
         }
         for (i, x) in list.iter().enumerate() {
-            let twin = |y: &Candidate| (0..3).all(|d| (x.displacement[d] - y.displacement[d]).abs() < 0.9 * spacing[d]);
+            let twin =
+                |y: &Candidate| (0..3).all(|d| (x.displacement.0[d] - y.displacement.0[d]).abs() < 0.9 * spacing[d]);
             assert!(!list[..i].iter().any(twin), "the same place twice: {list:?}");
         }
     }
@@ -261,7 +262,7 @@ fn candidates_know_where_the_volumes_start() {
     let cut: Vec<f32> =
         voxels(small).map(|p| moving[p[0] + start[0] + 30 * (p[1] + start[1] + 28 * (p[2] + start[2]))]).collect();
     let (here, there) = (Searchable::new(&fixed, shape, [3; 3]), Searchable::new(&cut, small, [3; 3]));
-    let a = [[13.0, 14.0, 12.0], [14.3, 13.6, 11.2]];
+    let a = [VoxelPoint([13.0, 14.0, 12.0]), VoxelPoint([14.3, 13.6, 11.2])];
     let b = corners(&cut, small, spacing, 100);
     let origin = start.map(|v| v as f64);
     let lists = candidates(
@@ -280,16 +281,16 @@ fn either_side_alone_finds_the_motion() {
     let (shape, spacing) = ([30, 28, 26], [1.0; 3]);
     let (fixed, moving) = shifted(shape);
     let (here, there) = (Searchable::new(&fixed, shape, [3; 3]), Searchable::new(&moving, shape, [3; 3]));
-    let find = |a: &[[f64; 3]], b: &[[f64; 3]]| {
+    let find = |a: &[VoxelPoint], b: &[VoxelPoint]| {
         let side = |volume, features| Side { volume, origin: [0.0; 3], features };
         candidates(&side(&here, a), &side(&there, b), spacing, REACH)
     };
     // No feature in the deformed volume: search alone.
-    let list = &find(&[[14.0, 14.0, 12.0]], &[])[0];
+    let list = &find(&[VoxelPoint([14.0, 14.0, 12.0])], &[])[0];
     assert!(right(&list[0], spacing), "{list:?}");
     // No patch around the initial feature (at the border): the deformed feature is found back
     // beside it.
-    let list = &find(&[[2.0, 14.0, 12.0]], &[[6.0, 12.0, 13.0]])[0];
+    let list = &find(&[VoxelPoint([2.0, 14.0, 12.0])], &[VoxelPoint([6.0, 12.0, 13.0])])[0];
     assert!(right(&list[0], spacing), "{list:?}");
 }
 
@@ -325,7 +326,7 @@ fn least_squares_matching_is_sub_voxel() {
         )
         .unwrap();
         for a in 0..3 {
-            let error = found.shift[a] / spacing[a] - D[a];
+            let error = found.shift.0[a] / spacing[a] - D[a];
             assert!(error.abs() < 0.02, "{centre:?} axis {a}: {error} voxels");
         }
         assert!(found.ncc > 0.999, "{}", found.ncc);
@@ -369,8 +370,8 @@ fn one_slice_is_matched_in_its_plane() {
         2.0,
     )
     .unwrap();
-    assert!((found.shift[0] - D[0]).abs() < 0.02 && (found.shift[1] - D[1]).abs() < 0.02, "{found:?}");
-    assert_eq!((found.shift[2], found.covariance[2], found.covariance[4], found.covariance[5]), (0.0, 0.0, 0.0, 0.0));
+    assert!((found.shift.0[0] - D[0]).abs() < 0.02 && (found.shift.0[1] - D[1]).abs() < 0.02, "{found:?}");
+    assert_eq!((found.shift.0[2], found.covariance[2], found.covariance[4], found.covariance[5]), (0.0, 0.0, 0.0, 0.0));
 }
 
 #[test]
@@ -396,7 +397,7 @@ fn the_covariance_of_a_match_is_calibrated() {
         ) else {
             continue;
         };
-        let e = std::array::from_fn(|a| found.shift[a] - D[a]);
+        let e = std::array::from_fn(|a| found.shift.0[a] - D[a]);
         sum += quadratic(&inverse(&found.covariance).unwrap(), e);
         count += 1;
     }

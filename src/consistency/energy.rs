@@ -22,6 +22,13 @@ pub struct EnergyParams {
     pub neighbours: usize,
 }
 
+impl EnergyParams {
+    /// The defaults, for candidates as precise as `precision_mm`.
+    pub fn new(precision_mm: f64) -> Self {
+        Self { lambda: 1.0, precision_mm, strain: 0.3, neighbours: 16 }
+    }
+}
+
 /// Places and the neighbours of each, with the displacement difference `s0 + s |x_i - x_j|` (mm) at
 /// which a pair counts as contradicting.
 #[derive(Debug, Clone)]
@@ -33,7 +40,16 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// The k-nearest-neighbour graph of `places` (mm).
+    /// The k-nearest-neighbour graph of `places` (mm, in any frame: only distances count).
+    ///
+    /// ```
+    /// use palpate::consistency::energy::{EnergyParams, Graph};
+    /// let places = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [9.0, 0.0, 0.0]];
+    /// let params = EnergyParams { lambda: 1.0, precision_mm: 0.5, strain: 0.25, neighbours: 1 };
+    /// let graph = Graph::new(&places, params);
+    /// // The nearest neighbour of the first place lies 1 mm away: 0.5 + 0.25 mm are allowed.
+    /// assert_eq!(graph.edges[0], [(1, 0.75)]);
+    /// ```
     pub fn new(places: &[[f64; 3]], params: EnergyParams) -> Self {
         let tree = Neighbours::new(places);
         let edges = places
@@ -59,7 +75,7 @@ impl Graph {
             sum += 1.0 - f64::from(c.ncc);
             for &(j, allowed) in edges {
                 if let Some(o) = pick(j) {
-                    sum += self.pair_weight * penalty(c.displacement, o.displacement, allowed);
+                    sum += self.pair_weight * penalty(c.displacement.0, o.displacement.0, allowed);
                 }
             }
         }

@@ -14,7 +14,7 @@ use crate::numerics::ablation;
 use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
 use crate::types::MotionModel;
-use crate::types::space::Matrix3;
+use crate::types::space::{Matrix3, matvec};
 
 /// An affine map `x -> linear x + shift` (mm along the lattice's axes).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,8 +30,17 @@ impl AffineMotion {
     pub const IDENTITY: Self = Self { linear: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], shift: [0.0; 3] };
 
     /// Displacement at `x` (mm).
+    ///
+    /// ```
+    /// use palpate::consistency::models::AffineMotion;
+    /// let mut motion = AffineMotion::IDENTITY;
+    /// assert_eq!(motion.displacement([3.0, 4.0, 5.0]), [0.0; 3]);
+    /// motion.linear[0][0] = 1.5;
+    /// motion.shift = [0.0, 0.0, 2.0];
+    /// assert_eq!(motion.displacement([4.0, 4.0, 5.0]), [2.0, 0.0, 2.0]);
+    /// ```
     pub fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
-        let y = product(&self.linear, x);
+        let y = matvec(&self.linear, x);
         std::array::from_fn(|a| y[a] + self.shift[a] - x[a])
     }
 }
@@ -153,10 +162,6 @@ fn apart(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|c| a[c] - b[c])
 }
 
-fn product(m: &Matrix3, v: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|r| m[r][0] * v[0] + m[r][1] * v[1] + m[r][2] * v[2])
-}
-
 /// One reweighted Gauss-Newton step for `N` parameters; `jacobian(m)` has a column of three a
 /// parameter.
 fn step<const N: usize>(
@@ -191,6 +196,25 @@ fn weights(measured: &[Measured]) -> Vec<Symmetric3> {
 }
 
 /// The rigid motion nearest to what was measured, robustly and weighed by the inverse covariances.
+///
+/// ```
+/// use palpate::consistency::models::nearest_rigid;
+/// use palpate::consistency::pruning::Measured;
+/// // A quarter of a radian about z, seen at eight places.
+/// let (s, c) = 0.25f64.sin_cos();
+/// let turned = |p: [f64; 3]| [c * p[0] - s * p[1] - p[0], s * p[0] + c * p[1] - p[1], 0.0];
+/// let corners = (0..8).map(|i| [0, 1, 2].map(|a| f64::from(i >> a & 1) * 10.0));
+/// let measured: Vec<Measured> = corners
+///     .map(|place| Measured {
+///         place,
+///         displacement: turned(place),
+///         covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
+///         field: turned(place),
+///     })
+///     .collect();
+/// let motion = nearest_rigid(&measured);
+/// assert!((motion.linear[1][0] - s).abs() < 1e-6 && (motion.linear[0][0] - c).abs() < 1e-6);
+/// ```
 pub fn nearest_rigid(measured: &[Measured]) -> AffineMotion {
     fit_rigid(measured, &weights(measured))
 }
@@ -216,7 +240,7 @@ fn fit_rigid(matches: &[Measured], information: &[Symmetric3]) -> AffineMotion {
             information,
             &now,
             |m| {
-                let y = product(&now.linear, m.place);
+                let y = matvec(&now.linear, m.place);
                 [
                     [0.0, -y[2], y[1]],
                     [y[2], 0.0, -y[0]],

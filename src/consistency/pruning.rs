@@ -5,7 +5,8 @@ use crate::numerics::neighbours::Neighbours;
 use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, quadratic};
 use rayon::prelude::*;
 
-/// A match as pruning sees it.
+/// A match as pruning sees it. All its vectors are in one frame, whose axes are at right angles:
+/// that of a lattice, or world mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measured {
     /// Place (mm along the lattice's axes).
@@ -28,6 +29,20 @@ pub const GATE: f64 = 16.27;
 /// an affine fit may miss): the squared Mahalanobis distance to the coupled field, and that to the
 /// affine map fitted to the (at most 24) nearest matches with weights from their distance to the
 /// field, must not pass `gate` (the 99.9 % point of chi-square with 3 degrees of freedom is 16.3).
+///
+/// ```
+/// use palpate::consistency::pruning::{GATE, Measured, prune};
+/// let at = |i: usize, displacement| Measured {
+///     place: [(i % 3) as f64, (i / 3 % 3) as f64, (i / 9) as f64],
+///     displacement,
+///     covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
+///     field: [1.0, 0.0, 0.0],
+/// };
+/// let mut matches: Vec<Measured> = (0..27).map(|i| at(i, [1.0, 0.0, 0.0])).collect();
+/// matches[13] = at(13, [-2.0, 0.0, 0.0]);
+/// let kept = prune(&matches, 0.1, GATE);
+/// assert!(!kept[13] && kept.iter().filter(|k| **k).count() == 26);
+/// ```
 pub fn prune(matches: &[Measured], model_mm: f64, gate: f64) -> Vec<bool> {
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.place).collect();
     let tree = Neighbours::new(&places);

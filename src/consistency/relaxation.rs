@@ -30,6 +30,24 @@ const BETAS: [f64; 12] = [4.0, 4.0, 6.0, 6.0, 9.0, 9.0, 13.0, 13.0, 20.0, 20.0, 
 const LEAST: f64 = 1e-6;
 
 /// Relaxes the candidates (each list best correlation first).
+///
+/// ```
+/// use palpate::consistency::energy::{EnergyParams, Graph};
+/// use palpate::consistency::relaxation::relax;
+/// use palpate::{Candidate, GridVector};
+/// let places: Vec<[f64; 3]> = (0..8).map(|i| [f64::from(i), 0.0, 0.0]).collect();
+/// let graph = Graph::new(
+///     &places,
+///     EnergyParams { lambda: 1.5, precision_mm: 1.0, strain: 0.3, neighbours: 4 },
+/// );
+/// let to = |x, ncc| Candidate { displacement: GridVector([x, 0.0, 0.0]), ncc };
+/// // Everything moves by 2 mm; the third place has a false candidate that correlates better.
+/// let mut candidates = vec![vec![to(2.0, 0.9)]; 8];
+/// candidates[3] = vec![to(-7.0, 0.95), to(2.0, 0.9)];
+/// let relaxed = relax(&graph, &candidates);
+/// assert_eq!(relaxed.chosen[3], 1);
+/// assert!(relaxed.energy_after < relaxed.energy_before);
+/// ```
 pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
     let mut q: Vec<Vec<f64>> =
         candidates.iter().map(|list| softmax(list.iter().map(|c| -8.0 * (1.0 - f64::from(c.ncc))))).collect();
@@ -39,7 +57,7 @@ pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
             .iter()
             .zip(&q)
             .map(|(list, q)| {
-                list.iter().zip(q).filter(|(_, p)| **p > LEAST).map(|(c, p)| (c.displacement, *p)).collect()
+                list.iter().zip(q).filter(|(_, p)| **p > LEAST).map(|(c, p)| (c.displacement.0, *p)).collect()
             })
             .collect();
         q = candidates
@@ -50,7 +68,7 @@ pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
                     let pairs: f64 = edges
                         .iter()
                         .map(|&(j, allowed)| {
-                            likely[j].iter().map(|(o, p)| p * penalty(c.displacement, *o, allowed)).sum::<f64>()
+                            likely[j].iter().map(|(o, p)| p * penalty(c.displacement.0, *o, allowed)).sum::<f64>()
                         })
                         .sum();
                     // Each pair stands in two sums of the energy.

@@ -27,6 +27,15 @@ pub struct Breaking<R> {
 /// that a severity cannot be had at all (`None`): the range ends there.
 ///
 /// What lies past the first break is tried too, but not searched: a curve need not be monotone.
+///
+/// ```
+/// use palpate::evaluate::breaking::{Spread, breaking_point};
+/// let found = breaking_point([0.0, 10.0], Spread::Linear, 5, 6, Some, |severity| *severity > 3.3);
+/// let (holds, breaks) =
+///     (found.holds_at.ok_or("never holds")?, found.breaks_at.ok_or("never breaks")?);
+/// assert!(holds <= 3.3 && breaks > 3.3 && breaks - holds < 0.1);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn breaking_point<R>(
     range: [f64; 2],
     spread: Spread,

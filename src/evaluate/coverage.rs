@@ -13,6 +13,18 @@ const REGIONS: [f64; 2] = [5.991, 7.815];
 /// The share of displacements over `mask` whose error lies in the 95 % region of `sigma` (mm, one
 /// standard deviation along an axis, by voxel): a ball, or a disc for a single slice. None for an
 /// empty mask.
+///
+/// ```
+/// use palpate::evaluate::coverage::coverage;
+/// use palpate::{Affine, DenseField, Grid, Mask};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let (found, truth) = (DenseField::from_fn(grid, |_| [0.3, 0.0, 0.0]), DenseField::zeros(grid));
+/// let mask = Mask::filled(grid, 1);
+/// // 0.3 mm lie within the region of 0.2 mm along an axis, not within that of 0.1 mm.
+/// assert_eq!(coverage(&found, &truth, &|_| 0.2, &mask), Some(1.0));
+/// assert_eq!(coverage(&found, &truth, &|_| 0.1, &mask), Some(0.0));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn coverage(
     field: &DenseField,
     truth: &DenseField,

@@ -67,6 +67,12 @@ fn standing(group: &[&Trial], relative: bool) -> Option<Standing> {
 
 /// Numbers of the places (cost, error) that no other place beats in one without losing in the
 /// other, cheapest first. Places that are not finite are left out.
+///
+/// ```
+/// use palpate::evaluate::frontier::pareto;
+/// // Cost and error: the third place costs more than the second and is no better.
+/// assert_eq!(pareto(&[[4.0, 0.1], [1.0, 0.5], [2.0, 0.5]]), [1, 0]);
+/// ```
 pub fn pareto(places: &[[f64; 2]]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..places.len()).filter(|&i| places[i].iter().all(|v| v.is_finite())).collect();
     order.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]).then(places[a][1].total_cmp(&places[b][1])));

@@ -21,6 +21,20 @@ use rayon::prelude::*;
 /// # Errors
 /// [`FieldError::Volume`] when the maps share no label, or the field is no number where the initial
 /// map lies.
+///
+/// ```
+/// use palpate::evaluate::labels::label_scores;
+/// use palpate::{Affine, DenseField, Grid, Mask};
+/// let grid = Grid::new([12; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let cube = |from: f64| {
+///     Mask::from_voxels(grid, |_, p| u8::from(p.0.iter().all(|x| (from..from + 5.0).contains(x))))
+/// };
+/// let field = DenseField::from_fn(grid, |_| [2.0; 3]);
+/// let scores = label_scores(&field, &cube(2.0), &cube(4.0))?;
+/// assert_eq!(scores.dice_mean, 1.0);
+/// assert!(scores.dice_mean_before < 0.3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn label_scores(field: &DenseField, initial: &Mask, deformed: &Mask) -> Result<LabelScores, FieldError> {
     let grid = initial.grid();
     let place = |at: usize| {

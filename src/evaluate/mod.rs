@@ -39,6 +39,16 @@ const STILL_VOXELS: usize = 1000;
 /// # Errors
 /// [`FieldError::GridMismatch`] when the three do not share one grid, [`FieldError::Volume`] when
 /// the mask is empty, or the truth or the field has voxels in it that are no number.
+///
+/// ```
+/// use palpate::{Affine, DenseField, Grid, evaluate};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let truth = DenseField::from_fn(grid, |_| [3.0, 0.0, 4.0]);
+/// let found = DenseField::from_fn(grid, |_| [3.0, 0.5, 4.0]);
+/// let m = evaluate::metrics(&found, &truth, None, &[])?;
+/// assert_eq!((m.mean_mm, m.identity_mm, m.voxels), (0.5, 5.0, 512));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn metrics(
     field: &DenseField,
     truth: &DenseField,
@@ -90,6 +100,17 @@ pub fn metrics(
 /// # Errors
 /// [`FieldError::GridMismatch`] when the mask lies on another grid, [`FieldError::Volume`] when a
 /// field is no number where it counts, or no voxel of the mask ends within the second grid.
+///
+/// ```
+/// use palpate::evaluate::inverse_consistency;
+/// use palpate::field::inverse::invert;
+/// use palpate::{Affine, DenseField, Grid};
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [-7.5; 3])?)?;
+/// let forward = DenseField::from_fn(grid, |p| [-0.1 * p.0[0], -0.1 * p.0[1], 0.0]);
+/// let backward = invert(&forward, None).field;
+/// assert!(inverse_consistency(&forward, &backward, None)?.inverse_mean_mm < 0.02);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn inverse_consistency(
     forward: &DenseField,
     backward: &DenseField,
@@ -130,12 +151,28 @@ pub fn inverse_consistency(
 }
 
 /// The error at each landmark: |initial + u(initial) - deformed| (mm), in the order given.
+///
+/// ```
+/// use palpate::{Affine, DenseField, Grid, Landmark, WorldPoint, evaluate};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |_| [1.0, 0.0, 0.0]);
+/// let mark =
+///     Landmark { initial: WorldPoint([2.0, 2.0, 2.0]), deformed: WorldPoint([3.0, 2.0, 4.0]) };
+/// assert_eq!(evaluate::landmarks(&field, &[mark]), [2.0]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn landmarks(field: &DenseField, landmarks: &[Landmark]) -> Vec<f64> {
     let error = |l: &Landmark| length(l.initial.moved(displacement(field, l.initial)).minus(l.deformed));
     landmarks.iter().map(error).collect()
 }
 
 /// Mean, median, 95th percentile and largest of `values` (mm), which are reordered.
+///
+/// ```
+/// use palpate::evaluate::distances;
+/// let d = distances(&mut [3.0, 1.0, 2.0, 6.0]);
+/// assert_eq!((d.mean_mm, d.median_mm, d.max_mm), (3.0, 2.5, 6.0));
+/// ```
 pub fn distances(values: &mut [f64]) -> Distances {
     Distances {
         mean_mm: mean(values),
@@ -151,6 +188,16 @@ pub fn distances(values: &mut [f64]) -> Distances {
 /// # Errors
 /// [`FieldError::TooFew`] without a landmark, [`FieldError::Volume`] when the field is no number at
 /// one.
+///
+/// ```
+/// use palpate::{Affine, DenseField, FieldError, Grid, evaluate};
+/// let field = DenseField::zeros(Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?);
+/// assert!(matches!(
+///     evaluate::target_error(&field, &[]),
+///     Err(FieldError::TooFew { found: 0, .. })
+/// ));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn target_error(field: &DenseField, marks: &[Landmark]) -> Result<TargetError, FieldError> {
     if marks.is_empty() {
         return Err(FieldError::TooFew { found: 0, what: "landmarks", needed: 1, hint: "give one at least".into() });

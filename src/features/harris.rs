@@ -31,6 +31,23 @@ const VALUES: usize = 5 << 20;
 /// axis, so anisotropic voxels weigh right. The measure is the inverse of the variance with which
 /// the place can be matched (Foerstner & Guelch 1987), needs no constant `k`, and is low on edges
 /// and planes. For one slice the in-plane 2 x 2 form is used.
+///
+/// ```
+/// use palpate::features::{HarrisParams, response};
+/// // A bright octant has one corner, at the middle of the volume.
+/// let shape = [16, 16, 16];
+/// let octant: Vec<f32> = (0..4096usize)
+///     .map(|o| f32::from(u8::from([o % 16, o / 16 % 16, o / 256].iter().all(|&v| v >= 8))))
+///     .collect();
+/// let measure = response(&octant, shape, [1.0; 3], HarrisParams::default());
+/// let (best, _) = measure.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1)).ok_or("empty")?;
+/// assert!([best % 16, best / 16 % 16, best / 256].iter().all(|&v| (6..=10).contains(&v)));
+/// // A constant volume has none.
+/// assert!(
+///     response(&[3.0; 4096], shape, [1.0; 3], HarrisParams::default()).iter().all(|&v| v == 0.0)
+/// );
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn response(data: &[f32], shape: [usize; 3], spacing: [f64; 3], params: HarrisParams) -> Vec<f32> {
     let finest = pyramid::finest(shape, spacing);
     let smooth = gaussian(data, shape, spacing.map(|s| params.derivative_sigma * finest / s));

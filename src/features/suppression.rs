@@ -2,13 +2,14 @@
 
 use crate::features::harris;
 use crate::numerics::pyramid::reduced_shape;
+use crate::types::VoxelPoint;
 use rayon::prelude::*;
 
 /// A corner in voxels of the volume it was found in.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Corner {
     /// Sub-voxel position.
-    pub voxel: [f64; 3],
+    pub voxel: VoxelPoint,
     /// The voxel it was found at.
     pub centre: [usize; 3],
     /// Response, (intensity/mm)^2.
@@ -22,6 +23,18 @@ pub struct Corner {
 /// Szeliski & Winder 2005 have the same aim). Global ranking would crowd the points on the
 /// brightest structure: measured, five times fewer usable points. Positions are refined by a
 /// parabola along each axis. The result's order does not depend on threads.
+///
+/// ```
+/// use palpate::features::spread;
+/// // Two maxima, the second one next to a high neighbour.
+/// let mut response = vec![0.0f32; 512];
+/// let at = |x: usize| x + 8 * (4 + 8 * 4);
+/// (response[at(2)], response[at(5)], response[at(6)]) = (1.0, 3.0, 2.0);
+/// let corners = spread(&response, [8; 3], [1.0; 3], None, 10, 0.5);
+/// assert_eq!(corners.len(), 2);
+/// let x: Vec<f64> = corners.iter().map(|c| c.voxel.0[0]).collect();
+/// assert!(x.contains(&2.0) && x.iter().any(|x| *x > 5.0 && *x < 5.5));
+/// ```
 pub fn spread(
     response: &[f32],
     shape: [usize; 3],
@@ -121,7 +134,7 @@ fn maxima(response: &[f32], shape: [usize; 3], from: usize, mask: Option<&[u8]>,
                 let inside = || mask.is_none_or(|m| m[skipped + at] != 0);
                 if response[at] > least && inside() && is_maximum(response, shape, [i, j, k]) {
                     let (centre, top) = ([i, j, k + from], refine(response, shape, [i, j, k]));
-                    let voxel = std::array::from_fn(|a| centre[a] as f64 + top[a]);
+                    let voxel = VoxelPoint(std::array::from_fn(|a| centre[a] as f64 + top[a]));
                     found.push(Corner { voxel, centre, response: response[at] });
                 }
             }

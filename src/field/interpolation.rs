@@ -43,6 +43,22 @@ pub struct Interpolated {
 ///
 /// # Errors
 /// [`MeshError::Length`] when there are not as many displacements as nodes.
+///
+/// ```
+/// use palpate::field::interpolation::interpolate_tetrahedra;
+/// use palpate::mesh::delaunay3::delaunay3;
+/// use palpate::{Affine, Grid, WorldPoint};
+/// let grid = Grid::new([9; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let corners: Vec<WorldPoint> =
+///     (0..8).map(|i| WorldPoint([0, 1, 2].map(|a| 6.0 * f64::from(i >> a & 1)))).collect();
+/// let mesh = delaunay3(&corners)?.mesh;
+/// // A stretch along x is linear, so it comes back as it is.
+/// let at_nodes: Vec<[f64; 3]> = corners.iter().map(|p| [0.5 * p.0[0], 0.0, 0.0]).collect();
+/// let found = interpolate_tetrahedra(&mesh, &at_nodes, &grid)?;
+/// assert_eq!(found.displacement.at(grid.index(4, 2, 3)), [2.0, 0.0, 0.0]);
+/// assert_eq!(found.inside.as_slice()[grid.index(8, 2, 3)], 0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn interpolate_tetrahedra(
     mesh: &TetMesh,
     displacement: &[[f64; 3]],
@@ -57,6 +73,20 @@ pub fn interpolate_tetrahedra(
 /// # Errors
 /// [`MeshError::Length`] as above; [`MeshError::NotOneSlice`] when the grid is thicker than one
 /// voxel along every axis.
+///
+/// ```
+/// use palpate::field::interpolation::interpolate_triangles;
+/// use palpate::mesh::delaunay2::delaunay2;
+/// use palpate::{Affine, Grid, WorldPoint};
+/// let slice = Grid::new([9, 9, 1], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let corners =
+///     [[0.0, 0.0], [8.0, 0.0], [8.0, 8.0], [0.0, 8.0]].map(|[x, y]| WorldPoint([x, y, 0.0]));
+/// let mesh = delaunay2(&corners)?.mesh;
+/// let at_nodes = corners.map(|p| [0.0, 0.25 * p.0[1], 0.0]);
+/// let found = interpolate_triangles(&mesh, &at_nodes, &slice)?;
+/// assert_eq!(found.displacement.at(slice.index(3, 4, 0)), [0.0, 1.0, 0.0]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn interpolate_triangles(
     mesh: &TriMesh,
     displacement: &[[f64; 3]],

@@ -35,6 +35,19 @@ pub struct Inverse {
 }
 
 /// The inverse of `field` on `grid` (the field's own when `None`).
+///
+/// ```
+/// use palpate::field::inverse::invert;
+/// use palpate::{Affine, DenseField, Grid};
+/// let grid = Grid::new([24; 3], Affine::scaled([1.0; 3], [-11.5; 3])?)?;
+/// // y = 1.25 x has the inverse x = 0.8 y.
+/// let stretch = DenseField::from_fn(grid, |p| [0.25 * p.0[0], 0.0, 0.0]);
+/// let inverse = invert(&stretch, None);
+/// let at = grid.index(16, 12, 12);
+/// assert!((f64::from(inverse.field.at(at)[0]) + 0.2 * grid.centre(at).0[0]).abs() < 1e-4);
+/// assert_eq!(inverse.folds, 0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn invert(field: &DenseField, grid: Option<&Grid>) -> Inverse {
     let target = *grid.unwrap_or(field.grid());
     let inverse = DenseField::from_voxels(target, |_, y| origin_of(field, y, TOLERANCE_MM).minus(y));

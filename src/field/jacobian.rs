@@ -13,6 +13,16 @@ use std::collections::BTreeSet;
 
 /// The Jacobian determinant of x + u(x) with respect to world mm (1): 1 = volume kept, at or below
 /// 0 = folded.
+///
+/// ```
+/// use palpate::field::jacobian::jacobian_determinant;
+/// use palpate::{Affine, DenseField, Grid};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |p| [0.5 * p.0[0], -0.2 * p.0[1], 0.0]);
+/// let determinant = jacobian_determinant(&field);
+/// assert!(determinant.as_slice().iter().all(|j| (j - 1.5 * 0.8).abs() < 1e-5));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn jacobian_determinant(field: &DenseField) -> Volume {
     Volume::by_rows(*field.grid(), |first, out| determinant_rows(field, first, out))
 }
@@ -37,6 +47,17 @@ pub fn determinant_at(field: &DenseField, offset: usize) -> f32 {
 ///
 /// # Errors
 /// [`FieldError::GridMismatch`] when the mask has another shape.
+///
+/// ```
+/// use palpate::field::jacobian::count_folds;
+/// use palpate::{Affine, DenseField, Grid};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let squeezed = |factor: f64| DenseField::from_fn(grid, |p| [-factor * p.0[0], 0.0, 0.0]);
+/// assert_eq!(count_folds(&squeezed(0.9), None)?, 0);
+/// // Past a factor of one the tissue is turned inside out.
+/// assert_eq!(count_folds(&squeezed(1.1), None)?, grid.len());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn count_folds(field: &DenseField, mask: Option<&Mask>) -> Result<usize, FieldError> {
     Ok(folds(field, mask)?.len())
 }

@@ -58,8 +58,7 @@ fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
 
 /// Unit vectors along the grid's axes, one a column (world RAS).
 pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
-    let (spacing, linear) = (grid.spacing(), grid.affine().linear());
-    std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
+    grid.axes()
 }
 
 /// The nodes of a lattice over `grid` as a grid of their own.

@@ -12,6 +12,20 @@ use crate::types::{Displacement, Grid, Volume, Voxels, WorldPoint};
 
 /// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background`
 /// outside the image.
+///
+/// ```
+/// use palpate::field::warp::warp_image;
+/// use palpate::numerics::sampling::Interpolation;
+/// use palpate::{Affine, DenseField, Grid, Volume};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let deformed = Volume::from_voxels(grid, |_, p| p.0[0] as f32);
+/// let field = DenseField::from_fn(grid, |_| [2.0, 0.0, 0.0]);
+/// let warped = warp_image(&deformed, &field, None, Interpolation::Linear, -1.0);
+/// assert_eq!(warped.as_slice()[grid.index(3, 4, 4)], 5.0);
+/// // Two voxels further there is no image.
+/// assert_eq!(warped.as_slice()[grid.index(7, 4, 4)], -1.0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn warp_image(
     image: &Voxels<'_>,
     field: &Displacement<'_>,
@@ -74,6 +88,17 @@ pub fn warped_at(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, 
 
 /// As [`warp_image`] by nearest neighbour, for labels or masks: no value appears that was not
 /// there.
+///
+/// ```
+/// use palpate::field::warp::warp_labels;
+/// use palpate::{Affine, DenseField, Grid, Mask};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let labels = Mask::from_voxels(grid, |_, p| if p.0[0] < 4.0 { 3 } else { 9 });
+/// let field = DenseField::from_fn(grid, |_| [1.4, 0.0, 0.0]);
+/// let warped = warp_labels(&labels, &field, None, 0);
+/// assert_eq!([2, 3].map(|i| warped.as_slice()[grid.index(i, 0, 0)]), [3, 9]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn warp_labels<T: Copy + Default + Send + Sync>(
     labels: &Volume<T>,
     field: &Displacement<'_>,
@@ -87,6 +112,16 @@ pub fn warp_labels<T: Copy + Default + Send + Sync>(
 }
 
 /// p + u(p) with u trilinear at each point (world mm), `None` for a point outside the field's grid.
+///
+/// ```
+/// use palpate::field::warp::warp_points;
+/// use palpate::{Affine, DenseField, Grid, WorldPoint};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |p| [0.0, 0.0, p.0[0]]);
+/// let moved = warp_points(&[WorldPoint([2.5, 1.0, 1.0]), WorldPoint([99.0, 0.0, 0.0])], &field);
+/// assert_eq!(moved, [Some(WorldPoint([2.5, 1.0, 3.5])), None]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn warp_points(points: &[WorldPoint], field: &Displacement<'_>) -> Vec<Option<WorldPoint>> {
     points.iter().map(|&p| warp_point(p, field)).collect()
 }

@@ -7,6 +7,7 @@
 //! `F(d) = sum A (d - gap)+ / sum(dz / E)`. For a uniform hemisphere this is `pi E d^2`.
 
 use crate::error::FingertipError;
+use crate::numerics::dense::dot;
 use crate::types::Volume;
 use crate::types::fingertip::{Column, PadModel, PadReduction, PlateCurve};
 
@@ -22,6 +23,20 @@ const FEWEST: usize = 20;
 ///
 /// # Errors
 /// [`FingertipError`] when no column meets bone, or too few have tissue.
+///
+/// ```
+/// use palpate::fingertip::columns;
+/// use palpate::{Affine, Grid, Volume};
+/// // Tissue of 40 kPa, 8 mm thick, under it bone.
+/// let grid = Grid::new([10, 10, 12], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let map = Volume::from_voxels(grid, |_, p| if p.0[2] < 8.0 { 40.0 } else { 15_000.0 });
+/// let columns = columns(&map, |o| map.as_slice()[o] > 10_000.0, 2, false)?;
+/// assert_eq!(columns.len(), 100);
+/// assert!(
+///     (columns[0].length - 8.0).abs() < 1e-9 && (columns[0].compliance - 8.0 / 40.0).abs() < 1e-9
+/// );
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn columns(
     modulus: &Volume,
     bone: impl Fn(usize) -> bool,
@@ -69,6 +84,18 @@ pub fn columns(
 }
 
 /// Force of the columns on a plate pressed in by `depth` mm (N, with moduli in kPa).
+///
+/// ```
+/// use palpate::fingertip::{columns, force};
+/// use palpate::{Affine, Grid, Volume};
+/// // Tissue of 40 kPa, 8 mm thick, under it bone.
+/// let grid = Grid::new([10, 10, 12], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let map = Volume::from_voxels(grid, |_, p| if p.0[2] < 8.0 { 40.0 } else { 15_000.0 });
+/// let columns = columns(&map, |o| map.as_slice()[o] > 10_000.0, 2, false)?;
+/// // 100 mm^2 at a strain of 1/8: 40 kPa * 1e-4 m^2 / 8 = 0.5 N.
+/// assert!((force(&columns, 1.0) - 0.5).abs() < 1e-9);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn force(columns: &[Column], depth: f64) -> f64 {
     columns.iter().map(|c| 1e-3 * c.area * (depth - c.gap).max(0.0) / c.compliance).sum()
 }
@@ -83,6 +110,20 @@ fn uniform_force(columns: &[Column], modulus: f64, depth: f64) -> f64 {
 /// `deepest` is the indentation up to which they are compared (mm). Layered means that all columns
 /// have the compliance of a mean column of their length, `length * p + q`: a surface layer of one
 /// thickness over a uniform rest.
+///
+/// ```
+/// use palpate::fingertip::{columns, reduce};
+/// use palpate::types::fingertip::PadModel;
+/// use palpate::{Affine, Grid, Volume};
+/// // Tissue of 40 kPa, 8 mm thick, under it bone.
+/// let grid = Grid::new([10, 10, 12], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let map = Volume::from_voxels(grid, |_, p| if p.0[2] < 8.0 { 40.0 } else { 15_000.0 });
+/// let columns = columns(&map, |o| map.as_slice()[o] > 10_000.0, 2, false)?;
+/// let pad = reduce(&columns, 2.0);
+/// assert_eq!(pad.model, PadModel::Uniform);
+/// assert!((pad.effective_kpa - 40.0).abs() < 1e-6);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     let depths: Vec<f64> = (1..=24).map(|i| deepest * f64::from(i) / 24.0).collect();
     let map: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
@@ -137,10 +178,6 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     }
 }
 
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
 /// Relative distance of the forces of a model from `truth` (1).
 fn distance(model: &[f64], truth: &[f64]) -> f64 {
     let off: Vec<f64> = model.iter().zip(truth).map(|(m, f)| m - f).collect();
@@ -191,6 +228,14 @@ const LEAST: f64 = 0.02;
 
 /// Force (N) at `depth` (mm) of a hemisphere with moduli (kPa) by the depth at which its springs
 /// are reached: `F = int 2 pi E(s) (d - s) ds`, whatever its radius.
+///
+/// ```
+/// use palpate::fingertip::profile_force;
+/// // A constant modulus of 30 kPa presses as pi E d^2.
+/// let flat = [[0.0, 30.0], [4.0, 30.0]];
+/// let exact = 1e-3 * std::f64::consts::PI * 30.0 * 2.0 * 2.0;
+/// assert!((profile_force(&flat, 2.0) / exact - 1.0).abs() < 1e-3);
+/// ```
 pub fn profile_force(profile: &[[f64; 2]], depth: f64) -> f64 {
     (0..profile.len()).map(|k| profile[k][1] * hat_force(profile, k, depth)).sum()
 }

@@ -26,6 +26,19 @@ const MOST: usize = 4;
 
 /// The table for all models, at the pinch of a scene: both fingers, one with the other locked, and
 /// a right finger of two joints, whose link is cut in half where the scene has it in one.
+///
+/// ```
+/// use palpate::grasp::degrees_of_freedom::table;
+/// use palpate::{FingertipModel, Scene};
+/// let rows = table(&Scene::reference());
+/// let soft = rows
+///     .iter()
+///     .find(|r| r.model == FingertipModel::Parallel && r.joints == [1, 1])
+///     .ok_or("no row")?;
+/// // Two fingers of one joint with soft tips set grasp and posture at once.
+/// assert_eq!(soft.controls(), "grasp and posture");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn table(scene: &Scene) -> Vec<Freedom> {
     let own = scene.fingers().map(|f| if f.upper.is_some() { 2 } else { 1 });
     let mut cases = vec![[1, 1], [1, 0], [1, 2]];

@@ -4,10 +4,11 @@
 //! Source: S. Hirai, "How Softness Contributes to Human Dexterity" (slides, with T. Inoue);
 //! docs/reference/grasp.md has every equation and two signs of the slides that had to be settled.
 //! Order: [`models`] (fingertips), [`constraints`] (where they touch), [`statics`] (equilibria),
-//! [`control`], [`plant`] (forces), [`minimal`] and [`multipliers`] (equations of motion),
+//! [`control`], [`dynamics`] (forces), [`minimal`] and [`multipliers`] (equations of motion),
 //! [`relaxing`] (tips that relax), [`friction`] and [`sliding`] (tips that slide), [`integrators`],
-//! [`stepping`] (which step is stable), [`watch`] and [`branch`] (what can fail), [`simulate`] (the
-//! loop), then the analyses: [`stability`], [`freedom`], [`pinch`], [`posture`], [`measured`].
+//! [`stepping`] (which step is stable), [`run_checks`] and [`equilibrium_branch`] (what can fail),
+//! [`simulate`] (the loop), then the analyses: [`stability`], [`degrees_of_freedom`], [`pinch`],
+//! [`posture`], [`measured`].
 //!
 //! Promises: SI units and radians everywhere; the same bits for the same scene; the object's pose
 //! is never fed back. Needs a scene that passes [`crate::types::Scene::check`]. Fails by name:

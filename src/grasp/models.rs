@@ -254,6 +254,14 @@ pub fn tip_of(fingertip: &Fingertip, model: FingertipModel) -> Box<dyn Tip> {
 /// Exact energy of springs along the radii of a hemisphere of radius `a` (m) that is pressed flat
 /// by `d` (m): pi E a^3 (1 - c^2 + 2 c ln c) with c = 1 - d / a (J). [`Radial`] is its first term
 /// in d / a.
+///
+/// ```
+/// use palpate::grasp::models::exact_radial_energy;
+/// // For a small press the first term is left: pi E d^3 / 3.
+/// let (radius, e, d) = (0.01, 30e3, 1e-5);
+/// let first = std::f64::consts::PI * e * d * d * d / 3.0;
+/// assert!((exact_radial_energy(radius, e, d) / first - 1.0).abs() < 1e-2);
+/// ```
 pub fn exact_radial_energy(radius: f64, youngs_modulus: f64, d: f64) -> f64 {
     let part = d / radius;
     // 1 - c^2 and ln c without the difference to 1.

@@ -36,6 +36,17 @@ const MOST_EVENTS: usize = 1000;
 /// # Errors
 /// [`GraspError`] where nothing can be simulated: a scene out of range, no stable equilibrium at
 /// the start, or a step or stabilisation gain that is unstable from the start.
+///
+/// ```
+/// use palpate::Scene;
+/// use palpate::grasp::simulate::simulate;
+/// let mut scene = Scene::reference();
+/// scene.motions.truncate(1);
+/// let run = simulate(&scene, &|_| {})?;
+/// assert!(run.completed && run.outcome() == "held");
+/// assert_eq!(run.motions.len(), 2);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn simulate(scene: &Scene, progress: Progress<'_>) -> Result<GraspRun, GraspError> {
     attempt(scene, progress, true)
 }

@@ -36,6 +36,13 @@ pub fn postures(scene: &Scene, model: FingertipModel) -> Vec<(usize, [f64; 2], R
 }
 
 /// What the eigenvalues of a Hessian mean, from the smallest to the largest.
+///
+/// ```
+/// use palpate::grasp::stability::classify;
+/// use palpate::types::grasp::Stability;
+/// assert_eq!(classify(&[0.5, 2.0]), Stability::Minimum);
+/// assert_eq!(classify(&[-0.5, 2.0]), Stability::Saddle);
+/// ```
 pub fn classify(eigenvalues: &[f64]) -> Stability {
     let largest = eigenvalues.iter().fold(0.0, |l: f64, v| l.max(v.abs()));
     let [low, high] = match eigenvalues {

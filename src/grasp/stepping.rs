@@ -103,6 +103,13 @@ pub fn growth_of<const N: usize, S: Form<N>>(
 
 /// Largest value between `low` and `high` up to which `stable` holds, to 1 %; `low` where it does
 /// not hold even there.
+///
+/// ```
+/// use palpate::grasp::stepping::largest;
+/// // Stable up to a step of 0.3.
+/// let found = largest(1e-6, 1.0, |h| h < 0.3);
+/// assert!((found / 0.3 - 1.0).abs() < 0.02);
+/// ```
 pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
     let (mut good, mut bad) = (low, low);
     // Upwards in factors of 1.5, so that an island of stability further up is not taken for the

@@ -18,6 +18,18 @@ const LONGEST: u64 = 1 << 24;
 /// # Errors
 /// [`IoError`] when the file cannot be read or is neither, a key is unknown (with the nearest known
 /// one), or a value is of a wrong type or out of range.
+///
+/// ```
+/// use palpate::io;
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("run.toml");
+/// std::fs::write(&path, "preset = \"fast\"\nsearch_mm = 12.0\n")?;
+/// assert_eq!(io::read_config(&path)?.search_mm, 12.0);
+/// // A slip of the keyboard is answered with the nearest key.
+/// std::fs::write(&path, "serch_mm = 12.0\n")?;
+/// assert!(io::read_config(&path).is_err_and(|e| e.to_string().contains("search_mm")));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn read_config(path: impl AsRef<Path>) -> Result<FieldParams, IoError> {
     let path = path.as_ref();
     let text = source::keyed(path, LONGEST, source::MOST_VALUES)?;

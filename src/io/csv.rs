@@ -69,6 +69,24 @@ pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
+///
+/// ```
+/// use palpate::{Match, SparseField, WorldPoint, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("matches.csv");
+/// let m = Match {
+///     initial: WorldPoint([1.0, 2.0, 3.0]),
+///     displacement: [0.5, 0.0, -0.25],
+///     ncc: 0.75,
+///     covariance: [0.25, 0.25, 0.25, 0.0, 0.0, 0.0],
+///     kept: true,
+///     raw: None,
+/// };
+/// let field = SparseField { matches: vec![m] };
+/// io::write_matches(&path, &field)?;
+/// assert_eq!(io::read_matches(&path)?, field);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_matches(path: impl AsRef<Path>, field: &SparseField) -> Result<(), IoError> {
     let rows = field.matches.iter().map(|m| {
         let numbers = [&m.initial.0[..], &m.displacement, &[f64::from(m.ncc), m.sigma()]].concat();
@@ -165,6 +183,17 @@ pub fn read_landmark_pair(initial: impl AsRef<Path>, deformed: impl AsRef<Path>)
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
+///
+/// ```
+/// use palpate::{Landmark, WorldPoint, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("landmarks.csv");
+/// let marks =
+///     [Landmark { initial: WorldPoint([1.0, 2.0, 3.0]), deformed: WorldPoint([1.5, 2.0, 3.0]) }];
+/// io::write_landmarks(&path, &marks)?;
+/// assert_eq!(io::read_landmarks(&path)?, marks);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_landmarks(path: impl AsRef<Path>, landmarks: &[Landmark]) -> Result<(), IoError> {
     let rows = landmarks.iter().map(|l| [l.initial.0, l.deformed.0].concat().into_iter().map(decimal).collect());
     write_table(path.as_ref(), &LANDMARK_COLUMNS, rows)
@@ -175,6 +204,17 @@ pub fn write_landmarks(path: impl AsRef<Path>, landmarks: &[Landmark]) -> Result
 ///
 /// # Errors
 /// As [`read_landmarks`].
+///
+/// ```
+/// use palpate::{WorldPoint, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("points.csv");
+/// std::fs::write(&path, "x,y,z,name\n1,2,3,apex\n")?;
+/// let table = io::read_points(&path)?;
+/// assert_eq!(table.points, [WorldPoint([1.0, 2.0, 3.0])]);
+/// assert_eq!(table.others[0], ["apex"]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn read_points(path: impl AsRef<Path>) -> Result<PointTable, IoError> {
     if markups::is_slicer(path.as_ref()) {
         return markups::read(path.as_ref());

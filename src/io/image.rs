@@ -186,6 +186,14 @@ pub(super) fn others(path: &Path) -> Vec<PathBuf> {
 /// # Errors
 /// [`IoError`] when the file cannot be read, is cut short or damaged, or is not a scalar volume of
 /// numbers.
+///
+/// ```
+/// use palpate::{IoError, io};
+/// let folder = tempfile::tempdir()?;
+/// let missing = io::read_volume(folder.path().join("missing.nii.gz"));
+/// assert!(missing.is_err_and(|e: IoError| e.to_string().contains("missing.nii.gz")));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
     let path = path.as_ref();
     let (grid, values) = match Format::of(path)? {

@@ -33,6 +33,19 @@ impl OutputFolder {
     /// # Errors
     /// [`IoError`] when `path` is a file, cannot be created or written, or holds files and `force`
     /// is not set.
+    ///
+    /// ```
+    /// use palpate::io::{OutputFolder, write_text};
+    /// let parent = tempfile::tempdir()?;
+    /// let path = parent.path().join("results");
+    /// let mut folder = OutputFolder::create(&path, false)?;
+    /// folder.write("note.txt", |file| write_text(file, "done"))?;
+    /// folder.commit()?;
+    /// assert!(path.join("note.txt").is_file());
+    /// // A folder that holds something is not written over.
+    /// assert!(OutputFolder::create(&path, false).is_err());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn create(path: impl AsRef<Path>, force: bool) -> Result<Self, IoError> {
         let path = path.as_ref();
         Self::check(path, force)?;

@@ -90,6 +90,14 @@ const MOST_CASES: usize = 100_000;
 /// [`IoError`] when the file or its fingertip file cannot be read or is no TOML, a key is unknown
 /// (with the nearest known one), missing or of a wrong type, or a value of any case is out of
 /// range.
+///
+/// ```
+/// use palpate::io::{SceneOverrides, read_scene};
+/// let path = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/eight_motions.toml");
+/// let file = read_scene(path, &SceneOverrides::default())?;
+/// assert_eq!(file.scene.motions.len(), 8);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<SceneFile, IoError> {
     let path = path.as_ref();
     let mut table = read_table(path)?;

@@ -52,6 +52,13 @@ struct RawBlock {
 /// # Errors
 /// [`IoError`] when the file cannot be read or is no TOML, a key is unknown (with the nearest known
 /// one), missing or of a wrong type, or a value is out of range.
+///
+/// ```
+/// use palpate::io::read_skin_scene;
+/// let scene = read_skin_scene(concat!(env!("CARGO_MANIFEST_DIR"), "/examples/skin.toml"))?;
+/// assert_eq!(scene.layers.len(), 3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
     let path = path.as_ref();
     let table = read_table(path)?;

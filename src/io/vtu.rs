@@ -27,6 +27,18 @@ const VTK_QUADRATIC_TETRA: u8 = 24;
 ///
 /// # Errors
 /// [`IoError`] when a length does not fit the mesh or the file cannot be written.
+///
+/// ```
+/// use palpate::mesh::delaunay3::delaunay3;
+/// use palpate::{WorldPoint, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("mesh.vtu");
+/// let corners: Vec<WorldPoint> =
+///     (0..8).map(|i| WorldPoint([0, 1, 2].map(|a| f64::from(i >> a & 1)))).collect();
+/// io::write_tet_mesh(&path, &delaunay3(&corners)?.mesh, &[[0.0; 3]; 8], &[])?;
+/// assert!(io::read_text(&path)?.contains("UnstructuredGrid"));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_tet_mesh(
     path: impl AsRef<Path>,
     mesh: &TetMesh,

@@ -17,6 +17,7 @@
 use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
 use crate::numerics::cholesky::Cholesky;
+use crate::numerics::dense::dot;
 use crate::numerics::exponential::{WHOLE, exp, ln};
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::simd::dispatch;
@@ -397,10 +398,6 @@ fn between_neighbours(blocks: &[Block], values: [&dyn Fn(&Block) -> f64; 2]) -> 
         });
         percentile(&mut beside.collect::<Vec<_>>(), 50.0)
     })
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Terms of place, then of tone where the brightness is scaled for them, with Cauchy weights; and

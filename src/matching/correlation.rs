@@ -232,6 +232,25 @@ impl<'a> Searchable<'a> {
     /// Shifts whose patch leaves the volume do not take part. Exhaustive where `reach` is short;
     /// along y and z, where it is not, every second shift is looked at and then all that lie beside
     /// the best of these: a patch of a smoothed volume is still like itself a voxel away.
+    ///
+    /// ```
+    /// use palpate::matching::correlation::Searchable;
+    /// // The same random texture, two voxels further along x.
+    /// let texture = |x: i64, y: i64, z: i64| {
+    ///     ((x * 7 + y * 101 + z * 1009) * 1_103_515_245 >> 8 & 255) as f32
+    /// };
+    /// let volume = |shift: i64| -> Vec<f32> {
+    ///     (0..4096).map(|o| texture(o % 16 - shift, o / 16 % 16, o / 256)).collect()
+    /// };
+    /// let (fixed, moving) = (volume(0), volume(2));
+    /// let (here, there) =
+    ///     (Searchable::new(&fixed, [16; 3], [2; 3]), Searchable::new(&moving, [16; 3], [2; 3]));
+    /// let template = here.template([8, 8, 8]).ok_or("no texture")?;
+    /// let found = there.search(&template, [8, 8, 8], [3; 3], 1);
+    /// assert_eq!(found[0].offset, [2, 0, 0]);
+    /// assert!(found[0].ncc > 0.999);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn search(&self, template: &Template, centre: [i64; 3], reach: [usize; 3], keep: usize) -> Vec<Peak> {
         // Shifts whose patch lies inside, along each axis.
         let within: [[i64; 2]; 3] = std::array::from_fn(|a| {

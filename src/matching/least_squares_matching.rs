@@ -9,6 +9,7 @@
 
 use crate::numerics::simd::{self, dispatch};
 use crate::numerics::symmetric3::{Symmetric3, inverse, multiply};
+use crate::types::GridVector;
 
 /// Noise of neighbouring voxels after the cubic B-spline is alike; a patch holds that many times
 /// fewer independent voxels: 1 / sum(k^2) of the kernel, 2 along each axis.
@@ -17,8 +18,8 @@ pub const CORRELATION: f64 = 2.0;
 /// A match found.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refined {
-    /// What has to be added to the start (mm along the lattice's axes).
-    pub shift: [f64; 3],
+    /// What has to be added to the start, along the lattice's axes.
+    pub shift: GridVector,
     /// Covariance of the displacement (mm^2).
     pub covariance: Symmetric3,
     /// Correlation of the patches at the end.
@@ -121,7 +122,11 @@ pub fn refine(
         covariance[a] = 0.0;
         shift[a] = 0.0;
     }
-    (ncc.is_finite() && covariance.iter().all(|v| v.is_finite())).then_some(Refined { shift, covariance, ncc })
+    (ncc.is_finite() && covariance.iter().all(|v| v.is_finite())).then_some(Refined {
+        shift: GridVector(shift),
+        covariance,
+        ncc,
+    })
 }
 
 /// The patch less its mean, its gradients (per mm) less what a change of offset (their mean) or of

@@ -37,31 +37,18 @@ impl<'a> Aligned<'a> {
         mask: &'a Mask,
         reach_mm: f64,
     ) -> Result<Self, FieldError> {
-        let (g, m) = (initial.grid(), deformed.grid());
-        let spacing = g.spacing();
-        let [lo, hi] = overlap(g, m, reach_mm)?;
-        let same_axes = (0..3)
-            .all(|r| (0..3).all(|c| (g.affine().linear()[r][c] - m.affine().linear()[r][c]).abs() < 1e-4 * spacing[c]));
-        let base = Self {
+        let g = initial.grid();
+        let OnAxes { values, shape, origin } = OnAxes::of(g, deformed, reach_mm)?;
+        Ok(Self {
             shape: g.shape(),
-            spacing,
+            spacing: g.spacing(),
             fixed: initial.as_slice().into(),
             mask: mask.as_slice().into(),
-            moving_shape: m.shape(),
-            moving_origin: g.affine().to_voxel(m.affine().origin()).0,
-            moving: Cow::Borrowed(&[]),
+            moving_shape: shape,
+            moving_origin: origin,
+            moving: values,
             anchors: Vec::new(),
-        };
-        if same_axes {
-            return Ok(Self { moving: deformed.as_slice().into(), ..base });
-        }
-        // A slice stays one, whatever rounding has made of its place.
-        let flat = |a: usize| g.shape()[a] == 1;
-        let origin = std::array::from_fn(|a| if flat(a) { 0.0 } else { lo[a].floor() });
-        let extent = |a: usize| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1;
-        let shape = std::array::from_fn(|a| if flat(a) { 1 } else { extent(a) });
-        let moving = resample(deformed, g, origin, shape)?;
-        Ok(Self { moving_shape: shape, moving_origin: origin, moving: moving.into(), ..base })
+        })
     }
 
     /// With landmarks, in voxels of the initial grid.
@@ -123,6 +110,36 @@ impl<'a> Aligned<'a> {
     }
 }
 
+/// A volume on the axes of another grid.
+pub(super) struct OnAxes<'a> {
+    /// Intensities, x fastest.
+    pub values: Cow<'a, [f32]>,
+    /// Voxels along each axis.
+    pub shape: [usize; 3],
+    /// Place of the first voxel, in voxels of the other grid.
+    pub origin: [f64; 3],
+}
+
+impl<'a> OnAxes<'a> {
+    /// The deformed volume on the axes of the initial grid `g`, as [`Aligned::new`] says.
+    pub fn of(g: &Grid, deformed: &'a Voxels<'a>, reach_mm: f64) -> Result<Self, FieldError> {
+        let (m, spacing) = (deformed.grid(), g.spacing());
+        let [lo, hi] = overlap(g, m, reach_mm)?;
+        let same_axes = (0..3)
+            .all(|r| (0..3).all(|c| (g.affine().linear()[r][c] - m.affine().linear()[r][c]).abs() < 1e-4 * spacing[c]));
+        if same_axes {
+            let origin = g.affine().to_voxel(m.affine().origin()).0;
+            return Ok(Self { values: deformed.as_slice().into(), shape: m.shape(), origin });
+        }
+        // A slice stays one, whatever rounding has made of its place.
+        let flat = |a: usize| g.shape()[a] == 1;
+        let origin = std::array::from_fn(|a| if flat(a) { 0.0 } else { lo[a].floor() });
+        let extent = |a: usize| (hi[a] - origin[a]).ceil().max(0.0) as usize + 1;
+        let shape = std::array::from_fn(|a| if flat(a) { 1 } else { extent(a) });
+        Ok(Self { values: resample(deformed, g, origin, shape)?.into(), shape, origin })
+    }
+}
+
 /// Position on a level of `factor` of a full-resolution voxel position.
 #[inline(always)]
 pub fn to_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
@@ -164,6 +181,20 @@ pub fn factors(shape: [usize; 3], spacing: [f64; 3], finest: usize, coarsest_mm:
 /// A mask of tissue where none is given: brighter than a tenth of the way from the dark to the
 /// bright end (2nd and 98th percentile) after smoothing; everything when that leaves less than 2 %
 /// of the volume. Voxels that are not finite are dark.
+///
+/// ```
+/// use palpate::matching::levels::foreground;
+/// use palpate::{Affine, Grid, Volume};
+/// let grid = Grid::new([24; 3], Affine::scaled([1.0; 3], [-11.5; 3])?)?;
+/// let ball =
+///     |r: f64| move |p: palpate::WorldPoint| p.0.iter().map(|x| x * x).sum::<f64>() < r * r;
+/// let volume = Volume::from_voxels(grid, |_, p| if ball(8.0)(p) { 100.0 } else { 0.0 });
+/// let mask = foreground(&volume);
+/// // All of the ball, and hardly more.
+/// assert!((0..grid.len()).all(|o| mask.as_slice()[o] == 1 || !ball(7.0)(grid.centre(o))));
+/// assert!((0..grid.len()).all(|o| mask.as_slice()[o] == 0 || ball(12.0)(grid.centre(o))));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn foreground(volume: &Voxels<'_>) -> Mask {
     let shape = volume.grid().shape();
     let smooth = filters::gaussian(&without_holes(volume), shape, [1.0; 3]);

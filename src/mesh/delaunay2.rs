@@ -33,6 +33,17 @@ impl HasPosition for Site {
 /// # Errors
 /// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points;
 /// [`MeshError::Collinear`].
+///
+/// ```
+/// use palpate::WorldPoint;
+/// use palpate::mesh::delaunay2::delaunay2;
+/// // The corners and the middle of a square that stands in the plane x = 3.
+/// let at = |y, z| WorldPoint([3.0, y, z]);
+/// let square = [at(0.0, 0.0), at(2.0, 0.0), at(2.0, 2.0), at(0.0, 2.0), at(1.0, 1.0)];
+/// assert_eq!(delaunay2(&square)?.mesh.triangles().len(), 4);
+/// assert!(delaunay2(&square[..2]).is_err());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn delaunay2(points: &[WorldPoint]) -> Result<Delaunay<TriMesh, 3>, MeshError> {
     let plane = Plane::through(points)?;
     let feet: Vec<WorldPoint> = points

@@ -23,6 +23,23 @@ use crate::types::{TetMesh, WorldPoint};
 /// [`delaunay2`](super::delaunay2::delaunay2)).
 ///
 /// Source: Bowyer (1981) and Watson (1981) with exact predicates and biased random insertion.
+///
+/// ```
+/// use palpate::mesh::delaunay3::delaunay3;
+/// use palpate::mesh::quality::total_volume;
+/// use palpate::{MeshError, WorldPoint};
+/// let mut points: Vec<WorldPoint> =
+///     (0..8).map(|i| WorldPoint([0, 1, 2].map(|a| f64::from(i >> a & 1)))).collect();
+/// points.push(points[0]);
+/// let delaunay = delaunay3(&points)?;
+/// // The cube is filled, and the repeated point is one node.
+/// assert!((total_volume(&delaunay.mesh) - 1.0).abs() < 1e-12);
+/// assert_eq!((delaunay.mesh.nodes().len(), delaunay.node[8]), (8, 0));
+/// // Four points of one plane need the other function.
+/// let flat = [0.0, 1.0, 2.0, 4.0].map(|x| WorldPoint([x, x * x, 0.0]));
+/// assert_eq!(delaunay3(&flat), Err(MeshError::Coplanar));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn delaunay3(points: &[WorldPoint]) -> Result<Delaunay<TetMesh, 4>, MeshError> {
     let scaled = normalise(points)?;
     let order = insertion_order(&scaled);

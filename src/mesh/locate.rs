@@ -45,6 +45,20 @@ impl<'a> TetrahedronLocator<'a> {
 
     /// The tetrahedron that holds `p` (world mm, RAS), walking from tetrahedron `hint` (any; a near
     /// one is faster). None outside the hull or where `p` is not finite.
+    ///
+    /// ```
+    /// use palpate::WorldPoint;
+    /// use palpate::mesh::delaunay3::delaunay3;
+    /// use palpate::mesh::locate::TetrahedronLocator;
+    /// let corners: Vec<WorldPoint> =
+    ///     (0..8).map(|i| WorldPoint([0, 1, 2].map(|a| f64::from(i >> a & 1)))).collect();
+    /// let delaunay = delaunay3(&corners)?;
+    /// let locator = TetrahedronLocator::new(&delaunay);
+    /// let found = locator.locate(WorldPoint([0.3, 0.2, 0.6]), 0).ok_or("outside")?;
+    /// assert!((found.weights.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+    /// assert!(locator.locate(WorldPoint([1.5, 0.2, 0.6]), 0).is_none());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn locate(&self, p: WorldPoint, hint: u32) -> Option<Located<4>> {
         if !self.bounds.hold(p.0) {
             return None;

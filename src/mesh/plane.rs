@@ -24,6 +24,15 @@ impl Plane {
     /// # Errors
     /// [`MeshError::NotFinite`]; [`MeshError::TooFew`] under three distinct points;
     /// [`MeshError::Collinear`].
+    ///
+    /// ```
+    /// use palpate::WorldPoint;
+    /// use palpate::mesh::plane::Plane;
+    /// let at = |x, y| WorldPoint([x, y, 7.0]);
+    /// let plane = Plane::through(&[at(0.0, 0.0), at(4.0, 0.0), at(0.0, 3.0)])?;
+    /// assert_eq!(plane.normal(), [0.0, 0.0, 1.0]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn through(points: &[WorldPoint]) -> Result<Self, MeshError> {
         if let Some(node) = points.iter().position(|p| p.0.iter().any(|v| !v.is_finite())) {
             return Err(MeshError::NotFinite { node });

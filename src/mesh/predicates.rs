@@ -108,6 +108,13 @@ fn bounds([x, y, z]: [f64; 3]) -> (f64, f64) {
 
 /// The sign of `det(b - a, c - a, d - a)`: positive for a positively oriented tetrahedron, zero
 /// where coplanar.
+///
+/// ```
+/// use palpate::mesh::predicates::orient3d;
+/// let [a, b, c] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+/// assert!(orient3d(&a, &b, &c, &[0.0, 0.0, 1e-300]) > 0.0);
+/// assert_eq!(orient3d(&a, &b, &c, &[0.3, 0.3, 0.0]), 0.0);
+/// ```
 pub fn orient3d(a: &[f64; 3], b: &[f64; 3], c: &[f64; 3], d: &[f64; 3]) -> f64 {
     orient3d_bounded(&StaticBounds::NONE, [a, b, c, d])
 }

@@ -24,6 +24,16 @@ pub fn volume([a, b, c, d]: [WorldPoint; 4]) -> f64 {
 /// The measures of one tetrahedron. Of a flat one the ratio is infinite or NaN.
 ///
 /// Source: J. R. Shewchuk, "What is a good linear finite element?" (2002).
+///
+/// ```
+/// use palpate::WorldPoint;
+/// use palpate::mesh::quality::quality;
+/// let regular =
+///     [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]].map(WorldPoint);
+/// let q = quality(regular);
+/// assert!((q.volume - 8.0 / 3.0).abs() < 1e-12);
+/// assert!((q.min_dihedral_angle - (1.0f64 / 3.0).acos()).abs() < 1e-9);
+/// ```
 pub fn quality(corners: [WorldPoint; 4]) -> Quality {
     let [a, b, c, d] = corners;
     let (u, v, w) = (b.minus(a), c.minus(a), d.minus(a));

@@ -3,6 +3,11 @@
 /// A square matrix, `m[row][column]`.
 pub type Square<const N: usize> = [[f64; N]; N];
 
+/// The scalar product of two vectors of one length.
+pub fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
 /// Solves `a x = b` by Gauss elimination with row pivots; none when a pivot vanishes against the
 /// largest entry.
 pub fn solve<const N: usize>(a: &Square<N>, b: &[f64; N]) -> Option<[f64; N]> {

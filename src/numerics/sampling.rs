@@ -118,6 +118,15 @@ impl Stencil {
 
 /// The displacement (mm) at a world position, trilinear; outside the grid the value of its nearest
 /// edge.
+///
+/// ```
+/// use palpate::numerics::sampling::displacement;
+/// use palpate::{Affine, DenseField, Grid, WorldPoint};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |p| [p.0[1], 0.0, 0.0]);
+/// assert_eq!(displacement(&field, WorldPoint([3.0, 2.5, 4.0])), [2.5, 0.0, 0.0]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[inline]
 pub fn displacement(field: &Displacement<'_>, p: WorldPoint) -> [f64; 3] {
     let grid = field.grid();

@@ -32,6 +32,27 @@ pub struct Known<'a> {
 
 /// What was measured at `nodes` of a mesh, in that order, under the name `patch`. Nodes more than a
 /// voxel outside of the body, or where the field gives nothing, are left out.
+///
+/// ```
+/// use palpate::pipeline::boundary::{Known, at_nodes};
+/// use palpate::types::SolidMesh;
+/// use palpate::{Affine, DenseField, Grid, Mask, WorldPoint};
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |_| [0.0, 0.0, -1.5]);
+/// let body = Mask::filled(grid, 1);
+/// let mesh = SolidMesh::new(
+///     vec![WorldPoint([8.0; 3]), WorldPoint([99.0; 3])],
+///     vec![1, 2],
+///     Vec::new(),
+///     Vec::new(),
+/// )?;
+/// let known = Known { field: &field, body: &body, deviation: None, draws: None };
+/// let found = at_nodes(&known, &mesh, &[0, 1], "top");
+/// // The second node lies outside the body.
+/// assert_eq!(found.len(), 1);
+/// assert!((found[0].displacement[2] + 1.5).abs() < 1e-6);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn at_nodes(known: &Known<'_>, mesh: &SolidMesh, nodes: &[u32], patch: &str) -> Vec<MeasuredNode> {
     let one = |&node: &u32| {
         let place = mesh.nodes()[node as usize];

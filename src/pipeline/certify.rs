@@ -99,6 +99,18 @@ impl Pairs<'_> {
 ///
 /// # Errors
 /// [`StrainError`] as [`field::run`] and [`crate::pipeline::strain::run`], or when grids differ.
+///
+/// ```
+/// use palpate::pipeline::certify::{CertifyInput, run};
+/// use palpate::types::params::Preset;
+/// use palpate::{FieldParams, PhantomKind, PhantomParams, phantom};
+/// let scan = phantom(&PhantomParams::new(PhantomKind::Block).sized(24))?.initial;
+/// let input = CertifyInput { initial: &scan, second: None, mask: None, like: None };
+/// let found = run(input, &FieldParams::preset(Preset::Fast), &|_, _| {})?;
+/// assert!(found.certificate.image_noise > 0.0);
+/// assert!(found.certificate.displacement_noise_mm < 1.0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>) -> Result<Certified, StrainError> {
     let CertifyInput { initial, second, mask, like } = input;
     let grid = *initial.grid();

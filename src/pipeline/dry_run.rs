@@ -35,6 +35,23 @@ pub fn strain_memory(grid: &Grid) -> u64 {
 ///
 /// # Errors
 /// As [`crate::pipeline::field::run`], but for too few matches.
+///
+/// ```
+/// use palpate::synth::MotionKind;
+/// use palpate::{FieldParams, PhantomKind, PhantomParams, phantom, pipeline};
+/// let block = PhantomParams::new(PhantomKind::Block).sized(24).moving(MotionKind::Translate);
+/// let pair = phantom(&block)?;
+/// let plan = pipeline::dry_run::field(
+///     &pair.initial,
+///     &pair.deformed,
+///     Some(&pair.mask),
+///     &FieldParams::default(),
+/// )?;
+/// assert_eq!(plan.mask_voxels, pair.mask.as_slice().iter().filter(|m| **m != 0).count());
+/// // The finest level has all voxels.
+/// assert_eq!(plan.levels.last(), Some(&[24, 24, 24]));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn field(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,

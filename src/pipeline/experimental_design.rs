@@ -8,6 +8,7 @@
 use crate::error::{ParamError, StiffnessError};
 use crate::mesh::tetrahedral::Mesher;
 use crate::numerics::cholesky::Cholesky;
+use crate::numerics::dense;
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::random::Random;
 use crate::numerics::tetrahedron::shapes;
@@ -279,6 +280,29 @@ fn on_grid(body: &Body, x: &[f64], labels: &Mask) -> DenseField {
 ///
 /// # Errors
 /// As [`run`].
+///
+/// ```
+/// use palpate::pipeline::experimental_design::{PlanInputs, simulate};
+/// use palpate::types::plan::PlanParams;
+/// use palpate::types::stiffness::{LawChoice, Side};
+/// use palpate::{Affine, Grid, Mask, Place, StiffnessParams};
+/// // A block of 12 mm of one tissue, held at its base and pressed from above.
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let labels =
+///     Mask::from_voxels(grid, |_, p| u8::from(p.0.iter().all(|x| (2.0..14.0).contains(x))));
+/// let side = |name| Side::parse(name).map(Place::Side).ok_or("no side");
+/// let (held, load) = (side("z-")?, side("z+")?);
+/// let stiffness =
+///     StiffnessParams { nodes: 500, model: LawChoice::Linear, ..StiffnessParams::default() };
+/// let inputs =
+///     PlanInputs { labels: &labels, held: &held, load: &load, names: &|_| "muscle".into() };
+/// let params = PlanParams { moduli: vec![(1, 20.0)], stiffness, ..PlanParams::default() };
+/// let press = simulate(&inputs, &params, 0.5)?;
+/// // The pressed face moves down by half a millimetre, and the block resists.
+/// assert!((press.field.at(grid.index(8, 8, 13))[2] + 0.5).abs() < 0.1);
+/// assert!(press.force_n > 0.0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn simulate(inputs: &PlanInputs<'_>, params: &PlanParams, press_mm: f64) -> Result<Simulated, StiffnessError> {
     Bench::new(inputs, params)?.simulate(press_mm)
 }
@@ -443,10 +467,10 @@ impl Solved {
                 .map(|k| f64::from(u8::from(self.free[r] == Some(k))) - if ratios { 0.0 } else { slope(k) })
                 .collect();
             let through =
-                |a: &[f64]| -> Vec<f64> { (0..p).map(|i| product(&a[i * p..(i + 1) * p], &gradient)).collect() };
-            let data = product(&gradient, &through(&stated));
+                |a: &[f64]| -> Vec<f64> { (0..p).map(|i| dense::dot(&a[i * p..(i + 1) * p], &gradient)).collect() };
+            let data = dense::dot(&gradient, &through(&stated));
             let by = through(&fitted);
-            let scatter: f64 = (0..p).map(|i| by[i] * product(&information[i * p..(i + 1) * p], &by)).sum::<f64>();
+            let scatter: f64 = (0..p).map(|i| by[i] * dense::dot(&information[i * p..(i + 1) * p], &by)).sum::<f64>();
             let mesh = self.mesh[r][usize::from(ratios)];
             [(data.max(0.0) + mesh * mesh).sqrt(), scatter.max(0.0).sqrt() / dilution]
         };
@@ -457,10 +481,6 @@ impl Solved {
     fn determines(&self, r: usize, sd: f64, ratios: bool) -> bool {
         sd <= VAGUE && !self.hidden[r] && !self.far[r] && (ratios || !self.borne)
     }
-}
-
-fn product(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
 /// The estimate at given moduli, with the plates as the field has them.
@@ -492,6 +512,32 @@ fn sorted(mut values: Vec<f64>) -> Vec<f64> {
 /// # Errors
 /// [`StiffnessError`] for parameters out of range, a label without a modulus, a body that is not
 /// whole, patches that are not found, and equations that cannot be solved for any press.
+///
+/// ```
+/// use palpate::pipeline::experimental_design::{PlanInputs, run};
+/// use palpate::types::plan::PlanParams;
+/// use palpate::types::stiffness::{LawChoice, Side};
+/// use palpate::{Affine, Grid, Mask, Place, StiffnessParams};
+/// // A block of 12 mm of one tissue, held at its base and pressed from above.
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let labels =
+///     Mask::from_voxels(grid, |_, p| u8::from(p.0.iter().all(|x| (2.0..14.0).contains(x))));
+/// let side = |name| Side::parse(name).map(Place::Side).ok_or("no side");
+/// let (held, load) = (side("z-")?, side("z+")?);
+/// let stiffness =
+///     StiffnessParams { nodes: 500, model: LawChoice::Linear, ..StiffnessParams::default() };
+/// let inputs =
+///     PlanInputs { labels: &labels, held: &held, load: &load, names: &|_| "muscle".into() };
+/// let params = PlanParams { moduli: vec![(1, 20.0)], stiffness, ..PlanParams::default() };
+/// let plan = run(
+///     &inputs,
+///     &PlanParams { press_mm: vec![0.5], noise_mm: vec![0.05], ..params },
+///     &|_, _| {},
+/// )?;
+/// assert_eq!(plan.of(1).count(), 1);
+/// assert!(plan.is_felt());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>) -> Result<Plan, StiffnessError> {
     let mut clock = Clock::start();
     progress("mesh", 0.0);

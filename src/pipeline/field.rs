@@ -111,6 +111,23 @@ pub(super) const FEWEST: usize = 20;
 /// # Errors
 /// [`FieldError`] when a volume is constant or not finite, the mask is empty or on another grid,
 /// the two volumes do not overlap, or fewer than 20 matches survive.
+///
+/// ```
+/// use palpate::synth::MotionKind;
+/// use palpate::{FieldParams, PhantomKind, PhantomParams, evaluate, phantom, pipeline};
+/// let block = PhantomParams::new(PhantomKind::Block).sized(24).moving(MotionKind::Translate);
+/// let pair = phantom(&block)?;
+/// let found = pipeline::field::run(
+///     &pair.initial,
+///     &pair.deformed,
+///     Some(&pair.mask),
+///     &FieldParams::default(),
+///     &|_, _| {},
+/// )?;
+/// let m = evaluate::metrics(&found.displacement, &pair.truth, Some(&pair.mask), &[])?;
+/// assert!(m.mean_mm < 0.1 * m.identity_mm);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,

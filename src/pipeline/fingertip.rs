@@ -176,6 +176,17 @@ fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f6
 /// # Errors
 /// [`FingertipError`] when the grid is askew, no bone lies under the pad, or there is hardly any
 /// tissue.
+///
+/// ```
+/// use palpate::pipeline::fingertip::run;
+/// use palpate::{Affine, Grid, Volume};
+/// // Tissue of 40 kPa, 8 mm thick, under it bone.
+/// let grid = Grid::new([10, 10, 12], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let map = Volume::from_voxels(grid, |_, p| if p.0[2] < 8.0 { 40.0 } else { 15_000.0 });
+/// let found = run(&map, |o| map.as_slice()[o] > 10_000.0, [0.0, 0.0, -1.0], Some(1.0))?;
+/// assert!((found.pad.effective_kpa - 40.0).abs() < 1e-6);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(
     map: &Volume,
     bone: impl Fn(usize) -> bool,

@@ -39,6 +39,17 @@ pub struct GraspOutcome {
 ///
 /// # Errors
 /// [`GraspError`] where nothing can be simulated; see [`simulate()`].
+///
+/// ```
+/// use palpate::{Scene, pipeline};
+/// let mut scene = Scene::reference();
+/// scene.motions.truncate(1);
+/// let found = pipeline::grasp::run(&scene, &|_, _| {})?;
+/// assert_eq!(found.run.outcome(), "held");
+/// // The same scene without tangential deformation stands beside it.
+/// assert!(found.without_tangential.is_some());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(scene: &Scene, progress: Progress<'_>) -> Result<GraspOutcome, GraspError> {
     let started = Instant::now();
     let run = simulate(scene, &|f| progress("simulate", 0.7 * f))?;

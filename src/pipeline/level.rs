@@ -24,7 +24,7 @@ use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{Symmetric3, inverse};
 use crate::numerics::{ablation, filters, pyramid};
 use crate::pipeline::landmarks;
-use crate::types::{Candidate, Counts, FieldParams, LevelReport, SparseField, VoxelPoint};
+use crate::types::{Candidate, Counts, FieldParams, GridVector, LevelReport, SparseField, VoxelPoint};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -433,12 +433,12 @@ pub fn matches(
     // Sub-voxel position and covariance of each choice.
     let template = template(pair, radius);
     let place = |i: usize| {
-        let start = list[i].get(chosen[i])?.displacement;
+        let start = list[i].get(chosen[i])?.displacement.0;
         let centre = initial[i].centre;
         let at: [f64; 3] = std::array::from_fn(|a| centre[a] as f64 + start[a] / spacing[a] - origin[a]);
         let mut found = refined(pair, warped.as_deref(), &template, centre, at, radius)?;
         if !params.sub_voxel {
-            found.shift = [0.0; 3];
+            found.shift = GridVector([0.0; 3]);
         }
         Some((i, start, found))
     };
@@ -451,7 +451,7 @@ pub fn matches(
     let measured = |(i, start, r): &(usize, [f64; 3], Refined)| {
         let u = field.map_or([0.0; 3], |f| f.lattice.at(&f.coefficients, starts[*i]));
         let base = if known.is_some() { u } else { [0.0; 3] };
-        let displacement = std::array::from_fn(|a| base[a] + (start[a] + r.shift[a]));
+        let displacement = std::array::from_fn(|a| base[a] + (start[a] + r.shift.0[a]));
         Measured { place: mm[*i], displacement, covariance: r.covariance, field: u }
     };
     let mut measured: Vec<Measured> = refined.iter().map(measured).collect();
@@ -514,11 +514,10 @@ fn sought(pair: &Pair<'_>, warped: Option<&[f32]>, params: &MatchParams) -> Soug
     let within = warped.is_some().then_some(&pair.mask[..]);
     let room = if params.thorough && warped.is_some() { room / 5.0 } else { room };
     let deformed = corners(smooth_data, shape, spacing, within, noise, room, quick, 5 * params.points);
-    let places: Vec<[f64; 3]> = deformed.iter().map(|c| c.voxel).collect();
+    let [starts, places] = [&initial, &deformed].map(|all| all.iter().map(|c| c.voxel).collect::<Vec<_>>());
     let fixed = if warped.is_some() { &pair.fixed_smooth[..] } else { &pair.fixed[..] };
     let searchable = if warped.is_some() { Searchable::near } else { Searchable::new };
     let (here, there) = (searchable(fixed, pair.shape, radius), searchable(data, shape, radius));
-    let starts: Vec<[f64; 3]> = initial.iter().map(|c| c.voxel).collect();
     let list = candidates(
         &Side { volume: &here, origin: [0.0; 3], features: &starts },
         &Side { volume: &there, origin, features: &places },
@@ -530,6 +529,7 @@ fn sought(pair: &Pair<'_>, warped: Option<&[f32]>, params: &MatchParams) -> Soug
             min_ncc: 0.3,
         },
     );
+    let starts = starts.into_iter().map(|p| p.0).collect();
     Sought { initial, starts, deformed: deformed.len(), list, origin }
 }
 
@@ -596,7 +596,7 @@ pub(super) fn follow(
         let field = known.lattice.at(&known.coefficients, voxel);
         let measured = Measured {
             place: std::array::from_fn(|a| voxel[a] * pair.spacing[a]),
-            displacement: std::array::from_fn(|a| field[a] + found.shift[a]),
+            displacement: std::array::from_fn(|a| field[a] + found.shift.0[a]),
             covariance: found.covariance,
             field,
         };
@@ -704,8 +704,8 @@ fn corners(
     let inside = mask.map(|m| pyramid::reduce_mask(m, shape, step));
     let mut found = features::corners(smooth, (shape, spacing), (sigma, step), inside.as_deref(), wanted, least);
     for corner in &mut found {
-        corner.voxel = from_level(corner.voxel, step);
-        corner.centre = std::array::from_fn(|a| (corner.voxel[a].round().max(0.0) as usize).min(shape[a] - 1));
+        corner.voxel.0 = from_level(corner.voxel.0, step);
+        corner.centre = std::array::from_fn(|a| (corner.voxel.0[a].round().max(0.0) as usize).min(shape[a] - 1));
     }
     found
 }
@@ -727,8 +727,9 @@ fn fit(
     refined: &[(usize, [f64; 3], Refined)],
     radius: &[usize; 3],
 ) -> SplineField {
-    let measured =
-        refined.iter().map(|(i, start, r)| (starts[*i], std::array::from_fn(|a| start[a] + r.shift[a]), r.covariance));
+    let measured = refined
+        .iter()
+        .map(|(i, start, r)| (starts[*i], std::array::from_fn(|a| start[a] + r.shift.0[a]), r.covariance));
     couple(pair, measured, (radius, 0.3), None).0
 }
 

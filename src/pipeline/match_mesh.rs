@@ -17,7 +17,7 @@ pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Ma
     let axes = spline::axes(grid);
     Match {
         initial: grid.affine().to_world(VoxelPoint(from_level(m.voxel, factor))),
-        displacement: std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * m.measured.displacement[a]).sum()),
+        displacement: grid.vector_to_world(GridVector(m.measured.displacement)),
         ncc: m.ncc,
         covariance: covariance_after(&axes, &m.measured.covariance),
         kept: m.kept,

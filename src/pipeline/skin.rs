@@ -67,6 +67,28 @@ pub fn notes(scene: &SkinScene, outcome: &SkinOutcome) -> Vec<String> {
 }
 
 /// Runs a checked scene.
+///
+/// ```
+/// use palpate::pipeline::skin::{check, run};
+/// use palpate::types::skin::{ElementKind, Layer, SkinBlock, SkinLoad, SkinScene};
+/// let layer = Layer {
+///     name: "dermis".into(),
+///     thickness: 2e-3,
+///     element: ElementKind::ThreeElement,
+///     e0: 0.0,
+///     c0: 400.0,
+///     maxwell: vec![[2e4, 2e5]],
+///     c_unload: Vec::new(),
+/// };
+/// let load = SkinLoad { displacement: 2e-4, ramp: 1.0, hold: 2.0, end: 8.0 };
+/// let block = SkinBlock { width: 2e-2, indenter: 5e-3, poisson: 0.45 };
+/// let scene = SkinScene { load, layers: vec![layer], block };
+/// check(&scene)?;
+/// let found = run(&scene);
+/// // One layer needs no replacement by one layer.
+/// assert!(found.single.is_none() && found.residual[0].is_some());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(scene: &SkinScene) -> SkinOutcome {
     let mut seconds = Vec::new();
     let mut timed = |name: &str, from: Instant| seconds.push((name.to_string(), from.elapsed().as_secs_f64()));

@@ -107,6 +107,19 @@ fn landmarks_before(map: &AffineMap, landmarks: &[Landmark]) -> Vec<Landmark> {
 ///
 /// # Errors
 /// [`FieldError`] when a volume is of one value, so that it has no centre of brightness.
+///
+/// ```
+/// use palpate::pipeline::start::{Alignment, aligned};
+/// use palpate::{Affine, Grid, Volume, WorldPoint};
+/// let at = |x: f64| -> Result<Volume, Box<dyn std::error::Error>> {
+///     let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [x, 0.0, 0.0])?)?;
+///     Ok(Volume::from_voxels(grid, |o, _| (o % 7) as f32))
+/// };
+/// // The second volume has its middle 40 mm further right.
+/// let map = aligned(&at(0.0)?, &at(40.0)?, Alignment::Centre)?;
+/// assert_eq!(map.at(WorldPoint([1.0, 2.0, 3.0])), WorldPoint([41.0, 2.0, 3.0]));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn aligned(initial: &Voxels<'_>, deformed: &Voxels<'_>, how: Alignment) -> Result<AffineMap, FieldError> {
     let identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     let volumes = [initial, deformed];

@@ -107,6 +107,41 @@ const PRECISION: f64 = 1e-5;
 ///
 /// # Errors
 /// [`StiffnessError`] when the input does not fit together or the equations cannot be solved.
+///
+/// ```
+/// use palpate::pipeline::experimental_design::{PlanInputs, simulate};
+/// use palpate::pipeline::stiffness::{FieldQuality, Inputs, run};
+/// use palpate::types::plan::PlanParams;
+/// use palpate::types::stiffness::{LawChoice, Side};
+/// use palpate::{Affine, Grid, Mask, Place, StiffnessParams};
+/// // A block of 12 mm of one tissue, held at its base and pressed from above.
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let labels =
+///     Mask::from_voxels(grid, |_, p| u8::from(p.0.iter().all(|x| (2.0..14.0).contains(x))));
+/// let side = |name| Side::parse(name).map(Place::Side).ok_or("no side");
+/// let (held, load) = (side("z-")?, side("z+")?);
+/// let stiffness =
+///     StiffnessParams { nodes: 500, model: LawChoice::Linear, ..StiffnessParams::default() };
+/// let inputs =
+///     PlanInputs { labels: &labels, held: &held, load: &load, names: &|_| "muscle".into() };
+/// let params = PlanParams { moduli: vec![(1, 20.0)], stiffness, ..PlanParams::default() };
+/// let truth = simulate(&inputs, &params, 0.5)?;
+/// let names = |_: u8| "muscle".to_string();
+/// let inputs = Inputs {
+///     field: &truth.field,
+///     matches: None,
+///     labels: &labels,
+///     labelled: true,
+///     held: &held,
+///     load: &load,
+///     names: &names,
+///     quality: FieldQuality::default(),
+/// };
+/// let params = StiffnessParams { force_n: Some(truth.force_n), ..params.stiffness };
+/// let found = run(&inputs, &params, &|_, _| {})?;
+/// assert!((found.regions[0].youngs_modulus / 20.0 - 1.0).abs() < 0.2);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(
     inputs: &Inputs<'_>,
     params: &StiffnessParams,

@@ -53,6 +53,18 @@ impl Sequence {
     ///
     /// # Errors
     /// The first frame's error when no frame could be solved.
+    ///
+    /// ```
+    /// use palpate::error::StiffnessError;
+    /// use palpate::pipeline::stiffness_sequence::Sequence;
+    /// use palpate::{Affine, Grid, Mask};
+    /// let labels = Mask::filled(Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?, 1);
+    /// let mut sequence = Sequence::default();
+    /// sequence.add(1, 0.4, Err(StiffnessError::NoEquilibrium));
+    /// // A sequence of frames that tell nothing tells why.
+    /// assert!(matches!(sequence.finish(&labels), Err(StiffnessError::NoEquilibrium)));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn finish(self, labels: &Mask) -> Result<SharedStiffness, StiffnessError> {
         let Some((shown, mut result)) = self.best else {
             return Err(self.failure.unwrap_or(StiffnessError::NoEquilibrium));
@@ -105,6 +117,15 @@ impl Sequence {
 }
 
 /// Mean displacement magnitude in the body (mm), where it is finite; NaN where it is nowhere.
+///
+/// ```
+/// use palpate::pipeline::stiffness_sequence::motion;
+/// use palpate::{Affine, DenseField, Grid, Mask};
+/// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |_| [0.0, 3.0, 4.0]);
+/// assert_eq!(motion(&field, &Mask::filled(grid, 1)), 5.0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn motion(field: &Displacement<'_>, labels: &Mask) -> f64 {
     let inside = labels.as_slice();
     let (mut sum, mut count) = (0.0, 0.0);

@@ -79,6 +79,20 @@ const SAMPLED: usize = 25_000;
 /// # Errors
 /// [`StrainError`] when the field is not finite or folds in the tissue, grids differ, the gauge
 /// does not fit or directions are missing.
+///
+/// ```
+/// use palpate::pipeline::strain::run;
+/// use palpate::{Affine, DenseField, Grid, Mask, StrainInput, StrainMeasure, StrainParams};
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |p| [0.03 * p.0[0], 0.0, 0.0]);
+/// let bodies = Mask::filled(grid, 1);
+/// let input =
+///     StrainInput { field: &field, bodies: &bodies, labels: None, samples: None, trust: None };
+/// let params = StrainParams { measure: StrainMeasure::Small, ..StrainParams::default() };
+/// let found = run(input, &params, &|_, _| {})?;
+/// assert!((found.strain.principal(grid.index(8, 8, 8))[0] - 0.03).abs() < 1e-5);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>) -> Result<StrainResult, StrainError> {
     progress("check", 0.0);
     let mut clock = Clock::start();

@@ -13,6 +13,7 @@
 
 use crate::field::spline::{FieldSpline, ScalarSpline, Spline};
 use crate::numerics::bspline::Lattice;
+use crate::numerics::dense::dot;
 use crate::numerics::eigen::symmetric;
 use crate::numerics::statistics::median;
 use rayon::prelude::*;
@@ -320,10 +321,6 @@ impl Data {
         );
         Modes { count, why, lattice: lattice.clone(), corrections }
     }
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Products of all rows with each other.

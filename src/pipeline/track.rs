@@ -108,6 +108,35 @@ pub struct Sequence<'a> {
 ///
 /// # Errors
 /// Those of `read` and `keep`, and [`FieldError`] when no frame at all can be measured.
+///
+/// ```
+/// use palpate::FieldParams;
+/// use palpate::error::FieldError;
+/// use palpate::pipeline::known::Known;
+/// use palpate::pipeline::track::{Frame, Sequence, run};
+/// use palpate::synth::{self, SequenceKind, SequenceParams};
+/// let mut params = SequenceParams::new(SequenceKind::Pinch).sized(24);
+/// params.frames = 2;
+/// let made = synth::Sequence::new(&params)?;
+/// let (reference, field) = (made.frame(0), FieldParams::default());
+/// let sequence = Sequence {
+///     frames: 2,
+///     origin: 0,
+///     reference: &reference,
+///     known: Known::mask(Some(&made.mask)),
+///     labels: None,
+///     params: &field,
+///     together: false,
+/// };
+/// let mut measured = Vec::new();
+/// let keep = |frame: Frame<'_>| {
+///     measured.push(frame.number);
+///     Ok::<_, FieldError>(())
+/// };
+/// run(&sequence, |t| Ok(made.frame(t)), keep, &|_, _| {})?;
+/// assert_eq!(measured, [1]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn run<'v, E: From<FieldError>>(
     sequence: &Sequence<'_>,
     mut read: impl FnMut(usize) -> Result<Voxels<'v>, E>,

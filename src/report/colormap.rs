@@ -58,6 +58,13 @@ impl ColorMap {
     }
 
     /// The same as `#rrggbb`.
+    ///
+    /// ```
+    /// use palpate::report::colormap::ColorMap;
+    /// assert_eq!(ColorMap::Gray.hex(1.0), "#ffffff");
+    /// // The middle of the diverging map is neutral.
+    /// assert_eq!(ColorMap::Diverging.hex(0.5), "#f7f7f7");
+    /// ```
     pub fn hex(self, t: f64) -> String {
         let [r, g, b] = self.rgb(t);
         format!("#{r:02x}{g:02x}{b:02x}")

@@ -19,6 +19,11 @@ use std::fmt::Write;
 const STYLE: &str = include_str!("style.css");
 
 /// Text as HTML.
+///
+/// ```
+/// use palpate::report::html::escape;
+/// assert_eq!(escape("a < b & c"), "a &lt; b &amp; c");
+/// ```
 pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -32,6 +32,17 @@ pub fn looks_like_labels(volume: &Volume) -> bool {
 
 /// The world direction that each voxel axis runs along most (R or L, A or P, S or I), and how far
 /// the axes are off the world's at most (degrees).
+///
+/// ```
+/// use palpate::report::info::orientation;
+/// use palpate::{Affine, Grid};
+/// let grid = Grid::new(
+///     [8; 3],
+///     Affine::new([[-1.0, 0.0, 0.0, 7.0], [0.0, 0.0, 2.0, 0.0], [0.0, 1.0, 0.0, 0.0]])?,
+/// )?;
+/// assert_eq!(orientation(&grid), ("LSA".to_string(), 0.0));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn orientation(grid: &Grid) -> (String, f64) {
     const ENDS: [[char; 2]; 3] = [['L', 'R'], ['P', 'A'], ['I', 'S']];
     let (linear, size) = (grid.affine().linear(), grid.spacing());

@@ -128,6 +128,11 @@ fn places_ticks(low: f64, high: f64, mut places: impl Iterator<Item = f64>) -> V
 }
 
 /// Round numbers from at or above `low` to at or below `high`, about `wanted` of them.
+///
+/// ```
+/// use palpate::report::plot::ticks;
+/// assert_eq!(ticks(0.0, 10.0, 5.0), [0.0, 2.0, 4.0, 6.0, 8.0, 10.0]);
+/// ```
 pub fn ticks(low: f64, high: f64, wanted: f64) -> Vec<f64> {
     let span = high - low;
     if !(span > 0.0 && span.is_finite()) {

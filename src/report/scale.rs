@@ -50,6 +50,11 @@ impl Scale {
 
 /// The smallest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is at or above `v` (1e-3 at
 /// least).
+///
+/// ```
+/// use palpate::report::scale::round_up;
+/// assert_eq!(round_up(7.3), 8.0);
+/// ```
 pub fn round_up(v: f64) -> f64 {
     let v = if v.is_finite() { v.max(1e-3) } else { 1.0 };
     let power = 10f64.powf(v.log10().floor());
@@ -58,6 +63,11 @@ pub fn round_up(v: f64) -> f64 {
 }
 
 /// A number with three digits at most after the point and no trailing zeros.
+///
+/// ```
+/// use palpate::report::scale::short;
+/// assert_eq!([0.25, 2.0, -0.0, 1234.4].map(short), ["0.25", "2", "0", "1234"]);
+/// ```
 pub fn short(v: f64) -> String {
     let digits = if v.abs() >= 100.0 { 0 } else { 3 };
     let s = format!("{v:.digits$}");
@@ -67,6 +77,11 @@ pub fn short(v: f64) -> String {
 
 /// A number rounded to three digits that count: 0.00146, 2.80, 26700; below a thousandth as
 /// 1.46e-4.
+///
+/// ```
+/// use palpate::report::scale::significant;
+/// assert_eq!([0.001_46, 26_670.0, 1e-7].map(significant), ["0.00146", "26700", "1.00e-7"]);
+/// ```
 pub fn significant(v: f64) -> String {
     match v.abs() {
         a if a == 0.0 || !a.is_finite() => short(v),
@@ -85,6 +100,11 @@ pub fn percent(v: f64) -> String {
 }
 
 /// 1234567 as 1,234,567.
+///
+/// ```
+/// use palpate::report::scale::thousands;
+/// assert_eq!(thousands(1_234_567), "1,234,567");
+/// ```
 pub fn thousands(n: usize) -> String {
     let digits = n.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);

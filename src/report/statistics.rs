@@ -21,6 +21,11 @@ pub fn sample(len: usize, mask: Option<&Mask>) -> Vec<usize> {
 
 /// The value below which the fraction `q` (0 to 1) of the finite `values` lies; 0 when there is
 /// none.
+///
+/// ```
+/// use palpate::report::statistics::quantile;
+/// assert_eq!(quantile([4.0, 1.0, f64::NAN, 3.0], 0.5), 3.0);
+/// ```
 pub fn quantile(values: impl IntoIterator<Item = f64>, q: f64) -> f64 {
     let mut v: Vec<f64> = values.into_iter().filter(|x| x.is_finite()).collect();
     if v.is_empty() {

@@ -8,6 +8,7 @@
 //! zero. In each phase of the load this is linear with constant coefficients, so `exp(A h)` takes
 //! it from any time to any other without a step error.
 
+use crate::numerics::dense::dot;
 use crate::skin::exponential::{exponential, rounding};
 use crate::types::skin::{Layer, SkinLoad, SkinSample, SkinScene};
 
@@ -165,6 +166,29 @@ pub fn precision(scene: &SkinScene) -> f64 {
 
 /// The response of a column to the scene's load; exact at each sample. A scene must have been
 /// checked.
+///
+/// ```
+/// use palpate::skin::column::respond;
+/// use palpate::types::skin::{ElementKind, Layer, SkinBlock, SkinLoad, SkinScene};
+/// let layer = Layer {
+///     name: "dermis".into(),
+///     thickness: 2e-3,
+///     element: ElementKind::ThreeElement,
+///     e0: 0.0,
+///     c0: 400.0,
+///     maxwell: vec![[2e4, 2e5]],
+///     c_unload: Vec::new(),
+/// };
+/// let load = SkinLoad { displacement: 2e-4, ramp: 1.0, hold: 2.0, end: 8.0 };
+/// let block = SkinBlock { width: 2e-2, indenter: 5e-3, poisson: 0.45 };
+/// let scene = SkinScene { load, layers: vec![layer], block };
+/// let response = respond(&scene);
+/// // A tenth of the thickness is pressed in, and without a lone spring some of it stays.
+/// let deepest = response.iter().map(|s| s.strain[0]).fold(0.0, f64::max);
+/// let last = response.last().ok_or("no sample")?.strain[0];
+/// assert!((deepest - 0.1).abs() < 1e-6 && last > 0.0 && last < deepest);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn respond(scene: &SkinScene) -> Vec<SkinSample> {
     respond_at(scene, &times(scene))
 }
@@ -225,11 +249,25 @@ pub fn times(scene: &SkinScene) -> [Vec<f64>; 3] {
 /// The strain that stays after all time in a layer without a lone spring: the integral of the
 /// stress over the sum of its dashpots; none where a spring brings it back, or where the dashpots
 /// change.
+///
+/// ```
+/// use palpate::skin::column::residual;
+/// use palpate::types::skin::{ElementKind, Layer};
+/// let mut layer = Layer {
+///     name: "fat".into(),
+///     thickness: 2e-3,
+///     element: ElementKind::ThreeElement,
+///     e0: 0.0,
+///     c0: 100.0,
+///     maxwell: vec![[2e4, 900.0]],
+///     c_unload: Vec::new(),
+/// };
+/// // An impulse of 50 Pa s over dashpots of 1000 Pa s.
+/// assert_eq!(residual(&layer, 50.0), Some(0.05));
+/// layer.e0 = 1e4;
+/// assert_eq!(residual(&layer, 50.0), None);
+/// ```
 pub fn residual(layer: &Layer, impulse: f64) -> Option<f64> {
     let constant = layer.e0 == 0.0 && layer.c_unload.is_empty();
     constant.then(|| impulse / (layer.c0 + layer.maxwell.iter().map(|b| b[1]).sum::<f64>()))
-}
-
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }

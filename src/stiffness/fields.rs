@@ -14,6 +14,14 @@ use crate::types::{Displacement, Mask, Trust, Volume, WorldPoint};
 use std::collections::BTreeSet;
 
 /// Volume of the voxels that are not 0 (mm^3).
+///
+/// ```
+/// use palpate::stiffness::fields::volume;
+/// use palpate::{Affine, Grid, Mask};
+/// let grid = Grid::new([10; 3], Affine::scaled([2.0, 2.0, 5.0], [0.0; 3])?)?;
+/// assert_eq!(volume(&Mask::filled(grid, 1)), 20_000.0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn volume(labels: &Mask) -> f64 {
     let voxel = crate::types::space::determinant(labels.grid().affine().linear()).abs();
     labels.as_slice().iter().filter(|&&v| v > 0).count() as f64 * voxel

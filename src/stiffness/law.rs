@@ -28,6 +28,13 @@ pub struct Material {
 
 impl Material {
     /// Of Young's modulus `e` (kPa).
+    ///
+    /// ```
+    /// use palpate::stiffness::law::Material;
+    /// let muscle = Material::of_youngs_modulus(30.0, 0.5 - 1e-9);
+    /// // Nearly incompressible tissue has a shear modulus of a third of Young's.
+    /// assert!((muscle.mu - 10.0).abs() < 1e-6);
+    /// ```
     pub fn of_youngs_modulus(e: f64, poisson: f64) -> Self {
         Self { mu: e / (2.0 * (1.0 + poisson)), poisson }
     }

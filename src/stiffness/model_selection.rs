@@ -50,6 +50,14 @@ pub struct Choice {
 }
 
 /// The Bayesian information criterion: `samples` ln(squares / samples) + `parameters` ln(samples).
+///
+/// ```
+/// use palpate::stiffness::model_selection::bic;
+/// // Two parameters more are worth it only where they explain enough.
+/// let simple = bic(100.0, 1000.0, 2);
+/// assert!(bic(99.9, 1000.0, 4) > simple);
+/// assert!(bic(90.0, 1000.0, 4) < simple);
+/// ```
 pub fn bic(squares: f64, samples: f64, parameters: usize) -> f64 {
     samples * (squares.max(1e-300) / samples).ln() + parameters as f64 * samples.max(2.0).ln()
 }

@@ -21,6 +21,16 @@ pub struct Gauge {
 
 impl Gauge {
     /// The cube of about this side (mm), at least the neighbours of a voxel.
+    ///
+    /// ```
+    /// use palpate::strain::gauge::Gauge;
+    /// use palpate::{Affine, Grid};
+    /// let grid = Grid::new([64, 64, 20], Affine::scaled([1.0, 1.0, 5.0], [0.0; 3])?)?;
+    /// let gauge = Gauge::of_length(&grid, 6.0);
+    /// assert_eq!(gauge.half, [3, 3, 1]);
+    /// assert_eq!(gauge.length_mm(&grid), [6.0, 6.0, 10.0]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn of_length(grid: &Grid, length_mm: f64) -> Self {
         let (shape, spacing) = (grid.shape(), grid.spacing());
         let half = |a: usize| ((length_mm / (2.0 * spacing[a])).round() as usize).clamp(1, shape[a]);

@@ -8,6 +8,17 @@ use crate::types::space::{Matrix3, cross};
 /// The Green-Lagrange strain E = (G + G^T + G^T G) / 2 of a displacement gradient G (rows:
 /// components; 1), that is (F^T F - I) / 2: free of rotation, on the initial configuration
 /// (Holzapfel 2000, eq. 2.69).
+///
+/// ```
+/// use palpate::strain::measure::green_lagrange;
+/// // A rotation is no strain, however large.
+/// let (s, c) = 0.8f64.sin_cos();
+/// let turn = [[c - 1.0, -s, 0.0], [s, c - 1.0, 0.0], [0.0; 3]];
+/// assert!(green_lagrange(&turn).iter().all(|e| e.abs() < 1e-12));
+/// // A stretch of 1.2 gives (1.2^2 - 1) / 2.
+/// let stretch = [[0.2, 0.0, 0.0], [0.0; 3], [0.0; 3]];
+/// assert!((green_lagrange(&stretch)[0] - 0.22).abs() < 1e-12);
+/// ```
 pub fn green_lagrange(g: &Matrix3) -> Symmetric3 {
     let e = |r: usize, c: usize| 0.5 * (g[r][c] + g[c][r] + (0..3).map(|k| g[k][r] * g[k][c]).sum::<f64>());
     [e(0, 0), e(1, 1), e(2, 2), e(0, 1), e(0, 2), e(1, 2)]
@@ -45,6 +56,11 @@ pub fn directions(strain: &Symmetric3) -> Matrix3 {
 }
 
 /// Largest shear: half the difference of the largest and the smallest principal strain (1).
+///
+/// ```
+/// use palpate::strain::measure::largest_shear;
+/// assert!((largest_shear(&[0.03, -0.01, 0.0, 0.0, 0.0, 0.0]) - 0.02).abs() < 1e-12);
+/// ```
 pub fn largest_shear(strain: &Symmetric3) -> f64 {
     let [high, _, low] = eigenvalues(strain);
     (high - low) / 2.0
@@ -52,6 +68,14 @@ pub fn largest_shear(strain: &Symmetric3) -> f64 {
 
 /// Relative change of volume, det F - 1 (1): exact for Green-Lagrange and logarithmic strain, to
 /// first order for small strain.
+///
+/// ```
+/// use palpate::StrainMeasure;
+/// use palpate::strain::measure::{tensor, volume_change};
+/// let g = [[0.1, 0.0, 0.0], [0.0, -0.05, 0.0], [0.0; 3]];
+/// let measure = StrainMeasure::GreenLagrange;
+/// assert!((volume_change(measure, &tensor(measure, &g)) - (1.1 * 0.95 - 1.0)).abs() < 1e-12);
+/// ```
 pub fn volume_change(measure: StrainMeasure, strain: &Symmetric3) -> f64 {
     let trace = strain[0] + strain[1] + strain[2];
     match measure {

@@ -31,6 +31,19 @@ pub struct StrainField {
 impl StrainField {
     /// Of a displacement field within `bodies` (a label for each voxel, 0 outside, where strain is
     /// 0; empty: one body everywhere): no displacement of one body enters the strain of another.
+    ///
+    /// ```
+    /// use palpate::strain::{StrainField, gauge::Gauge};
+    /// use palpate::{Affine, DenseField, Grid, StrainMeasure};
+    /// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// let field = DenseField::from_fn(grid, |p| [0.02 * p.0[0], 0.0, -0.01 * p.0[2]]);
+    /// let strain = StrainField::of(&field, &[], Gauge::shortest(&grid), StrainMeasure::Small);
+    /// let [largest, middle, smallest] = strain.principal(grid.index(4, 4, 4));
+    /// assert!(
+    ///     (largest - 0.02).abs() < 1e-5 && middle.abs() < 1e-5 && (smallest + 0.01).abs() < 1e-5
+    /// );
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn of(field: &DenseField, bodies: &[u8], gauge: gauge::Gauge, measure: StrainMeasure) -> Self {
         let strain = |_: usize, g: &Matrix3| measure::tensor(measure, g).map(|v| v as f32);
         Self { grid: *field.grid(), measure, values: gauge::map_gradients(field, bodies, gauge, strain) }

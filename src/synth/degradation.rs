@@ -126,6 +126,17 @@ impl Trouble {
 ///
 /// # Errors
 /// [`SynthError`] when the severity is outside [`Trouble::range`], or as [`phantom`] has it.
+///
+/// ```
+/// use palpate::synth::{Trouble, troubled};
+/// use palpate::{PhantomKind, PhantomParams};
+/// let block = PhantomParams::new(PhantomKind::Block).sized(24);
+/// let [clean, noisy] = [0.0, 20.0].map(|percent| troubled(&block, Trouble::Noise, percent));
+/// assert!(clean?.initial != noisy?.initial);
+/// // The severity has a range.
+/// assert!(troubled(&block, Trouble::Noise, 1e6).is_err());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn troubled(base: &PhantomParams, trouble: Trouble, severity: f64) -> Result<Phantom, SynthError> {
     let [low, high] = trouble.range();
     if !(low..=high).contains(&severity) {
@@ -162,6 +173,17 @@ pub fn troubled(base: &PhantomParams, trouble: Trouble, severity: f64) -> Result
 
 /// `truth` with errors as a measurement has them: normal with a standard deviation of `sigma` (mm)
 /// along each axis, correlated over about three voxels.
+///
+/// ```
+/// use palpate::synth::degradation::disturbed;
+/// use palpate::{Affine, DenseField, Grid, evaluate};
+/// let grid = Grid::new([24; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let truth = DenseField::from_fn(grid, |p| [0.1 * p.0[0], 0.0, 0.0]);
+/// let error = evaluate::metrics(&disturbed(&truth, 0.2, 1), &truth, None, &[])?.mean_mm;
+/// // The mean length of three normal components is 1.6 standard deviations.
+/// assert!((error / (0.2 * 1.596) - 1.0).abs() < 0.15);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn disturbed(truth: &DenseField, sigma: f64, seed: u64) -> DenseField {
     let (grid, n) = (*truth.grid(), truth.grid().len());
     let mut out = truth.clone();

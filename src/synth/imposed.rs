@@ -69,6 +69,18 @@ impl Star {
 
 /// The displacement (mm, RAS) of a uniform stretch by `strain` along voxel axis `axis` about the
 /// middle of a grid, which keeps the volume to first order.
+///
+/// ```
+/// use palpate::field::jacobian::jacobian_determinant;
+/// use palpate::synth::imposed::stretch;
+/// use palpate::{Affine, Grid};
+/// let grid = Grid::new([9; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = stretch(&grid, 2, 0.02);
+/// assert!((field.at(grid.index(4, 4, 8))[2] - 0.08).abs() < 1e-6);
+/// // The volume is kept to first order.
+/// assert!((jacobian_determinant(&field).as_slice()[0] - 1.0).abs() < 1e-3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn stretch(grid: &Grid, axis: usize, strain: f64) -> DenseField {
     let (shape, linear) = (grid.shape(), grid.affine().linear());
     let others = (0..3).filter(|&a| a != axis && shape[a] > 1).count().max(1) as f64;
@@ -83,6 +95,18 @@ pub fn stretch(grid: &Grid, axis: usize, strain: f64) -> DenseField {
 }
 
 /// The volume at x + u(x), on the field's grid; outside it the value of its border.
+///
+/// ```
+/// use palpate::synth::imposed::imposed;
+/// use palpate::{Affine, DenseField, Grid, Volume};
+/// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let scan = Volume::from_voxels(grid, |_, p| (0.5 * p.0[0]).sin() as f32);
+/// let moved = imposed(&scan, &DenseField::from_fn(grid, |_| [1.0, 0.0, 0.0]));
+/// assert!(
+///     (moved.as_slice()[grid.index(7, 8, 8)] - scan.as_slice()[grid.index(8, 8, 8)]).abs() < 1e-3
+/// );
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn imposed(volume: &Voxels<'_>, field: &DenseField) -> Volume {
     let (grid, there) = (*field.grid(), volume.grid());
     let sampler = Sampler::new(volume, Interpolation::Cubic, 0.0);
@@ -94,6 +118,17 @@ pub fn imposed(volume: &Voxels<'_>, field: &DenseField) -> Volume {
 }
 
 /// The volume with white Gaussian noise of this standard deviation.
+///
+/// ```
+/// use palpate::synth::imposed::with_noise;
+/// use palpate::{Affine, Grid, Volume};
+/// let grid = Grid::new([24; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let noisy = with_noise(&Volume::filled(grid, 100.0), 5.0, 1);
+/// let variance: f32 =
+///     noisy.as_slice().iter().map(|v| (v - 100.0).powi(2)).sum::<f32>() / grid.len() as f32;
+/// assert!((variance.sqrt() - 5.0).abs() < 0.2);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn with_noise(volume: &Voxels<'_>, sigma: f64, seed: u64) -> Volume {
     let nx = volume.grid().shape()[0];
     Volume::by_rows(*volume.grid(), |row, out| {

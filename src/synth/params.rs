@@ -193,6 +193,12 @@ impl PhantomParams {
     }
 
     /// The same field of view with `n` voxels along x, and the other sides in proportion.
+    ///
+    /// ```
+    /// use palpate::{PhantomKind, PhantomParams};
+    /// let head = PhantomParams::new(PhantomKind::Head).sized(48);
+    /// assert_eq!((head.size, head.spacing), ([48, 56, 48], [4.0; 3]));
+    /// ```
     pub fn sized(mut self, n: usize) -> Self {
         let factor = n as f64 / self.size[0] as f64;
         for a in 0..3 {

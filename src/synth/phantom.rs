@@ -88,6 +88,16 @@ pub struct Description {
 ///
 /// # Errors
 /// [`SynthError`] when a value is out of range or the motion folds at this amplitude.
+///
+/// ```
+/// use palpate::evaluate::landmarks;
+/// use palpate::{PhantomKind, PhantomParams, phantom};
+/// let pair = phantom(&PhantomParams::new(PhantomKind::Block).sized(24))?;
+/// assert_eq!(pair.initial.grid().shape(), [24, 24, 24]);
+/// // The landmarks are exact; the truth at them is read between voxels.
+/// assert!(landmarks(&pair.truth, &pair.landmarks).iter().all(|e| *e < 0.5));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn phantom(params: &PhantomParams) -> Result<Phantom, SynthError> {
     let grid = params.grid()?;
     phantom_on(params, grid, grid)
@@ -98,6 +108,20 @@ pub fn phantom(params: &PhantomParams) -> Result<Phantom, SynthError> {
 ///
 /// # Errors
 /// As [`phantom`].
+///
+/// ```
+/// use palpate::synth::phantom_on;
+/// use palpate::{Affine, Grid, PhantomKind, PhantomParams};
+/// let params = PhantomParams::new(PhantomKind::Block).sized(24);
+/// let initial = params.grid()?;
+/// // The deformed volume in thick slices.
+/// let thick =
+///     Grid::new([24, 24, 8], Affine::scaled([2.7, 2.7, 8.0], initial.affine().origin().0)?)?;
+/// let pair = phantom_on(&params, initial, thick)?;
+/// assert_eq!(pair.deformed.grid().shape(), [24, 24, 8]);
+/// assert_eq!(pair.truth.grid(), &initial);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn phantom_on(params: &PhantomParams, initial: Grid, deformed: Grid) -> Result<Phantom, SynthError> {
     params.check()?;
     Ok(imaged(params, pair(params, initial, deformed)?, initial, deformed))

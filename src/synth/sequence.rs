@@ -203,6 +203,17 @@ impl Sequence {
     ///
     /// # Errors
     /// [`SynthError`] when a value is out of range or some frame folds at this amplitude.
+    ///
+    /// ```
+    /// use palpate::synth::{Sequence, SequenceKind, SequenceParams};
+    /// let mut params = SequenceParams::new(SequenceKind::Pinch).sized(24);
+    /// params.frames = 4;
+    /// let sequence = Sequence::new(&params)?;
+    /// assert_eq!(sequence.frames(), 4);
+    /// // The first frame is at rest.
+    /// assert!(sequence.truth(0).as_slice().iter().all(|u| *u == 0.0));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn new(params: &SequenceParams) -> Result<Self, SynthError> {
         let grid = params.grid()?;
         let body = body(params.kind.body(), &grid, params.seed);

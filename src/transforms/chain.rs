@@ -20,6 +20,21 @@ impl Chain {
     ///
     /// A field says nothing outside its grid or where it is not finite, its inverse nothing where
     /// no point of the grid leads: there it is `None`. (ITK leaves such points where they are.)
+    ///
+    /// ```
+    /// use palpate::transforms::Chain;
+    /// use palpate::types::Transform;
+    /// use palpate::{Affine, AffineMap, DenseField, Grid, WorldPoint};
+    /// let shift =
+    ///     AffineMap::new([[1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])?;
+    /// let grid = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// let field = DenseField::from_fn(grid, |p| [0.0, p.0[0], 0.0]);
+    /// let chain = Chain(vec![Transform::Affine(shift), Transform::Field(field)]);
+    /// assert_eq!(chain.at(WorldPoint([1.0, 1.0, 1.0])), Some(WorldPoint([3.0, 4.0, 1.0])));
+    /// // The shift leads out of the field.
+    /// assert_eq!(chain.at(WorldPoint([7.0, 1.0, 1.0])), None);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn at(&self, p: WorldPoint) -> Option<WorldPoint> {
         self.0.iter().try_fold(p, step)
     }
@@ -47,6 +62,21 @@ impl Chain {
     }
 
     /// The chain from the deformed to the initial volume: each transform inverted, last one first.
+    ///
+    /// ```
+    /// use palpate::transforms::Chain;
+    /// use palpate::types::Transform;
+    /// use palpate::types::space::length;
+    /// use palpate::{Affine, DenseField, Grid, WorldPoint};
+    /// let grid = Grid::new([16; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// let field = DenseField::from_fn(grid, |p| [0.1 * p.0[1], 0.05 * p.0[0], 0.0]);
+    /// let chain = Chain(vec![Transform::Field(field)]);
+    /// let start = WorldPoint([5.0, 6.0, 7.0]);
+    /// let end = chain.at(start).ok_or("outside")?;
+    /// let back = chain.inverse().at(end).ok_or("outside")?;
+    /// assert!(length(back.minus(start)) < 1e-6);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn inverse(self) -> Self {
         Self(self.0.into_iter().rev().map(Transform::inverse).collect())
     }

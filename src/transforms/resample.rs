@@ -17,6 +17,20 @@ pub struct Resampled {
 }
 
 /// `image`, on any grid, at [`Chain::at`] of each voxel centre of `grid`; `background` outside.
+///
+/// ```
+/// use palpate::numerics::sampling::Interpolation;
+/// use palpate::transforms::{Chain, resample::resample};
+/// use palpate::{Affine, Grid, Volume};
+/// let fine = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let coarse = Grid::new([4; 3], Affine::scaled([2.0; 3], [0.5; 3])?)?;
+/// let image = Volume::from_voxels(fine, |_, p| p.0[2] as f32);
+/// // An empty chain moves nothing.
+/// let out = resample(&image, &Chain::default(), &coarse, Interpolation::Linear, 0.0);
+/// assert_eq!(out.image.as_slice()[coarse.index(1, 1, 3)], 6.5);
+/// assert_eq!(out.outside, 0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn resample(
     image: &Voxels<'_>,
     chain: &Chain,

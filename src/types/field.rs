@@ -21,6 +21,14 @@ pub type DenseField = Displacement<'static>;
 
 impl DenseField {
     /// No motion.
+    ///
+    /// ```
+    /// use palpate::{Affine, DenseField, Grid};
+    /// let field = DenseField::zeros(Grid::new([4; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?);
+    /// assert_eq!(field.as_slice().len(), 3 * 64);
+    /// assert_eq!(field.at(17), [0.0; 3]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn zeros(grid: Grid) -> Self {
         Self { grid, values: vec![0.0; 3 * grid.len()].into() }
     }
@@ -34,6 +42,16 @@ impl DenseField {
     }
 
     /// The displacement (mm) that `f` gives for each voxel centre.
+    ///
+    /// ```
+    /// use palpate::{Affine, DenseField, Grid};
+    /// let grid = Grid::new([8; 3], Affine::scaled([2.0; 3], [0.0; 3])?)?;
+    /// // Tissue is compressed by a tenth along z.
+    /// let field = DenseField::from_fn(grid, |p| [0.0, 0.0, -0.1 * p.0[2]]);
+    /// assert_eq!(field.at(grid.index(0, 0, 5)), [0.0, 0.0, -1.0]);
+    /// assert_eq!(field.component(2)[grid.index(3, 3, 5)], -1.0);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn from_fn(grid: Grid, mut f: impl FnMut(WorldPoint) -> [f64; 3]) -> Self {
         let mut out = Self::zeros(grid);
         let s = grid.shape();

@@ -93,6 +93,15 @@ impl Fingertip {
     ///
     /// # Errors
     /// [`ParamError`] names the first value out of range.
+    ///
+    /// ```
+    /// use palpate::{Fingertip, FingertipModel};
+    /// let tip = Fingertip::new(0.01, 30e3, [5.0, 5.0], FingertipModel::Parallel)?;
+    /// assert_eq!(tip.modulus_at(0.002), 30e3);
+    /// // Ten is a radius in millimetres; metres are asked for.
+    /// assert!(Fingertip::new(10.0, 30e3, [5.0, 5.0], FingertipModel::Parallel).is_err());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn new(radius: f64, youngs_modulus: f64, damping: [f64; 2], model: FingertipModel) -> Result<Self, ParamError> {
         let tip = Self {
             radius,

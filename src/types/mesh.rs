@@ -17,6 +17,22 @@ impl TetMesh {
     /// # Errors
     /// [`MeshError`] when an index is out of range or a coordinate is not finite. Orientation is
     /// the maker's duty.
+    ///
+    /// ```
+    /// use palpate::{MeshError, TetMesh, WorldPoint};
+    /// let nodes = vec![
+    ///     WorldPoint([0.0; 3]),
+    ///     WorldPoint([1.0, 0.0, 0.0]),
+    ///     WorldPoint([0.0, 1.0, 0.0]),
+    ///     WorldPoint([0.0, 0.0, 1.0]),
+    /// ];
+    /// assert_eq!(TetMesh::new(nodes.clone(), vec![[0, 1, 2, 3]])?.tetrahedra().len(), 1);
+    /// assert_eq!(
+    ///     TetMesh::new(nodes, vec![[0, 1, 2, 4]]),
+    ///     Err(MeshError::Index { index: 4, nodes: 4 })
+    /// );
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn new(nodes: Vec<WorldPoint>, tetrahedra: Vec<[u32; 4]>) -> Result<Self, MeshError> {
         check(&nodes, tetrahedra.iter().flatten())?;
         Ok(Self { nodes, tetrahedra })

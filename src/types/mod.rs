@@ -74,7 +74,7 @@ pub use result::{
 pub use samples::ErrorSamples;
 pub use scene::Scene;
 pub use solid::{ElementModulus, Measured, MeasuredNode, SolidElement, SolidMesh, SolidShape};
-pub use space::{Affine, Grid, VoxelPoint, WorldPoint};
+pub use space::{Affine, Grid, GridVector, VoxelPoint, WorldPoint};
 pub use stiffness::{StiffnessParams, StiffnessResult};
 pub use strain::{GaugeTrial, RegionStrain, StrainMeasure, StrainSummary};
 pub use track::{FrameSummary, Place, PointState, StrainRow, Together, Tracked, Trajectory};

@@ -164,6 +164,14 @@ impl FieldParams {
     ];
 
     /// The values of a preset (docs/explanation/accuracy.md has the measurements behind them).
+    ///
+    /// ```
+    /// use palpate::FieldParams;
+    /// use palpate::types::params::Preset;
+    /// let [fast, accurate] = [Preset::Fast, Preset::Accurate].map(FieldParams::preset);
+    /// // Fewer voxels for each point are more points.
+    /// assert!(fast.voxels_per_point > accurate.voxels_per_point);
+    /// ```
     pub fn preset(preset: Preset) -> Self {
         let balanced = Self {
             preset,
@@ -200,6 +208,14 @@ impl FieldParams {
     ///
     /// # Errors
     /// [`ParamError`] names the first value out of range, the range, and the unit.
+    ///
+    /// ```
+    /// use palpate::FieldParams;
+    /// assert!(FieldParams::default().check().is_ok());
+    /// let wrong = FieldParams { passes: 0, ..FieldParams::default() };
+    /// let error = wrong.check().unwrap_err();
+    /// assert_eq!((error.name, error.range), ("passes", "1 to 100"));
+    /// ```
     pub fn check(&self) -> Result<(), ParamError> {
         if !(self.search_mm.is_finite() && (0.0..=200.0).contains(&self.search_mm)) {
             return Err(ParamError { name: "search", value: self.search_mm, range: "0 (automatic) to 200 mm" });

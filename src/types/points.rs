@@ -1,6 +1,6 @@
 //! Feature points, matches and sparse displacement fields.
 
-use crate::types::space::{Matrix3, VoxelPoint, WorldPoint};
+use crate::types::space::{GridVector, Matrix3, VoxelPoint, WorldPoint};
 use crate::types::transform::AffineMap;
 
 /// A corner-like place of a volume (3D Harris).
@@ -18,9 +18,9 @@ pub struct FeaturePoint {
 /// One of several places where the tissue of an initial feature may have gone.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Candidate {
-    /// Displacement (mm along the initial grid's axes).
-    pub displacement: [f64; 3],
-    /// Normalised cross-correlation of the two patches, -1 to 1.
+    /// Displacement along the initial grid's axes.
+    pub displacement: GridVector,
+    /// Normalised cross-correlation of the two patches, -1 to 1; or another similarity, at most 1.
     pub ncc: f32,
 }
 
@@ -71,6 +71,19 @@ impl Match {
     }
 
     /// One number for the precision: the root of a third of the covariance's trace (mm).
+    ///
+    /// ```
+    /// use palpate::{Match, WorldPoint};
+    /// let m = Match {
+    ///     initial: WorldPoint([0.0; 3]),
+    ///     displacement: [1.0, 0.0, 0.0],
+    ///     ncc: 0.9,
+    ///     covariance: [0.04, 0.04, 0.04, 0.0, 0.0, 0.0],
+    ///     kept: true,
+    ///     raw: None,
+    /// };
+    /// assert!((m.sigma() - 0.2).abs() < 1e-12);
+    /// ```
     pub fn sigma(&self) -> f64 {
         ((self.covariance[0] + self.covariance[1] + self.covariance[2]) / 3.0).max(0.0).sqrt()
     }
@@ -99,6 +112,21 @@ impl SparseField {
     pub const PATCH: usize = 3;
 
     /// The matches that consistency kept.
+    ///
+    /// ```
+    /// use palpate::{Match, SparseField, WorldPoint};
+    /// let at = |x, kept| Match {
+    ///     initial: WorldPoint([x, 0.0, 0.0]),
+    ///     displacement: [0.5, 0.0, 0.0],
+    ///     ncc: 0.9,
+    ///     covariance: [0.01, 0.01, 0.01, 0.0, 0.0, 0.0],
+    ///     kept,
+    ///     raw: None,
+    /// };
+    /// let field = SparseField { matches: vec![at(0.0, true), at(1.0, false), at(2.0, true)] };
+    /// let places: Vec<f64> = field.kept().map(|m| m.initial.0[0]).collect();
+    /// assert_eq!(places, [0.0, 2.0]);
+    /// ```
     pub fn kept(&self) -> impl Iterator<Item = &Match> {
         self.matches.iter().filter(|m| m.kept)
     }

@@ -321,6 +321,15 @@ impl Scene {
 
     /// The reference scene: eight motions of 0.5 s with 1 s of hold after 0.5 s of rest
     /// (docs/reference/grasp.md).
+    ///
+    /// ```
+    /// use palpate::Scene;
+    /// let scene = Scene::reference();
+    /// assert_eq!(scene.motions.len(), 8);
+    /// assert!(scene.check().is_ok());
+    /// // Half a second of rest, then motions of 0.5 s with 1 s of hold each.
+    /// assert!((scene.duration() - 12.5).abs() < 1e-9);
+    /// ```
     pub fn reference() -> Self {
         let motion = |degrees: [f64; 2]| Motion { target: degrees.map(f64::to_radians), duration: 0.5, hold: 1.0 };
         Self {
@@ -389,6 +398,13 @@ impl Scene {
     ///
     /// # Errors
     /// [`SceneError`] names the first value out of range, or those that do not go together.
+    ///
+    /// ```
+    /// use palpate::Scene;
+    /// let mut scene = Scene::reference();
+    /// scene.object.mass = -1.0;
+    /// assert!(scene.check().unwrap_err().to_string().contains("mass"));
+    /// ```
     pub fn check(&self) -> Result<(), SceneError> {
         let Self { fingertip, object, initial, integrator, .. } = self;
         self.fingertips().into_iter().try_for_each(Fingertip::check)?;

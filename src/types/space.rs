@@ -1,8 +1,9 @@
 //! Frames: voxel indices, world millimetres (RAS), and the affine between them.
 //!
 //! The two kinds of point are different types, so that one cannot be used for the other. A
-//! *displacement* is a plain `[f64; 3]` in world millimetres, pointing from the initial to the
-//! deformed place of the same tissue.
+//! *displacement* points from the initial to the deformed place of the same tissue. A plain
+//! `[f64; 3]` is a displacement in world millimetres; one along the axes of a lattice is a
+//! [`GridVector`], which [`Grid::vector_to_world`] turns into the former.
 
 use crate::error::SpaceError;
 
@@ -18,6 +19,14 @@ pub struct WorldPoint(pub [f64; 3]);
 
 impl WorldPoint {
     /// This point moved by `d` (mm).
+    ///
+    /// ```
+    /// use palpate::WorldPoint;
+    /// let (before, after) = (WorldPoint([1.0, 2.0, 3.0]), WorldPoint([1.5, 2.0, 1.0]));
+    /// let u = after.minus(before);
+    /// assert_eq!(u, [0.5, 0.0, -2.0]);
+    /// assert_eq!(before.moved(u), after);
+    /// ```
     pub fn moved(self, d: [f64; 3]) -> WorldPoint {
         WorldPoint([self.0[0] + d[0], self.0[1] + d[1], self.0[2] + d[2]])
     }
@@ -27,6 +36,22 @@ impl WorldPoint {
         [self.0[0] - other.0[0], self.0[1] - other.0[1], self.0[2] - other.0[2]]
     }
 }
+
+/// A displacement in millimetres along the axes of a grid: matching works in this frame.
+///
+/// It equals the world displacement only where the grid's axes run right, anterior and superior.
+/// [`Grid::vector_to_world`] converts it.
+///
+/// A field does not take it for a displacement in world mm:
+///
+/// ```compile_fail
+/// use palpate::{DenseField, Grid, GridVector};
+/// fn field(grid: Grid, found: GridVector) -> DenseField {
+///     DenseField::from_fn(grid, |_| found)
+/// }
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GridVector(pub [f64; 3]);
 
 /// A 3 x 3 matrix, row by row.
 pub type Matrix3 = [[f64; 3]; 3];
@@ -63,17 +88,19 @@ pub fn length(v: [f64; 3]) -> f64 {
     dot(v, v).sqrt()
 }
 
-/// `a b`.
-fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
+/// The product of a matrix with a vector.
+#[inline]
+pub fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])
 }
 
 /// The identity.
 const UNIT: Matrix3 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
-/// `a b`.
-fn matmul(a: &Matrix3, b: &Matrix3) -> Matrix3 {
-    std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| a[r][k] * b[k][c]).sum()))
+/// The product of two matrices.
+#[inline]
+pub fn matmul(a: &Matrix3, b: &Matrix3) -> Matrix3 {
+    std::array::from_fn(|r| std::array::from_fn(|c| a[r][0] * b[0][c] + a[r][1] * b[1][c] + a[r][2] * b[2][c]))
 }
 
 impl Affine {
@@ -122,6 +149,16 @@ impl Affine {
     ///
     /// # Errors
     /// As [`Affine::new`].
+    ///
+    /// ```
+    /// use palpate::{Affine, VoxelPoint, WorldPoint};
+    /// let affine = Affine::scaled([1.5, 1.5, 5.0], [-70.0, -60.0, 0.0])?;
+    /// assert_eq!(affine.to_world(VoxelPoint([10.0, 0.0, 2.0])), WorldPoint([-55.0, -60.0, 10.0]));
+    /// assert_eq!(affine.to_voxel(WorldPoint([-55.0, -60.0, 10.0])), VoxelPoint([10.0, 0.0, 2.0]));
+    /// // An axis without length has no inverse.
+    /// assert!(Affine::scaled([1.0, 1.0, 0.0], [0.0; 3]).is_err());
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn scaled(spacing: [f64; 3], origin: [f64; 3]) -> Result<Self, SpaceError> {
         let mut rows = [[0.0; 4]; 3];
         for a in 0..3 {
@@ -189,6 +226,14 @@ impl Grid {
     ///
     /// # Errors
     /// [`SpaceError::Empty`] when a side is zero, [`SpaceError::TooLarge`] past 2^31 voxels.
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, SpaceError};
+    /// let affine = Affine::scaled([2.0; 3], [0.0; 3])?;
+    /// assert_eq!(Grid::new([64, 64, 20], affine)?.len(), 81_920);
+    /// assert!(matches!(Grid::new([64, 0, 20], affine), Err(SpaceError::Empty { .. })));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn new(shape: [usize; 3], affine: Affine) -> Result<Self, SpaceError> {
         if shape.contains(&0) {
             return Err(SpaceError::Empty { shape });
@@ -214,6 +259,43 @@ impl Grid {
         self.affine.spacing()
     }
 
+    /// Unit vectors along the grid's axes, one a column (world RAS).
+    pub fn axes(&self) -> Matrix3 {
+        let (spacing, linear) = (self.spacing(), self.affine.linear());
+        std::array::from_fn(|r| std::array::from_fn(|a| linear[r][a] / spacing[a]))
+    }
+
+    /// A displacement along the grid's axes (mm) as one in world mm (RAS).
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, GridVector};
+    /// // Voxels stored from right to left: their first axis points to the patient's left.
+    /// let flipped =
+    ///     Affine::new([[-1.0, 0.0, 0.0, 31.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])?;
+    /// let grid = Grid::new([32, 32, 32], flipped)?;
+    /// assert_eq!(grid.vector_to_world(GridVector([2.0, 0.5, 0.0])), [-2.0, 0.5, 0.0]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn vector_to_world(&self, d: GridVector) -> [f64; 3] {
+        let axes = self.axes();
+        std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * d.0[a]).sum())
+    }
+
+    /// A displacement in world mm (RAS) as one along the grid's axes (mm).
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid};
+    /// let grid = Grid::new([8, 8, 4], Affine::scaled([1.0, 1.0, 2.5], [0.0; 3])?)?;
+    /// let along = grid.vector_from_world([1.0, 0.0, 5.0]);
+    /// assert_eq!(along.0, [1.0, 0.0, 5.0]);
+    /// assert_eq!(grid.vector_to_world(along), [1.0, 0.0, 5.0]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    pub fn vector_from_world(&self, d: [f64; 3]) -> GridVector {
+        let (voxels, spacing) = (self.affine.vector_to_voxel(d), self.spacing());
+        GridVector(std::array::from_fn(|a| voxels[a] * spacing[a]))
+    }
+
     /// Shortest voxel edge (mm).
     pub fn least_spacing(&self) -> f64 {
         self.spacing().into_iter().fold(f64::INFINITY, f64::min)
@@ -235,6 +317,14 @@ impl Grid {
     }
 
     /// Offset of voxel `(i, j, k)` in x-fastest order (NIfTI's order on disk).
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid};
+    /// let grid = Grid::new([4, 3, 2], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// assert_eq!(grid.index(1, 2, 1), 1 + 4 * (2 + 3));
+    /// assert_eq!(grid.voxel(grid.index(1, 2, 1)), [1, 2, 1]);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     #[inline]
     pub fn index(&self, i: usize, j: usize, k: usize) -> usize {
         i + self.shape[0] * (j + self.shape[1] * k)
@@ -261,6 +351,15 @@ impl Grid {
 
     /// Whether the two grids have the same shape and their corners coincide to 1e-3 of a voxel
     /// (NIfTI stores float32).
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid};
+    /// let at = |x| Grid::new([8; 3], Affine::scaled([1.0; 3], [x, 0.0, 0.0])?);
+    /// let grid = at(0.0)?;
+    /// assert!(grid.same_as(&at(1e-5)?));
+    /// assert!(!grid.same_as(&at(0.5)?));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn same_as(&self, other: &Grid) -> bool {
         let far = |g: &Grid, c: usize| {
             let s = self.shape;

@@ -82,6 +82,12 @@ impl Side {
     }
 
     /// From `x-`, `z+` ...; none for anything else.
+    ///
+    /// ```
+    /// use palpate::types::stiffness::Side;
+    /// assert_eq!(Side::parse("z-").map(Side::direction), Some([0.0, 0.0, -1.0]));
+    /// assert_eq!(Side::parse("z"), None);
+    /// ```
     pub fn parse(text: &str) -> Option<Self> {
         let (axis, sign) = text.split_at_checked(1)?;
         let axis = ["x", "y", "z"].iter().position(|a| a.eq_ignore_ascii_case(axis))?;
@@ -173,6 +179,14 @@ impl StiffnessParams {
     ///
     /// # Errors
     /// [`ParamError`] names the first value out of range.
+    ///
+    /// ```
+    /// use palpate::StiffnessParams;
+    /// let params = StiffnessParams { force_n: Some(3.6), ..StiffnessParams::default() };
+    /// assert!(params.check().is_ok());
+    /// // No stiffness matrix of a displacement method holds exactly incompressible tissue.
+    /// assert!(StiffnessParams { poisson: 0.5, ..params }.check().is_err());
+    /// ```
     pub fn check(&self) -> Result<(), ParamError> {
         let ratios = self.poisson_of.iter().map(|p| p.1).chain([self.poisson]);
         if let Some(value) = ratios.into_iter().find(|nu| !(0.0..0.5).contains(nu)) {

@@ -57,6 +57,18 @@ impl AffineMap {
     }
 
     /// This map, then `next`.
+    ///
+    /// ```
+    /// use palpate::{AffineMap, WorldPoint};
+    /// let shift =
+    ///     AffineMap::new([[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])?;
+    /// let twice =
+    ///     AffineMap::new([[2.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]])?;
+    /// let both = shift.then(&twice);
+    /// assert_eq!(both.at(WorldPoint([1.0, 1.0, 0.0])), WorldPoint([12.0, 2.0, 0.0]));
+    /// assert_eq!(both.inverse().at(WorldPoint([12.0, 2.0, 0.0])), WorldPoint([1.0, 1.0, 0.0]));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn then(&self, next: &Self) -> Self {
         Self(self.0.then(&next.0))
     }

@@ -25,6 +25,17 @@ impl<T: Clone> Volume<T> {
     ///
     /// # Errors
     /// [`SpaceError::Length`] when it is not.
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, SpaceError, Volume};
+    /// let grid = Grid::new([3, 2, 1], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// let volume = Volume::from_vec(grid, vec![0.0f32, 1.0, 2.0, 3.0, 4.0, 5.0])?;
+    /// // The array is indexed by x, y, z.
+    /// assert_eq!(volume.array()[[2, 1, 0]], 5.0);
+    /// let short = Volume::from_vec(grid, vec![0.0f32; 5]);
+    /// assert_eq!(short.unwrap_err(), SpaceError::Length { expected: 6, found: 5 });
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn from_vec(grid: Grid, values: Vec<T>) -> Result<Self, SpaceError> {
         Self::of(grid, values.into())
     }
@@ -44,6 +55,16 @@ impl<T: Clone> Volume<T> {
 
     /// The value that `f` gives for each voxel's x-fastest offset and centre, in parallel: `f` must
     /// not depend on the order of calls.
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, Mask};
+    /// let grid = Grid::new([20; 3], Affine::scaled([1.0; 3], [-9.5; 3])?)?;
+    /// let ball =
+    ///     Mask::from_voxels(grid, |_, p| u8::from(p.0.iter().map(|x| x * x).sum::<f64>() < 64.0));
+    /// assert_eq!(ball.as_slice()[grid.index(10, 10, 10)], 1);
+    /// assert_eq!(ball.as_slice()[0], 0);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn from_voxels(grid: Grid, f: impl Fn(usize, WorldPoint) -> T + Sync) -> Self
     where
         T: Send + Sync + Default,
@@ -78,6 +99,16 @@ impl<'a, T: Clone> Voxels<'a, T> {
     ///
     /// # Errors
     /// [`SpaceError::Length`] when it is not.
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, Voxels};
+    /// let values = vec![7.0f32; 8];
+    /// let grid = Grid::new([2; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// let volume = Voxels::lent(grid, &values)?;
+    /// // Nothing is copied.
+    /// assert!(std::ptr::eq(volume.as_slice(), values.as_slice()));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn lent(grid: Grid, values: &'a [T]) -> Result<Self, SpaceError> {
         Self::of(grid, values.into())
     }
@@ -138,6 +169,17 @@ impl<'a, T: Clone> Voxels<'a, T> {
 
 impl Voxels<'_, u8> {
     /// The first and the last voxel along each axis of those that are not 0; none of an empty mask.
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, Mask};
+    /// let grid = Grid::new([9; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// let mut mask = Mask::filled(grid, 0);
+    /// assert_eq!(mask.bounds(), None);
+    /// mask.as_mut_slice()[grid.index(2, 3, 4)] = 1;
+    /// mask.as_mut_slice()[grid.index(5, 3, 1)] = 1;
+    /// assert_eq!(mask.bounds(), Some([[2, 3, 1], [5, 3, 4]]));
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn bounds(&self) -> Option<[[usize; 3]; 2]> {
         let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
         for (at, _) in self.as_slice().iter().enumerate().filter(|(_, v)| **v != 0) {

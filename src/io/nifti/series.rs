@@ -42,6 +42,18 @@ impl Series {
     /// # Errors
     /// [`IoError`] when the file cannot be read, is cut short, or is no scalar volume or series of
     /// these.
+    ///
+    /// ```
+    /// use palpate::{Affine, Grid, Volume, io};
+    /// let folder = tempfile::tempdir()?;
+    /// let path = folder.path().join("one.nii.gz");
+    /// let grid = Grid::new([6; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+    /// io::write_volume(&path, &Volume::filled(grid, 2.0), "")?;
+    /// let mut series = io::Series::open(&path)?;
+    /// assert_eq!(series.frames(), 1);
+    /// assert_eq!(series.read(0)?.as_slice()[5], 2.0);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn open(path: impl AsRef<Path>) -> Result<Self, IoError> {
         let path = path.as_ref();
         let opened = open(path)?;

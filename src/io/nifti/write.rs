@@ -42,6 +42,17 @@ const COARSE: f64 = 0.25;
 /// # Errors
 /// [`IoError`] when the name ends in none of `.nii`, `.nii.gz`, `.nrrd` and `.mha`, an axis of
 /// NIfTI has more than 32,767 voxels or the file cannot be written.
+///
+/// ```
+/// use palpate::{Affine, Grid, Volume, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("ramp.nii.gz");
+/// let grid = Grid::new([6, 5, 4], Affine::scaled([1.0, 1.0, 2.5], [-3.0, 0.0, 8.0])?)?;
+/// let ramp = Volume::from_voxels(grid, |o, _| o as f32);
+/// io::write_volume(&path, &ramp, "a ramp")?;
+/// assert_eq!(io::read_volume(&path)?, ramp);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_volume(path: impl AsRef<Path>, volume: &Volume, description: &str) -> Result<(), IoError> {
     let form = Form { description, ..Form::FLOATS };
     write(path.as_ref(), volume.grid(), form, &[volume.as_slice()], |_, v| stored(v).to_le_bytes()).map(drop)
@@ -131,6 +142,25 @@ pub fn write_integers(path: impl AsRef<Path>, volume: &Volume, description: &str
 ///
 /// # Errors
 /// As [`write_volume`].
+///
+/// ```
+/// use palpate::{Affine, Grid, Mask, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("labels.nii.gz");
+/// let grid = Grid::new([6; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let labels = Mask::from_voxels(grid, |_, p| if p.0[0] < 3.0 { 0 } else { 7 });
+/// io::write_labels(&path, &labels, "two halves")?;
+/// assert_eq!(io::read_labels(&path)?, labels);
+/// // A mask is what is not 0.
+/// assert!(
+///     io::read_mask(&path)?
+///         .as_slice()
+///         .iter()
+///         .zip(labels.as_slice())
+///         .all(|(m, l)| (*m != 0) == (*l != 0))
+/// );
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) -> Result<(), IoError> {
     let form = Form { datatype: 2, bits: 8, description, ..Form::FLOATS };
     write(path.as_ref(), labels.grid(), form, &[labels.as_slice()], |_, v: u8| [v]).map(drop)
@@ -144,6 +174,18 @@ pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) ->
 ///
 /// # Errors
 /// As [`write_volume`].
+///
+/// ```
+/// use palpate::{Affine, DenseField, Grid, io};
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("displacement.nii.gz");
+/// let grid = Grid::new([6; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let field = DenseField::from_fn(grid, |p| [0.25 * p.0[0], 0.0, -0.5]);
+/// io::write_field(&path, &field)?;
+/// // On disk the components are LPS, in memory RAS.
+/// assert_eq!(io::read_field(&path)?, field);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_field(path: impl AsRef<Path>, field: &DenseField) -> Result<(), IoError> {
     write_series_field(path, field).map(drop)
 }

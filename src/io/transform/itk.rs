@@ -8,7 +8,7 @@ use crate::error::IoError;
 use crate::io::format_error::Flaw;
 use crate::io::raw::grid_from_lps;
 use crate::io::read_text;
-use crate::types::space::Matrix3;
+use crate::types::space::{Matrix3, matmul};
 use crate::types::{AffineMap, DenseField, Transform};
 use std::path::Path;
 
@@ -166,10 +166,6 @@ fn diagonal(d: [f64; 3]) -> Matrix3 {
     std::array::from_fn(|r| std::array::from_fn(|c| if r == c { d[r] } else { 0.0 }))
 }
 
-fn product(a: &Matrix3, b: &Matrix3) -> Matrix3 {
-    std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| a[r][k] * b[k][c]).sum()))
-}
-
 /// Rotations about x, y and z (radians): Z X Y, or Z Y X (itkEuler3DTransform.hxx).
 fn euler([x, y, z]: [f64; 3], zyx: bool) -> Matrix3 {
     let (rx, ry, rz) = (
@@ -178,8 +174,8 @@ fn euler([x, y, z]: [f64; 3], zyx: bool) -> Matrix3 {
         [[z.cos(), -z.sin(), 0.0], [z.sin(), z.cos(), 0.0], [0.0, 0.0, 1.0]],
     );
     match zyx {
-        true => product(&rz, &product(&ry, &rx)),
-        false => product(&rz, &product(&rx, &ry)),
+        true => matmul(&rz, &matmul(&ry, &rx)),
+        false => matmul(&rz, &matmul(&rx, &ry)),
     }
 }
 

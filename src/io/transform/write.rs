@@ -46,6 +46,19 @@ pub enum FieldFormat<'a> {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written, or a grid lies absurdly far off.
+///
+/// ```
+/// use palpate::AffineMap;
+/// use palpate::io::{AffineFormat, TransformSource, read_transform, write_affine};
+/// use palpate::types::Transform;
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("affine.txt");
+/// let map = AffineMap::new([[1.0, 0.0, 0.0, 4.0], [0.0, 1.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.0]])?;
+/// write_affine(&path, &map, AffineFormat::Itk)?;
+/// let stored = read_transform(&path, Some(TransformSource::Itk), None, None)?;
+/// assert_eq!(stored.transforms, [Transform::Affine(map)]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn write_affine(path: impl AsRef<Path>, map: &AffineMap, format: AffineFormat<'_>) -> Result<(), IoError> {
     let path = path.as_ref();
     let matrix = match format {

@@ -9,7 +9,7 @@
 use crate::synth::elastic::quadratic::{GAUSS, NODES, Nodal, Tables, divergence, gradient, line, weight};
 use crate::synth::elastic::space::{Entries, LANES, Space, entries};
 use crate::synth::elastic::tangent::Batch;
-use crate::types::space::{Matrix3, determinant};
+use crate::types::space::{Matrix3, determinant, matmul};
 use rayon::prelude::*;
 
 /// Lame's constants (kPa).
@@ -49,11 +49,6 @@ fn adjugate(m: &Matrix3) -> (Matrix3, f64) {
         })
     });
     (adjugate, determinant(m))
-}
-
-#[inline(always)]
-fn product(a: &Matrix3, b: &Matrix3) -> Matrix3 {
-    std::array::from_fn(|r| std::array::from_fn(|c| a[r][0] * b[0][c] + a[r][1] * b[1][c] + a[r][2] * b[2][c]))
 }
 
 /// A pressure p (kPa) that is linear in an element: at the world's origin, and its slopes (a mm).
@@ -132,7 +127,7 @@ fn element(
         let ((cut, rest_volume), (cut_moved, moved_volume)) = (adjugate(&at(rest, q, l)), adjugate(&at(moved, q, l)));
         local[q] = cut.map(|r| r.map(|v| v / rest_volume));
         back[q] = cut_moved.map(|r| r.map(|v| v / moved_volume));
-        strain[q] = product(&at(moved, q, l), &local[q]);
+        strain[q] = matmul(&at(moved, q, l), &local[q]);
         w[q] = weight(q) * rest_volume;
         let j = moved_volume / rest_volume;
         if rest_volume <= 0.0 || j <= 0.0 {
