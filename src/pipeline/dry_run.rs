@@ -130,7 +130,7 @@ pub fn stiffness_memory(nodes: usize) -> u64 {
     if nodes <= FACTORISED { 120_000_000 + 26_000 * n } else { 150_000_000 + 10_000 * n }
 }
 
-/// Time of a stiffness run of labels on a mesh of so many nodes (CPU s) on a core of 2.5 GHz: 2 s,
+/// Time of a stiffness run of labels on a mesh of `nodes` nodes (CPU s) on a core of 2.5 GHz: 2 s,
 /// and 0.45 ms a node (docs/lab/2026-11-solver.md).
 pub fn stiffness_seconds(nodes: usize) -> f64 {
     2.0 + 0.45e-3 * nodes as f64

@@ -119,7 +119,7 @@ impl<'a> Tangent<'a> {
         }
     }
 
-    /// As [`Self::sensitivities`], for so many that a factor of the matrix itself is worth it.
+    /// As [`Self::sensitivities`], for as many as make a factor of the matrix itself worth it.
     ///
     /// # Errors
     /// As [`Self::solve`].
