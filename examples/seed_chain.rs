@@ -4,7 +4,8 @@
 //!
 //!     cargo run --release --example seed_chain
 //!
-//! `seed.rs` runs the finished form of it, coarse to fine and with sub-voxel matching.
+//! Its matches are true to a voxel. `seed.rs` runs the finished form, coarse to fine and with
+//! sub-voxel matching.
 
 use palpate::consistency::energy::{EnergyParams, Graph};
 use palpate::consistency::relaxation::relax;
@@ -23,7 +24,7 @@ const WANTED: [usize; 2] = [1_000, 5_000];
 const REACH_MM: f64 = 8.0;
 
 /// Least probability of a choice that is kept.
-const SURE: f64 = 0.9;
+const SURE: f64 = 0.5;
 
 /// The displacement of the tissue inside the mesh of the matches (mm, RAS).
 pub fn chain(initial: &Volume, deformed: &Volume, mask: &Mask) -> Result<Interpolated, Box<dyn Error>> {

@@ -96,9 +96,9 @@ fn own_similarity_sees_through_a_contrast_that_is_the_other_way_round() {
 fn own_matches_make_a_field_and_its_strain() {
     let (out, _) = example("own_matches", &[]);
     let [error, motion] = beside(&out, " mm of a motion of ");
-    assert!(error < 0.3 * motion, "{out}");
+    assert!(error < 0.5 * motion, "{out}");
     let strain: f64 = out.split("principal strain ").nth(1).unwrap().trim().parse().unwrap();
-    assert!((0.01..0.6).contains(&strain), "{out}");
+    assert!((0.1..1.5).contains(&strain), "{out}");
 }
 
 #[test]

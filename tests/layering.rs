@@ -277,3 +277,28 @@ fn the_checker_lets_pass_what_is_allowed() {
         assert_eq!(violations(part, source), Vec::<String>::new(), "{source}");
     }
 }
+
+/// A file that moves takes its name in the documents along.
+#[test]
+fn documents_name_source_files_that_exist() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut pages = vec![root.join("README.md"), root.join("CONTRIBUTING.md")];
+    for shelf in ["tutorials", "how-to", "reference", "explanation"] {
+        pages.extend(fs::read_dir(root.join("docs").join(shelf)).unwrap().map(|e| e.unwrap().path()));
+    }
+    let names: Vec<String> = sources(&root.join("src")).iter().map(|p| p.to_string_lossy().into_owned()).collect();
+    let mut checked = 0;
+    for page in pages.iter().filter(|p| p.extension().is_some_and(|e| e == "md")) {
+        let text = fs::read_to_string(page).unwrap();
+        for named in
+            text.split('`').skip(1).step_by(2).filter(|n| n.ends_with(".rs") && !n.contains(char::is_whitespace))
+        {
+            let inside = named.strip_prefix("src/").unwrap_or(named);
+            let is_one = |f: &String| f.ends_with(&format!("/{inside}"));
+            let elsewhere = ["tests", "benches", "examples", ""].iter().any(|d| root.join(d).join(named).exists());
+            assert!(names.iter().any(is_one) || elsewhere || named.contains("NAME"), "{}: {named}", page.display());
+            checked += 1;
+        }
+    }
+    assert!(checked > 100, "{checked}");
+}

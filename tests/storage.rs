@@ -53,10 +53,10 @@ fn error(pair: &Phantom, initial: Storage, deformed: Storage) -> [f64; 2] {
 
 #[test]
 fn the_chain_written_against_the_library_gives_the_same_error_however_voxels_are_stored() {
-    let params = PhantomParams { amplitude: 6.0, size: [48; 3], ..PhantomParams::new(PhantomKind::Block) };
+    let params = PhantomParams { size: [48; 3], ..PhantomParams::new(PhantomKind::Block) };
     let pair = phantom(&params).unwrap();
     let plain = error(&pair, PLAIN, PLAIN);
-    assert!(plain[0] < 0.5 * plain[1], "{plain:?}");
+    assert!(plain[0] < 0.7 * plain[1], "{plain:?}");
     let flipped = ([0, 1, 2], [true, false, false]);
     let turned = ([1, 2, 0], [false; 3]);
     let swapped = ([2, 1, 0], [true, true, false]);

@@ -102,7 +102,7 @@ pub fn text(report: &SkinReport<'_>) -> String {
     }
     for (at, layer) in report.scene.layers.iter().enumerate() {
         let strain = end.map_or(0.0, |s| s.strain[at]);
-        let stays = report.residual[at].map_or(String::new(), |r| format!(", {} for ever", short(r)));
+        let stays = report.residual[at].map_or(String::new(), |r| format!(", {} permanent", short(r)));
         let _ = writeln!(out, "  {:<12} strain {} at the end{stays}", layer.name, short(strain));
     }
     out
