@@ -100,15 +100,25 @@ impl Pairs<'_> {
 /// # Errors
 /// [`StrainError`] as [`field::run`] and [`crate::pipeline::strain::run`], or when grids differ.
 ///
+/// ```no_run
+/// use palpate::pipeline::certify::{CertifyInput, run};
+/// use palpate::{FieldParams, io};
+/// let scan = io::read_volume("scan.nii.gz")?;
+/// let input = CertifyInput { initial: &scan, second: None, mask: None, like: None };
+/// let found = run(input, &FieldParams::default(), &|_, _| {})?;
+/// println!("displacement noise {:.3} mm", found.certificate.displacement_noise_mm);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
 /// ```
 /// use palpate::pipeline::certify::{CertifyInput, run};
-/// use palpate::types::params::Preset;
-/// use palpate::{FieldParams, PhantomKind, PhantomParams, phantom};
-/// let scan = phantom(&PhantomParams::new(PhantomKind::Block).sized(24))?.initial;
-/// let input = CertifyInput { initial: &scan, second: None, mask: None, like: None };
-/// let found = run(input, &FieldParams::preset(Preset::Fast), &|_, _| {})?;
-/// assert!(found.certificate.image_noise > 0.0);
-/// assert!(found.certificate.displacement_noise_mm < 1.0);
+/// use palpate::{Affine, FieldParams, Grid, Volume};
+/// let affine = Affine::scaled([1.0; 3], [0.0; 3])?;
+/// let [scan, other] = [16, 12].map(|n| Grid::new([n; 3], affine).map(|g| Volume::filled(g, 1.0)));
+/// let (scan, other) = (scan?, other?);
+/// // A second scan lies on the same grid.
+/// let input = CertifyInput { initial: &scan, second: Some(&other), mask: None, like: None };
+/// assert!(run(input, &FieldParams::default(), &|_, _| {}).is_err());
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>) -> Result<Certified, StrainError> {
