@@ -382,7 +382,7 @@ fn a_time_limit_stops_with_a_reason() {
 fn too_little_memory_is_refused_before_the_voxels_are_read() {
     let folder = small_pair();
     let stiffness = "stiffness --field truth.nii.gz --mask mask.nii.gz --nodes 400000 -o stiff";
-    let output = shell(folder.path(), "ulimit -v 6000000", stiffness);
+    let output = shell(folder.path(), "ulimit -v 3000000", stiffness);
     let said = text(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("of memory") && said.contains("--nodes "), "{said}");
