@@ -43,7 +43,7 @@ def table(folder, name="batch.csv"):
 
 
 def test_a_cohort_from_end_to_end(shell, tmp_path):
-    make(tmp_path / "data", SUBJECTS, 28, 1, shell.program)
+    make(tmp_path / "data", SUBJECTS, 36, 1, shell.program)
     names = [f"sub-{n:02}_ses-01" for n in range(1, SUBJECTS + 1)]
 
     # The first subject's volume is damaged; the last one's stiffness fails once, as a busy node might. Fingertips of all but the
@@ -117,7 +117,7 @@ def test_a_cohort_from_end_to_end(shell, tmp_path):
 def test_every_job_has_a_place_on_a_cluster(shell, tmp_path):
     """The dry run with the Slurm executor plans the same jobs."""
     pytest.importorskip("snakemake_executor_plugin_slurm")
-    make(tmp_path / "data", 1, 28, 1, shell.program)
+    make(tmp_path / "data", 1, 36, 1, shell.program)
     process = snakemake(tmp_path, shell.program, "--dry-run", "--executor", "slurm", "--jobs", "4")
     said = finish(process, tmp_path)
     for rule in ("field", "stiffness", "fingertip", "grasp", "collect"):
