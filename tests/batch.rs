@@ -70,6 +70,30 @@ fn a_bids_folder_gives_pairs_by_run_or_session_and_derivatives() {
     run(folder.path(), &["batch", "bids", "-o", "out", "--preset", "fast"], 0);
     assert_eq!(statuses(folder.path()), ["sub-01_run-10_T1w skipped", "sub-02_ses-2_acq-hand_T2w skipped"]);
 
+    // A field that cannot be measured any more leaves no derivative of the earlier one.
+    fs::write(at("bids/sub-01/anat/sub-01_run-10_T1w.nii.gz"), "no volume").unwrap();
+    run(folder.path(), &["batch", "bids", "-o", "out", "--preset", "fast"], 1);
+    assert!(!at("out/sub-01/anat/sub-01_from-run10_to-run9_mode-image_desc-T1w_xfm.nii.gz").exists());
+    assert!(at("out/sub-02/anat/sub-02_acq-hand_from-ses2_to-ses1_mode-image_desc-T2w_xfm.nii.gz").exists());
+
+    // Masks are no images, and two files are no two runs.
+    put("mask.nii.gz", "sub-02/ses-1/anat/sub-02_ses-1_run-1_mod-T2w_defacemask.nii.gz");
+    put("mask.nii.gz", "sub-02/ses-1/anat/sub-02_ses-1_run-2_mod-T2w_defacemask.nii.gz");
+    run(folder.path(), &["batch", "bids", "-o", "out", "--collect"], 1);
+    assert_eq!(statuses(folder.path()).len(), 2);
+    put("initial.nii.gz", "sub-01/anat/sub-01_run-09_T1w.nii.gz");
+    let (_, err) = run(folder.path(), &["batch", "bids", "-o", "o"], 1);
+    assert!(err.contains("sub-01_run-9_T1w.nii.gz") && err.contains("same run"), "{err}");
+
+    // A description that is cut short or empty.
+    for text in [r#"{"Name": "ha"#, ""] {
+        fs::write(at("bids/dataset_description.json"), text).unwrap();
+        let (_, err) = run(folder.path(), &["batch", "bids", "-o", "o"], 1);
+        assert!(err.contains("dataset_description.json"), "{err}");
+        assert!(!at("o").exists());
+    }
+    fs::write(at("bids/dataset_description.json"), r#"{"Name": "hands"}"#).unwrap();
+
     // No subject with two images: said, with what to do.
     fs::create_dir_all(at("one")).unwrap();
     fs::copy(at("bids/dataset_description.json"), at("one/dataset_description.json")).unwrap();

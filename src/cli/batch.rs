@@ -38,7 +38,8 @@ const RECORD: &str = "pair.json";
 pub struct Options {
     /// Table of pairs (CSV): initial, deformed, and as wanted mask, start, deformed_mask, ignore,
     /// landmarks, labels, names, held, load, force_n, scene, name, subject, session; paths count
-    /// from the table's folder. Or a BIDS data set: runs of each session, else sessions
+    /// from the table's folder. Or a BIDS data set, whose runs of a session, else whose sessions,
+    /// are pairs
     table: PathBuf,
     /// Folder for the results; those that are there already are not made again
     #[arg(short, long, value_name = "DIR")]
@@ -90,8 +91,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     // What each stage has read is in its own summary.
     let listed = if bids { table.join("dataset_description.json") } else { table.clone() };
     let record = Recording::start(console, record::inputs(&[("table", Some(&listed)), ("config", tuning.config())]));
-    let mut outcomes: Vec<PairOutcome> = match collect {
-        true => pairs.iter().map(|pair| collected(pair, &folder_of(options, pair), tuning)).collect(),
+    let outcomes: Vec<PairOutcome> = match collect {
+        true => pairs.iter().map(|pair| collected(pair, output, tuning)).collect(),
         false => {
             let free = io::memory_left();
             let budget = memory.map(|gb| (1e9 * gb) as u64).or(free.map(|b| (SHARE * b as f64) as u64));
@@ -101,14 +102,11 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             batch.run(jobs.min(pairs.len()))?
         }
     };
-    for (outcome, pair) in outcomes.iter_mut().zip(&pairs) {
-        outcome.folder = place(options, pair);
-    }
     write(output, &outcomes, &record.finish())?;
     if bids {
         io::describe_derivative(output, table)?;
-        for (pair, _) in pairs.iter().zip(&outcomes).filter(|(_, o)| o.status != Status::Failed) {
-            io::write_derivative(output, table, pair, folder_of(options, pair).join("field"))?;
+        for (pair, outcome) in pairs.iter().zip(&outcomes) {
+            io::write_derivative(output, table, pair, outcome.status != Status::Failed)?;
         }
     }
     for o in outcomes.iter().filter(|o| o.status == Status::Failed) {
@@ -130,16 +128,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         );
     }
     Ok(())
-}
-
-/// Where the results of a pair are: of a BIDS data set beside the derivatives.
-fn folder_of(options: &Options, pair: &Pair) -> PathBuf {
-    options.output.join(place(options, pair))
-}
-
-/// The same, from the folder of the batch.
-fn place(options: &Options, pair: &Pair) -> String {
-    if io::is_bids(&options.table) { format!("pairs/{}", pair.name) } else { pair.name.clone() }
 }
 
 /// The tables and the report.
@@ -167,14 +155,15 @@ fn gather(folder: &Path, outcome: &mut PairOutcome) {
 }
 
 /// A pair whose results someone else has made.
-fn collected(pair: &Pair, folder: &Path, tuning: &Tuning) -> PairOutcome {
+fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
+    let folder = output.join(&pair.folder);
     let mut outcome = PairOutcome { status: Status::Done, ..PairOutcome::waiting(pair) };
     // Made by a batch, a stage counts where its record stands: one that failed when it was run
     // again has left older results.
     let earlier = io::read_json(folder.join(RECORD)).unwrap_or_default();
     outcome.seconds = took(&earlier);
     let recorded = earlier["stages"].as_array().map(Vec::len);
-    for (k, stage) in stages(pair, folder, tuning, 0).into_iter().enumerate() {
+    for (k, stage) in stages(pair, &folder, tuning, 0).into_iter().enumerate() {
         if !stage.marker.exists() || recorded.is_some_and(|n| n <= k) {
             let log = io::read_text(folder.join(format!("{}.log", stage.name))).unwrap_or_default();
             outcome.status = Status::Failed;
@@ -183,7 +172,7 @@ fn collected(pair: &Pair, folder: &Path, tuning: &Tuning) -> PairOutcome {
             break;
         }
     }
-    gather(folder, &mut outcome);
+    gather(&folder, &mut outcome);
     outcome
 }
 
@@ -367,7 +356,7 @@ impl Batch<'_> {
     /// One pair from start to end.
     fn one(&self, index: usize, need: &Result<u64>, threads: usize) -> PairOutcome {
         let (pair, started) = (&self.pairs[index], Instant::now());
-        let folder = folder_of(self.options, pair);
+        let folder = self.options.output.join(&pair.folder);
         let mut outcome = PairOutcome::waiting(pair);
         let problem = match need {
             Err(error) => Some(error.to_string()),

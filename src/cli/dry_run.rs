@@ -5,7 +5,7 @@ use super::limits::bytes;
 use super::outputs::Target;
 use anyhow::Result;
 use palpate::error::Shown;
-use palpate::pipeline::dry_run::{FieldPlan, stiffness_memory, stiffness_seconds};
+use palpate::pipeline::dry_run::{FieldPlan, stiffness_memory};
 use palpate::report::scale::{short, thousands};
 use palpate::types::{FieldParams, Grid, Mask, StiffnessParams};
 use std::path::{Path, PathBuf};
@@ -99,12 +99,6 @@ fn body(labels: &Mask, labelled: bool, most: usize) -> (&'static str, String) {
     ("labels", regions.join(", "))
 }
 
-/// A number to two digits.
-fn two_digits(v: f64) -> f64 {
-    let unit = 10f64.powf(v.log10().floor() - 1.0);
-    (v / unit).round() * unit
-}
-
 /// The plan of `palpate stiffness` for labels, or a mask where not `labelled`; `frames` are the
 /// forces of a sequence, whose first field `path` is.
 pub fn stiffness(
@@ -137,10 +131,6 @@ pub fn stiffness(
     line(&mut out, "law", &format!("{:?}, Poisson's ratio {}", params.model, params.poisson).to_lowercase());
     line(&mut out, "mesh", &format!("about {} nodes", thousands(params.nodes)));
     line(&mut out, "memory", &format!("about {}", bytes(stiffness_memory(params.nodes))));
-    if labelled && frames.is_empty() {
-        let seconds = stiffness_seconds(params.nodes);
-        line(&mut out, "time", &format!("about {} s of one core", short(two_digits(seconds))));
-    }
     end(&mut out, output, files);
     out
 }

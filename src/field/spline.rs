@@ -19,7 +19,7 @@ pub type Spline = (Lattice, Vec<f32>);
 /// The lattices must lie over `grid`'s shape.
 fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
     let [nx, ny, _] = grid.shape();
-    let axes = axes(grid).map(|row| row.map(|v| v as f32));
+    let axes = grid.axes().map(|row| row.map(|v| v as f32));
     let mut out = DenseField::zeros(*grid);
     let n = grid.len();
     let (x, rest) = out.as_mut_slice().split_at_mut(n);
@@ -54,11 +54,6 @@ fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
         }
     });
     out
-}
-
-/// Unit vectors along the grid's axes, one a column (world RAS).
-pub fn axes(grid: &Grid) -> [[f64; 3]; 3] {
-    grid.axes()
 }
 
 /// The nodes of a lattice over `grid` as a grid of their own.
@@ -116,7 +111,7 @@ impl FieldSpline {
     /// The same field, followed by an affine map of the world (mm, RAS).
     #[must_use]
     pub(crate) fn followed_by(mut self, map: &AffineMap) -> Self {
-        let (grid, axes) = (self.grid, axes(&self.grid));
+        let (grid, axes) = (self.grid, self.grid.axes());
         let spacing = grid.spacing();
         for (lattice, coefficients) in &mut self.bodies {
             let n = lattice.len();
@@ -172,7 +167,7 @@ impl FieldSpline {
 
     /// The displacement (mm, RAS) at a place of the canonical grid (voxels).
     pub(crate) fn at_place(&self, place: [f64; 3]) -> [f64; 3] {
-        let (axes, v) = (axes(&self.grid), self.along_axes(place));
+        let (axes, v) = (self.grid.axes(), self.along_axes(place));
         std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * v[a]).sum())
     }
 

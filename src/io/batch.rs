@@ -116,6 +116,7 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
             load: side("load"),
             force_n,
             scene: file("scene"),
+            folder: name.clone(),
             name,
             subject,
             session,

@@ -1,7 +1,9 @@
 //! Pairs from a folder in the Brain Imaging Data Structure (bids-specification.readthedocs.io), and
 //! its derivatives: fields named as transforms (BEP 014).
 
+use super::atomic::write_atomic;
 use super::batch::make_folder;
+use super::source::open;
 use super::text::{list, read_json, write_json, write_text};
 use super::{format, os};
 use crate::error::IoError;
@@ -15,13 +17,35 @@ use std::path::{Path, PathBuf};
 const DESCRIPTION: &str = "dataset_description.json";
 /// The version of the specification that is written.
 const VERSION: &str = "1.10.0";
+/// Folder of the pairs' results beside the derivatives.
+const PAIRS: &str = "pairs";
 
-/// An anatomical image: its file, and the entities of its name.
+/// An anatomical image: its file, its name without the extension, and two entities of that.
 #[derive(Debug, Clone)]
 struct Scan {
     path: PathBuf,
+    stem: String,
     session: String,
     run: String,
+}
+
+impl Scan {
+    /// None of a file that is no image, or holds a mask or labels.
+    fn of(path: &Path) -> Option<Self> {
+        let name = path.file_name()?.to_str()?;
+        let stem = name.strip_suffix(".nii.gz").or(name.strip_suffix(".nii"))?.to_string();
+        let suffix = stem.rsplit('_').next().unwrap_or_default();
+        if suffix.ends_with("mask") || suffix.ends_with("seg") {
+            return None;
+        }
+        let [session, run] = ["ses-", "run-"].map(|key| entity(&stem, key).to_string());
+        Some(Self { path: path.into(), stem, session, run })
+    }
+
+    /// Its place in time: session, then run, numbers as numbers.
+    fn order(&self) -> [(u64, &str); 2] {
+        [&self.session, &self.run].map(|label| (label.parse().unwrap_or(u64::MAX), label.as_str()))
+    }
 }
 
 /// What the images of a series share: subject, other entities and suffix.
@@ -37,17 +61,21 @@ pub fn is_bids(folder: impl AsRef<Path>) -> bool {
 /// first.
 ///
 /// # Errors
-/// [`IoError`] when a folder cannot be read, or no subject has two runs or sessions.
+/// [`IoError`] when a folder or the description cannot be read, two files are one image, or no
+/// subject has two runs or sessions.
 pub fn read_bids(folder: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     let folder = folder.as_ref();
+    read_json(folder.join(DESCRIPTION))?;
     let mut series = Series::new();
     for subject in folders(folder, "sub-")? {
         let sessions = folders(&subject, "ses-")?;
         for place in sessions.iter().chain([&subject]).map(|p| p.join("anat")).filter(|p| p.is_dir()) {
-            list(&place)?.into_iter().for_each(|path| add(&mut series, path));
+            for scan in list(&place)?.iter().filter_map(|path| Scan::of(path)) {
+                add(&mut series, scan)?;
+            }
         }
     }
-    let pairs: Vec<Pair> = series.values().flat_map(|scans| pairs(scans)).collect();
+    let pairs: Vec<Pair> = series.into_values().flat_map(pairs).collect();
     if pairs.is_empty() {
         let what = "no subject has two runs or two sessions of one anatomical image";
         return Err(format(folder, what, "name them run-1, run-2 (or ses-1, ses-2), or give a table of pairs"));
@@ -61,51 +89,40 @@ fn folders(folder: &Path, key: &str) -> Result<Vec<PathBuf>, IoError> {
     Ok(list(folder)?.into_iter().filter(named).collect())
 }
 
-/// The name of an image without its folder and extension.
-fn stem(path: &Path) -> Option<String> {
-    let name = path.file_name()?.to_str()?;
-    Some(name.strip_suffix(".nii.gz").or(name.strip_suffix(".nii"))?.to_string())
-}
-
 /// The value of an entity of a name.
 fn entity<'a>(stem: &'a str, key: &str) -> &'a str {
     stem.split('_').find_map(|part| part.strip_prefix(key)).unwrap_or_default()
 }
 
-fn add(series: &mut Series, path: PathBuf) {
-    let Some(stem) = stem(&path) else { return };
-    let [session, run] = ["ses-", "run-"].map(|key| entity(&stem, key).to_string());
+fn add(series: &mut Series, scan: Scan) -> Result<(), IoError> {
     let shared = |part: &&str| !part.starts_with("ses-") && !part.starts_with("run-");
-    let kind = stem.split('_').filter(shared).collect::<Vec<_>>().join("_");
-    series.entry((entity(&stem, "sub-").into(), kind)).or_default().push(Scan { path, session, run });
+    let kind = scan.stem.split('_').filter(shared).collect::<Vec<_>>().join("_");
+    let scans = series.entry((entity(&scan.stem, "sub-").into(), kind)).or_default();
+    if let Some(other) = scans.iter().find(|other| other.order() == scan.order()) {
+        let what = format!("is the same run as {}", other.path.display());
+        return Err(format(&scan.path, what, "give each run a label of its own, and keep one file of it"));
+    }
+    scans.push(scan);
+    Ok(())
 }
 
-/// A run's or session's place in the order: numbers count as numbers.
-fn order(label: &str) -> (u64, &str) {
-    (label.parse().unwrap_or(u64::MAX), label)
+fn pairs(mut scans: Vec<Scan>) -> Vec<Pair> {
+    scans.sort_by(|a, b| a.order().cmp(&b.order()));
+    let of = |group: &[Scan]| -> Vec<Pair> { group.iter().skip(1).map(|second| pair(&group[0], second)).collect() };
+    let within: Vec<Pair> = scans.chunk_by(|a, b| a.session == b.session).flat_map(of).collect();
+    if within.is_empty() { of(&scans) } else { within }
 }
 
-fn pairs(scans: &[Scan]) -> Vec<Pair> {
-    let mut scans = scans.to_vec();
-    scans.sort_by(|a, b| (order(&a.session), order(&a.run)).cmp(&(order(&b.session), order(&b.run))));
-    let of =
-        |group: &[&Scan]| -> Vec<Pair> { group.iter().skip(1).filter_map(|second| pair(group[0], second)).collect() };
-    let mut sessions: BTreeMap<(u64, &str), Vec<&Scan>> = BTreeMap::new();
-    scans.iter().for_each(|scan| sessions.entry(order(&scan.session)).or_default().push(scan));
-    let within: Vec<Pair> = sessions.values().flat_map(|runs| of(runs)).collect();
-    if within.is_empty() { of(&scans.iter().collect::<Vec<_>>()) } else { within }
-}
-
-fn pair(initial: &Scan, deformed: &Scan) -> Option<Pair> {
-    let name = stem(&deformed.path)?;
-    Some(Pair {
-        subject: entity(&name, "sub-").into(),
+fn pair(initial: &Scan, deformed: &Scan) -> Pair {
+    Pair {
+        name: deformed.stem.clone(),
+        folder: format!("{PAIRS}/{}", deformed.stem),
+        subject: entity(&deformed.stem, "sub-").into(),
         session: deformed.session.clone(),
-        name,
         initial: initial.path.clone(),
         deformed: deformed.path.clone(),
         ..Pair::default()
-    })
+    }
 }
 
 /// Writes what makes a folder of results a BIDS derivative of the data set `source`; its own files
@@ -115,27 +132,29 @@ fn pair(initial: &Scan, deformed: &Scan) -> Option<Pair> {
 /// [`IoError`] when a file cannot be written.
 pub fn describe_derivative(output: impl AsRef<Path>, source: impl AsRef<Path>) -> Result<(), IoError> {
     let (output, source) = (output.as_ref(), source.as_ref());
-    let name = read_json(source.join(DESCRIPTION)).ok().and_then(|d| d["Name"].as_str().map(String::from));
-    let name = name.unwrap_or_else(|| "unnamed".into());
+    let raw = read_json(source.join(DESCRIPTION))?;
     let description = json!({
-        "Name": format!("palpate: {name}"),
+        "Name": format!("palpate: {}", raw["Name"].as_str().unwrap_or("unnamed")),
         "BIDSVersion": VERSION,
         "DatasetType": "derivative",
         "GeneratedBy": [{ "Name": "palpate", "Version": env!("CARGO_PKG_VERSION") }],
         "SourceDatasets": [{ "URL": fs::canonicalize(source).map_err(os(source, "read"))?.to_string_lossy() }],
     });
     write_json(output.join(DESCRIPTION), &description)?;
-    let readme = "Displacement fields by palpate. sub-*/ holds them as BIDS transforms; the folders in pairs/ hold all results \
+    let readme = output.join("README.md");
+    let about = "Displacement fields by palpate. sub-*/ holds them as BIDS transforms; the folders in pairs/ hold all results \
                   and their reports.\n";
-    write_text(output.join("README.md"), readme)?;
-    write_text(
-        output.join(".bidsignore"),
-        "pairs\npairs/**\nbatch.csv\nregions.csv\nsummary.json\nreport.html\n*_xfm.*\n",
-    )
+    // Who works with the folder may have written more.
+    if !readme.exists() {
+        write_text(readme, about)?;
+    }
+    let ours = "pairs\npairs/**\nbatch.csv\nregions.csv\nsummary.json\nreport.html\n*_xfm.*\n";
+    write_text(output.join(".bidsignore"), ours)
 }
 
 /// Places the field of a pair among the derivatives of `output`, as the transform that takes the
-/// deformed image to the initial one's space, with a sidecar; `field` is the folder of its results.
+/// deformed image to the initial one's space, with a sidecar. Without a `result`, one of an earlier
+/// run is removed.
 ///
 /// # Errors
 /// [`IoError`] when a file cannot be written.
@@ -143,41 +162,49 @@ pub fn write_derivative(
     output: impl AsRef<Path>,
     source: impl AsRef<Path>,
     pair: &Pair,
-    field: impl AsRef<Path>,
-) -> Result<PathBuf, IoError> {
-    let name = stem(&pair.initial).unwrap_or_default();
-    let [sessions, runs] = ["ses-", "run-"].map(|key| {
-        let second = stem(&pair.deformed).unwrap_or_default();
-        [&second, &name].map(|n| entity(n, key).to_string())
-    });
-    let one_session = sessions[0] == sessions[1];
-    let label = |i: usize| if one_session { format!("run{}", runs[i]) } else { format!("ses{}", sessions[i]) };
-    let shared = |part: &&str| !(part.starts_with("run-") || !one_session && part.starts_with("ses-"));
-    let mut parts: Vec<&str> = name.split('_').filter(shared).collect();
+    result: bool,
+) -> Result<(), IoError> {
+    let (output, source) = (output.as_ref(), source.as_ref());
+    let Some((first, second)) = Scan::of(&pair.initial).zip(Scan::of(&pair.deformed)) else { return Ok(()) };
+    let one_session = first.session == second.session;
+    let label = |scan: &Scan| match one_session {
+        true => format!("run{}", scan.run),
+        false => format!("ses{}", scan.session),
+    };
+    let shared = |part: &&str| !part.starts_with("run-") && (one_session || !part.starts_with("ses-"));
+    let mut parts: Vec<&str> = first.stem.split('_').filter(shared).collect();
     let suffix = parts.pop().unwrap_or_default();
-    let kind = format!("{}_from-{}_to-{}_mode-image_desc-{suffix}_xfm", parts.join("_"), label(0), label(1));
+    let entities = parts.join("_");
+    let name = format!("{entities}_from-{}_to-{}_mode-image_desc-{suffix}_xfm", label(&second), label(&first));
 
-    let mut folder = output.as_ref().join(format!("sub-{}", pair.subject));
-    if one_session && !sessions[1].is_empty() {
-        folder = folder.join(format!("ses-{}", sessions[1]));
+    let mut folder = output.join(format!("sub-{}", pair.subject));
+    if one_session && !first.session.is_empty() {
+        folder.push(format!("ses-{}", first.session));
     }
-    let folder = folder.join("anat");
+    folder.push("anat");
+    let [field, sidecar] = ["nii.gz", "json"].map(|end| folder.join(format!("{name}.{end}")));
+    // A link or a copy does not follow a field that is measured again.
+    for path in [&field, &sidecar].into_iter().filter(|path| path.exists()) {
+        fs::remove_file(path).map_err(os(path, "remove"))?;
+    }
+    if !result {
+        return Ok(());
+    }
     make_folder(&folder)?;
-    let target = folder.join(format!("{kind}.nii.gz"));
-    let made = field.as_ref().join("displacement.nii.gz");
-    let _ = fs::remove_file(&target);
-    if fs::hard_link(&made, &target).is_err() {
-        fs::copy(&made, &target).map_err(os(&target, "write"))?;
+    let made = output.join(&pair.folder).join("field/displacement.nii.gz");
+    // Without links a copy takes its room again.
+    if fs::hard_link(&made, &field).is_err() {
+        let mut whole = open(&made)?;
+        write_atomic(&field, |file| std::io::copy(&mut whole, file).map(drop))?;
     }
     let at = |path: &Path| {
-        let inside = path.strip_prefix(source.as_ref()).unwrap_or(path);
+        let inside = path.strip_prefix(source).unwrap_or(path);
         format!("bids:raw:{}", inside.to_string_lossy())
     };
-    let sidecar = json!({
+    let about = json!({
         "Description": "Displacement from the image before to the image after the deformation (mm, LPS), on the grid of the former",
         "Sources": [at(&pair.initial), at(&pair.deformed)],
         "Units": "mm",
     });
-    write_json(folder.join(format!("{kind}.json")), &sidecar)?;
-    Ok(target)
+    write_json(sidecar, &about)
 }

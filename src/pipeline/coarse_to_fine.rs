@@ -2,7 +2,6 @@
 //! themselves, and the matches about their field.
 
 use crate::error::FieldError;
-use crate::field::spline;
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
@@ -119,11 +118,12 @@ impl<'a> CoarseToFine<'a, '_> {
             let matching = || self.tell("matching", place, 0.0);
             let search =
                 Search { params: self.params, range: account.range, flat: self.flat, matching: &matching, tick: &tick };
-            let Entry { mut bodies, mut begun, sought } = match coarser.take() {
+            let mut entry = match coarser.take() {
                 Some(coarser) => self.carried(&search, &level, &pair, coarser, &mut account),
                 None => self.begun(&search, &level, &mut pair, &tissue, &mut account),
             };
-            self.divided(&search, &level, &pair, (&mut bodies, &begun, sought), &mut account);
+            self.divide(&search, &level, &pair, &mut entry, &mut account);
+            let Entry { mut bodies, mut begun, .. } = entry;
             if let Some(field) = begun.of_matches.take() {
                 let name = if level.is_first() { "matches alone" } else { "matches of the next level" };
                 account.stages.push(Left { name: name.into(), motion: field.into(), factor });
@@ -204,15 +204,8 @@ impl<'a> CoarseToFine<'a, '_> {
     }
 
     /// Divides the motion into bodies: those that are given, or those that the matches show.
-    fn divided(
-        &self,
-        search: &Search<'_>,
-        level: &Level,
-        pair: &Pair<'_>,
-        motion: (&mut Bodies, &Begun, bool),
-        account: &mut Account,
-    ) {
-        let (bodies, begun, sought) = motion;
+    fn divide(&self, search: &Search<'_>, level: &Level, pair: &Pair<'_>, entry: &mut Entry, account: &mut Account) {
+        let Entry { bodies, begun, sought } = entry;
         let Level { factor, lattice, passes, .. } = level;
         if let Some(given) = self.given {
             let labels = given.on(pair.shape, *factor);
@@ -223,7 +216,7 @@ impl<'a> CoarseToFine<'a, '_> {
                 bodies.relabel(labels);
                 bodies.refine(pair, *passes, self.params.seed, search.tick);
             }
-        } else if sought && self.params.bodies == BodySource::Found {
+        } else if *sought && self.params.bodies == BodySource::Found {
             let edges = pair.spacing.into_iter().zip(*factor).map(|(s, f)| s / f as f64);
             let edge = edges.fold(f64::INFINITY, f64::min);
             account.asked.extend(bodies.divide(pair, &begun.matches, *passes, edge, self.params.seed));
@@ -361,7 +354,7 @@ pub(super) fn begun_from(
         return Vec::new();
     }
     let pair = aligned.level(factor);
-    let axes = spline::axes(grid);
+    let axes = grid.axes();
     let of = |start: &StartMap<'_>| {
         let rest = start::rest(start);
         let along = |p: [f64; 3]| {

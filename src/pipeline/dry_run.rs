@@ -6,6 +6,7 @@ use crate::numerics::orientation::Orientation;
 use crate::pipeline::coarse_to_fine::{finest_level, inside, search_mm, worked_on};
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::{last_passes, sparse};
+use crate::stiffness::fem_body::DIRECT;
 use crate::types::params::Method;
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
@@ -120,20 +121,17 @@ pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
     14_000_000 + 18 * voxels.min(20_000_000) + 13 * voxels.saturating_sub(20_000_000) + copies
 }
 
-/// Nodes of a mesh up to which its equations are solved with a factor.
-const FACTORISED: usize = 46_000;
-
-/// Memory of a stiffness run on a mesh of `nodes` nodes (bytes): 120 MB and 26 kB a node for a
-/// factor, 150 MB and 10 kB a node for iterations (docs/lab/2026-11-solver.md).
+/// Memory of a stiffness run on a mesh of `nodes` nodes (bytes), at most.
+///
+/// With a factor: 150 MB and 40 kB a node to 20,000, growing with the cube root past them, as the
+/// factors of a sparse matrix in space do. Measured on finger pads with three labels, layers under
+/// a punch and inclusions with and without labels: 0.15 to 0.23 GB at 2,000 nodes, 0.27 to 0.43 at
+/// 8,000, 0.69 to 0.85 at 20,000, 1.7 to 1.9 at 40,000. With iterations: 150 MB and 10 kB a node
+/// (2.8 GB at 300,000; docs/lab/2026-11-solver.md).
 pub fn stiffness_memory(nodes: usize) -> u64 {
-    let n = nodes as u64;
-    if nodes <= FACTORISED { 120_000_000 + 26_000 * n } else { 150_000_000 + 10_000 * n }
-}
-
-/// Time of a stiffness run of labels on a mesh of `nodes` nodes (CPU s) on a core of 2.5 GHz: 2 s,
-/// and 0.45 ms a node (docs/lab/2026-11-solver.md).
-pub fn stiffness_seconds(nodes: usize) -> f64 {
-    2.0 + 0.45e-3 * nodes as f64
+    let n = nodes as f64;
+    let each = if nodes <= DIRECT { 40_000.0 * (n / 20_000.0).cbrt().max(1.0) } else { 10_000.0 };
+    150_000_000 + (each * n) as u64
 }
 
 #[cfg(test)]

@@ -6,7 +6,6 @@
 use crate::consistency::energy::distance;
 use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{GATE, Measured};
-use crate::field::spline;
 use crate::matching::pair::{Anchor, Pair};
 use crate::matching::residual::{NormalEquations, UNSURE};
 use crate::numerics::bspline::Lattice;
@@ -33,7 +32,7 @@ pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
     let sd = if known.landmark_sd_mm > 0.0 { known.landmark_sd_mm } else { voxel(grid) };
     // Of no place more is known than interpolation leaves sure.
     let sd = sd.max(UNSURE * voxel(grid));
-    let axes = spline::axes(grid);
+    let axes = grid.axes();
     let of = |l: &Landmark| {
         let d = l.deformed.minus(l.initial);
         let along = |a: usize| (0..3).map(|r| axes[r][a] * d[r]).sum();

@@ -1,7 +1,7 @@
 //! Matches in world mm, their Delaunay mesh, and the field that is piecewise linear on it.
 
 use crate::error::{FieldError, MeshError};
-use crate::field::spline::{self, FieldSpline, ScalarSpline};
+use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::field::{interpolation, jacobian};
 use crate::matching::levels::from_level;
 use crate::mesh::{delaunay2::delaunay2, delaunay3::delaunay3};
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 /// A level's match in world mm (RAS).
 pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
-    let axes = spline::axes(grid);
+    let axes = grid.axes();
     Match {
         initial: grid.affine().to_world(VoxelPoint(from_level(m.voxel, factor))),
         displacement: grid.vector_to_world(GridVector(m.measured.displacement)),

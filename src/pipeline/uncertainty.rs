@@ -202,7 +202,7 @@ impl Variances {
         let wider: Vec<f32> =
             (0..n).map(|m| self.at_node(m) / self.free[m].sqrt().max(f32::MIN_POSITIVE.sqrt())).collect();
         let full = self.full(grid, factor);
-        let axes = spline::axes(grid);
+        let axes = grid.axes();
         let sample = |draw: &Vec<f32>| {
             let widened = draw.iter().enumerate().map(|(at, v)| v * wider[at % n]).collect();
             let along = self.on_full(&full, widened, factor);

@@ -2,7 +2,7 @@
 
 use crate::report::field::FieldReport;
 use crate::report::scale::{short, thousands};
-use crate::report::statistics::sample;
+use crate::report::statistics::{quantile, sample};
 pub use crate::types::Trust;
 use crate::types::{ErrorSource, FieldSummary, FrameSummary, Mask, MotionModel};
 
@@ -94,7 +94,9 @@ fn advice(s: &FieldSummary) -> String {
             "watch the initial and the warped volume in turns in the report: where parts slide give --bodies, where tissue changed its look \
              leave it out with --ignore"
         }
-        Some(ErrorSource::Model) => "compare with --model free: a small motion model stands for what it leaves out",
+        Some(ErrorSource::Model) => {
+            "compare with --model free: the motion model that was chosen may leave some motion out"
+        }
         Some(ErrorSource::OutOfView) => "leave tissue out of view out with --mask, or image a larger field of view",
         Some(ErrorSource::Borders) => "give the parts that slide as a label map with --bodies",
         Some(ErrorSource::OtherMotions) => {
@@ -108,10 +110,8 @@ fn advice(s: &FieldSummary) -> String {
 /// How unsure the worst tenth of the tissue is, and where it lies; nothing where all is alike.
 fn least_sure(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32) -> Option<String> {
     let picked = sample(bodies.grid().len(), Some(bodies));
-    let mut sorted: Vec<f64> = picked.iter().map(|&o| f64::from(uncertainty(o))).filter(|u| u.is_finite()).collect();
-    sorted.sort_by(f64::total_cmp);
-    let at = |part: f64| sorted.get((part * sorted.len() as f64) as usize).copied();
-    let (middle, worst) = (at(0.5)?, at(0.9)?);
+    let at = |part: f64| quantile(picked.iter().map(|&o| f64::from(uncertainty(o))), part);
+    let (middle, worst) = (at(0.5), at(0.9));
     let (_, side) = uncertain(bodies, uncertainty, worst);
     (worst > UNEVEN * middle).then(|| {
         format!(

@@ -16,9 +16,9 @@ pub const ELEMENT_NODES: usize = 14;
 /// Unknowns of an element.
 pub const SIDE: usize = 34;
 
-/// Unknowns up to which a factor is taken: 46,000 nodes, in 1.4 GB. Iterations need less time and
-/// memory, but more time where a plate presses a curved body (docs/lab/2026-11-solver.md).
-const DIRECT: usize = 150_000;
+/// Nodes of a mesh up to which a factor solves its equations. Iterations need less time and memory,
+/// but more time where a plate presses a curved body (docs/lab/2026-11-solver.md).
+pub const DIRECT: usize = 46_000;
 
 /// A triangle of the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,7 +96,7 @@ impl Body {
             volumes[r as usize] += q.iter().map(|p| p.weight).sum::<f64>();
         }
         let surface = surface(&cells, &places);
-        let large = pattern.unknowns() > DIRECT;
+        let large = places.len() > DIRECT;
         let out =
             Self { places, cells, pressures, region, labels, quadrature, pattern, levels: None, surface, volumes };
         if large { out.iterated() } else { Ok(out) }

@@ -3,6 +3,7 @@
 use crate::numerics::sparse::{Factor, Singular};
 use crate::stiffness::fem_body::Body;
 use crate::stiffness::saddle::{Levels, Saddle};
+use rayon::prelude::*;
 
 /// Relative error of an iterative solution (weighted 2-norm).
 const SOLVED: f64 = 1e-7;
@@ -12,6 +13,9 @@ const NEWTON: f64 = 1e-3;
 const SENSITIVE: f64 = 1e-3;
 /// Relative error of a step whose residual is worked out anew.
 const STEP: f64 = 1e-2;
+
+/// Right-hand sides that a factor solves for at a time: it is read once for all of them.
+const TOGETHER: usize = 32;
 
 /// The values of a tangent in a body's pattern, and on both levels of a large body.
 #[derive(Debug)]
@@ -119,13 +123,17 @@ impl<'a> Tangent<'a> {
         }
     }
 
-    /// As [`Self::sensitivities`], for as many as make a factor of the matrix itself worth it.
+    /// As [`Self::sensitivities`], in parallel, for as many as make a factor of the matrix itself
+    /// worth it; each has `n` numbers.
     ///
     /// # Errors
     /// As [`Self::solve`].
-    pub fn many(&self, x: &mut [f64]) -> Result<(), Singular> {
+    pub fn many(&self, x: &mut [f64], n: usize) -> Result<(), Singular> {
         match self {
-            Self::Direct(factor) => factor.whole()?.solve(x),
+            Self::Direct(factor) => {
+                let whole = factor.whole()?;
+                x.par_chunks_mut(TOGETHER * n).map(|part| whole.solve(part)).collect()
+            }
             Self::Iterative(_) => self.sensitivities(x, None),
         }
     }

@@ -385,10 +385,7 @@ fn jacobian(
         }
     }
     sides.extend(setup.plate_sides(problem, &solution.x));
-    sides
-        .par_chunks_mut(32 * n)
-        .map(|part| solution.factor.many(part).map_err(|_| StiffnessError::Unsolvable))
-        .collect::<Result<(), _>>()?;
+    solution.factor.many(&mut sides, n).map_err(|_| StiffnessError::Unsolvable)?;
     Ok(sides.par_chunks(n).flat_map_iter(|y| picked.iter().flat_map(move |o| o.read(body, y))).collect())
 }
 

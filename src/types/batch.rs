@@ -8,6 +8,8 @@ use std::path::PathBuf;
 pub struct Pair {
     /// Unique, and fit to name a folder.
     pub name: String,
+    /// The folder of its results, from that of the batch.
+    pub folder: String,
     /// Who was measured, where the table says so.
     pub subject: String,
     /// When, where the table says so.
@@ -99,7 +101,7 @@ impl PairOutcome {
     pub fn waiting(pair: &Pair) -> Self {
         Self {
             name: pair.name.clone(),
-            folder: pair.name.clone(),
+            folder: pair.folder.clone(),
             subject: pair.subject.clone(),
             session: pair.session.clone(),
             status: Status::Waiting,
