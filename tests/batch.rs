@@ -85,8 +85,8 @@ fn a_bids_folder_gives_pairs_by_run_or_session_and_derivatives() {
     let (_, err) = run(folder.path(), &["batch", "bids", "-o", "o"], 1);
     assert!(err.contains("sub-01_run-9_T1w.nii.gz") && err.contains("same run"), "{err}");
 
-    // A description that is cut short or empty.
-    for text in [r#"{"Name": "ha"#, ""] {
+    // A description that is cut short, empty or without its key.
+    for text in [r#"{"Name": "ha"#, "", r#"{"Nam": "hands"}"#, "[1, 2]"] {
         fs::write(at("bids/dataset_description.json"), text).unwrap();
         let (_, err) = run(folder.path(), &["batch", "bids", "-o", "o"], 1);
         assert!(err.contains("dataset_description.json"), "{err}");

@@ -61,11 +61,11 @@ pub fn is_bids(folder: impl AsRef<Path>) -> bool {
 /// first.
 ///
 /// # Errors
-/// [`IoError`] when a folder or the description cannot be read, two files are one image, or no
-/// subject has two runs or sessions.
+/// [`IoError`] when a folder or the description cannot be read, the data set has no name, two files
+/// are one image, or no subject has two runs or sessions.
 pub fn read_bids(folder: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     let folder = folder.as_ref();
-    read_json(folder.join(DESCRIPTION))?;
+    name(folder)?;
     let mut series = Series::new();
     for subject in folders(folder, "sub-")? {
         let sessions = folders(&subject, "ses-")?;
@@ -81,6 +81,15 @@ pub fn read_bids(folder: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
         return Err(format(folder, what, "name them run-1, run-2 (or ses-1, ses-2), or give a table of pairs"));
     }
     Ok(pairs)
+}
+
+/// The name of a data set.
+fn name(folder: &Path) -> Result<String, IoError> {
+    let path = folder.join(DESCRIPTION);
+    match read_json(&path)?["Name"].as_str() {
+        Some(name) => Ok(name.into()),
+        None => Err(format(&path, "has no key Name", "add it: BIDS asks for the name of the data set")),
+    }
 }
 
 /// The folders in `folder` whose names begin with `key`.
@@ -132,9 +141,8 @@ fn pair(initial: &Scan, deformed: &Scan) -> Pair {
 /// [`IoError`] when a file cannot be written.
 pub fn describe_derivative(output: impl AsRef<Path>, source: impl AsRef<Path>) -> Result<(), IoError> {
     let (output, source) = (output.as_ref(), source.as_ref());
-    let raw = read_json(source.join(DESCRIPTION))?;
     let description = json!({
-        "Name": format!("palpate: {}", raw["Name"].as_str().unwrap_or("unnamed")),
+        "Name": format!("palpate: {}", name(source)?),
         "BIDSVersion": VERSION,
         "DatasetType": "derivative",
         "GeneratedBy": [{ "Name": "palpate", "Version": env!("CARGO_PKG_VERSION") }],
