@@ -55,7 +55,7 @@ pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary
     let named: Vec<String> =
         named.map(|(source, share)| format!("{} ({:.0} %)", source.words(), 100.0 * share)).collect();
     if !named.is_empty() {
-        reasons.push(format!("its square comes from {}", named.join(", ")));
+        reasons.push(format!("the squared error comes from {}", named.join(", ")));
     }
     let (share, side) = uncertain(bodies, uncertainty, edge);
     if share >= 0.01 {
@@ -271,7 +271,7 @@ mod tests {
         assert_eq!([high.trust, moderate.trust, low.trust], [Trust::High, Trust::Moderate, Trust::Low]);
         assert!(low.headline.contains("expected error 0.51 mm"), "{}", low.headline);
         assert_eq!(low.reasons[0], "the expected error is 34 % of the motion");
-        assert_eq!(low.reasons[1], "its square comes from noise where texture is weak (90 %)");
+        assert_eq!(low.reasons[1], "the squared error comes from noise where texture is weak (90 %)");
         case.summary.folds = 100;
         case.summary.warnings.push("one more".into());
         case.summary.expected.mean_mm = 0.14;
