@@ -80,7 +80,8 @@ fn a_bids_folder_gives_pairs_by_run_or_session_and_derivatives() {
     put("mask.nii.gz", "sub-02/ses-1/anat/sub-02_ses-1_run-1_mod-T2w_defacemask.nii.gz");
     put("mask.nii.gz", "sub-02/ses-1/anat/sub-02_ses-1_run-2_mod-T2w_defacemask.nii.gz");
     run(folder.path(), &["batch", "bids", "-o", "out", "--collect"], 1);
-    assert_eq!(statuses(folder.path()).len(), 2);
+    assert_eq!(statuses(folder.path()), ["sub-01_run-10_T1w failed", "sub-02_ses-2_acq-hand_T2w done"]);
+    assert!(rows(folder.path(), "out/batch.csv")[0]["reason"].contains("other inputs"));
     put("initial.nii.gz", "sub-01/anat/sub-01_run-09_T1w.nii.gz");
     let (_, err) = run(folder.path(), &["batch", "bids", "-o", "o"], 1);
     assert!(err.contains("sub-01_run-9_T1w.nii.gz") && err.contains("same run"), "{err}");

@@ -168,7 +168,10 @@ fn collected(pair: &Pair, output: &Path, tuning: &Tuning) -> PairOutcome {
             let log = io::read_text(folder.join(format!("{}.log", stage.name))).unwrap_or_default();
             outcome.status = Status::Failed;
             outcome.stage = stage.name;
-            outcome.reason = reason(&log).unwrap_or_else(|| format!("there is no {}", stage.marker.shown()));
+            outcome.reason = reason(&log).unwrap_or_else(|| match stage.marker.exists() {
+                true => format!("{} was made from other inputs; run the batch again", stage.marker.shown()),
+                false => format!("there is no {}", stage.marker.shown()),
+            });
             break;
         }
     }
@@ -368,7 +371,10 @@ impl Batch<'_> {
             Ok(_) => None,
         };
         let done = match problem {
-            Some(problem) => Err(("check", problem)),
+            Some(problem) => {
+                self.void_outdated(pair, &folder);
+                Err(("check", problem))
+            }
             None => self.stages(pair, &folder, threads),
         };
         match done {
@@ -384,6 +390,20 @@ impl Batch<'_> {
             gather(&folder, &mut outcome);
         }
         outcome
+    }
+
+    /// Strikes from the record of earlier results each stage that ran on other inputs or arguments.
+    fn void_outdated(&self, pair: &Pair, folder: &Path) {
+        let earlier = io::read_json(folder.join(RECORD)).unwrap_or_default();
+        let list = |key: &str| earlier[key].as_array().cloned().unwrap_or_default();
+        let (records, seconds) = (list("stages"), list("seconds"));
+        let now = stages(pair, folder, &self.options.tuning, self.options.nodes);
+        let same = now.iter().zip(&records).take_while(|(s, old)| record(s).is_ok_and(|r| r == **old)).count();
+        if same < records.len() {
+            let seconds: Vec<f64> = seconds.iter().take(same).filter_map(Value::as_f64).collect();
+            // A folder that cannot be written cannot be gathered from as done either: its table fails.
+            let _ = io::write_json(folder.join(RECORD), &kept(&records[..same], &seconds));
+        }
     }
 
     /// All stages of a pair that are not done yet; whether there was one, and how long all took, in
