@@ -398,12 +398,21 @@ fn too_little_memory_is_refused_before_the_voxels_are_read() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("initial.nii.gz") && said.contains("of memory") && said.contains("halve"), "{said}");
     assert!(!folder.path().join("results").exists());
-    for command in ["strain large/truth.nii.gz", "certify large/initial.nii.gz", "chart --case large"] {
+    let commands = [
+        ("strain large/truth.nii.gz", "large"),
+        ("certify large/initial.nii.gz", "large"),
+        ("chart --case large", "large"),
+        ("phantom block --size 400", "--size"),
+        ("demo --size 400", "--size"),
+        ("stress --part stiffness --quick", "--part"),
+        ("stress --part field", "--threads"),
+    ];
+    for (command, named) in commands {
         let output = shell(folder.path(), "ulimit -v 150000", &format!("{command} -o results --threads 1"));
         let said = text(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{command}: {said}");
-        assert!(said.contains("large") && said.contains("of memory"), "{command}: {said}");
-        assert!(!folder.path().join("results").exists());
+        assert!(said.contains(named) && said.contains("of memory"), "{command}: {said}");
+        assert!(!folder.path().join("results").exists(), "{command}");
     }
 }
 

@@ -6,7 +6,8 @@ use super::inputs::name;
 use anyhow::{Result, bail};
 use palpate::error::Shown;
 use palpate::io;
-use palpate::pipeline::dry_run::{memory, stiffness_memory, strain_memory};
+use palpate::pipeline::dry_run::{memory, phantom_memory, stiffness_memory, strain_memory};
+use palpate::pipeline::robustness::Effort;
 use palpate::report::scale::short;
 use palpate::types::{FieldParams, Grid};
 use std::path::Path;
@@ -89,52 +90,68 @@ pub fn cap_search(params: &mut FieldParams, grid: &Grid, path: &Path) -> Option<
     })
 }
 
+/// What is left, where that is less than `needed` (bytes).
+fn left_under(needed: u64) -> Option<u64> {
+    io::memory_left().filter(|left| needed > *left)
+}
+
+/// Refuses `what` where it needs more memory than is left (bytes); `remedy` says what needs less.
+fn fits(what: &str, needed: u64, remedy: &str) -> Result<()> {
+    let Some(left) = left_under(needed) else { return Ok(()) };
+    let [needed, left] = [needed, left].map(bytes);
+    bail!("{what} needs about {needed} of memory, but only {left} are left; close other programs, {remedy}")
+}
+
 /// The same of two volumes whose grids are known.
 pub fn grids_fit(initial: &Path, a: &Grid, deformed: &Path, b: &Grid) -> Result<()> {
-    let (needed, left) = (memory(a, b), io::memory_left().unwrap_or(u64::MAX));
-    if needed <= left {
-        return Ok(());
-    }
     let half = |g: &Grid| Grid::new(g.shape().map(|n| n.div_ceil(2)), *g.affine());
     let halved = half(a).and_then(|a| Ok(memory(&a, &half(b)?))).map(bytes).unwrap_or_default();
-    bail!(
-        "{} and {}: a field needs about {} of memory, but only {} are left; close other programs, crop both to the tissue, \
-         or halve their resolution, which needs {halved} (the presets need the same)",
-        initial.shown(),
-        deformed.shown(),
-        bytes(needed),
-        bytes(left)
-    );
+    fits(
+        &format!("{} and {}: a field", initial.shown(), deformed.shown()),
+        memory(a, b),
+        &format!(
+            "crop both to the tissue, or halve their resolution, which needs {halved} (the presets need the same)"
+        ),
+    )
 }
 
 /// Refuses a field whose strain needs more memory than is left.
 pub fn strain_fits(field: &Path) -> Result<()> {
     let Ok((stored, _)) = io::read_header(field) else { return Ok(()) };
-    let (needed, left) = (strain_memory(&stored.grid), io::memory_left().unwrap_or(u64::MAX));
-    if needed > left {
-        bail!(
-            "{}: its strain needs about {} of memory, but only {} are left; close other programs, or crop the field to the tissue",
-            field.shown(),
-            bytes(needed),
-            bytes(left)
-        );
-    }
-    Ok(())
+    let strain = format!("{}: its strain", field.shown());
+    fits(&strain, strain_memory(&stored.grid), "or crop the field to the tissue")
 }
 
 /// Refuses a mesh that needs more memory than is left.
 pub fn mesh_fits(nodes: usize) -> Result<()> {
-    let (needed, left) = (stiffness_memory(nodes), io::memory_left().unwrap_or(u64::MAX));
-    if needed <= left {
-        return Ok(());
-    }
+    let needed = stiffness_memory(nodes);
+    let Some(left) = left_under(needed) else { return Ok(()) };
     let most = (1..).map(|n| 500 * n).take_while(|&n| stiffness_memory(n) <= left).last();
-    let instead = most.map_or_else(String::new, |n| format!(", or take --nodes {n}, which fits"));
-    bail!(
-        "{nodes} nodes need about {} of memory, but only {} are left; close other programs{instead}",
-        bytes(needed),
-        bytes(left)
-    );
+    let instead = most.map_or("or take fewer --nodes".into(), |n| format!("or take --nodes {n}, which fits"));
+    fits(&format!("a mesh of {nodes} nodes"), needed, &instead)
+}
+
+/// Refuses a phantom that needs more memory than is left.
+pub fn phantom_fits(grid: &Grid, elastic: bool) -> Result<()> {
+    let [x, y, z] = grid.shape();
+    fits(&format!("a phantom of {x} x {y} x {z} voxels"), phantom_memory(grid, elastic), "or lower --size")
+}
+
+/// Refuses stress runs that need more memory than is left: one field for each thread, or one
+/// stiffness after the other.
+pub fn stress_fits(effort: &Effort, field: bool, stiffness: bool) -> Result<()> {
+    let mut needed = 0;
+    if field {
+        for body in &effort.bodies {
+            let grid = body.grid()?;
+            needed = needed.max(phantom_memory(&grid, false) + memory(&grid, &grid));
+        }
+        needed *= rayon::current_num_threads() as u64;
+    }
+    if stiffness {
+        needed = needed.max(effort.stiffness_memory()?);
+    }
+    fits("this stress test", needed, "or take one --part, --quick or fewer --threads")
 }
 
 /// Ends the program at once, with nothing half-written left behind.

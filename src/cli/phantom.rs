@@ -1,6 +1,7 @@
 //! `palpate phantom`: a synthetic pair with exactly known displacement.
 
 use super::console::Console;
+use super::limits::phantom_fits;
 use super::{Usage, sequence};
 use anyhow::{Result, bail};
 use clap::Args;
@@ -161,6 +162,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         Kind::Pair(kind) => kind,
         Kind::Sequence(kind) => {
             let params = options.sequence(kind)?;
+            phantom_fits(&params.grid()?, false)?;
             let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
             let summary = sequence::write(&mut folder, &params, console)?;
             folder.commit()?;
@@ -169,6 +171,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         }
     };
     let params = options.params(kind)?;
+    phantom_fits(&params.grid()?, params.motion == MotionKind::Elastic)?;
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let phantom = synth::phantom(&params)?;
     write(&mut folder, &phantom)?;

@@ -2,6 +2,7 @@
 
 use super::Usage;
 use super::console::Console;
+use super::limits::stress_fits;
 use super::outputs::Target;
 use super::record::Recording;
 use anyhow::{Result, bail};
@@ -90,11 +91,12 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let Options { target, quick, part, axis } = options;
     let wanted = |p: Part| part.is_empty() || part.contains(&p);
     check_axes(axis, wanted)?;
+    let effort = Effort::new(*quick);
+    stress_fits(&effort, wanted(Part::Field), wanted(Part::Stiffness))?;
     let mut folder = target.create()?;
     let record = Recording::start(console, Vec::new());
     let started = Instant::now();
     let progress = console.progress();
-    let effort = Effort::new(*quick);
     let mut curves = Vec::new();
     let troubles = picked(axis, &field_axes());
     if wanted(Part::Field) && !troubles.is_empty() {

@@ -6,7 +6,7 @@ use super::batch::make_folder;
 use super::source::open;
 use super::text::{list, read_json, write_json, write_text};
 use super::{format, os};
-use crate::error::IoError;
+use crate::error::{IoError, Shown};
 use crate::types::batch::Pair;
 use serde_json::json;
 use std::collections::BTreeMap;
@@ -110,7 +110,7 @@ fn add(series: &mut Series, scan: Scan) -> Result<(), IoError> {
     let kind = scan.stem.split('_').filter(shared).collect::<Vec<_>>().join("_");
     let scans = series.entry((entity(&scan.stem, "sub-").into(), kind)).or_default();
     if let Some(other) = scans.iter().find(|other| other.order() == scan.order()) {
-        let what = format!("is the same run as {}", other.path.display());
+        let what = format!("is the same run as {}", other.path.shown());
         return Err(format(&scan.path, what, "give each run a label of its own, and keep one file of it"));
     }
     scans.push(scan);

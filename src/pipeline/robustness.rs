@@ -7,6 +7,7 @@ use crate::evaluate::breaking::{Breaking, Spread, breaking_point};
 use crate::evaluate::coverage::{BAND, coverage};
 use crate::grasp::simulate::simulate;
 use crate::pipeline::compression_phantoms::Pressed;
+use crate::pipeline::dry_run::{phantom_memory, stiffness_memory};
 use crate::pipeline::field::{self, FieldResult};
 use crate::pipeline::speed_accuracy::{exact, posture_error};
 use crate::synth::degradation::{disturbed, shifted_labels};
@@ -47,7 +48,19 @@ impl Effort {
         let bodies = vec![body(PhantomKind::Block, 64), body(PhantomKind::Head, 64), body(PhantomKind::Calf, 72)];
         Self { bodies, seeds: vec![1, 2, 3], coarse: 6, halvings: 3, side: 40, nodes: 2000 }
     }
+
+    /// Memory that its stiffness runs hold at most (bytes): the body, and the finest mesh.
+    ///
+    /// # Errors
+    /// [`SynthError`] where the body is out of range.
+    pub fn stiffness_memory(&self) -> Result<u64, SynthError> {
+        let grid = PhantomParams::new(PhantomKind::Inclusion).sized(self.side).grid()?;
+        Ok(phantom_memory(&grid, true) + stiffness_memory(MESH_NODES[0] as usize))
+    }
 }
+
+/// Nodes of the meshes along that axis, most first.
+const MESH_NODES: [f64; 2] = [8000.0, 500.0];
 
 /// Mean error beyond which a field is of no use, as a part of the mean motion (1): there trust is
 /// low.
@@ -210,7 +223,7 @@ pub fn stiffness_curves(
         StiffnessAxis::Labels => search("labels beside their place", "voxels", [0.0, 8.0], Spread::Whole, &|s| {
             exact(s, &shifted_labels(&labels, s as usize), &usual)
         }),
-        StiffnessAxis::Mesh => search("mesh", "nodes", [8000.0, 500.0], Spread::Ratio, &|s| {
+        StiffnessAxis::Mesh => search("mesh", "nodes", MESH_NODES, Spread::Ratio, &|s| {
             exact(s, &labels, &StiffnessParams { nodes: s.round() as usize, ..usual.clone() })
         }),
     };
