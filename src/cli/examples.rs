@@ -9,7 +9,7 @@ const EXAMPLES: &[(&str, &[(&str, &str)])] = &[
         &[
             ("measure inside a mask", "field before.nii.gz after.nii.gz --mask tissue.nii.gz -o results"),
             ("look at the plan first", "field before.nii.gz after.nii.gz -o results --dry-run"),
-            ("more matches, wider search", "field before.nrrd after.nrrd -o results --preset accurate --search 25"),
+            ("more matches, wider search", "field before.nrrd after.nrrd -o results --points 20000 --search 25"),
             ("repeat an earlier run", "field before.nii.gz after.nii.gz -o again --config results/summary.json"),
         ],
     ),

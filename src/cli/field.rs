@@ -14,7 +14,7 @@ use palpate::error::{StrainError, UnknownName};
 use palpate::pipeline::field::{FieldResult, Progress};
 use palpate::pipeline::strain::{StrainInput, StrainParams, StrainResult};
 use palpate::types::params::{BodySource, Method, ModelSource, Preset};
-use palpate::types::{DenseField, FieldParams, FieldSummary, Grid, Mask, names};
+use palpate::types::{DenseField, FieldParams, Grid, Mask, names};
 use palpate::{evaluate, io, pipeline};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -65,7 +65,8 @@ pub struct Options {
 /// What `field`, `track` and `demo` share.
 #[derive(Debug, Args)]
 pub struct Tuning {
-    /// Time against error: fast, balanced or accurate [default: balanced]
+    /// Time against error: fast or balanced; accurate is balanced with twice the matches [default:
+    /// balanced]
     #[arg(long, value_parser = preset, conflicts_with = "config")]
     preset: Option<Preset>,
     /// What makes the field: full (all voxels) or sparse (matches alone, as in the source)
@@ -289,7 +290,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let summary = write_field(&mut folder, measured, &mut result)?;
     folder.commit()?;
     drop(progress);
-    explain(console, &result.summary);
     warn_all(console, &result.summary.warnings);
     console.say(&format!("{summary}{}", target.look()));
     Ok(())
@@ -347,16 +347,4 @@ fn bodies_of(path: &Path, mut labels: Mask, mask: Option<&Mask>, rigid: &[u8]) -
         (_, Some(label)) => bail!("{}: --rigid {label} is no body of it; there are {}", path.shown(), names()),
         _ => Ok(labels),
     }
-}
-
-/// Levels, reasons and stages, for -v.
-pub fn explain(console: &Console, summary: &FieldSummary) {
-    for l in &summary.levels {
-        console.detail(&format!(
-            "level {:.2?} mm: {} candidates, {} kept, energy {:.4} -> {:.4}, residual {:.3} mm",
-            l.spacing_mm, l.counts.candidates, l.counts.kept, l.energy_before, l.energy_after, l.residual_mm
-        ));
-    }
-    summary.evidence.iter().for_each(|e| console.detail(&format!("model: {e}")));
-    summary.seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.2} s")));
 }

@@ -106,11 +106,11 @@ impl Peers {
         io::write_volume(&moving, &case.deformed, "palpate chart")?;
         let own = own::words();
         let pair = [&fixed, &moving].map(|p| p.clone().into_os_string());
-        let presets = Variant::presets();
+        let steps = Variant::steps();
         let tools: Vec<&Tool> = self.tools.iter().filter(|t| t.missing.is_empty() && t.name != SIMULATOR).collect();
-        let count = (presets.len() + tools.len()) as f64;
+        let count = (steps.len() + tools.len()) as f64;
         let mut out = Vec::new();
-        for preset in presets {
+        for step in steps {
             progress(out.len() as f64 / count);
             // A folder a run: what one leaves is not taken for another's.
             let results = io::Scratch::new()?;
@@ -118,10 +118,10 @@ impl Peers {
             command.push("field".into());
             command.extend(pair.clone());
             command.extend(["-o".into(), results.path().into()]);
-            let flags = ["--overwrite", "--quiet", "--threads", "2", "--preset", preset.method.as_str()];
+            let flags = ["--overwrite", "--quiet", "--threads", "2"].into_iter().chain(step.settings.split(' '));
             command.extend(flags.map(Into::into));
-            let (method, settings) = (format!("palpate {}", preset.method), format!("{}, 2 threads", preset.settings));
-            let variant = Variant { varied: "whole command", method, settings, ..preset };
+            let (method, settings) = (format!("palpate {}", step.method), format!("{}, 2 threads", step.settings));
+            let variant = Variant { varied: "whole command", method, settings, ..step };
             out.push(self.trial(case, &variant, &command, &results.path().join("displacement.nii.gz"))?);
         }
         for tool in tools {

@@ -8,7 +8,7 @@ use crate::numerics::statistics::percentile;
 use crate::pipeline::{cpu, field};
 use crate::synth::{MotionKind, Phantom, PhantomKind, PhantomParams, phantom};
 use crate::types::grasp::GraspRun;
-use crate::types::params::{Interpolation, Preset};
+use crate::types::params::{Interpolation, Method as FieldMethod, Preset};
 use crate::types::scene::{Formulation, Method};
 use crate::types::space::length;
 use crate::types::{DenseField, FieldParams, Landmark, Mask, Part, Scene, Trial, Volume};
@@ -50,18 +50,20 @@ impl Variant {
         Self { varied, method: method.into(), settings: settings.into(), params }
     }
 
-    /// The three presets.
-    pub fn presets() -> Vec<Self> {
+    /// The steps between speed and accuracy: the field from matches alone, and the presets. That
+    /// called accurate writes more matches of the field that balanced makes.
+    pub fn steps() -> Vec<Self> {
         let preset = |name: &str, preset| {
             Self::new("preset", name, &format!("--preset {name}"), |p| *p = FieldParams::preset(preset))
         };
-        vec![preset("fast", Preset::Fast), preset("balanced", Preset::Balanced), preset("accurate", Preset::Accurate)]
+        let sparse = Self::new("preset", "sparse", "--method sparse", |p| p.method = FieldMethod::Sparse);
+        vec![sparse, preset("fast", Preset::Fast), preset("balanced", Preset::Balanced)]
     }
 
     /// Presets, point budgets and changes of single stages of the balanced preset; fewer when
     /// `quick`.
     pub fn all(quick: bool) -> Vec<Self> {
-        let mut out = Self::presets();
+        let mut out = Self::steps();
         let budgets: &[usize] = if quick { &[500] } else { &[200, 1000, 5000, 25_000] };
         for &points in budgets {
             let name = format!("{points} points");
@@ -198,7 +200,7 @@ impl Case {
     }
 }
 
-/// The three presets on heads of the same field of view with `sides` voxels across.
+/// All [steps](Variant::steps) on heads of the same field of view with `sides` voxels across.
 ///
 /// # Errors
 /// As [`phantom()`].
@@ -206,7 +208,7 @@ pub fn sizes(sides: &[usize], progress: &dyn Fn(f64)) -> Result<Vec<Trial>, Synt
     let mut out = Vec::new();
     for (i, &side) in sides.iter().enumerate() {
         let case = Case::embedded(&PhantomParams::new(PhantomKind::Head).sized(side))?;
-        for mut variant in Variant::presets() {
+        for mut variant in Variant::steps() {
             variant.varied = "size";
             out.push(case.run(&variant));
         }
