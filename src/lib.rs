@@ -13,6 +13,8 @@
 //! - before the scan: [`pipeline::experimental_design::run`] chooses the press, and
 //!   [`pipeline::certify::run`] states what a scan can show.
 //!
+//! Reasons and runtimes go to the crate `log` at the level debug, as they come.
+//!
 //! # Frames and units
 //!
 //! A [`VoxelPoint`] counts voxels, a [`WorldPoint`] is in world mm (RAS), and a [`Grid`] leads from

@@ -26,6 +26,18 @@ fn help_names_every_subcommand_and_exits_with_0() {
 }
 
 #[test]
+fn reasons_come_while_the_run_goes_on() {
+    let folder = small_pair();
+    let field = ["field", "initial.nii.gz", "deformed.nii.gz", "-o", "f"];
+    let (_, silent) = run(folder.path(), &field, 0);
+    let (_, said) = run(folder.path(), &[&field[..], &["-v", "--overwrite"]].concat(), 0);
+    let at = |line: &str| said.lines().position(|l| l.starts_with(line)).unwrap_or_else(|| panic!("{line}: {said}"));
+    // A level, the evidence for the motion model, and the stages in the order in which they end.
+    assert!(at("level [") < at("free: ") && at("free: ") < at("model: ") && at("model: ") < at("uncertainty: "));
+    assert!(!silent.contains("level [") && !silent.contains("uncertainty: "), "{silent}");
+}
+
+#[test]
 fn wrong_usage_exits_with_2_and_writes_nothing() {
     let folder = small_pair();
     let cases: [(&[&str], &str); 14] = [

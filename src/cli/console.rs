@@ -75,6 +75,13 @@ impl Console {
         }
     }
 
+    /// Shows what the library logs, with --verbose. A process that has a logger keeps it.
+    pub fn listen(&self) {
+        if self.verbose && log::set_logger(&Details).is_ok() {
+            log::set_max_level(log::LevelFilter::Debug);
+        }
+    }
+
     /// Why it ends here, each cause once.
     pub fn error(&self, error: &anyhow::Error) {
         let mut said = error.to_string();
@@ -92,11 +99,28 @@ impl Console {
         let shown = match () {
             _ if self.xml => Shown::Xml,
             _ if self.quiet => Shown::Nothing,
-            _ if stderr().is_terminal() => Shown::Bar(bar()),
+            _ if stderr().is_terminal() && !self.verbose => Shown::Bar(bar()),
             _ => Shown::Lines(Instant::now()),
         };
         Progress { shown, last: Mutex::default() }
     }
+}
+
+/// The reasons and stages that the library logs, on stderr.
+struct Details;
+
+impl log::Log for Details {
+    fn enabled(&self, metadata: &log::Metadata<'_>) -> bool {
+        metadata.target().starts_with("palpate")
+    }
+
+    fn log(&self, record: &log::Record<'_>) {
+        if self.enabled(record.metadata()) {
+            let _ = writeln!(stderr(), "{}", plain(&record.args().to_string()));
+        }
+    }
+
+    fn flush(&self) {}
 }
 
 fn bar() -> ProgressBar {

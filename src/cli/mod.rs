@@ -244,6 +244,7 @@ pub fn run(mut typed: Vec<OsString>, own: Vec<OsString>) -> u8 {
     let Cli { common, command } = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.format(&mut whole()).exit());
     let console = Console::new(common.quiet, common.verbose, &words).with_xml(asked.progress);
     warning.iter().for_each(|text| console.warn(text));
+    console.listen();
     limits::watch(console.clone(), common.timeout);
     // Everything runs inside the pool: work that starts on a thread of its own would wake the pool
     // for each small step.

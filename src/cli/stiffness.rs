@@ -306,8 +306,6 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     folder.write("report.html", |p| io::write_text(p, &on_page(page, &record)))?;
     folder.commit()?;
     drop(progress);
-    result.evidence.iter().for_each(|e| console.detail(&report::evidence_line(e)));
-    result.seconds.iter().for_each(|(stage, s)| console.detail(&format!("{stage}: {s:.2} s")));
     warn_all(console, &result.warnings);
     let used = match &source.matches {
         Some(path) if options.matches.is_none() => {

@@ -1,6 +1,13 @@
-//! How long each stage of a run takes.
+//! How long each stage of a run takes, and why it went as it did: both are logged as they come.
 
+use std::fmt::Display;
 use std::time::{Duration, Instant};
+
+/// What was found, also logged.
+pub(super) fn noted<T: Display>(found: T) -> T {
+    log::debug!("{found}");
+    found
+}
 
 /// Stage names and their wall seconds.
 pub(super) struct Clock(pub(super) Vec<(String, f64)>, Instant);
@@ -15,6 +22,7 @@ impl Clock {
     pub(super) fn book(&mut self, stage: &str) {
         let seconds = self.1.elapsed().as_secs_f64();
         self.1 = Instant::now();
+        log::debug!("{stage}: {seconds:.2} s");
         self.add(stage, seconds);
     }
 

@@ -7,7 +7,7 @@ use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::brightness::Light;
-use crate::pipeline::clock::Clock;
+use crate::pipeline::clock::{Clock, noted};
 use crate::pipeline::field::Progress;
 use crate::pipeline::field_warnings::no_match;
 use crate::pipeline::hypotheses::{Begun, Search, Start};
@@ -177,7 +177,7 @@ impl<'a> CoarseToFine<'a, '_> {
         let loose = level.place == 1 && begun.is_loose();
         match loose.then(|| search.closer(pair, &bodies, level.passes, &mut account.matched)).flatten() {
             Some(found) => {
-                account.reports.extend(found.report.clone());
+                account.reports.extend(found.report.clone().map(noted));
                 Entry { bodies: found.motion.clone(), begun: found, sought: !level.last }
             }
             None => Entry { bodies, begun, sought: false },
@@ -199,7 +199,7 @@ impl<'a> CoarseToFine<'a, '_> {
         let Account { light, range, asked, matched, .. } = account;
         let around = || tissue().map(|mask| light.level_within(self.aligned, &mask, *factor));
         let begun = self.begin(search, (pair, *factor, lattice), around, *passes, (range, asked), matched);
-        account.reports.extend(begun.report.clone());
+        account.reports.extend(begun.report.clone().map(noted));
         Entry { bodies: begun.motion.clone(), begun, sought: true }
     }
 
@@ -219,7 +219,8 @@ impl<'a> CoarseToFine<'a, '_> {
         } else if *sought && self.params.bodies == BodySource::Found {
             let edges = pair.spacing.into_iter().zip(*factor).map(|(s, f)| s / f as f64);
             let edge = edges.fold(f64::INFINITY, f64::min);
-            account.asked.extend(bodies.divide(pair, &begun.matches, *passes, edge, self.params.seed));
+            let said = bodies.divide(pair, &begun.matches, *passes, edge, self.params.seed);
+            account.asked.extend(said.into_iter().map(noted));
         }
     }
 
@@ -242,7 +243,7 @@ impl<'a> CoarseToFine<'a, '_> {
             let refine = |field: &mut SplineField, passes| level::refine(&part, field, passes, params.seed, |_| ());
             let explained = finer(&part, bodies.fields[b].clone(), level.apart, params.seed, refine);
             apart = apart.min(explained.apart);
-            asked.extend(explained.said);
+            asked.extend(explained.said.into_iter().map(noted));
             bodies.fields[b] = explained.field;
         }
         let [left, gain] = level::misfit(&pair, &bodies.warp(&pair, &pair.spans));
@@ -256,7 +257,7 @@ impl<'a> CoarseToFine<'a, '_> {
         if level.is_first() {
             reports.clear();
         }
-        reports.push(report);
+        reports.push(noted(report));
         clock.book("matching");
         stages.push(Left { name: "finest level".into(), motion: bodies.without_blocks(), factor });
         Found { bodies, factor, pair, matches, points, reports, begun, light, search, left, gain, apart, asked, stages }
@@ -314,7 +315,7 @@ impl<'a> CoarseToFine<'a, '_> {
             let far = Search { range: TWICE * search.range, ..*search };
             let wide = far.begin((pair, factor), lattice, self.starts_given(), passes, matched);
             let taken = wide.outdoes(pair, &found);
-            asked.push(why_farther(search.range, &found, &wide, taken));
+            asked.push(noted(why_farther(search.range, &found, &wide, taken)));
             if taken {
                 (*range, found) = (far.range, wide);
             }

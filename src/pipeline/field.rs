@@ -10,7 +10,7 @@ use crate::numerics::orientation::Orientation;
 use crate::pipeline::background::{self, Cut};
 use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::body_models::{Concluded, labelled};
-use crate::pipeline::clock::Clock;
+use crate::pipeline::clock::{Clock, noted};
 use crate::pipeline::coarse_to_fine::{
     COARSE, CoarseToFine, Found, TWICE, around, begun_from, finest_level, search_mm, worked_on,
 };
@@ -387,12 +387,13 @@ impl Task<'_> {
         evidence.extend(background::why_unseen(self.cut));
         evidence.extend(light.why());
         evidence.extend(self.common.map(Common::why));
+        evidence.iter().for_each(|e| log::debug!("{e}"));
         evidence.extend(found.asked);
-        evidence.push(why_so_many(params, points, features));
+        evidence.push(noted(why_so_many(params, points, features)));
         let unlike = unlike(&pair, found.left);
         let unseen = level::unseen(&pair, |p| bodies.at(p));
         let plain = without_texture(pair.plain());
-        evidence.extend(concluded.iter().filter_map(|c| c.rest.as_ref()).map(Rest::why));
+        evidence.extend(concluded.iter().filter_map(|c| c.rest.as_ref()).map(Rest::why).map(noted));
         clock.book("model");
 
         let sparse = SparseField { matches: matches.iter().map(|m| world_match(grid, m, factor)).collect() };
@@ -416,7 +417,7 @@ impl Task<'_> {
                 bodies.relabel(given.on(pair.shape, next));
             }
             factor = next;
-            evidence.push(last_passes::why(&pair, nodes, params));
+            evidence.push(noted(last_passes::why(&pair, nodes, params)));
             clock.book("residual");
         }
         let rejected = concluded.iter().any(|c| c.choice.rejected);

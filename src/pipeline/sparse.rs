@@ -25,7 +25,7 @@ use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{inverse, quadratic};
 use crate::pipeline::background;
 use crate::pipeline::body_models;
-use crate::pipeline::clock::Clock;
+use crate::pipeline::clock::{Clock, noted};
 use crate::pipeline::coarse_to_fine;
 use crate::pipeline::field::{FEWEST, FieldResult, Progress, Start, lengths};
 use crate::pipeline::field_warnings::{
@@ -154,7 +154,7 @@ impl<'a> Levels<'a> {
                 }
             };
             let found = on_level(&pair, begun, l + 1 == self.factors.len(), params);
-            reports.push(found.report.clone());
+            reports.push(noted(found.report.clone()));
             let motion = found.field.without_blocks().into();
             left.push(Left { name: "matches of a level".into(), motion, factor });
             state = Some((found, pair, factor));
@@ -186,6 +186,7 @@ fn chosen(
     choice.evidence.insert(0, MADE_BY.into());
     choice.evidence.extend(background::why_unseen(cut));
     choice.evidence.push(why_so_many(params, points(params, pair.inside), corners));
+    choice.evidence = choice.evidence.into_iter().map(noted).collect();
     choice
 }
 

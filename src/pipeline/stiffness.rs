@@ -3,6 +3,7 @@
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::{displacement, nearest};
+use crate::pipeline::clock::Clock;
 use crate::pipeline::stiffness_regions;
 use crate::stiffness::boundary_conditions::{Patch, Place};
 use crate::stiffness::geometry::Geometry;
@@ -25,7 +26,6 @@ use crate::types::stiffness::{
 use crate::types::{
     DenseField, Displacement, ErrorSamples, Mask, MotionModel, QuadraticMesh, SparseField, Trust, WorldPoint,
 };
-use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
 /// from any thread.
@@ -325,7 +325,7 @@ fn labelled(
     tried: Vec<Evidence>,
     progress: Progress<'_>,
 ) -> Result<StiffnessResult, StiffnessError> {
-    let mut clock = Clock { seconds: Vec::new(), since: Instant::now() };
+    let mut clock = Clock::start();
     let (solved, mesh) = solved(inputs, params, progress, &mut clock)?;
     progress("uncertainty", 0.9);
     let setup = solved.fine.setup(solved.choice.law, params, solved.reference);
@@ -380,7 +380,7 @@ fn labelled(
         model_force: estimate.force[0] * estimate.leaning * kpa / 1000.0,
         strain,
         warnings,
-        seconds: clock.seconds,
+        seconds: clock.0,
         samples: [3.0 * estimate.residuals.len() as f64, estimate.effective],
         labelled: inputs.labelled,
         left_over: None,
@@ -625,17 +625,5 @@ pub(super) fn whole(labels: &Mask) -> Result<(), StiffnessError> {
             next,
         }),
         _ => Ok(()),
-    }
-}
-
-struct Clock {
-    seconds: Vec<(String, f64)>,
-    since: Instant,
-}
-
-impl Clock {
-    fn book(&mut self, stage: &str) {
-        self.seconds.push((stage.into(), self.since.elapsed().as_secs_f64()));
-        self.since = Instant::now();
     }
 }

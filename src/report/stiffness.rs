@@ -139,7 +139,7 @@ pub fn text(result: &StiffnessResult) -> String {
         load.contact.name()
     );
     for e in &result.evidence {
-        let _ = writeln!(out, "  evidence     {}", evidence_line(e));
+        let _ = writeln!(out, "  evidence     {e}");
     }
     let _ = writeln!(
         out,
@@ -156,15 +156,6 @@ pub fn text(result: &StiffnessResult) -> String {
 fn figures(e: &Evidence) -> [String; 2] {
     let shown = |v: f64, digits: usize| if v.is_finite() { format!("{v:.digits$}") } else { String::new() };
     [shown(e.residual_mm, 4), shown(e.bic, 0)]
-}
-
-/// One model, in a line.
-pub fn evidence_line(e: &Evidence) -> String {
-    let mark = if e.chosen { "chosen" } else { "not chosen" };
-    let [residual, criterion] = figures(e);
-    let tried =
-        if e.bic.is_finite() { format!("residual {residual} mm, criterion {criterion}, ") } else { String::new() };
-    format!("{}: {}: {tried}{mark} ({})", e.question, e.model, e.reason)
 }
 
 /// summary.json; the keys are those of docs/reference/file-formats.md.

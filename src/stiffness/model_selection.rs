@@ -168,17 +168,15 @@ impl Chooser<'_> {
             (law, chosen) = self.law(tried, best)?;
         } else {
             let (e, reason) = (&chosen.estimate, "as asked".to_string());
-            self.evidence.push(shown(
-                "law",
-                law.name().into(),
-                e,
-                bic(e.squares, e.effective, e.parameters),
-                true,
-                reason,
-            ));
+            self.show(shown("law", law.name().into(), e, bic(e.squares, e.effective, e.parameters), true, reason));
         }
         let estimate = settle(self.level, law, self.params, self.reference, chosen.estimate, MOVES, COARSE)?;
         Ok(Choice { law, estimate, evidence: self.evidence, warnings: self.warnings })
+    }
+
+    fn show(&mut self, evidence: Evidence) {
+        log::debug!("{evidence}");
+        self.evidence.push(evidence);
     }
 
     /// Tries every contact under a law, and says which ranks first.
@@ -228,7 +226,7 @@ impl Chooser<'_> {
                 }
                 _ => "explains it less",
             };
-            self.evidence.push(shown("contact", t.name(), &t.estimate, t.score(samples), i == best, reason.into()));
+            self.show(shown("contact", t.name(), &t.estimate, t.score(samples), i == best, reason.into()));
         }
     }
 
@@ -250,7 +248,7 @@ impl Chooser<'_> {
             let e = &small.estimate;
             let criterion = bic(e.squares, e.effective, e.parameters);
             let reason = "no equilibrium was found under the neo-Hookean one".to_string();
-            self.evidence.push(shown("law", Law::Linear.name().into(), e, criterion, true, reason));
+            self.show(shown("law", Law::Linear.name().into(), e, criterion, true, reason));
             if strain > SMALL_STRAIN {
                 self.warnings.push(format!(
                     "strains reach {:.0} %, where the linear law is an approximation, but no equilibrium was found under the neo-Hookean one",
@@ -264,7 +262,7 @@ impl Chooser<'_> {
         let law = self.judged(strain, gain);
         for (of, t) in [(Law::Linear, &small), (Law::NeoHookean, &large)] {
             let reason = reason(law, gain);
-            self.evidence.push(shown("law", of.name().into(), &t.estimate, t.score(samples), of == law, reason));
+            self.show(shown("law", of.name().into(), &t.estimate, t.score(samples), of == law, reason));
         }
         if law == Law::Linear {
             self.touch(&small);

@@ -100,8 +100,13 @@ impl Support {
         out
     }
 
+    fn show(&mut self, evidence: Evidence) {
+        log::debug!("{evidence}");
+        self.evidence.push(evidence);
+    }
+
     fn push(&mut self, count: usize, chosen: bool, reason: String) {
-        self.evidence.push(Evidence {
+        self.show(Evidence {
             question: "regions",
             model: count.to_string(),
             parameters: self.parameters,
@@ -158,7 +163,7 @@ impl Support {
 
     /// There is no estimate with this number of regions: neither a residual nor a criterion.
     pub fn none(&mut self, count: usize, why: &str) {
-        self.evidence.push(Evidence {
+        self.show(Evidence {
             question: "regions",
             model: count.to_string(),
             parameters: 0,

@@ -2,6 +2,7 @@
 
 use crate::types::{ExpectedError, TetMesh, TriMesh};
 use serde::{Deserialize, Serialize};
+use std::fmt;
 
 /// The mesh through the kept matches: tetrahedra, or triangles for one slice.
 #[derive(Debug, Clone, PartialEq)]
@@ -119,6 +120,15 @@ pub struct LevelReport {
     pub energy_after: f64,
     /// Median distance of the kept matches to the coupled field (mm).
     pub residual_mm: f64,
+}
+
+impl fmt::Display for LevelReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { spacing_mm, counts, energy_before, energy_after, residual_mm } = self;
+        let Counts { candidates, kept, .. } = counts;
+        write!(f, "level {spacing_mm:.2?} mm: {candidates} candidates, {kept} kept, ")?;
+        write!(f, "energy {energy_before:.4} -> {energy_after:.4}, residual {residual_mm:.3} mm")
+    }
 }
 
 impl LevelReport {

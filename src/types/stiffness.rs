@@ -4,6 +4,7 @@ use crate::error::{ParamError, UnknownName};
 use crate::types::names::choose;
 use crate::types::{Mask, QuadraticMesh, Trust, Volume};
 use serde::{Deserialize, Serialize};
+use std::fmt;
 use std::str::FromStr;
 
 /// How stress follows strain.
@@ -290,6 +291,18 @@ pub struct Evidence {
     pub chosen: bool,
     /// Why, in words.
     pub reason: String,
+}
+
+impl fmt::Display for Evidence {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { question, model, residual_mm, bic, reason, .. } = self;
+        let mark = if self.chosen { "chosen" } else { "not chosen" };
+        write!(f, "{question}: {model}: ")?;
+        if bic.is_finite() {
+            write!(f, "residual {residual_mm:.4} mm, criterion {bic:.0}, ")?;
+        }
+        write!(f, "{mark} ({reason})")
+    }
 }
 
 /// From which contrast on a ball would be found without labels, in three of four places.
