@@ -10,7 +10,7 @@ use crate::consistency::grouping;
 use crate::consistency::pruning::{GATE, Measured};
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, Spans};
-use crate::matching::residual::{self, CAUCHY};
+use crate::matching::residual::{self, CAUCHY_TUNING};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::sampling::beside;
 use crate::numerics::statistics::median;
@@ -543,7 +543,7 @@ fn window(width: f64) -> f64 {
 /// show it.
 fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f32> {
     let [nx, ny, _] = pair.shape;
-    let cut = 1.0 / (CAUCHY * sigma);
+    let cut = 1.0 / (CAUCHY_TUNING * sigma);
     let mut out = vec![0.0f32; warped.len()];
     let room = || (vec![0.0; nx], vec![0.0; nx]);
     out.par_chunks_mut(nx).enumerate().for_each_init(room, |(a, b), (row, out)| {
@@ -551,7 +551,7 @@ fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f3
         for (i, out) in out.iter_mut().enumerate().filter(|(i, _)| pair.mask[row * nx + i] != 0) {
             let at = row * nx + i;
             let t = cut * (pair.fixed_smooth[at] - (a[i] * warped[at] + b[i]));
-            *out = if t.is_finite() { CAUCHY * CAUCHY * (t * t).ln_1p() } else { GATE as f32 };
+            *out = if t.is_finite() { CAUCHY_TUNING * CAUCHY_TUNING * (t * t).ln_1p() } else { GATE as f32 };
         }
     });
     out

@@ -7,7 +7,7 @@ use crate::consistency::energy::distance;
 use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{GATE, Measured};
 use crate::matching::pair::{Anchor, Pair};
-use crate::matching::residual::{NormalEquations, UNSURE};
+use crate::matching::residual::{MIN_POSITION_ERROR_VOXELS, NormalEquations};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::statistics::median;
 use crate::pipeline::bodies::Bodies;
@@ -31,7 +31,7 @@ pub(super) const FEWEST: usize = 4;
 pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
     let sd = if known.landmark_sd_mm > 0.0 { known.landmark_sd_mm } else { voxel(grid) };
     // Of no place more is known than interpolation leaves sure.
-    let sd = sd.max(UNSURE * voxel(grid));
+    let sd = sd.max(MIN_POSITION_ERROR_VOXELS * voxel(grid));
     let axes = grid.axes();
     let of = |l: &Landmark| {
         let d = l.deformed.minus(l.initial);

@@ -93,7 +93,7 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each
 /// axis).
 pub(super) fn independent(pair: &Pair<'_>) -> f32 {
-    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / least_squares_matching::CORRELATION as f32)
+    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / least_squares_matching::NOISE_CORRELATION_VOXELS as f32)
 }
 
 /// How much of the last step is carried into the next where that goes on the same way (heavy ball,

@@ -9,7 +9,7 @@ use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, SpaceError};
 use crate::matching::contrast::Relation;
 use crate::matching::levels::foreground;
-use crate::matching::residual::UNSURE;
+use crate::matching::residual::MIN_POSITION_ERROR_VOXELS;
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::median;
@@ -288,7 +288,7 @@ pub(super) fn rest<'a>(start: &'a StartMap<'a>) -> impl Fn(WorldPoint) -> [f64; 
 /// Whether a start whose affine part was taken out is more than that, by what interpolation leaves
 /// unsure of any place.
 pub(super) fn bends(rest: impl Fn(WorldPoint) -> [f64; 3], grid: &Grid, mask: Option<&Mask>) -> bool {
-    places(grid, mask).into_iter().any(|x| length(rest(x)) > UNSURE * grid.least_spacing())
+    places(grid, mask).into_iter().any(|x| length(rest(x)) > MIN_POSITION_ERROR_VOXELS * grid.least_spacing())
 }
 
 impl FieldResult {
