@@ -76,7 +76,7 @@ pub const CHANCE: f64 = 1.7;
 
 /// Least number of degrees of freedom in a ratio of misfits: with fewer, chance and the rounding of
 /// the noise model dominate.
-const MIN_DEGREES_OF_FREEDOM: f64 = 100.0;
+pub const MIN_DEGREES_OF_FREEDOM: f64 = 100.0;
 
 /// Median distance of the matches from a model (units of `model_mm`, a fiftieth of a voxel) beyond
 /// which it is rejected: a small mask overrates the degrees of freedom.

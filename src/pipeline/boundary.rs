@@ -6,16 +6,12 @@
 
 use crate::numerics::sampling::{Stencil, nearest};
 use crate::stiffness::observations::{REACH, at_surface};
-use crate::strain::deviation::errors_at;
+use crate::strain::deviation::{DRAW_SMOOTHING_NODES, errors_at};
 use crate::types::{
     DenseField, ElementModulus, ErrorSamples, Mask, MeasuredNode, SolidMesh, StiffnessResult, Volume, VoxelPoint,
     WorldPoint,
 };
 use rayon::prelude::*;
-
-/// Width over which the directions of a few draws are averaged (nodes of the draws, one standard
-/// deviation of a Gaussian).
-const AVERAGED: f64 = 1.5;
 
 /// What is known of the motion.
 #[derive(Debug, Clone, Copy)]
@@ -97,7 +93,7 @@ fn directions(draws: &ErrorSamples, place: WorldPoint) -> Option<[f64; 6]> {
                 let step = [i, j, k].map(f64::from);
                 let near = nodes.affine().to_world(VoxelPoint(std::array::from_fn(|a| at[a] + step[a])));
                 let apart: f64 = step.iter().map(|s| s * s).sum();
-                let weight = (-0.5 * apart / (AVERAGED * AVERAGED)).exp();
+                let weight = (-0.5 * apart / (DRAW_SMOOTHING_NODES * DRAW_SMOOTHING_NODES)).exp();
                 for [x, y, z] in errors_at(draws, near) {
                     let products = [x * x, x * y, x * z, y * y, y * z, z * z];
                     sum.iter_mut().zip(products).for_each(|(s, p)| *s += weight * p);

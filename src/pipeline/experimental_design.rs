@@ -14,7 +14,7 @@ use crate::numerics::random::Random;
 use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::clock::Clock;
 use crate::pipeline::field::Progress;
-use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, evenly_meshed, whole};
+use crate::pipeline::stiffness::{FORWARD_TOLERANCE_MM, FieldQuality, Inputs, Meshed, evenly_meshed, whole};
 use crate::stiffness::boundary_conditions::{self, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::elements::Mapping;
 use crate::stiffness::fem_body::Body;
@@ -56,14 +56,13 @@ pub struct Simulated {
     pub strain: f64,
 }
 
-/// Precision of forward solutions (mm).
-const PRECISION: f64 = 1e-5;
-/// Part of what faces the load from which its end is a flat face, which is pressed as a whole.
-const FLAT: f64 = 0.6;
+/// Part of the area facing the load at the body's end, beyond which the end is a flat face pressed
+/// as a whole.
+const MIN_FLAT_FRACTION: f64 = 0.6;
 /// Cosine of the angle to the load within which a facet faces it.
-const FACING: f64 = 0.7;
-/// Largest press over the body's extent along the load: beyond, a linear law says nothing.
-const DEEPEST: f64 = 0.5;
+const MIN_FACING_COSINE: f64 = 0.7;
+/// Deepest press over the body's extent along the load: a linear law does not hold beyond.
+const MAX_PRESS_FRACTION: f64 = 0.5;
 
 /// The body with its plates, before it is pressed.
 struct Bench<'a> {
@@ -126,13 +125,13 @@ impl<'a> Bench<'a> {
                 let (d, voxel) = (self.outward, self.voxel());
                 let height = |n: u32| dot(body.places[n as usize], d);
                 let facing: Vec<usize> =
-                    (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > FACING).collect();
+                    (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > MIN_FACING_COSINE).collect();
                 let end =
                     facing.iter().flat_map(|&f| body.surface[f].nodes).map(height).fold(f64::NEG_INFINITY, f64::max);
                 let near = |f: &usize| body.surface[*f].nodes.iter().filter(|n| height(**n) > end - voxel).count() >= 3;
                 let area = |all: &[usize]| all.iter().map(|&f| body.surface[f].area).sum::<f64>();
                 let at_end: Vec<usize> = facing.iter().copied().filter(near).collect();
-                self.flat = (area(&at_end) > FLAT * area(&facing)).then(|| body.nodes_on(at_end));
+                self.flat = (area(&at_end) > MIN_FLAT_FRACTION * area(&facing)).then(|| body.nodes_on(at_end));
             }
             Place::Mask(..) => {
                 // A push all over tells which surface the masks cover.
@@ -190,7 +189,7 @@ impl<'a> Bench<'a> {
 
     /// The field of a press of `press` mm.
     fn simulate(&self, press: f64) -> Result<Simulated, StiffnessError> {
-        if press > DEEPEST * self.extent {
+        if press > MAX_PRESS_FRACTION * self.extent {
             let range = "half of the body's extent along the load at most; press less";
             return Err(ParamError { name: "press", value: press, range }.into());
         }
@@ -216,7 +215,7 @@ impl<'a> Bench<'a> {
             pinned: Vec::new(),
         };
         let mut state = State { theta, ..setup.start() };
-        let (problem, solution) = setup.solve(&state, PRECISION)?;
+        let (problem, solution) = setup.solve(&state, FORWARD_TOLERANCE_MM)?;
         let force = setup.forces(&problem, &state, &solution.x)[0] * setup.leaning(&problem, &state, &solution.x);
         let e = self.params.modulus(body.labels[0]).unwrap_or(1.0);
         let kpa = e / (2.0 * (1.0 + setup.poisson[0]));
@@ -485,7 +484,7 @@ impl Solved {
 
 /// The estimate at given moduli, with the plates as the field has them.
 fn true_state(setup: &Setup<'_>, theta: &[f64]) -> Result<Estimate, StiffnessError> {
-    setup.run(State { theta: theta.to_vec(), ..setup.start() }, 0, PRECISION)
+    setup.run(State { theta: theta.to_vec(), ..setup.start() }, 0, FORWARD_TOLERANCE_MM)
 }
 
 /// The step of all parameters that an estimate would still take, to first order.

@@ -12,7 +12,8 @@ use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::body_models::{Concluded, labelled};
 use crate::pipeline::clock::Clock;
 use crate::pipeline::coarse_to_fine::{
-    COARSE, CoarseToFine, Found, TWICE, around, begun_from, finest_level, search_mm, worked_on,
+    COARSE_NODE_SPACING_VOXELS, CoarseToFine, Found, WIDE_SEARCH_RATIO, around, begun_from, finest_level, search_mm,
+    worked_on,
 };
 use crate::pipeline::contrast::{self, Common};
 use crate::pipeline::field_warnings::{
@@ -97,11 +98,11 @@ impl FieldResult {
     }
 }
 
-/// Voxels about the tissue in which nothing folds either.
-const BORDER: usize = 2;
+/// Voxels around the tissue in which folds are also removed.
+const UNFOLDED_MARGIN_VOXELS: usize = 2;
 
-/// Fewest matches that a result may rest on.
-pub(super) const FEWEST: usize = 20;
+/// Fewest matches of a result.
+pub(super) const MIN_MATCHES: usize = 20;
 
 /// Measures the displacement from `initial` to `deformed`.
 ///
@@ -242,8 +243,8 @@ fn canonical(
         anchors: &anchors,
         factors: &factors,
         range,
-        reach: TWICE * range,
-        nodes: COARSE,
+        reach: WIDE_SEARCH_RATIO * range,
+        nodes: COARSE_NODE_SPACING_VOXELS,
         params,
     };
     let aligned = scene.aligned(&clean, &seen)?;
@@ -362,7 +363,7 @@ impl Task<'_> {
         };
         let found = chain.run(range, tissue, clock)?;
         let kept = found.matches.iter().filter(|m| m.kept).count();
-        if kept < FEWEST {
+        if kept < MIN_MATCHES {
             return Err(too_few(kept, &found.pair, found.search, params, known.start.is_some()));
         }
         Ok(found)
@@ -410,7 +411,7 @@ impl Task<'_> {
             pair = light.level(aligned, next);
             clock.book("pyramid");
             let tick = |p: usize| (self.progress)("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-            let nodes = last_passes::WIDEST.min(2 * found.apart);
+            let nodes = last_passes::MAX_NODE_SPACING_VOXELS.min(2 * found.apart);
             bodies = last_passes::polish((&pair, next, nodes), (&bodies, factor), params, tick);
             if let Some(given) = &self.given {
                 bodies.relabel(given.on(pair.shape, next));
@@ -426,7 +427,11 @@ impl Task<'_> {
         let (labels, labelled) = self.labels(&bodies, factor);
         let body_reports = self.reported(models, &labelled, &bodies, &pair);
         // Where there is one body its field folds nowhere but between knots.
-        let tissue = if labels.is_empty() { Vec::new() } else { dilate(self.mask.as_slice(), grid.shape(), BORDER) };
+        let tissue = if labels.is_empty() {
+            Vec::new()
+        } else {
+            dilate(self.mask.as_slice(), grid.shape(), UNFOLDED_MARGIN_VOXELS)
+        };
         let coefficients = FieldSpline::new(*grid, splines, labels, tissue);
         let stages = stages::account(grid, (&pair, factor), found.stages, &coefficients);
         let agreement = agreement(&pair, &bodies, model)?;

@@ -16,16 +16,17 @@ use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Grid, Landmark, LandmarkReport};
 
-/// Squared distance, over the variance, at which a landmark's weight is a half in the end: three
-/// standard deviations, as for matches.
-const SCALE: f64 = 9.0;
+/// Squared distance over the variance at which a landmark's final weight is a half: three standard
+/// deviations, as for matches.
+const FINAL_SCALE_SQUARED: f64 = 9.0;
 
-/// Factor by which that falls from pass to pass, and the passes at the end in which it holds.
-const FALLS: f64 = 4.0;
-const SETTLING: usize = 3;
+/// Factor by which that scale falls from pass to pass.
+const SCALE_DECAY: f64 = 4.0;
+/// Passes at the end in which it holds.
+const FINAL_PASSES: usize = 3;
 
 /// Landmarks from which a motion of their own may start the search: an affine map takes four.
-pub(super) const FEWEST: usize = 4;
+pub(super) const MIN_LANDMARKS: usize = 4;
 
 /// The landmarks on the initial volume's grid.
 pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
@@ -51,11 +52,11 @@ fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
 }
 
-/// The scale of the weights, by the passes `to_come` after this one: it falls by [`FALLS`] from
-/// pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and Zisserman
-/// 1987), and holds in the last [`SETTLING`].
+/// The scale of the weights, by the passes `to_come` after this one: it falls by [`SCALE_DECAY`]
+/// from pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and
+/// Zisserman 1987), and holds in the last [`FINAL_PASSES`].
 fn scale(to_come: usize) -> f64 {
-    SCALE * FALLS.powi(to_come.saturating_sub(SETTLING - 1).min(20) as i32)
+    FINAL_SCALE_SQUARED * SCALE_DECAY.powi(to_come.saturating_sub(FINAL_PASSES - 1).min(20) as i32)
 }
 
 /// How far the field is from most landmarks (mm, twice the median).
@@ -67,7 +68,7 @@ pub(super) fn reach(pair: &Pair<'_>, field: &SplineField) -> f64 {
 
 /// Whether the passes may end with `to_come` left: the weights are final.
 pub(super) fn are_settled(pair: &Pair<'_>, to_come: usize) -> bool {
-    pair.anchors.is_empty() || to_come < SETTLING
+    pair.anchors.is_empty() || to_come < FINAL_PASSES
 }
 
 /// Adds what the landmarks pull with to a pass with `to_come` passes after it.
@@ -84,7 +85,7 @@ pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalE
 
 /// What a squared distance over the variance costs: the logarithm of its density (Cauchy).
 fn cost(q: f64) -> f64 {
-    SCALE * (q / SCALE).ln_1p()
+    FINAL_SCALE_SQUARED * (q / FINAL_SCALE_SQUARED).ln_1p()
 }
 
 /// How much better the landmarks agree with one motion than with another.
@@ -126,7 +127,7 @@ pub(super) fn measured(pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
 /// The field through the landmarks alone on a level of `factor`, from which a search may start.
 pub(super) fn start(pair: &Pair<'_>, factor: [usize; 3]) -> Option<Start> {
     let thick: Vec<usize> = (0..3).filter(|&a| pair.shape[a] > 1).collect();
-    if pair.anchors.len() < FEWEST {
+    if pair.anchors.len() < MIN_LANDMARKS {
         return None;
     }
     let of = |a: &Anchor| {

@@ -49,9 +49,8 @@ impl Effort {
     }
 }
 
-/// Mean error beyond which a field is of no use, as a part of the mean motion (1): there trust is
-/// low.
-const USEFUL: f64 = 1.0 / 3.0;
+/// Mean error of a usable field over the mean motion (1); trust is low beyond it.
+const MAX_FIELD_ERROR_RATIO: f64 = 1.0 / 3.0;
 
 /// The field on every body along every axis of `troubles`.
 pub fn field_curves(effort: &Effort, troubles: &[Trouble], progress: Progress<'_>) -> Vec<StressCurve> {
@@ -107,7 +106,7 @@ pub fn field_run(body: &PhantomParams, trouble: Trouble, severity: f64) -> Resul
         Err(e) => StressRun {
             severity,
             error: f64::NAN,
-            limit: USEFUL * p.description.mean_mm,
+            limit: MAX_FIELD_ERROR_RATIO * p.description.mean_mm,
             refused: Some(e.to_string()),
             said: Vec::new(),
             inside: None,
@@ -119,7 +118,7 @@ pub fn field_run(body: &PhantomParams, trouble: Trouble, severity: f64) -> Resul
             StressRun {
                 severity,
                 error: scored.as_ref().map_or(f64::NAN, |m| m.mean_mm),
-                limit: USEFUL * scored.as_ref().map_or(0.0, |m| m.identity_mm),
+                limit: MAX_FIELD_ERROR_RATIO * scored.as_ref().map_or(0.0, |m| m.identity_mm),
                 refused: None,
                 said: distrusted(&result).into_iter().collect(),
                 inside: coverage(&result.displacement, &p.truth, &sigma, &p.mask),
@@ -136,8 +135,8 @@ fn distrusted(result: &FieldResult) -> Option<String> {
     low.then(|| format!("trust is low: the expected error is {:.0} % of the motion", 100.0 * expected.share()))
 }
 
-/// Error of a modulus beyond which it is of no use (per cent).
-const MODULUS: f64 = 20.0;
+/// Largest error of a usable modulus (per cent).
+const MAX_MODULUS_ERROR_PERCENT: f64 = 20.0;
 
 /// What makes a stiffness worse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -230,7 +229,7 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
             return StressRun {
                 severity,
                 error: f64::NAN,
-                limit: MODULUS,
+                limit: MAX_MODULUS_ERROR_PERCENT,
                 refused,
                 said: Vec::new(),
                 inside: None,
@@ -244,7 +243,7 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
         let band = 100.0 * BAND * r.sd / r.youngs_modulus;
         if !r.identifiable {
             said.push(format!("{} is not identifiable", r.name));
-        } else if band > MODULUS {
+        } else if band > MAX_MODULUS_ERROR_PERCENT {
             said.push(format!("the 95 % band of {} is {band:.0} % wide to either side", r.name));
         }
     }
@@ -252,7 +251,7 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
     StressRun {
         severity,
         error: errors.iter().copied().fold(0.0, f64::max),
-        limit: MODULUS,
+        limit: MAX_MODULUS_ERROR_PERCENT,
         refused: None,
         inside: Some(inside.count() as f64 / result.regions.len() as f64),
         expected: None,
@@ -260,8 +259,8 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
     }
 }
 
-/// Error of a posture beyond which it is of no use (degrees).
-const POSTURE: f64 = 0.5;
+/// Largest error of a usable posture (degrees).
+const MAX_POSTURE_ERROR_DEGREES: f64 = 0.5;
 
 /// What makes a grasp harder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -351,7 +350,7 @@ pub fn grasp_curves(effort: &Effort, axes: &[GraspAxis], progress: Progress<'_>)
 /// One scene against the same scene by the adaptive integrator. With `friction` the error is the
 /// largest share of the friction that the contacts ask for.
 fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
-    let limit = if friction { 1.0 } else { POSTURE };
+    let limit = if friction { 1.0 } else { MAX_POSTURE_ERROR_DEGREES };
     let (mut error, mut refused, mut said) = (f64::NAN, None, Vec::new());
     match simulate(scene, &|_| {}) {
         Err(e) => refused = Some(e.to_string()),

@@ -15,12 +15,12 @@ use crate::types::stiffness::{Detectable, Evidence, Law, LeftOver, StiffnessPara
 use crate::types::{Grid, Mask};
 use std::time::Instant;
 
-/// Times that found regions are drawn anew at most.
-const REDRAWN: usize = 5;
+/// Most times that regions found without labels are redrawn.
+const MAX_REDRAWS: usize = 5;
 /// Surfaces that move less than this stay (voxels).
-const STAYS: f64 = 0.2;
-/// Part of the residual that drawing anew must take away for another time.
-const WORTH: f64 = 0.002;
+const MIN_MOVE_VOXELS: f64 = 0.2;
+/// Relative reduction of the residual by a redraw, below which no further one follows.
+const MIN_RESIDUAL_GAIN: f64 = 0.002;
 
 /// Regions and why these.
 pub(super) struct Found {
@@ -83,7 +83,7 @@ impl Search<'_> {
         }
         let setup = old.level.setup(self.law, self.params, old.level.largest());
         let Some(fit) = geometry::fit(&setup, &old.estimate, grid, &[], &inclusions)? else { return Ok(None) };
-        if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
+        if fit.shapes.iter().all(|offset| offset.abs() < MIN_MOVE_VOXELS) {
             return Ok(None);
         }
         let mut labels = old.labels.clone();
@@ -112,13 +112,13 @@ impl Search<'_> {
 
     /// Drawn anew as long as it helps. What cannot be drawn or solved anew stays as the map has it.
     fn settled(&self, mut candidate: Candidate) -> Candidate {
-        for _ in 0..REDRAWN {
+        for _ in 0..MAX_REDRAWS {
             let Ok(Some(next)) = self.redrawn(&candidate) else { break };
             let gain = 1.0 - next.estimate.rms / candidate.estimate.rms;
             if gain > 0.0 {
                 candidate = next;
             }
-            if gain < WORTH {
+            if gain < MIN_RESIDUAL_GAIN {
                 break;
             }
         }
