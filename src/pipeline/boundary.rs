@@ -5,7 +5,7 @@
 //! size of the covariance, and the draws of `posterior.nii.gz` its directions.
 
 use crate::numerics::sampling::{Stencil, nearest};
-use crate::stiffness::observations::{REACH, at_surface};
+use crate::stiffness::observations::{SURFACE_REACH_VOXELS, at_surface};
 use crate::strain::deviation::{DRAW_SMOOTHING_NODES, errors_at};
 use crate::types::{
     DenseField, ElementModulus, ErrorSamples, Mask, MeasuredNode, SolidMesh, StiffnessResult, Volume, VoxelPoint,
@@ -52,8 +52,8 @@ pub struct Known<'a> {
 pub fn at_nodes(known: &Known<'_>, mesh: &SolidMesh, nodes: &[u32], patch: &str) -> Vec<MeasuredNode> {
     let one = |&node: &u32| {
         let place = mesh.nodes()[node as usize];
-        let (displacement, _) =
-            beside_body(known.body, place).then(|| at_surface(known.field, known.body, place.0, REACH))??;
+        let (displacement, _) = beside_body(known.body, place)
+            .then(|| at_surface(known.field, known.body, place.0, SURFACE_REACH_VOXELS))??;
         Some(MeasuredNode { node, patch: patch.into(), displacement, covariance: covariance(known, place) })
     };
     nodes.par_iter().filter_map(one).collect()

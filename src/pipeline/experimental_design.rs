@@ -15,16 +15,16 @@ use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::clock::Clock;
 use crate::pipeline::field::Progress;
 use crate::pipeline::stiffness::{FORWARD_TOLERANCE_MM, FieldQuality, Inputs, Meshed, evenly_meshed, whole};
-use crate::stiffness::boundary_conditions::{self, Patch, Place, SurfaceMotion, least_travel};
+use crate::stiffness::boundary_conditions::{self, MIN_FLAT_FRACTION, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::elements::Mapping;
 use crate::stiffness::fem_body::Body;
 use crate::stiffness::fields;
 use crate::stiffness::geometry::{self, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::mesh_problem::{Level, NEEDED, plate_prior};
-use crate::stiffness::observations::{REACH, block_for, find, read};
-use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
+use crate::stiffness::mesh_problem::{Level, MIN_OBSERVATIONS, plate_prior};
+use crate::stiffness::observations::{SURFACE_REACH_VOXELS, block_for, find, read};
+use crate::stiffness::summary::{self, MAX_IDENTIFIED_CONTRAST_LN, MAX_IDENTIFIED_SD_LN, MIN_LOAD_SHARE, Scale};
 use crate::stiffness::systematic_error::dilution;
 use crate::stiffness::verdict::mesh_error;
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion, Press};
@@ -56,9 +56,6 @@ pub struct Simulated {
     pub strain: f64,
 }
 
-/// Part of the area facing the load at the body's end, beyond which the end is a flat face pressed
-/// as a whole.
-const MIN_FLAT_FRACTION: f64 = 0.6;
 /// Cosine of the angle to the load within which a facet faces it.
 const MIN_FACING_COSINE: f64 = 0.7;
 /// Deepest press over the body's extent along the load: a linear law does not hold beyond.
@@ -105,7 +102,13 @@ impl<'a> Bench<'a> {
         for n in self.body.nodes_on(0..self.body.surface.len()) {
             displacement[n as usize] = Some(along(n).map(|v| -depth(n) * v));
         }
-        SurfaceMotion { sharp: displacement.clone(), displacement, error: 0.0, sharp_error: 0.0, near: REACH }
+        SurfaceMotion {
+            sharp: displacement.clone(),
+            displacement,
+            error: 0.0,
+            sharp_error: 0.0,
+            near: SURFACE_REACH_VOXELS,
+        }
     }
 
     fn find(&self, motion: &SurfaceMotion) -> Result<Vec<Patch>, StiffnessError> {
@@ -413,8 +416,8 @@ impl Solved {
             plate_prior: setup.plate_prior,
             sampled: (inside, level.block.max(1), estimate.residuals.len() as f64),
             hidden,
-            borne: borne > BEARS,
-            far: theta.iter().map(|t| t.abs() > SEEN).collect(),
+            borne: borne > MIN_LOAD_SHARE,
+            far: theta.iter().map(|t| t.abs() > MAX_IDENTIFIED_CONTRAST_LN).collect(),
             reference,
         })
     }
@@ -434,7 +437,7 @@ impl Solved {
         let voxels = inside as f64 / voxel.powi(3);
         let wide = block_for(voxels as usize) as f64;
         let count = samples * (block as f64 / (voxel * wide)).powi(3);
-        if count < NEEDED as f64 {
+        if count < MIN_OBSERVATIONS as f64 {
             return None;
         }
         let model = (deeper * self.rest).max(voxel * self.floor);
@@ -478,7 +481,7 @@ impl Solved {
 
     /// Whether a region is known, and not just a bound, with a deviation of `sd`.
     fn determines(&self, r: usize, sd: f64, ratios: bool) -> bool {
-        sd <= VAGUE && !self.hidden[r] && !self.far[r] && (ratios || !self.borne)
+        sd <= MAX_IDENTIFIED_SD_LN && !self.hidden[r] && !self.far[r] && (ratios || !self.borne)
     }
 }
 
@@ -668,7 +671,7 @@ impl Options<'_> {
             }
             if expected.len() == before {
                 warnings.push(format!(
-                    "voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"
+                    "voxels of {voxel} mm are too few in this body: {MIN_OBSERVATIONS} samples are needed; take smaller ones"
                 ));
             }
         }

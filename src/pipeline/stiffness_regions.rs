@@ -5,7 +5,7 @@ use crate::mesh::tetrahedral::{Fineness, mesh_labels};
 use crate::pipeline::stiffness::{Inputs, Progress, coarse_fineness};
 use crate::stiffness::geometry;
 use crate::stiffness::identify::{Estimate, State};
-use crate::stiffness::inclusion::{Inclusion, SHAPES};
+use crate::stiffness::inclusion::{Inclusion, SHAPE_FUNCTIONS};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::model_selection::choose;
@@ -87,7 +87,7 @@ impl Search<'_> {
             return Ok(None);
         }
         let mut labels = old.labels.clone();
-        for (inclusion, offsets) in inclusions.iter().zip(fit.shapes.chunks_exact(SHAPES)) {
+        for (inclusion, offsets) in inclusions.iter().zip(fit.shapes.chunks_exact(SHAPE_FUNCTIONS)) {
             inclusion.draw(&mut labels, &std::array::from_fn(|k| offsets[k] * grid.least_spacing()));
         }
         self.candidate(labels, (&old.level, &old.estimate.state)).map(Some)
