@@ -195,9 +195,8 @@ impl Brightness {
     ) -> Option<Self> {
         let seen = seen_blocks(pair, warped, displacement);
         let noise = noise_sigma(&pair.moving, pair.moving_shape, |_| true);
-        let above = (factor.iter().product::<usize>() as f64).sqrt() * BLOCKS.max_count.min_voxel_snr;
-        let least =
-            [f64::from(pair.noise) * BLOCKS.max_count.min_snr, f64::from(noise) * above.max(BLOCKS.max_count.min_snr)];
+        let above = (factor.iter().product::<usize>() as f64).sqrt() * BLOCKS.min_voxel_snr;
+        let least = [f64::from(pair.noise) * BLOCKS.min_snr, f64::from(noise) * above.max(BLOCKS.min_snr)];
         let found = Zero::of(pair).into_iter().filter_map(|zero| {
             let blocks = blocks(&seen, (zero, least), factor)?;
             Self::of(&blocks, shape, (zero, both))

@@ -8,6 +8,7 @@
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::tetrahedron::EDGES;
 use crate::stiffness::fem_body::Body;
+use crate::stiffness::interface::MAX_EXAMINED;
 use crate::types::space::{cross, dot, length};
 use std::collections::{BTreeMap, HashMap};
 
