@@ -78,12 +78,15 @@ pub const CHANCE: f64 = 1.7;
 /// the noise model dominate.
 pub const MIN_DEGREES_OF_FREEDOM: f64 = 100.0;
 
-/// Median distance of the matches from a model (units of `model_mm`, a fiftieth of a voxel) beyond
-/// which it is rejected: a small mask overrates the degrees of freedom.
-const CONTRADICTION_DISTANCE: f64 = 50.0;
+/// When matches reject a model, whatever the misfit: a small mask overrates the degrees of freedom.
+struct Contradiction {
+    /// Median distance of the matches from the model (units of `model_mm`, a fiftieth of a voxel).
+    min_distance: f64,
+    /// The same over their distance from the free field: scattered matches contradict no model.
+    min_ratio: f64,
+}
 
-/// The same over the matches' distance from the free field: scattered matches contradict no model.
-const CONTRADICTION_RATIO: f64 = 1.5;
+const CONTRADICTION: Contradiction = Contradiction { min_distance: 50.0, min_ratio: 1.5 };
 
 /// Excess misfit per degree of freedom about one place beyond which no map is accepted: true maps
 /// reach 2.7. Calibrated: docs/lab/2026-11-expected-error.md.
@@ -133,7 +136,7 @@ pub fn choose(
         let ratio = total / determined.max(MIN_DEGREES_OF_FREEDOM);
         let off = middle(&|m| distance(motion.displacement(m.place), m.displacement));
         let name = model.name();
-        let contradicted = off > CONTRADICTION_DISTANCE * model_mm && off > CONTRADICTION_RATIO * astray;
+        let contradicted = off > CONTRADICTION.min_distance * model_mm && off > CONTRADICTION.min_ratio * astray;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
         let there = format!(", {worst:.1} at the worst place (at most {PLACE})");
         evidence.push(format!(

@@ -221,11 +221,15 @@ pub fn against_plate(mut pad: PadReduction, columns: &[Column], curve: Vec<[f64;
 
 /// Knots of a profile.
 const KNOTS: usize = 7;
-/// Weight of a profile's second differences over that of its misfit: enough to hide the steps of
-/// voxels.
-const BENDING_WEIGHT: f64 = 1e-4;
-/// Least modulus of a profile over the mean.
-const MIN_MODULUS_RATIO: f64 = 0.02;
+/// How the moduli of a profile are fitted to forces.
+struct ProfileFit {
+    /// Weight of second differences over that of the misfit: enough to hide the steps of voxels.
+    bending_weight: f64,
+    /// Least modulus over the mean.
+    min_modulus_ratio: f64,
+}
+
+const PROFILE_FIT: ProfileFit = ProfileFit { bending_weight: 1e-4, min_modulus_ratio: 0.02 };
 
 /// Force (N) at `depth` (mm) of a hemisphere with moduli (kPa) by the depth at which its springs
 /// are reached: `F = int 2 pi E(s) (d - s) ds`, whatever its radius.
@@ -257,7 +261,7 @@ fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
     all.map(|s| 2e-3 * std::f64::consts::PI * hat(s) * (depth - s) * step).sum()
 }
 
-/// The moduli above [`MIN_MODULUS_RATIO`] whose forces are nearest to `force` at `depths`: least
+/// The moduli whose forces are nearest to `force` at `depths`: least
 /// squares with a small weight on bends, by coordinate descent. The first two are one where the pad
 /// is `curved`: a face touches it in a point, and what forces say of the springs there is the
 /// surface's step of a voxel. A flat pad is touched all over, and its first springs are the
@@ -273,7 +277,7 @@ fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 
             (0..KNOTS).for_each(|j| a[i][j] += row[i] * row[j]);
         }
     }
-    let weight = BENDING_WEIGHT * (0..KNOTS).map(|i| a[i][i]).sum::<f64>();
+    let weight = PROFILE_FIT.bending_weight * (0..KNOTS).map(|i| a[i][i]).sum::<f64>();
     for i in 1..KNOTS - 1 {
         let bend = [(i - 1, 1.0), (i, -2.0), (i + 1, 1.0)];
         for (r, x) in bend {
@@ -295,7 +299,7 @@ fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 
     for _ in 0..2000 {
         for i in first..KNOTS {
             let rest: f64 = (0..KNOTS).filter(|&j| j != i).map(|j| a[i][j] * out[j][1]).sum();
-            out[i][1] = ((b[i] - rest) / a[i][i].max(f64::MIN_POSITIVE)).max(MIN_MODULUS_RATIO * mean);
+            out[i][1] = ((b[i] - rest) / a[i][i].max(f64::MIN_POSITIVE)).max(PROFILE_FIT.min_modulus_ratio * mean);
         }
     }
     out[0][1] = out[first][1];

@@ -61,11 +61,15 @@ struct ZeroLevel {
 
 const ZERO_LEVEL: ZeroLevel = ZeroLevel { percentile: 0.5, min_darkest_ratio: 0.2, sampled_voxels: 100_000 };
 
-/// Iterations of reweighted least squares, which also alternate P and Q: the two converge slowly.
-const IRLS_ITERATIONS: usize = 12;
+/// Iteratively reweighted least squares for both polynomials.
+struct RobustFit {
+    /// Iterations, which also alternate P and Q: the two converge slowly.
+    iterations: usize,
+    /// Residual at which the Cauchy weight is a half (robust standard deviations).
+    cauchy_tuning: f64,
+}
 
-/// Residual at which the Cauchy weight is a half (robust standard deviations).
-const CAUCHY_TUNING: f64 = 2.0;
+const ROBUST_FIT: RobustFit = RobustFit { iterations: 12, cauchy_tuning: 2.0 };
 
 /// Logarithms of brightness that differ by less than this are equal.
 const LOG_TOLERANCE: f64 = 1e-6;
@@ -99,10 +103,15 @@ const TONE_CURVE: ToneCurve = ToneCurve {
 /// How far beyond its measured values P is extrapolated (logarithm).
 const PLACE_MARGIN_LOG: f64 = 0.1;
 
-/// Blocks whose median stands for the difference at a block.
-const MEDIAN_BLOCKS: usize = 12;
-/// Neighbouring blocks with which that median is compared.
-const COMPARED_NEIGHBOURS: usize = 6;
+/// How the difference in brightness is compared between neighbours.
+struct NeighbourComparison {
+    /// Blocks whose median stands for the difference at a block.
+    median_blocks: usize,
+    /// Neighbouring blocks with which that median is compared.
+    compared: usize,
+}
+
+const NEIGHBOURS: NeighbourComparison = NeighbourComparison { median_blocks: 12, compared: 6 };
 
 /// The deformed volume's way to the initial one's brightness.
 #[derive(Debug, Clone, PartialEq)]
@@ -412,14 +421,15 @@ fn steepest(terms: &[f64]) -> f64 {
 fn between_neighbours(blocks: &[Block], values: [&dyn Fn(&Block) -> f64; 2]) -> [f64; 2] {
     let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at).collect();
     let tree = Neighbours::new(&places);
-    let near: Vec<Vec<usize>> = places.iter().map(|p| tree.within(*p, f64::INFINITY, MEDIAN_BLOCKS)).collect();
+    let near: Vec<Vec<usize>> =
+        places.iter().map(|p| tree.within(*p, f64::INFINITY, NEIGHBOURS.median_blocks)).collect();
     values.map(|value| {
         let values: Vec<f64> = blocks.iter().map(value).collect();
         let middle = |near: &Vec<usize>| percentile(&mut near.iter().map(|&i| values[i]).collect::<Vec<_>>(), 50.0);
         let smooth: Vec<f64> = near.iter().map(middle).collect();
         let beside = near.iter().zip(&smooth).flat_map(|(near, here)| {
             let smooth = &smooth;
-            near.iter().skip(1).take(COMPARED_NEIGHBOURS).map(move |&i| (smooth[i] - here).abs())
+            near.iter().skip(1).take(NEIGHBOURS.compared).map(move |&i| (smooth[i] - here).abs())
         });
         percentile(&mut beside.collect::<Vec<_>>(), 50.0)
     })
@@ -439,7 +449,7 @@ fn robust(
     let mut weights: Vec<f64> = blocks.iter().map(|b| b.weight).collect();
     let mut best = (vec![0.0; n], 0.0);
     best.0[0] = usual;
-    for _ in 0..IRLS_ITERATIONS {
+    for _ in 0..ROBUST_FIT.iterations {
         for (row, b) in rows.iter_mut().zip(blocks) {
             let middle = 0.5 * (b.log[0] + b.log[1] + dot(&row[..n], &best.0[..n]));
             row.truncate(n);
@@ -456,7 +466,7 @@ fn robust(
         let left = || rows.iter().zip(blocks).map(|(row, b)| b.difference() - dot(row, &terms));
         let deviation = robust_deviation(left());
         for ((w, off), b) in weights.iter_mut().zip(left()).zip(blocks) {
-            *w = b.weight / (1.0 + (off / (CAUCHY_TUNING * deviation).max(LOG_TOLERANCE)).powi(2));
+            *w = b.weight / (1.0 + (off / (ROBUST_FIT.cauchy_tuning * deviation).max(LOG_TOLERANCE)).powi(2));
         }
         best = (terms, deviation);
     }

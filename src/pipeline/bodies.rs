@@ -22,45 +22,60 @@ use crate::types::LevelReport;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Passes between two updates of the segmentation into bodies.
-const PASSES_PER_SEGMENTATION: usize = 2;
+/// How voxels are assigned to bodies; trade-offs are of 12 sliding scenes.
+struct SegmentationControl {
+    /// Passes between two updates of the segmentation.
+    passes: usize,
+    /// Window of the residuals (finest voxels, one Gaussian standard deviation): 0.6 to 1.4 change
+    /// errors by 5 %.
+    residual_window_voxels: f64,
+    /// Log odds of a voxel whose whole neighbourhood belongs to a body: 3 to 12 change errors by
+    /// 2 %.
+    coherence_weight: f32,
+    /// Width of that neighbourhood (finest voxels, one Gaussian standard deviation): 1 to 2.2
+    /// change errors by 2 %.
+    coherence_window_voxels: f64,
+    /// Parts of a body below this fraction of its largest connected part join the body around them.
+    max_island_fraction: f64,
+    /// Mean-field iterations that balance each voxel's shares with its neighbourhood's.
+    iterations: usize,
+}
 
-/// Segmentations in a trial; then it must explain more than its degrees of freedom cost.
-const TRIAL_ROUNDS: usize = 2;
+const SEGMENTATION: SegmentationControl = SegmentationControl {
+    passes: 2,
+    residual_window_voxels: 0.8,
+    coherence_weight: 5.0,
+    coherence_window_voxels: 1.2,
+    max_island_fraction: 0.1,
+    iterations: 5,
+};
 
-/// A trial ends unless its first round reduces the initial loss to this part: of 22 scenes those
-/// with one body kept 0.31 to 0.97, those with more 0.13 at most.
-const MAX_TRIAL_LOSS_RATIO: f64 = 0.25;
+/// How a further body is tested.
+struct TrialControl {
+    /// Segmentations in a trial; then the body must explain more than its degrees of freedom cost.
+    rounds: usize,
+    /// A trial ends unless its first round reduces the initial loss to this part: of 22 scenes
+    /// those with one body kept 0.31 to 0.97, those with more 0.13 at most.
+    max_loss_ratio: f64,
+    /// Misfit that each further degree of freedom must explain (Akaike 1974): twice what chance
+    /// gives.
+    min_gain_per_degree_of_freedom: f64,
+    /// Fewest matches of a body.
+    min_matches: usize,
+    /// Least median jump of the motion at its border (voxels of the initial volume).
+    min_jump_voxels: f64,
+    /// Most bodies.
+    max_bodies: usize,
+}
 
-/// Misfit that each further degree of freedom must explain (Akaike 1974): twice what chance gives.
-const MIN_GAIN_PER_DEGREE_OF_FREEDOM: f64 = 2.0;
-
-/// Fewest matches of a body.
-const MIN_MATCHES: usize = 6;
-
-/// Least median jump of the motion at the border of two bodies (voxels of the initial volume).
-const MIN_JUMP_VOXELS: f64 = 1.0;
-
-/// Largest number of bodies.
-const MAX_BODIES: usize = 8;
-
-/// Window in which residuals assign a voxel to a body (finest voxels, one Gaussian standard
-/// deviation): 0.6 to 1.4 change the errors of 12 sliding scenes by 5 %.
-const RESIDUAL_WINDOW_VOXELS: f64 = 0.8;
-
-/// Log odds of a voxel whose whole neighbourhood belongs to a body: 3 to 12 change the errors of 12
-/// sliding scenes by 2 %.
-const COHERENCE_WEIGHT: f32 = 5.0;
-
-/// Width of that neighbourhood (finest voxels, one Gaussian standard deviation): as insensitive
-/// from 1 to 2.2.
-const COHERENCE_WINDOW_VOXELS: f64 = 1.2;
-
-/// Parts of a body below this fraction of its largest connected part join the body around them.
-const MAX_ISLAND_FRACTION: f64 = 0.1;
-
-/// Mean-field iterations that balance each voxel's shares with its neighbourhood's.
-const MEAN_FIELD_ITERATIONS: usize = 5;
+const TRIAL: TrialControl = TrialControl {
+    rounds: 2,
+    max_loss_ratio: 0.25,
+    min_gain_per_degree_of_freedom: 2.0,
+    min_matches: 6,
+    min_jump_voxels: 1.0,
+    max_bodies: 8,
+};
 
 /// Tissue shared out among bodies, with their motions.
 #[derive(Debug, Clone, PartialEq)]
@@ -246,13 +261,13 @@ impl Bodies {
             return level::refine(pair, field, passes, seed, tick);
         }
         let begun: Vec<Vec<f32>> = self.fields.iter().map(|f| f.coefficients.clone()).collect();
-        for done in (0..passes).step_by(PASSES_PER_SEGMENTATION) {
+        for done in (0..passes).step_by(SEGMENTATION.passes) {
             if done > 0 && !self.fixed {
                 self.share_out(pair);
             }
             for b in 0..self.count() {
                 let part = self.part(pair, b);
-                let (field, passes) = (&mut self.fields[b], PASSES_PER_SEGMENTATION.min(passes - done));
+                let (field, passes) = (&mut self.fields[b], SEGMENTATION.passes.min(passes - done));
                 level::refine_from(&part, field, &begun[b], passes, seed, |_| ());
             }
             tick(done);
@@ -295,16 +310,16 @@ impl Bodies {
         if self.fixed || !ablation::is_on("bodies") {
             return said;
         }
-        while self.count() < MAX_BODIES {
+        while self.count() < TRIAL.max_bodies {
             let tried = (0..self.count()).flat_map(|b| self.proposed(pair, matches, b));
             let tried = tried.filter_map(|bodies| bodies.tried(pair, self, seed));
             let rests = |t: &Trial| {
                 let own = matches.iter().filter(|m| t.bodies.label_near(m.voxel) == self.count());
-                own.count() >= MIN_MATCHES
+                own.count() >= TRIAL.min_matches
             };
             let worth = |t: &Trial| {
-                t.gain > MIN_GAIN_PER_DEGREE_OF_FREEDOM * t.more.max(MIN_DEGREES_OF_FREEDOM)
-                    && t.jump > MIN_JUMP_VOXELS * finest
+                t.gain > TRIAL.min_gain_per_degree_of_freedom * t.more.max(MIN_DEGREES_OF_FREEDOM)
+                    && t.jump > TRIAL.min_jump_voxels * finest
             };
             let Some(best) = tried.filter(|t| worth(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain)) else {
                 break;
@@ -376,12 +391,12 @@ impl Bodies {
         let before = fewer.warp(pair, &pair.spans);
         let gained = |bodies: &Self| level::gained(pair, &before, bodies.warp(pair, &pair.spans));
         let mut gain = gained(&self);
-        for round in 0..TRIAL_ROUNDS {
+        for round in 0..TRIAL.rounds {
             let last = gain;
-            self.refine(pair, PASSES_PER_SEGMENTATION, seed, |_| ());
+            self.refine(pair, SEGMENTATION.passes, seed, |_| ());
             self.share_out(pair);
             gain = gained(&self);
-            if gain < last.min(0.0) * if round + 1 < TRIAL_ROUNDS { MAX_TRIAL_LOSS_RATIO } else { 0.0 } {
+            if gain < last.min(0.0) * if round + 1 < TRIAL.rounds { TRIAL.max_loss_ratio } else { 0.0 } {
                 return None;
             }
         }
@@ -439,7 +454,7 @@ impl Bodies {
         // Voxels that the window stands for.
         let held: f64 = (0..3)
             .filter(|&a| pair.shape[a] > 1)
-            .map(|a| (window(RESIDUAL_WINDOW_VOXELS) * finest / pair.spacing[a]).max(1.0))
+            .map(|a| (window(SEGMENTATION.residual_window_voxels) * finest / pair.spacing[a]).max(1.0))
             .product();
         let trust = 0.5 * held as f32 * level::independent(pair);
         let costs: Vec<Vec<f32>> = self
@@ -448,13 +463,13 @@ impl Bodies {
             .map(|f| {
                 around(
                     &cost(pair, &pair.warp(&f.lattice, &f.coefficients, &pair.spans), &gain, sigma),
-                    RESIDUAL_WINDOW_VOXELS,
+                    SEGMENTATION.residual_window_voxels,
                 )
             })
             .collect();
         let tissue = around(
             &pair.mask.iter().map(|m| f32::from(u8::from(*m != 0))).collect::<Vec<_>>(),
-            COHERENCE_WINDOW_VOXELS,
+            SEGMENTATION.coherence_window_voxels,
         );
         let of = |b: usize| move |(at, l): (usize, &u8)| f32::from(pair.mask[at] != 0 && usize::from(*l) == b);
         // The shares of the last body are what those of the others leave.
@@ -465,10 +480,11 @@ impl Bodies {
             Some(own) => own[at],
             None => whole - all.iter().map(|s| s[at]).sum::<f32>(),
         };
-        for _ in 0..MEAN_FIELD_ITERATIONS {
-            let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, COHERENCE_WINDOW_VOXELS)).collect();
-            let energy =
-                |b: usize, at: usize| trust * costs[b][at] - COHERENCE_WEIGHT * share_of(&about, tissue[at], b, at);
+        for _ in 0..SEGMENTATION.iterations {
+            let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, SEGMENTATION.coherence_window_voxels)).collect();
+            let energy = |b: usize, at: usize| {
+                trust * costs[b][at] - SEGMENTATION.coherence_weight * share_of(&about, tissue[at], b, at)
+            };
             for (b, share) in shares.iter_mut().enumerate() {
                 share.par_iter_mut().enumerate().filter(|(at, _)| pair.mask[*at] != 0).for_each(|(at, share)| {
                     let own = energy(b, at);
@@ -477,7 +493,7 @@ impl Bodies {
             }
         }
         // Outside the tissue the nearest body goes on.
-        let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, COHERENCE_WINDOW_VOXELS)).collect();
+        let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, SEGMENTATION.coherence_window_voxels)).collect();
         self.labels.par_iter_mut().enumerate().for_each(|(at, label)| {
             let share = |b: usize| match pair.mask[at] {
                 0 => share_of(&about, tissue[at], b, at),
@@ -514,7 +530,7 @@ impl Bodies {
         }
         let mut largest = vec![0usize; self.count()];
         parts.iter().for_each(|p| largest[self.label(p[0])] = largest[self.label(p[0])].max(p.len()));
-        parts.retain(|p| (p.len() as f64) < MAX_ISLAND_FRACTION * largest[self.label(p[0])] as f64);
+        parts.retain(|p| (p.len() as f64) < SEGMENTATION.max_island_fraction * largest[self.label(p[0])] as f64);
         for own in &parts {
             let mut touched = vec![0usize; self.count()];
             let around = own.iter().flat_map(|&at| beside(pair.shape, at)).filter(|&o| pair.mask[o] != 0);
@@ -542,7 +558,7 @@ impl Trial {
             "bodies: {number} taken; the last explains {gain:.0} of the misfit with {:.0} degrees of freedom {than} (each more must explain {}); \
              its motion differs by {jump:.1} mm from its neighbours' along their border (median)",
             more.abs(),
-            MIN_GAIN_PER_DEGREE_OF_FREEDOM
+            TRIAL.min_gain_per_degree_of_freedom
         )
     }
 }

@@ -135,13 +135,19 @@ pub(super) fn said_of_model(rejected: bool) -> Option<String> {
     })
 }
 
-/// Part of the tissue without texture that earns a warning: 0 to 8 % in scans of heads, legs and a
-/// spine.
-const WARN_PLAIN_FRACTION: f64 = 0.1;
+/// Parts of the tissue that earn a warning.
+struct Warnings {
+    /// Without texture: 0 to 8 % in scans of heads, legs and a spine.
+    plain_fraction: f64,
+    /// Outside the deformed volume.
+    out_of_view_fraction: f64,
+}
+
+const WARN: Warnings = Warnings { plain_fraction: 0.1, out_of_view_fraction: 0.05 };
 
 /// Says so where much of the tissue shows nothing that could be seen to move.
 pub(super) fn without_texture(share: f64) -> Option<String> {
-    (share > WARN_PLAIN_FRACTION).then(|| {
+    (share > WARN.plain_fraction).then(|| {
         format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: there the field is carried in from around, smooth, \
              and its uncertainty says too little; leave such parts out with --mask, or image finer or with less noise",
@@ -150,12 +156,9 @@ pub(super) fn without_texture(share: f64) -> Option<String> {
     })
 }
 
-/// Part of the tissue outside the deformed volume that earns a warning.
-const WARN_OUT_OF_VIEW_FRACTION: f64 = 0.05;
-
 /// Says so where much of the tissue is not in the deformed volume.
 pub(super) fn out_of_view(share: f64) -> Option<String> {
-    (share > WARN_OUT_OF_VIEW_FRACTION).then(|| {
+    (share > WARN.out_of_view_fraction).then(|| {
         format!(
             "{:.0} % of the tissue moves out of the deformed volume, or to where that shows nothing (not finite, or cut off): there the field is carried over from \
              what is in view, and may be off by more than its uncertainty says; leave such parts out with --mask",

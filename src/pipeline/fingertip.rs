@@ -38,8 +38,15 @@ pub fn check_nodes(nodes: usize) -> Result<(), ParamError> {
 /// Most classes of modulus in the finite elements.
 const MAX_MODULUS_CLASSES: usize = 48;
 
-/// Modulus of bone over that of the stiffest tissue in the finite elements.
-const BONE_MODULUS_RATIO: f64 = 100.0;
+/// Parts that hold as a back plate.
+struct HardParts {
+    /// Modulus of bone over that of the stiffest tissue in the finite elements.
+    bone_modulus_ratio: f64,
+    /// Modulus over that of the softest region, from which a region holds.
+    min_modulus_ratio: f64,
+}
+
+const HARD_PARTS: HardParts = HardParts { bone_modulus_ratio: 100.0, min_modulus_ratio: 20.0 };
 
 /// What a pad was reduced to, and its force at the press that was measured.
 #[derive(Debug, Clone, PartialEq)]
@@ -165,7 +172,7 @@ fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f6
     };
     let labels = Mask::from_voxels(*map.grid(), label);
     let stiffest = moduli.last().copied().unwrap_or(1.0);
-    moduli.push(BONE_MODULUS_RATIO * stiffest);
+    moduli.push(HARD_PARTS.bone_modulus_ratio * stiffest);
     (labels, moduli)
 }
 
@@ -206,9 +213,6 @@ pub fn run(
     Ok(PadOutcome { at_press: known.map(|d| [d, force(&columns, d)]), pad, failure: None, columns })
 }
 
-/// Modulus over that of the softest region from which a region is a back plate.
-const MIN_HARD_MODULUS_RATIO: f64 = 20.0;
-
 /// Names of hard parts.
 const BONE_NAMES: [&str; 4] = ["bone", "plate", "phalanx", "nail"];
 
@@ -238,7 +242,7 @@ fn hard(folder: &StiffnessFolder) -> Vec<&StiffnessRegion> {
     // A bound says nothing of how soft the softest is.
     let tissue = folder.regions.iter().filter(|r| !known(r) && r.bound.is_none());
     let softest = tissue.map(|r| r.youngs_modulus).fold(f64::INFINITY, f64::min);
-    folder.regions.iter().filter(|r| known(r) || r.youngs_modulus >= MIN_HARD_MODULUS_RATIO * softest).collect()
+    folder.regions.iter().filter(|r| known(r) || r.youngs_modulus >= HARD_PARTS.min_modulus_ratio * softest).collect()
 }
 
 /// Names of the tissue of which only a bound is known: the map has that in place of its modulus.

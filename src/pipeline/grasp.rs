@@ -17,11 +17,15 @@ use std::time::Instant;
 /// from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
-/// Largest joint angle of the pinch map (degrees).
-const PINCH_MAP_MAX_DEGREES: f64 = 30.0;
+/// The map of pinch equilibria.
+struct PinchMap {
+    /// Largest joint angle (degrees).
+    max_degrees: f64,
+    /// Joint angles along each side.
+    angles: usize,
+}
 
-/// Joint angles along each side of that map.
-const PINCH_MAP_ANGLES: usize = 61;
+const PINCH_MAP: PinchMap = PinchMap { max_degrees: 30.0, angles: 61 };
 
 /// A run with what it is shown beside.
 #[derive(Debug, Clone, PartialEq)]
@@ -199,7 +203,7 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
     let push = simulate(&pushed(&soft), &|_| {})?;
     book("push", 0.3);
     let map = |f: f64| progress("pinch map", 0.3 + 0.6 * f);
-    let pinch = pinch::map(&soft, FingertipModel::Parallel, PINCH_MAP_MAX_DEGREES.to_radians(), PINCH_MAP_ANGLES, &map);
+    let pinch = pinch::map(&soft, FingertipModel::Parallel, PINCH_MAP.max_degrees.to_radians(), PINCH_MAP.angles, &map);
     book("pinch map", 0.9);
     let stable_steps = stable_steps(&soft);
     book("stable steps", 1.0);

@@ -50,14 +50,20 @@ impl Start {
     }
 }
 
-/// Frames after which the whole volume is searched again, even if the features confirm the field.
-const MAX_FRAMES_FOLLOWED: usize = 5;
+/// The search of a whole volume.
+struct WholeSearch {
+    /// Frames after which it is repeated, even if the features confirm the field.
+    max_frames_followed: usize,
+    /// Voxels of a level's mask for each feature; a quarter of it in one slice.
+    voxels_per_feature: usize,
+    /// Most features of the coarsest level.
+    max_features: usize,
+    /// Fewest matches from which a search may start.
+    min_matches: usize,
+}
 
-/// Voxels of a level's mask for each feature of a whole search; a quarter of it in one slice.
-const VOXELS_PER_FEATURE: usize = 24;
-
-/// Most features of the coarsest level.
-const MAX_FEATURES: usize = 4000;
+const WHOLE_SEARCH: WholeSearch =
+    WholeSearch { max_frames_followed: 5, voxels_per_feature: 24, max_features: 4000, min_matches: 8 };
 
 /// The search of the level after the coarsest.
 struct NextLevelSearch {
@@ -72,9 +78,6 @@ struct NextLevelSearch {
 
 const NEXT_LEVEL: NextLevelSearch =
     NextLevelSearch { features_times_spacing: 75_000, min_features: 190, range_fraction: 0.25 };
-
-/// Fewest matches from which a search may start.
-const MIN_MATCHES: usize = 8;
 
 /// Shares of the features that agree with their neighbours, below which a search is not trusted.
 pub(super) struct KeptShare {
@@ -198,7 +201,7 @@ pub(super) struct Search<'a> {
 impl Search<'_> {
     /// How the matches of a level are sought within `reach_mm`, with at most `most` features.
     fn wide(&self, pair: &Pair<'_>, reach_mm: f64, most: usize) -> MatchParams {
-        let share = if self.flat { VOXELS_PER_FEATURE / 4 } else { VOXELS_PER_FEATURE };
+        let share = if self.flat { WHOLE_SEARCH.voxels_per_feature / 4 } else { WHOLE_SEARCH.voxels_per_feature };
         let points = pair.inside.div_ceil(share).min(most).max(40);
         MatchParams::new(self.params, points, false, reach_mm, 2, 0.3)
     }
@@ -226,7 +229,7 @@ impl Search<'_> {
         let refined = |motion| self.refined(pair, motion, passes);
         let better = |a, b| Bodies::better(pair, a, b);
         let course = known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
-        let followed = known.first().and_then(|s| s.followed).filter(|&f| f < MAX_FRAMES_FOLLOWED);
+        let followed = known.first().and_then(|s| s.followed).filter(|&f| f < WHOLE_SEARCH.max_frames_followed);
         if let Some((motion, followed)) = course.as_ref().zip(followed)
             && timed(seconds, || self.is_confirmed(pair, motion))
         {
@@ -261,13 +264,16 @@ impl Search<'_> {
     /// agree they are sought again about the rigid motion that most agree on, for as long as no
     /// fewer agree there: patches that turned by much are hardly alike.
     fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
-        let wide = self.wide(pair, self.range, MAX_FEATURES);
+        let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
         let agreed = |matches: &[LevelMatch]| matches.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
         let (matches, field, report) = level::matches(pair, None, wide);
         let (mut kept, mut best) = (agreed(&matches), (field, report, matches));
         for _ in 0..RIGID_SEARCH.max_count {
             let before = best.1.counts;
-            if before.kept_share() >= KEPT_SHARE.confirmed || kept.len() < MIN_MATCHES || !ablation::is_on("turned") {
+            if before.kept_share() >= KEPT_SHARE.confirmed
+                || kept.len() < WHOLE_SEARCH.min_matches
+                || !ablation::is_on("turned")
+            {
                 break;
             }
             let rigid = nearest_rigid(&kept);
@@ -283,7 +289,7 @@ impl Search<'_> {
             }
         }
         let (field, report, matches) = best;
-        let enough = report.counts.kept >= MIN_MATCHES;
+        let enough = report.counts.kept >= WHOLE_SEARCH.min_matches;
         (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
     }
 
@@ -304,11 +310,11 @@ impl Search<'_> {
     pub fn closer(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
         let only = own.only().filter(|_| ablation::is_on("next-level"))?;
         let most = (NEXT_LEVEL.features_times_spacing / self.params.voxels_per_point.max(1))
-            .clamp(NEXT_LEVEL.min_features, MAX_FEATURES);
+            .clamp(NEXT_LEVEL.min_features, WHOLE_SEARCH.max_features);
         let wide = self.wide(pair, NEXT_LEVEL.range_fraction * self.range, most);
         (self.matching)();
         let (matches, found, report) = timed(seconds, || level::matches_again(pair, only, wide));
-        let of_matches = found.filter(|_| report.counts.kept >= MIN_MATCHES)?;
+        let of_matches = found.filter(|_| report.counts.kept >= WHOLE_SEARCH.min_matches)?;
         let motion = self.refined(pair, of_matches.clone().into(), passes);
         let begun = |motion| Begun { motion, of_matches: Some(of_matches), report: Some(report), matches, followed: 0 };
         motion.agree_better(pair, own).then(|| begun(motion))

@@ -185,24 +185,27 @@ fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     volume
 }
 
-/// Volume of soft tissue over its initial volume; a smaller ratio or a larger inverse earns a
-/// warning.
-const MIN_VOLUME_RATIO: f64 = 0.75;
+/// Whether soft tissue keeps its volume.
+struct VolumeCheck {
+    /// Volume over the initial volume; a smaller ratio or a larger inverse earns a warning.
+    min_ratio: f64,
+    /// Approximate number of voxels at which it is measured.
+    sampled_voxels: usize,
+}
 
-/// Voxels at which that is measured.
-const SAMPLED_VOXELS: usize = 5000;
+const VOLUME_CHECK: VolumeCheck = VolumeCheck { min_ratio: 0.75, sampled_voxels: 5000 };
 
 /// What to say where the tissue as a whole does not keep its volume: most often a header is wrong.
 /// Nothing of one slice.
 pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
     let inside = || (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0);
-    let share = SAMPLED_VOXELS as f64 / inside().count().max(1) as f64;
+    let share = VOLUME_CHECK.sampled_voxels as f64 / inside().count().max(1) as f64;
     let some = inside().enumerate().filter(|(i, _)| stands_for_all(*i, share));
     let volumes: Vec<f64> = some.map(|(_, o)| f64::from(determinant_at(field, o))).filter(|v| v.is_finite()).collect();
     let volume = volumes.iter().sum::<f64>() / volumes.len().max(1) as f64;
     let kept = field.grid().is_single_slice()
         || volumes.is_empty()
-        || (MIN_VOLUME_RATIO..=1.0 / MIN_VOLUME_RATIO).contains(&volume);
+        || (VOLUME_CHECK.min_ratio..=1.0 / VOLUME_CHECK.min_ratio).contains(&volume);
     (!kept).then(|| {
         format!(
             "the tissue as a whole comes out at {volume:.2} of its volume, which soft tissue keeps: check the voxel sizes in both headers \
@@ -314,27 +317,34 @@ fn filled(volume: &Voxels<'_>, least: usize) -> Volume {
     out
 }
 
-/// Spreads of the intensities that are used as they are.
-const UNSCALED_SPREADS: std::ops::Range<f64> = 1e-3..1e7;
-/// Largest intensity, in spreads, that is used as it is.
-const MAX_OFFSET_SPREADS: f64 = 100.0;
+/// Intensities that are used as they are.
+struct UnscaledIntensities {
+    /// Their robust spread.
+    spreads: std::ops::Range<f64>,
+    /// Their largest absolute value, in spreads.
+    max_offset: f64,
+}
 
-/// Quantiles of a volume's intensities that span its robust range.
-const ROBUST_QUANTILES: [f64; 2] = [0.001, 0.999];
+const UNSCALED: UnscaledIntensities = UnscaledIntensities { spreads: 1e-3..1e7, max_offset: 100.0 };
+
+/// Which voxels are hot.
+struct HotVoxels {
+    /// Quantiles of a volume's intensities that span its robust range.
+    robust_quantiles: [f64; 2],
+    /// Distance beyond the robust range, in widths of that range.
+    margin: f32,
+    /// Most extreme neighbours that are ignored in a comparison: hot voxels come in short runs.
+    ignored_extremes: usize,
+}
+
+const HOT_VOXELS: HotVoxels = HotVoxels { robust_quantiles: [0.001, 0.999], margin: 3.0, ignored_extremes: 3 };
 
 /// The range of some intensities without far outliers (hot voxels, spikes); none where they are all
 /// alike.
 fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
-    let [low, high] = ROBUST_QUANTILES.map(|q| quantile(sample, q));
+    let [low, high] = HOT_VOXELS.robust_quantiles.map(|q| quantile(sample, q));
     (high > low).then_some([low, high])
 }
-
-/// Distance beyond the robust range from which a voxel is hot, in widths of that range.
-const HOT_VOXEL_MARGIN: f32 = 3.0;
-
-/// Most extreme neighbours that are ignored in a comparison with a voxel: hot voxels come in short
-/// runs.
-const IGNORED_EXTREMES: usize = 3;
 
 /// The volume with padding that lies far from its intensities as the darkest of these, lone far
 /// outliers as the median of their neighbours, and others drawn in to the end of the range.
@@ -345,7 +355,7 @@ pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
     sample.retain(|v| !padding.contains(&Some(*v)));
     let Some([low, high]) = robust_range(&mut sample) else { return volume.view() };
     let width = high - low;
-    let (least, most) = (low - HOT_VOXEL_MARGIN * width, high + HOT_VOXEL_MARGIN * width);
+    let (least, most) = (low - HOT_VOXELS.margin * width, high + HOT_VOXELS.margin * width);
     if least <= reached.low && reached.high <= most {
         return volume.view();
     }
@@ -357,9 +367,9 @@ pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
         }
         let mut beside = neighbours(values, shape, at);
         beside.sort_by(f32::total_cmp);
-        let lone = beside.len() > 2 * IGNORED_EXTREMES
-            && !far(beside[IGNORED_EXTREMES])
-            && !far(beside[beside.len() - 1 - IGNORED_EXTREMES]);
+        let lone = beside.len() > 2 * HOT_VOXELS.ignored_extremes
+            && !far(beside[HOT_VOXELS.ignored_extremes])
+            && !far(beside[beside.len() - 1 - HOT_VOXELS.ignored_extremes]);
         if lone { beside[beside.len() / 2] } else { values[at].clamp(least, most) }
     };
     let outliers: Vec<(usize, f32)> =
@@ -393,7 +403,7 @@ fn in_range<'a>(mut volume: Voxels<'a>, like: Option<f64>) -> (Voxels<'a>, f64) 
     let spread = high - low;
     let furthest = low.abs().max(high.abs());
     let alike = like.is_none_or(|l| (l / spread).log2().abs() < 0.5);
-    if UNSCALED_SPREADS.contains(&spread) && furthest <= MAX_OFFSET_SPREADS * spread && alike {
+    if UNSCALED.spreads.contains(&spread) && furthest <= UNSCALED.max_offset * spread && alike {
         return (volume, spread);
     }
     let scale = (like.unwrap_or(1000.0) / spread).log2().round().exp2();

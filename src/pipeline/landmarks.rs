@@ -16,14 +16,18 @@ use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Grid, Landmark, LandmarkReport};
 
-/// Squared distance over the variance at which a landmark's final weight is a half: three standard
-/// deviations, as for matches.
-const FINAL_SCALE_SQUARED: f64 = 9.0;
+/// Graduated non-convexity of the landmarks' weights (Blake and Zisserman 1987).
+struct Annealing {
+    /// Squared distance over the variance at which the final weight is a half: three standard
+    /// deviations, as for matches.
+    final_scale_squared: f64,
+    /// Factor by which that scale falls from pass to pass.
+    decay: f64,
+    /// Passes at the end in which it holds.
+    final_passes: usize,
+}
 
-/// Factor by which that scale falls from pass to pass.
-const SCALE_DECAY: f64 = 4.0;
-/// Passes at the end in which it holds.
-const FINAL_PASSES: usize = 3;
+const ANNEALING: Annealing = Annealing { final_scale_squared: 9.0, decay: 4.0, final_passes: 3 };
 
 /// Landmarks from which a motion of their own may start the search: an affine map takes four.
 pub(super) const MIN_LANDMARKS: usize = 4;
@@ -52,11 +56,12 @@ fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
 }
 
-/// The scale of the weights, by the passes `to_come` after this one: it falls by [`SCALE_DECAY`]
+/// The scale of the weights, by the passes `to_come` after this one: it falls by [`ANNEALING`]
 /// from pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and
-/// Zisserman 1987), and holds in the last [`FINAL_PASSES`].
+/// Zisserman 1987), and holds in the last few.
 fn scale(to_come: usize) -> f64 {
-    FINAL_SCALE_SQUARED * SCALE_DECAY.powi(to_come.saturating_sub(FINAL_PASSES - 1).min(20) as i32)
+    ANNEALING.final_scale_squared
+        * ANNEALING.decay.powi(to_come.saturating_sub(ANNEALING.final_passes - 1).min(20) as i32)
 }
 
 /// How far the field is from most landmarks (mm, twice the median).
@@ -68,7 +73,7 @@ pub(super) fn reach(pair: &Pair<'_>, field: &SplineField) -> f64 {
 
 /// Whether the passes may end with `to_come` left: the weights are final.
 pub(super) fn are_settled(pair: &Pair<'_>, to_come: usize) -> bool {
-    pair.anchors.is_empty() || to_come < FINAL_PASSES
+    pair.anchors.is_empty() || to_come < ANNEALING.final_passes
 }
 
 /// Adds what the landmarks pull with to a pass with `to_come` passes after it.
@@ -85,7 +90,7 @@ pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalE
 
 /// What a squared distance over the variance costs: the logarithm of its density (Cauchy).
 fn cost(q: f64) -> f64 {
-    FINAL_SCALE_SQUARED * (q / FINAL_SCALE_SQUARED).ln_1p()
+    ANNEALING.final_scale_squared * (q / ANNEALING.final_scale_squared).ln_1p()
 }
 
 /// How much better the landmarks agree with one motion than with another.

@@ -722,15 +722,18 @@ fn corners(
     found
 }
 
-/// Iterations of the robust fit: its scale has then fallen to three standard deviations.
-const FIT_ITERATIONS: usize = 7;
+/// The robust fit of a field to matches alone.
+struct MatchFit {
+    /// Iterations: the robust scale has then fallen to three standard deviations.
+    iterations: usize,
+    /// The same from a field that is nearly right.
+    refit_iterations: usize,
+    /// Voxels between nodes: over 37 pairs 3 to 6 left the same error to 0.1 %, and 6 needs an
+    /// eighth of the nodes of 3.
+    node_spacing_voxels: usize,
+}
 
-/// The same from a field that is nearly right.
-const REFIT_ITERATIONS: usize = 3;
-
-/// Voxels between the nodes to which matches alone are fitted: over 37 pairs 3 to 6 left the same
-/// error to 0.1 %, and 6 needs an eighth of the nodes of 3.
-const MATCH_NODE_SPACING_VOXELS: usize = 6;
+const MATCH_FIT: MatchFit = MatchFit { iterations: 7, refit_iterations: 3, node_spacing_voxels: 6 };
 
 /// Couples the matches of a level into a spline field.
 fn fit(
@@ -770,15 +773,15 @@ pub(super) fn couple(
             Evidence { at, displacement, information }
         })
         .collect();
-    let lattice = known.map_or_else(|| lattice(pair, MATCH_NODE_SPACING_VOXELS), |k| k.lattice.clone());
+    let lattice = known.map_or_else(|| lattice(pair, MATCH_FIT.node_spacing_voxels), |k| k.lattice.clone());
     let energy = smoothness(&lattice, pair.spacing);
     let cell = cell_volume(&lattice, pair.spacing) as f32;
     let (coefficients, weight) = match known {
         Some(known) => {
             let start = (&known.coefficients[..], known.smoothness[0] * cell);
-            coupling::fit_from(&lattice, &energy, &evidence, Some(start), REFIT_ITERATIONS)
+            coupling::fit_from(&lattice, &energy, &evidence, Some(start), MATCH_FIT.refit_iterations)
         }
-        None => coupling::fit(&lattice, &energy, &evidence, FIT_ITERATIONS),
+        None => coupling::fit(&lattice, &energy, &evidence, MATCH_FIT.iterations),
     };
     let smoothness = vec![weight / cell; 3 * lattice.len()];
     (SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }, evidence)

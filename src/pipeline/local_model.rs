@@ -17,35 +17,46 @@ use crate::numerics::symmetric3::inverse;
 use crate::pipeline::level::SplineField;
 use crate::types::{MotionModel, VoxelPoint};
 
-/// Excess misfit per degree of freedom up to which tissue is at rest, and from which the free field
-/// applies (1). Calibrated: docs/lab/2026-11-expected-error.md.
-const REST_MISFIT_RANGE: [f32; 2] = [0.85, 2.2];
+/// When tissue is at rest or follows one rigid motion. The misfits are calibrated:
+/// docs/lab/2026-11-expected-error.md.
+struct RestTest {
+    /// Excess misfit per degree of freedom up to which tissue is at rest, and from which the free
+    /// field applies (1).
+    misfit_range: [f32; 2],
+    /// Excess misfit per degree of freedom from which tissue at rest is as uncertain as the free
+    /// field (1).
+    uncertain_misfit: f32,
+    /// Least uncertainty at rest over the free field's: how small a motion would show is not known
+    /// better.
+    min_uncertainty_ratio: f32,
+    /// Least part of the tissue at rest for it to be held there: 0 to 0.11 in 34 of 37 pairs that
+    /// moved smoothly or slid, 0.32 to 0.87 in 22 of 23 pressed ones.
+    min_fraction: f64,
+    /// Tissue at rest under a rigid motion over that under none, from which the rigid motion is
+    /// taken.
+    min_rigid_gain: f64,
+    /// Refits of a rigid motion to the tissue at rest under the one before.
+    rigid_refits: usize,
+}
 
-/// Excess misfit per degree of freedom from which tissue at rest is as uncertain as the free field
-/// (1). Calibrated with [`REST_MISFIT_RANGE`].
-const UNCERTAIN_MISFIT: f32 = 1.7;
+const REST: RestTest = RestTest {
+    misfit_range: [0.85, 2.2],
+    uncertain_misfit: 1.7,
+    min_uncertainty_ratio: 1.0 / 3.0,
+    min_fraction: 0.15,
+    min_rigid_gain: 1.25,
+    rigid_refits: 2,
+};
 
-/// Least uncertainty at rest over the free field's: how small a motion would show is not known
-/// better.
-const MIN_UNCERTAINTY_RATIO: f32 = 1.0 / 3.0;
+/// What windows around a place add to its misfit and degrees of freedom.
+struct Neighbourhood {
+    /// Weight: they decide only where the data determine little.
+    weight: f32,
+    /// Width (windows, one Gaussian standard deviation).
+    width_windows: f64,
+}
 
-/// Weight of the neighbours' misfit and degrees of freedom: they decide only where the data
-/// determine little.
-const NEIGHBOUR_WEIGHT: f32 = 0.02;
-
-/// Width of that neighbourhood (windows, one Gaussian standard deviation).
-const NEIGHBOUR_WIDTH_WINDOWS: f64 = 3.0;
-
-/// Least part of the tissue at rest for it to be held there: 0 to 0.11 in 34 of 37 pairs that moved
-/// smoothly or slid, 0.32 to 0.87 in 22 of 23 pressed ones.
-const MIN_REST_FRACTION: f64 = 0.15;
-
-/// Tissue at rest under a rigid motion over that under no motion, from which the rigid motion is
-/// taken.
-const MIN_RIGID_GAIN: f64 = 1.25;
-
-/// Times that a rigid motion is refitted to the tissue at rest under the one before.
-const RIGID_REFITS: usize = 2;
+const NEIGHBOURHOOD: Neighbourhood = Neighbourhood { weight: 0.02, width_windows: 3.0 };
 
 /// A map that was compared with the free field.
 pub(super) struct Tried {
@@ -148,12 +159,12 @@ impl Rest {
         let (still, rigid) = (of(MotionModel::Identity), of(MotionModel::Rigid));
         // What else moves draws the first fit of the whole to itself.
         let refit = |whole: Self| {
-            (0..RIGID_REFITS).fold(whole, |last, _| {
+            (0..REST.rigid_refits).fold(whole, |last, _| {
                 let motion = nearest_rigid(&last.at_rest(pair, field));
                 judged(&Tried { model: MotionModel::Rigid, motion, excess: excess(&motion) })
             })
         };
-        let more = |rigid: &Self| still.as_ref().is_none_or(|still| rigid.share > MIN_RIGID_GAIN * still.share);
+        let more = |rigid: &Self| still.as_ref().is_none_or(|still| rigid.share > REST.min_rigid_gain * still.share);
         rigid.filter(more).map(refit).filter(more).or(still)
     }
 
@@ -170,12 +181,13 @@ impl Rest {
 
     /// The uncertainty at a place (voxels in which it was judged) as a part of the free field's.
     pub fn narrowed(&self, at: [f64; 3]) -> f32 {
-        (self.windows.stencil_near(at).gather(&self.ratio) / UNCERTAIN_MISFIT).clamp(MIN_UNCERTAINTY_RATIO, 1.0)
+        (self.windows.stencil_near(at).gather(&self.ratio) / REST.uncertain_misfit)
+            .clamp(REST.min_uncertainty_ratio, 1.0)
     }
 
     /// Whether so much is at rest that it is held there.
     pub fn is_taken(&self) -> bool {
-        self.share >= MIN_REST_FRACTION
+        self.share >= REST.min_fraction
     }
 
     /// What was found, in words.
@@ -186,7 +198,7 @@ impl Rest {
         };
         let held = match self.is_taken() {
             true => "it is held there".to_string(),
-            false => format!("too little to hold it there (at least {:.0} %)", 100.0 * MIN_REST_FRACTION),
+            false => format!("too little to hold it there (at least {:.0} %)", 100.0 * REST.min_fraction),
         };
         format!("at rest: {:.0} % of the tissue {how}, as far as the data tell; {held}", 100.0 * self.share)
     }
@@ -224,17 +236,17 @@ pub(super) fn shown(pair: &Pair<'_>, field: &SplineField, counts: impl Fn([f64; 
     field.blocks.iter().enumerate().filter_map(of).collect()
 }
 
-/// Values with the weighted sum of their neighbourhood, see [`NEIGHBOUR_WEIGHT`].
+/// Values with the weighted sum of their neighbourhood, see [`NEIGHBOURHOOD`].
 fn with_neighbours(mut values: Vec<f32>, nodes: [usize; 3]) -> Vec<f32> {
-    let about = filters::gaussian(&values, nodes, [NEIGHBOUR_WIDTH_WINDOWS; 3]);
-    values.iter_mut().zip(about).for_each(|(v, about)| *v += NEIGHBOUR_WEIGHT * about);
+    let about = filters::gaussian(&values, nodes, [NEIGHBOURHOOD.width_windows; 3]);
+    values.iter_mut().zip(about).for_each(|(v, about)| *v += NEIGHBOURHOOD.weight * about);
     values
 }
 
 /// How much of the free field stands at an excess misfit for each degree of freedom, without a
 /// step.
 fn stands(ratio: f32) -> f32 {
-    let [low, high] = REST_MISFIT_RANGE;
+    let [low, high] = REST.misfit_range;
     let t = ((ratio - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }

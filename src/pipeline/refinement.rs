@@ -16,20 +16,26 @@ const MIN_GAIN_PER_DEGREE_OF_FREEDOM: f64 = 0.8;
 /// Passes on each finer lattice, and again where it is accepted.
 const TRIAL_PASSES: usize = 4;
 
-/// Nodes in the tissue beyond which their spacing exceeds [`MIN_NODE_SPACING_VOXELS`]. Calibrated:
-/// docs/lab/2026-11-local-signal.md.
-const MAX_INITIAL_NODES: f64 = 6000.0;
+/// Node spacing of the finest level at the start. Calibrated: docs/lab/2026-11-local-signal.md.
+struct InitialSpacing {
+    /// Nodes in the tissue beyond which their spacing exceeds the least.
+    max_nodes: f64,
+    /// Least spacing (voxels).
+    min_voxels: usize,
+}
 
-/// Fewest voxels between nodes at the start.
-const MIN_NODE_SPACING_VOXELS: usize = 4;
+const INITIAL_SPACING: InitialSpacing = InitialSpacing { max_nodes: 6000.0, min_voxels: 4 };
 
-/// Residual over the standard deviation of the initial volume's tissue, up to which there is no
-/// warning.
-const MIN_WARNED_RESIDUAL: f32 = 0.05;
+/// Residuals that earn a warning.
+struct Warnings {
+    /// Residual over the standard deviation of the initial volume's tissue.
+    residual: f32,
+    /// Variation of the gain: 1.01 to 1.02 without a bias, 1.10 to 1.19 at 15 %, 1.26 to 1.49 at
+    /// 40 %, where errors grow by 19 to 31 %.
+    gain_variation: f32,
+}
 
-/// Variation of the gain that earns a warning: 1.01 to 1.02 without a bias, 1.10 to 1.19 at 15 %,
-/// 1.26 to 1.49 at 40 %, where errors grow by 19 to 31 %.
-const WARN_GAIN_VARIATION: f32 = 1.25;
+const WARN: Warnings = Warnings { residual: 0.05, gain_variation: 1.25 };
 
 /// Most nodes, to bound memory.
 const MAX_NODES: usize = 4_000_000;
@@ -37,8 +43,8 @@ const MAX_NODES: usize = 4_000_000;
 /// Voxels between the nodes of the finest level to begin with: as asked, or by the `inside` voxels
 /// of tissue.
 pub(super) fn apart(asked: usize, inside: usize) -> usize {
-    let wide = (inside as f64 / MAX_INITIAL_NODES).cbrt().round() as usize;
-    if asked > 0 { asked } else { wide.max(MIN_NODE_SPACING_VOXELS) }
+    let wide = (inside as f64 / INITIAL_SPACING.max_nodes).cbrt().round() as usize;
+    if asked > 0 { asked } else { wide.max(INITIAL_SPACING.min_voxels) }
 }
 
 /// A field with what it leaves.
@@ -102,7 +108,7 @@ pub(super) fn unlike(pair: &Pair<'_>, left: f32) -> Option<String> {
     let tissue =
         pair.fixed_smooth.iter().zip(&pair.mask[..]).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);
     let (times, part) = (times(left, pair.noise), left / deviation(tissue) as f32);
-    (times > MAX_RESIDUAL_TO_NOISE && part > MIN_WARNED_RESIDUAL).then(|| {
+    (times > MAX_RESIDUAL_TO_NOISE && part > WARN.residual).then(|| {
         format!(
             "what is left of the difference is {times:.1} times the noise ({:.0} % of the contrast in the tissue): the volumes differ \
              by more than motion (contrast, brightness, missing tissue, another person), and the field may follow that; look at warped.nii.gz",
@@ -117,7 +123,7 @@ pub(super) fn uneven(gain: f32) -> Option<String> {
         g if g.is_infinite() => "changes its sign".into(),
         g => format!("varies by a factor of {g:.2} from its tenth to its 90th percentile"),
     };
-    (gain > WARN_GAIN_VARIATION).then(|| {
+    (gain > WARN.gain_variation).then(|| {
         format!(
             "the gain between the two volumes {how} in the tissue (a bias field, or another contrast): a part of it is taken for motion, and errors \
              grow by a fifth and more; take the bias out of both volumes first (N4, say)"

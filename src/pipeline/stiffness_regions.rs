@@ -15,12 +15,17 @@ use crate::types::stiffness::{Detectable, Evidence, Law, LeftOver, StiffnessPara
 use crate::types::{Grid, Mask};
 use std::time::Instant;
 
-/// Most times that regions found without labels are redrawn.
-const MAX_REDRAWS: usize = 5;
-/// Surfaces that move less than this stay (voxels).
-const MIN_MOVE_VOXELS: f64 = 0.2;
-/// Relative reduction of the residual by a redraw, below which no further one follows.
-const MIN_RESIDUAL_GAIN: f64 = 0.002;
+/// Iterated redrawing of regions found without labels.
+struct RedrawControl {
+    /// Most redraws.
+    max_count: usize,
+    /// Surfaces that move less than this stay (voxels).
+    min_move_voxels: f64,
+    /// Relative reduction of the residual, below which no further redraw follows.
+    min_residual_gain: f64,
+}
+
+const REDRAW: RedrawControl = RedrawControl { max_count: 5, min_move_voxels: 0.2, min_residual_gain: 0.002 };
 
 /// Regions and why these.
 pub(super) struct Found {
@@ -83,7 +88,7 @@ impl Search<'_> {
         }
         let setup = old.level.setup(self.law, self.params, old.level.largest());
         let Some(fit) = geometry::fit(&setup, &old.estimate, grid, &[], &inclusions)? else { return Ok(None) };
-        if fit.shapes.iter().all(|offset| offset.abs() < MIN_MOVE_VOXELS) {
+        if fit.shapes.iter().all(|offset| offset.abs() < REDRAW.min_move_voxels) {
             return Ok(None);
         }
         let mut labels = old.labels.clone();
@@ -112,13 +117,13 @@ impl Search<'_> {
 
     /// Drawn anew as long as it helps. What cannot be drawn or solved anew stays as the map has it.
     fn settled(&self, mut candidate: Candidate) -> Candidate {
-        for _ in 0..MAX_REDRAWS {
+        for _ in 0..REDRAW.max_count {
             let Ok(Some(next)) = self.redrawn(&candidate) else { break };
             let gain = 1.0 - next.estimate.rms / candidate.estimate.rms;
             if gain > 0.0 {
                 candidate = next;
             }
-            if gain < MIN_RESIDUAL_GAIN {
+            if gain < REDRAW.min_residual_gain {
                 break;
             }
         }

@@ -12,10 +12,16 @@ use crate::stiffness::interface::MAX_EXAMINED;
 use crate::types::space::{cross, dot, length};
 use std::collections::{BTreeMap, HashMap};
 
-/// Largest change of a node in the last sweep of the extension (parts of an offset).
-const CONVERGENCE_TOLERANCE: f64 = 1e-3;
-/// Most sweeps of the extension.
-const MAX_SWEEPS: usize = 2000;
+/// Iteration control of the extension of offsets into the body.
+struct ExtensionControl {
+    /// Largest change of a node in the last sweep (parts of an offset).
+    tolerance: f64,
+    /// Most sweeps.
+    max_sweeps: usize,
+}
+
+const EXTENSION: ExtensionControl = ExtensionControl { tolerance: 1e-3, max_sweeps: 2000 };
+
 /// Part of the normals around a node, from which a direction is across the surface: a quarter at a
 /// ridge of 120 degrees, under 0.05 on a ball of eight facets around.
 const MIN_NORMAL_FRACTION: f64 = 0.1;
@@ -148,7 +154,7 @@ fn extended(
     }
     let free: Vec<u32> =
         (0..out.len() as u32).filter(|n| !around[*n as usize].is_empty() && !fixed.contains_key(n)).collect();
-    for _ in 0..MAX_SWEEPS {
+    for _ in 0..EXTENSION.max_sweeps {
         let mut most = 0.0f64;
         for &n in &free {
             let near = &around[n as usize];
@@ -157,7 +163,7 @@ fn extended(
             let old = std::mem::replace(&mut out[n as usize], next);
             most = (0..3).fold(most, |m, a| m.max((next[a] - old[a]).abs()));
         }
-        if most < CONVERGENCE_TOLERANCE {
+        if most < EXTENSION.tolerance {
             break;
         }
     }

@@ -24,12 +24,15 @@ use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Reach (voxels) of the reading that tells whether a node touches the plate: short, as the edge of
-/// a punch is sharp.
-const SHARP_REACH_VOXELS: f64 = 1.8;
+/// The reading of a surface's motion that tells whether a node touches the plate.
+struct SharpReading {
+    /// Reach (voxels): short, as the edge of a punch is sharp.
+    reach_voxels: f64,
+    /// Noise (voxels) beyond which the longer reach is used.
+    max_noise_voxels: f64,
+}
 
-/// Noise of that reading (voxels) beyond which the longer reach is used.
-const MAX_SHARP_NOISE_VOXELS: f64 = 0.1;
+const SHARP_READING: SharpReading = SharpReading { reach_voxels: 1.8, max_noise_voxels: 0.1 };
 
 /// Least error of a displacement that is read from the field (voxels).
 const MIN_READING_ERROR_VOXELS: f64 = 0.001;
@@ -91,8 +94,8 @@ impl SurfaceMotion {
             (displacement, percentile(&mut errors, 50.0))
         };
         let (displacement, error) = all(SURFACE_REACH_VOXELS);
-        let (read, sharp_error) = all(SHARP_REACH_VOXELS);
-        if sharp_error > MAX_SHARP_NOISE_VOXELS * field.grid().least_spacing() {
+        let (read, sharp_error) = all(SHARP_READING.reach_voxels);
+        if sharp_error > SHARP_READING.max_noise_voxels * field.grid().least_spacing() {
             return Self {
                 sharp: displacement.clone(),
                 displacement,
@@ -102,7 +105,7 @@ impl SurfaceMotion {
             };
         }
         let sharp = read.into_iter().zip(&displacement).map(|(n, d)| n.or(*d)).collect();
-        Self { displacement, error, sharp, sharp_error, near: SHARP_REACH_VOXELS }
+        Self { displacement, error, sharp, sharp_error, near: SHARP_READING.reach_voxels }
     }
 }
 

@@ -20,13 +20,18 @@ use crate::types::stiffness::{Law, Side};
 pub const PENALTY_STIFFNESS: f64 = 50.0;
 /// Penetration over which a plate reaches its stiffness (parts of an element's size).
 const ONSET_FRACTION: f64 = 0.02;
-/// Last Newton step of a solution (mm): the error left is about a tenth of it.
-const CONTINUATION_TOLERANCE_MM: f64 = 1e-3;
+/// Continuation of a solution over the depth of the press.
+struct Continuation {
+    /// Last Newton step of a solution (mm): the error left is about a tenth of it.
+    tolerance_mm: f64,
+    /// Shortest step that is tried, over the whole depth.
+    min_step_fraction: f64,
+}
+
+const CONTINUATION: Continuation = Continuation { tolerance_mm: 1e-3, min_step_fraction: 0.05 };
+
 /// Largest modulus over the softest: a part beyond it is as good as rigid.
 const MAX_MODULUS_RATIO: f64 = 500.0;
-/// Shortest step of the press that is tried, over its whole depth.
-const MIN_STEP_FRACTION: f64 = 0.05;
-
 /// Contact points of a facet: three in each of its quarters.
 const POINTS_PER_FACET: usize = 12;
 
@@ -268,14 +273,14 @@ impl Press<'_> {
                 let ahead = before.as_ref().and_then(|(y, from)| {
                     let part = (next - reached) / (reached - from);
                     let ahead: Vec<f64> = x.iter().zip(y).map(|(x, y)| x + part * (x - y)).collect();
-                    lowered.near(&ahead, CONTINUATION_TOLERANCE_MM).ok()
+                    lowered.near(&ahead, CONTINUATION.tolerance_mm).ok()
                 });
-                match ahead.map_or_else(|| lowered.near(&x, CONTINUATION_TOLERANCE_MM), Ok) {
+                match ahead.map_or_else(|| lowered.near(&x, CONTINUATION.tolerance_mm), Ok) {
                     Ok(found) => {
                         before = Some((std::mem::replace(&mut x, found), reached));
                         reached = next;
                     }
-                    Err(error) if step < MIN_STEP_FRACTION * whole => {
+                    Err(error) if step < CONTINUATION.min_step_fraction * whole => {
                         return if out.is_empty() { Err(error) } else { Ok(out) };
                     }
                     Err(_) => step *= 0.5,

@@ -97,13 +97,28 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: &[Option<&[u32]>])
     out
 }
 
-/// Excess of the whole force over its part across the plate that earns a warning.
-const WARN_LEANING_FORCE: f64 = 0.01;
+/// What earns a warning.
+struct Warnings {
+    /// Excess of the whole force over its part across the plate.
+    leaning_force: f64,
+    /// Part of the surface on the volume's border.
+    cut_fraction: f64,
+    /// Held over loaded area, below which they may have been mistaken for each other.
+    area_ratio: f64,
+    /// Area beside a patch that moves with it over the patch's: the rim is known to a voxel.
+    beside_fraction: f64,
+    /// Thickness (voxels) below which a measured field does not resolve a region: two lattice
+    /// steps.
+    region_voxels: usize,
+}
+
+const WARN: Warnings =
+    Warnings { leaning_force: 0.01, cut_fraction: 0.02, area_ratio: 0.1, beside_fraction: 0.07, region_voxels: 8 };
 
 /// Says so where the plate also pushes the body sideways, so that it matters which force is known;
 /// `whole` is it over its part across the plate.
 pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
-    (whole > 1.0 + WARN_LEANING_FORCE).then(|| {
+    (whole > 1.0 + WARN.leaning_force).then(|| {
         format!(
             "the plate pushes sideways as well: {force_n} N are taken for the whole force, of which {:.4} N act across the plate; if a load cell along \
              its axis read {force_n} N, moduli are {:.1} % higher",
@@ -163,9 +178,6 @@ pub fn one_map(is_affine: bool, regions: usize) -> Option<String> {
     })
 }
 
-/// Part of the surface on the volume's border that earns a warning.
-const WARN_CUT_FRACTION: f64 = 0.02;
-
 /// Says so where the body ends with the volume, away from the held and the loaded patch.
 fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
     let cut = level.patches.get(2)?;
@@ -174,7 +186,7 @@ fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
     let sides: BTreeSet<&str> = cut.facets.iter().filter_map(side).collect();
     let all: f64 = body.surface.iter().map(|f| f.area).sum();
     let part = cut.area(body) / all;
-    (part > WARN_CUT_FRACTION).then(|| {
+    (part > WARN.cut_fraction).then(|| {
         format!(
             "the body ends at the volume's border ({} along the voxels' axes, {:.0} % of its surface) and is taken to go on beyond: there \
              it moves as measured; if it does end there, leave a voxel of background around it",
@@ -203,7 +215,7 @@ pub fn warnings(
 ) -> Vec<String> {
     let mut out = Vec::new();
     for (r, voxels) in regions.iter().filter(|r| r.identifiable).map(|r| (r, thickness(labels, r.label))) {
-        if voxels < MIN_RESOLVED_VOXELS {
+        if voxels < WARN.region_voxels {
             out.push(format!(
                 "{} is {voxels} voxels thick: a displacement measured from images does not resolve its strain, and its \
                  modulus may be off by far more than stated; trust it only where the displacement is known better",
@@ -227,7 +239,7 @@ pub fn warnings(
         out.push(format!("the loaded patch is small ({area:.1} mm^2), so absolute moduli hang on its edge"));
     }
     let areas = [0, 1].map(|p| level.patches[p].area(&level.body));
-    if areas[0] < SUSPECT_AREA_RATIO * areas[1] {
+    if areas[0] < WARN.area_ratio * areas[1] {
         out.push(format!(
             "the body is held at {:.1} mm^2 and loaded at {:.0} mm^2: is it the other way round? --held and --load say which side is which",
             areas[0], areas[1]
@@ -235,7 +247,7 @@ pub fn warnings(
     }
     for (patch, which) in level.patches.iter().zip(["held", "loaded"]) {
         let part = patch.beside / patch.area(&level.body);
-        if part > WARN_BESIDE_FRACTION {
+        if part > WARN.beside_fraction {
             out.push(format!(
                 "the surface beside the {which} patch moves with it, over {:.0} mm^2 or {:.0} % of its area: if that is {which} \
                  as well, widen the mask; moduli come out wrong otherwise",
@@ -276,14 +288,6 @@ pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usiz
     };
     hidden.iter().map(one).collect()
 }
-
-/// Held over loaded area below which they may have been mistaken for each other.
-const SUSPECT_AREA_RATIO: f64 = 0.1;
-/// Area beside a patch that moves with it over the patch's, which earns a warning: the rim is known
-/// to a voxel.
-const WARN_BESIDE_FRACTION: f64 = 0.07;
-/// Least thickness (voxels) of a region that a measured field resolves: two lattice steps.
-const MIN_RESOLVED_VOXELS: usize = 8;
 
 /// Thickness of a region where it is thickest (voxels): of each of its voxels the shortest run
 /// through it along an axis of the grid.

@@ -18,13 +18,19 @@ use rayon::prelude::*;
 const TIE_STIFFNESS_RATIO: f64 = 1e6;
 /// Most Newton steps for one load.
 const MAX_NEWTON_STEPS: usize = 25;
-/// Largest step over the one before with which the tangent is kept.
-const MAX_CONTRACTION: f64 = 0.4;
-/// Distance from a solution, over the largest displacement, up to which a tangent serves for
-/// derivatives: about their relative error.
-const DERIVATIVE_TANGENT_DISTANCE: f64 = 0.01;
-/// The same, up to which the tangent's factor still refines solutions quickly.
-const REFINABLE_TANGENT_DISTANCE: f64 = 0.2;
+/// How long a tangent is kept; distances are from a solution, over the largest displacement.
+struct TangentReuse {
+    /// Largest step over the one before.
+    max_contraction: f64,
+    /// Distance up to which it serves for derivatives: about their relative error.
+    derivative_distance: f64,
+    /// Distance up to which its factor still refines solutions quickly.
+    refinable_distance: f64,
+}
+
+const TANGENT_REUSE: TangentReuse =
+    TangentReuse { max_contraction: 0.4, derivative_distance: 0.01, refinable_distance: 0.2 };
+
 /// Elements computed together.
 const ELEMENTS_PER_CHUNK: usize = 256;
 
@@ -211,7 +217,7 @@ impl<'a> Problem<'a> {
     /// # Errors
     /// [`StiffnessError`] when no equilibrium is found.
     pub fn solve(&self, start: Option<&[f64]>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
-        self.reach(start, precision, DERIVATIVE_TANGENT_DISTANCE)
+        self.reach(start, precision, TANGENT_REUSE.derivative_distance)
     }
 
     /// As [`Self::solve`], without a tangent for derivatives.
@@ -339,12 +345,13 @@ impl<'a> Problem<'a> {
                 break;
             }
             // Where a contact changes, yesterday's tangent leads astray.
-            let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > MAX_CONTRACTION * last);
+            let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > TANGENT_REUSE.max_contraction * last);
             let stale = moved > stale * self.size(&x);
             fresh = if done { stale } else { slow };
             if fresh {
                 // Another contact is another matrix, except where it alone is worked out anew.
-                let near = far < REFINABLE_TANGENT_DISTANCE * self.size(&x) && (done || self.body.pattern.renews());
+                let near =
+                    far < TANGENT_REUSE.refinable_distance * self.size(&x) && (done || self.body.pattern.renews());
                 let matrix = self.tangent(&x).ok_or(StiffnessError::InsideOut)?;
                 let renewed = factor.map(|f| f.renewed(self.body, matrix, near)).transpose();
                 factor = renewed.map_err(|_| StiffnessError::Unsolvable)?;

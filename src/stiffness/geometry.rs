@@ -24,14 +24,21 @@ use crate::stiffness::punch_edge::Edge;
 use crate::stiffness::systematic_error::Fit;
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
-/// Prior standard deviation of a flat face (voxels): uniform over one voxel, 1 / sqrt(12).
-const FACE_PRIOR_VOXELS: f64 = 0.288_675;
-/// Prior standard deviation of the edge of a punch (voxels).
-const PUNCH_EDGE_PRIOR_VOXELS: f64 = 3.0;
-/// Largest offset (prior standard deviations).
-const MAX_OFFSET_SD: f64 = 3.5;
-/// The same for the walls of a hole: a channel of 12 by 10 voxels reached 1.5 voxels.
-const MAX_WALL_OFFSET_SD: f64 = 6.0;
+/// Prior of the offsets of surfaces.
+struct OffsetPrior {
+    /// Standard deviation of a flat face (voxels): uniform over one voxel, 1 / sqrt(12) rounded.
+    face_sd_voxels: f64,
+    /// Standard deviation of the edge of a punch (voxels).
+    punch_edge_sd_voxels: f64,
+    /// Largest offset (standard deviations).
+    max_sd: f64,
+    /// The same for the walls of a hole: a channel of 12 by 10 voxels reached 1.5 voxels.
+    max_wall_sd: f64,
+}
+
+const PRIOR: OffsetPrior =
+    OffsetPrior { face_sd_voxels: 0.288_675, punch_edge_sd_voxels: 3.0, max_sd: 3.5, max_wall_sd: 6.0 };
+
 /// Standard deviation of a mesh about a flat interface (voxels): calibration of the volumes moves
 /// surfaces by hundredths.
 const MESH_FACE_SD_VOXELS: f64 = 0.02;
@@ -40,11 +47,16 @@ const MIN_BOX_FACE_FRACTION: f64 = 0.2;
 /// Power of the distance from the middle with which an offset fades inwards: the outermost tenth
 /// moves by two thirds or more.
 const FADE_EXPONENT: i32 = 4;
-/// Offsets over which a derivative is taken (voxels); the second one where the first has no
-/// equilibrium.
-const DERIVATIVE_STEPS_VOXELS: [f64; 2] = [FACE_PRIOR_VOXELS, 0.25 * FACE_PRIOR_VOXELS];
-/// Tolerance of the forward solutions (mm).
-const FORWARD_TOLERANCE_MM: f64 = 1e-6;
+/// Finite differences of solutions by an offset.
+struct Derivative {
+    /// Offsets (voxels); the second one where the first has no equilibrium.
+    steps_voxels: [f64; 2],
+    /// Tolerance of the solutions (mm).
+    tolerance_mm: f64,
+}
+
+const DERIVATIVE: Derivative =
+    Derivative { steps_voxels: [PRIOR.face_sd_voxels, 0.25 * PRIOR.face_sd_voxels], tolerance_mm: 1e-6 };
 
 /// A part of the body's shape that is known to a part of a voxel only.
 #[derive(Debug, Clone)]
@@ -62,14 +74,14 @@ pub struct Part {
 impl Part {
     /// The edge of a punch.
     pub fn edge(edge: &Edge, body: &Body, voxel: f64) -> Self {
-        Self::of(body, Some("edge".into()), PUNCH_EDGE_PRIOR_VOXELS, |p| edge.widened(p, voxel))
+        Self::of(body, Some("edge".into()), PRIOR.punch_edge_sd_voxels, |p| edge.widened(p, voxel))
     }
 
     /// The border between two labels, which moves along its normal as `border` says; `sigma` in
     /// voxels.
     pub fn border(border: Border, sigma: f64, voxel: f64) -> Self {
         let movement = border.normals.iter().map(|n| n.map(|v| voxel * v)).collect();
-        Self { name: Some(border.name), sigma, most: MAX_OFFSET_SD, movement }
+        Self { name: Some(border.name), sigma, most: PRIOR.max_sd, movement }
     }
 
     /// A flat face of the box of the body: voxel axis, and whether it is the upper one.
@@ -77,7 +89,7 @@ impl Part {
         let name = format!("{}{axis}", if upper { '+' } else { '-' });
         let [low, high] = bounds(body, grid);
         let middle = 0.5 * (low[axis] + high[axis]);
-        Self::of(body, Some(name), FACE_PRIOR_VOXELS, |p| {
+        Self::of(body, Some(name), PRIOR.face_sd_voxels, |p| {
             let mut q = grid.affine().to_voxel(WorldPoint(p)).0;
             let part = (q[axis] - middle) / (high[axis] - middle);
             let part = if upper { part } else { -part };
@@ -91,8 +103,8 @@ impl Part {
     /// A flat border between two labels, or the wall of a hole. The mesh rounds the edges in which
     /// the walls of a hole meet, and the walls answer for that as well.
     fn interface(interface: &Interface, body: &Body, grid: &Grid) -> Self {
-        let part = Self::of(body, Some(interface.name()), FACE_PRIOR_VOXELS, |p| interface.moved(p, grid, 1.0));
-        Self { most: if interface.is_wall() { MAX_WALL_OFFSET_SD } else { MAX_OFFSET_SD }, ..part }
+        let part = Self::of(body, Some(interface.name()), PRIOR.face_sd_voxels, |p| interface.moved(p, grid, 1.0));
+        Self { most: if interface.is_wall() { PRIOR.max_wall_sd } else { PRIOR.max_sd }, ..part }
     }
 
     /// The shapes of a region that was found without labels.
@@ -100,7 +112,7 @@ impl Part {
         let shapes = inclusion.shapes(&body.places);
         let one = |k: usize| {
             let movement = shapes.iter().map(|s| s[k].map(|v| voxel * v)).collect();
-            Self { name: None, sigma: inclusion.prior() / voxel, most: MAX_OFFSET_SD, movement }
+            Self { name: None, sigma: inclusion.prior() / voxel, most: PRIOR.max_sd, movement }
         };
         (0..SHAPE_FUNCTIONS).map(one).collect()
     }
@@ -110,7 +122,7 @@ impl Part {
             let q = moved(*p);
             std::array::from_fn(|a| q[a] - p[a])
         };
-        Self { name, sigma, most: MAX_OFFSET_SD, movement: body.places.iter().map(one).collect() }
+        Self { name, sigma, most: PRIOR.max_sd, movement: body.places.iter().map(one).collect() }
     }
 
     /// The penalty of an offset (voxels) under its prior: squared standard deviations.
@@ -223,12 +235,12 @@ fn columns(
     let factor = setup.problem(&estimate.state).factorise(x)?;
     let (mut rows, mut force_slope) = (Vec::new(), Vec::new());
     for (part, _) in parts {
-        let column = DERIVATIVE_STEPS_VOXELS.into_iter().find_map(|by| {
+        let column = DERIVATIVE.steps_voxels.into_iter().find_map(|by| {
             let body = part.moved(setup.body, by);
             let moved = Setup { body: &body, ..setup.clone() };
             let problem = moved.problem(&estimate.state);
-            let near = problem.solve_near(x, &factor, FORWARD_TOLERANCE_MM);
-            let y = near.or_else(|| problem.solve(Some(x), FORWARD_TOLERANCE_MM).ok().map(|s| s.x))?;
+            let near = problem.solve_near(x, &factor, DERIVATIVE.tolerance_mm);
+            let y = near.or_else(|| problem.solve(Some(x), DERIVATIVE.tolerance_mm).ok().map(|s| s.x))?;
             let found = find(&body, &places);
             let column = before.iter().zip(&found).map(|(before, now)| match (before, now) {
                 (Some(before), Some(now)) => {

@@ -25,12 +25,17 @@ const MAX_MOVE_FRACTION: f64 = 0.4;
 /// Smoothing before a region is redrawn (voxels): removes stairs, and moves the surface of a ball
 /// of 14 voxels by 0.02.
 const SMOOTHING_VOXELS: f64 = 0.7;
-/// Voxel faces whose mean is the normal without the stairs.
-const NORMAL_FACES: usize = 32;
-/// The same where the edges of a surface shall not be rounded.
-const SHARP_NORMAL_FACES: usize = 9;
-/// Length of a mean of normals below which a surface has an edge, and above which it has none.
-const EDGE_NORMAL_LENGTHS: [f64; 2] = [0.85, 0.95];
+/// How normals of a voxel surface are estimated.
+struct SurfaceNormals {
+    /// Voxel faces whose mean is the normal without the stairs.
+    faces: usize,
+    /// The same where the edges of a surface shall not be rounded.
+    sharp_faces: usize,
+    /// Length of a mean of normals below which a surface has an edge, and above which it has none.
+    edge_lengths: [f64; 2],
+}
+
+const NORMALS: SurfaceNormals = SurfaceNormals { faces: 32, sharp_faces: 9, edge_lengths: [0.85, 0.95] };
 
 fn apart(p: [f64; 3], q: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|a| p[a] - q[a])
@@ -63,7 +68,7 @@ impl Sheet {
 
     /// Distance (mm) of a place, and the mean of the normals nearest to it: as long as they agree.
     fn at(&self, p: [f64; 3]) -> (f64, [f64; 3]) {
-        self.around(p, NORMAL_FACES)
+        self.around(p, NORMALS.faces)
     }
 
     fn around(&self, p: [f64; 3], faces: usize) -> (f64, [f64; 3]) {
@@ -147,20 +152,20 @@ impl Inclusion {
                 }
             }
         }
-        if surface.len() < NORMAL_FACES {
+        if surface.len() < NORMALS.faces {
             return None;
         }
         let middle = sum.map(|s| s / count as f64);
         let volume = count as f64 * grid.spacing().iter().product::<f64>();
         let radius = (0.75 * volume / std::f64::consts::PI).cbrt();
         let voxel = grid.least_spacing();
-        let surface = Sheet::new(&surface, NORMAL_FACES);
+        let surface = Sheet::new(&surface, NORMALS.faces);
         let clear = |p: &[f64; 3]| surface.around(*p, 1).0;
         let within = skin.par_iter().map(|f| clear(&f.0)).reduce(|| f64::INFINITY, f64::min);
         let beside = others.par_iter().map(clear).reduce(|| f64::INFINITY, f64::min);
         let open = within <= MIN_CLEARANCE_VOXELS * voxel;
         let reach = radius.min(beside).min(if open { f64::INFINITY } else { within });
-        let skin = open.then(|| Sheet::new(&skin, SHARP_NORMAL_FACES));
+        let skin = open.then(|| Sheet::new(&skin, NORMALS.sharp_faces));
         let furthest = surface.places.iter().map(|p| length(apart(*p, middle))).fold(0.0, f64::max);
         (beside > MIN_CLEARANCE_VOXELS * voxel).then_some(Self {
             label,
@@ -205,8 +210,8 @@ impl Inclusion {
             let (depth, out) = skin.at(p);
             let size = length(out);
             let bound = 1.0 - ((depth - self.voxel) / (0.5 * self.reach)).clamp(0.0, 1.0);
-            let smooth =
-                ((size - EDGE_NORMAL_LENGTHS[0]) / (EDGE_NORMAL_LENGTHS[1] - EDGE_NORMAL_LENGTHS[0])).clamp(0.0, 1.0);
+            let smooth = ((size - NORMALS.edge_lengths[0]) / (NORMALS.edge_lengths[1] - NORMALS.edge_lengths[0]))
+                .clamp(0.0, 1.0);
             let across = bound * dot(step, out) / (size * size).max(1e-9);
             let free = 1.0 - bound * (1.0 - smooth);
             step = std::array::from_fn(|a| free * (step[a] - across * out[a]));

@@ -15,10 +15,15 @@ pub const MIN_BIC_GAIN: f64 = 10.0;
 /// Largest principal strain (95th percentile) for the linear law: its error is of the order of the
 /// strain, and exceeds that of a modulus beyond.
 const MAX_LINEAR_STRAIN: f64 = 0.05;
-/// Tolerance of forward solutions on the coarse mesh (mm).
-const COARSE_TOLERANCE_MM: f64 = 1e-4;
-/// Most iterations on the coarse mesh.
-const MAX_COARSE_ITERATIONS: usize = 12;
+/// Identification on the coarse mesh.
+struct CoarseSolve {
+    /// Tolerance of forward solutions (mm).
+    tolerance_mm: f64,
+    /// Most iterations.
+    max_iterations: usize,
+}
+
+const COARSE: CoarseSolve = CoarseSolve { tolerance_mm: 1e-4, max_iterations: 12 };
 
 /// How the open offsets of the shape are moved to the data.
 struct ShapeMoves {
@@ -191,7 +196,7 @@ impl Chooser<'_> {
             self.reference,
             chosen.estimate,
             SHAPE_MOVES.max_count,
-            COARSE_TOLERANCE_MM,
+            COARSE.tolerance_mm,
         )?;
         Ok(Choice { law, estimate, evidence: self.evidence, warnings: self.warnings })
     }
@@ -210,7 +215,7 @@ impl Chooser<'_> {
                 (start.theta, start.x) = (last.estimate.state.theta.clone(), last.estimate.state.x.clone());
             }
             match setup
-                .run(start, MAX_COARSE_ITERATIONS, COARSE_TOLERANCE_MM)
+                .run(start, COARSE.max_iterations, COARSE.tolerance_mm)
                 .and_then(|e| Tried::new(self.level, &setup, e, rivals))
             {
                 Ok(one) => tried.push(one),
@@ -260,7 +265,7 @@ impl Chooser<'_> {
             self.reference,
             small,
             SHAPE_MOVES.max_per_law,
-            COARSE_TOLERANCE_MM,
+            COARSE.tolerance_mm,
         )?;
         let strain = summary::strain(&self.level.setup(Law::Linear, self.params, self.reference), &small.state);
         let setup = self.level.setup(Law::Linear, self.params, self.reference);
@@ -323,7 +328,7 @@ impl Chooser<'_> {
 
     fn large_strain_from(&mut self, from: &Tried) -> Result<Tried, StiffnessError> {
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
-        let large = setup.run(from.estimate.state.clone(), MAX_COARSE_ITERATIONS, COARSE_TOLERANCE_MM)?;
+        let large = setup.run(from.estimate.state.clone(), COARSE.max_iterations, COARSE.tolerance_mm)?;
         let large = settle(
             self.level,
             Law::NeoHookean,
@@ -331,7 +336,7 @@ impl Chooser<'_> {
             self.reference,
             large,
             SHAPE_MOVES.max_per_law,
-            COARSE_TOLERANCE_MM,
+            COARSE.tolerance_mm,
         )?;
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
         Tried::new(self.level, &setup, large, true)
@@ -415,7 +420,7 @@ pub fn settle(
             // A shape that cannot be solved is left alone.
             let found = level
                 .setup(law, params, reference)
-                .run(estimate.state.clone(), MAX_COARSE_ITERATIONS, precision)
+                .run(estimate.state.clone(), COARSE.max_iterations, precision)
                 .ok()?;
             (misfit(level, &found) < least).then_some(found)
         });
@@ -442,7 +447,7 @@ pub fn as_meshed(
 ) -> Result<Estimate, StiffnessError> {
     level.move_back();
     level.settled = false;
-    level.setup(law, params, reference).run(estimate.state.clone(), MAX_COARSE_ITERATIONS, COARSE_TOLERANCE_MM)
+    level.setup(law, params, reference).run(estimate.state.clone(), COARSE.max_iterations, COARSE.tolerance_mm)
 }
 
 /// How the scale of given moduli converges; it depends little on what they change.
@@ -489,7 +494,7 @@ pub fn known_moduli(
         }
         level.known = known;
         let start = estimate.state.clone();
-        estimate = level.setup(law, params, reference).run(start, MAX_COARSE_ITERATIONS, COARSE_TOLERANCE_MM)?;
+        estimate = level.setup(law, params, reference).run(start, COARSE.max_iterations, COARSE.tolerance_mm)?;
     }
     Ok(estimate)
 }

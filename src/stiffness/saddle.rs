@@ -21,17 +21,22 @@ use rayon::prelude::*;
 
 /// Right-hand sides in lockstep: as many as a vector register of AVX2 holds.
 const LANES: usize = 8;
-/// Error over the one before that one Krylov space reaches at best: the resolution of single
-/// precision.
-const MAX_REDUCTION: f64 = 1e-5;
+/// Iteration control of the mixed-precision solution.
+struct KrylovControl {
+    /// Error over the one before that one Krylov space reaches at best: the resolution of single
+    /// precision.
+    max_reduction: f64,
+    /// Goal of a Krylov space over the error allowed: it measures the refined solution's error only
+    /// approximately.
+    goal_fraction: f64,
+    /// Most Krylov spaces for one right-hand side.
+    max_spaces: usize,
+}
+
+const KRYLOV: KrylovControl = KrylovControl { max_reduction: 1e-5, goal_fraction: 0.5, max_spaces: 12 };
+
 /// Strength of a tie beyond which its node hardly moves under the tissue's forces.
 const FIRM_TIE_STRENGTH: f64 = 1e-3;
-/// Goal of a Krylov space over the error allowed: it measures the refined solution's error only
-/// approximately.
-const GOAL_FRACTION: f64 = 0.5;
-/// Most Krylov spaces for one right-hand side.
-const MAX_SPACES: usize = 12;
-
 /// What belongs to a mesh: the linear elements of its corners, and its pressures.
 #[derive(Debug)]
 pub struct TwoLevel {
@@ -369,7 +374,7 @@ impl<'a> Saddle<'a> {
         let mut rest = self.rest(right, &x);
         self.close(&mut x, &mut rest);
         rest = self.rest(right, &x);
-        for _ in 0..MAX_SPACES {
+        for _ in 0..KRYLOV.max_spaces {
             let left = self.precondition(interleaved::<L>(&rest, self.pattern.unknowns()));
             let sizes = krylov::norms(&self.weights, &left);
             if sizes.iter().any(|v| !v.is_finite()) {
@@ -379,7 +384,7 @@ impl<'a> Saddle<'a> {
                 right.copy_from_slice(&x);
                 return Ok(());
             }
-            let goals = std::array::from_fn(|l| (GOAL_FRACTION * whole[l]).max(MAX_REDUCTION * sizes[l]));
+            let goals = std::array::from_fn(|l| (KRYLOV.goal_fraction * whole[l]).max(KRYLOV.max_reduction * sizes[l]));
             let apply = |v: &[[f32; L]]| self.precondition(self.blocks.multiply(&self.levels.nodes, v));
             let change = krylov::solve(left, &self.weights, goals, apply);
             for (l, x) in x.chunks_mut(self.pattern.unknowns()).enumerate() {

@@ -19,14 +19,21 @@ use crate::types::space::dot;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Most lattice nodes of the map.
-const MAX_LATTICE_NODES: f64 = 420.0;
-/// Most observations used for the map.
-const MAX_OBSERVATIONS: usize = 5000;
-/// Difference of ln mu between nodes up to which total variation is smoothed.
-const SMOOTH_STEP_LN: f64 = 0.05;
-/// Most iterations.
-const MAX_ITERATIONS: usize = 9;
+/// Identification of a map of moduli with total variation.
+struct MapControl {
+    /// Most lattice nodes.
+    max_nodes: f64,
+    /// Most observations.
+    max_observations: usize,
+    /// Difference of ln mu between nodes up to which total variation is smoothed.
+    smooth_step_ln: f64,
+    /// Most iterations.
+    max_iterations: usize,
+}
+
+const MAP_CONTROL: MapControl =
+    MapControl { max_nodes: 420.0, max_observations: 5000, smooth_step_ln: 0.05, max_iterations: 9 };
+
 /// How regions are found in the map.
 struct Segmentation {
     /// Smoothing of a region's border (lattice steps, one Gaussian standard deviation).
@@ -75,7 +82,7 @@ impl Lattice {
             }
         }
         // The outer layer adds nodes: aim lower inside.
-        let size = (volume / (0.6 * MAX_LATTICE_NODES)).cbrt();
+        let size = (volume / (0.6 * MAP_CONTROL.max_nodes)).cbrt();
         let count = std::array::from_fn(|a| ((high[a] - low[a]) / size).ceil() as usize + 1);
         let low = std::array::from_fn(|a| 0.5 * (low[a] + high[a]) - 0.5 * size * (count[a] - 1) as f64);
         let mut out =
@@ -146,11 +153,11 @@ impl Lattice {
     /// functions over it; none where the ball reaches past the lattice.
     fn ball(&self, middle: [f64; 3], radius: f64) -> Option<BTreeMap<u32, f64>> {
         let volume = 4.0 / 3.0 * std::f64::consts::PI * radius.powi(3);
-        let share = volume / self.size.powi(3) / SAMPLES_PER_BALL as f64;
+        let share = volume / self.size.powi(3) / BALLS.samples as f64;
         let mut out = BTreeMap::new();
-        for k in 0..SAMPLES_PER_BALL {
+        for k in 0..BALLS.samples {
             // Evenly over the ball: shells of one volume, turned by the golden angle.
-            let t = (k as f64 + 0.5) / SAMPLES_PER_BALL as f64;
+            let t = (k as f64 + 0.5) / BALLS.samples as f64;
             let (height, turn) = (1.0 - 2.0 * ((k as f64 * 0.618_034).fract()), k as f64 * 2.399_963);
             let (r, flat) = (radius * t.cbrt(), (1.0 - height * height).sqrt());
             let d = [flat * turn.cos(), flat * turn.sin(), height].map(|v| r * v);
@@ -197,16 +204,21 @@ impl Basis {
         };
         let lattice = Lattice::new(&body.places, body.volumes.iter().sum());
         let weights = body.cells.iter().map(|c| lattice.weights(middle(c))).collect();
-        let step = setup.observations.len().div_ceil(MAX_OBSERVATIONS).max(1);
+        let step = setup.observations.len().div_ceil(MAP_CONTROL.max_observations).max(1);
         let picked = setup.observations.iter().step_by(step).cloned().collect();
         Self { lattice, weights, picked }
     }
 }
 
-/// Diameters of the balls whose detection limit is reported, over the body's least extent.
-const BALL_DIAMETER_FRACTIONS: [f64; 3] = [0.25, 0.35, 0.5];
-/// Places in a ball over which the lattice's functions are averaged.
-const SAMPLES_PER_BALL: usize = 200;
+/// Balls whose detection limit is reported.
+struct Balls {
+    /// Diameters over the body's least extent.
+    diameter_fractions: [f64; 3],
+    /// Places in a ball over which the lattice's functions are averaged.
+    samples: usize,
+}
+
+const BALLS: Balls = Balls { diameter_fractions: [0.25, 0.35, 0.5], samples: 200 };
 
 /// For balls of some diameters (mm): what one moves, the plates fitted again, for a unit of ln mu
 /// (mm, root mean square of one component), where it moves less than in three of four places.
@@ -242,7 +254,7 @@ pub fn shown_by_balls(setup: &Setup<'_>, identified: &State) -> Result<Vec<(f64,
         let mut found: Vec<f64> = lattice.places().into_par_iter().filter_map(moved).collect();
         (!found.is_empty()).then(|| (diameter, percentile(&mut found, 25.0)))
     };
-    Ok(BALL_DIAMETER_FRACTIONS.into_iter().filter_map(|part| of(part * least)).collect())
+    Ok(BALLS.diameter_fractions.into_iter().filter_map(|part| of(part * least)).collect())
 }
 
 /// The vectors made orthogonal to each other, each of length 1; those that add nothing left out.
@@ -287,7 +299,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
     let mut values = vec![0.0; used];
     let mut state = identified.clone();
     let (mut kappa, mut best): (f64, Option<(f64, Vec<f64>)>) = (0.0, None);
-    for iteration in 0..MAX_ITERATIONS {
+    for iteration in 0..MAP_CONTROL.max_iterations {
         let mut problem = setup.problem(&state);
         for (m, w) in problem.materials.iter_mut().zip(&weights) {
             m.mu *= w.iter().map(|&(n, w)| w * values[n as usize]).sum::<f64>().exp();
@@ -304,7 +316,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         if best.as_ref().is_none_or(|b| rms < b.0) {
             best = Some((rms, values.clone()));
         }
-        if rms <= target || iteration + 1 == MAX_ITERATIONS {
+        if rms <= target || iteration + 1 == MAP_CONTROL.max_iterations {
             break;
         }
         let jacobian = jacobian(setup, &problem, &solution, &weights, &picked, used)?;
@@ -330,7 +342,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         let mean = (0..used).map(|k| normal[(k, k)]).sum::<f64>() / used as f64;
         if iteration == 0 {
             // A step of one in ln mu across an edge weighs as much as what one node can explain.
-            kappa = 0.3 * mean * SMOOTH_STEP_LN.max(0.1);
+            kappa = 0.3 * mean * MAP_CONTROL.smooth_step_ln.max(0.1);
         } else {
             kappa *= 0.4;
         }
@@ -339,7 +351,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         for &(i, j) in &lattice.pairs {
             let (i, j) = (i as usize, j as usize);
             let difference = values[i] - values[j];
-            let w = kappa / (difference * difference + SMOOTH_STEP_LN * SMOOTH_STEP_LN).sqrt();
+            let w = kappa / (difference * difference + MAP_CONTROL.smooth_step_ln * MAP_CONTROL.smooth_step_ln).sqrt();
             a[i * p + i] += w;
             a[j * p + j] += w;
             a[i * p + j] -= w;
