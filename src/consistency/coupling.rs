@@ -150,7 +150,7 @@ const MAX_ROUNDING_FRACTION: f64 = 0.1;
 
 /// The largest weight of the bending energy in single precision: of an affine field `L c` is zero
 /// but for rounding, and that must not outweigh the evidence.
-fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
+fn max_smoothness(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
     let pull = evidence.iter().map(|e| e.information[..3].iter().sum::<f64>() / 3.0).sum::<f64>();
     let rounded = smoothness.diagonal(&vec![1.0; smoothness.len()]).iter().map(|&v| f64::from(v)).sum::<f64>()
         * f64::from(f32::EPSILON);
@@ -181,7 +181,7 @@ pub fn fit_from(
     rounds: usize,
 ) -> (Vec<f32>, f32) {
     let n = lattice.len();
-    let most = borne(smoothness, evidence);
+    let most = max_smoothness(smoothness, evidence);
     // A first guess of lambda: second derivatives of 0.01 / mm.
     let (mut c, mut lambda, mut scale) = match start {
         Some((c, lambda)) => (c.to_vec(), lambda.clamp(1e-2, most), 9.0 * f64::from(1u32 << rounds.clamp(1, 8)) / 2.0),

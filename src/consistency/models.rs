@@ -130,13 +130,13 @@ pub fn choose(
         let mut off: Vec<f32> = matches.iter().map(|m| off(m) as f32).collect();
         if off.is_empty() { 0.0 } else { f64::from(median(&mut off)) }
     };
-    let astray = middle(&|m| distance(m.field, m.displacement));
+    let scatter = middle(&|m| distance(m.field, m.displacement));
     for (model, motion) in tried {
         let Excess { total, worst } = excess(model, &motion);
         let ratio = total / determined.max(MIN_DEGREES_OF_FREEDOM);
         let off = middle(&|m| distance(motion.displacement(m.place), m.displacement));
         let name = model.name();
-        let contradicted = off > CONTRADICTION.min_distance * model_mm && off > CONTRADICTION.min_ratio * astray;
+        let contradicted = off > CONTRADICTION.min_distance * model_mm && off > CONTRADICTION.min_ratio * scatter;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
         let there = format!(", {worst:.1} at the worst place (at most {PLACE})");
         evidence.push(format!(

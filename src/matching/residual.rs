@@ -159,12 +159,12 @@ pub fn normal_equations(
     let [nx, ny, nz] = pair.shape;
     let sigma = residual_sigma(pair, warped, gain).max(floor).max(f32::MIN_POSITIVE);
     let (variance, cut) = (sigma * sigma, 1.0 / (CAUCHY_TUNING * CAUCHY_TUNING));
-    let unsure = if ablation::is_on("gradient-floor") {
+    let position_error = if ablation::is_on("gradient-floor") {
         MIN_POSITION_ERROR_VOXELS * pyramid::finest(pair.shape, pair.spacing)
     } else {
         0.0
     };
-    let least = unsure.powi(2) as f32;
+    let least = position_error.powi(2) as f32;
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
     // Of the residual no more is noise than the volumes have.
     let thick = pair.shape.iter().filter(|&&n| n > 1).count() as i32;

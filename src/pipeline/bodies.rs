@@ -275,9 +275,9 @@ impl Bodies {
     }
 
     /// Brings back what the bending energy flattened of each body's field.
-    pub fn twice(&mut self, pair: &Pair<'_>, seed: u64) {
+    pub fn twicing(&mut self, pair: &Pair<'_>, seed: u64) {
         for b in 0..self.count() {
-            level::twice(&self.part(pair, b), &mut self.fields[b], seed);
+            level::twicing(&self.part(pair, b), &mut self.fields[b], seed);
         }
     }
 
@@ -317,11 +317,12 @@ impl Bodies {
                 let own = matches.iter().filter(|m| t.bodies.label_near(m.voxel) == self.count());
                 own.count() >= TRIAL.min_matches
             };
-            let worth = |t: &Trial| {
+            let is_significant = |t: &Trial| {
                 t.gain > TRIAL.min_gain_per_degree_of_freedom * t.more.max(MIN_DEGREES_OF_FREEDOM)
                     && t.jump > TRIAL.min_jump_voxels * finest
             };
-            let Some(best) = tried.filter(|t| worth(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain)) else {
+            let Some(best) = tried.filter(|t| is_significant(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain))
+            else {
                 break;
             };
             said.push(best.why(self.count() + 1));

@@ -174,8 +174,8 @@ impl<'a> CoarseToFine<'a, '_> {
             return Entry { bodies, begun, sought: false };
         }
         bodies.refine(pair, level.passes, self.params.seed, search.tick);
-        let loose = level.place == 1 && begun.is_loose();
-        match loose.then(|| search.closer(pair, &bodies, level.passes, &mut account.matched)).flatten() {
+        let searches_again = level.place == 1 && begun.needs_next_level();
+        match searches_again.then(|| search.next_level(pair, &bodies, level.passes, &mut account.matched)).flatten() {
             Some(found) => {
                 account.reports.extend(found.report.clone());
                 Entry { bodies: found.motion.clone(), begun: found, sought: !level.last }
@@ -306,14 +306,14 @@ impl<'a> CoarseToFine<'a, '_> {
         matched: &mut f64,
     ) -> Begun {
         let mut found = search.begin((pair, factor), lattice, self.starts, passes, matched);
-        if let Some(tissue) = found.is_unsure().then(around).flatten() {
+        if let Some(tissue) = found.is_unconfirmed().then(around).flatten() {
             let wider = search.begin((&tissue, factor), lattice, self.starts_given(), passes, matched);
-            found = Begun::surer(pair, found, wider);
+            found = Begun::more_consistent(pair, found, wider);
         }
         if self.params.search_mm == 0.0 && found.leaves_open(pair, search.range) {
             let far = Search { range: WIDE_SEARCH_RATIO * search.range, ..*search };
             let wide = far.begin((pair, factor), lattice, self.starts_given(), passes, matched);
-            let taken = wide.outdoes(pair, &found);
+            let taken = wide.improves_on(pair, &found);
             asked.push(why_farther(search.range, &found, &wide, taken));
             if taken {
                 (*range, found) = (far.range, wide);
@@ -329,7 +329,7 @@ pub(super) const WIDE_SEARCH_RATIO: f64 = 2.0;
 
 /// What a search twice as far gave, in words.
 fn why_farther(range: f64, own: &Begun, wide: &Begun, taken: bool) -> String {
-    let open = if own.agrees_on_few() { "few features agree" } else { "the motion reaches its end" };
+    let open = if own.is_partial() { "few features agree" } else { "the motion reaches its end" };
     format!(
         "search range: within {range:.1} mm {open} ({:.0} % of the features agree); within {:.1} mm {:.0} % agree, {}",
         100.0 * own.share(),

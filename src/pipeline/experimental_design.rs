@@ -340,7 +340,7 @@ struct Solved {
     /// Regions that the field shows nothing of.
     hidden: Vec<bool>,
     /// Whether those bear so much force that others are bounds.
-    borne: bool,
+    hidden_load: bool,
     /// Regions so far from the reference that they are as good as rigid or empty.
     far: Vec<bool>,
     /// The region that ratios refer to.
@@ -374,10 +374,10 @@ impl Solved {
         let theta = bench.theta(&level.body, reference);
         let mut estimate = true_state(&setup, &theta)?;
         // A region that the data do not show counts as known for the others.
-        let (mut hidden, mut borne) = (vec![false; theta.len()], 0.0);
+        let (mut hidden, mut hidden_load) = (vec![false; theta.len()], 0.0);
         while let Some(found) = summary::least_seen(&setup, &estimate) {
             let Some(r) = level.body.labels.iter().position(|l| *l == found.label) else { break };
-            (hidden[r], borne) = (true, borne + found.share);
+            (hidden[r], hidden_load) = (true, hidden_load + found.share);
             setup.pinned.push((r, theta[r]));
             estimate = true_state(&setup, &theta)?;
         }
@@ -416,7 +416,7 @@ impl Solved {
             plate_prior: setup.plate_prior,
             sampled: (inside, level.block.max(1), estimate.residuals.len() as f64),
             hidden,
-            borne: borne > MIN_LOAD_SHARE,
+            hidden_load: hidden_load > MIN_LOAD_SHARE,
             far: theta.iter().map(|t| t.abs() > MAX_IDENTIFIED_CONTRAST_LN).collect(),
             reference,
         })
@@ -481,7 +481,7 @@ impl Solved {
 
     /// Whether a region is known, and not just a bound, with a deviation of `sd`.
     fn determines(&self, r: usize, sd: f64, ratios: bool) -> bool {
-        sd <= MAX_IDENTIFIED_SD_LN && !self.hidden[r] && !self.far[r] && (ratios || !self.borne)
+        sd <= MAX_IDENTIFIED_SD_LN && !self.hidden[r] && !self.far[r] && (ratios || !self.hidden_load)
     }
 }
 
@@ -565,12 +565,12 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
     let regions: Vec<PlannedRegion> = (0..body.labels.len()).map(planned).collect();
     let options = Options { bench: &bench, params, presses: &presses, solved: &solved, regions: &regions };
     let (expected, least_press) = options.expected(&voxels, &mut warnings)?;
-    let told = |&press: &f64| {
+    let press_at = |&press: &f64| {
         let solved = solved.of(press)?;
         let deeper = press / solved.press;
         Some(Press { press_mm: press, strain: deeper * solved.strain, force_n: deeper * solved.force.abs() })
     };
-    let presses: Vec<Press> = presses.iter().filter_map(told).collect();
+    let presses: Vec<Press> = presses.iter().filter_map(press_at).collect();
     warnings.extend(large_strain(&presses));
     clock.book("options");
     Ok(Plan {

@@ -17,8 +17,8 @@ use crate::pipeline::coarse_to_fine::{
 };
 use crate::pipeline::contrast::{self, Common};
 use crate::pipeline::field_warnings::{
-    agreement, in_doubt, most_move, no_measurement, out_of_view, said_of_model, too_few, warnings, why_so_many,
-    without_texture,
+    agreement, most_move, no_measurement, out_of_view, said_of_model, too_few, unreliable_search, warnings,
+    why_so_many, without_texture,
 };
 use crate::pipeline::hypotheses::Begun;
 pub use crate::pipeline::hypotheses::Start;
@@ -402,7 +402,7 @@ impl Task<'_> {
         let any_free = concluded.iter().any(|c| c.choice.motion.is_none());
         // What is concluded rests on the smooth field: what comes back brings noise with it.
         if any_free {
-            bodies.twice(&pair, params.seed);
+            bodies.twicing(&pair, params.seed);
             clock.book("residual");
         }
         // What the average of voxels hides.
@@ -488,7 +488,7 @@ impl Task<'_> {
         // Given borders are certain.
         let jumps = if self.given.is_some() { Vec::new() } else { coefficients.jumps(self.mask) };
         variances.add_borders(jumps, factor);
-        if begun.is_unsure() && concluded.unlike.is_some() {
+        if begun.is_unconfirmed() && concluded.unlike.is_some() {
             variances.set_other_motions(begun.share(), concluded.search);
         }
         if let Some(common) = self.common {
@@ -527,9 +527,9 @@ impl Task<'_> {
         let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, self.grid.is_single_slice(), &mut clock)?;
         let displacement = &meshed.displacement;
         let (mean_mm, max_mm, mask_voxels) = lengths(displacement, mask);
-        let doubted = begun.doubted();
+        let unreliable = begun.unreliable_counts();
         // Landmarks bear out what features do not.
-        if let Some(seen) = doubted.filter(|_| self.anchors.is_empty()) {
+        if let Some(seen) = unreliable.filter(|_| self.anchors.is_empty()) {
             let far = most_move(displacement, mask) > concluded.search;
             let found = reports.last().map_or(0, |r| r.counts.features_initial);
             no_measurement(concluded.kept, found, seen, far, concluded.unlike.is_some())?;
@@ -554,7 +554,7 @@ impl Task<'_> {
             .chain(said_of_model(concluded.rejected))
             .chain(damage)
             .chain(input_checks::squeezed(displacement, mask))
-            .chain(doubted.map(in_doubt))
+            .chain(unreliable.map(unreliable_search))
             .chain(concluded.unlike)
             .chain(uneven(concluded.gain))
             .chain(concluded.plain)

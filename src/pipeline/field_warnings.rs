@@ -65,7 +65,7 @@ pub(super) fn agreement(pair: &Pair<'_>, bodies: &Bodies, model: MotionModel) ->
     Ok(found)
 }
 
-pub(super) fn in_doubt(counts: Counts) -> String {
+pub(super) fn unreliable_search(counts: Counts) -> String {
     let Counts { kept, features_initial: all, .. } = counts;
     format!(
         "only {kept} of {all} features agreed with their neighbours when the whole volume was searched: the motion may be \

@@ -134,17 +134,17 @@ impl Begun {
     }
 
     /// Whether all was searched and few features agreed with their neighbours.
-    pub fn is_unsure(&self) -> bool {
+    pub fn is_unconfirmed(&self) -> bool {
         self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.confirmed || c.kept < MIN_COUNTED_MATCHES)
     }
 
     /// Whether so few features agreed that the next level is to be searched as well.
-    pub fn is_loose(&self) -> bool {
+    pub fn needs_next_level(&self) -> bool {
         self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.next_level)
     }
 
     /// The features and those that agreed, where these are too few to go by.
-    pub fn doubted(&self) -> Option<Counts> {
+    pub fn unreliable_counts(&self) -> Option<Counts> {
         self.counts().filter(|c| c.kept_share() < KEPT_SHARE.reliable)
     }
 
@@ -154,33 +154,33 @@ impl Begun {
     }
 
     /// Whether few of the features that were sought agree.
-    pub fn agrees_on_few(&self) -> bool {
+    pub fn is_partial(&self) -> bool {
         self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.in_range)
     }
 
     /// Whether a search within `range` (mm) leaves open what lies past it.
     pub fn leaves_open(&self, pair: &Pair<'_>, range: f64) -> bool {
-        self.agrees_on_few()
+        self.is_partial()
             || self.report.is_some() && level::lengths(pair, |p| self.motion.at(p))[1] > NEAR_RANGE_FRACTION * range
     }
 
     /// Whether a search twice as far found what the nearer one, `own`, did not: the volumes agree
     /// better, and hardly fewer features.
-    pub fn outdoes(&self, pair: &Pair<'_>, own: &Self) -> bool {
+    pub fn improves_on(&self, pair: &Pair<'_>, own: &Self) -> bool {
         self.share() >= MIN_WIDE_SHARE_RATIO * own.share() && self.motion.agree_better(pair, &own.motion)
     }
 
     /// Of an unsure search and a wider one the one in which more of the features agreed: the
     /// agreement of the volumes does not tell a wrong island from the truth, neighbours do. Where
     /// there are too few features to count it is all there is.
-    pub fn surer(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
+    pub fn more_consistent(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
         let [few, many] = [&own, &wider].map(|s| s.counts().unwrap_or_default());
-        let wider_is_surer = match (few.kept < MIN_COUNTED_MATCHES, many.kept < MIN_COUNTED_MATCHES) {
+        let wider_is_better = match (few.kept < MIN_COUNTED_MATCHES, many.kept < MIN_COUNTED_MATCHES) {
             (false, false) => many.kept_share() > few.kept_share(),
             (true, false) if many.kept_share() >= KEPT_SHARE.confirmed => true,
             _ => wider.motion.agree_better(pair, &own.motion),
         };
-        if wider_is_surer { wider } else { own }
+        if wider_is_better { wider } else { own }
     }
 }
 
@@ -247,15 +247,15 @@ impl Search<'_> {
         let of_matches = found.clone();
         let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
         let own = refined(own.into());
-        let in_doubt = counts.kept_share() < KEPT_SHARE.next_level || counts.kept < MIN_COUNTED_MATCHES;
+        let unconfirmed = counts.kept_share() < KEPT_SHARE.next_level || counts.kept < MIN_COUNTED_MATCHES;
         let given = known.iter().any(Start::is_given);
         // If few features agree, landmarks decide.
-        let marked = counts.kept_share() < KEPT_SHARE.reliable && !pair.anchors.is_empty();
-        let beats = |known: &Bodies| match marked {
+        let landmarks_decide = counts.kept_share() < KEPT_SHARE.reliable && !pair.anchors.is_empty();
+        let beats = |known: &Bodies| match landmarks_decide {
             true => landmarks::gained(pair, &own, known) > 0.0,
             false => known.agree_better(pair, &own),
         };
-        let wins = |known: &Bodies| (in_doubt || given) && beats(known);
+        let wins = |known: &Bodies| (unconfirmed || given) && beats(known);
         let motion = course.filter(wins).map_or(own, refined);
         Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }
@@ -307,7 +307,7 @@ impl Search<'_> {
 
     /// What a search of the next level about its field finds, if the volumes agree better there:
     /// smaller patches are distorted less, and fine texture tells a wrong island from the truth.
-    pub fn closer(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
+    pub fn next_level(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
         let only = own.only().filter(|_| ablation::is_on("next-level"))?;
         let most = (NEXT_LEVEL.features_times_spacing / self.params.voxels_per_point.max(1))
             .clamp(NEXT_LEVEL.min_features, WHOLE_SEARCH.max_features);

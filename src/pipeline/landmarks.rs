@@ -56,9 +56,8 @@ fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
 }
 
-/// The scale of the weights, by the passes `to_come` after this one: it falls by [`ANNEALING`]
-/// from pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and
-/// Zisserman 1987), and holds in the last few.
+/// The squared scale of the weights, by the passes `to_come` after this one, as [`ANNEALING`] says:
+/// at first all landmarks pull.
 fn scale(to_come: usize) -> f64 {
     ANNEALING.final_scale_squared
         * ANNEALING.decay.powi(to_come.saturating_sub(ANNEALING.final_passes - 1).min(20) as i32)

@@ -148,13 +148,13 @@ pub(super) fn refine_from(
     advance(pair, field, begun, Held::Whole, passes, seed, tick);
 }
 
-/// Passes of [`twice`]: one leaves waves of 20 to 30 voxels 1 % lower, and twelve pairs with 2 %
+/// Passes of [`twicing`]: one leaves waves of 20 to 30 voxels 1 % lower, and twelve pairs with 2 %
 /// more error.
 const TWICING_PASSES: usize = 2;
 
 /// Passes from a settled field in which the bending energy holds the change alone (twicing; Tukey
 /// 1977): what it flattened of long waves comes back, and short ones stay out.
-pub fn twice(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
+pub fn twicing(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
     let begun = field.coefficients.clone();
     advance(pair, field, &begun, Held::Change, TWICING_PASSES, seed, |_| ());
 }
@@ -168,7 +168,7 @@ enum Held {
     Change,
 }
 
-/// The passes of [`refine`] and [`twice`].
+/// The passes of [`refine`] and [`twicing`].
 fn advance(
     pair: &Pair<'_>,
     field: &mut SplineField,

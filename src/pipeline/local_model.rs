@@ -143,7 +143,7 @@ impl Rest {
         let all: f64 = tissue.iter().map(|&v| f64::from(v)).sum();
         let judged = |&Tried { model, motion, ref excess }: &Tried| {
             let ratio = places.ratio(excess);
-            let free: Vec<f32> = ratio.iter().map(|&r| stands(r)).collect();
+            let free: Vec<f32> = ratio.iter().map(|&r| free_share(r)).collect();
             let share: f64 = free.iter().zip(tissue).map(|(f, t)| f64::from((1.0 - f) * t)).sum();
             Self {
                 model,
@@ -243,9 +243,8 @@ fn with_neighbours(mut values: Vec<f32>, nodes: [usize; 3]) -> Vec<f32> {
     values
 }
 
-/// How much of the free field stands at an excess misfit for each degree of freedom, without a
-/// step.
-fn stands(ratio: f32) -> f32 {
+/// Weight of the free field (0 to 1) at an excess misfit per degree of freedom: a smooth step.
+fn free_share(ratio: f32) -> f32 {
     let [low, high] = REST.misfit_range;
     let t = ((ratio - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)

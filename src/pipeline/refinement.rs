@@ -79,11 +79,11 @@ pub(super) fn finer(
         refine(&mut next, TRIAL_PASSES);
         let gain = level::gained(pair, &warped(&best.field), warped(&next));
         let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
-        let worth = gain / (many - few).max(1.0);
-        let taken = gain > 0.0 && worth > MIN_GAIN_PER_DEGREE_OF_FREEDOM;
+        let gain_per_degree = gain / (many - few).max(1.0);
+        let taken = gain > 0.0 && gain_per_degree > MIN_GAIN_PER_DEGREE_OF_FREEDOM;
         best.said.push(format!(
             "nodes every {closer} voxels: {}; the residual is {noisy:.1} times the noise, and {:.0} degrees of freedom more explain \
-             {worth:.2} of the misfit each (chance: up to {MIN_GAIN_PER_DEGREE_OF_FREEDOM})",
+             {gain_per_degree:.2} of the misfit each (chance: up to {MIN_GAIN_PER_DEGREE_OF_FREEDOM})",
             if taken { "taken" } else { "not taken" },
             many - few
         ));

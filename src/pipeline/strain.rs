@@ -133,7 +133,7 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
     // Of a field without draws only a part of the error is known.
     let known_best = if samples.is_some() { Trust::High } else { Trust::Moderate };
     let own = Trust::of(noise / size.max(f64::MIN_POSITIVE)).max(known_best);
-    let told = trust.map(|t| format!("trust in the field is {}", t.name()));
+    let field_trust = trust.map(|t| format!("trust in the field is {}", t.name()));
     let ratio = match noise / size.max(f64::MIN_POSITIVE) {
         share if share < 1.0 => format!("the deviation of a normal strain is {:.1} % of the strain", 100.0 * share),
         _ => "the deviation of a normal strain is as large as the strain".into(),
@@ -158,7 +158,7 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
             deviation_from: known,
             regions,
             trust: trust.map_or(own, |field| field.max(own)),
-            trust_reasons: told.into_iter().chain([ratio]).chain(in_part).collect(),
+            trust_reasons: field_trust.into_iter().chain([ratio]).chain(in_part).collect(),
             seconds: clock.0,
             warnings: Vec::new(),
         },

@@ -150,17 +150,18 @@ impl<'a, 'v> Course<'a, 'v> {
             let [own, beside] = [here, there].map(|moved| self.misfit(block, moved, volume));
             (block.len(), own.zip(beside).map(|(own, beside)| (apart, own > OUTLIER.max_misfit_ratio * beside)))
         };
-        let told: Vec<(usize, Option<(f64, bool)>)> = self.blocks.par_iter().zip(&starts).map(one).collect();
+        let tested: Vec<(usize, Option<(f64, bool)>)> = self.blocks.par_iter().zip(&starts).map(one).collect();
         let count = |keep: &dyn Fn(&Option<(f64, bool)>) -> bool| -> f64 {
-            told.iter().filter(|t| keep(&t.1)).map(|t| t.0 as f64).sum()
+            tested.iter().filter(|t| keep(&t.1)).map(|t| t.0 as f64).sum()
         };
         let (all, out) = (count(&|_| true), count(&Option::is_some));
         let alone = |t: &Option<(f64, bool)>| t.is_some_and(|t| t.1);
-        let unborne = count(&alone);
-        (unborne > OUTLIER.min_tissue_fraction * all && unborne > OUTLIER.min_outlier_fraction * out).then(|| {
-            let sum: f64 = told.iter().filter(|t| alone(&t.1)).filter_map(|t| Some(t.0 as f64 * t.1?.0)).sum();
+        let unconfirmed = count(&alone);
+        let least = (OUTLIER.min_tissue_fraction * all).max(OUTLIER.min_outlier_fraction * out);
+        (unconfirmed > least).then(|| {
+            let sum: f64 = tested.iter().filter(|t| alone(&t.1)).filter_map(|t| Some(t.0 as f64 * t.1?.0)).sum();
             let beside = (before.number, next.map(|n| n.number));
-            (own.number, OutOfLine { share: unborne / all, apart_mm: sum / unborne, beside })
+            (own.number, OutOfLine { share: unconfirmed / all, apart_mm: sum / unconfirmed, beside })
         })
     }
 

@@ -191,10 +191,12 @@ impl Found<'_> {
     /// The part of the force that a region bears at most, where regions that are not seen make that
     /// all that is known of it: those can bear anything from none to all of their share.
     fn at_most(&self, label: u8) -> Option<f64> {
-        let borne = self.hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
+        let hidden_share = self.hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
         match self.hides(label) {
             Some(h) => Some(h.share),
-            None => (matches!(self.scale, Scale::Force(_)) && borne > MIN_LOAD_SHARE).then_some(1.0 - borne),
+            None => {
+                (matches!(self.scale, Scale::Force(_)) && hidden_share > MIN_LOAD_SHARE).then_some(1.0 - hidden_share)
+            }
         }
     }
 
