@@ -261,11 +261,10 @@ fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
     all.map(|s| 2e-3 * std::f64::consts::PI * hat(s) * (depth - s) * step).sum()
 }
 
-/// The moduli whose forces are nearest to `force` at `depths`: least
-/// squares with a small weight on bends, by coordinate descent. The first two are one where the pad
-/// is `curved`: a face touches it in a point, and what forces say of the springs there is the
-/// surface's step of a voxel. A flat pad is touched all over, and its first springs are the
-/// stiffest.
+/// The moduli whose forces are nearest to `force` at `depths`: least squares with a small weight on
+/// bends, by coordinate descent. The first two are one where the pad is `curved`: a face touches it
+/// in a point, and what forces say of the springs there is the surface's step of a voxel. A flat
+/// pad is touched all over, and its first springs are the stiffest.
 fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 2]> {
     let deepest = depths.last().copied().unwrap_or(1.0);
     let mut out: Vec<[f64; 2]> = (0..KNOTS).map(|k| [deepest * k as f64 / (KNOTS - 1) as f64, mean]).collect();

@@ -51,7 +51,7 @@ struct MotionGrowth {
     /// Relative change of the exponent by a halving, up to which the growth is the motion's own.
     tolerance: f64,
     /// Relative error of a step's exponent with which it follows the motion: both methods are of
-    /// first order at least, so halves differ by less than half of it.
+    /// first order at least, so it differs by less than half.
     max_exponent_error: f64,
 }
 

@@ -45,11 +45,15 @@ pub struct Certified {
     pub tissue: Mask,
 }
 
-/// Amplitude of the waves (voxels of the finest axis): that of the DIC Challenge 2.0.
-const WAVE_AMPLITUDE_VOXELS: f64 = 0.5;
+/// The known motions of a certificate.
+struct ImposedMotion {
+    /// Amplitude of the waves (voxels of the finest axis): that of the DIC Challenge 2.0.
+    wave_amplitude_voxels: f64,
+    /// Uniform strain (1).
+    uniform_strain: f64,
+}
 
-/// Uniform strain that is imposed (1).
-const UNIFORM_STRAIN: f64 = 0.02;
+const IMPOSED: ImposedMotion = ImposedMotion { wave_amplitude_voxels: 0.5, uniform_strain: 0.02 };
 
 /// Half the 95 % interval of a normal error (standard deviations).
 const NORMAL_95: f64 = 1.96;
@@ -170,11 +174,13 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
         _ => NORMAL_95 as f32 * variances.as_slice()[at].sqrt(),
     });
     let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
-    let blind =
-        inside.iter().filter(|&&at| f64::from(detectable.as_slice()[at]) > WAVE_AMPLITUDE_VOXELS * edge).count();
+    let blind = inside
+        .iter()
+        .filter(|&&at| f64::from(detectable.as_slice()[at]) > IMPOSED.wave_amplitude_voxels * edge)
+        .count();
     let thick = (0..3).filter(|&a| grid.shape()[a] > 1).max_by_key(|&a| grid.shape()[a]).unwrap_or(0);
-    let uniform = stretch(&grid, thick, UNIFORM_STRAIN);
-    let mut known = vec![(format!("uniform strain of {:.0} %", 100.0 * UNIFORM_STRAIN), uniform)];
+    let uniform = stretch(&grid, thick, IMPOSED.uniform_strain);
+    let mut known = vec![(format!("uniform strain of {:.0} %", 100.0 * IMPOSED.uniform_strain), uniform)];
     known.extend(like.map(|like| ("the motion that was given".to_string(), like.clone())));
     let mut imposed = vec![compared("none (at rest)".into(), &at_rest, &still, &tissue, chosen.gauge_mm)?];
     for (motion, truth) in known {
@@ -197,7 +203,7 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
             gauge_mm: chosen.gauge_mm,
             strain_noise: chosen.noise,
             strain_noise_by_gauge: by_gauge,
-            amplitude_mm: WAVE_AMPLITUDE_VOXELS * edge,
+            amplitude_mm: IMPOSED.wave_amplitude_voxels * edge,
             gains: by_wavelength.iter().map(|&[wavelength_mm, gain]| Gain { wavelength_mm, gain }).collect(),
             wavelength_90_mm,
             wavelength_50_mm,
@@ -258,7 +264,7 @@ fn image_noise(initial: &Voxels<'_>, second: Option<&Voxels<'_>>, tissue: &Mask)
 /// a slice they move along the axis that they grow along.
 fn stars(tissue: &Mask) -> Vec<Star> {
     let grid = tissue.grid();
-    let amplitude = WAVE_AMPLITUDE_VOXELS * grid.least_spacing();
+    let amplitude = IMPOSED.wave_amplitude_voxels * grid.least_spacing();
     let thick: Vec<usize> = (0..3).filter(|&a| grid.shape()[a] > 1).collect();
     let n = thick.len();
     (0..n).map(|i| Star::over(tissue, [thick[i], thick[(i + 1) % n], thick[(i + 2) % n]], amplitude)).collect()

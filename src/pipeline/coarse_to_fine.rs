@@ -375,9 +375,16 @@ pub(super) fn around(mask: &Mask, initial: &Voxels<'_>) -> Vec<u8> {
     tissue.as_slice().iter().zip(mask.as_slice()).map(|(t, m)| u8::from(*t != 0 || *m != 0)).collect()
 }
 
-/// Fewest voxels of tissue on the coarsest level: about one in seventy is a corner, and the field
-/// needs [`MIN_MATCHES`](super::field::MIN_MATCHES).
-const MIN_LEVEL_VOXELS: usize = 1500;
+/// Voxels of tissue on a level.
+struct LevelSize {
+    /// Fewest on the coarsest level: about one in seventy is a corner, and the field needs
+    /// [`MIN_MATCHES`](super::field::MIN_MATCHES).
+    min_coarsest: usize,
+    /// Most on the finest level of a preset that does not fix that level.
+    max_finest: usize,
+}
+
+const LEVEL_VOXELS: LevelSize = LevelSize { min_coarsest: 1500, max_finest: 600_000 };
 
 /// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30
 /// mm.
@@ -395,23 +402,21 @@ pub(super) fn inside(mask: &Mask) -> usize {
 }
 
 /// Reduction factors of the levels, coarse to fine: none but the finest with less tissue than
-/// [`MIN_LEVEL_VOXELS`].
+/// [`LEVEL_VOXELS`] says.
 pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) -> Vec<[usize; 3]> {
     let inside = inside(mask);
     let mut all = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
-    let too_coarse = all.iter().take_while(|f| inside / f.iter().product::<usize>() < MIN_LEVEL_VOXELS).count();
+    let too_coarse =
+        all.iter().take_while(|f| inside / f.iter().product::<usize>() < LEVEL_VOXELS.min_coarsest).count();
     all.drain(..too_coarse.min(all.len() - 1));
     all
 }
 
-/// Most voxels of the mask on the finest level of a preset that does not fix that level.
-const MAX_FINEST_VOXELS: usize = 600_000;
-
 /// Voxels between the nodes of the lattice on all levels but the finest.
 pub(super) const COARSE_NODE_SPACING_VOXELS: usize = 3;
 
-/// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than
-/// [`MAX_FINEST_VOXELS`] voxels of tissue are left.
+/// The finest level: as asked, or the first of 1, 2, 4, 8 at which the voxels of tissue are few
+/// enough, see [`LEVEL_VOXELS`].
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
     if asked > 0 {
         return asked;
@@ -421,5 +426,5 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
         let factor = factors(grid.shape(), grid.spacing(), f, 0.0)[0];
         inside / factor.iter().product::<usize>()
     };
-    [1, 2, 4].into_iter().find(|&f| left(f) <= MAX_FINEST_VOXELS).unwrap_or(8)
+    [1, 2, 4].into_iter().find(|&f| left(f) <= LEVEL_VOXELS.max_finest).unwrap_or(8)
 }

@@ -69,7 +69,7 @@ const WHOLE_SEARCH: WholeSearch =
 struct NextLevelSearch {
     /// Most features times the finest level's voxels per point: over 29 pairs 1,500 and 600
     /// features left the same error, 190 left 0.9 % more.
-    features_times_spacing: usize,
+    features_times_voxels_per_point: usize,
     /// Fewest features, even if few points are asked for.
     min_features: usize,
     /// Reach about the coarsest level's field over the search range.
@@ -77,7 +77,7 @@ struct NextLevelSearch {
 }
 
 const NEXT_LEVEL: NextLevelSearch =
-    NextLevelSearch { features_times_spacing: 75_000, min_features: 190, range_fraction: 0.25 };
+    NextLevelSearch { features_times_voxels_per_point: 75_000, min_features: 190, range_fraction: 0.25 };
 
 /// Shares of the features that agree with their neighbours, below which a search is not trusted.
 pub(super) struct KeptShare {
@@ -309,7 +309,7 @@ impl Search<'_> {
     /// smaller patches are distorted less, and fine texture tells a wrong island from the truth.
     pub fn next_level(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
         let only = own.only().filter(|_| ablation::is_on("next-level"))?;
-        let most = (NEXT_LEVEL.features_times_spacing / self.params.voxels_per_point.max(1))
+        let most = (NEXT_LEVEL.features_times_voxels_per_point / self.params.voxels_per_point.max(1))
             .clamp(NEXT_LEVEL.min_features, WHOLE_SEARCH.max_features);
         let wide = self.wide(pair, NEXT_LEVEL.range_fraction * self.range, most);
         (self.matching)();

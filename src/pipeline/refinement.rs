@@ -5,16 +5,22 @@ use crate::matching::pair::Pair;
 use crate::numerics::statistics::deviation;
 use crate::pipeline::level::{self, SplineField};
 
-/// Residual over the noise beyond which a finer lattice is tried: 0.5 to 0.75 where the motion was
-/// found, up to 0.95 where not, 1.4 to 12 for brains of two people.
-const MAX_RESIDUAL_TO_NOISE: f32 = 1.1;
+/// When a finer lattice is tried and accepted.
+struct LatticeTrial {
+    /// Residual over the noise beyond which it is tried: 0.5 to 0.75 where the motion was found, up
+    /// to 0.95 where not, 1.4 to 12 for brains of two people.
+    min_residual_to_noise: f32,
+    /// Misfit per degree of freedom that it must explain: superfluous lattices explained 0.3 to
+    /// 0.75 (docs/lab/2026-11-local-signal.md).
+    min_gain_per_degree_of_freedom: f64,
+    /// Passes on it, and again where it is accepted.
+    passes: usize,
+    /// Most nodes, to bound memory.
+    max_nodes: usize,
+}
 
-/// Misfit per degree of freedom that a finer lattice must explain: superfluous ones explained 0.3
-/// to 0.75 (docs/lab/2026-11-local-signal.md).
-const MIN_GAIN_PER_DEGREE_OF_FREEDOM: f64 = 0.8;
-
-/// Passes on each finer lattice, and again where it is accepted.
-const TRIAL_PASSES: usize = 4;
+const TRIAL: LatticeTrial =
+    LatticeTrial { min_residual_to_noise: 1.1, min_gain_per_degree_of_freedom: 0.8, passes: 4, max_nodes: 4_000_000 };
 
 /// Node spacing of the finest level at the start. Calibrated: docs/lab/2026-11-local-signal.md.
 struct InitialSpacing {
@@ -36,9 +42,6 @@ struct Warnings {
 }
 
 const WARN: Warnings = Warnings { residual: 0.05, gain_variation: 1.25 };
-
-/// Most nodes, to bound memory.
-const MAX_NODES: usize = 4_000_000;
 
 /// Voxels between the nodes of the finest level to begin with: as asked, or by the `inside` voxels
 /// of tissue.
@@ -72,25 +75,26 @@ pub(super) fn finer(
     let mut best = Explained { field, apart, said: Vec::new() };
     for closer in (2..apart).rev() {
         let lattice = level::lattice(pair, closer);
-        if noisy < MAX_RESIDUAL_TO_NOISE || lattice.len() > MAX_NODES || lattice == best.field.lattice {
+        if noisy < TRIAL.min_residual_to_noise || lattice.len() > TRIAL.max_nodes || lattice == best.field.lattice {
             break;
         }
         let mut next = level::carry(&best.field, lattice, |p| p);
-        refine(&mut next, TRIAL_PASSES);
+        refine(&mut next, TRIAL.passes);
         let gain = level::gained(pair, &warped(&best.field), warped(&next));
         let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
         let gain_per_degree = gain / (many - few).max(1.0);
-        let taken = gain > 0.0 && gain_per_degree > MIN_GAIN_PER_DEGREE_OF_FREEDOM;
+        let taken = gain > 0.0 && gain_per_degree > TRIAL.min_gain_per_degree_of_freedom;
         best.said.push(format!(
             "nodes every {closer} voxels: {}; the residual is {noisy:.1} times the noise, and {:.0} degrees of freedom more explain \
-             {gain_per_degree:.2} of the misfit each (chance: up to {MIN_GAIN_PER_DEGREE_OF_FREEDOM})",
+             {gain_per_degree:.2} of the misfit each (chance: up to {})",
             if taken { "taken" } else { "not taken" },
-            many - few
+            many - few,
+            TRIAL.min_gain_per_degree_of_freedom
         ));
         if !taken {
             break;
         }
-        refine(&mut next, TRIAL_PASSES);
+        refine(&mut next, TRIAL.passes);
         noisy = times(left(&next), pair.noise);
         (best.field, best.apart) = (next, closer);
     }
@@ -108,7 +112,7 @@ pub(super) fn unlike(pair: &Pair<'_>, left: f32) -> Option<String> {
     let tissue =
         pair.fixed_smooth.iter().zip(&pair.mask[..]).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);
     let (times, part) = (times(left, pair.noise), left / deviation(tissue) as f32);
-    (times > MAX_RESIDUAL_TO_NOISE && part > WARN.residual).then(|| {
+    (times > TRIAL.min_residual_to_noise && part > WARN.residual).then(|| {
         format!(
             "what is left of the difference is {times:.1} times the noise ({:.0} % of the contrast in the tissue): the volumes differ \
              by more than motion (contrast, brightness, missing tissue, another person), and the field may follow that; look at warped.nii.gz",

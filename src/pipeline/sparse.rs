@@ -61,21 +61,27 @@ struct LevelSearch {
 const LEVEL_SEARCH: LevelSearch =
     LevelSearch { patch_radius_voxels: 2, max_strain: 0.1, reach_voxels: [2.0, 1.0], iterations: [2, 3] };
 
-/// Voxels of the finest axis between lattice nodes: 4 and 6 leave 2 % less and 10 % more error.
+/// Voxels of the finest axis between lattice nodes: over the same pairs 4 and 6 leave 2 % less and
+/// 10 % more error.
 const NODE_SPACING_VOXELS: usize = 5;
 
-/// Error of a match beyond its covariance (voxels): 0.05 leaves 2 % more error, 0.3 a third more.
-const MODEL_ERROR_VOXELS: f64 = 0.02;
+/// Error of a match beyond its covariance; trade-offs are of the same five pairs.
+struct MatchError {
+    /// Its own error (voxels): 0.05 leaves 2 % more error, 0.3 a third more.
+    own_voxels: f64,
+    /// Error in common with its neighbours (voxels) in the choice of a motion model: a brightness
+    /// ramp of 15 % passes for an affine motion without it.
+    common_voxels: f64,
+}
 
-/// Common error of neighbouring matches (voxels) in the choice of a motion model: a brightness ramp
-/// of 15 % passes for an affine motion without it.
-const COMMON_ERROR_VOXELS: f64 = 0.1;
+const MATCH_ERROR: MatchError = MatchError { own_voxels: 0.02, common_voxels: 0.1 };
 
-/// Voxels of tissue for each point on coarser levels: 12 and 48 leave the same error.
+/// Voxels of tissue for each point on coarser levels: over the same pairs 12 and 48 leave equal
+/// errors.
 const VOXELS_PER_COARSE_POINT: usize = 24;
 
-/// Points on the finest level over those of the full method: half as many leave 40 % more error,
-/// twice as many the same.
+/// Points on the finest level over those of the full method: over the same pairs half as many leave
+/// 40 % more error, twice as many the same.
 const POINTS_RATIO: f64 = 2.5;
 
 /// Fewest voxels of tissue for each point asked for; with fewer, the next finer level is used.
@@ -376,7 +382,7 @@ fn coupled(
 ) -> Found {
     let radius = pair.in_voxels(LEVEL_SEARCH.patch_radius_voxels);
     let measured = matches.iter().map(|m| (m.voxel, m.measured.displacement, m.measured.covariance));
-    let (mut field, evidence) = level::couple(pair, measured, (&radius, MODEL_ERROR_VOXELS), Some(known));
+    let (mut field, evidence) = level::couple(pair, measured, (&radius, MATCH_ERROR.own_voxels), Some(known));
     unfold(&field.lattice, pair.spacing, &mut field.coefficients, MIN_JACOBIAN);
     let at = |m: &LevelMatch| field.lattice.at(&field.coefficients, m.voxel);
     let mut measured: Vec<Measured> = matches.iter().map(|m| Measured { field: at(m), ..m.measured }).collect();
@@ -418,7 +424,7 @@ fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: 
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let off = |m: &Measured, u: [f64; 3]| {
         let mut c = m.covariance;
-        c[..3].iter_mut().for_each(|v| *v += (COMMON_ERROR_VOXELS * finest).powi(2));
+        c[..3].iter_mut().for_each(|v| *v += (MATCH_ERROR.common_voxels * finest).powi(2));
         inverse(&c).map_or(0.0, |i| quadratic(&i, std::array::from_fn(|a| m.displacement[a] - u[a])))
     };
     let excess = |_, motion: &AffineMotion| {

@@ -34,21 +34,24 @@ struct Calibration {
 
 const CALIBRATION: Calibration = Calibration { region: 1.05, mean_length: 0.63, interval: 2.0 };
 
-/// Position error of interpolation and a voxel's extent (voxels, one axis): affine motions without
-/// noise come out 0.005 to 0.03 voxels off.
-const INTERPOLATION_ERROR_VOXELS: f64 = 0.015;
+/// Errors that the posterior does not contain.
+struct SourceErrors {
+    /// Position error of interpolation and a voxel's extent (voxels, one axis): affine motions
+    /// without noise come out 0.005 to 0.03 voxels off.
+    interpolation_voxels: f64,
+    /// Deviation of tissue out of view or without texture over what smoothness says (1).
+    /// Calibrated: docs/lab/2026-11-expected-error.md.
+    extrapolation: f32,
+    /// Deviation along an axis at a border between bodies over the jump there (1): one in ten such
+    /// voxels follows the wrong side (13 scenes).
+    side_fraction: f32,
+    /// Relative widening of the deviation per unexplained part of the variance between two
+    /// contrasts (1): 16 scenes, docs/lab/2026-11-inputs.md.
+    contrast: f64,
+}
 
-/// Deviation of tissue out of view or without texture over what smoothness says (1). Calibrated:
-/// docs/lab/2026-11-expected-error.md.
-const EXTRAPOLATION_WIDENING: f32 = 3.0;
-
-/// Deviation along an axis at a border between bodies over the jump there (1): one in ten such
-/// voxels follows the wrong side (13 scenes).
-const SIDE_ERROR_FRACTION: f32 = 0.18;
-
-/// Relative widening of the deviation per unexplained part of the variance between two contrasts
-/// (1): 16 scenes, docs/lab/2026-11-inputs.md.
-const CONTRAST_WIDENING: f64 = 5.0;
+const SOURCE: SourceErrors =
+    SourceErrors { interpolation_voxels: 0.015, extrapolation: 3.0, side_fraction: 0.18, contrast: 5.0 };
 
 /// Approximate number of voxels from which means over the mask are taken.
 pub(super) const SAMPLED_VOXELS: usize = 25_000;
@@ -83,7 +86,7 @@ impl Variances {
         let thick = || (0..3).filter(|&a| lattice.shape[a] > 1);
         let axes = thick().count().max(1) as f64;
         let edges = thick().map(|a| spacing[a].powi(2)).sum::<f64>();
-        let interpolation = (INTERPOLATION_ERROR_VOXELS * INTERPOLATION_ERROR_VOXELS * edges / axes) as f32;
+        let interpolation = (SOURCE.interpolation_voxels * SOURCE.interpolation_voxels * edges / axes) as f32;
         let mut parts: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; lattice.len()]);
         for m in 0..lattice.len() {
             let narrowed = (CALIBRATION.region * nodes.narrowed[m]).powi(2);
@@ -91,7 +94,7 @@ impl Variances {
             let model = narrowed * nodes.departure[m].powi(2) / axes as f32;
             let noise = free + interpolation;
             let misfit = free * (nodes.misfit[m] - 1.0).max(0.0);
-            let more = if nodes.hidden[m] { EXTRAPOLATION_WIDENING * EXTRAPOLATION_WIDENING - 1.0 } else { 0.0 };
+            let more = if nodes.hidden[m] { SOURCE.extrapolation * SOURCE.extrapolation - 1.0 } else { 0.0 };
             let all = [noise, misfit, model, more * (noise + misfit + model), 0.0, 0.0];
             all.into_iter().zip(&mut parts).for_each(|(v, part)| part[m] = v);
         }
@@ -142,7 +145,7 @@ impl Variances {
         let cell: usize = (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] * factor[a]).product();
         let borders = self.part(ErrorSource::Borders);
         for (voxel, jump) in jumps {
-            let square = (SIDE_ERROR_FRACTION * jump).powi(2) / cell as f32;
+            let square = (SOURCE.side_fraction * jump).powi(2) / cell as f32;
             lattice.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| borders[node] += w * square);
         }
     }
@@ -162,7 +165,7 @@ impl Variances {
     /// Widens all where the volumes have different contrasts, of whose variance their relation
     /// leaves this part.
     pub fn add_contrast(&mut self, left: f64) {
-        let more = ((1.0 + CONTRAST_WIDENING * left).powi(2) - 1.0) as f32;
+        let more = ((1.0 + SOURCE.contrast * left).powi(2) - 1.0) as f32;
         for m in 0..self.lattice.len() {
             let all: f32 = self.parts.iter().map(|part| part[m]).sum();
             self.part(ErrorSource::Misfit)[m] += more * all;

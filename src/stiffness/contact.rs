@@ -24,7 +24,7 @@ const ONSET_FRACTION: f64 = 0.02;
 struct Continuation {
     /// Last Newton step of a solution (mm): the error left is about a tenth of it.
     tolerance_mm: f64,
-    /// Shortest step that is tried, over the whole depth.
+    /// Shortest step that is tried, over the way between two depths.
     min_step_fraction: f64,
 }
 

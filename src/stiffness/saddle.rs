@@ -23,17 +23,16 @@ use rayon::prelude::*;
 const LANES: usize = 8;
 /// Iteration control of the mixed-precision solution.
 struct KrylovControl {
-    /// Error over the one before that one Krylov space reaches at best: the resolution of single
+    /// Least error of one Krylov space over the error before it: the resolution of single
     /// precision.
-    max_reduction: f64,
-    /// Goal of a Krylov space over the error allowed: it measures the refined solution's error only
-    /// approximately.
+    min_error_ratio: f64,
+    /// Goal of a Krylov space over the error allowed: it leaves a part for the refined solution.
     goal_fraction: f64,
     /// Most Krylov spaces for one right-hand side.
     max_spaces: usize,
 }
 
-const KRYLOV: KrylovControl = KrylovControl { max_reduction: 1e-5, goal_fraction: 0.5, max_spaces: 12 };
+const KRYLOV: KrylovControl = KrylovControl { min_error_ratio: 1e-5, goal_fraction: 0.5, max_spaces: 12 };
 
 /// Strength of a tie beyond which its node hardly moves under the tissue's forces.
 const FIRM_TIE_STRENGTH: f64 = 1e-3;
@@ -384,7 +383,8 @@ impl<'a> Saddle<'a> {
                 right.copy_from_slice(&x);
                 return Ok(());
             }
-            let goals = std::array::from_fn(|l| (KRYLOV.goal_fraction * whole[l]).max(KRYLOV.max_reduction * sizes[l]));
+            let goals =
+                std::array::from_fn(|l| (KRYLOV.goal_fraction * whole[l]).max(KRYLOV.min_error_ratio * sizes[l]));
             let apply = |v: &[[f32; L]]| self.precondition(self.blocks.multiply(&self.levels.nodes, v));
             let change = krylov::solve(left, &self.weights, goals, apply);
             for (l, x) in x.chunks_mut(self.pattern.unknowns()).enumerate() {

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 struct Tolerances {
     /// A solution.
     solution: f64,
-    /// A step of Newton's method, whose last step has this error.
+    /// A step of Newton's method: the solution is off by this part of the last step.
     newton_step: f64,
     /// A sensitivity, which is needed to a few per cent.
     sensitivity: f64,

@@ -146,11 +146,11 @@ impl Body {
     /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1; exactly 0 far outside.
     fn cover(&self, shape: &Superellipsoid, q: [f64; 3]) -> f64 {
         /// Beyond this number of voxels outside, the logistic is under 1e-9.
-        const CUTOFF_WIDTHS: f64 = 9.5;
+        const CUTOFF_VOXELS: f64 = 9.5;
         let d: [f64; 3] = std::array::from_fn(|a| q[a] - shape.centre[a]);
         // The voxel's extent in the plane is all that counts for a tube.
         let reach = shape.radii[0].max(shape.radii[1])
-            + CUTOFF_WIDTHS * if shape.radii[2].is_finite() { self.edge } else { self.edge_in_plane };
+            + CUTOFF_VOXELS * if shape.radii[2].is_finite() { self.edge } else { self.edge_in_plane };
         if d[0] * d[0] + d[1] * d[1] > reach * reach {
             return 0.0;
         }
@@ -159,7 +159,7 @@ impl Body {
         // changes the width.
         let rate = self.edges.iter().map(|e| (0..3).map(|w| e[w] * gradient[w]).sum::<f64>().powi(2)).sum::<f64>();
         let voxels = (1.0 - value) / rate.sqrt().max(1e-12);
-        if voxels < -CUTOFF_WIDTHS { 0.0 } else { cover(voxels, BORDER_WIDTH_VOXELS) }
+        if voxels < -CUTOFF_VOXELS { 0.0 } else { cover(voxels, BORDER_WIDTH_VOXELS) }
     }
 }
 

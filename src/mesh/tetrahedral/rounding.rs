@@ -29,7 +29,7 @@ struct SurfaceSmoothing {
     edge_curvature: f32,
     /// Power of the curvature over that one, with which bending counts less.
     edge_exponent: i32,
-    /// Length below which bending outweighs the fit to the binary distance (voxels).
+    /// Length below which bending outweighs the fit to the stepped distance (voxels).
     length_voxels: f32,
     /// Least distance of a voxel's centre from the surface (voxels).
     min_distance_voxels: f32,
