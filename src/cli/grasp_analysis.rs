@@ -95,7 +95,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         analysis.lost.iter().map(|(step, why)| format!("{name}: motion {step} is not reached: {why}")).collect();
     if let Some(fit) = &fit {
         warnings.extend(fit.failed.iter().map(|(model, why)| format!("{name}: {model} is not fitted: {why}")));
-        if fit.joints_off > pipeline::grasp::SHORT {
+        if fit.joints_off > pipeline::grasp::JOINT_TOLERANCE_RAD {
             warnings.push(format!(
                 "{name}: measured joint angles are up to {:.1} degrees from those that the scene's motions give; the fit takes the scene's",
                 fit.joints_off.to_degrees()

@@ -14,7 +14,7 @@ use palpate::error::Shown;
 use palpate::error::StiffnessError;
 use palpate::io::{self, OutputFolder};
 use palpate::pipeline;
-use palpate::pipeline::stiffness::{ENOUGH, FieldQuality, Inputs, inside};
+use palpate::pipeline::stiffness::{FieldQuality, Inputs, MIN_MATCHES_IN_BODY, inside};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
 use palpate::stiffness::boundary_conditions::Place;
@@ -259,7 +259,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let setting = Setting::read(options, params, body, field.grid(), &source.field)?;
     let mut matches = source.matches.as_ref().map(io::read_matches).transpose()?;
     if options.matches.is_none() && matches.as_ref().is_some_and(|m| !setting.holds_enough(m)) {
-        console.detail(&format!("fewer than {ENOUGH} matches in the body: the field itself is taken"));
+        console.detail(&format!("fewer than {MIN_MATCHES_IN_BODY} matches in the body: the field itself is taken"));
         (matches, source.matches) = (None, None);
     }
     let images = images(options, source.image.as_deref(), field.grid())?;
@@ -395,7 +395,7 @@ pub(super) struct Setting {
 impl Setting {
     /// Whether the body holds matches enough to go by them in place of the field.
     pub(super) fn holds_enough(&self, matches: &SparseField) -> bool {
-        inside(matches, &self.labels) >= ENOUGH
+        inside(matches, &self.labels) >= MIN_MATCHES_IN_BODY
     }
 
     pub(super) fn read(

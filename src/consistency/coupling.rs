@@ -35,14 +35,12 @@ pub fn step(
     (report, d, (moved / n as f64).sqrt() as f32)
 }
 
-/// How far the smoothness of a place and axis is drawn to that of the whole: weight of the mean
-/// over the lattice beside the window's own (dimensionless). Calibrated:
-/// docs/lab/2026-11-local-signal.md.
-const SHARED: f32 = 0.02;
+/// Weight of the lattice's mean smoothness beside that of the local window (dimensionless).
+/// Calibrated: docs/lab/2026-11-local-signal.md.
+const GLOBAL_SMOOTHNESS_WEIGHT: f32 = 0.02;
 
-/// Width of the window over which smoothness is estimated (nodes, one standard deviation of a
-/// Gaussian).
-const WINDOW: f64 = 1.5;
+/// Width of the window in which smoothness is estimated (nodes, one Gaussian standard deviation).
+const SMOOTHNESS_WINDOW_NODES: f64 = 1.5;
 
 /// The weights of the bending energy that the data support at each node and axis (planar, three
 /// components).
@@ -52,10 +50,11 @@ const WINDOW: f64 = 1.5;
 /// `energy` are planar and by node, `seen` the nodes that any data inform.
 pub fn supported(determined: &[f32], energy: &[f32], nodes: [usize; 3], seen: usize) -> Vec<f32> {
     let n = determined.len() / 3;
-    let shared = if ablation::is_on("local-smoothness") { SHARED } else { f32::MAX.sqrt() };
+    let shared = if ablation::is_on("local-smoothness") { GLOBAL_SMOOTHNESS_WEIGHT } else { f32::MAX.sqrt() };
     let mean = |v: &[f32]| shared * v.iter().map(|v| f64::from(*v)).sum::<f64>() as f32 / (3 * seen.max(1)) as f32;
     let (all, bent) = (mean(determined).max(1e-6), mean(energy));
-    let about = |v: &[f32]| filters::gaussian(v, nodes, nodes.map(|n| if n > 1 { WINDOW } else { 0.0 }));
+    let about =
+        |v: &[f32]| filters::gaussian(v, nodes, nodes.map(|n| if n > 1 { SMOOTHNESS_WINDOW_NODES } else { 0.0 }));
     let axes = determined.chunks_exact(n).zip(energy.chunks_exact(n));
     axes.flat_map(|(determined, energy)| {
         let pairs = about(determined).into_iter().zip(about(energy)).collect::<Vec<_>>();
@@ -146,16 +145,16 @@ pub struct Evidence {
     pub information: Symmetric3,
 }
 
-/// What rounding of `lambda L c` may pull with, of what the evidence pulls with.
-const ROUNDING: f64 = 0.1;
+/// Largest rounding of `lambda L c` over the gradient of the data term.
+const MAX_ROUNDING_FRACTION: f64 = 0.1;
 
 /// The largest weight of the bending energy in single precision: of an affine field `L c` is zero
 /// but for rounding, and that must not outweigh the evidence.
-fn borne(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
+fn max_smoothness(smoothness: &Smoothness, evidence: &[Evidence]) -> f32 {
     let pull = evidence.iter().map(|e| e.information[..3].iter().sum::<f64>() / 3.0).sum::<f64>();
     let rounded = smoothness.diagonal(&vec![1.0; smoothness.len()]).iter().map(|&v| f64::from(v)).sum::<f64>()
         * f64::from(f32::EPSILON);
-    ((ROUNDING * pull / rounded.max(f64::MIN_POSITIVE)) as f32).clamp(1.0, 1e9)
+    ((MAX_ROUNDING_FRACTION * pull / rounded.max(f64::MIN_POSITIVE)) as f32).clamp(1.0, 1e9)
 }
 
 /// The smooth field nearest to scattered evidence, robustly.
@@ -182,7 +181,7 @@ pub fn fit_from(
     rounds: usize,
 ) -> (Vec<f32>, f32) {
     let n = lattice.len();
-    let most = borne(smoothness, evidence);
+    let most = max_smoothness(smoothness, evidence);
     // A first guess of lambda: second derivatives of 0.01 / mm.
     let (mut c, mut lambda, mut scale) = match start {
         Some((c, lambda)) => (c.to_vec(), lambda.clamp(1e-2, most), 9.0 * f64::from(1u32 << rounds.clamp(1, 8)) / 2.0),
@@ -251,8 +250,8 @@ pub fn fit_from(
     (c, lambda)
 }
 
-/// Draws worked out side by side: each holds six vectors of the lattice.
-const SIDE_BY_SIDE: usize = 2;
+/// Posterior draws computed in parallel: each holds six lattice vectors in memory.
+const PARALLEL_DRAWS: usize = 2;
 
 /// What the data leave open and what they determine, by node of a lattice.
 #[derive(Debug, Clone, PartialEq)]
@@ -306,8 +305,8 @@ pub fn posterior(
     let mut squares = vec![0.0f32; n];
     let mut determined = vec![0.0f32; n];
     let mut drawn = Vec::with_capacity(draws);
-    for first in (0..draws).step_by(SIDE_BY_SIDE) {
-        let some: Vec<Vec<f32>> = (first..(first + SIDE_BY_SIDE).min(draws)).into_par_iter().map(draw).collect();
+    for first in (0..draws).step_by(PARALLEL_DRAWS) {
+        let some: Vec<Vec<f32>> = (first..(first + PARALLEL_DRAWS).min(draws)).into_par_iter().map(draw).collect();
         for x in some {
             for (i, (s, d)) in squares.iter_mut().zip(&mut determined).enumerate() {
                 *s += share * seen.iter().map(|c| x[c * n + i] * x[c * n + i]).sum::<f32>();

@@ -12,37 +12,53 @@ use crate::numerics::neighbours::Neighbours;
 use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, quadratic};
 use rayon::prelude::*;
 
-/// Neighbours about a match from which a motion is fitted.
-const NEIGHBOURS: usize = 8;
+/// How an affine motion grows from the neighbours of a match.
+struct MotionFit {
+    /// Neighbours of a match from which its motion is first fitted.
+    neighbours: usize,
+    /// Largest difference of displacement between neighbours of one body: a part of the voxel, and
+    /// a strain.
+    max_neighbour_difference: [f64; 2],
+    /// Error of the motion beyond a match's covariance (voxels), in each iteration of its growth.
+    model_error_voxels: [f64; 3],
+    /// Fewest matches of a motion, before it grows and after.
+    min_matches: [usize; 2],
+    /// Ridge weight on the motion's gradient, as a part of the places' spread.
+    ridge_weight: f64,
+    /// Most motions that are fitted.
+    max_seeds: usize,
+}
 
-/// Difference of displacement that neighbours of one body may show: a part of the voxel, and a
-/// strain.
-const ALIKE: [f64; 2] = [0.5, 0.5];
+const MOTION_FIT: MotionFit = MotionFit {
+    neighbours: 8,
+    max_neighbour_difference: [0.5, 0.5],
+    model_error_voxels: [0.09, 0.06, 0.03],
+    min_matches: [5, 6],
+    ridge_weight: 0.01,
+    max_seeds: 300,
+};
 
-/// What an affine motion may be off beyond a match's covariance (voxels), as it grows.
-const OFF: [f64; 3] = [0.09, 0.06, 0.03];
+/// How each match is assigned to one of two motions.
+struct Labelling {
+    /// Weight of the neighbours' assignment against the match's own cost (log odds where all
+    /// agree).
+    neighbour_weight: f64,
+    /// Mean-field iterations.
+    iterations: usize,
+}
 
-/// Fewest matches that a motion rests on, before it grows and after.
-const FEWEST: [usize; 2] = [5, 6];
+const LABELLING: Labelling = Labelling { neighbour_weight: 3.0, iterations: 10 };
 
-/// How far the gradient of an affine motion is drawn to zero, as a part of the places' spread.
-const RIDGE: f64 = 0.01;
+/// When two motions explain matches better than one.
+struct SplitTest {
+    /// Whole matches more that the second motion must explain.
+    min_matches_explained: f64,
+    /// Mean squared distance that it must take from each of its matches: the three degrees of
+    /// freedom of one.
+    min_mean_chi2: f64,
+}
 
-/// Motions that are fitted at most.
-const TRIED: usize = 300;
-
-/// Weight of the neighbours' side against a match's own cost (log odds where all of them agree).
-const TOGETHER: f64 = 3.0;
-
-/// Times that sides are balanced against the neighbours'.
-const ROUNDS: usize = 10;
-
-/// Matches more, in whole ones, that a second motion must explain for a split to be looked at.
-const WORTH: f64 = 3.0;
-
-/// Squared distance that the second motion must take from each match on its side (mean): the
-/// degrees of freedom of one.
-const FREEDOM: f64 = 3.0;
+const SPLIT_TEST: SplitTest = SplitTest { min_matches_explained: 3.0, min_mean_chi2: 3.0 };
 
 /// The second side of each split of `matches` that two motions explain better than one: at most
 /// two, the first against what is known of them ([`Measured::field`]), the other against the affine
@@ -50,8 +66,9 @@ const FREEDOM: f64 = 3.0;
 pub fn splits(matches: &[Measured], voxel: f64) -> Vec<Vec<bool>> {
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.place).collect();
     let tree = Neighbours::new(&places);
-    let near: Vec<Vec<usize>> = places.par_iter().map(|&p| tree.within(p, f64::INFINITY, NEIGHBOURS + 1)).collect();
-    let every = matches.len().div_ceil(TRIED).max(1);
+    let near: Vec<Vec<usize>> =
+        places.par_iter().map(|&p| tree.within(p, f64::INFINITY, MOTION_FIT.neighbours + 1)).collect();
+    let every = matches.len().div_ceil(MOTION_FIT.max_seeds).max(1);
     let tried: Vec<usize> = (0..matches.len()).step_by(every).collect();
     let informed = Informed::new(matches, voxel);
     let motions: Vec<Vec<f64>> =
@@ -60,31 +77,31 @@ pub fn splits(matches: &[Measured], voxel: f64) -> Vec<Vec<bool>> {
         let left = |costs: &Vec<f64>| costs.iter().zip(base).map(|(a, b)| a.min(*b)).sum::<f64>();
         motions.iter().map(|costs| (left(costs), costs)).min_by(|a, b| a.0.total_cmp(&b.0))
     };
-    let known = informed.costs(OFF.len() - 1, |m| m.field);
+    let known = informed.costs(MOTION_FIT.model_error_voxels.len() - 1, |m| m.field);
     let commonest = best(&vec![GATE; matches.len()]).map(|(_, costs)| costs.clone());
     let mut found: Vec<Vec<bool>> = Vec::new();
     for base in [known].into_iter().chain(commonest) {
         let Some((left, other)) = best(&base) else { continue };
-        if base.iter().sum::<f64>() - left < WORTH * GATE {
+        if base.iter().sum::<f64>() - left < SPLIT_TEST.min_matches_explained * GATE {
             continue;
         }
         let second = sides(&base, other, &near);
         let count = second.iter().filter(|s| **s).count();
         let own = base.iter().zip(other).zip(&second).filter(|(_, s)| **s).map(|((a, b), _)| a - b).sum::<f64>();
-        if own < FREEDOM * count as f64 {
+        if own < SPLIT_TEST.min_mean_chi2 * count as f64 {
             continue;
         }
-        if count.min(matches.len() - count) >= FEWEST[1] && !found.contains(&second) {
+        if count.min(matches.len() - count) >= MOTION_FIT.min_matches[1] && !found.contains(&second) {
             found.push(second);
         }
     }
     found
 }
 
-/// Matches with their information (1/mm^2) at each of [`OFF`].
+/// Matches with their information (1/mm^2) at each of the errors of [`MOTION_FIT`].
 struct Informed<'a> {
     matches: &'a [Measured],
-    information: [Vec<Option<Symmetric3>>; OFF.len()],
+    information: [Vec<Option<Symmetric3>>; MOTION_FIT.model_error_voxels.len()],
 }
 
 impl<'a> Informed<'a> {
@@ -97,7 +114,7 @@ impl<'a> Informed<'a> {
             };
             matches.iter().map(of).collect()
         };
-        Self { matches, information: OFF.map(with) }
+        Self { matches, information: MOTION_FIT.model_error_voxels.map(with) }
     }
 
     /// Squared distance of each match from the displacement `at` it, in its own standard
@@ -114,20 +131,21 @@ impl<'a> Informed<'a> {
     /// What the affine motion about a match leaves of all matches; none where too few agree.
     fn grown(&self, about: &Measured, near: &[usize], voxel: f64) -> Option<Vec<f64>> {
         let alike = |m: &&Measured| {
-            let allowed = ALIKE[0] * voxel + ALIKE[1] * distance(m.place, about.place);
+            let allowed = MOTION_FIT.max_neighbour_difference[0] * voxel
+                + MOTION_FIT.max_neighbour_difference[1] * distance(m.place, about.place);
             distance(m.displacement, about.displacement) < allowed
         };
         let mut held: Vec<Measured> = near.iter().map(|&j| &self.matches[j]).filter(alike).copied().collect();
         let mut costs = Vec::new();
-        let mut least = FEWEST[0];
-        for off in 0..OFF.len() {
+        let mut least = MOTION_FIT.min_matches[0];
+        for off in 0..MOTION_FIT.model_error_voxels.len() {
             if held.len() < least {
                 return None;
             }
-            let motion = affine(&held, OFF[off] * voxel)?;
+            let motion = affine(&held, MOTION_FIT.model_error_voxels[off] * voxel)?;
             costs = self.costs(off, |m| motion(m.place));
             held = self.matches.iter().zip(&costs).filter(|(_, c)| **c < GATE).map(|(m, _)| *m).collect();
-            least = FEWEST[1];
+            least = MOTION_FIT.min_matches[1];
         }
         Some(costs)
     }
@@ -149,7 +167,7 @@ fn affine(held: &[Measured], off: f64) -> Option<impl Fn([f64; 3]) -> [f64; 3] +
         }
         spread += weight * distance(m.place, centre).powi(2);
     }
-    (1..4).for_each(|r| a[r][r] += RIDGE * spread + f64::MIN_POSITIVE);
+    (1..4).for_each(|r| a[r][r] += MOTION_FIT.ridge_weight * spread + f64::MIN_POSITIVE);
     let rows = [cholesky_solve(a, b[0])?, cholesky_solve(a, b[1])?, cholesky_solve(a, b[2])?];
     Some(move |p| rows.map(|row| row.iter().zip(from(p)).map(|(r, x)| r * x).sum()))
 }
@@ -160,9 +178,12 @@ fn sides(first: &[f64], second: &[f64], near: &[Vec<usize>]) -> Vec<bool> {
     let chance = |log_odds: f64| 1.0 / (1.0 + (-log_odds).exp());
     let own: Vec<f64> = first.iter().zip(second).map(|(a, b)| 0.5 * (a - b)).collect();
     let mut share: Vec<f64> = own.iter().map(|&v| chance(v)).collect();
-    for _ in 0..ROUNDS {
+    for _ in 0..LABELLING.iterations {
         let about = |near: &[usize]| near[1..].iter().map(|&j| share[j]).sum::<f64>() / (near.len() - 1).max(1) as f64;
-        let next = near.iter().zip(&own).map(|(near, own)| chance(own + TOGETHER * (2.0 * about(near) - 1.0)));
+        let next = near
+            .iter()
+            .zip(&own)
+            .map(|(near, own)| chance(own + LABELLING.neighbour_weight * (2.0 * about(near) - 1.0)));
         share = next.collect();
     }
     share.into_iter().map(|s| s > 0.5).collect()

@@ -70,28 +70,26 @@ impl Choice {
     }
 }
 
-/// Excess misfit per determined degree of freedom up to which a simpler model stands. Measured on
-/// 96 phantoms without motion (four kinds, three noise levels, two sizes, four seeds): median 0.49,
-/// nine in ten under 1.07, at most 1.39.
+/// Excess misfit per degree of freedom up to which a simpler model is accepted. 96 phantoms without
+/// motion: median 0.49, nine in ten under 1.07, at most 1.39.
 pub const CHANCE: f64 = 1.7;
 
-/// Degrees of freedom that are counted at least: with fewer, chance and rounding in the noise model
-/// weigh too much.
-const FEWEST: f64 = 100.0;
+/// Least number of degrees of freedom in a ratio of misfits: with fewer, chance and the rounding of
+/// the noise model dominate.
+pub const MIN_DEGREES_OF_FREEDOM: f64 = 100.0;
 
-/// Median distance of the matches from a model (in units of `model_mm`, a fiftieth of a voxel)
-/// beyond which it does not stand, whatever the misfit: in a mask of a hundredth of a volume the
-/// degrees of freedom are overrated, and stillness passed for a motion of four voxels on which 32
-/// of 34 matches agreed.
-const CONTRADICTED: f64 = 50.0;
+/// When matches reject a model, whatever the misfit: a small mask overrates the degrees of freedom.
+struct Contradiction {
+    /// Median distance of the matches from the model (units of `model_mm`, a fiftieth of a voxel).
+    min_distance: f64,
+    /// The same over their distance from the free field: scattered matches contradict no model.
+    min_ratio: f64,
+}
 
-/// ... and in units of how far they are from the free field: matches that agree with nothing speak
-/// against no model.
-const ASTRAY: f64 = 1.5;
+const CONTRADICTION: Contradiction = Contradiction { min_distance: 50.0, min_ratio: 1.5 };
 
-/// Excess misfit per degree of freedom about any one place beyond which no map stands: tissue that
-/// moves otherwise is not outvoted by more tissue that does not. True maps reach 2.7, muscle that
-/// moves inside a still ring 5.7 and more. Calibrated: docs/lab/2026-11-expected-error.md.
+/// Excess misfit per degree of freedom about one place beyond which no map is accepted: true maps
+/// reach 2.7. Calibrated: docs/lab/2026-11-expected-error.md.
 pub const PLACE: f64 = 4.0;
 
 /// How much worse the volumes agree under a map than under the free field, in units of noise.
@@ -132,13 +130,13 @@ pub fn choose(
         let mut off: Vec<f32> = matches.iter().map(|m| off(m) as f32).collect();
         if off.is_empty() { 0.0 } else { f64::from(median(&mut off)) }
     };
-    let astray = middle(&|m| distance(m.field, m.displacement));
+    let scatter = middle(&|m| distance(m.field, m.displacement));
     for (model, motion) in tried {
         let Excess { total, worst } = excess(model, &motion);
-        let ratio = total / determined.max(FEWEST);
+        let ratio = total / determined.max(MIN_DEGREES_OF_FREEDOM);
         let off = middle(&|m| distance(motion.displacement(m.place), m.displacement));
         let name = model.name();
-        let contradicted = off > CONTRADICTED * model_mm && off > ASTRAY * astray;
+        let contradicted = off > CONTRADICTION.min_distance * model_mm && off > CONTRADICTION.min_ratio * scatter;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
         let there = format!(", {worst:.1} at the worst place (at most {PLACE})");
         evidence.push(format!(
@@ -156,7 +154,7 @@ pub fn choose(
 }
 
 /// Squared Mahalanobis distance at which the robust cost reaches half of its bound.
-const SCALE: f64 = 16.0;
+const ROBUST_SCALE_SQUARED: f64 = 16.0;
 
 fn apart(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|c| a[c] - b[c])
@@ -174,7 +172,7 @@ fn step<const N: usize>(
     let (mut h, mut b) = ([[0.0; N]; N], [0.0; N]);
     for (m, i) in matches.iter().zip(information) {
         let e = apart(m.displacement, motion.displacement(m.place));
-        let w = if first { 1.0 } else { (SCALE / (SCALE + quadratic(i, e))).powi(2) };
+        let w = if first { 1.0 } else { (ROBUST_SCALE_SQUARED / (ROBUST_SCALE_SQUARED + quadratic(i, e))).powi(2) };
         let (pull, j) = (multiply(i, e), jacobian(m));
         let ij = j.map(|column| multiply(i, column));
         for r in 0..N {

@@ -19,8 +19,8 @@ pub struct Measured {
     pub field: [f64; 3],
 }
 
-/// 99.9 % point of chi-square with three degrees of freedom: a match further off, as a squared
-/// Mahalanobis distance, does not fit.
+/// 99.9 % quantile of chi-square with three degrees of freedom: a match with a larger squared
+/// Mahalanobis distance is an outlier.
 pub const GATE: f64 = 16.27;
 
 /// Which matches to keep.

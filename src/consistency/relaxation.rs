@@ -23,11 +23,11 @@ pub struct Relaxed {
     pub energy_after: f64,
 }
 
-/// Inverse temperatures of the rounds: from undecided to decided.
-const BETAS: [f64; 12] = [4.0, 4.0, 6.0, 6.0, 9.0, 9.0, 13.0, 13.0, 20.0, 20.0, 30.0, 30.0];
+/// Inverse temperature of each iteration: the assignment goes from undecided to decided.
+const INVERSE_TEMPERATURES: [f64; 12] = [4.0, 4.0, 6.0, 6.0, 9.0, 9.0, 13.0, 13.0, 20.0, 20.0, 30.0, 30.0];
 
-/// Probability under which a candidate has no say with its neighbours.
-const LEAST: f64 = 1e-6;
+/// Probability below which a candidate does not influence its neighbours.
+const MIN_PROBABILITY: f64 = 1e-6;
 
 /// Relaxes the candidates (each list best correlation first).
 ///
@@ -51,13 +51,13 @@ const LEAST: f64 = 1e-6;
 pub fn relax(graph: &Graph, candidates: &[Vec<Candidate>]) -> Relaxed {
     let mut q: Vec<Vec<f64>> =
         candidates.iter().map(|list| softmax(list.iter().map(|c| -8.0 * (1.0 - f64::from(c.ncc))))).collect();
-    for beta in BETAS {
+    for beta in INVERSE_TEMPERATURES {
         // Most places have one or two candidates left after a few rounds.
         let likely: Vec<Vec<([f64; 3], f64)>> = candidates
             .iter()
             .zip(&q)
             .map(|(list, q)| {
-                list.iter().zip(q).filter(|(_, p)| **p > LEAST).map(|(c, p)| (c.displacement.0, *p)).collect()
+                list.iter().zip(q).filter(|(_, p)| **p > MIN_PROBABILITY).map(|(c, p)| (c.displacement.0, *p)).collect()
             })
             .collect();
         q = candidates

@@ -20,10 +20,10 @@ impl Default for HarrisParams {
     }
 }
 
-/// Slices worked on at once, and values of one product where slices are large: bounds the memory of
-/// the six products.
-const SLAB: usize = 24;
-const VALUES: usize = 5 << 20;
+/// Slices processed together: bounds the memory of the six gradient products.
+const MAX_SLICES_PER_SLAB: usize = 24;
+/// Values of one gradient product in memory where slices are large.
+const MAX_VALUES_PER_SLAB: usize = 5 << 20;
 
 /// Foerstner's measure `det M / trace(adj M) = 1 / trace(M^-1)` at each voxel, (intensity/mm)^2.
 ///
@@ -95,7 +95,7 @@ pub fn slabs(
     let halo = kernels[2].len();
     let flat = shape.contains(&1);
     let per_mm: [f32; 3] = std::array::from_fn(|a| (1.0 / spacing[a]) as f32);
-    let slab = (VALUES / plane).clamp(1, SLAB);
+    let slab = (MAX_VALUES_PER_SLAB / plane).clamp(1, MAX_SLICES_PER_SLAB);
     let mut out = vec![0.0f32; plane * slab.min(blocks[2])];
     for start in (0..blocks[2]).step_by(slab) {
         let end = (start + slab).min(blocks[2]);

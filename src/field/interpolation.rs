@@ -15,19 +15,19 @@ use crate::types::space::{cross, dot};
 use crate::types::{DenseField, Grid, Mask, TetMesh, TriMesh, Volume, WorldPoint};
 use rayon::prelude::*;
 
-/// Voxel centres this far (voxels) outside of an element are filled too, so that rounding leaves no
+/// Voxel centres this far (voxels) outside an element are also filled, so that rounding leaves no
 /// gaps.
-const TOLERANCE: f64 = 1e-9;
+const FILL_TOLERANCE_VOXELS: f64 = 1e-9;
 
-/// Rounding of a determinant, per unit of the coordinates that it is made of.
-const ROUNDING: f64 = 1e-15;
+/// Rounding error of a determinant, per unit of the coordinates that it is computed from.
+const DETERMINANT_ROUNDING: f64 = 1e-15;
 
-/// Up to this number of rows, cutting each with the faces costs less than finding those that an
-/// element reaches in a slice.
-const FEW_ROWS: usize = 6;
+/// Up to this number of rows, intersecting each with the faces costs less than first finding the
+/// rows that an element reaches in a slice.
+const MAX_ROWS_UNSECTIONED: usize = 6;
 
 /// Slices filled by one task.
-const SLAB: usize = 16;
+const SLICES_PER_TASK: usize = 16;
 
 /// A field inside of a mesh.
 #[derive(Debug, Clone, PartialEq)]
@@ -125,7 +125,7 @@ fn triangle_gradients(x: &[[f64; 3]; 3], axis: usize) -> ([[f64; 3]; 3], f64) {
     ([std::array::from_fn(|k| -(b[k] + c[k])), b, c], dot(u, b))
 }
 
-/// One slab of the result: `SLAB` slices of each component and of the mask.
+/// One slab of the result: `SLICES_PER_TASK` slices of each component and of the mask.
 struct Slab<'a> {
     components: [&'a mut [f32]; 3],
     inside: &'a mut [u8],
@@ -150,13 +150,13 @@ fn fill_elements<const N: usize>(
     });
     let mut displacements = DenseField::zeros(*grid);
     let mut inside = Volume::filled(*grid, 0u8);
-    let (n, plane) = (grid.len(), SLAB * shape[0] * shape[1]);
+    let (n, plane) = (grid.len(), SLICES_PER_TASK * shape[0] * shape[1]);
     let (right, rest) = displacements.as_mut_slice().split_at_mut(n);
     let (front, up) = rest.split_at_mut(n);
     let parts = right.par_chunks_mut(plane).zip(front.par_chunks_mut(plane)).zip(up.par_chunks_mut(plane));
     parts.zip(inside.as_mut_slice().par_chunks_mut(plane)).zip(&queues).enumerate().for_each(
         |(s, ((((right, front), up), inside), queue))| {
-            let mut slab = Slab { components: [right, front, up], inside, first: s * SLAB, shape };
+            let mut slab = Slab { components: [right, front, up], inside, first: s * SLICES_PER_TASK, shape };
             for &e in queue {
                 let values = elements[e as usize].map(|v| displacement[v as usize]);
                 let x = corners(e);
@@ -176,16 +176,18 @@ fn is_flat<const N: usize>(x: &[[f64; 3]; N], weights: &[[f64; 3]; N], determina
     let steepest = weights.iter().map(|&g| norm(g)).fold(0.0, f64::max);
     let reach = x.iter().map(|&p| norm(p)).fold(0.0, f64::max);
     let length = norm(std::array::from_fn(|k| extent(x, k)[1] - extent(x, k)[0]));
-    determinant.abs() <= TOLERANCE * steepest + ROUNDING * reach * length.powi(N as i32 - 2)
+    determinant.abs() <= FILL_TOLERANCE_VOXELS * steepest + DETERMINANT_ROUNDING * reach * length.powi(N as i32 - 2)
 }
 
 /// The elements that touch each slab, in the mesh's order; `slices` gives those of an element.
 fn queues(elements: usize, depth: usize, slices: impl Fn(u32) -> std::ops::Range<usize>) -> Vec<Vec<u32>> {
-    let mut queues = vec![Vec::new(); depth.div_ceil(SLAB)];
+    let mut queues = vec![Vec::new(); depth.div_ceil(SLICES_PER_TASK)];
     for e in 0..elements as u32 {
         let range = slices(e);
         if !range.is_empty() {
-            queues[range.start / SLAB..=(range.end - 1) / SLAB].iter_mut().for_each(|queue| queue.push(e));
+            queues[range.start / SLICES_PER_TASK..=(range.end - 1) / SLICES_PER_TASK]
+                .iter_mut()
+                .for_each(|queue| queue.push(e));
         }
     }
     queues
@@ -202,7 +204,7 @@ impl Slab<'_> {
             let [right, front, up] = gradients[i].map(|v| v / dot(gradients[i], gradients[i]).sqrt());
             // A face along the row is turned by less than the tolerance, to cut far away.
             let right = if right.abs() < 1e-12 { 1e-12 } else { right };
-            let offset = TOLERANCE - dot([right, front, up], x[(i + 1) % N]);
+            let offset = FILL_TOLERANCE_VOXELS - dot([right, front, up], x[(i + 1) % N]);
             (right > 0.0, [-offset / right, -front / right, -up / right])
         });
         if faces.iter().any(|(_, limit)| !dot(*limit, *limit).is_finite()) {
@@ -218,7 +220,7 @@ impl Slab<'_> {
         for k in slices.start.max(self.first)..slices.end {
             let z = k as f64;
             let cuts = faces.map(|(above, limit)| (above, limit[0] + limit[2] * z, limit[1]));
-            let rows = if rows.len() > FEW_ROWS { voxel_range(section(x, z), depth) } else { rows.clone() };
+            let rows = if rows.len() > MAX_ROWS_UNSECTIONED { voxel_range(section(x, z), depth) } else { rows.clone() };
             for j in rows {
                 let y = j as f64;
                 let (mut low, mut high) = (columns.start as f64, columns.end as f64 - 1.0);
@@ -265,18 +267,19 @@ impl Slab<'_> {
 /// The extent along y of an element's cut with the plane at `z`, or a little more.
 fn section<const N: usize>(x: &[[f64; 3]; N], z: f64) -> [f64; 2] {
     // An edge this close to level counts from end to end.
-    const LEVEL: f64 = 1e-6;
+    const LEVEL_TOLERANCE_VOXELS: f64 = 1e-6;
     let mut range = [f64::INFINITY, f64::NEG_INFINITY];
-    let mut reach = |y: f64| range = [range[0].min(y - LEVEL), range[1].max(y + LEVEL)];
+    let mut reach =
+        |y: f64| range = [range[0].min(y - LEVEL_TOLERANCE_VOXELS), range[1].max(y + LEVEL_TOLERANCE_VOXELS)];
     for i in 1..N {
         for j in 0..i {
             let (p, q) = if x[i][2] < x[j][2] { (x[i], x[j]) } else { (x[j], x[i]) };
             let (below, above) = (z - p[2], q[2] - z);
-            if below < -LEVEL || above < -LEVEL {
+            if below < -LEVEL_TOLERANCE_VOXELS || above < -LEVEL_TOLERANCE_VOXELS {
                 continue;
             }
             let rise = q[2] - p[2];
-            if rise < LEVEL {
+            if rise < LEVEL_TOLERANCE_VOXELS {
                 reach(p[1]);
                 reach(q[1]);
             } else {
@@ -298,8 +301,8 @@ fn extent(vectors: &[[f64; 3]], k: usize) -> [f64; 2] {
 
 /// The voxels of an axis with `count` of them whose centres lie within an extent.
 fn voxel_range([low, high]: [f64; 2], count: usize) -> std::ops::Range<usize> {
-    let from = round_up(low - TOLERANCE).min(count);
-    let to = if high + TOLERANCE < 0.0 { 0 } else { (high + TOLERANCE) as u32 as usize + 1 };
+    let from = round_up(low - FILL_TOLERANCE_VOXELS).min(count);
+    let to = if high + FILL_TOLERANCE_VOXELS < 0.0 { 0 } else { (high + FILL_TOLERANCE_VOXELS) as u32 as usize + 1 };
     from..to.min(count).max(from)
 }
 

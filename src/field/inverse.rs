@@ -12,9 +12,8 @@ use crate::types::space::length;
 use crate::types::{DenseField, Grid};
 use rayon::prelude::*;
 
-/// Good enough (mm), well under f32's resolution of a millimetre-sized displacement on a
-/// metre-sized grid.
-const TOLERANCE_MM: f64 = 1e-5;
+/// Convergence tolerance (mm): under the resolution of single precision on a metre-sized grid.
+const CONVERGENCE_TOLERANCE_MM: f64 = 1e-5;
 
 /// An inverse field and how good it is.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,7 +49,7 @@ pub struct Inverse {
 /// ```
 pub fn invert(field: &DenseField, grid: Option<&Grid>) -> Inverse {
     let target = *grid.unwrap_or(field.grid());
-    let inverse = DenseField::from_voxels(target, |_, y| origin_of(field, y, TOLERANCE_MM).minus(y));
+    let inverse = DenseField::from_voxels(target, |_, y| origin_of(field, y, CONVERGENCE_TOLERANCE_MM).minus(y));
     let (max_residual_mm, outside) = (0..target.len())
         .into_par_iter()
         .map(|at| {

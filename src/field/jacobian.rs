@@ -102,12 +102,12 @@ fn up_to(field: &DenseField, mask: Option<&Mask>, limit: f32) -> Vec<usize> {
     (0..nz).into_par_iter().flat_map_iter(slice).collect()
 }
 
-/// Times that all that folds is gone over.
-const ROUNDS: usize = 500;
+/// Largest number of sweeps over the folded voxels.
+const MAX_ITERATIONS: usize = 500;
 
-/// Determinant below which a voxel counts as a fold to be opened, and to which it is: more than
-/// rounding in a file.
-const OPENED: [f32; 2] = [0.01, 0.02];
+/// Jacobian determinant below which a voxel is a fold, and the one that it is raised to: both
+/// exceed the rounding of a file.
+const FOLD_DETERMINANTS: [f32; 2] = [0.01, 0.02];
 
 /// Moves the voxels about each fold at the voxels that `count` (all where it is empty) by as little
 /// as opens it, until none is left or after 500 rounds.
@@ -116,12 +116,12 @@ const OPENED: [f32; 2] = [0.01, 0.02];
 /// on both sides, rises to a little above zero (Kaczmarz's method on one constraint after another).
 pub fn unfold(field: &mut DenseField, count: &[u8]) {
     let counts = |at: usize| count.get(at).is_none_or(|c| *c != 0);
-    let mut folds: Vec<usize> = up_to(field, None, OPENED[0]).into_iter().filter(|&at| counts(at)).collect();
+    let mut folds: Vec<usize> = up_to(field, None, FOLD_DETERMINANTS[0]).into_iter().filter(|&at| counts(at)).collect();
     let shape = field.grid().shape();
     let inverse = *field.grid().affine().inverse_linear();
     let stride = [1, shape[0], shape[0] * shape[1]];
     let n = field.grid().len();
-    for _ in 0..ROUNDS {
+    for _ in 0..MAX_ITERATIONS {
         if folds.is_empty() {
             break;
         }
@@ -153,7 +153,7 @@ pub fn unfold(field: &mut DenseField, count: &[u8]) {
                 })
             });
             let determinant: f64 = (0..3).map(|r| f[0][r] * cofactor[0][r]).sum();
-            let short = f64::from(OPENED[1]) - determinant;
+            let short = f64::from(FOLD_DETERMINANTS[1]) - determinant;
             if short <= 0.0 {
                 continue;
             }
@@ -175,7 +175,7 @@ pub fn unfold(field: &mut DenseField, count: &[u8]) {
             }
         }
         let near: Vec<usize> = near.into_iter().filter(|&at| counts(at)).collect();
-        folds = near.into_par_iter().filter(|&at| determinant_at(field, at) <= OPENED[0]).collect();
+        folds = near.into_par_iter().filter(|&at| determinant_at(field, at) <= FOLD_DETERMINANTS[0]).collect();
     }
 }
 

@@ -11,8 +11,8 @@ use crate::numerics::dense::dot;
 use crate::types::Volume;
 use crate::types::fingertip::{Column, PadModel, PadReduction, PlateCurve};
 
-/// Columns that a pad must have.
-const FEWEST: usize = 20;
+/// Fewest columns of a pad.
+const MIN_COLUMNS: usize = 20;
 
 /// The columns of a pad under its surface, along the voxel axis that faces the contact.
 ///
@@ -77,8 +77,8 @@ pub fn columns(
             compliance: tissue.iter().map(|e| thick / e).sum(),
         });
     }
-    if out.len() < FEWEST {
-        return Err(FingertipError::TooFew { found: out.len(), needed: FEWEST });
+    if out.len() < MIN_COLUMNS {
+        return Err(FingertipError::TooFew { found: out.len(), needed: MIN_COLUMNS });
     }
     Ok(out)
 }
@@ -154,8 +154,8 @@ pub fn reduce(columns: &[Column], deepest: f64) -> PadReduction {
     let layered: Vec<f64> = depths.iter().map(|&d| force(&mean, d)).collect();
     let residuals = [residual(&uniform), residual(&layered), 0.0];
     let model = match residuals {
-        [r, ..] if r <= ENOUGH => PadModel::Uniform,
-        [_, r, _] if r <= ENOUGH => PadModel::Layered,
+        [r, ..] if r <= MAX_FORCE_RESIDUAL => PadModel::Uniform,
+        [_, r, _] if r <= MAX_FORCE_RESIDUAL => PadModel::Layered,
         _ => PadModel::Map,
     };
     let radius_mm = radius(columns, deepest);
@@ -221,10 +221,15 @@ pub fn against_plate(mut pad: PadReduction, columns: &[Column], curve: Vec<[f64;
 
 /// Knots of a profile.
 const KNOTS: usize = 7;
-/// Weight of a profile's bends over that of its misfit: enough for the steps of voxels not to show.
-const STIFF: f64 = 1e-4;
-/// Least modulus of a profile, over the mean.
-const LEAST: f64 = 0.02;
+/// How the moduli of a profile are fitted to forces.
+struct ProfileFit {
+    /// Weight of second differences over that of the misfit: enough to hide the steps of voxels.
+    bending_weight: f64,
+    /// Least modulus over the mean.
+    min_modulus_ratio: f64,
+}
+
+const PROFILE_FIT: ProfileFit = ProfileFit { bending_weight: 1e-4, min_modulus_ratio: 0.02 };
 
 /// Force (N) at `depth` (mm) of a hemisphere with moduli (kPa) by the depth at which its springs
 /// are reached: `F = int 2 pi E(s) (d - s) ds`, whatever its radius.
@@ -242,8 +247,8 @@ pub fn profile_force(profile: &[[f64; 2]], depth: f64) -> f64 {
 
 /// The part of knot `k` for a modulus of 1 kPa.
 fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
-    const STEPS: usize = 200;
-    let step = depth / STEPS as f64;
+    const QUADRATURE_STEPS: usize = 200;
+    let step = depth / QUADRATURE_STEPS as f64;
     let hat = |s: f64| {
         let at = profile[k][0];
         match (k.checked_sub(1).map(|i| profile[i][0]), profile.get(k + 1).map(|p| p[0])) {
@@ -252,14 +257,14 @@ fn hat_force(profile: &[[f64; 2]], k: usize, depth: f64) -> f64 {
             _ => 1.0,
         }
     };
-    let all = (0..STEPS).map(|i| (i as f64 + 0.5) * step);
+    let all = (0..QUADRATURE_STEPS).map(|i| (i as f64 + 0.5) * step);
     all.map(|s| 2e-3 * std::f64::consts::PI * hat(s) * (depth - s) * step).sum()
 }
 
-/// The moduli above [`LEAST`] whose forces are nearest to `force` at `depths`: least squares with a
-/// small weight on bends, by coordinate descent. The first two are one where the pad is `curved`:
-/// a face touches it in a point, and what forces say of the springs there is the surface's step of
-/// a voxel. A flat pad is touched all over, and its first springs are the stiffest.
+/// The moduli whose forces are nearest to `force` at `depths`: least squares with a small weight on
+/// bends, by coordinate descent. The first two are one where the pad is `curved`: a face touches it
+/// in a point, and what forces say of the springs there is the surface's step of a voxel. A flat
+/// pad is touched all over, and its first springs are the stiffest.
 fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 2]> {
     let deepest = depths.last().copied().unwrap_or(1.0);
     let mut out: Vec<[f64; 2]> = (0..KNOTS).map(|k| [deepest * k as f64 / (KNOTS - 1) as f64, mean]).collect();
@@ -271,7 +276,7 @@ fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 
             (0..KNOTS).for_each(|j| a[i][j] += row[i] * row[j]);
         }
     }
-    let weight = STIFF * (0..KNOTS).map(|i| a[i][i]).sum::<f64>();
+    let weight = PROFILE_FIT.bending_weight * (0..KNOTS).map(|i| a[i][i]).sum::<f64>();
     for i in 1..KNOTS - 1 {
         let bend = [(i - 1, 1.0), (i, -2.0), (i + 1, 1.0)];
         for (r, x) in bend {
@@ -293,18 +298,18 @@ fn profile(depths: &[f64], force: &[f64], mean: f64, curved: bool) -> Vec<[f64; 
     for _ in 0..2000 {
         for i in first..KNOTS {
             let rest: f64 = (0..KNOTS).filter(|&j| j != i).map(|j| a[i][j] * out[j][1]).sum();
-            out[i][1] = ((b[i] - rest) / a[i][i].max(f64::MIN_POSITIVE)).max(LEAST * mean);
+            out[i][1] = ((b[i] - rest) / a[i][i].max(f64::MIN_POSITIVE)).max(PROFILE_FIT.min_modulus_ratio * mean);
         }
     }
     out[0][1] = out[first][1];
     out
 }
 
-/// Relative residual of the forces below which a smaller model is enough.
-const ENOUGH: f64 = 0.02;
+/// Relative residual of the forces up to which a smaller model is sufficient.
+const MAX_FORCE_RESIDUAL: f64 = 0.02;
 
-/// Rounds of the fit of a sphere.
-const SPHERES: usize = 20;
+/// Iterations of the fit of a sphere.
+const SPHERE_FIT_ITERATIONS: usize = 20;
 
 /// Radius (mm) of the sphere whose surface is nearest to that of the columns which a press of
 /// `deepest` mm touches: least squares of the gap along the press, from the paraboloid's on (Gauss
@@ -316,7 +321,7 @@ fn radius(columns: &[Column], deepest: f64) -> f64 {
     // gap = g + k s^2 / (1 + w) with s the distance from (x, y), w^2 = 1 - k^2 s^2 and k = 1 / R; w
     // is 1 at first.
     let (mut k, mut at, mut g) = (0.0f64, [0.0; 2], 0.0);
-    for round in 0..SPHERES {
+    for round in 0..SPHERE_FIT_ITERATIONS {
         let (mut m, mut rhs) = ([[0.0; 4]; 4], [0.0; 4]);
         for c in &near {
             let [x, y] = [0, 1].map(|a| c.place[a] - middle[a] - at[a]);

@@ -82,8 +82,8 @@ impl Phase {
     }
 }
 
-/// Times closer than this are one (s).
-pub const SAME: f64 = 1e-9;
+/// Times closer than this are equal (s).
+pub const TIME_TOLERANCE_S: f64 = 1e-9;
 
 /// The times of a run (s).
 #[derive(Debug, Clone)]
@@ -112,12 +112,12 @@ impl Schedule {
         }
         times.extend(scene.pushes.iter().flat_map(|p| [p.start, p.start + p.duration]));
         let (duration, every) = (scene.duration(), scene.integrator.output_every);
-        let samples = (duration / every + SAME).floor() as usize;
+        let samples = (duration / every + TIME_TOLERANCE_S).floor() as usize;
         times.extend((1..=samples).map(|k| k as f64 * every));
         times.sort_by(f64::total_cmp);
-        times.dedup_by(|a, b| *a - *b < SAME);
+        times.dedup_by(|a, b| *a - *b < TIME_TOLERANCE_S);
         // Without a rest its end is the start, which no interval ends at.
-        ends.retain(|end| end.0 > SAME);
+        ends.retain(|end| end.0 > TIME_TOLERANCE_S);
         Self { times, ends, duration }
     }
 }

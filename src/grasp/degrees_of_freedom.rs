@@ -12,17 +12,17 @@ use crate::numerics::dense::rank;
 use crate::types::grasp::Freedom;
 use crate::types::{FingertipModel, Scene};
 
-/// Directions shorter than this part of the longest do not count.
-const TOLERANCE: f64 = 1e-9;
-/// Turn of a joint for the derivative of an equilibrium (rad).
-const TURN: f64 = 1e-5;
-/// Derivatives below this part of a grip a radian, or of a turn, do not count (1).
-const LEAST: f64 = 1e-6;
-/// Bend of the knuckle of a finger of two joints at the pinch (rad): 20 degrees.
-const KNUCKLE: f64 = 20.0 * std::f64::consts::PI / 180.0;
+/// Length over the longest below which a direction does not count for the rank.
+const RANK_TOLERANCE: f64 = 1e-9;
+/// Rotation of a joint for the derivative of an equilibrium (rad).
+const DIFFERENCE_STEP_RAD: f64 = 1e-5;
+/// Least derivative of a grip per radian, or of a rotation, that is not zero (1).
+const MIN_DERIVATIVE: f64 = 1e-6;
+/// Bend of the knuckle of a two-joint finger at the pinch (rad): 20 degrees.
+const KNUCKLE_BEND_RAD: f64 = 20.0 * std::f64::consts::PI / 180.0;
 
-/// Joints of a left and a right finger that move, at most.
-const MOST: usize = 4;
+/// Most moving joints of a left and a right finger.
+const MAX_JOINTS: usize = 4;
 
 /// The table for all models, at the pinch of a scene: both fingers, one with the other locked, and
 /// a right finger of two joints, whose link is cut in half where the scene has it in one.
@@ -69,7 +69,7 @@ fn joints(scene: &Scene, counts: [usize; 2]) -> Vec<Joint> {
             let upper = of.upper.unwrap_or(0.5 * whole);
             let lower = whole - upper;
             // The upper link points outwards by the knuckle's bend, the lower one down.
-            let (sin, cos) = KNUCKLE.sin_cos();
+            let (sin, cos) = KNUCKLE_BEND_RAD.sin_cos();
             out.push(Joint { finger, tip: [side * (upper * cos + lower), -upper * sin] });
             out.push(Joint { finger, tip: [side * lower, 0.0] });
         }
@@ -106,21 +106,21 @@ fn freedom(scene: &Scene, model: FingertipModel, counts: [usize; 2]) -> Freedom 
     let moving = joints(&scene, counts);
     let columns: Vec<[f64; 4]> = moving.iter().map(|j| over(&rows, j, &scene).map(|v| v / a)).collect();
     let soft = [!normal, !normal, !tangent, !tangent];
-    let with = |count: usize| -> Vec<[f64; 3 + MOST + 4]> {
+    let with = |count: usize| -> Vec<[f64; 3 + MAX_JOINTS + 4]> {
         (0..4)
             .map(|k| {
-                let mut row = [0.0; 3 + MOST + 4];
+                let mut row = [0.0; 3 + MAX_JOINTS + 4];
                 // Lengths over the radius, so that all columns are of one size.
                 (row[0], row[1], row[2]) = (rows[k][0], rows[k][1], rows[k][2] / a);
                 columns.iter().take(count).enumerate().for_each(|(j, c)| row[3 + j] = c[k]);
-                row[3 + MOST + k] = if soft[k] { -1.0 } else { 0.0 };
+                row[3 + MAX_JOINTS + k] = if soft[k] { -1.0 } else { 0.0 };
                 row
             })
             .collect()
     };
     let count = moving.len();
     let displacements = soft.iter().filter(|s| **s).count();
-    let (all, locked) = (rank(&with(count), TOLERANCE), rank(&with(0), TOLERANCE));
+    let (all, locked) = (rank(&with(count), RANK_TOLERANCE), rank(&with(0), RANK_TOLERANCE));
     let coordinates = 3 + count + displacements;
     // Rigid tips answer to angles along their null space alone, and to torques also by their grip.
     let angles: Vec<[f64; 2]> = if normal {
@@ -139,10 +139,10 @@ fn freedom(scene: &Scene, model: FingertipModel, counts: [usize; 2]) -> Freedom 
     };
     let unit = |v: &[f64; 2]| {
         let length = v[0].hypot(v[1]);
-        if length > LEAST { [v[0] / length, v[1] / length] } else { [0.0; 2] }
+        if length > MIN_DERIVATIVE { [v[0] / length, v[1] / length] } else { [0.0; 2] }
     };
-    let significant = |k: usize, ways: &[[f64; 2]]| usize::from(ways.iter().any(|v| v[k].abs() > LEAST));
-    let both = |ways: &[[f64; 2]]| rank(&ways.iter().map(unit).collect::<Vec<_>>(), LEAST);
+    let significant = |k: usize, ways: &[[f64; 2]]| usize::from(ways.iter().any(|v| v[k].abs() > MIN_DERIVATIVE));
+    let both = |ways: &[[f64; 2]]| rank(&ways.iter().map(unit).collect::<Vec<_>>(), MIN_DERIVATIVE);
     // A tip of springs also carries a moment on its plate.
     let carried = if normal || model == FingertipModel::Radial { 2 } else { 3 };
     Freedom {
@@ -168,7 +168,7 @@ fn response(statics: &Statics<'_>, pinch: &Equilibrium, joint: &Joint, scene: &S
     let whole = of.upper.unwrap_or(0.0) + of.link;
     let side = if joint.finger == 0 { 1.0 } else { -1.0 };
     let turned = |sign: f64| {
-        let turn = sign * TURN;
+        let turn = sign * DIFFERENCE_STEP_RAD;
         let mut moved = *statics;
         // The plate turns with the angle of one joint; the base makes up for where that puts the
         // tip.
@@ -183,11 +183,11 @@ fn response(statics: &Statics<'_>, pinch: &Equilibrium, joint: &Joint, scene: &S
     };
     let (up, down) = (turned(1.0)?, turned(-1.0)?);
     let grip = |e: &Equilibrium| 0.5 * (e.forces[0] + e.forces[1]) / pinch.forces[0];
-    Some([(up.q[2] - down.q[2]) / (2.0 * TURN), (grip(&up) - grip(&down)) / (2.0 * TURN)])
+    Some([(up.q[2] - down.q[2]) / (2.0 * DIFFERENCE_STEP_RAD), (grip(&up) - grip(&down)) / (2.0 * DIFFERENCE_STEP_RAD)])
 }
 
 /// Turns of the object along the directions that the rows leave, a unit turn of one joint each.
-fn null_turns(rows: &[[f64; 3 + MOST + 4]], count: usize) -> Vec<f64> {
+fn null_turns(rows: &[[f64; 3 + MAX_JOINTS + 4]], count: usize) -> Vec<f64> {
     // Each joint that the others leave free: pose and the other joints answer to it.
     let mut out = Vec::new();
     for free in 0..count {

@@ -3,12 +3,17 @@
 use crate::grasp::constraints::Coordinates;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
 
-/// Stride along the branch (rad).
-pub const STRIDE: f64 = 0.05;
-/// Slower than this the object rests (m/s, and rad/s times the tip's radius).
-const REST: f64 = 1e-4;
-/// A resting object further than this from the branch has left it (m).
-const APART: f64 = 1e-4;
+/// Step along the branch of equilibria (rad).
+pub const BRANCH_STEP_RAD: f64 = 0.05;
+/// When an object at rest has left the branch.
+struct RestTest {
+    /// Largest speed of an object at rest (m/s, and rad/s times the tip's radius).
+    max_speed: f64,
+    /// Largest distance from the branch (m).
+    max_distance_m: f64,
+}
+
+const REST: RestTest = RestTest { max_speed: 1e-4, max_distance_m: 1e-4 };
 
 /// The branch behind a run.
 #[derive(Debug, Clone)]
@@ -61,8 +66,8 @@ impl<'a> Branch<'a> {
         }
         let a = statics.geometry.scale();
         let size = |d: [f64; 3]| d[0].hypot(d[1]).max(a * d[2].abs());
-        let rests = size([v[0], v[1], v[2]]) <= REST;
-        let found = self.at.map(|at| statics.follow(&at, [q[3], q[4]], STRIDE));
+        let rests = size([v[0], v[1], v[2]]) <= REST.max_speed;
+        let found = self.at.map(|at| statics.follow(&at, [q[3], q[4]], BRANCH_STEP_RAD));
         let look = match found {
             None => {
                 self.at = if rests { self.near(q, f) } else { None };
@@ -71,7 +76,7 @@ impl<'a> Branch<'a> {
             Some(Ok(found)) => {
                 self.at = Some(found);
                 let apart = size([0, 1, 2].map(|k| found.q[k] - q[k]));
-                if rests && apart >= APART {
+                if rests && apart >= REST.max_distance_m {
                     self.at = self.near(q, f);
                     let mm = 1e3 * apart;
                     Look::Elsewhere(format!(

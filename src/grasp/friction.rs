@@ -10,11 +10,11 @@
 
 use crate::types::{FingertipModel, Scene};
 
-/// Lever of the torsion that a paraboloid of pressure carries, over the contact's radius (1):
-/// int (1 - s^2) s^2 ds / int (1 - s^2) s ds over 0 to 1.
-const LEVER: f64 = 8.0 / 15.0;
+/// Lever of the torsion of a parabolic pressure over the contact's radius (1): int (1 - s^2) s^2 ds
+/// / int (1 - s^2) s ds over 0 to 1.
+const TORSION_LEVER: f64 = 8.0 / 15.0;
 /// Normal force below which a contact carries nothing (N), far under the rounding of a force.
-const LEAST: f64 = 1e-9;
+const MIN_NORMAL_FORCE_N: f64 = 1e-9;
 
 /// Friction of both tips on the object.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,9 +50,13 @@ impl Friction {
         }
         let lever = |i: usize| {
             let d = d[i].clamp(0.0, self.radius[i]);
-            LEVER * (d * (2.0 * self.radius[i] - d)).sqrt()
+            TORSION_LEVER * (d * (2.0 * self.radius[i] - d)).sqrt()
         };
-        self.moment / (0..2).map(|i| f[i].max(LEAST) * lever(i)).sum::<f64>().max(LEAST * LEAST)
+        self.moment
+            / (0..2)
+                .map(|i| f[i].max(MIN_NORMAL_FORCE_N) * lever(i))
+                .sum::<f64>()
+                .max(MIN_NORMAL_FORCE_N * MIN_NORMAL_FORCE_N)
     }
 
     /// The coefficient that is left along the face, under the contact forces `f` (N) at the
@@ -75,6 +79,6 @@ impl Friction {
     /// The least coefficient that keeps both tips from sliding (1).
     pub fn required(&self, f: &[f64; 4], d: &[f64; 4]) -> f64 {
         let spin = self.spin(f, d);
-        (0..2).map(|i| (f[2 + i] / f[i].max(LEAST)).hypot(spin)).fold(0.0, f64::max)
+        (0..2).map(|i| (f[2 + i] / f[i].max(MIN_NORMAL_FORCE_N)).hypot(spin)).fold(0.0, f64::max)
     }
 }

@@ -129,26 +129,37 @@ impl Stepper for SemiImplicitEuler {
     }
 }
 
-/// Dormand and Prince's coefficients (Hairer et al., table II.5.2): nodes, stages, weights of order
-/// 5, error weights.
-const NODES: [f64; 7] = [0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0, 1.0];
-const STAGES: [[f64; 6]; 6] = [
-    [0.2, 0.0, 0.0, 0.0, 0.0, 0.0],
-    [3.0 / 40.0, 9.0 / 40.0, 0.0, 0.0, 0.0, 0.0],
-    [44.0 / 45.0, -56.0 / 15.0, 32.0 / 9.0, 0.0, 0.0, 0.0],
-    [19372.0 / 6561.0, -25360.0 / 2187.0, 64448.0 / 6561.0, -212.0 / 729.0, 0.0, 0.0],
-    [9017.0 / 3168.0, -355.0 / 33.0, 46732.0 / 5247.0, 49.0 / 176.0, -5103.0 / 18656.0, 0.0],
-    [35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
-];
-const ERROR: [f64; 7] =
-    [71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0];
-/// Size below which a coordinate's error is measured against this (m, rad, and their rates).
-const FLOOR: f64 = 1e-3;
+/// Dormand and Prince's coefficients (Hairer et al., table II.5.2); the last stage holds the
+/// weights of order 5.
+struct DormandPrince {
+    /// Times of the stages, in steps.
+    nodes: [f64; 7],
+    /// Weights of the rates before each stage.
+    stages: [[f64; 6]; 6],
+    /// Weights of the error estimate.
+    error: [f64; 7],
+}
+
+const DORMAND_PRINCE: DormandPrince = DormandPrince {
+    nodes: [0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0, 1.0],
+    stages: [
+        [0.2, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3.0 / 40.0, 9.0 / 40.0, 0.0, 0.0, 0.0, 0.0],
+        [44.0 / 45.0, -56.0 / 15.0, 32.0 / 9.0, 0.0, 0.0, 0.0],
+        [19372.0 / 6561.0, -25360.0 / 2187.0, 64448.0 / 6561.0, -212.0 / 729.0, 0.0, 0.0],
+        [9017.0 / 3168.0, -355.0 / 33.0, 46732.0 / 5247.0, 49.0 / 176.0, -5103.0 / 18656.0, 0.0],
+        [35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
+    ],
+    error: [71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0],
+};
+
+/// Size below which a coordinate's error is relative to this (m, rad, and their rates).
+const MIN_ERROR_SCALE: f64 = 1e-3;
 /// Shortest step that is tried (s).
-pub const SHORTEST: f64 = 1e-8;
+pub const MIN_STEP_S: f64 = 1e-8;
 
 /// A step with control from `state`, whose rates are `first`: the state, the step taken and the one
-/// to try next (s). None where no step down to [`SHORTEST`] meets the tolerance.
+/// to try next (s). None where no step down to [`MIN_STEP_S`] meets the tolerance.
 pub fn dormand_prince<const N: usize, S: System<N>>(
     system: &S,
     phase: &Phase,
@@ -164,15 +175,15 @@ pub fn dormand_prince<const N: usize, S: System<N>>(
         let mut next = *state;
         for stage in 0..6 {
             next = *state;
-            for (weight, rate) in STAGES[stage].iter().zip(&rates).take(stage + 1) {
+            for (weight, rate) in DORMAND_PRINCE.stages[stage].iter().zip(&rates).take(stage + 1) {
                 next = along(&next, h * weight, rate);
             }
-            rates[stage + 1] = system.rate(&phase.inputs(t + NODES[stage + 1] * h), &next).0;
+            rates[stage + 1] = system.rate(&phase.inputs(t + DORMAND_PRINCE.nodes[stage + 1] * h), &next).0;
         }
         let mut error: f64 = 0.0;
         for k in 0..N {
-            let off: f64 = h * (0..7).map(|i| ERROR[i] * rates[i][k]).sum::<f64>();
-            let part = off.abs() / (tolerance * state[k].abs().max(next[k].abs()).max(FLOOR));
+            let off: f64 = h * (0..7).map(|i| DORMAND_PRINCE.error[i] * rates[i][k]).sum::<f64>();
+            let part = off.abs() / (tolerance * state[k].abs().max(next[k].abs()).max(MIN_ERROR_SCALE));
             error = if part.is_nan() { f64::INFINITY } else { error.max(part) };
         }
         let factor = if error.is_finite() { (0.9 * error.powf(-0.2)).clamp(0.2, 5.0) } else { 0.1 };
@@ -181,7 +192,7 @@ pub fn dormand_prince<const N: usize, S: System<N>>(
             return Some((next, h, h * factor));
         }
         h *= factor.min(0.9);
-        if h < SHORTEST {
+        if h < MIN_STEP_S {
             return None;
         }
     }

@@ -13,16 +13,24 @@ use crate::types::measured::{CoursePoint, Estimate, ForcePoint, MeasuredFit, Mea
 use crate::types::{FingertipModel, Scene};
 
 /// Models that are compared with measurements: with tangential deformation, without, and radial.
-const MODELS: [FingertipModel; 3] = [FingertipModel::Parallel, FingertipModel::ParallelNormal, FingertipModel::Radial];
-/// Largest correlation of neighbours that is believed: beyond it a table says next to nothing.
-const MOST_ALIKE: f64 = 0.98;
+const COMPARED_MODELS: [FingertipModel; 3] =
+    [FingertipModel::Parallel, FingertipModel::ParallelNormal, FingertipModel::Radial];
+/// Largest correlation of neighbouring samples: at a larger one the effective sample size of a
+/// table vanishes.
+const MAX_CORRELATION: f64 = 0.98;
 /// Time between samples of a run that is compared with measurements (s).
-const EVERY: f64 = 0.002;
-/// Steps of a fit, and the change of a logarithm at which it has settled.
-const STEPS: usize = 30;
-const SETTLED: f64 = 1e-7;
-/// Change of a logarithm for a derivative.
-const PROBE: f64 = 1e-3;
+const SAMPLE_INTERVAL_S: f64 = 0.002;
+/// Levenberg-Marquardt fit of the parameters' logarithms.
+struct FitControl {
+    /// Most iterations.
+    max_iterations: usize,
+    /// Step at which the fit has converged.
+    tolerance: f64,
+    /// Step of the central differences.
+    difference_step: f64,
+}
+
+const FIT: FitControl = FitControl { max_iterations: 30, tolerance: 1e-7, difference_step: 1e-3 };
 
 /// A fit before its evidence is known.
 struct Raw {
@@ -42,7 +50,7 @@ pub fn fit(scene: &Scene, measured: &Measurements) -> MeasuredFit {
         Measurements::Course(_) => ("course", 3),
     };
     let (mut raws, mut failed) = (Vec::new(), Vec::new());
-    for model in MODELS {
+    for model in COMPARED_MODELS {
         let found = match measured {
             // Without d_t a table of presses does not tell the first two apart.
             Measurements::Force(points)
@@ -92,7 +100,7 @@ fn fewer(misfit: &[f64], channels: usize) -> f64 {
         along += channel.windows(2).map(|w| w[0] * w[1]).sum::<f64>();
         whole += channel.iter().map(|v| v * v).sum::<f64>();
     }
-    let r = (along / whole).clamp(0.0, MOST_ALIKE);
+    let r = (along / whole).clamp(0.0, MAX_CORRELATION);
     (1.0 - r) / (1.0 + r)
 }
 
@@ -192,7 +200,7 @@ fn simulated(mut scene: Scene, points: &[CoursePoint]) -> Result<Vec<Sample>, St
 /// its part of c_n (Levenberg and Marquardt).
 fn course(scene: &Scene, model: FingertipModel, points: &[CoursePoint]) -> Result<Raw, String> {
     let mut scene = scene.with_model(model);
-    scene.integrator.output_every = EVERY.max(scene.integrator.step);
+    scene.integrator.output_every = SAMPLE_INTERVAL_S.max(scene.integrator.step);
     scene.object.friction = None;
     let a = scene.fingertip.radius;
     let start = [scene.fingertip.youngs_modulus, scene.fingertip.damping[0]];
@@ -213,16 +221,16 @@ fn course(scene: &Scene, model: FingertipModel, points: &[CoursePoint]) -> Resul
     let (mut p, mut states) = ([0.0; 2], with([0.0; 2])?);
     let (mut r, mut weight) = (misfit(&states), 1e-3);
     let mut normal = [[0.0; 2]; 2];
-    for _ in 0..STEPS {
+    for _ in 0..FIT.max_iterations {
         let mut columns: Vec<Vec<f64>> = Vec::new();
         for k in 0..parameters {
             let moved = |sign: f64| {
                 let mut q = p;
-                q[k] += sign * PROBE;
+                q[k] += sign * FIT.difference_step;
                 with(q).map(|s| misfit(&s))
             };
             let (up, down) = (moved(1.0)?, moved(-1.0)?);
-            columns.push(up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * PROBE)).collect());
+            columns.push(up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * FIT.difference_step)).collect());
         }
         let dot = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(a, b)| a * b).sum::<f64>();
         let mut b = [0.0; 2];
@@ -244,7 +252,7 @@ fn course(scene: &Scene, model: FingertipModel, points: &[CoursePoint]) -> Resul
             let part = (0.5 / size).min(1.0);
             let next = [p[0] + part * step[0], p[1] + part * step[1]];
             let better = with(next).ok().map(|s| (misfit(&s), s)).filter(|(m, _)| squares(m) <= squares(&r));
-            settled = size < SETTLED;
+            settled = size < FIT.tolerance;
             if let Some((misfit, s)) = better {
                 (p, r, states, weight) = (next, misfit, s, weight * 0.1);
                 break;

@@ -14,32 +14,37 @@ use crate::grasp::models::Tip;
 use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
-/// Branches of a tip at most.
-pub const MOST: usize = 3;
+/// Most branches of a tip.
+pub const MAX_BRANCHES: usize = 3;
 /// Forces and moments that a branch follows: d_n and d_t of both tips, and their tilts.
-const FOLLOWED: usize = 6;
+const BRANCH_ENTRIES: usize = 6;
 /// Entries of a state: those of the minimal form, then what each branch follows.
-pub const STATE: usize = minimal::STATE + MOST * FOLLOWED;
+pub const STATE: usize = minimal::STATE + MAX_BRANCHES * BRANCH_ENTRIES;
 
 /// What the branches carry at a contact, and how they go on.
 #[derive(Debug, Clone, Copy)]
 pub struct Carried {
     /// Forces (N) and moments (N m) of all branches together.
-    pub forces: [f64; FOLLOWED],
+    pub forces: [f64; BRANCH_ENTRIES],
     /// Rates of what they follow.
-    pub rates: [f64; MOST * FOLLOWED],
+    pub rates: [f64; MAX_BRANCHES * BRANCH_ENTRIES],
 }
 
 /// The branches of `plant`, which follow `p`, where the springs give the forces `f` (N) and
 /// `moments` (N m).
 #[inline(always)]
-pub fn carried<T: Tip>(plant: &Plant<T>, f: &[f64; 4], moments: &[f64; 2], p: &[f64; MOST * FOLLOWED]) -> Carried {
+pub fn carried<T: Tip>(
+    plant: &Plant<T>,
+    f: &[f64; 4],
+    moments: &[f64; 2],
+    p: &[f64; MAX_BRANCHES * BRANCH_ENTRIES],
+) -> Carried {
     let all = [f[0], f[1], f[2], f[3], moments[0], moments[1]];
-    let mut out = Carried { forces: [0.0; FOLLOWED], rates: [0.0; MOST * FOLLOWED] };
+    let mut out = Carried { forces: [0.0; BRANCH_ENTRIES], rates: [0.0; MAX_BRANCHES * BRANCH_ENTRIES] };
     for (i, [share, time]) in plant.branches.iter().enumerate() {
-        for k in 0..FOLLOWED {
-            let behind = all[k] - p[i * FOLLOWED + k];
-            out.rates[i * FOLLOWED + k] = behind / time;
+        for k in 0..BRANCH_ENTRIES {
+            let behind = all[k] - p[i * BRANCH_ENTRIES + k];
+            out.rates[i * BRANCH_ENTRIES + k] = behind / time;
             // A row that is held has no spring for a branch to stand beside.
             if k >= 4 || !plant.holds(k) {
                 out.forces[k] += share * behind;
@@ -52,13 +57,13 @@ pub fn carried<T: Tip>(plant: &Plant<T>, f: &[f64; 4], moments: &[f64; 2], p: &[
 /// Power that goes into the branches at the rates `w` of the displacements and the velocity `v`
 /// (W).
 #[inline(always)]
-pub fn taken(forces: &[f64; FOLLOWED], w: &[f64; 4], v: &Coordinates) -> f64 {
+pub fn taken(forces: &[f64; BRANCH_ENTRIES], w: &[f64; 4], v: &Coordinates) -> f64 {
     let tilts = [v[2] - v[3], -(v[2] + v[4])];
     (0..4).map(|k| forces[k] * w[k]).sum::<f64>() + forces[4] * tilts[0] + forces[5] * tilts[1]
 }
 
 /// What the branches of a state follow.
-pub fn followed<const N: usize>(s: &[f64; N]) -> [f64; MOST * FOLLOWED] {
+pub fn followed<const N: usize>(s: &[f64; N]) -> [f64; MAX_BRANCHES * BRANCH_ENTRIES] {
     std::array::from_fn(|k| s[minimal::STATE + k])
 }
 
@@ -127,7 +132,7 @@ impl<T: Tip> Form<STATE> for Relaxing<T> {
         let contact = self.0.geometry.contact(&e.q);
         let (f, moments) = self.0.contact_forces(&contact, &contact.displacements(), &[0.0; 4]);
         let rest = [f[0], f[1], f[2], f[3], moments[0], moments[1]];
-        for branch in s[minimal::STATE..].chunks_exact_mut(FOLLOWED) {
+        for branch in s[minimal::STATE..].chunks_exact_mut(BRANCH_ENTRIES) {
             branch.copy_from_slice(&rest);
         }
         s

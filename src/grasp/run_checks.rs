@@ -20,17 +20,17 @@ pub struct Watch {
     quiet: bool,
 }
 
-/// What goes on over a time and has its place in [`Watch`]'s and a run's tables.
-pub const LASTING: [EventKind; 2] = [EventKind::Slip, EventKind::ValidityRange];
+/// Events with a duration, by place in [`Watch`]'s and a run's tables.
+pub const LASTING_EVENTS: [EventKind; 2] = [EventKind::Slip, EventKind::ValidityRange];
 
 /// What a look at the contacts shows.
 #[derive(Debug, Clone, Default)]
 pub struct Findings {
     /// What ends the run: what, which tip (0 or 1), in words.
     pub fatal: Option<(EventKind, usize, String)>,
-    /// What begins now: place in [`LASTING`], tip, in words.
+    /// What begins now: place in [`LASTING_EVENTS`], tip, in words.
     pub begins: Vec<(usize, usize, String)>,
-    /// What is over: place in [`LASTING`], tip.
+    /// What is over: place in [`LASTING_EVENTS`], tip.
     pub over: Vec<(usize, usize)>,
 }
 
@@ -106,7 +106,7 @@ impl Watch {
             for (k, now) in now.into_iter().enumerate() {
                 let before = std::mem::replace(&mut self.ongoing[k][i], now);
                 if now && !before {
-                    let what = match LASTING[k] {
+                    let what = match LASTING_EVENTS[k] {
                         EventKind::Slip => {
                             let spin = if self.friction.moment == 0.0 { "" } else { " along the face" };
                             format!("|f_t| is {:.3} N and f_n {f_n:.3} N, friction{spin} {along:.3}", f_t.abs())

@@ -2,20 +2,20 @@
 //! that can fail.
 
 use crate::error::{GraspError, SceneError, below};
-use crate::grasp::control::{Phase, SAME, Schedule};
+use crate::grasp::control::{Phase, Schedule, TIME_TOLERANCE_S};
 use crate::grasp::dynamics::{Plant, Reading};
-use crate::grasp::equilibrium_branch::{Branch, Look, STRIDE};
+use crate::grasp::equilibrium_branch::{BRANCH_STEP_RAD, Branch, Look};
 use crate::grasp::friction::Friction;
 use crate::grasp::integrators::{Form, Rk4, SemiImplicitEuler, Stepper, System, dormand_prince};
 use crate::grasp::minimal::Minimal;
 use crate::grasp::models::{self, Tip};
 use crate::grasp::multipliers::Multipliers;
 use crate::grasp::relaxing::Relaxing;
-use crate::grasp::run_checks::{LASTING, Watch};
+use crate::grasp::run_checks::{LASTING_EVENTS, Watch};
 use crate::grasp::sliding::{self, Sliding};
 use crate::grasp::stability;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
-use crate::grasp::stepping::{self, LIMIT};
+use crate::grasp::stepping::{self, MAX_STABLE_GROWTH};
 use crate::grasp::tabulated::Tabulated;
 use crate::types::grasp::{ConstraintDrift, Event, EventKind, GraspRun, MotionRow, Sample};
 use crate::types::scene::{Formulation, Integrator, Method};
@@ -25,8 +25,8 @@ use std::f64::consts::PI;
 /// Called with the fraction of the run that is done (0 to 1).
 pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 
-/// Events that are kept at most; a tip at the edge may begin to slip in every step.
-const MOST_EVENTS: usize = 1000;
+/// Most events that are kept: a tip at the edge may begin to slip in every step.
+const MAX_EVENTS: usize = 1000;
 
 /// Simulates a scene from its pinch at rest.
 ///
@@ -126,7 +126,7 @@ pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspE
     if scene.initial.joints == [0.0; 2] {
         return Ok(start);
     }
-    statics.follow(&start, scene.initial.joints, STRIDE).map_err(|(lost, last)| GraspError::NoStart {
+    statics.follow(&start, scene.initial.joints, BRANCH_STEP_RAD).map_err(|(lost, last)| GraspError::NoStart {
         what: format!(
             "initial.theta cannot be reached from the pinch: at joint angles {:.2} and {:.2} degrees {}",
             last.q[3].to_degrees(),
@@ -137,8 +137,8 @@ pub fn start(scene: &Scene, statics: &Statics<'_>) -> Result<Equilibrium, GraspE
     })
 }
 
-/// Steps that a trial of an advised step takes at most.
-const TRIED: f64 = 3e5;
+/// Most steps of the trial of an advised step.
+const MAX_TRIAL_STEPS: f64 = 3e5;
 
 /// A step (s) that is stable at the start, at the postures of the motions, and, where that is soon
 /// tried, all the way.
@@ -149,7 +149,7 @@ fn advised(scene: &Scene, start: Equilibrium) -> f64 {
     // What is found is true to 1 %.
     let mut step = 0.98 * stepping::stable_step(scene, method, formulation, &at);
     let mut trial = scene.clone();
-    while scene.duration() / step < TRIED {
+    while scene.duration() / step < MAX_TRIAL_STEPS {
         trial.integrator.step = step;
         trial.integrator.output_every = trial.integrator.output_every.max(step);
         let blames = |run: &GraspRun| run.events.iter().any(|e| e.kind == EventKind::BadStep);
@@ -219,7 +219,8 @@ struct Run<'a, const N: usize, S: Form<N>> {
     trial: f64,
     /// Places from which d_t was counted at the start (m).
     origin: [f64; 2],
-    /// Events that go on, by place in [`LASTING`] and tip, with the origin of d_t when they began.
+    /// Events that go on, by place in [`LASTING_EVENTS`] and tip, with the origin of d_t when they
+    /// began.
     open: [[Option<(usize, f64)>; 2]; 2],
     /// The last that was over of each, with the length of its words before their end was added.
     over: [[Option<(usize, f64, usize)>; 2]; 2],
@@ -276,11 +277,18 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
                 self.open[k][i] = Some((at, origin));
                 continue;
             }
-            if self.result.events.len() < MOST_EVENTS {
+            if self.result.events.len() < MAX_EVENTS {
                 let origin = self.system.plant().geometry.origin[i];
                 self.open[k][i] = Some((self.result.events.len(), origin));
                 let last_valid = self.sample(phase, t, state).0;
-                self.push(Event { kind: LASTING[k], time: t, until: None, finger: Some(i + 1), what, last_valid });
+                self.push(Event {
+                    kind: LASTING_EVENTS[k],
+                    time: t,
+                    until: None,
+                    finger: Some(i + 1),
+                    what,
+                    last_valid,
+                });
             }
         }
         for (k, i) in found.over {
@@ -298,7 +306,7 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
         self.result.events.push(event);
     }
 
-    /// An event of [`LASTING`] is over at `until`, or its run.
+    /// An event of [`LASTING_EVENTS`] is over at `until`, or its run.
     fn close(&mut self, k: usize, i: usize, until: Option<f64>) {
         let Some((at, origin)) = self.open[k][i].take() else { return };
         let event = &mut self.result.events[at];
@@ -343,14 +351,14 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
     fn cause(&self, phase: &Phase, state: &[f64; N]) -> Option<EventKind> {
         let Integrator { method, step, .. } = self.scene.integrator;
         let growth = stepping::growth_of(method, &self.system, phase, step, state);
-        if growth <= LIMIT {
+        if growth <= MAX_STABLE_GROWTH {
             return None;
         }
         let here = Equilibrium { q: std::array::from_fn(|k| state[k]), ..Equilibrium::default() };
         let tips = models::tips(self.scene);
         let tips = [tips[0].as_ref(), tips[1].as_ref()];
         let minimal = stepping::growth_at(self.scene, tips, method, Formulation::Minimal, [step, 0.0], &here);
-        let gain = self.scene.integrator.formulation == Formulation::Multipliers && minimal <= LIMIT;
+        let gain = self.scene.integrator.formulation == Formulation::Multipliers && minimal <= MAX_STABLE_GROWTH;
         Some(if gain { EventKind::BadGain } else { EventKind::BadStep })
     }
 
@@ -445,7 +453,7 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
             Look::Elsewhere(what) => (what, Some(t)),
             _ => return,
         };
-        if self.result.events.len() < MOST_EVENTS {
+        if self.result.events.len() < MAX_EVENTS {
             let last_valid = self.sample(phase, t, &now).0;
             self.fold = until.is_none().then_some(self.result.events.len());
             self.push(Event { kind: EventKind::Fold, time: t, until, finger: None, what, last_valid });
@@ -481,7 +489,7 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
             self.result.constraint_drift = self.result.constraint_drift.worse(self.system.drift(&now));
             self.result.required_friction = self.result.required_friction.max(sample.required_friction);
 
-            let end = ends.next_if(|end| t1 >= end.0 - SAME);
+            let end = ends.next_if(|end| t1 >= end.0 - TIME_TOLERANCE_S);
             self.look_at_branch(&mut branch, &phase, t1, &reading, end.is_some());
             if let Some(&(_, step, target)) = end {
                 self.result.motions.push(MotionRow { step, target, reached: sample });
@@ -491,7 +499,7 @@ impl<const N: usize, S: Form<N>> Run<'_, N, S> {
                     break;
                 }
             }
-            if t1 >= next_output * output_every - SAME || t1 >= schedule.duration - SAME {
+            if t1 >= next_output * output_every - TIME_TOLERANCE_S || t1 >= schedule.duration - TIME_TOLERANCE_S {
                 self.result.samples.push(sample);
                 next_output += 1.0;
                 progress(t1 / schedule.duration);
@@ -547,7 +555,7 @@ fn run<const N: usize, S: Form<N>>(
         start,
         advice,
     };
-    if step_growth > LIMIT {
+    if step_growth > MAX_STABLE_GROWTH {
         let gain_to_blame = run.cause(&at_rest, &state) == Some(EventKind::BadGain);
         return Err(if gain_to_blame {
             let stable = stepping::stable_gain(scene, &start);

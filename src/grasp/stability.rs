@@ -11,12 +11,12 @@ use crate::numerics::dense::solve;
 use crate::types::grasp::{EnergySurface, Hold, Stability, StabilityRow};
 use crate::types::{FingertipModel, Scene};
 
-/// Below this part of the largest eigenvalue an eigenvalue counts as zero.
-const ZERO: f64 = 1e-9;
-/// Points along each side of a surface.
-const POINTS: usize = 41;
+/// Eigenvalue over the largest up to which it is zero.
+const ZERO_EIGENVALUE_RATIO: f64 = 1e-9;
+/// Points along each side of an energy surface.
+const POINTS_PER_SIDE: usize = 41;
 /// Models that are compared.
-pub const COMPARED: [FingertipModel; 2] = [FingertipModel::Parallel, FingertipModel::Radial];
+pub const COMPARED_MODELS: [FingertipModel; 2] = [FingertipModel::Parallel, FingertipModel::Radial];
 
 /// The equilibria of the pinch (step 0) and of each motion's target, on the branch from the pinch,
 /// with the model `model`; where one cannot be reached, the reason.
@@ -50,7 +50,7 @@ pub fn classify(eigenvalues: &[f64]) -> Stability {
         [one] => [*one, *one],
         [low, .., high] => [*low, *high],
     };
-    let zero = ZERO * largest;
+    let zero = ZERO_EIGENVALUE_RATIO * largest;
     match () {
         () if low > zero => Stability::Minimum,
         () if high < -zero => Stability::Maximum,
@@ -173,7 +173,7 @@ pub fn rows(scene: &Scene, step: usize, at: &Equilibrium) -> Vec<StabilityRow> {
         }
         row
     };
-    Hold::ALL.iter().flat_map(|hold| COMPARED.map(|model| row(model, *hold))).collect()
+    Hold::ALL.iter().flat_map(|hold| COMPARED_MODELS.map(|model| row(model, *hold))).collect()
 }
 
 /// Energy over (theta, y) and (theta, x) about `at`, joints and the third coordinate fixed, for the
@@ -184,16 +184,17 @@ pub fn surfaces(scene: &Scene, step: usize, at: &Equilibrium) -> Vec<EnergySurfa
     let least = at.displacements[0].min(at.displacements[1]);
     // theta to 12 degrees, y to a fifth of the radius, x until a tip leaves.
     let sides = [("y", 1, 0.2 * a), ("x", 0, (0.95 * least).min(0.2 * a))];
-    let steps =
-        |half: f64| -> Vec<f64> { (0..POINTS).map(|i| half * (2.0 * i as f64 / (POINTS - 1) as f64 - 1.0)).collect() };
+    let steps = |half: f64| -> Vec<f64> {
+        (0..POINTS_PER_SIDE).map(|i| half * (2.0 * i as f64 / (POINTS_PER_SIDE - 1) as f64 - 1.0)).collect()
+    };
     let mut out = Vec::new();
-    for model in COMPARED {
+    for model in COMPARED_MODELS {
         let tips = tips_of(scene, model);
         let statics = Statics::of(scene, [tips[0].as_ref(), tips[1].as_ref()]);
         let base = statics.energy(&at.q);
         for (axis, k, half) in sides {
             let (turns, moves) = (steps(12f64.to_radians()), steps(half));
-            let mut energy = Vec::with_capacity(POINTS * POINTS);
+            let mut energy = Vec::with_capacity(POINTS_PER_SIDE * POINTS_PER_SIDE);
             for other in &moves {
                 for turn in &turns {
                     let mut q = at.q;

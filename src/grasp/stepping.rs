@@ -14,9 +14,9 @@ use crate::types::Scene;
 use crate::types::grasp::StableStep;
 use crate::types::scene::{Formulation, Method};
 
-/// Growth of a step that still counts as stable: rounding of the derivatives is far below, and it
-/// means a factor e in 100,000 steps.
-pub const LIMIT: f64 = 1.0 + 1e-5;
+/// Largest growth of a stable step: far above the rounding of the derivatives, a factor e in
+/// 100,000 steps.
+pub const MAX_STABLE_GROWTH: f64 = 1.0 + 1e-5;
 
 /// Spectral radius of one step of `h` seconds about `state`, from central differences of the step
 /// itself.
@@ -42,39 +42,40 @@ pub fn growth<P: Stepper, const N: usize, S: Form<N>>(system: &S, phase: &Phase,
     spectral_radius(&matrix)
 }
 
-/// Parts of a step by which the motion's own growth is measured at first.
-const PARTS: f64 = 50.0;
+/// How the motion's own growth is separated from that of a step.
+struct MotionGrowth {
+    /// Parts of a step in which that growth is first measured.
+    initial_parts: f64,
+    /// Most halvings of the parts.
+    max_halvings: usize,
+    /// Relative change of the exponent by a halving, up to which the growth is the motion's own.
+    tolerance: f64,
+    /// Relative error of a step's exponent with which it follows the motion: both methods are of
+    /// first order at least, so it differs by less than half.
+    max_exponent_error: f64,
+}
 
-/// Times that they are halved at most.
-const HALVINGS: usize = 24;
-
-/// Part of the exponent by which the growth of halved parts may differ for it to be the motion's
-/// own.
-const SETTLED: f64 = 0.005;
+const MOTION_GROWTH: MotionGrowth =
+    MotionGrowth { initial_parts: 50.0, max_halvings: 24, tolerance: 0.005, max_exponent_error: 0.5 };
 
 /// By how much the motion itself grows in `h` seconds about `state`, from parts so short that
 /// halving them changes nothing; None where it does not. Longer parts would blow up by themselves,
 /// and what blows up in parts excused the step that blew up as a whole.
 fn own_growth<const N: usize, S: Form<N>>(system: &S, phase: &Phase, h: f64, state: &[f64; N]) -> Option<f64> {
-    let mut parts = PARTS;
+    let mut parts = MOTION_GROWTH.initial_parts;
     let mut before = f64::NAN;
-    for _ in 0..HALVINGS {
+    for _ in 0..MOTION_GROWTH.max_halvings {
         let exponent = parts * growth::<Rk4, N, S>(system, phase, h / parts, state).ln();
-        if exponent <= LIMIT.ln() {
+        if exponent <= MAX_STABLE_GROWTH.ln() {
             return None;
         }
-        if (exponent - before).abs() <= SETTLED * exponent {
+        if (exponent - before).abs() <= MOTION_GROWTH.tolerance * exponent {
             return Some(exponent.exp());
         }
         (before, parts) = (exponent, 2.0 * parts);
     }
     None
 }
-
-/// Largest part of the motion's own exponent, up to 1 in a step, by which a step's may differ and
-/// still follow it: both methods are at least of first order, so that they differ by less than half
-/// of it.
-const FOLLOWS: f64 = 0.5;
 
 /// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp
 /// itself is unstable (an object that falls, or by its control) and the step follows that growth,
@@ -91,12 +92,16 @@ pub fn growth_of<const N: usize, S: Form<N>>(
         Method::SemiImplicitEuler => growth::<SemiImplicitEuler, N, S>(system, phase, h, state),
         Method::Adaptive => 0.0,
     };
-    if found <= LIMIT || !found.is_finite() {
+    if found <= MAX_STABLE_GROWTH || !found.is_finite() {
         return found;
     }
     match own_growth(system, phase, h, state) {
         Some(own) if own.is_finite() && found <= 1.02 * own => 1.0,
-        Some(own) if own.ln() <= 1.0 && (found.ln() - own.ln()).abs() <= FOLLOWS * own.ln() => 1.0,
+        Some(own)
+            if own.ln() <= 1.0 && (found.ln() - own.ln()).abs() <= MOTION_GROWTH.max_exponent_error * own.ln() =>
+        {
+            1.0
+        }
         _ => found,
     }
 }
@@ -132,7 +137,7 @@ pub fn largest(low: f64, high: f64, stable: impl Fn(f64) -> bool) -> f64 {
 pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: &[Equilibrium]) -> f64 {
     let (gain, tips) = (scene.integrator.baumgarte, tips(scene));
     let tips = [tips[0].as_ref(), tips[1].as_ref()];
-    let stable = |h, e| growth_at(scene, tips, method, formulation, [h, gain], e) <= LIMIT;
+    let stable = |h, e| growth_at(scene, tips, method, formulation, [h, gain], e) <= MAX_STABLE_GROWTH;
     largest(1e-7, 1.0, |h| at.iter().all(|e| stable(h, e)))
 }
 
@@ -141,7 +146,7 @@ pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: 
 pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
     let (method, step, tips) = (scene.integrator.method, scene.integrator.step, tips(scene));
     let tips = [tips[0].as_ref(), tips[1].as_ref()];
-    largest(1e-3, 1e9, |g| growth_at(scene, tips, method, Formulation::Multipliers, [step, g], at) <= LIMIT)
+    largest(1e-3, 1e9, |g| growth_at(scene, tips, method, Formulation::Multipliers, [step, g], at) <= MAX_STABLE_GROWTH)
 }
 
 /// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tips`, with the

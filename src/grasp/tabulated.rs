@@ -14,12 +14,12 @@ use crate::numerics::surface::{Jet, Surface};
 use crate::types::Fingertip;
 use std::f64::consts::PI;
 
-/// Places of the table along depth and tilt.
-const PLACES: [usize; 2] = [25, 17];
+/// Entries of the table along depth and tilt.
+const TABLE_SIZE: [usize; 2] = [25, 17];
 /// Largest tilt in the table (rad).
-const STEEPEST: f64 = 1.4;
-/// Nodes of the quadrature along the cap's height and around it.
-const NODES: [usize; 2] = [16, 16];
+const MAX_TILT_RAD: f64 = 1.4;
+/// Quadrature nodes along the cap's height and around it.
+const QUADRATURE_NODES: [usize; 2] = [16, 16];
 
 /// The tables of a fingertip.
 #[derive(Debug, Clone)]
@@ -33,14 +33,16 @@ impl Tabulated {
     /// From `modulus` (Pa) of the springs by the depth (m, 0 to `radius`) at which a face that
     /// comes straight on reaches them.
     pub fn new(radius: f64, modulus: impl Fn(f64) -> f64) -> Self {
-        let step = [radius / (PLACES[0] - 1) as f64, STEEPEST / (PLACES[1] - 1) as f64];
+        let step = [radius / (TABLE_SIZE[0] - 1) as f64, MAX_TILT_RAD / (TABLE_SIZE[1] - 1) as f64];
         let at = |i: usize| {
-            weighted_means(radius, &modulus, (i % PLACES[0]) as f64 * step[0], (i / PLACES[0]) as f64 * step[1])
+            weighted_means(radius, &modulus, (i % TABLE_SIZE[0]) as f64 * step[0], (i / TABLE_SIZE[0]) as f64 * step[1])
         };
-        let all: Vec<[f64; 3]> = (0..PLACES[0] * PLACES[1]).map(at).collect();
+        let all: Vec<[f64; 3]> = (0..TABLE_SIZE[0] * TABLE_SIZE[1]).map(at).collect();
         let index = |v: f64, a: usize| (v / step[a]).round() as usize;
         let surface = |k: usize| {
-            Surface::new([radius, STEEPEST], PLACES, |d, tilt| all[index(d, 0) + PLACES[0] * index(tilt, 1)][k])
+            Surface::new([radius, MAX_TILT_RAD], TABLE_SIZE, |d, tilt| {
+                all[index(d, 0) + TABLE_SIZE[0] * index(tilt, 1)][k]
+            })
         };
         Self { means: [surface(0), surface(1), surface(2)] }
     }
@@ -63,16 +65,16 @@ fn weighted_means(radius: f64, modulus: &impl Fn(f64) -> f64, d: f64, tilt: f64)
     let part = (d / radius).max(1e-6);
     let (sin, cos) = tilt.sin_cos();
     let (mut sum, mut total) = ([0.0; 3], [0.0; 3]);
-    for i in 0..NODES[0] {
+    for i in 0..QUADRATURE_NODES[0] {
         // Midpoints in the root of the height resolve the middle of the cap, where the face first
         // touches.
-        let root = (i as f64 + 0.5) / NODES[0] as f64;
+        let root = (i as f64 + 0.5) / QUADRATURE_NODES[0] as f64;
         let height = part * (1.0 - root * root);
         let c: f64 = 1.0 - part + height;
         let s = (1.0 - c * c).max(0.0).sqrt();
-        let turn = |k: usize| PI * (k as f64 + 0.5) / NODES[1] as f64;
+        let turn = |k: usize| PI * (k as f64 + 0.5) / QUADRATURE_NODES[1] as f64;
         let around = |k| modulus(radius * (1.0 - (c * cos + s * sin * f64::cos(turn(k))).clamp(0.0, 1.0)));
-        let mean = (0..NODES[1]).map(around).sum::<f64>() / NODES[1] as f64;
+        let mean = (0..QUADRATURE_NODES[1]).map(around).sum::<f64>() / QUADRATURE_NODES[1] as f64;
         for (k, power) in [2, 1, 0].into_iter().enumerate() {
             let weight = root * height.powi(power);
             sum[k] += weight * mean;

@@ -18,77 +18,100 @@ use crate::matching::levels::from_level;
 use crate::matching::pair::Pair;
 use crate::numerics::cholesky::Cholesky;
 use crate::numerics::dense::dot;
-use crate::numerics::exponential::{WHOLE, exp, ln};
+use crate::numerics::exponential::{ROUND_TO_INTEGER, exp, ln};
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::{noise_sigma, percentile, robust_deviation, stands_for_all};
 use rayon::prelude::*;
 
-/// Edge of a block (the finest axis' voxels).
-const BLOCK: usize = 4;
+/// Which blocks of voxels the polynomials are fitted to.
+struct BlockSelection {
+    /// Edge of a block (voxels of the finest axis).
+    edge_voxels: usize,
+    /// Least number of blocks for each term of a polynomial.
+    min_per_term: usize,
+    /// Least brightness of a block over the noise: below it, the logarithm is unreliable.
+    min_snr: f64,
+    /// Least brightness of a deformed block over a single voxel's noise: excludes air and holes.
+    /// Averaging does not lower the Rician floor of 1.25 deviations.
+    min_voxel_snr: f64,
+    /// Largest number of blocks: about 25 for each term.
+    max_count: usize,
+}
 
-/// Degree of the polynomial; a lower one where there are few blocks.
-const DEGREE: usize = 4;
+const BLOCKS: BlockSelection =
+    BlockSelection { edge_voxels: 4, min_per_term: 8, min_snr: 5.0, min_voxel_snr: 3.0, max_count: 1000 };
 
-/// Blocks for each term of the polynomial at least.
-const BLOCKS_A_TERM: usize = 8;
+/// Highest degree of P; it is lower where there are few blocks.
+const PLACE_DEGREE: usize = 4;
 
-/// Brightness of a block, over the noise, from which its logarithm is believed.
-const ABOVE_NOISE: f64 = 5.0;
+/// Largest part of the values or blocks at or below zero in a volume whose brightness begins at 0.
+const MAX_NONPOSITIVE_FRACTION: f64 = 0.02;
 
-/// How far above the noise of a voxel (not of a level's averages: magnitudes have a floor of 1.25
-/// deviations that no average lowers) the deformed volume's blocks must be. Darker ones are air, a
-/// hole or a coil's far end, and their ratio says nothing.
-const ABOVE_FLOOR: f64 = 3.0;
+/// How the intensity at which brightness begins is estimated where it is not 0.
+struct ZeroLevel {
+    /// Percentile of a volume that stands for its darkest value; 100 minus it for the brightest.
+    percentile: f64,
+    /// Darkest over brightest value beyond which brightness may begin at the darkest value,
+    /// although none is negative.
+    min_darkest_ratio: f64,
+    /// Approximate number of voxels from which the percentiles are taken.
+    sampled_voxels: usize,
+}
 
-/// Part of the blocks that may be 0 or negative, in volumes of brightness.
-const NOT_POSITIVE: f64 = 0.02;
+const ZERO_LEVEL: ZeroLevel = ZeroLevel { percentile: 0.5, min_darkest_ratio: 0.2, sampled_voxels: 100_000 };
 
-/// Blocks at most, about 25 times the terms.
-const BLOCKS: usize = 1000;
+/// Iteratively reweighted least squares for both polynomials.
+struct RobustFit {
+    /// Iterations, which also alternate P and Q: the two converge slowly.
+    iterations: usize,
+    /// Residual at which the Cauchy weight is a half (robust standard deviations).
+    cauchy_tuning: f64,
+}
 
-/// Percentile of a volume where its brightness begins, where that is not 0, and the voxels that
-/// tell it. Where it is more than `OFFSET` of the percentile at the other end of both volumes, it
-/// may be that although no value is negative.
-const DARKEST: f64 = 0.5;
-const OFFSET: f64 = 0.2;
-const SAMPLED: usize = 100_000;
+const ROBUST_FIT: RobustFit = RobustFit { iterations: 12, cauchy_tuning: 2.0 };
 
-/// Rounds of weights, and of P in Q: the two settle slowly together.
-const ROUNDS: usize = 12;
+/// Logarithms of brightness that differ by less than this are equal.
+const LOG_TOLERANCE: f64 = 1e-6;
 
-/// Where the Cauchy weight is a half, in deviations of what is left.
-const HALF: f64 = 2.0;
+/// The polynomial Q of the logarithm of brightness; its argument is -1 to 1 over the tissue.
+struct ToneCurve {
+    /// Degree of Q.
+    degree: usize,
+    /// Argument beyond which Q is constant.
+    max_argument: f64,
+    /// Argument at which blocks are clamped in the fit.
+    max_fitted_argument: f64,
+    /// Steps of the table of Q.
+    table_steps: usize,
+    /// Fixed-point iterations that evaluate Q at the mean of both volumes' logarithms.
+    fixed_point_iterations: usize,
+    /// Steepest slope: a cube root has 1, a fourth root 1.2; at 2 the brightness of one volume no
+    /// longer grows with that of the other.
+    max_slope: f64,
+}
 
-/// Logarithms that differ by less are equal.
-const EQUAL: f64 = 1e-6;
+const TONE_CURVE: ToneCurve = ToneCurve {
+    degree: 3,
+    max_argument: 2.5,
+    max_fitted_argument: 1.2,
+    table_steps: 256,
+    fixed_point_iterations: 40,
+    max_slope: 1.5,
+};
 
-/// How far past the range of the tissue Q is followed, in halves of it.
-const PAST: f64 = 2.5;
+/// How far beyond its measured values P is extrapolated (logarithm).
+const PLACE_MARGIN_LOG: f64 = 0.1;
 
-/// How far past it blocks are fitted, in halves of it.
-const FITTED: f64 = 1.2;
+/// How the difference in brightness is compared between neighbours.
+struct NeighbourComparison {
+    /// Blocks whose median stands for the difference at a block.
+    median_blocks: usize,
+    /// Neighbouring blocks with which that median is compared.
+    compared: usize,
+}
 
-/// Steps of the table of Q.
-const TABLE: usize = 256;
-
-/// Rounds in which what Q leads to settles.
-const SETTLED: usize = 40;
-
-/// How far past the values that were measured the polynomial is followed (logarithm).
-const BEYOND: f64 = 0.1;
-
-/// Steepest Q: a cube root has 1, a fourth root 1.2, and at 2 another brightness no longer grows
-/// with the first.
-const STEEPEST: f64 = 1.5;
-
-/// Blocks about each whose middle difference is compared with their neighbours', and the
-/// neighbours.
-const AROUND: usize = 12;
-const BESIDE: usize = 6;
-
-/// Powers of the logarithm of brightness.
-const TONES: usize = 3;
+const NEIGHBOURS: NeighbourComparison = NeighbourComparison { median_blocks: 12, compared: 6 };
 
 /// The deformed volume's way to the initial one's brightness.
 #[derive(Debug, Clone, PartialEq)]
@@ -127,16 +150,24 @@ impl Zero {
     /// values.
     fn of(pair: &Pair<'_>) -> Vec<Self> {
         let sample = |v: &[f32]| -> Vec<f64> {
-            v.iter().step_by((v.len() / SAMPLED).max(1)).filter(|v| v.is_finite()).map(|v| f64::from(*v)).collect()
+            v.iter()
+                .step_by((v.len() / ZERO_LEVEL.sampled_voxels).max(1))
+                .filter(|v| v.is_finite())
+                .map(|v| f64::from(*v))
+                .collect()
         };
         let mut samples = [sample(&pair.fixed), sample(&pair.moving)];
-        let positive = |s: &Vec<f64>| s.iter().filter(|v| **v < 0.0).count() as f64 <= NOT_POSITIVE * s.len() as f64;
+        let positive =
+            |s: &Vec<f64>| s.iter().filter(|v| **v < 0.0).count() as f64 <= MAX_NONPOSITIVE_FRACTION * s.len() as f64;
         let all = samples.iter().all(positive);
-        let [darkest, brightest] = [DARKEST, 100.0 - DARKEST].map(|q| samples.each_mut().map(|s| percentile(s, q)));
+        let [darkest, brightest] = [ZERO_LEVEL.percentile, 100.0 - ZERO_LEVEL.percentile]
+            .map(|q| samples.each_mut().map(|s| percentile(s, q)));
         let zero = Self { at: [0.0; 2], sign: 1.0 };
         let from_darkest = Self { at: darkest, sign: 1.0 };
         match all {
-            true if darkest.iter().zip(brightest).all(|(low, high)| *low > OFFSET * high) => vec![zero, from_darkest],
+            true if darkest.iter().zip(brightest).all(|(low, high)| *low > ZERO_LEVEL.min_darkest_ratio * high) => {
+                vec![zero, from_darkest]
+            }
             true => vec![zero],
             false => vec![from_darkest, Self { at: brightest, sign: -1.0 }],
         }
@@ -173,40 +204,42 @@ impl Brightness {
     ) -> Option<Self> {
         let seen = seen_blocks(pair, warped, displacement);
         let noise = noise_sigma(&pair.moving, pair.moving_shape, |_| true);
-        let above = (factor.iter().product::<usize>() as f64).sqrt() * ABOVE_FLOOR;
-        let least = [f64::from(pair.noise) * ABOVE_NOISE, f64::from(noise) * above.max(ABOVE_NOISE)];
+        let above = (factor.iter().product::<usize>() as f64).sqrt() * BLOCKS.min_voxel_snr;
+        let least = [f64::from(pair.noise) * BLOCKS.min_snr, f64::from(noise) * above.max(BLOCKS.min_snr)];
         let found = Zero::of(pair).into_iter().filter_map(|zero| {
             let blocks = blocks(&seen, (zero, least), factor)?;
             Self::of(&blocks, shape, (zero, both))
         });
-        let left = |b: &Self| b.deviation[1] / b.deviation[0].max(EQUAL);
+        let left = |b: &Self| b.deviation[1] / b.deviation[0].max(LOG_TOLERANCE);
         found.min_by(|a, b| left(a).total_cmp(&left(b)))
     }
 
     /// From blocks of brightness from `zero` on.
     fn of(blocks: &[Block], shape: [usize; 3], (zero, both): (Zero, f64)) -> Option<Self> {
-        let room = blocks.len() / BLOCKS_A_TERM;
-        let powers = (0..=DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONES)?;
+        let room = blocks.len() / BLOCKS.min_per_term;
+        let powers =
+            (0..=PLACE_DEGREE).rev().map(|d| powers(shape, d)).find(|p| room >= p.len() + TONE_CURVE.degree)?;
         let mut differences: Vec<f64> = blocks.iter().map(Block::difference).collect();
         let usual = percentile(&mut differences, 50.0);
         let before = robust_deviation(differences.into_iter());
         let mut logs: Vec<f64> = blocks.iter().map(|b| 0.5 * (b.log[0] + b.log[1] + usual)).collect();
         let [low, high] = [2.0, 98.0].map(|q| percentile(&mut logs, q));
-        let scale = [0.5 * (low + high), (0.5 * (high - low)).max(EQUAL)];
+        let scale = [0.5 * (low + high), (0.5 * (high - low)).max(LOG_TOLERANCE)];
         let fitted = |place: bool, tone: bool| {
             let powers = if place { powers.clone() } else { vec![[0; 3]] };
             let n = powers.len();
             let by_place = |b: &Block| powers.iter().map(|p| monomial(scaled(shape, b.at), *p)).collect();
             let (terms, left) = robust(blocks, by_place, usual, tone.then_some(scale))?;
-            if steepest(&terms[n..]) > STEEPEST * scale[1] {
+            if steepest(&terms[n..]) > TONE_CURVE.max_slope * scale[1] {
                 return None;
             }
             let mut values: Vec<f64> = blocks.iter().map(|b| dot(&by_place(b), &terms[..n])).collect();
             let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(*v), r[1].max(*v)]);
             let [low, high] = [10.0, 90.0].map(|q| percentile(&mut values, q));
-            let [tone_low, tone_high] = [-PAST, PAST].map(|t| scale[0] + t * scale[1] - of_tone(&terms[n..], t) / 2.0);
-            let step = (tone_high - tone_low) / TABLE as f64;
-            let tone = (0..=TABLE).map(|i| tone_from(&terms[n..], scale, tone_low + i as f64 * step));
+            let [tone_low, tone_high] = [-TONE_CURVE.max_argument, TONE_CURVE.max_argument]
+                .map(|t| scale[0] + t * scale[1] - of_tone(&terms[n..], t) / 2.0);
+            let step = (tone_high - tone_low) / TONE_CURVE.table_steps as f64;
+            let tone = (0..=TONE_CURVE.table_steps).map(|i| tone_from(&terms[n..], scale, tone_low + i as f64 * step));
             Some(Self {
                 zero,
                 shape,
@@ -225,7 +258,7 @@ impl Brightness {
         let tone = Tone::of(&best);
         let left = |b: &Block| b.difference() - best.logarithm(tone.as_ref(), scaled(shape, b.at), b.log[1]);
         let [as_it_is, left] = between_neighbours(blocks, [&Block::difference, &left]);
-        Some(Self { uneven: left / as_it_is.max(EQUAL), ..best })
+        Some(Self { uneven: left / as_it_is.max(LOG_TOLERANCE), ..best })
     }
 
     /// P + Q at a place (-1 to 1) and logarithm of brightness in the deformed volume; `tone` is its
@@ -254,11 +287,11 @@ impl Brightness {
             scaled(self.shape, from_level(p, factor))
         };
         let step = if nx > 1 { (at([nx - 1, 0, 0])[0] - at([0; 3])[0]) / (nx - 1) as f64 } else { 0.0 };
-        let range = [self.range[0] - BEYOND, self.range[1] + BEYOND].map(|v| v as f32);
+        let range = [self.range[0] - PLACE_MARGIN_LOG, self.range[1] + PLACE_MARGIN_LOG].map(|v| v as f32);
         let tone = Tone::of(self);
         let one = |log: &mut Vec<f32>, (row, values): (usize, &mut [f32])| {
             let first = at([0, row % ny, row / ny]);
-            let mut along = [0.0; DEGREE + 1];
+            let mut along = [0.0; PLACE_DEGREE + 1];
             for ([x, y, z], t) in &self.place {
                 along[*x] += t * monomial(first, [0, *y, *z]);
             }
@@ -275,7 +308,7 @@ impl Brightness {
 
 /// Q as a table, with room for indices that are not checked.
 struct Tone {
-    table: [f32; 2 * TABLE],
+    table: [f32; 2 * TONE_CURVE.table_steps],
     /// The lowest logarithm, and steps of the table for 1.
     low: f32,
     steps: f32,
@@ -287,24 +320,25 @@ impl Tone {
         let [low, high] = found.tones;
         let last = *found.tone.last()?;
         let table = std::array::from_fn(|i| *found.tone.get(i).unwrap_or(&last) as f32);
-        Some(Self { table, low: low as f32, steps: (TABLE as f64 / (high - low)) as f32 })
+        Some(Self { table, low: low as f32, steps: (TONE_CURVE.table_steps as f64 / (high - low)) as f32 })
     }
 
     /// Of a logarithm of brightness, P in it: linear between the steps, and even past them.
     #[inline(always)]
     fn at(&self, tone: f32) -> f32 {
-        let at = ((tone - self.low) * self.steps).max(0.0).min(TABLE as f32);
-        let shifted = (at - 0.5) + WHOLE;
+        let at = ((tone - self.low) * self.steps).max(0.0).min(TONE_CURVE.table_steps as f32);
+        let shifted = (at - 0.5) + ROUND_TO_INTEGER;
         let i = (shifted.to_bits() & 0xffff) as usize;
-        let t = at - (shifted - WHOLE);
-        (1.0 - t) * self.table[i % (2 * TABLE)] + t * self.table[(i + 1) % (2 * TABLE)]
+        let t = at - (shifted - ROUND_TO_INTEGER);
+        (1.0 - t) * self.table[i % (2 * TONE_CURVE.table_steps)]
+            + t * self.table[(i + 1) % (2 * TONE_CURVE.table_steps)]
     }
 }
 
 /// What is taken out along a row of voxels.
 struct Row {
     /// P by powers of the place along the row.
-    along: [f32; DEGREE + 1],
+    along: [f32; PLACE_DEGREE + 1],
     /// That place (-1 to 1) at the first voxel, and from one to the next.
     x: [f32; 2],
     /// Lowest and highest P.
@@ -356,7 +390,7 @@ fn scaled(shape: [usize; 3], at: [f64; 3]) -> [f64; 3] {
 
 /// A logarithm of brightness, -1 to 1 over the range of the tissue, and little past it.
 fn toned(scale: [f64; 2], log: f64) -> f64 {
-    ((log - scale[0]) / scale[1]).clamp(-PAST, PAST)
+    ((log - scale[0]) / scale[1]).clamp(-TONE_CURVE.max_argument, TONE_CURVE.max_argument)
 }
 
 /// Q at a scaled brightness; straight on past the range of the tissue.
@@ -374,7 +408,7 @@ fn slope(terms: &[f64], t: f64) -> f64 {
 /// Q for a logarithm of the deformed volume's brightness: at the middle between that and the
 /// initial one's that it leads to.
 fn tone_from(terms: &[f64], scale: [f64; 2], log: f64) -> f64 {
-    (0..SETTLED).fold(0.0, |q, _| 0.5 * (q + of_tone(terms, toned(scale, log + q / 2.0))))
+    (0..TONE_CURVE.fixed_point_iterations).fold(0.0, |q, _| 0.5 * (q + of_tone(terms, toned(scale, log + q / 2.0))))
 }
 
 /// The steepest that Q is, either way, in the range of the tissue.
@@ -387,14 +421,15 @@ fn steepest(terms: &[f64]) -> f64 {
 fn between_neighbours(blocks: &[Block], values: [&dyn Fn(&Block) -> f64; 2]) -> [f64; 2] {
     let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at).collect();
     let tree = Neighbours::new(&places);
-    let near: Vec<Vec<usize>> = places.iter().map(|p| tree.within(*p, f64::INFINITY, AROUND)).collect();
+    let near: Vec<Vec<usize>> =
+        places.iter().map(|p| tree.within(*p, f64::INFINITY, NEIGHBOURS.median_blocks)).collect();
     values.map(|value| {
         let values: Vec<f64> = blocks.iter().map(value).collect();
         let middle = |near: &Vec<usize>| percentile(&mut near.iter().map(|&i| values[i]).collect::<Vec<_>>(), 50.0);
         let smooth: Vec<f64> = near.iter().map(middle).collect();
         let beside = near.iter().zip(&smooth).flat_map(|(near, here)| {
             let smooth = &smooth;
-            near.iter().skip(1).take(BESIDE).map(move |&i| (smooth[i] - here).abs())
+            near.iter().skip(1).take(NEIGHBOURS.compared).map(move |&i| (smooth[i] - here).abs())
         });
         percentile(&mut beside.collect::<Vec<_>>(), 50.0)
     })
@@ -414,18 +449,24 @@ fn robust(
     let mut weights: Vec<f64> = blocks.iter().map(|b| b.weight).collect();
     let mut best = (vec![0.0; n], 0.0);
     best.0[0] = usual;
-    for _ in 0..ROUNDS {
+    for _ in 0..ROBUST_FIT.iterations {
         for (row, b) in rows.iter_mut().zip(blocks) {
             let middle = 0.5 * (b.log[0] + b.log[1] + dot(&row[..n], &best.0[..n]));
             row.truncate(n);
-            let powers = |s| (1..=TONES).map(move |p| toned(s, middle).clamp(-FITTED, FITTED).powi(p as i32));
+            let powers = |s| {
+                (1..=TONE_CURVE.degree).map(move |p| {
+                    toned(s, middle)
+                        .clamp(-TONE_CURVE.max_fitted_argument, TONE_CURVE.max_fitted_argument)
+                        .powi(p as i32)
+                })
+            };
             row.extend(scale.into_iter().flat_map(powers));
         }
         let terms = fit(&rows, blocks, &weights)?;
         let left = || rows.iter().zip(blocks).map(|(row, b)| b.difference() - dot(row, &terms));
         let deviation = robust_deviation(left());
         for ((w, off), b) in weights.iter_mut().zip(left()).zip(blocks) {
-            *w = b.weight / (1.0 + (off / (HALF * deviation).max(EQUAL)).powi(2));
+            *w = b.weight / (1.0 + (off / (ROBUST_FIT.cauchy_tuning * deviation).max(LOG_TOLERANCE)).powi(2));
         }
         best = (terms, deviation);
     }
@@ -465,7 +506,7 @@ struct BlockMeans {
 
 /// The blocks that lie in the mask by half at least.
 fn seen_blocks(pair: &Pair<'_>, warped: &[f32], displacement: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<BlockMeans> {
-    let side = pair.in_voxels(BLOCK);
+    let side = pair.in_voxels(BLOCKS.edge_voxels);
     let along = |a: usize| (0..pair.shape[a]).step_by(side[a]);
     let starts: Vec<[usize; 3]> =
         along(2).flat_map(|k| along(1).flat_map(move |j| along(0).map(move |i| [i, j, k]))).collect();
@@ -482,12 +523,12 @@ fn blocks(seen: &[BlockMeans], (zero, least): (Zero, [f64; 2]), factor: [usize; 
     let bright = |s: &BlockMeans| -> [f64; 2] { std::array::from_fn(|i| zero.sign * (s.mean[i] - zero.at[i])) };
     let positive: Vec<(&BlockMeans, [f64; 2])> =
         seen.iter().map(|s| (s, bright(s))).filter(|(_, b)| b.iter().all(|v| *v > 0.0)).collect();
-    if (seen.len() - positive.len()) as f64 > NOT_POSITIVE * seen.len() as f64 {
+    if (seen.len() - positive.len()) as f64 > MAX_NONPOSITIVE_FRACTION * seen.len() as f64 {
         return None;
     }
     let clear: Vec<_> =
         positive.into_iter().filter(|(_, b)| b.iter().zip(least).all(|(b, least)| *b > least)).collect();
-    let share = BLOCKS as f64 / clear.len().max(1) as f64;
+    let share = BLOCKS.max_count as f64 / clear.len().max(1) as f64;
     let thinned = clear.into_iter().enumerate().filter(|(i, _)| stands_for_all(*i, share));
     let block =
         |(s, b): (&BlockMeans, [f64; 2])| Block { at: from_level(s.at, factor), log: b.map(f64::ln), weight: s.weight };

@@ -8,14 +8,14 @@
 use crate::numerics::filters;
 use crate::numerics::statistics::quantile;
 
-/// Number of intensity bins.
-const BINS: usize = 48;
+/// Intensity bins of each volume in the joint histogram.
+const INTENSITY_BINS: usize = 48;
 
-/// Quantiles between which they lie.
-const RANGE: [f64; 2] = [0.005, 0.995];
+/// Quantiles of the intensities at the first and the last bin.
+const RANGE_QUANTILES: [f64; 2] = [0.005, 0.995];
 
-/// Voxels for each intensity at least.
-const VOXELS: usize = 8;
+/// Least number of voxels for each intensity bin.
+const MIN_VOXELS_PER_BIN: usize = 8;
 
 /// The joint histogram of two volumes.
 #[derive(Debug, Clone)]
@@ -46,33 +46,33 @@ impl Relation {
     /// left out. None where there are too few, or all alike.
     pub fn of(pairs: impl Iterator<Item = [f32; 2]>) -> Option<Self> {
         let pairs: Vec<[f32; 2]> = pairs.filter(|p| p[0].is_finite() && p[1].is_finite()).collect();
-        if pairs.len() < VOXELS * BINS {
+        if pairs.len() < MIN_VOXELS_PER_BIN * INTENSITY_BINS {
             return None;
         }
         let range = |c: usize| {
             let mut values: Vec<f32> = pairs.iter().map(|p| p[c]).collect();
-            RANGE.map(|q| quantile(&mut values, q))
+            RANGE_QUANTILES.map(|q| quantile(&mut values, q))
         };
         let ranges = [range(0), range(1)];
         if ranges.iter().any(|[low, high]| high.partial_cmp(low) != Some(std::cmp::Ordering::Greater)) {
             return None;
         }
-        let mut counts = vec![0.0f32; BINS * BINS];
+        let mut counts = vec![0.0f32; INTENSITY_BINS * INTENSITY_BINS];
         for pair in &pairs {
             let [a, b] = std::array::from_fn(|c| bin(ranges[c], pair[c]).round() as usize);
-            counts[a + BINS * b] += 1.0;
+            counts[a + INTENSITY_BINS * b] += 1.0;
         }
-        let smooth = filters::gaussian(&counts, [BINS, BINS, 1], [1.0, 1.0, 0.0]);
+        let smooth = filters::gaussian(&counts, [INTENSITY_BINS, INTENSITY_BINS, 1], [1.0, 1.0, 0.0]);
         let all: f64 = smooth.iter().map(|v| f64::from(*v)).sum();
         Some(Self { joint: smooth.iter().map(|v| f64::from(*v) / all).collect(), ranges })
     }
 
     /// The share of the voxels with each of the intensities of the volume that tells, and the mean
     /// of the other one there.
-    fn means(&self, explained: Side) -> ([f64; BINS], [f64; BINS]) {
-        let (mut share, mut mean) = ([0.0; BINS], [0.0; BINS]);
+    fn means(&self, explained: Side) -> ([f64; INTENSITY_BINS], [f64; INTENSITY_BINS]) {
+        let (mut share, mut mean) = ([0.0; INTENSITY_BINS], [0.0; INTENSITY_BINS]);
         for (at, p) in self.joint.iter().enumerate() {
-            let (first, second) = (at % BINS, at / BINS);
+            let (first, second) = (at % INTENSITY_BINS, at / INTENSITY_BINS);
             let (from, to) = if explained == Side::Initial { (second, first) } else { (first, second) };
             share[from] += p;
             mean[from] += p * to as f64;
@@ -86,7 +86,7 @@ impl Relation {
     /// The part of the initial volume's variance that the deformed one explains, and the other way
     /// round (0 to 1).
     pub fn explained(&self) -> [f64; 2] {
-        let variance = |share: &[f64; BINS], values: &[f64; BINS]| {
+        let variance = |share: &[f64; INTENSITY_BINS], values: &[f64; INTENSITY_BINS]| {
             let moment = |power: i32| share.iter().zip(values).map(|(s, v)| s * v.powi(power)).sum::<f64>();
             moment(2) - moment(1).powi(2)
         };
@@ -107,7 +107,7 @@ impl Relation {
     /// gain and offset. Negative where the line falls (-1 to 1).
     pub fn explained_by_gain(&self) -> f64 {
         let mean = |v: &dyn Fn(usize) -> f64| self.joint.iter().enumerate().map(|(at, p)| p * v(at)).sum::<f64>();
-        let (first, second) = (|at: usize| (at % BINS) as f64, |at: usize| (at / BINS) as f64);
+        let (first, second) = (|at: usize| (at % INTENSITY_BINS) as f64, |at: usize| (at / INTENSITY_BINS) as f64);
         let (a, b) = (mean(&first), mean(&second));
         let covariance = mean(&|at| (first(at) - a) * (second(at) - b));
         let variances = [mean(&|at| (first(at) - a).powi(2)), mean(&|at| (second(at) - b).powi(2))];
@@ -128,10 +128,10 @@ impl Relation {
             Side::Deformed => (self.ranges[1], self.ranges[0]),
         };
         let (_, mean) = self.means(side.other());
-        let scale = f64::from(other[1] - other[0]) / (BINS - 1) as f64;
+        let scale = f64::from(other[1] - other[0]) / (INTENSITY_BINS - 1) as f64;
         for v in values.iter_mut().filter(|v| v.is_finite()) {
             let at = bin(own, *v);
-            let low = (at as usize).min(BINS - 2);
+            let low = (at as usize).min(INTENSITY_BINS - 2);
             let part = f64::from(at) - low as f64;
             let there = (1.0 - part) * mean[low] + part * mean[low + 1];
             *v = (f64::from(other[0]) + scale * there) as f32;
@@ -141,7 +141,7 @@ impl Relation {
 
 /// Which bin an intensity falls into.
 fn bin([low, high]: [f32; 2], v: f32) -> f32 {
-    ((v - low) / (high - low) * (BINS - 1) as f32).clamp(0.0, (BINS - 1) as f32)
+    ((v - low) / (high - low) * (INTENSITY_BINS - 1) as f32).clamp(0.0, (INTENSITY_BINS - 1) as f32)
 }
 
 #[cfg(test)]

@@ -20,20 +20,20 @@ pub struct Searchable<'a> {
 pub struct Template {
     values: Vec<f32>,
     /// The same, each row along x filled up with zeros; empty where rows are wider.
-    padded: Vec<[f32; WIDTH]>,
+    padded: Vec<[f32; MAX_DIRECT_WIDTH_VOXELS]>,
 }
 
-/// Shifts worked out together, or twice as many.
+/// Shifts whose correlation is computed together, or twice as many.
 const LANES: usize = 16;
 
-/// Reach along y or z (voxels) from which every second shift is looked at first.
-const SPARSE: usize = 4;
+/// Reach along y or z (voxels) from which the first search visits every second shift only.
+const STRIDED_SEARCH_REACH_VOXELS: usize = 4;
 
-/// Places about which all shifts are then looked at, for each that is kept.
-const ROUGH: usize = 2;
+/// Peaks of that search about which all shifts are then visited, for each candidate that is kept.
+const COARSE_PEAKS_PER_CANDIDATE: usize = 2;
 
-/// Widest patch along x whose sums are made on the spot.
-const WIDTH: usize = 8;
+/// Widest patch along x (voxels) whose sums are computed directly.
+const MAX_DIRECT_WIDTH_VOXELS: usize = 8;
 
 /// A place found: offset from the centre of the search in voxels, and the correlation there (-1 to
 /// 1).
@@ -73,7 +73,7 @@ impl<'a> Searchable<'a> {
     /// than 8 voxels along x are prepared all the same.
     pub fn near(data: &'a [f32], shape: [usize; 3], radius: [usize; 3]) -> Self {
         let radius = patch_radius(shape, radius);
-        if 2 * radius[0] + 1 > WIDTH {
+        if 2 * radius[0] + 1 > MAX_DIRECT_WIDTH_VOXELS {
             return Self::new(data, shape, radius);
         }
         Self { data, shape, radius, norm: Vec::new() }
@@ -87,17 +87,17 @@ impl<'a> Searchable<'a> {
         let width = 2 * rx + 1;
         let [nx, ny, _] = self.shape;
         let centre = self.data[at[0] + nx * (at[1] + ny * at[2])];
-        let [mut cross, mut sum, mut square] = [[0.0f32; WIDTH]; 3];
+        let [mut cross, mut sum, mut square] = [[0.0f32; MAX_DIRECT_WIDTH_VOXELS]; 3];
         for (row, t) in template.padded.iter().enumerate() {
             let (j, k) = (at[1] + row % (2 * ry + 1) - ry, at[2] + row / (2 * ry + 1) - rz);
             let rest = &self.data[at[0] - rx + nx * (j + ny * k)..];
-            let mut v = [centre; WIDTH];
-            match rest.first_chunk::<WIDTH>() {
+            let mut v = [centre; MAX_DIRECT_WIDTH_VOXELS];
+            match rest.first_chunk::<MAX_DIRECT_WIDTH_VOXELS>() {
                 // Past the patch stand the next voxels of the row: they do not count.
-                Some(row) => (0..WIDTH).for_each(|l| v[l] = if l < width { row[l] } else { centre }),
+                Some(row) => (0..MAX_DIRECT_WIDTH_VOXELS).for_each(|l| v[l] = if l < width { row[l] } else { centre }),
                 None => v[..width].copy_from_slice(&rest[..width]),
             }
-            for l in 0..WIDTH {
+            for l in 0..MAX_DIRECT_WIDTH_VOXELS {
                 let d = v[l] - centre;
                 cross[l] += t[l] * d;
                 sum[l] += d;
@@ -171,19 +171,19 @@ impl<'a> Searchable<'a> {
         let [rx, ry, rz] = self.radius;
         let [nx, ny, _] = self.shape;
         let width = 2 * rx + 1;
-        let mut cross = [0.0f32; WIDTH];
+        let mut cross = [0.0f32; MAX_DIRECT_WIDTH_VOXELS];
         let mut t = template.padded.iter();
         for k in at[2] - rz..=at[2] + rz {
             for j in at[1] - ry..=at[1] + ry {
                 let Some(t) = t.next() else { continue };
                 let rest = &self.data[at[0] - rx + nx * (j + ny * k)..];
                 // Past the patch stand the next voxels of the row, and zeros in the template.
-                let mut v = [0.0; WIDTH];
-                match rest.first_chunk::<WIDTH>() {
-                    Some(row) => (0..WIDTH).for_each(|l| v[l] = if l < width { row[l] } else { 0.0 }),
+                let mut v = [0.0; MAX_DIRECT_WIDTH_VOXELS];
+                match rest.first_chunk::<MAX_DIRECT_WIDTH_VOXELS>() {
+                    Some(row) => (0..MAX_DIRECT_WIDTH_VOXELS).for_each(|l| v[l] = if l < width { row[l] } else { 0.0 }),
                     None => v[..width].copy_from_slice(&rest[..width]),
                 }
-                (0..WIDTH).for_each(|l| cross[l] += t[l] * v[l]);
+                (0..MAX_DIRECT_WIDTH_VOXELS).for_each(|l| cross[l] += t[l] * v[l]);
             }
         }
         cross.iter().sum()
@@ -211,9 +211,9 @@ impl<'a> Searchable<'a> {
         values.iter_mut().for_each(|v| *v /= norm);
         let width = 2 * rx + 1;
         let mut padded = Vec::new();
-        if width <= WIDTH {
+        if width <= MAX_DIRECT_WIDTH_VOXELS {
             padded.extend(values.chunks_exact(width).map(|row| {
-                let mut wide = [0.0; WIDTH];
+                let mut wide = [0.0; MAX_DIRECT_WIDTH_VOXELS];
                 wide[..width].copy_from_slice(row);
                 wide
             }));
@@ -260,7 +260,8 @@ impl<'a> Searchable<'a> {
         if within.iter().any(|[first, last]| first > last) {
             return Vec::new();
         }
-        let rows_apart = |a: usize| if reach[a] >= SPARSE && !template.padded.is_empty() { 2 } else { 1 };
+        let rows_apart =
+            |a: usize| if reach[a] >= STRIDED_SEARCH_REACH_VOXELS && !template.padded.is_empty() { 2 } else { 1 };
         let step = if self.norm.is_empty() { [1; 3] } else { [1, rows_apart(1), rows_apart(2)] };
         let count = |a: usize| (within[a][1] - within[a][0]) as usize / step[a] + 1;
         let size = [count(0), count(1), count(2)];
@@ -293,7 +294,7 @@ impl<'a> Searchable<'a> {
             let whole = |(i, ncc)| Peak { offset: shift(i), ncc };
             return peaks(&scores, size, keep).into_iter().map(whole).collect();
         }
-        let rough = peaks(&scores, size, ROUGH * keep);
+        let rough = peaks(&scores, size, COARSE_PEAKS_PER_CANDIDATE * keep);
         let mut found: Vec<Peak> = Vec::with_capacity(rough.len());
         dispatch(
             #[inline(always)]

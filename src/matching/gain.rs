@@ -17,36 +17,38 @@ use crate::numerics::statistics::percentile;
 use rayon::prelude::*;
 
 /// Edge of a block (voxels).
-const BLOCK: usize = 8;
+const BLOCK_VOXELS: usize = 8;
 
-/// Places of the voxels between the centres of two blocks, as parts of the way.
-const BETWEEN: [f32; BLOCK] = {
-    let mut out = [0.0; BLOCK];
+/// Positions of the voxels between the centres of two blocks, as fractions of the distance.
+const VOXEL_FRACTIONS: [f32; BLOCK_VOXELS] = {
+    let mut out = [0.0; BLOCK_VOXELS];
     let mut i = 0;
-    while i < BLOCK {
-        out[i] = (i as f32 + 0.5) / BLOCK as f32;
+    while i < BLOCK_VOXELS {
+        out[i] = (i as f32 + 0.5) / BLOCK_VOXELS as f32;
         i += 1;
     }
     out
 };
 
-/// Times that what is left is put back.
-const AGAIN: usize = 3;
+/// Times that the residual of the smoothed gain is smoothed and added back (twicing, Tukey 1977).
+const TWICING_ITERATIONS: usize = 3;
 
-/// The greatest weight of a voxel.
-const FULL: f32 = 255.0;
+/// How the gradient reduces the weight of a voxel, where residual motion changes the intensity.
+struct VoxelWeights {
+    /// Largest weight, stored in a byte.
+    max: f32,
+    /// Residual motion variance along an axis (voxels^2) over the part of the noise variance that
+    /// smoothing leaves: 0.5^2 / 0.25. Errors change by 1 % at 0.1 and 3, by 3 % at 10.
+    motion_variance_voxels: f32,
+    /// Least noise variance over the mean square gradient: volumes without noise differ by
+    /// interpolation.
+    min_noise_fraction: f32,
+    /// Approximate number of rows from which that mean is taken.
+    sampled_rows: usize,
+}
 
-/// Variance of what is left of the motion along an axis, over that of the smoothed difference's
-/// noise in the volume's own (voxels^-2): half a voxel for a quarter of the noise's variance. 0.1
-/// and 3 gave the same errors within 1 %, 10 was 3 % worse.
-const LEFT: f32 = 1.0;
-
-/// Least variance of the noise, in the mean square of the gradients: volumes without noise differ
-/// by interpolation at least.
-const LEAST_NOISE: f32 = 0.03;
-
-/// Rows from which the mean square of the gradients is taken, about.
-const SAMPLED: usize = 1000;
+const WEIGHTS: VoxelWeights =
+    VoxelWeights { max: 255.0, motion_variance_voxels: 1.0, min_noise_fraction: 0.03, sampled_rows: 1000 };
 
 /// A voxel's weight in [`GainField`] in place of each that is set in `mask`, 1 to 255: the inverse
 /// variance of the difference there, noise and the gradient times what is left of the motion.
@@ -71,21 +73,22 @@ pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 
     let room = || std::array::from_fn(|_| vec![0.0f32; nx]);
     let rows = mask.len() / nx;
     let (mut sum, mut count, mut g) = (0.0f64, 0usize, room());
-    for row in (0..rows).step_by(row_step(rows / SAMPLED, ny)) {
+    for row in (0..rows).step_by(row_step(rows / WEIGHTS.sampled_rows, ny)) {
         squares(row, &mut g);
         for (square, _) in g[3].iter().zip(&mask[row * nx..]).filter(|(s, m)| **m != 0 && s.is_finite()) {
             (sum, count) = (sum + f64::from(*square), count + 1);
         }
     }
     let mean = (sum / count.max(1) as f64) as f32;
-    let over = LEFT / (noise * noise + LEAST_NOISE * mean).max(f32::MIN_POSITIVE);
+    let over =
+        WEIGHTS.motion_variance_voxels / (noise * noise + WEIGHTS.min_noise_fraction * mean).max(f32::MIN_POSITIVE);
     mask.par_chunks_mut(nx).enumerate().for_each_init(room, |g, (row, mask)| {
         if mask.iter().all(|&m| m == 0) {
             return;
         }
         squares(row, g);
         for (m, square) in mask.iter_mut().zip(&g[3]).filter(|(m, _)| **m != 0) {
-            *m = (FULL / (1.0 + over * square)).max(1.0) as u8;
+            *m = (WEIGHTS.max / (1.0 + over * square)).max(1.0) as u8;
         }
     });
 }
@@ -112,13 +115,13 @@ impl GainField {
     /// As [`GainField::measure`], with what its smoothing flattened put back: little of a bias is
     /// then taken for motion, but it takes up more of another contrast as well.
     pub fn sharpened(pair: &Pair<'_>, warped: &[f32]) -> Self {
-        Self::of(pair, &block_sums(pair, warped), AGAIN)
+        Self::of(pair, &block_sums(pair, warped), TWICING_ITERATIONS)
     }
 
     /// [`GainField::measure`] and [`GainField::sharpened`] from one look at the volumes.
     pub fn both(pair: &Pair<'_>, warped: &[f32]) -> [Self; 2] {
         let sums = block_sums(pair, warped);
-        [0, AGAIN].map(|again| Self::of(pair, &sums, again))
+        [0, TWICING_ITERATIONS].map(|again| Self::of(pair, &sums, again))
     }
 
     /// From the sums of the blocks, with the remainder put back `again` times.
@@ -163,7 +166,7 @@ impl GainField {
     pub fn row(&self, j: usize, k: usize, gain: &mut [f32], offset: &mut [f32]) {
         let [bx, by, bz] = self.blocks;
         let split = |i: usize, n: usize| {
-            let p = ((i as f32 + 0.5) / BLOCK as f32 - 0.5).clamp(0.0, (n - 1) as f32);
+            let p = ((i as f32 + 0.5) / BLOCK_VOXELS as f32 - 0.5).clamp(0.0, (n - 1) as f32);
             let lo = (p as usize).min(n.saturating_sub(2));
             (lo, (lo + 1).min(n - 1), p - lo as f32)
         };
@@ -185,16 +188,16 @@ impl GainField {
         };
         // Half a block before the first centre, whole blocks between centres, half a block after
         // the last.
-        let (first, rest) = gain.split_at_mut((BLOCK / 2).min(gain.len()));
+        let (first, rest) = gain.split_at_mut((BLOCK_VOXELS / 2).min(gain.len()));
         let (first_offset, rest_offset) = offset.split_at_mut(first.len());
         let mut lo = at(0);
         first.fill(lo[0]);
         first_offset.fill(lo[1]);
-        let between = rest.chunks_mut(BLOCK).zip(rest_offset.chunks_mut(BLOCK));
+        let between = rest.chunks_mut(BLOCK_VOXELS).zip(rest_offset.chunks_mut(BLOCK_VOXELS));
         for (b, (gain, offset)) in between.enumerate() {
             let hi = at((b + 1).min(bx - 1));
             let step = [hi[0] - lo[0], hi[1] - lo[1]];
-            for ((g, o), t) in gain.iter_mut().zip(offset).zip(BETWEEN) {
+            for ((g, o), t) in gain.iter_mut().zip(offset).zip(VOXEL_FRACTIONS) {
                 (*g, *o) = (lo[0] + t * step[0], lo[1] + t * step[1]);
             }
             lo = hi;
@@ -204,7 +207,7 @@ impl GainField {
 
 /// Blocks along each axis.
 fn blocks(pair: &Pair<'_>) -> [usize; 3] {
-    pair.shape.map(|n| n.div_ceil(BLOCK))
+    pair.shape.map(|n| n.div_ceil(BLOCK_VOXELS))
 }
 
 /// The sums of all blocks.
@@ -216,10 +219,10 @@ fn block_sums(pair: &Pair<'_>, warped: &[f32]) -> Vec<Sums> {
     let mut sums = vec![[0.0f64; 6]; blocks.iter().product()];
     sums.par_chunks_mut(bx).enumerate().for_each(|(row, sums)| {
         // One partial sum for each column of a block.
-        let mut lanes = vec![[[0.0f32; BLOCK]; 6]; bx];
-        let (from, to) = ([row % by, row / by].map(|b| b * BLOCK), [ny, pair.shape[2]]);
-        for k in from[1]..(from[1] + BLOCK).min(to[1]) {
-            for j in from[0]..(from[0] + BLOCK).min(to[0]) {
+        let mut lanes = vec![[[0.0f32; BLOCK_VOXELS]; 6]; bx];
+        let (from, to) = ([row % by, row / by].map(|b| b * BLOCK_VOXELS), [ny, pair.shape[2]]);
+        for k in from[1]..(from[1] + BLOCK_VOXELS).min(to[1]) {
+            for j in from[0]..(from[0] + BLOCK_VOXELS).min(to[0]) {
                 let span = pair.spans.row(j, k);
                 if span.is_empty() {
                     continue;
@@ -228,9 +231,10 @@ fn block_sums(pair: &Pair<'_>, warped: &[f32]) -> Vec<Sums> {
                 dispatch(
                     #[inline(always)]
                     || {
-                        for b in span.start / BLOCK..span.end.div_ceil(BLOCK) {
-                            let part = at + b * BLOCK..at + ((b + 1) * BLOCK).min(nx);
-                            let (mut f, mut w, mut m) = ([0.0f32; BLOCK], [f32::NAN; BLOCK], [0u8; BLOCK]);
+                        for b in span.start / BLOCK_VOXELS..span.end.div_ceil(BLOCK_VOXELS) {
+                            let part = at + b * BLOCK_VOXELS..at + ((b + 1) * BLOCK_VOXELS).min(nx);
+                            let (mut f, mut w, mut m) =
+                                ([0.0f32; BLOCK_VOXELS], [f32::NAN; BLOCK_VOXELS], [0u8; BLOCK_VOXELS]);
                             f[..part.len()].copy_from_slice(&pair.fixed_smooth[part.clone()]);
                             w[..part.len()].copy_from_slice(&warped[part.clone()]);
                             m[..part.len()].copy_from_slice(&pair.mask[part]);
@@ -249,11 +253,17 @@ fn block_sums(pair: &Pair<'_>, warped: &[f32]) -> Vec<Sums> {
 
 /// Adds one row of a block: a voxel counts by its weight where the warp saw it.
 #[inline(always)]
-fn add_columns(lanes: &mut [[f32; BLOCK]; 6], f: &[f32; BLOCK], w: &[f32; BLOCK], m: &[u8; BLOCK], centre: [f32; 2]) {
-    for l in 0..BLOCK {
+fn add_columns(
+    lanes: &mut [[f32; BLOCK_VOXELS]; 6],
+    f: &[f32; BLOCK_VOXELS],
+    w: &[f32; BLOCK_VOXELS],
+    m: &[u8; BLOCK_VOXELS],
+    centre: [f32; 2],
+) {
+    for l in 0..BLOCK_VOXELS {
         let good = (f[l] + w[l]).is_finite();
         let (m, f, w) =
-            if good { (f32::from(m[l]) / FULL, f[l] - centre[0], w[l] - centre[1]) } else { (0.0, 0.0, 0.0) };
+            if good { (f32::from(m[l]) / WEIGHTS.max, f[l] - centre[0], w[l] - centre[1]) } else { (0.0, 0.0, 0.0) };
         let (mf, mw) = (m * f, m * w);
         lanes[0][l] += m;
         lanes[1][l] += mf;

@@ -11,9 +11,9 @@ use crate::numerics::simd::{self, dispatch};
 use crate::numerics::symmetric3::{Symmetric3, inverse, multiply};
 use crate::types::GridVector;
 
-/// Noise of neighbouring voxels after the cubic B-spline is alike; a patch holds that many times
-/// fewer independent voxels: 1 / sum(k^2) of the kernel, 2 along each axis.
-pub const CORRELATION: f64 = 2.0;
+/// Voxels per independent sample along an axis: the cubic B-spline correlates the noise of
+/// neighbours. 1 / sum(k^2) of its kernel.
+pub const NOISE_CORRELATION_VOXELS: f64 = 2.0;
 
 /// A match found.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -116,7 +116,7 @@ pub fn refine(
             break;
         }
     }
-    let variance = spread.max(2.0 * noise * noise) * CORRELATION.powi(3 - flat.len() as i32);
+    let variance = spread.max(2.0 * noise * noise) * NOISE_CORRELATION_VOXELS.powi(3 - flat.len() as i32);
     let mut covariance = hi.map(|v| v * variance);
     for &a in &flat {
         covariance[a] = 0.0;

@@ -9,12 +9,12 @@ use rayon::prelude::*;
 use std::borrow::Cow;
 use std::ops::Range;
 
-/// Side of the blocks in which texture is looked for (finest voxels).
-const BLOCK: usize = 7;
+/// Edge of the blocks in which texture is measured (finest voxels).
+const TEXTURE_BLOCK_VOXELS: usize = 7;
 
-/// Standard deviation in a block, over the noise, from which there is texture; that of noise alone
-/// scatters by 4 % (343 voxels).
-const STANDS_OUT: f32 = 1.25;
+/// Least standard deviation in a block over the noise for it to have texture; that of noise alone
+/// varies by 4 % (343 voxels).
+const MIN_TEXTURE_SNR: f32 = 1.25;
 
 /// A place that is known in both volumes, with how well.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -121,7 +121,7 @@ impl<'a> Pair<'a> {
 
     /// Whether a place (voxels) lies in such a block, with none that has texture beside it.
     pub fn is_plain(&self) -> impl Fn([f64; 3]) -> bool + Sync + use<> {
-        let side = self.in_voxels(BLOCK);
+        let side = self.in_voxels(TEXTURE_BLOCK_VOXELS);
         let [nx, ny, nz] = std::array::from_fn(|a| self.shape[a].div_ceil(side[a]));
         let textured: Vec<bool> = self.blocks().into_iter().map(|(textured, inside)| textured && inside > 0).collect();
         move |p| {
@@ -135,8 +135,8 @@ impl<'a> Pair<'a> {
     /// mask.
     fn blocks(&self) -> Vec<(bool, usize)> {
         let [nx, ny, nz] = self.shape;
-        let side = self.in_voxels(BLOCK);
-        let least = f64::from(STANDS_OUT * self.noise).powi(2);
+        let side = self.in_voxels(TEXTURE_BLOCK_VOXELS);
+        let least = f64::from(MIN_TEXTURE_SNR * self.noise).powi(2);
         let corners = |n: usize, a: usize| (0..n).step_by(side[a]);
         let in_slab = |k: usize| -> Vec<(bool, usize)> {
             let blocks = corners(ny, 1).flat_map(|j| corners(nx, 0).map(move |i| self.block([i, j, k], side)));

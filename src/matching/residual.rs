@@ -20,26 +20,23 @@ use crate::numerics::symmetric3::eigenvalues;
 use crate::numerics::{ablation, filters, pyramid};
 use rayon::prelude::*;
 
-/// Cauchy's tuning constant: 95 % efficiency for Gaussian noise (Holland & Welsch 1977).
-pub const CAUCHY: f32 = 2.385;
+/// Cauchy's tuning constant (standard deviations): 95 % efficiency for Gaussian noise (Holland &
+/// Welsch 1977).
+pub const CAUCHY_TUNING: f32 = 2.385;
 
-/// Place that interpolation leaves unsure at any voxel, however steep (finest voxels): bright edges
-/// say no more than this. Measured on affine motions without noise, which come out .005 to .03 of a
-/// voxel off.
-pub const UNSURE: f64 = 0.02;
+/// Position error that interpolation leaves at any voxel, however steep (finest voxels): affine
+/// motions without noise come out 0.005 to 0.03 voxels off.
+pub const MIN_POSITION_ERROR_VOXELS: f64 = 0.02;
 
-/// Variance of the gradient that white noise leaves, along an axis (voxel^-2), over that of the
-/// residual.
-///
-/// Both volumes are smoothed by (1, 4, 1) / 6, whose correlation over two voxels is 1/18. A central
-/// difference then has half of 17/18 of a volume's variance, the mean of two half of that.
-const NOISE_SLOPE: f32 = 17.0 / 144.0;
+/// Gradient variance of white noise along an axis (voxel^-2) over that of the residual: smoothing
+/// by (1, 4, 1) / 6 correlates voxels two apart by 1/18; then (1 - 1/18) / 2 / 4.
+const NOISE_GRADIENT_VARIANCE: f32 = 17.0 / 144.0;
 
-/// Variance of white noise that (1, 4, 1) / 6 leaves along an axis.
-const SMOOTHED: f32 = 0.5;
+/// Variance of unit white noise after smoothing by (1, 4, 1) / 6 along an axis.
+const SMOOTHED_NOISE_VARIANCE: f32 = 0.5;
 
-/// Residual beyond which a voxel's misfit counts no more (robust standard deviations).
-const TRIMMED: f32 = 5.0;
+/// Residual at which a voxel's misfit is clipped (robust standard deviations).
+const RESIDUAL_CLIP_SD: f32 = 5.0;
 
 /// Mean square of the residual about each node of `lattice`, over the robust variance of the whole
 /// (1): squares of 5 deviations at most, and 1 where no tissue is near. `warped` is the deformed
@@ -56,7 +53,8 @@ pub fn misfit_by_place(pair: &Pair<'_>, warped: &[f32], lattice: &Lattice) -> Ve
         for i in span.clone() {
             let r = scale * (pair.fixed_smooth[from + i] - (squares[i] * warped[from + i] + counts[i]));
             let good = pair.mask[from + i] != 0 && r.is_finite();
-            (squares[i], counts[i]) = if good { ((r * r).min(TRIMMED * TRIMMED), 1.0) } else { (0.0, 0.0) };
+            (squares[i], counts[i]) =
+                if good { ((r * r).min(RESIDUAL_CLIP_SD * RESIDUAL_CLIP_SD), 1.0) } else { (0.0, 0.0) };
         }
         span
     });
@@ -124,8 +122,8 @@ fn is_positive(&[xx, yy, zz, xy, xz, yz]: &[f32; 6]) -> bool {
     xx >= 0.0 && xx * yy >= xy * xy && determinant >= 0.0
 }
 
-/// Rows of a volume that are worth handing to another thread.
-const ROWS: usize = 64;
+/// Least number of rows that are worth another thread.
+const MIN_ROWS_PER_TASK: usize = 64;
 
 /// Robust spread of `f - (a w + b)` over the mask (1.4826 MAD), from at most about 200,000 voxels.
 pub fn residual_sigma(pair: &Pair<'_>, warped: &[f32], gain: &GainField) -> f32 {
@@ -145,7 +143,7 @@ pub fn residual_sigma(pair: &Pair<'_>, warped: &[f32], gain: &GainField) -> f32 
         left.filter(|v| v.is_finite()).map(f32::abs).collect()
     };
     let some: Vec<usize> = (0..rows).step_by(stride).collect();
-    let mut r: Vec<f32> = some.into_par_iter().with_min_len(ROWS).flat_map_iter(in_row).collect();
+    let mut r: Vec<f32> = some.into_par_iter().with_min_len(MIN_ROWS_PER_TASK).flat_map_iter(in_row).collect();
     if r.is_empty() { 0.0 } else { 1.4826 * median(&mut r) }
 }
 
@@ -160,17 +158,20 @@ pub fn normal_equations(
 ) -> NormalEquations {
     let [nx, ny, nz] = pair.shape;
     let sigma = residual_sigma(pair, warped, gain).max(floor).max(f32::MIN_POSITIVE);
-    let (variance, cut) = (sigma * sigma, 1.0 / (CAUCHY * CAUCHY));
-    let unsure =
-        if ablation::is_on("gradient-floor") { UNSURE * pyramid::finest(pair.shape, pair.spacing) } else { 0.0 };
-    let least = unsure.powi(2) as f32;
+    let (variance, cut) = (sigma * sigma, 1.0 / (CAUCHY_TUNING * CAUCHY_TUNING));
+    let position_error = if ablation::is_on("gradient-floor") {
+        MIN_POSITION_ERROR_VOXELS * pyramid::finest(pair.shape, pair.spacing)
+    } else {
+        0.0
+    };
+    let least = position_error.powi(2) as f32;
     let per_mm: [f32; 3] = std::array::from_fn(|a| (0.5 / pair.spacing[a]) as f32);
     // Of the residual no more is noise than the volumes have.
     let thick = pair.shape.iter().filter(|&&n| n > 1).count() as i32;
-    let white = variance.min(2.0 * SMOOTHED.powi(thick) * pair.noise * pair.noise);
+    let white = variance.min(2.0 * SMOOTHED_NOISE_VARIANCE.powi(thick) * pair.noise * pair.noise);
     let counts = ablation::is_on("noise-gradient");
     let noise = std::array::from_fn(|a| match pair.shape[a] > 1 && counts {
-        true => NOISE_SLOPE * white / (pair.spacing[a] * pair.spacing[a]) as f32,
+        true => NOISE_GRADIENT_VARIANCE * white / (pair.spacing[a] * pair.spacing[a]) as f32,
         false => 0.0,
     });
     // Differences over two voxels, over one at the border; none along a side of one voxel.
@@ -285,8 +286,8 @@ pub fn excess_by_place(pair: &Pair<'_>, a: &[f32], b: &Baseline, windows: &Latti
     })
 }
 
-/// Voxels in a row whose costs share a logarithm.
-const TOGETHER: usize = 8;
+/// Voxels in a row whose costs share one logarithm.
+const VOXELS_PER_LOGARITHM: usize = 8;
 
 /// Two warps side by side.
 struct Compared<'a> {
@@ -308,7 +309,7 @@ impl<'a> Compared<'a> {
         if span.is_empty() {
             return;
         }
-        let cut = 1.0 / (CAUCHY * better.sigma);
+        let cut = 1.0 / (CAUCHY_TUNING * better.sigma);
         let from = nx * (j + pair.shape[1] * k);
         let (mut gain, mut offset) = (vec![0.0; nx], vec![0.0; nx]);
         let mut costs = [vec![0.0f32; nx], vec![0.0f32; nx]];
@@ -323,15 +324,16 @@ impl<'a> Compared<'a> {
             }
         }
         // Logarithms of products of a few voxels, not of each: ln is dear.
-        for (at, (a, b)) in costs[0].chunks(TOGETHER).zip(costs[1].chunks(TOGETHER)).enumerate() {
-            let mask = &pair.mask[from + TOGETHER * at..];
+        for (at, (a, b)) in costs[0].chunks(VOXELS_PER_LOGARITHM).zip(costs[1].chunks(VOXELS_PER_LOGARITHM)).enumerate()
+        {
+            let mask = &pair.mask[from + VOXELS_PER_LOGARITHM * at..];
             let mut ratio = 1.0f64;
             for ((a, b), m) in a.iter().zip(b).zip(mask) {
                 let r = f64::from(*a) / f64::from(*b);
                 ratio *= if *m != 0 && r.is_finite() { r } else { 1.0 };
             }
-            let middle = TOGETHER * at + a.len() / 2;
-            sum(middle.clamp(span.start, span.end - 1), f64::from(CAUCHY * CAUCHY) * ratio.ln());
+            let middle = VOXELS_PER_LOGARITHM * at + a.len() / 2;
+            sum(middle.clamp(span.start, span.end - 1), f64::from(CAUCHY_TUNING * CAUCHY_TUNING) * ratio.ln());
         }
     }
 }

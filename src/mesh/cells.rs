@@ -20,7 +20,7 @@ pub(super) type Cell = [[u32; 4]; 2];
 
 /// For each apex, the other three facets, each with the two vertices of its edge across from the
 /// apex.
-const SIDES: [[[usize; 3]; 3]; 4] = [
+const APEX_FACETS: [[[usize; 3]; 3]; 4] = [
     [[1, 2, 3], [2, 1, 3], [3, 1, 2]],
     [[0, 2, 3], [2, 0, 3], [3, 0, 2]],
     [[0, 1, 3], [1, 0, 3], [3, 0, 1]],
@@ -194,7 +194,7 @@ impl Cells {
             let mut links = [0; 4];
             links[spoke.apex] = spoke.outward;
             cells[(spoke.outward >> 2) as usize][1][spoke.outward as usize & 3] = slot << 2 | spoke.apex as u32;
-            for &[j, k, l] in &SIDES[spoke.apex] {
+            for &[j, k, l] in &APEX_FACETS[spoke.apex] {
                 let here = slot << 2 | j as u32;
                 if let Some(there) = edges.pair(spoke.vertices[k], spoke.vertices[l], here) {
                     links[j] = there;

@@ -3,8 +3,8 @@
 //! Sources: N. Amenta, S. Choi, G. Rote, "Incremental constructions con BRIO", SoCG 2003; J.
 //! Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004).
 
-/// Bits an axis on the curve.
-const BITS: u32 = 16;
+/// Bits of the curve along each axis.
+const BITS_PER_AXIS: u32 = 16;
 
 /// The order in which to insert the points: a permutation of their numbers, the same every time.
 ///
@@ -20,10 +20,10 @@ pub(super) fn insertion_order(points: &[[f64; 3]]) -> Vec<u32> {
         }
     }
     let extent = (0..3).map(|a| high[a] - low[a]).fold(f64::MIN_POSITIVE, f64::max);
-    let scale = f64::from((1 << BITS) - 1) / extent;
+    let scale = f64::from((1 << BITS_PER_AXIS) - 1) / extent;
     let key = |i: usize, p: &[f64; 3]| {
         let cell = std::array::from_fn(|a| ((p[a] - low[a]) * scale) as u32);
-        (15 - u64::from(round(i as u64))) << (3 * BITS) | hilbert_index(cell)
+        (15 - u64::from(round(i as u64))) << (3 * BITS_PER_AXIS) | hilbert_index(cell)
     };
     let mut keyed: Vec<(u64, u32)> = points.iter().enumerate().map(|(i, p)| (key(i, p), i as u32)).collect();
     keyed.sort_unstable();
@@ -42,7 +42,7 @@ fn round(i: u64) -> u32 {
 /// Position of a cell of the 2^16-cube along the Hilbert curve (Skilling's `AxestoTranspose`, then
 /// interleaved).
 fn hilbert_index(mut x: [u32; 3]) -> u64 {
-    for bit in (1..BITS).rev() {
+    for bit in (1..BITS_PER_AXIS).rev() {
         let (q, mask) = (1 << bit, (1 << bit) - 1);
         for a in 0..3 {
             // Invert the low bits of x[0], or exchange them with those of x[a].

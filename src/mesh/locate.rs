@@ -15,8 +15,8 @@ use crate::error::MeshError;
 use crate::types::space::{cross, dot};
 use crate::types::{TetMesh, TriMesh, WorldPoint};
 
-/// Points this part of the mesh's size outside of the hull still count as on it.
-const TOLERANCE: f64 = 1e-9;
+/// Distance outside the hull, over the mesh's size, up to which a point is on it.
+const HULL_TOLERANCE: f64 = 1e-9;
 
 /// An element and the barycentric weights of a point in it: not negative, of sum one, in the order
 /// of its corners.
@@ -195,13 +195,13 @@ impl Bounds {
             }
         }
         let size = (0..3).map(|a| high[a] - low[a]).fold(0.0, f64::max);
-        Self { low, high, mean, tolerance: TOLERANCE * size }
+        Self { low, high, mean, tolerance: HULL_TOLERANCE * size }
     }
 
     /// The point moved towards the mean by up to the tolerance: off the hull, where rounding makes
     /// slivers so thin that a point beside them seems to be in one far from it.
     fn inwards(&self, p: [f64; 3]) -> [f64; 3] {
-        std::array::from_fn(|a| p[a] + TOLERANCE * (self.mean[a] - p[a]))
+        std::array::from_fn(|a| p[a] + HULL_TOLERANCE * (self.mean[a] - p[a]))
     }
 
     /// Whether a point is in the box; not so where a coordinate is NaN.

@@ -5,12 +5,12 @@ use crate::error::MeshError;
 use crate::types::WorldPoint;
 
 /// Coordinates smaller than this part of the largest count as zero (2^-142).
-const SMALLEST: f64 = 1.793662034335766e-43;
+const MIN_RELATIVE_COORDINATE: f64 = 1.793662034335766e-43;
 
 /// The points with their largest coordinate brought to between 1/2 and 2.
 ///
 /// A power of two keeps every bit, so all exact signs stay what they were (but for coordinates
-/// under [`SMALLEST`]).
+/// under [`MIN_RELATIVE_COORDINATE`]).
 ///
 /// # Errors
 /// [`MeshError::NotFinite`] names the first point with NaN or infinity.
@@ -27,7 +27,7 @@ pub(super) fn normalise(points: &[WorldPoint]) -> Result<Vec<[f64; 3]>, MeshErro
     let (first, second) = (2f64.powi(exponent / 2), 2f64.powi(exponent - exponent / 2));
     let scaled = |v: f64| {
         let s = v * first * second;
-        if s.abs() < SMALLEST { 0.0 } else { s }
+        if s.abs() < MIN_RELATIVE_COORDINATE { 0.0 } else { s }
     };
     Ok(points.iter().map(|p| p.0.map(scaled)).collect())
 }

@@ -4,9 +4,9 @@ use crate::error::MeshError;
 use crate::types::WorldPoint;
 use crate::types::space::{cross, dot};
 
-/// Points are on one line when they lie within this part of their extent of it: two hundred times
-/// the rounding of an oblique line's coordinates.
-const COLLINEAR: f64 = 1e-13;
+/// Width over extent up to which points are collinear: two hundred times the rounding of an oblique
+/// line's coordinates.
+const COLLINEARITY_TOLERANCE: f64 = 1e-13;
 
 /// A plane anywhere in space.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,7 +50,7 @@ impl Plane {
         let along = far.map(|v| v / dot(far, far).sqrt());
         let across = farthest(points.iter().map(|p| cross(along, offset(p))));
         let width = dot(across, across).sqrt();
-        if width <= COLLINEAR {
+        if width <= COLLINEARITY_TOLERANCE {
             let distinct = points.iter().any(|p| offset(p) != [0.0; 3] && offset(p) != far);
             return Err(if distinct { MeshError::Collinear } else { MeshError::TooFew { found: 2, needed: 3 } });
         }

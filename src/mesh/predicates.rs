@@ -21,9 +21,9 @@ const ORIENT3D_BOUND: f64 = 4.7e-15;
 /// `(16 + 224 e) e` (isperrboundA) times 72: 4 lifts of 3 squares, 6 products each.
 const INSPHERE_BOUND: f64 = 1.29e-13;
 
-/// The same bound in doubled precision over [`INSPHERE_BOUND`]: 72 times 41 u^2, u = 2^-53, by the
-/// errors that `double_double` cites.
-const DOUBLED: f64 = 3e-16;
+/// The bound in double-double arithmetic over [`INSPHERE_BOUND`]: 72 times 41 u^2, u = 2^-53, by
+/// the errors that `double_double` cites.
+const DOUBLED_INSPHERE_BOUND: f64 = 3e-16;
 
 fn coord(p: &[f64; 3]) -> Coord3D<f64> {
     Coord3D { x: p[0], y: p[1], z: p[2] }
@@ -188,7 +188,7 @@ fn close_insphere(known: &StaticBounds, det: f64, corners: [&[f64; 3]; 4], e: &[
     let det = insphere_determinant(x, y, z).rounded();
     // So that nothing underflows in the low parts.
     let least = size.iter().fold(f64::INFINITY, |m, &v| smaller(m, v));
-    if least > 1e-45 && det.abs() > DOUBLED * bound {
+    if least > 1e-45 && det.abs() > DOUBLED_INSPHERE_BOUND * bound {
         return det;
     }
     let [a, b, c, d] = corners.map(coord);

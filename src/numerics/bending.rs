@@ -54,7 +54,7 @@ impl Smoothness {
     /// differences about each node.
     pub fn apply(&self, weight: &[f32], x: &[f32], out: &mut [f32]) {
         let plane = self.nodes[0] * self.nodes[1];
-        let slab = worthwhile(plane);
+        let slab = planes_per_task(plane);
         out.par_chunks_mut(slab * plane).enumerate().for_each(|(s, out)| {
             let mut differences = Differences::new(self, weight, x, s * slab);
             for out in out.chunks_exact_mut(plane) {
@@ -71,7 +71,7 @@ impl Smoothness {
         let [nx, ny, nz] = self.nodes;
         let plane = nx * ny;
         let mut out = vec![0.0f32; x.len()];
-        out.par_chunks_mut(plane).with_min_len(worthwhile(plane)).enumerate().for_each(|(k, out)| {
+        out.par_chunks_mut(plane).with_min_len(planes_per_task(plane)).enumerate().for_each(|(k, out)| {
             dispatch(
                 #[inline(always)]
                 || {
@@ -572,11 +572,11 @@ fn planes<const N: usize>(
     let mut quantities: [_; N] = std::array::from_fn(|_| parts.next().unwrap_or_default().chunks_mut(plane));
     let plane_of = |_| std::array::from_fn(|q| quantities[q].next().unwrap_or_default());
     let planes: Vec<[&mut [f32]; N]> = (0..n / plane).map(plane_of).collect();
-    planes.into_par_iter().with_min_len(worthwhile(plane)).enumerate()
+    planes.into_par_iter().with_min_len(planes_per_task(plane)).enumerate()
 }
 
 /// Planes of `plane` nodes that are worth handing to another thread.
-fn worthwhile(plane: usize) -> usize {
+fn planes_per_task(plane: usize) -> usize {
     (1 << 13) / plane.max(1) + 1
 }
 

@@ -11,10 +11,9 @@ use crate::numerics::simd::dispatch;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Sums of cells of a lattice along z that are held at a time: the number of values, where that is
-/// no fewer cells than keep the threads busy. Those of 128 cells of a lattice of 131 x 152 nodes a
-/// plane were 0.4 GB.
-const HELD: usize = 1 << 22;
+/// Most values of cell sums along z in memory, unless the threads need more cells: 128 cells of a
+/// lattice of 131 x 152 nodes a plane took 0.4 GB.
+const MAX_VALUES_IN_MEMORY: usize = 1 << 22;
 
 /// The four cubic B-spline weights at fraction `t` (0 to 1) between the second and the third node.
 #[inline(always)]
@@ -36,11 +35,11 @@ pub struct Lattice {
     pub nodes: [usize; 3],
     phases: [Vec<[f32; 4]>; 3],
     /// The first phases along x, by node.
-    across: [[f32; ACROSS]; 4],
+    across: [[f32; ROW_LANES]; 4],
 }
 
-/// Voxels along x that are worked out at once.
-const ACROSS: usize = 8;
+/// Voxels along x computed together.
+const ROW_LANES: usize = 8;
 
 impl Lattice {
     /// A lattice of `step` voxels over `shape`.
@@ -185,11 +184,11 @@ impl Lattice {
         }
         // Whole vectors: what one cell has too many the next writes over.
         let (step, [w0, w1, w2, w3]) = (self.step[0], &self.across);
-        let whole = if step <= ACROSS && out.len() >= ACROSS { (out.len() - ACROSS) / step + 1 } else { 0 };
+        let whole = if step <= ROW_LANES && out.len() >= ROW_LANES { (out.len() - ROW_LANES) / step + 1 } else { 0 };
         for cell in 0..whole {
             let c = &nodes[cell..cell + 4];
-            let out = &mut out[cell * step..][..ACROSS];
-            for l in 0..ACROSS {
+            let out = &mut out[cell * step..][..ROW_LANES];
+            for l in 0..ROW_LANES {
                 out[l] = w0[l] * c[0] + w1[l] * c[1] + w2[l] * c[2] + w3[l] * c[3];
             }
         }
@@ -330,7 +329,7 @@ impl Lattice {
         };
         // A few cells at a time, from the last to the first: each node plane sums them in that
         // order, however many these are.
-        let most = (HELD / (taps_z * Q * plane)).max(2 * rayon::current_num_threads());
+        let most = (MAX_VALUES_IN_MEMORY / (taps_z * Q * plane)).max(2 * rayon::current_num_threads());
         let mut out = vec![0.0f32; Q * total];
         let mut end = nz.div_ceil(self.step[2]);
         while end > 0 {

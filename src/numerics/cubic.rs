@@ -6,12 +6,11 @@
 
 use crate::numerics::bspline::weights;
 
-/// Places treated at once.
+/// Positions processed together.
 pub const LANES: usize = 16;
 
-/// The longest run of neighbouring places that is worked out at once: where tissue is strained most
-/// are shorter.
-const RUN: usize = 8;
+/// Most adjacent positions computed together: most runs are shorter where tissue is strained.
+const MAX_RUN: usize = 8;
 
 /// Sixteen places: the cell that holds each (the index below it along each axis) and the fraction
 /// inside the cell.
@@ -85,9 +84,9 @@ pub fn sample(
             start += 1;
             continue;
         }
-        let lane = start.min(LANES - RUN);
+        let lane = start.min(LANES - MAX_RUN);
         let mut end = start + 1;
-        while end < count.min(lane + RUN)
+        while end < count.min(lane + MAX_RUN)
             && cx[end] - first[0] == (end - start) as i32
             && cx[end] < n[0] - 2
             && cy[end] == first[1]
@@ -119,16 +118,16 @@ fn run(
     base: usize,
     w: &[[[f32; LANES]; 4]; 3],
     lane: usize,
-) -> Option<[f32; RUN]> {
-    let data = data.get(base..base + 3 * nx * ny + 3 * nx + RUN + 3)?;
+) -> Option<[f32; MAX_RUN]> {
+    let data = data.get(base..base + 3 * nx * ny + 3 * nx + MAX_RUN + 3)?;
     let weight = |a: usize, m: usize| eight(&w[a][m][lane..]);
     let x = [weight(0, 0), weight(0, 1), weight(0, 2), weight(0, 3)];
-    let mut sum = [0.0; RUN];
+    let mut sum = [0.0; MAX_RUN];
     for c in 0..4 {
-        let mut plane = [0.0; RUN];
+        let mut plane = [0.0; MAX_RUN];
         for b in 0..4 {
-            let row = &data[nx * (b + ny * c)..][..RUN + 3];
-            let mut along = [0.0; RUN];
+            let row = &data[nx * (b + ny * c)..][..MAX_RUN + 3];
+            let mut along = [0.0; MAX_RUN];
             for m in 0..4 {
                 add_product(&mut along, x[m], eight(&row[m..]));
             }
@@ -141,15 +140,15 @@ fn run(
 
 /// The first eight of a slice of that many or more.
 #[inline(always)]
-fn eight(v: &[f32]) -> [f32; RUN] {
-    let v = &v[..RUN];
+fn eight(v: &[f32]) -> [f32; MAX_RUN] {
+    let v = &v[..MAX_RUN];
     std::array::from_fn(|l| v[l])
 }
 
 /// `sum += a * b`, lane by lane.
 #[inline(always)]
-fn add_product(sum: &mut [f32; RUN], a: [f32; RUN], b: [f32; RUN]) {
-    for l in 0..RUN {
+fn add_product(sum: &mut [f32; MAX_RUN], a: [f32; MAX_RUN], b: [f32; MAX_RUN]) {
+    for l in 0..MAX_RUN {
         sum[l] += a[l] * b[l];
     }
 }

@@ -11,12 +11,11 @@ fn series<const N: usize>(x: f32, terms: [f32; N]) -> f32 {
     sum
 }
 
-/// 1.5 * 2^23: adding it rounds a small number to the nearest whole one, which then stands in the
-/// lowest bits.
-pub const WHOLE: f32 = 12_582_912.0;
+/// 1.5 * 2^23: adding it rounds a small number to an integer, which then stands in the lowest bits.
+pub const ROUND_TO_INTEGER: f32 = 12_582_912.0;
 
-/// ln 2 in two parts, of which the first has few digits: its multiples by exponents are exact.
-const LN_2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
+/// ln 2 as a sum of two: the first has so few digits that its products with exponents are exact.
+const LN_2_PARTS: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
 
 /// `e^x` within 2e-7 of itself, for x held to -87 to 88 (what single precision holds); NaN for NaN.
 ///
@@ -25,9 +24,9 @@ const LN_2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
-    let shifted = x * std::f32::consts::LOG2_E + WHOLE;
-    let n = shifted - WHOLE;
-    let r = (x - n * LN_2[0]) - n * LN_2[1];
+    let shifted = x * std::f32::consts::LOG2_E + ROUND_TO_INTEGER;
+    let n = shifted - ROUND_TO_INTEGER;
+    let r = (x - n * LN_2_PARTS[0]) - n * LN_2_PARTS[1];
     let terms = [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0];
     let power = f32::from_bits(shifted.to_bits().wrapping_shl(23).wrapping_add(127 << 23));
     series(r, terms) * power
@@ -46,7 +45,7 @@ pub fn ln(x: f32) -> f32 {
     let m = f32::from_bits(bits.wrapping_sub((above << 23) as u32));
     let (n, s) = (above as f32, (m - 1.0) / (m + 1.0));
     let odd = series(s * s, [2.0 / 9.0, 2.0 / 7.0, 2.0 / 5.0, 2.0 / 3.0, 2.0]);
-    n * LN_2[0] + (n * LN_2[1] + s * odd)
+    n * LN_2_PARTS[0] + (n * LN_2_PARTS[1] + s * odd)
 }
 
 #[cfg(test)]

@@ -5,17 +5,17 @@ use crate::numerics::simd::dispatch;
 use crate::types::space::determinant;
 use rayon::prelude::*;
 
-/// Rounds of smoothing at most.
-const ROUNDS: usize = 20;
+/// Most smoothing iterations.
+const MAX_ITERATIONS: usize = 20;
 
-/// Weights of the three nodes about a knot: of the value, and of the derivative in steps.
-const VALUE: [f32; 3] = [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0];
-const SLOPE: [f32; 3] = [-0.5, 0.0, 0.5];
-/// Of the smoothing.
-const SMOOTH: [f32; 3] = [0.25, 0.5, 0.25];
+/// B-spline weights of the three nodes about a knot: of the value, and of the derivative per step.
+const VALUE_WEIGHTS: [f32; 3] = [1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0];
+const SLOPE_WEIGHTS: [f32; 3] = [-0.5, 0.0, 0.5];
+/// Smoothing weights of a node and its two neighbours along an axis.
+const SMOOTHING_WEIGHTS: [f32; 3] = [0.25, 0.5, 0.25];
 
-/// What single precision leaves open of a determinant, where the derivatives are about 1 or less.
-const ROUNDED: f32 = 1e-4;
+/// Rounding of a determinant in single precision, for derivatives of about 1 or less.
+const DETERMINANT_ROUNDING: f32 = 1e-4;
 
 /// A lattice with its steps in mm.
 struct Knots<'a> {
@@ -50,9 +50,9 @@ impl<'a> Knots<'a> {
                 for i in 0..3 {
                     let node = self.node(at, [i, j, k]);
                     let w = [
-                        SLOPE[i] * VALUE[j] * VALUE[k] * self.per_mm[0],
-                        VALUE[i] * SLOPE[j] * VALUE[k] * self.per_mm[1],
-                        VALUE[i] * VALUE[j] * SLOPE[k] * self.per_mm[2],
+                        SLOPE_WEIGHTS[i] * VALUE_WEIGHTS[j] * VALUE_WEIGHTS[k] * self.per_mm[0],
+                        VALUE_WEIGHTS[i] * SLOPE_WEIGHTS[j] * VALUE_WEIGHTS[k] * self.per_mm[1],
+                        VALUE_WEIGHTS[i] * VALUE_WEIGHTS[j] * SLOPE_WEIGHTS[k] * self.per_mm[2],
                     ];
                     for (c, row) in gradient.iter_mut().enumerate() {
                         let u = coefficients[c * total + node];
@@ -135,9 +135,9 @@ impl<'a> Knots<'a> {
                                 for (c_y, j) in near(j, ny).into_iter().enumerate() {
                                     let row = &coefficients[c * total + nx * (j + ny * k)..][..nx];
                                     let [wx, wy, wz] = [
-                                        VALUE[c_y] * VALUE[c_z] * self.per_mm[0],
-                                        SLOPE[c_y] * VALUE[c_z] * self.per_mm[1],
-                                        VALUE[c_y] * SLOPE[c_z] * self.per_mm[2],
+                                        VALUE_WEIGHTS[c_y] * VALUE_WEIGHTS[c_z] * self.per_mm[0],
+                                        SLOPE_WEIGHTS[c_y] * VALUE_WEIGHTS[c_z] * self.per_mm[1],
+                                        VALUE_WEIGHTS[c_y] * SLOPE_WEIGHTS[c_z] * self.per_mm[2],
                                     ];
                                     for i in 0..nx {
                                         x[i] += wx * row[i];
@@ -150,15 +150,17 @@ impl<'a> Knots<'a> {
                         let [[ux, uy, uz], [vx, vy, vz], [wx, wy, wz]] =
                             sums.each_ref().map(|s| s.each_ref().map(|s| &s[..nx]));
                         for (i, room) in room.iter_mut().enumerate() {
-                            let slope = |s: &[f32]| SLOPE[0] * s[i] + SLOPE[2] * s[i + 2];
-                            let value = |s: &[f32]| VALUE[0] * s[i] + VALUE[1] * s[i + 1] + VALUE[2] * s[i + 2];
+                            let slope = |s: &[f32]| SLOPE_WEIGHTS[0] * s[i] + SLOPE_WEIGHTS[2] * s[i + 2];
+                            let value = |s: &[f32]| {
+                                VALUE_WEIGHTS[0] * s[i] + VALUE_WEIGHTS[1] * s[i + 1] + VALUE_WEIGHTS[2] * s[i + 2]
+                            };
                             let [a, b, c] = [slope(ux), value(uy), value(uz)];
                             let [d, e, f] = [slope(vx), value(vy), value(vz)];
                             let [g, h, l] = [slope(wx), value(wy), value(wz)];
                             let square = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + l * l;
                             let (a, e, l) = (1.0 + a, 1.0 + e, 1.0 + l);
                             let volume = a * (e * l - f * h) - b * (d * l - f * g) + c * (d * h - e * g);
-                            *room = volume - least - ROUNDED * (1.0 + square * square);
+                            *room = volume - least - DETERMINANT_ROUNDING * (1.0 + square * square);
                         }
                     },
                 );
@@ -188,7 +190,10 @@ impl<'a> Knots<'a> {
         for k in 0..3 {
             for j in 0..3 {
                 for i in 0..3 {
-                    sum += SMOOTH[i] * SMOOTH[j] * SMOOTH[k] * values[self.node(at, [i, j, k])];
+                    sum += SMOOTHING_WEIGHTS[i]
+                        * SMOOTHING_WEIGHTS[j]
+                        * SMOOTHING_WEIGHTS[k]
+                        * values[self.node(at, [i, j, k])];
                 }
             }
         }
@@ -202,7 +207,7 @@ impl<'a> Knots<'a> {
 pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
     let knots = Knots::new(lattice, spacing);
     let mut folded = knots.folded(coefficients, knots.suspects(coefficients, least).into_par_iter(), least);
-    for _ in 0..ROUNDS {
+    for _ in 0..MAX_ITERATIONS {
         if folded.is_empty() {
             break;
         }

@@ -13,11 +13,11 @@ use crate::types::{DenseField, WorldPoint};
 /// From y, steps towards the x with x + u(x) = y (world mm), until x is off by less than
 /// `tolerance` (mm) in y. [`residual`] tells whether it got there.
 pub fn origin_of(field: &DenseField, y: WorldPoint, tolerance: f64) -> WorldPoint {
-    const STEPS: usize = 60;
+    const MAX_ITERATIONS: usize = 60;
     let mut x = y;
     let mut r = residual(field, x, y);
     let mut newton = false;
-    for _ in 0..STEPS {
+    for _ in 0..MAX_ITERATIONS {
         let before = length(r);
         if before < tolerance {
             break;

@@ -4,10 +4,10 @@ use crate::numerics::sampling::beside;
 use crate::types::Voxels;
 use rayon::prelude::*;
 
-/// Labels beyond this are not looked for.
-const LARGEST: f32 = 1_048_576.0;
-/// A region three voxels across, the smallest that counts, in voxels.
-const REGION: usize = 27;
+/// Largest value that is considered as a label.
+const MAX_LABEL: f32 = 1_048_576.0;
+/// Voxels of the smallest region that counts: three voxels across.
+const MIN_REGION_VOXELS: usize = 27;
 
 /// Whether the values are those of a label map: whole numbers that form plateaus.
 ///
@@ -23,7 +23,7 @@ pub fn is_label_map(volume: &Voxels<'_>) -> bool {
     if different <= 2 {
         return different == 2;
     }
-    if different > 1 + (values.len() - common) / REGION {
+    if different > 1 + (values.len() - common) / MIN_REGION_VOXELS {
         return false;
     }
     let plane = shape[0] * shape[1];
@@ -46,10 +46,10 @@ pub fn is_label_map(volume: &Voxels<'_>) -> bool {
 /// How many values there are, the commonest one and how often it occurs; none when one is no whole
 /// number up to the largest label.
 fn whole_values(values: &[f32]) -> Option<(usize, f32, usize)> {
-    if !values.iter().all(|v| v.abs() <= LARGEST && v.fract() == 0.0) {
+    if !values.iter().all(|v| v.abs() <= MAX_LABEL && v.fract() == 0.0) {
         return None;
     }
-    let (low, high) = values.iter().fold((LARGEST, -LARGEST), |(l, h), &v| (l.min(v), h.max(v)));
+    let (low, high) = values.iter().fold((MAX_LABEL, -MAX_LABEL), |(l, h), &v| (l.min(v), h.max(v)));
     let mut counts = vec![0usize; (high - low).max(0.0) as usize + 1];
     values.iter().for_each(|v| counts[(v - low) as usize] += 1);
     let different = counts.iter().filter(|n| **n > 0).count();

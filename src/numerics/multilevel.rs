@@ -13,8 +13,8 @@ use rayon::prelude::*;
 /// Two-scale weights of the cubic B-spline: coarse node `m` stands on fine node `2 m - 1`.
 const TWO_SCALE: [f32; 5] = [0.125, 0.5, 0.75, 0.5, 0.125];
 
-/// Lattices are coarsened along an axis while it has more nodes than this.
-const FEWEST: usize = 6;
+/// Most nodes of an axis that is not coarsened further.
+const MAX_COARSEST_NODES: usize = 6;
 
 /// A coarser lattice with the inverse blocks of the matrix there.
 pub(super) struct Coarse {
@@ -44,7 +44,7 @@ impl Coarse {
         blocks: &[f32],
         shape: &[Vec<f64>; 3],
     ) -> Option<Box<Self>> {
-        let nodes = fine.map(|n| if n > FEWEST { (n + 2) / 2 + 1 } else { n });
+        let nodes = fine.map(|n| if n > MAX_COARSEST_NODES { (n + 2) / 2 + 1 } else { n });
         if nodes == fine {
             return None;
         }

@@ -14,7 +14,7 @@ pub struct Orientation {
 }
 
 /// The orders of three axes.
-const ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+const AXIS_ORDERS: [[usize; 3]; 6] = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
 
 impl Orientation {
     /// Of a grid: the order of axes whose directions are nearest to the world's, by the sum of
@@ -26,7 +26,7 @@ impl Orientation {
         // A margin, so that rounding does not choose between axes that lie between two of the
         // world's.
         let nearest = |best: [usize; 3], order| if along(&order) > along(&best) + 1e-6 { order } else { best };
-        let axis = ORDERS.into_iter().reduce(nearest).unwrap_or([0, 1, 2]);
+        let axis = AXIS_ORDERS.into_iter().reduce(nearest).unwrap_or([0, 1, 2]);
         Self { axis, backwards: std::array::from_fn(|a| cosine(a, axis[a]) < 0.0) }
     }
 
@@ -148,7 +148,7 @@ mod tests {
 
     /// All 48 ways to store a grid's voxels: an order of its axes and the ways they run.
     fn ways() -> impl Iterator<Item = ([usize; 3], [bool; 3])> {
-        ORDERS.into_iter().flat_map(|order| (0..8).map(move |f| (order, [0, 1, 2].map(|a| f >> a & 1 == 1))))
+        AXIS_ORDERS.into_iter().flat_map(|order| (0..8).map(move |f| (order, [0, 1, 2].map(|a| f >> a & 1 == 1))))
     }
 
     #[test]

@@ -13,8 +13,8 @@ use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::sparse::linalg::cholesky::{SymbolicCholesky, SymbolicCholeskyRaw};
 use faer::{Accum, Mat, Par};
 
-/// Work of a renewal over that of the whole factor from which it is not worth it.
-const WORTH: f64 = 0.5;
+/// Cost of a partial refactorisation over that of a whole one, beyond which the whole one is done.
+const MAX_RENEWAL_COST: f64 = 0.5;
 
 /// The last columns of a factor.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ impl Tail {
             })
             .sum();
         // Put together and factorised again, a third of the cube each.
-        if 2.0 / 3.0 * (columns as f64).powi(3) > WORTH * whole {
+        if 2.0 / 3.0 * (columns as f64).powi(3) > MAX_RENEWAL_COST * whole {
             return None;
         }
         let first = symbolic.ncols() - columns;

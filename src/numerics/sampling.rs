@@ -46,13 +46,16 @@ impl std::str::FromStr for Interpolation {
     }
 }
 
-/// Slack (voxels) for positions that rounding puts just past the grid's face.
-const SLACK: f64 = 1e-6;
+/// Rounding of a position (voxels): how far outside the grid's face it may lie, and the least
+/// weight of a voxel.
+const POSITION_TOLERANCE_VOXELS: f64 = 1e-6;
 
 /// Whether `p` lies in a voxel of a grid of `shape`.
 #[inline]
 pub fn inside(shape: [usize; 3], p: VoxelPoint) -> bool {
-    (0..3).all(|a| p.0[a] >= -0.5 - SLACK && p.0[a] <= shape[a] as f64 - 0.5 + SLACK)
+    (0..3).all(|a| {
+        p.0[a] >= -0.5 - POSITION_TOLERANCE_VOXELS && p.0[a] <= shape[a] as f64 - 0.5 + POSITION_TOLERANCE_VOXELS
+    })
 }
 
 /// The voxels (x fastest) of a volume of `shape` that share a face with voxel `at`, along x first.
@@ -208,7 +211,7 @@ impl<'a> Sampler<'a> {
             return false;
         }
         let around = Stencil::new(self.shape, p);
-        around.index.iter().zip(around.weight).any(|(&at, w)| w > SLACK && self.missing[at])
+        around.index.iter().zip(around.weight).any(|(&at, w)| w > POSITION_TOLERANCE_VOXELS && self.missing[at])
     }
 
     /// The values at the first `out.len()` (at most [`LANES`]) of some places (voxels), fast where
@@ -271,7 +274,7 @@ fn majority(stencil: &Stencil, values: &[f32], nearest: f32) -> f32 {
     for at in stencil.index {
         let found = (values[at], weight(values[at]));
         // Rounding must not decide between equals.
-        if found.1 > best.1 + SLACK {
+        if found.1 > best.1 + POSITION_TOLERANCE_VOXELS {
             best = found;
         }
     }

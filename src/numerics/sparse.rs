@@ -29,15 +29,19 @@ use faer::{Conj, MatMut, Par, Side};
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-/// Parts with this many nodes or fewer are not divided further.
-const LEAF: usize = 60;
-/// Relative error of a refined solution at most.
-const REFINED: f64 = 1e-7;
-/// Refinements at most: as many cost more than a factorisation.
-const REFINEMENTS: i32 = 16;
-/// Where refinements change the solution by more than this part of the last one on average, the
-/// factor is given up.
-const SLOWEST: f64 = 0.5;
+/// Parts with this many nodes or fewer are not dissected further.
+const MAX_LEAF_NODES: usize = 60;
+/// Iterative refinement of a solution by a factor in single precision.
+struct Refinement {
+    /// Largest relative error of the refined solution.
+    tolerance: f64,
+    /// Most refinements: more cost as much as a factorisation.
+    max_count: i32,
+    /// Largest mean ratio of successive changes: beyond it, the factor is discarded.
+    max_contraction: f64,
+}
+
+const REFINEMENT: Refinement = Refinement { tolerance: 1e-7, max_count: 16, max_contraction: 0.5 };
 
 /// What keeps a system from being solved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -500,7 +504,7 @@ impl<'a> Factor<'a> {
         let mut x = vec![0.0; right.len()];
         let mut step: Vec<f32> = right.iter().map(|&v| v as f32).collect();
         let mut last = 1.0;
-        for round in 0..REFINEMENTS {
+        for round in 0..REFINEMENT.max_count {
             self.pattern.substitute(factor, &mut step).ok()?;
             let mut change = 0.0f64;
             for (x, step) in x.chunks_exact_mut(n).zip(step.chunks_exact(n)) {
@@ -517,12 +521,12 @@ impl<'a> Factor<'a> {
                 }
                 change = change.max(part);
             }
-            if change > SLOWEST.powi(round) {
+            if change > REFINEMENT.max_contraction.powi(round) {
                 return None;
             }
             // What is left is the next change and those after it: each as much smaller as this one
             // is than the last.
-            if round > 0 && change * change < REFINED * last {
+            if round > 0 && change * change < REFINEMENT.tolerance * last {
                 return Some(x);
             }
             last = change;
@@ -578,8 +582,8 @@ fn dissection(elements: &[u32], per: usize, places: &[[f64; 3]], width: &[u8]) -
     order
 }
 
-/// Directions across which a part may be cut: along the axes and between two of them.
-const ACROSS: [[f64; 3]; 9] = [
+/// Normals of the planes that may divide a part: the axes and the diagonals between two of them.
+const CUT_DIRECTIONS: [[f64; 3]; 9] = [
     [1.0, 0.0, 0.0],
     [0.0, 1.0, 0.0],
     [0.0, 0.0, 1.0],
@@ -627,7 +631,7 @@ impl Dissection<'_> {
     }
 
     fn divide(&mut self, part: &mut [u32], nodes: Vec<u32>) {
-        if nodes.len() <= LEAF || part.len() < 2 {
+        if nodes.len() <= MAX_LEAF_NODES || part.len() < 2 {
             self.order.extend(nodes);
             return;
         }
@@ -638,7 +642,7 @@ impl Dissection<'_> {
         let middle = 0.5 * part.len() as f64;
         let range = (part.len() / 3).max(1)..(2 * part.len() / 3).max(2).min(part.len());
         let mut best = (f64::INFINITY, 0, part.len() / 2);
-        for (direction, d) in ACROSS.iter().enumerate() {
+        for (direction, d) in CUT_DIRECTIONS.iter().enumerate() {
             sort(part, &self.centres, d);
             let sizes = self.cuts(part, &nodes);
             for c in range.clone() {
@@ -650,7 +654,7 @@ impl Dissection<'_> {
             }
         }
         let (_, direction, cut) = best;
-        sort(part, &self.centres, &ACROSS[direction]);
+        sort(part, &self.centres, &CUT_DIRECTIONS[direction]);
         self.cuts(part, &nodes);
         let spans = &self.spans;
         let pick = |keep: &dyn Fn([u32; 2]) -> bool| {

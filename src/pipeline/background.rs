@@ -7,28 +7,33 @@ use crate::numerics::{ablation, pyramid};
 use crate::types::{Grid, Voxels};
 use rayon::prelude::*;
 
-/// Part of a volume that a background of one value takes at least.
-const BACKGROUND: f64 = 0.02;
+/// Smallest part of a volume that a background of one value fills.
+const MIN_BACKGROUND_FRACTION: f64 = 0.02;
 
-/// Part of the voxels beside such a background that is as bright as tissue from which all of it was
-/// cut: where tissue ends in air it is 0 in phantoms without noise and 0.1 to 0.25 beside padding,
-/// where a mask cut through tissue 0.48 to 0.91.
-const CUT: f64 = 0.4;
+/// How a background that was cut from tissue is told from air.
+struct CutDetection {
+    /// Part of the voxels beside the background that are as bright as tissue, beyond which all of
+    /// it was cut: 0.1 to 0.25 beside padding, 0.48 to 0.91 where a mask cut tissue.
+    min_lit_fraction: f64,
+    /// The same about one place, beyond which the background was cut there.
+    min_local_lit_fraction: f64,
+    /// Part of the border at such places beyond which some was cut: 0.06 to 0.27 where a side was
+    /// set to 0, 0.003 to 0.02 where air was 0 before.
+    min_border_fraction: f64,
+    /// Intensity of a voxel as bright as tissue, over the tissue's median.
+    tissue_intensity: f32,
+    /// Edge of the blocks in which a cut is detected (finest voxels); three along each axis are a
+    /// place.
+    block_voxels: f64,
+}
 
-/// The same about one place from which it was cut there, and the part of the border at such places
-/// from which some was. Of volumes of which a box, an end or what lies past an oblique plane was
-/// set to 0 such places hold 0.06 to 0.27 of the border, 0.003 to 0.02 where their air was 0
-/// before; of scans whose air was set to 0 up to a twentieth of the brightest 0.0002, up to a tenth
-/// 0.008 (where it costs next to nothing).
-const CUT_HERE: f64 = 0.6;
-const PLACES: f64 = 0.004;
-
-/// Part of the tissue's median intensity that is as bright as tissue.
-const BRIGHT: f32 = 0.5;
-
-/// Edge of the blocks by which a cut is looked for, in the finest voxels; three of them along each
-/// axis are one place.
-const BLOCK: f64 = 8.0;
+const CUT_DETECTION: CutDetection = CutDetection {
+    min_lit_fraction: 0.4,
+    min_local_lit_fraction: 0.6,
+    min_border_fraction: 0.004,
+    tissue_intensity: 0.5,
+    block_voxels: 8.0,
+};
 
 /// A background of one value that was cut.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,7 +54,8 @@ impl Cut {
         let all = sum(&|b| border[b][1]).max(1.0);
         let lit = sum(&|b| border[b][0]) / all;
         let places = sum(&|b| if blocks.is_cut(&border, b) { border[b][1] } else { 0 }) / all;
-        ((lit > CUT || places > PLACES) && ablation::is_on("cut")).then_some(Self { lit, places })
+        ((lit > CUT_DETECTION.min_lit_fraction || places > CUT_DETECTION.min_border_fraction) && ablation::is_on("cut"))
+            .then_some(Self { lit, places })
     }
 }
 
@@ -64,7 +70,7 @@ pub fn empty(volume: &Voxels<'_>, least: f32) -> Option<f32> {
 
 /// Whether enough voxels hold a value to be a background.
 pub fn filled_with(values: &[f32], value: f32) -> bool {
-    held(values, value) as f64 >= BACKGROUND * values.len() as f64
+    held(values, value) as f64 >= MIN_BACKGROUND_FRACTION * values.len() as f64
 }
 
 fn held(values: &[f32], value: f32) -> usize {
@@ -80,7 +86,7 @@ pub fn hidden(mut volume: Voxels<'_>, empty: f32) -> Voxels<'_> {
 /// What to say of backgrounds that were cut.
 pub fn why_unseen(cut: [Option<Cut>; 2]) -> Option<String> {
     let of = |(cut, volume): (Option<Cut>, &str)| {
-        cut.map(|Cut { lit, places }| match lit > CUT {
+        cut.map(|Cut { lit, places }| match lit > CUT_DETECTION.min_lit_fraction {
             true => format!("{:.0} % of what borders on it in the {volume} volume is as bright as tissue", 100.0 * lit),
             false => format!(
                 "{:.0} % of its border in the {volume} volume lies where most of what borders on it is as bright as tissue",
@@ -98,7 +104,7 @@ fn bright(values: &[f32], empty: f32) -> Option<f32> {
     let mut shown = sampled(values);
     let [low, high] = [0.02, 0.98].map(|q| quantile(&mut shown, q));
     shown.retain(|v| *v > low + 0.1 * (high - low));
-    (!shown.is_empty()).then(|| empty + BRIGHT * (quantile(&mut shown, 0.5) - empty))
+    (!shown.is_empty()).then(|| empty + CUT_DETECTION.tissue_intensity * (quantile(&mut shown, 0.5) - empty))
 }
 
 /// A volume in blocks.
@@ -114,7 +120,7 @@ impl Blocks {
     fn of(grid: &Grid) -> Self {
         let (shape, spacing) = (grid.shape(), grid.spacing());
         let finest = pyramid::finest(shape, spacing);
-        let edge = spacing.map(|s| ((BLOCK * finest / s).round() as usize).max(2));
+        let edge = spacing.map(|s| ((CUT_DETECTION.block_voxels * finest / s).round() as usize).max(2));
         Self { shape, edge, count: pyramid::reduced_shape(shape, edge) }
     }
 
@@ -161,6 +167,6 @@ impl Blocks {
                 }
             }
         }
-        f64::from(sums[0]) > CUT_HERE * f64::from(sums[1])
+        f64::from(sums[0]) > CUT_DETECTION.min_local_lit_fraction * f64::from(sums[1])
     }
 }

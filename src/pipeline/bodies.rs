@@ -7,10 +7,11 @@
 
 use crate::consistency::energy::distance;
 use crate::consistency::grouping;
+use crate::consistency::models::MIN_DEGREES_OF_FREEDOM;
 use crate::consistency::pruning::{GATE, Measured};
 use crate::matching::gain::GainField;
 use crate::matching::pair::{Pair, Spans};
-use crate::matching::residual::{self, CAUCHY};
+use crate::matching::residual::{self, CAUCHY_TUNING};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::sampling::beside;
 use crate::numerics::statistics::median;
@@ -21,44 +22,60 @@ use crate::types::LevelReport;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Passes between two times that voxels are shared out.
-const PASSES: usize = 2;
+/// How voxels are assigned to bodies; trade-offs are of 12 sliding scenes.
+struct SegmentationControl {
+    /// Passes between two updates of the segmentation.
+    passes: usize,
+    /// Window of the residuals (finest voxels, one Gaussian standard deviation): 0.6 to 1.4 change
+    /// errors by 5 %.
+    residual_window_voxels: f64,
+    /// Log odds of a voxel whose whole neighbourhood belongs to a body: 3 to 12 change errors by
+    /// 2 %.
+    coherence_weight: f32,
+    /// Width of that neighbourhood (finest voxels, one Gaussian standard deviation): 1 to 2.2
+    /// change errors by 2 %.
+    coherence_window_voxels: f64,
+    /// Parts of a body below this fraction of its largest connected part join the body around them.
+    max_island_fraction: f64,
+    /// Mean-field iterations that balance each voxel's shares with its neighbourhood's.
+    iterations: usize,
+}
 
-/// Times that voxels are shared out in a trial; then it must explain more than it costs.
-const TRIAL: usize = 2;
+const SEGMENTATION: SegmentationControl = SegmentationControl {
+    passes: 2,
+    residual_window_voxels: 0.8,
+    coherence_weight: 5.0,
+    coherence_window_voxels: 1.2,
+    max_island_fraction: 0.1,
+    iterations: 5,
+};
 
-/// Part of its first loss that a trial may still have after the first passes, or it ends. Of 22
-/// scenes those with one body had 0.31 to 0.97 of it, those with more 0.13 at most.
-const HOPE: f64 = 0.25;
+/// How a further body is tested.
+struct TrialControl {
+    /// Segmentations in a trial; then the body must explain more than its degrees of freedom cost.
+    rounds: usize,
+    /// A trial ends unless its first round reduces the initial loss to this part: of 22 scenes
+    /// those with one body kept 0.31 to 0.97, those with more 0.13 at most.
+    max_loss_ratio: f64,
+    /// Misfit that each further degree of freedom must explain (Akaike 1974): twice what chance
+    /// gives.
+    min_gain_per_degree_of_freedom: f64,
+    /// Fewest matches of a body.
+    min_matches: usize,
+    /// Least median jump of the motion at its border (voxels of the initial volume).
+    min_jump_voxels: f64,
+    /// Most bodies.
+    max_bodies: usize,
+}
 
-/// Misfit that each further degree of freedom must explain (Akaike 1974: twice what chance gives),
-/// and how many are counted at least: with fewer, chance and rounding weigh too much.
-const WORTH: (f64, f64) = (2.0, 100.0);
-
-/// Matches that a body rests on at least.
-const FEWEST: usize = 6;
-
-/// Jump of the motion at the border of two bodies, at least (voxels of the initial volume, median):
-/// less is one body.
-const JUMP: f64 = 1.0;
-
-/// Bodies at most.
-const MOST: usize = 8;
-
-/// Window in which residuals tell whose a voxel is (finest voxels, one standard deviation of a
-/// Gaussian). With .6 to 1.4 the errors of 12 scenes that slide differ by 5 %.
-const WINDOW: f64 = 0.8;
-
-/// Log odds of a voxel all of whose surroundings belong to a body, and the width of these (finest
-/// voxels, one standard deviation). With 3 to 12, and with 1 to 2.2, the errors of 12 scenes that
-/// slide differ by 2 %.
-const COHERENCE: (f32, f64) = (5.0, 1.2);
-
-/// Part of a body's largest connected part under which another joins what is around it.
-const ISLAND: f64 = 0.1;
-
-/// Times that shares are balanced against those around (mean field).
-const BALANCED: usize = 5;
+const TRIAL: TrialControl = TrialControl {
+    rounds: 2,
+    max_loss_ratio: 0.25,
+    min_gain_per_degree_of_freedom: 2.0,
+    min_matches: 6,
+    min_jump_voxels: 1.0,
+    max_bodies: 8,
+};
 
 /// Tissue shared out among bodies, with their motions.
 #[derive(Debug, Clone, PartialEq)]
@@ -244,13 +261,13 @@ impl Bodies {
             return level::refine(pair, field, passes, seed, tick);
         }
         let begun: Vec<Vec<f32>> = self.fields.iter().map(|f| f.coefficients.clone()).collect();
-        for done in (0..passes).step_by(PASSES) {
+        for done in (0..passes).step_by(SEGMENTATION.passes) {
             if done > 0 && !self.fixed {
                 self.share_out(pair);
             }
             for b in 0..self.count() {
                 let part = self.part(pair, b);
-                let (field, passes) = (&mut self.fields[b], PASSES.min(passes - done));
+                let (field, passes) = (&mut self.fields[b], SEGMENTATION.passes.min(passes - done));
                 level::refine_from(&part, field, &begun[b], passes, seed, |_| ());
             }
             tick(done);
@@ -258,9 +275,9 @@ impl Bodies {
     }
 
     /// Brings back what the bending energy flattened of each body's field.
-    pub fn twice(&mut self, pair: &Pair<'_>, seed: u64) {
+    pub fn twicing(&mut self, pair: &Pair<'_>, seed: u64) {
         for b in 0..self.count() {
-            level::twice(&self.part(pair, b), &mut self.fields[b], seed);
+            level::twicing(&self.part(pair, b), &mut self.fields[b], seed);
         }
     }
 
@@ -293,15 +310,19 @@ impl Bodies {
         if self.fixed || !ablation::is_on("bodies") {
             return said;
         }
-        while self.count() < MOST {
+        while self.count() < TRIAL.max_bodies {
             let tried = (0..self.count()).flat_map(|b| self.proposed(pair, matches, b));
             let tried = tried.filter_map(|bodies| bodies.tried(pair, self, seed));
             let rests = |t: &Trial| {
                 let own = matches.iter().filter(|m| t.bodies.label_near(m.voxel) == self.count());
-                own.count() >= FEWEST
+                own.count() >= TRIAL.min_matches
             };
-            let worth = |t: &Trial| t.gain > WORTH.0 * t.more.max(WORTH.1) && t.jump > JUMP * finest;
-            let Some(best) = tried.filter(|t| worth(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain)) else {
+            let is_significant = |t: &Trial| {
+                t.gain > TRIAL.min_gain_per_degree_of_freedom * t.more.max(MIN_DEGREES_OF_FREEDOM)
+                    && t.jump > TRIAL.min_jump_voxels * finest
+            };
+            let Some(best) = tried.filter(|t| is_significant(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain))
+            else {
                 break;
             };
             said.push(best.why(self.count() + 1));
@@ -371,12 +392,12 @@ impl Bodies {
         let before = fewer.warp(pair, &pair.spans);
         let gained = |bodies: &Self| level::gained(pair, &before, bodies.warp(pair, &pair.spans));
         let mut gain = gained(&self);
-        for round in 0..TRIAL {
+        for round in 0..TRIAL.rounds {
             let last = gain;
-            self.refine(pair, PASSES, seed, |_| ());
+            self.refine(pair, SEGMENTATION.passes, seed, |_| ());
             self.share_out(pair);
             gain = gained(&self);
-            if gain < last.min(0.0) * if round + 1 < TRIAL { HOPE } else { 0.0 } {
+            if gain < last.min(0.0) * if round + 1 < TRIAL.rounds { TRIAL.max_loss_ratio } else { 0.0 } {
                 return None;
             }
         }
@@ -434,16 +455,23 @@ impl Bodies {
         // Voxels that the window stands for.
         let held: f64 = (0..3)
             .filter(|&a| pair.shape[a] > 1)
-            .map(|a| (window(WINDOW) * finest / pair.spacing[a]).max(1.0))
+            .map(|a| (window(SEGMENTATION.residual_window_voxels) * finest / pair.spacing[a]).max(1.0))
             .product();
         let trust = 0.5 * held as f32 * level::independent(pair);
         let costs: Vec<Vec<f32>> = self
             .fields
             .iter()
-            .map(|f| around(&cost(pair, &pair.warp(&f.lattice, &f.coefficients, &pair.spans), &gain, sigma), WINDOW))
+            .map(|f| {
+                around(
+                    &cost(pair, &pair.warp(&f.lattice, &f.coefficients, &pair.spans), &gain, sigma),
+                    SEGMENTATION.residual_window_voxels,
+                )
+            })
             .collect();
-        let (together, width) = COHERENCE;
-        let tissue = around(&pair.mask.iter().map(|m| f32::from(u8::from(*m != 0))).collect::<Vec<_>>(), width);
+        let tissue = around(
+            &pair.mask.iter().map(|m| f32::from(u8::from(*m != 0))).collect::<Vec<_>>(),
+            SEGMENTATION.coherence_window_voxels,
+        );
         let of = |b: usize| move |(at, l): (usize, &u8)| f32::from(pair.mask[at] != 0 && usize::from(*l) == b);
         // The shares of the last body are what those of the others leave.
         let last = self.count() - 1;
@@ -453,9 +481,11 @@ impl Bodies {
             Some(own) => own[at],
             None => whole - all.iter().map(|s| s[at]).sum::<f32>(),
         };
-        for _ in 0..BALANCED {
-            let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, width)).collect();
-            let energy = |b: usize, at: usize| trust * costs[b][at] - together * share_of(&about, tissue[at], b, at);
+        for _ in 0..SEGMENTATION.iterations {
+            let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, SEGMENTATION.coherence_window_voxels)).collect();
+            let energy = |b: usize, at: usize| {
+                trust * costs[b][at] - SEGMENTATION.coherence_weight * share_of(&about, tissue[at], b, at)
+            };
             for (b, share) in shares.iter_mut().enumerate() {
                 share.par_iter_mut().enumerate().filter(|(at, _)| pair.mask[*at] != 0).for_each(|(at, share)| {
                     let own = energy(b, at);
@@ -464,7 +494,7 @@ impl Bodies {
             }
         }
         // Outside the tissue the nearest body goes on.
-        let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, width)).collect();
+        let about: Vec<Vec<f32>> = shares.iter().map(|s| around(s, SEGMENTATION.coherence_window_voxels)).collect();
         self.labels.par_iter_mut().enumerate().for_each(|(at, label)| {
             let share = |b: usize| match pair.mask[at] {
                 0 => share_of(&about, tissue[at], b, at),
@@ -501,7 +531,7 @@ impl Bodies {
         }
         let mut largest = vec![0usize; self.count()];
         parts.iter().for_each(|p| largest[self.label(p[0])] = largest[self.label(p[0])].max(p.len()));
-        parts.retain(|p| (p.len() as f64) < ISLAND * largest[self.label(p[0])] as f64);
+        parts.retain(|p| (p.len() as f64) < SEGMENTATION.max_island_fraction * largest[self.label(p[0])] as f64);
         for own in &parts {
             let mut touched = vec![0usize; self.count()];
             let around = own.iter().flat_map(|&at| beside(pair.shape, at)).filter(|&o| pair.mask[o] != 0);
@@ -529,7 +559,7 @@ impl Trial {
             "bodies: {number} taken; the last explains {gain:.0} of the misfit with {:.0} degrees of freedom {than} (each more must explain {}); \
              its motion differs by {jump:.1} mm from its neighbours' along their border (median)",
             more.abs(),
-            WORTH.0
+            TRIAL.min_gain_per_degree_of_freedom
         )
     }
 }
@@ -543,7 +573,7 @@ fn window(width: f64) -> f64 {
 /// show it.
 fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f32> {
     let [nx, ny, _] = pair.shape;
-    let cut = 1.0 / (CAUCHY * sigma);
+    let cut = 1.0 / (CAUCHY_TUNING * sigma);
     let mut out = vec![0.0f32; warped.len()];
     let room = || (vec![0.0; nx], vec![0.0; nx]);
     out.par_chunks_mut(nx).enumerate().for_each_init(room, |(a, b), (row, out)| {
@@ -551,7 +581,7 @@ fn cost(pair: &Pair<'_>, warped: &[f32], gain: &GainField, sigma: f32) -> Vec<f3
         for (i, out) in out.iter_mut().enumerate().filter(|(i, _)| pair.mask[row * nx + i] != 0) {
             let at = row * nx + i;
             let t = cut * (pair.fixed_smooth[at] - (a[i] * warped[at] + b[i]));
-            *out = if t.is_finite() { CAUCHY * CAUCHY * (t * t).ln_1p() } else { GATE as f32 };
+            *out = if t.is_finite() { CAUCHY_TUNING * CAUCHY_TUNING * (t * t).ln_1p() } else { GATE as f32 };
         }
     });
     out

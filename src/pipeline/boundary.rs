@@ -5,17 +5,13 @@
 //! size of the covariance, and the draws of `posterior.nii.gz` its directions.
 
 use crate::numerics::sampling::{Stencil, nearest};
-use crate::stiffness::observations::{REACH, at_surface};
-use crate::strain::deviation::errors_at;
+use crate::stiffness::observations::{SURFACE_REACH_VOXELS, at_surface};
+use crate::strain::deviation::{DRAW_SMOOTHING_NODES, errors_at};
 use crate::types::{
     DenseField, ElementModulus, ErrorSamples, Mask, MeasuredNode, SolidMesh, StiffnessResult, Volume, VoxelPoint,
     WorldPoint,
 };
 use rayon::prelude::*;
-
-/// Width over which the directions of a few draws are averaged (nodes of the draws, one standard
-/// deviation of a Gaussian).
-const AVERAGED: f64 = 1.5;
 
 /// What is known of the motion.
 #[derive(Debug, Clone, Copy)]
@@ -56,8 +52,8 @@ pub struct Known<'a> {
 pub fn at_nodes(known: &Known<'_>, mesh: &SolidMesh, nodes: &[u32], patch: &str) -> Vec<MeasuredNode> {
     let one = |&node: &u32| {
         let place = mesh.nodes()[node as usize];
-        let (displacement, _) =
-            beside_body(known.body, place).then(|| at_surface(known.field, known.body, place.0, REACH))??;
+        let (displacement, _) = beside_body(known.body, place)
+            .then(|| at_surface(known.field, known.body, place.0, SURFACE_REACH_VOXELS))??;
         Some(MeasuredNode { node, patch: patch.into(), displacement, covariance: covariance(known, place) })
     };
     nodes.par_iter().filter_map(one).collect()
@@ -97,7 +93,7 @@ fn directions(draws: &ErrorSamples, place: WorldPoint) -> Option<[f64; 6]> {
                 let step = [i, j, k].map(f64::from);
                 let near = nodes.affine().to_world(VoxelPoint(std::array::from_fn(|a| at[a] + step[a])));
                 let apart: f64 = step.iter().map(|s| s * s).sum();
-                let weight = (-0.5 * apart / (AVERAGED * AVERAGED)).exp();
+                let weight = (-0.5 * apart / (DRAW_SMOOTHING_NODES * DRAW_SMOOTHING_NODES)).exp();
                 for [x, y, z] in errors_at(draws, near) {
                     let products = [x * x, x * y, x * z, y * y, y * z, z * z];
                     sum.iter_mut().zip(products).for_each(|(s, p)| *s += weight * p);

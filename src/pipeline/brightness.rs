@@ -6,37 +6,30 @@ use crate::matching::pair::Pair;
 use crate::numerics::ablation;
 use crate::pipeline::bodies::Bodies;
 
-/// What may be left of the difference, as a part of it, for the rest to be taken out. Of 82 pairs
-/// of all kinds those without a bias kept 0.75 to 1.0 of it on the coarsest level, those with one
-/// of 5 % 0.18 to 0.86 and of 15 % 0.09 to 0.56.
-const LEAVES: f64 = 0.6;
+/// Largest residuals with which a brightness correction is accepted; `REGISTERED` under a motion,
+/// `AT_REST` before the motion is known.
+struct Acceptance {
+    /// Residual over the whole difference: of 82 pairs those without a bias kept 0.75 to 1.0 on the
+    /// coarsest level, those with 15 % 0.09 to 0.56.
+    residual: f64,
+    /// Residual of place and contrast together over that of the better one alone: a bias alone
+    /// leaves 0.76 to 1.08, another contrast 0.08 to 0.8.
+    joint: f64,
+}
 
-/// The same at rest, before anything is found: motion shows as well. Of the same pairs a calf whose
-/// halves move past each other was 12 % worse with 0.32 left taken out. Coils beside the tissue
-/// leave 0.02, small presses at a bias of 15 % 0.09.
-const LEAVES_AT_REST: f64 = 0.2;
+const REGISTERED: Acceptance = Acceptance { residual: 0.6, joint: 0.95 };
 
-/// What place and contrast may leave together, as a part of what the better one leaves alone, to be
-/// taken together. Under a bias alone they leave 0.76 to 1.08 of what place does, in another
-/// contrast 0.08 to 0.8; and place alone, taken out in another contrast, does harm (a thigh in a
-/// cube root 0.73 -> 1.85 mm), while both under a bias alone do none.
-const BOTH: f64 = 0.95;
+/// Stricter, as motion shows too and passes for contrast: the looser limits raised the errors of
+/// sliding calves by 12 % (residual 0.32) and 30 % (joint 0.95).
+const AT_REST: Acceptance = Acceptance { residual: 0.2, joint: 0.7 };
 
-/// The same at rest, where motion passes for contrast: a calf whose halves slide under a bias of 40
-/// % was 0.87 in place of 0.67 mm off with 0.95.
-const BOTH_AT_REST: f64 = 0.7;
+/// Largest part of the variation between neighbours ([`Brightness::uneven`]) that may remain: 0.03
+/// to 0.56 for smooth fields, 0.42 to 15 for steps, whose polynomials do harm.
+const MAX_STEP_RATIO: f64 = 0.4;
 
-/// What may be left of how the difference varies between neighbours ([`Brightness::uneven`]), as a
-/// part of it. Of 64 pairs with a coil's profile, a bias of 5 to 40 % or another contrast those
-/// under their field kept 0.03 to 0.56 (of 15 % and more 0.37 at most), those at rest that
-/// [`LEAVES_AT_REST`] lets pass 0.05 to 0.34. Of 11 whose one half is 1.4 to 3 times as bright it
-/// was 0.44 to 1.9, and 0.42 to 15, and smooth polynomials across the step did harm (a head turned
-/// by 5 degrees 0.008 -> 0.208 mm, calves that slide 0.18 -> 0.56).
-const UNEVEN: f64 = 0.4;
-
-/// Difference in brightness (logarithm, robust standard deviation over blocks) below which it is no
-/// matter.
-const MATTERS: f64 = 0.005;
+/// Difference in brightness below which it is ignored (logarithm, robust standard deviation over
+/// blocks).
+const MIN_DIFFERENCE_LOG: f64 = 0.005;
 
 /// The difference as far as it is known.
 #[derive(Default)]
@@ -78,7 +71,7 @@ impl Light {
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),
         motion: &Bodies,
     ) -> bool {
-        self.judge(pair, (aligned, factor), motion, (LEAVES, BOTH))
+        self.judge(pair, (aligned, factor), motion, &REGISTERED)
     }
 
     /// The same before the motion is known.
@@ -88,7 +81,7 @@ impl Light {
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),
         still: &Bodies,
     ) -> bool {
-        self.judge(pair, (aligned, factor), still, (LEAVES_AT_REST, BOTH_AT_REST))
+        self.judge(pair, (aligned, factor), still, &AT_REST)
     }
 
     fn judge<'a>(
@@ -96,7 +89,7 @@ impl Light {
         pair: &mut Pair<'a>,
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),
         motion: &Bodies,
-        (leaves, both): (f64, f64),
+        limits: &Acceptance,
     ) -> bool {
         let before = self.taken.take();
         let was_taken = before.is_some();
@@ -104,9 +97,12 @@ impl Light {
             pair.put(aligned.deformed(factor));
         }
         let warped = motion.warp(pair, &pair.spans);
-        let found = Brightness::measure(pair, (factor, aligned.shape()), &warped, |p| motion.at(p), both);
+        let found = Brightness::measure(pair, (factor, aligned.shape()), &warped, |p| motion.at(p), limits.joint);
         let matters = |b: &Brightness| {
-            ablation::is_on("brightness") && b.deviation[0] > MATTERS && explains(b, leaves) && b.uneven <= UNEVEN
+            ablation::is_on("brightness")
+                && b.deviation[0] > MIN_DIFFERENCE_LOG
+                && explains(b, limits.residual)
+                && b.uneven <= MAX_STEP_RATIO
         };
         match found {
             Some(found) if matters(&found) => self.taken = Some(found),
@@ -124,7 +120,7 @@ impl Light {
         let found = self.taken.as_ref().or(self.left.as_ref())?;
         let [before, after] = found.deviation.map(|d| 100.0 * d.exp_m1());
         if self.taken.is_none() {
-            let step = if found.uneven > UNEVEN && explains(found, LEAVES) {
+            let step = if found.uneven > MAX_STEP_RATIO && explains(found, REGISTERED.residual) {
                 " (it is not smooth: a step, or other tissue)"
             } else {
                 ""

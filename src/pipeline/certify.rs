@@ -45,21 +45,24 @@ pub struct Certified {
     pub tissue: Mask,
 }
 
-/// Amplitude of the waves (voxels of the finest axis): that of the DIC Challenge 2.0.
-const AMPLITUDE: f64 = 0.5;
+/// The known motions of a certificate.
+struct ImposedMotion {
+    /// Amplitude of the waves (voxels of the finest axis): that of the DIC Challenge 2.0.
+    wave_amplitude_voxels: f64,
+    /// Uniform strain (1).
+    uniform_strain: f64,
+}
 
-/// Uniform strain that is imposed (1).
-const STRETCH: f64 = 0.02;
+const IMPOSED: ImposedMotion = ImposedMotion { wave_amplitude_voxels: 0.5, uniform_strain: 0.02 };
 
-/// Normal deviations that 95 % of the errors lie within.
+/// Half the 95 % interval of a normal error (standard deviations).
 const NORMAL_95: f64 = 1.96;
 
-/// Gauges whose noise is given, in units of the shortest.
-const GAUGES: [usize; 7] = [1, 2, 3, 4, 6, 8, 12];
+/// Gauge lengths whose noise is reported, in units of the shortest.
+const GAUGE_MULTIPLES: [usize; 7] = [1, 2, 3, 4, 6, 8, 12];
 
-/// Of a wavelength, the gauge over which strain is taken: a mean over a quarter of a wave keeps 90
-/// % of its amplitude.
-const GAUGE_OF_WAVE: f64 = 0.25;
+/// Gauge length over a wavelength: a mean over a quarter of a wave keeps 90 % of its amplitude.
+const GAUGE_PER_WAVELENGTH: f64 = 0.25;
 
 /// Makes the pairs: a volume with a known motion, and a scan with noise of its own.
 struct Pairs<'a> {
@@ -155,7 +158,7 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
     let displacement_noise_mm = axis_deviation(&differences, &tissue);
     let by_gauge = noise_by_gauge(&differences, &tissue);
     let longest = by_wavelength.last().map_or(0.0, |g| g[0]);
-    let wanted = GAUGE_OF_WAVE * wavelength_90_mm.unwrap_or(longest);
+    let wanted = GAUGE_PER_WAVELENGTH * wavelength_90_mm.unwrap_or(longest);
     let fallback = GaugeNoise { gauge_mm: 0.0, noise: 0.0, detectable: 0.0 };
     let chosen =
         by_gauge.iter().find(|g| g.gauge_mm >= wanted * 0.999).or(by_gauge.last()).copied().unwrap_or(fallback);
@@ -171,10 +174,13 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
         _ => NORMAL_95 as f32 * variances.as_slice()[at].sqrt(),
     });
     let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
-    let blind = inside.iter().filter(|&&at| f64::from(detectable.as_slice()[at]) > AMPLITUDE * edge).count();
+    let blind = inside
+        .iter()
+        .filter(|&&at| f64::from(detectable.as_slice()[at]) > IMPOSED.wave_amplitude_voxels * edge)
+        .count();
     let thick = (0..3).filter(|&a| grid.shape()[a] > 1).max_by_key(|&a| grid.shape()[a]).unwrap_or(0);
-    let uniform = stretch(&grid, thick, STRETCH);
-    let mut known = vec![(format!("uniform strain of {:.0} %", 100.0 * STRETCH), uniform)];
+    let uniform = stretch(&grid, thick, IMPOSED.uniform_strain);
+    let mut known = vec![(format!("uniform strain of {:.0} %", 100.0 * IMPOSED.uniform_strain), uniform)];
     known.extend(like.map(|like| ("the motion that was given".to_string(), like.clone())));
     let mut imposed = vec![compared("none (at rest)".into(), &at_rest, &still, &tissue, chosen.gauge_mm)?];
     for (motion, truth) in known {
@@ -197,7 +203,7 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
             gauge_mm: chosen.gauge_mm,
             strain_noise: chosen.noise,
             strain_noise_by_gauge: by_gauge,
-            amplitude_mm: AMPLITUDE * edge,
+            amplitude_mm: IMPOSED.wave_amplitude_voxels * edge,
             gains: by_wavelength.iter().map(|&[wavelength_mm, gain]| Gain { wavelength_mm, gain }).collect(),
             wavelength_90_mm,
             wavelength_50_mm,
@@ -258,7 +264,7 @@ fn image_noise(initial: &Voxels<'_>, second: Option<&Voxels<'_>>, tissue: &Mask)
 /// a slice they move along the axis that they grow along.
 fn stars(tissue: &Mask) -> Vec<Star> {
     let grid = tissue.grid();
-    let amplitude = AMPLITUDE * grid.least_spacing();
+    let amplitude = IMPOSED.wave_amplitude_voxels * grid.least_spacing();
     let thick: Vec<usize> = (0..3).filter(|&a| grid.shape()[a] > 1).collect();
     let n = thick.len();
     (0..n).map(|i| Star::over(tissue, [thick[i], thick[(i + 1) % n], thick[(i + 2) % n]], amplitude)).collect()
@@ -308,7 +314,7 @@ fn noise_by_gauge(noise: &[DenseField], tissue: &Mask) -> Vec<GaugeNoise> {
         let noise = (noise.iter().map(square).sum::<f64>() / noise.len().max(1) as f64).sqrt();
         GaugeNoise { gauge_mm, noise, detectable: NORMAL_95 * noise }
     };
-    GAUGES.into_iter().filter(|&t| t == 1 || t as f64 * shortest <= widest).map(of).collect()
+    GAUGE_MULTIPLES.into_iter().filter(|&t| t == 1 || t as f64 * shortest <= widest).map(of).collect()
 }
 
 /// How a known motion came back.

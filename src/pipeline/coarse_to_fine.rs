@@ -153,7 +153,7 @@ impl<'a> CoarseToFine<'a, '_> {
     fn level(&self, place: usize, pair: &Pair<'_>) -> Level {
         let params = self.params;
         let last = place + 1 == self.factors.len();
-        let apart = if last { refinement::apart(params.node_spacing, pair.inside) } else { COARSE };
+        let apart = if last { refinement::apart(params.node_spacing, pair.inside) } else { COARSE_NODE_SPACING_VOXELS };
         let passes = if last { params.passes } else { params.coarse_passes };
         Level { place, last, factor: self.factors[place], apart, lattice: level::lattice(pair, apart), passes }
     }
@@ -174,8 +174,8 @@ impl<'a> CoarseToFine<'a, '_> {
             return Entry { bodies, begun, sought: false };
         }
         bodies.refine(pair, level.passes, self.params.seed, search.tick);
-        let loose = level.place == 1 && begun.is_loose();
-        match loose.then(|| search.closer(pair, &bodies, level.passes, &mut account.matched)).flatten() {
+        let searches_again = level.place == 1 && begun.needs_next_level();
+        match searches_again.then(|| search.next_level(pair, &bodies, level.passes, &mut account.matched)).flatten() {
             Some(found) => {
                 account.reports.extend(found.report.clone().map(noted));
                 Entry { bodies: found.motion.clone(), begun: found, sought: !level.last }
@@ -250,9 +250,9 @@ impl<'a> CoarseToFine<'a, '_> {
         clock.skip("matching", matched);
         clock.book("residual");
         self.tell("matching", level.place, 0.9);
-        let automatic = (pair.inside / params.voxels_per_point).max(LEAST_POINTS);
+        let automatic = (pair.inside / params.voxels_per_point).max(MIN_POINTS);
         let points = if params.points > 0 { params.points } else { automatic };
-        let near = MatchParams::near(params, &pair, points.max(LEAST_POINTS), params.points > 0);
+        let near = MatchParams::near(params, &pair, points.max(MIN_POINTS), params.points > 0);
         let (matches, report) = bodies.matches(&pair, near);
         if level.is_first() {
             reports.clear();
@@ -307,14 +307,14 @@ impl<'a> CoarseToFine<'a, '_> {
         matched: &mut f64,
     ) -> Begun {
         let mut found = search.begin((pair, factor), lattice, self.starts, passes, matched);
-        if let Some(tissue) = found.is_unsure().then(around).flatten() {
+        if let Some(tissue) = found.is_unconfirmed().then(around).flatten() {
             let wider = search.begin((&tissue, factor), lattice, self.starts_given(), passes, matched);
-            found = Begun::surer(pair, found, wider);
+            found = Begun::more_consistent(pair, found, wider);
         }
         if self.params.search_mm == 0.0 && found.leaves_open(pair, search.range) {
-            let far = Search { range: TWICE * search.range, ..*search };
+            let far = Search { range: WIDE_SEARCH_RATIO * search.range, ..*search };
             let wide = far.begin((pair, factor), lattice, self.starts_given(), passes, matched);
-            let taken = wide.outdoes(pair, &found);
+            let taken = wide.improves_on(pair, &found);
             asked.push(noted(why_farther(search.range, &found, &wide, taken)));
             if taken {
                 (*range, found) = (far.range, wide);
@@ -324,23 +324,24 @@ impl<'a> CoarseToFine<'a, '_> {
     }
 }
 
-/// How far is searched if few features agree or the motion reaches the range, in ranges.
-pub(super) const TWICE: f64 = 2.0;
+/// Reach of the wide search, for few agreeing features or a motion near the end of the range
+/// (ranges).
+pub(super) const WIDE_SEARCH_RATIO: f64 = 2.0;
 
 /// What a search twice as far gave, in words.
 fn why_farther(range: f64, own: &Begun, wide: &Begun, taken: bool) -> String {
-    let open = if own.agrees_on_few() { "few features agree" } else { "the motion reaches its end" };
+    let open = if own.is_partial() { "few features agree" } else { "the motion reaches its end" };
     format!(
         "search range: within {range:.1} mm {open} ({:.0} % of the features agree); within {:.1} mm {:.0} % agree, {}",
         100.0 * own.share(),
-        TWICE * range,
+        WIDE_SEARCH_RATIO * range,
         100.0 * wide.share(),
         if taken { "taken" } else { "not taken" }
     )
 }
 
-/// Points that are matched at least, however few are asked for: a field is judged by them.
-pub(super) const LEAST_POINTS: usize = 200;
+/// Fewest points that are matched, even if fewer are asked for: the field is judged by them.
+pub(super) const MIN_POINTS: usize = 200;
 
 /// The fields that what is known suggests on the coarsest level: what is left of a start, and one
 /// through the landmarks.
@@ -362,7 +363,7 @@ pub(super) fn begun_from(
             let d = rest(grid.affine().to_world(VoxelPoint(from_level(p, factor))));
             std::array::from_fn(|a| (0..3).map(|r| axes[r][a] * d[r]).sum())
         };
-        let field = SplineField::still(level::lattice(&pair, COARSE));
+        let field = SplineField::still(level::lattice(&pair, COARSE_NODE_SPACING_VOXELS));
         let motion = SplineField { coefficients: field.lattice.fit(along), ..field };
         start::bends(rest, grid, mask).then(|| Start { motion: Bodies::from(motion), factor, followed: None })
     };
@@ -375,9 +376,16 @@ pub(super) fn around(mask: &Mask, initial: &Voxels<'_>) -> Vec<u8> {
     tissue.as_slice().iter().zip(mask.as_slice()).map(|(t, m)| u8::from(*t != 0 || *m != 0)).collect()
 }
 
-/// Voxels of tissue that a level to start from needs: about one in seventy is a corner, and
-/// [`FEWEST`] must be left.
-const LEAST_SEARCHED: usize = 1500;
+/// Voxels of tissue on a level.
+struct LevelSize {
+    /// Fewest on the coarsest level: about one in seventy is a corner, and the field needs
+    /// [`MIN_MATCHES`](super::field::MIN_MATCHES).
+    min_coarsest: usize,
+    /// Most on the finest level of a preset that does not fix that level.
+    max_finest: usize,
+}
+
+const LEVEL_VOXELS: LevelSize = LevelSize { min_coarsest: 1500, max_finest: 600_000 };
 
 /// The reach of the search: as asked, or 15 % of the smallest side, at least 2 voxels, at most 30
 /// mm.
@@ -395,23 +403,21 @@ pub(super) fn inside(mask: &Mask) -> usize {
 }
 
 /// Reduction factors of the levels, coarse to fine: none but the finest with less tissue than
-/// [`LEAST_SEARCHED`].
+/// [`LEVEL_VOXELS`] says.
 pub(super) fn worked_on(grid: &Grid, mask: &Mask, finest: usize, search: f64) -> Vec<[usize; 3]> {
     let inside = inside(mask);
     let mut all = factors(grid.shape(), grid.spacing(), finest, search / 6.0);
-    let too_coarse = all.iter().take_while(|f| inside / f.iter().product::<usize>() < LEAST_SEARCHED).count();
+    let too_coarse =
+        all.iter().take_while(|f| inside / f.iter().product::<usize>() < LEVEL_VOXELS.min_coarsest).count();
     all.drain(..too_coarse.min(all.len() - 1));
     all
 }
 
-/// Voxels of the mask that a preset without a fixed finest level works on at most.
-const WORKED_ON: usize = 600_000;
+/// Voxels between the nodes of the lattice on all levels but the finest.
+pub(super) const COARSE_NODE_SPACING_VOXELS: usize = 3;
 
-/// Voxels between the nodes of the lattice on levels above the finest.
-pub(super) const COARSE: usize = 3;
-
-/// The finest level: as asked, or the first of 1, 2, 4, 8 at which no more than [`WORKED_ON`]
-/// voxels of tissue are left.
+/// The finest level: as asked, or the first of 1, 2, 4, 8 at which the voxels of tissue are few
+/// enough, see [`LEVEL_VOXELS`].
 pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
     if asked > 0 {
         return asked;
@@ -421,5 +427,5 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, asked: usize) -> usize {
         let factor = factors(grid.shape(), grid.spacing(), f, 0.0)[0];
         inside / factor.iter().product::<usize>()
     };
-    [1, 2, 4].into_iter().find(|&f| left(f) <= WORKED_ON).unwrap_or(8)
+    [1, 2, 4].into_iter().find(|&f| left(f) <= LEVEL_VOXELS.max_finest).unwrap_or(8)
 }

@@ -14,12 +14,12 @@ use crate::pipeline::hypotheses::Search;
 use crate::pipeline::level;
 use crate::types::{Agreement, FieldParams, Mask, Voxels};
 
-/// Part of what a gain and an offset leave of the variance that any relation must explain for the
+/// Part of the variance left by a gain and an offset that a free relation must explain for the
 /// contrasts to differ (1). Calibrated: docs/lab/2026-11-inputs.md.
-const DIFFER: f64 = 0.36;
+const MIN_NONLINEAR_FRACTION: f64 = 0.36;
 
-/// Times that the relation is taken on each level.
-const ROUNDS: usize = 3;
+/// Estimates of the intensity relation on each level.
+const ITERATIONS_PER_LEVEL: usize = 3;
 
 /// What the search works on in place of volumes of different contrasts.
 pub(super) struct Common<'a> {
@@ -75,7 +75,7 @@ impl<'a> Scene<'a> {
         let mut motion: Option<(Bodies, [usize; 3])> = None;
         for &factor in self.factors {
             let pair = aligned.level(factor);
-            for _ in 0..ROUNDS {
+            for _ in 0..ITERATIONS_PER_LEVEL {
                 let (initial, deformed) = self.recast(&found);
                 let recast = self.aligned(&initial, &deformed)?;
                 let moved = self.motion(&recast.level(factor), factor, motion.take());
@@ -132,7 +132,7 @@ impl<'a> Scene<'a> {
 /// Whether the intensities go together otherwise than in one contrast.
 fn differs(relation: &Relation) -> bool {
     let (any, by_gain) = (relation.most(), relation.explained_by_gain());
-    any - by_gain.max(0.0) > DIFFER * (1.0 - by_gain.max(0.0))
+    any - by_gain.max(0.0) > MIN_NONLINEAR_FRACTION * (1.0 - by_gain.max(0.0))
 }
 
 impl Common<'_> {

@@ -6,7 +6,7 @@ use crate::numerics::orientation::Orientation;
 use crate::pipeline::coarse_to_fine::{finest_level, inside, search_mm, worked_on};
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::{last_passes, sparse};
-use crate::stiffness::fem_body::DIRECT;
+use crate::stiffness::fem_body::MAX_DIRECT_NODES;
 use crate::types::params::Method;
 use crate::types::{FieldParams, Grid, Mask, Voxels};
 
@@ -139,7 +139,7 @@ pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
 /// (2.8 GB at 300,000; docs/lab/2026-11-solver.md).
 pub fn stiffness_memory(nodes: usize) -> u64 {
     let n = nodes as f64;
-    let each = if nodes <= DIRECT { 40_000.0 * (n / 20_000.0).cbrt().max(1.0) } else { 10_000.0 };
+    let each = if nodes <= MAX_DIRECT_NODES { 40_000.0 * (n / 20_000.0).cbrt().max(1.0) } else { 10_000.0 };
     150_000_000 + (each * n) as u64
 }
 

@@ -14,17 +14,17 @@ use crate::numerics::random::Random;
 use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::clock::Clock;
 use crate::pipeline::field::Progress;
-use crate::pipeline::stiffness::{FieldQuality, Inputs, Meshed, evenly_meshed, whole};
-use crate::stiffness::boundary_conditions::{self, Patch, Place, SurfaceMotion, least_travel};
+use crate::pipeline::stiffness::{FORWARD_TOLERANCE_MM, FieldQuality, Inputs, Meshed, evenly_meshed, whole};
+use crate::stiffness::boundary_conditions::{self, MIN_FLAT_FRACTION, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::elements::Mapping;
 use crate::stiffness::fem_body::Body;
 use crate::stiffness::fields;
 use crate::stiffness::geometry::{self, Geometry, Open};
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::mesh_problem::{Level, NEEDED, plate_prior};
-use crate::stiffness::observations::{REACH, block_for, find, read};
-use crate::stiffness::summary::{self, BEARS, SEEN, Scale, VAGUE};
+use crate::stiffness::mesh_problem::{Level, MIN_OBSERVATIONS, plate_prior};
+use crate::stiffness::observations::{SURFACE_REACH_VOXELS, block_for, find, read};
+use crate::stiffness::summary::{self, MAX_IDENTIFIED_CONTRAST_LN, MAX_IDENTIFIED_SD_LN, MIN_LOAD_SHARE, Scale};
 use crate::stiffness::systematic_error::dilution;
 use crate::stiffness::verdict::mesh_error;
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion, Press};
@@ -56,14 +56,10 @@ pub struct Simulated {
     pub strain: f64,
 }
 
-/// Precision of forward solutions (mm).
-const PRECISION: f64 = 1e-5;
-/// Part of what faces the load from which its end is a flat face, which is pressed as a whole.
-const FLAT: f64 = 0.6;
 /// Cosine of the angle to the load within which a facet faces it.
-const FACING: f64 = 0.7;
-/// Largest press over the body's extent along the load: beyond, a linear law says nothing.
-const DEEPEST: f64 = 0.5;
+const MIN_FACING_COSINE: f64 = 0.7;
+/// Deepest press over the body's extent along the load: a linear law does not hold beyond.
+const MAX_PRESS_FRACTION: f64 = 0.5;
 
 /// The body with its plates, before it is pressed.
 struct Bench<'a> {
@@ -106,7 +102,13 @@ impl<'a> Bench<'a> {
         for n in self.body.nodes_on(0..self.body.surface.len()) {
             displacement[n as usize] = Some(along(n).map(|v| -depth(n) * v));
         }
-        SurfaceMotion { sharp: displacement.clone(), displacement, error: 0.0, sharp_error: 0.0, near: REACH }
+        SurfaceMotion {
+            sharp: displacement.clone(),
+            displacement,
+            error: 0.0,
+            sharp_error: 0.0,
+            near: SURFACE_REACH_VOXELS,
+        }
     }
 
     fn find(&self, motion: &SurfaceMotion) -> Result<Vec<Patch>, StiffnessError> {
@@ -126,13 +128,13 @@ impl<'a> Bench<'a> {
                 let (d, voxel) = (self.outward, self.voxel());
                 let height = |n: u32| dot(body.places[n as usize], d);
                 let facing: Vec<usize> =
-                    (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > FACING).collect();
+                    (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > MIN_FACING_COSINE).collect();
                 let end =
                     facing.iter().flat_map(|&f| body.surface[f].nodes).map(height).fold(f64::NEG_INFINITY, f64::max);
                 let near = |f: &usize| body.surface[*f].nodes.iter().filter(|n| height(**n) > end - voxel).count() >= 3;
                 let area = |all: &[usize]| all.iter().map(|&f| body.surface[f].area).sum::<f64>();
                 let at_end: Vec<usize> = facing.iter().copied().filter(near).collect();
-                self.flat = (area(&at_end) > FLAT * area(&facing)).then(|| body.nodes_on(at_end));
+                self.flat = (area(&at_end) > MIN_FLAT_FRACTION * area(&facing)).then(|| body.nodes_on(at_end));
             }
             Place::Mask(..) => {
                 // A push all over tells which surface the masks cover.
@@ -190,7 +192,7 @@ impl<'a> Bench<'a> {
 
     /// The field of a press of `press` mm.
     fn simulate(&self, press: f64) -> Result<Simulated, StiffnessError> {
-        if press > DEEPEST * self.extent {
+        if press > MAX_PRESS_FRACTION * self.extent {
             let range = "half of the body's extent along the load at most; press less";
             return Err(ParamError { name: "press", value: press, range }.into());
         }
@@ -216,7 +218,7 @@ impl<'a> Bench<'a> {
             pinned: Vec::new(),
         };
         let mut state = State { theta, ..setup.start() };
-        let (problem, solution) = setup.solve(&state, PRECISION)?;
+        let (problem, solution) = setup.solve(&state, FORWARD_TOLERANCE_MM)?;
         let force = setup.forces(&problem, &state, &solution.x)[0] * setup.leaning(&problem, &state, &solution.x);
         let e = self.params.modulus(body.labels[0]).unwrap_or(1.0);
         let kpa = e / (2.0 * (1.0 + setup.poisson[0]));
@@ -338,7 +340,7 @@ struct Solved {
     /// Regions that the field shows nothing of.
     hidden: Vec<bool>,
     /// Whether those bear so much force that others are bounds.
-    borne: bool,
+    hidden_load: bool,
     /// Regions so far from the reference that they are as good as rigid or empty.
     far: Vec<bool>,
     /// The region that ratios refer to.
@@ -372,10 +374,10 @@ impl Solved {
         let theta = bench.theta(&level.body, reference);
         let mut estimate = true_state(&setup, &theta)?;
         // A region that the data do not show counts as known for the others.
-        let (mut hidden, mut borne) = (vec![false; theta.len()], 0.0);
+        let (mut hidden, mut hidden_load) = (vec![false; theta.len()], 0.0);
         while let Some(found) = summary::least_seen(&setup, &estimate) {
             let Some(r) = level.body.labels.iter().position(|l| *l == found.label) else { break };
-            (hidden[r], borne) = (true, borne + found.share);
+            (hidden[r], hidden_load) = (true, hidden_load + found.share);
             setup.pinned.push((r, theta[r]));
             estimate = true_state(&setup, &theta)?;
         }
@@ -414,8 +416,8 @@ impl Solved {
             plate_prior: setup.plate_prior,
             sampled: (inside, level.block.max(1), estimate.residuals.len() as f64),
             hidden,
-            borne: borne > BEARS,
-            far: theta.iter().map(|t| t.abs() > SEEN).collect(),
+            hidden_load: hidden_load > MIN_LOAD_SHARE,
+            far: theta.iter().map(|t| t.abs() > MAX_IDENTIFIED_CONTRAST_LN).collect(),
             reference,
         })
     }
@@ -435,7 +437,7 @@ impl Solved {
         let voxels = inside as f64 / voxel.powi(3);
         let wide = block_for(voxels as usize) as f64;
         let count = samples * (block as f64 / (voxel * wide)).powi(3);
-        if count < NEEDED as f64 {
+        if count < MIN_OBSERVATIONS as f64 {
             return None;
         }
         let model = (deeper * self.rest).max(voxel * self.floor);
@@ -479,13 +481,13 @@ impl Solved {
 
     /// Whether a region is known, and not just a bound, with a deviation of `sd`.
     fn determines(&self, r: usize, sd: f64, ratios: bool) -> bool {
-        sd <= VAGUE && !self.hidden[r] && !self.far[r] && (ratios || !self.borne)
+        sd <= MAX_IDENTIFIED_SD_LN && !self.hidden[r] && !self.far[r] && (ratios || !self.hidden_load)
     }
 }
 
 /// The estimate at given moduli, with the plates as the field has them.
 fn true_state(setup: &Setup<'_>, theta: &[f64]) -> Result<Estimate, StiffnessError> {
-    setup.run(State { theta: theta.to_vec(), ..setup.start() }, 0, PRECISION)
+    setup.run(State { theta: theta.to_vec(), ..setup.start() }, 0, FORWARD_TOLERANCE_MM)
 }
 
 /// The step of all parameters that an estimate would still take, to first order.
@@ -563,12 +565,12 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
     let regions: Vec<PlannedRegion> = (0..body.labels.len()).map(planned).collect();
     let options = Options { bench: &bench, params, presses: &presses, solved: &solved, regions: &regions };
     let (expected, least_press) = options.expected(&voxels, &mut warnings)?;
-    let told = |&press: &f64| {
+    let press_at = |&press: &f64| {
         let solved = solved.of(press)?;
         let deeper = press / solved.press;
         Some(Press { press_mm: press, strain: deeper * solved.strain, force_n: deeper * solved.force.abs() })
     };
-    let presses: Vec<Press> = presses.iter().filter_map(told).collect();
+    let presses: Vec<Press> = presses.iter().filter_map(press_at).collect();
     warnings.extend(large_strain(&presses));
     clock.book("options");
     Ok(Plan {
@@ -669,7 +671,7 @@ impl Options<'_> {
             }
             if expected.len() == before {
                 warnings.push(format!(
-                    "voxels of {voxel} mm are too few in this body: {NEEDED} samples are needed; take smaller ones"
+                    "voxels of {voxel} mm are too few in this body: {MIN_OBSERVATIONS} samples are needed; take smaller ones"
                 ));
             }
         }

@@ -12,12 +12,13 @@ use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::body_models::{Concluded, labelled};
 use crate::pipeline::clock::{Clock, noted};
 use crate::pipeline::coarse_to_fine::{
-    COARSE, CoarseToFine, Found, TWICE, around, begun_from, finest_level, search_mm, worked_on,
+    COARSE_NODE_SPACING_VOXELS, CoarseToFine, Found, WIDE_SEARCH_RATIO, around, begun_from, finest_level, search_mm,
+    worked_on,
 };
 use crate::pipeline::contrast::{self, Common};
 use crate::pipeline::field_warnings::{
-    agreement, in_doubt, most_move, no_measurement, out_of_view, said_of_model, too_few, warnings, why_so_many,
-    without_texture,
+    agreement, most_move, no_measurement, out_of_view, said_of_model, too_few, unreliable_search, warnings,
+    why_so_many, without_texture,
 };
 use crate::pipeline::hypotheses::Begun;
 pub use crate::pipeline::hypotheses::Start;
@@ -97,11 +98,11 @@ impl FieldResult {
     }
 }
 
-/// Voxels about the tissue in which nothing folds either.
-const BORDER: usize = 2;
+/// Voxels around the tissue in which folds are also removed.
+const UNFOLDED_MARGIN_VOXELS: usize = 2;
 
-/// Fewest matches that a result may rest on.
-pub(super) const FEWEST: usize = 20;
+/// Fewest matches of a result.
+pub(super) const MIN_MATCHES: usize = 20;
 
 /// Measures the displacement from `initial` to `deformed`.
 ///
@@ -242,8 +243,8 @@ fn canonical(
         anchors: &anchors,
         factors: &factors,
         range,
-        reach: TWICE * range,
-        nodes: COARSE,
+        reach: WIDE_SEARCH_RATIO * range,
+        nodes: COARSE_NODE_SPACING_VOXELS,
         params,
     };
     let aligned = scene.aligned(&clean, &seen)?;
@@ -362,7 +363,7 @@ impl Task<'_> {
         };
         let found = chain.run(range, tissue, clock)?;
         let kept = found.matches.iter().filter(|m| m.kept).count();
-        if kept < FEWEST {
+        if kept < MIN_MATCHES {
             return Err(too_few(kept, &found.pair, found.search, params, known.start.is_some()));
         }
         Ok(found)
@@ -402,7 +403,7 @@ impl Task<'_> {
         let any_free = concluded.iter().any(|c| c.choice.motion.is_none());
         // What is concluded rests on the smooth field: what comes back brings noise with it.
         if any_free {
-            bodies.twice(&pair, params.seed);
+            bodies.twicing(&pair, params.seed);
             clock.book("residual");
         }
         // What the average of voxels hides.
@@ -411,7 +412,7 @@ impl Task<'_> {
             pair = light.level(aligned, next);
             clock.book("pyramid");
             let tick = |p: usize| (self.progress)("residual", 0.9 + 0.02 * (p + 1) as f64 / params.finer_passes as f64);
-            let nodes = last_passes::WIDEST.min(2 * found.apart);
+            let nodes = last_passes::MAX_NODE_SPACING_VOXELS.min(2 * found.apart);
             bodies = last_passes::polish((&pair, next, nodes), (&bodies, factor), params, tick);
             if let Some(given) = &self.given {
                 bodies.relabel(given.on(pair.shape, next));
@@ -427,7 +428,11 @@ impl Task<'_> {
         let (labels, labelled) = self.labels(&bodies, factor);
         let body_reports = self.reported(models, &labelled, &bodies, &pair);
         // Where there is one body its field folds nowhere but between knots.
-        let tissue = if labels.is_empty() { Vec::new() } else { dilate(self.mask.as_slice(), grid.shape(), BORDER) };
+        let tissue = if labels.is_empty() {
+            Vec::new()
+        } else {
+            dilate(self.mask.as_slice(), grid.shape(), UNFOLDED_MARGIN_VOXELS)
+        };
         let coefficients = FieldSpline::new(*grid, splines, labels, tissue);
         let stages = stages::account(grid, (&pair, factor), found.stages, &coefficients);
         let agreement = agreement(&pair, &bodies, model)?;
@@ -484,7 +489,7 @@ impl Task<'_> {
         // Given borders are certain.
         let jumps = if self.given.is_some() { Vec::new() } else { coefficients.jumps(self.mask) };
         variances.add_borders(jumps, factor);
-        if begun.is_unsure() && concluded.unlike.is_some() {
+        if begun.is_unconfirmed() && concluded.unlike.is_some() {
             variances.set_other_motions(begun.share(), concluded.search);
         }
         if let Some(common) = self.common {
@@ -523,9 +528,9 @@ impl Task<'_> {
         let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, self.grid.is_single_slice(), &mut clock)?;
         let displacement = &meshed.displacement;
         let (mean_mm, max_mm, mask_voxels) = lengths(displacement, mask);
-        let doubted = begun.doubted();
+        let unreliable = begun.unreliable_counts();
         // Landmarks bear out what features do not.
-        if let Some(seen) = doubted.filter(|_| self.anchors.is_empty()) {
+        if let Some(seen) = unreliable.filter(|_| self.anchors.is_empty()) {
             let far = most_move(displacement, mask) > concluded.search;
             let found = reports.last().map_or(0, |r| r.counts.features_initial);
             no_measurement(concluded.kept, found, seen, far, concluded.unlike.is_some())?;
@@ -550,7 +555,7 @@ impl Task<'_> {
             .chain(said_of_model(concluded.rejected))
             .chain(damage)
             .chain(input_checks::squeezed(displacement, mask))
-            .chain(doubted.map(in_doubt))
+            .chain(unreliable.map(unreliable_search))
             .chain(concluded.unlike)
             .chain(uneven(concluded.gain))
             .chain(concluded.plain)

@@ -5,8 +5,8 @@ use crate::matching::pair::Pair;
 use crate::numerics::statistics::quantile;
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::contrast;
-use crate::pipeline::field::FEWEST;
-use crate::pipeline::hypotheses::NEAR;
+use crate::pipeline::field::MIN_MATCHES;
+use crate::pipeline::hypotheses::NEAR_RANGE_FRACTION;
 use crate::pipeline::uncertainty::some_of;
 use crate::types::*;
 
@@ -48,8 +48,8 @@ pub(super) fn most_move(field: &DenseField, mask: &Mask) -> f64 {
     f64::from(quantile(&mut lengths, 0.95))
 }
 
-/// Part of the variance by which a displacement may leave the volumes less alike than at rest.
-const NO_WORSE: f64 = 0.01;
+/// Loss of explained variance against rest up to which a displacement is accepted.
+const MAX_SIMILARITY_LOSS: f64 = 0.01;
 
 /// How well the volumes agree at rest and under the bodies' fields.
 ///
@@ -58,14 +58,14 @@ const NO_WORSE: f64 = 0.01;
 pub(super) fn agreement(pair: &Pair<'_>, bodies: &Bodies, model: MotionModel) -> Result<Agreement, FieldError> {
     let found = contrast::agreement(pair, bodies);
     let Agreement { at_rest, found: now } = found;
-    if model != MotionModel::Identity && now < at_rest - NO_WORSE {
+    if model != MotionModel::Identity && now < at_rest - MAX_SIMILARITY_LOSS {
         let hint = "check that both volumes show the same tissue, or say more: --initial, --landmarks, --mask".into();
         return Err(FieldError::Worse { at_rest, found: now, hint });
     }
     Ok(found)
 }
 
-pub(super) fn in_doubt(counts: Counts) -> String {
+pub(super) fn unreliable_search(counts: Counts) -> String {
     let Counts { kept, features_initial: all, .. } = counts;
     format!(
         "only {kept} of {all} features agreed with their neighbours when the whole volume was searched: the motion may be \
@@ -73,12 +73,12 @@ pub(super) fn in_doubt(counts: Counts) -> String {
     )
 }
 
-/// Part of the tissue without texture from which that is why few matches survive.
-const MOSTLY: f64 = 0.5;
+/// Part of the tissue without texture beyond which that explains why few matches survive.
+const MOSTLY_PLAIN_FRACTION: f64 = 0.5;
 
-/// Part of the variance that the volumes explain of each other at rest under which they show
-/// nothing of the same.
-const STRANGERS: f64 = 0.1;
+/// Part of the variance that the volumes explain of each other at rest; below it, they do not show
+/// the same.
+const MIN_SIMILARITY: f64 = 0.1;
 
 /// Refuses a run with too few matches, with what was measured of the volumes and the one thing to
 /// try. Nothing is advised that was asked for already.
@@ -87,16 +87,16 @@ pub(super) fn too_few(found: usize, pair: &Pair<'_>, search: f64, params: &Field
     // Volumes of cells are under a millimetre.
     let search = format!("{search:.*}", if search < 1.0 { 3 } else { 0 });
     let hint = match () {
-        _ if plain > MOSTLY => format!(
+        _ if plain > MOSTLY_PLAIN_FRACTION => format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: image finer or with less noise, or give --landmarks",
             100.0 * plain
         ),
-        _ if agreement < STRANGERS && started => format!(
+        _ if agreement < MIN_SIMILARITY && started => format!(
             "at the start one volume explains {:.0} % of the other's variance: check its direction (,-1 after a name turns it round), or \
              try --initial principal",
             100.0 * agreement
         ),
-        _ if agreement < STRANGERS => format!(
+        _ if agreement < MIN_SIMILARITY => format!(
             "at rest one volume explains {:.0} % of the other's variance: check that both show the same tissue; where they lie apart, \
              begin with --initial centre",
             100.0 * agreement
@@ -110,7 +110,7 @@ pub(super) fn too_few(found: usize, pair: &Pair<'_>, search: f64, params: &Field
 }
 
 pub(super) fn no_match(found: usize, hint: String) -> FieldError {
-    FieldError::TooFew { found, what: "matches survive", needed: FEWEST, hint }
+    FieldError::TooFew { found, what: "matches survive", needed: MIN_MATCHES, hint }
 }
 
 /// Where the number of points comes from.
@@ -135,13 +135,19 @@ pub(super) fn said_of_model(rejected: bool) -> Option<String> {
     })
 }
 
-/// Part of the tissue without texture that earns a warning: pairs made from scans of heads, legs
-/// and a spine have 0 to 8 %, legs in slices four times as thick as their voxels are wide 10.
-const PLAIN: f64 = 0.1;
+/// Parts of the tissue that earn a warning.
+struct Warnings {
+    /// Without texture: 0 to 8 % in scans of heads, legs and a spine.
+    plain_fraction: f64,
+    /// Outside the deformed volume.
+    out_of_view_fraction: f64,
+}
+
+const WARN: Warnings = Warnings { plain_fraction: 0.1, out_of_view_fraction: 0.05 };
 
 /// Says so where much of the tissue shows nothing that could be seen to move.
 pub(super) fn without_texture(share: f64) -> Option<String> {
-    (share > PLAIN).then(|| {
+    (share > WARN.plain_fraction).then(|| {
         format!(
             "{:.0} % of the tissue shows no texture that stands out of the noise: there the field is carried in from around, smooth, \
              and its uncertainty says too little; leave such parts out with --mask, or image finer or with less noise",
@@ -150,12 +156,9 @@ pub(super) fn without_texture(share: f64) -> Option<String> {
     })
 }
 
-/// Part of the tissue outside the deformed volume that earns a warning.
-const OUT_OF_VIEW: f64 = 0.05;
-
 /// Says so where much of the tissue is not in the deformed volume.
 pub(super) fn out_of_view(share: f64) -> Option<String> {
-    (share > OUT_OF_VIEW).then(|| {
+    (share > WARN.out_of_view_fraction).then(|| {
         format!(
             "{:.0} % of the tissue moves out of the deformed volume, or to where that shows nothing (not finite, or cut off): there the field is carried over from \
              what is in view, and may be off by more than its uncertainty says; leave such parts out with --mask",
@@ -175,7 +178,7 @@ pub(super) fn warnings(counts: Counts, folds: usize, not_finite: [usize; 2], max
     if folds > 0 {
         out.push(format!("{folds} voxels fold (Jacobian at or below zero); do not trust strains there"));
     }
-    if max_mm > NEAR * search {
+    if max_mm > NEAR_RANGE_FRACTION * search {
         let at = if max_mm > search { "past" } else { "near" };
         out.push(format!(
             "the motion reaches {max_mm:.1} mm, {at} the search range of {search:.1} mm: where it goes further, it was not found; try a wider --search"

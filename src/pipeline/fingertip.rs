@@ -12,14 +12,13 @@ use crate::types::stiffness::Side;
 use crate::types::{Mask, Volume};
 
 /// Largest angle between the pressed side and a voxel axis (degrees).
-const ASKEW: f64 = 10.0;
+const MAX_TILT_DEGREES: f64 = 10.0;
 
-/// Part of the tissue's thickness to which forces are compared, where the press is not known to
-/// have gone further.
-const DEPTH: f64 = 0.2;
+/// Depth to which forces are compared at least, over the tissue's thickness.
+const MIN_DEPTH_FRACTION: f64 = 0.2;
 
 /// Depths at which the finite elements are solved.
-const DEPTHS: u32 = 12;
+const DEPTH_COUNT: u32 = 12;
 
 /// Nodes of the finite elements of a map, about: forces on a fingertip change by 1 % up to eight
 /// times as many.
@@ -36,11 +35,18 @@ pub fn check_nodes(nodes: usize) -> Result<(), ParamError> {
     }
 }
 
-/// Classes of modulus that the finite elements tell apart at most.
-const CLASSES: usize = 48;
+/// Most classes of modulus in the finite elements.
+const MAX_MODULUS_CLASSES: usize = 48;
 
-/// Modulus of bone over that of the stiffest tissue in the finite elements.
-const HARDER: f64 = 100.0;
+/// Parts that hold as a back plate.
+struct HardParts {
+    /// Modulus of bone over that of the stiffest tissue in the finite elements.
+    bone_modulus_ratio: f64,
+    /// Modulus over that of the softest region, from which a region holds.
+    min_modulus_ratio: f64,
+}
+
+const HARD_PARTS: HardParts = HardParts { bone_modulus_ratio: 100.0, min_modulus_ratio: 20.0 };
 
 /// What a pad was reduced to, and its force at the press that was measured.
 #[derive(Debug, Clone, PartialEq)]
@@ -88,7 +94,7 @@ impl PadOutcome {
     /// map; as it is where these cannot be solved, with the reason.
     fn pressed(mut self, elements: &Elements<'_>, progress: Progress<'_>) -> Self {
         let deepest = self.pad.curve.last().map_or(0.0, |c| c[0]);
-        let depths: Vec<f64> = (1..=DEPTHS).map(|i| deepest * f64::from(i) / f64::from(DEPTHS)).collect();
+        let depths: Vec<f64> = (1..=DEPTH_COUNT).map(|i| deepest * f64::from(i) / f64::from(DEPTH_COUNT)).collect();
         match elements.forces(&depths, progress) {
             Ok((curve, nodes)) => {
                 let pad = against_plate(self.pad.clone(), &self.columns, curve, nodes);
@@ -147,10 +153,10 @@ fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f6
     values.dedup();
     let mut moduli: Vec<f64> = values.iter().map(|v| f64::from(*v)).collect();
     if let [low, .., high] = moduli[..]
-        && moduli.len() > CLASSES
+        && moduli.len() > MAX_MODULUS_CLASSES
     {
-        let step = (high / low).ln() / CLASSES as f64;
-        moduli = (0..CLASSES).map(|k| low * ((k as f64 + 0.5) * step).exp()).collect();
+        let step = (high / low).ln() / MAX_MODULUS_CLASSES as f64;
+        moduli = (0..MAX_MODULUS_CLASSES).map(|k| low * ((k as f64 + 0.5) * step).exp()).collect();
     }
     let (values, hard) = (map.as_slice(), moduli.len() as u8 + 1);
     let apart = |k: usize, v: f32| (moduli[k] / f64::from(v)).ln().abs();
@@ -166,7 +172,7 @@ fn classes(map: &Volume, bone: &(dyn Fn(usize) -> bool + Sync)) -> (Mask, Vec<f6
     };
     let labels = Mask::from_voxels(*map.grid(), label);
     let stiffest = moduli.last().copied().unwrap_or(1.0);
-    moduli.push(HARDER * stiffest);
+    moduli.push(HARD_PARTS.bone_modulus_ratio * stiffest);
     (labels, moduli)
 }
 
@@ -197,21 +203,18 @@ pub fn run(
     let along = |a: usize| (0..3).map(|r| linear[r][a] * outward[r]).sum::<f64>() / spacing[a];
     let axis = (1..3).fold(0, |best, a| if along(a).abs() > along(best).abs() { a } else { best });
     let degrees = along(axis).abs().min(1.0).acos().to_degrees();
-    if degrees > ASKEW {
+    if degrees > MAX_TILT_DEGREES {
         return Err(FingertipError::Askew { degrees });
     }
     let columns = columns(map, bone, axis, along(axis) > 0.0)?;
     let thickness = columns.iter().filter(|c| c.gap == 0.0).map(|c| c.length).fold(0.0, f64::max);
     let known = indentation.filter(|d| *d > 0.0 && *d < thickness);
-    let pad = reduce(&columns, known.unwrap_or(0.0).max(DEPTH * thickness));
+    let pad = reduce(&columns, known.unwrap_or(0.0).max(MIN_DEPTH_FRACTION * thickness));
     Ok(PadOutcome { at_press: known.map(|d| [d, force(&columns, d)]), pad, failure: None, columns })
 }
 
-/// A region that is this many times stiffer than the softest holds as a back plate.
-const HARD: f64 = 20.0;
-
 /// Names of hard parts.
-const BONE: [&str; 4] = ["bone", "plate", "phalanx", "nail"];
+const BONE_NAMES: [&str; 4] = ["bone", "plate", "phalanx", "nail"];
 
 /// The unit vector out of the pressed side.
 fn outward(folder: &StiffnessFolder) -> [f64; 3] {
@@ -232,14 +235,14 @@ fn outward(folder: &StiffnessFolder) -> [f64; 3] {
 /// Regions that stand for bone or a back plate: by name; where none is so named, those known by a
 /// lower bound; and those far stiffer than the softest.
 fn hard(folder: &StiffnessFolder) -> Vec<&StiffnessRegion> {
-    let named = |r: &StiffnessRegion| BONE.iter().any(|b| r.name.to_lowercase().contains(b));
+    let named = |r: &StiffnessRegion| BONE_NAMES.iter().any(|b| r.name.to_lowercase().contains(b));
     let some_named = folder.regions.iter().any(named);
     // Thin skin is often known by a bound alone, and is no bone for that.
     let known = |r: &StiffnessRegion| named(r) || (!some_named && r.bound.as_deref() == Some("lower"));
     // A bound says nothing of how soft the softest is.
     let tissue = folder.regions.iter().filter(|r| !known(r) && r.bound.is_none());
     let softest = tissue.map(|r| r.youngs_modulus).fold(f64::INFINITY, f64::min);
-    folder.regions.iter().filter(|r| known(r) || r.youngs_modulus >= HARD * softest).collect()
+    folder.regions.iter().filter(|r| known(r) || r.youngs_modulus >= HARD_PARTS.min_modulus_ratio * softest).collect()
 }
 
 /// Names of the tissue of which only a bound is known: the map has that in place of its modulus.
@@ -249,13 +252,12 @@ fn vague(folder: &StiffnessFolder) -> Vec<&str> {
     tissue.map(|r| r.name.as_str()).collect()
 }
 
-/// Deviation of the force that a press of known travel gives (1): forces of the elements at the
-/// travel that `palpate stiffness` measures are the phantom's to 3 % (docs/reference/fingertip.md).
-const TRAVEL: f64 = 0.03;
+/// Relative deviation of the force at a press of known travel: the elements' forces are the
+/// phantom's to 3 % (docs/reference/fingertip.md).
+const TRAVEL_FORCE_ERROR: f64 = 0.03;
 
-/// Modulus of a tissue of which only a bound is known, at the far end, over the bound: so stiff or
-/// soft that its springs no longer count.
-const FAR: f64 = 1e3;
+/// Modulus over its only bound, at the far end: so stiff or soft that its springs no longer count.
+const UNBOUNDED_MODULUS_RATIO: f64 = 1e3;
 
 /// The deviation of the tip's modulus and its bounds, both over it: each tissue's modulus is moved
 /// by its deviation, or to the far end of its bound, and the columns reduced again by `reduced`.
@@ -275,11 +277,11 @@ fn deviation(
         reduced(&moved).map(|o| tip(&o) / own)
     };
     let known = out.at_press.is_some() && folder.force_n.is_some();
-    let mut square = if known { TRAVEL * TRAVEL } else { 0.0 };
+    let mut square = if known { TRAVEL_FORCE_ERROR * TRAVEL_FORCE_ERROR } else { 0.0 };
     let mut bounds: Option<[f64; 2]> = None;
     for region in folder.regions.iter().filter(|r| !bones.contains(&r.name.as_str()) && r.youngs_modulus > 0.0) {
         if let Some(bound) = region.bound.as_deref() {
-            let far = if bound == "lower" { FAR } else { 1.0 / FAR };
+            let far = if bound == "lower" { UNBOUNDED_MODULUS_RATIO } else { 1.0 / UNBOUNDED_MODULUS_RATIO };
             if let Some(part) = with(region, far) {
                 let [low, high] = bounds.unwrap_or([1.0; 2]);
                 bounds = Some([low * part.min(1.0), high * part.max(1.0)]);

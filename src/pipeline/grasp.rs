@@ -17,8 +17,15 @@ use std::time::Instant;
 /// from any thread.
 pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
-/// Largest joint angle of the pinch map (degrees), and angles along each side.
-const MAP: (f64, usize) = (30.0, 61);
+/// The map of pinch equilibria.
+struct PinchMap {
+    /// Largest joint angle (degrees).
+    max_degrees: f64,
+    /// Joint angles along each side.
+    angles: usize,
+}
+
+const PINCH_MAP: PinchMap = PinchMap { max_degrees: 30.0, angles: 61 };
 
 /// A run with what it is shown beside.
 #[derive(Debug, Clone, PartialEq)]
@@ -100,18 +107,19 @@ fn bands(scene: &Scene, run: &GraspRun) -> Result<Option<Bands>, GraspError> {
     Ok(Some(Bands { low: among(f64::min), high: among(f64::max), factors, outcomes }))
 }
 
-/// How far a joint may be from its target when a hold ends (rad).
-pub const SHORT: f64 = 0.5 * std::f64::consts::PI / 180.0;
+/// Largest distance of a joint from its target at the end of a hold (rad): half a degree.
+pub const JOINT_TOLERANCE_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
-/// How far past the end of a tabulated tip's profile it may be pressed.
-const PAST: f64 = 1.02;
+/// Deepest press of a tabulated tip over the end of its profile.
+const MAX_PROFILE_EXTRAPOLATION: f64 = 1.02;
 
 /// What a user should know of a run beside its events: joints that do not come to where they are
 /// told to, and tips that are pressed in further than their profile was measured.
 pub fn notes(scene: &Scene, run: &GraspRun) -> Vec<String> {
     let mut out = Vec::new();
     let off = |row: &MotionRow, i: usize| (row.reached.joints[i] - row.target[i]).abs();
-    let all = run.motions.iter().flat_map(|row| [(row, 0), (row, 1)]).filter(|&(row, i)| off(row, i) > SHORT);
+    let all =
+        run.motions.iter().flat_map(|row| [(row, 0), (row, 1)]).filter(|&(row, i)| off(row, i) > JOINT_TOLERANCE_RAD);
     if let Some((row, i)) = all.reduce(|a, b| if off(b.0, b.1) > off(a.0, a.1) { b } else { a }) {
         let [reached, target] = [row.reached.joints[i], row.target[i]].map(f64::to_degrees);
         let when = if row.step == 0 { "the rest".into() } else { format!("the hold of motion {}", row.step) };
@@ -131,8 +139,10 @@ pub fn notes(scene: &Scene, run: &GraspRun) -> Vec<String> {
         ));
     }
     let deepest = run.samples.iter().flat_map(|s| s.normal).fold(0.0, f64::max);
-    if let Some([end, _]) =
-        tip.profile.last().filter(|p| tip.model == FingertipModel::Tabulated && deepest > PAST * p[0])
+    if let Some([end, _]) = tip
+        .profile
+        .last()
+        .filter(|p| tip.model == FingertipModel::Tabulated && deepest > MAX_PROFILE_EXTRAPOLATION * p[0])
     {
         out.push(format!(
             "a tip is pressed in by {:.2} mm, and fingertip.profile_depth ends at {:.2} mm: further in its last modulus is taken, which nothing was \
@@ -193,7 +203,7 @@ pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, 
     let push = simulate(&pushed(&soft), &|_| {})?;
     book("push", 0.3);
     let map = |f: f64| progress("pinch map", 0.3 + 0.6 * f);
-    let pinch = pinch::map(&soft, FingertipModel::Parallel, MAP.0.to_radians(), MAP.1, &map);
+    let pinch = pinch::map(&soft, FingertipModel::Parallel, PINCH_MAP.max_degrees.to_radians(), PINCH_MAP.angles, &map);
     book("pinch map", 0.9);
     let stable_steps = stable_steps(&soft);
     book("stable steps", 1.0);

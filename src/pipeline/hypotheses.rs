@@ -50,65 +50,71 @@ impl Start {
     }
 }
 
-/// Frames after which all is searched again, whatever confirms the field.
-const FOLLOWED: usize = 5;
+/// The search of a whole volume.
+struct WholeSearch {
+    /// Frames after which it is repeated, even if the features confirm the field.
+    max_frames_followed: usize,
+    /// Voxels of a level's mask for each feature; a quarter of it in one slice.
+    voxels_per_feature: usize,
+    /// Most features of the coarsest level.
+    max_features: usize,
+    /// Fewest matches from which a search may start.
+    min_matches: usize,
+}
 
-/// Voxels of a level's mask for each feature, where a whole volume is searched; a quarter of it in
-/// one slice.
-const SHARE: usize = 24;
+const WHOLE_SEARCH: WholeSearch =
+    WholeSearch { max_frames_followed: 5, voxels_per_feature: 24, max_features: 4000, min_matches: 8 };
 
-/// The most features of the coarsest level.
-const POINTS: usize = 4000;
+/// The search of the level after the coarsest.
+struct NextLevelSearch {
+    /// Most features times the finest level's voxels per point: over 29 pairs 1,500 and 600
+    /// features left the same error, 190 left 0.9 % more.
+    features_times_voxels_per_point: usize,
+    /// Fewest features, even if few points are asked for.
+    min_features: usize,
+    /// Reach about the coarsest level's field over the search range.
+    range_fraction: f64,
+}
 
-/// The most features of the next level, times the voxels of the finest level for each of its
-/// points. Over 29 pairs, legs above all, 1,500 and 600 features in the default left the same
-/// error, 400 and 190 left 0.7 and 0.9 % more.
-const CLOSER_POINTS: usize = 75_000;
+const NEXT_LEVEL: NextLevelSearch =
+    NextLevelSearch { features_times_voxels_per_point: 75_000, min_features: 190, range_fraction: 0.25 };
 
-/// Features of the next level that are not saved on, however few points are wanted.
-const CLOSER_LEAST: usize = 190;
+/// Shares of the features that agree with their neighbours, below which a search is not trusted.
+pub(super) struct KeptShare {
+    /// Below it, the search goes on about a rigid motion and outside the mask: heads, pads and
+    /// small motions keep nine tenths, legs in thick slices 0.4.
+    pub confirmed: f64,
+    /// Below it, the next level is searched too: slides and legs that move far keep 0.4 to 0.81.
+    next_level: f64,
+    /// Below it, a whole search is unreliable: 0.73 or more where the motion was found, 0.45 or
+    /// less with inverted contrast.
+    reliable: f64,
+    /// Below it, features may agree on a part of a motion beyond the range: 0.56 to 0.6 in a core
+    /// that slid by 28 mm, 0.75 or more in 20 pairs within the range.
+    in_range: f64,
+}
 
-/// Part of the search range within which the next level is searched about the coarsest one's field.
-const CLOSER: f64 = 0.25;
+pub(super) const KEPT_SHARE: KeptShare = KeptShare { confirmed: 0.75, next_level: 0.85, reliable: 0.5, in_range: 0.65 };
 
-/// Fewest matches that a search may start from.
-const FEWEST: usize = 8;
+/// Fewest matches for their share to tell whether a search found the motion.
+const MIN_COUNTED_MATCHES: usize = 20;
 
-/// Where fewer of the features than this agree with each other, more is sought: about a rigid
-/// motion and outside the mask. Heads, pads and small motions keep nine tenths, legs in thick
-/// slices that moved by 16 mm four tenths.
-pub(super) const AGREED: f64 = 0.75;
+/// Part of the search range beyond which motion is near the end of it.
+pub(super) const NEAR_RANGE_FRACTION: f64 = 0.9;
 
-/// The same for a search of the next level. Slides and legs that move far keep 0.4 to 0.81.
-const LOOSE: f64 = 0.85;
+/// Agreeing share of a wide search over the near one's, from which its better similarity counts: it
+/// had 0.83 to 1.15 in nine pairs it improved, 0.6 to 0.66 in six it did not.
+const MIN_WIDE_SHARE_RATIO: f64 = 0.8;
 
-/// The share of features that agree when a whole volume is searched: under it, what was found is
-/// doubtful. It was 0.73 or more where the motion was found (heads and legs, 3 to 20 mm), and 0.45
-/// or less with inverted contrast.
-const BORNE_OUT: f64 = 0.5;
+/// Repeated searches about a rigid motion.
+struct RigidSearch {
+    /// Most searches.
+    max_count: usize,
+    /// Agreeing features over the search before; below it, no further one follows.
+    min_kept_ratio: f64,
+}
 
-/// Matches that must agree for their share to tell a search that found the motion from one that did
-/// not.
-const ENOUGH: usize = 20;
-
-/// Share of the features under which those that agree may do so on a part of what moved past the
-/// range: a core that slid by 28 mm in a head had 0.56 to 0.6 under a texture of its own, and was
-/// found to reach 7 mm (of 20 small pairs whose motion lies in the range none had less than 0.75).
-const FEW: f64 = 0.65;
-
-/// Part of the search range from which motion is called near the end of it.
-pub(super) const NEAR: f64 = 0.9;
-
-/// Share of the features that agree in a search twice as far, in that of the nearer one, from which
-/// its better agreement of the volumes is believed. Of 39 pairs whose motion reached the range the
-/// nine that it took on had 0.83 to 1.15 of it and 0.32 to 1.06 of the error; six with 0.6 to 0.66
-/// of it had 1.00 to 1.7.
-const HARDLY_FEWER: f64 = 0.8;
-
-/// Searches about a rigid motion at most, and the part of the features agreed before that each must
-/// keep for another.
-const TURNS: usize = 3;
-const KEPT: f64 = 0.9;
+const RIGID_SEARCH: RigidSearch = RigidSearch { max_count: 3, min_kept_ratio: 0.9 };
 
 /// What the coarsest level found.
 pub(super) struct Begun {
@@ -128,18 +134,18 @@ impl Begun {
     }
 
     /// Whether all was searched and few features agreed with their neighbours.
-    pub fn is_unsure(&self) -> bool {
-        self.counts().is_some_and(|c| c.kept_share() < AGREED || c.kept < ENOUGH)
+    pub fn is_unconfirmed(&self) -> bool {
+        self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.confirmed || c.kept < MIN_COUNTED_MATCHES)
     }
 
     /// Whether so few features agreed that the next level is to be searched as well.
-    pub fn is_loose(&self) -> bool {
-        self.counts().is_some_and(|c| c.kept_share() < LOOSE)
+    pub fn needs_next_level(&self) -> bool {
+        self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.next_level)
     }
 
     /// The features and those that agreed, where these are too few to go by.
-    pub fn doubted(&self) -> Option<Counts> {
-        self.counts().filter(|c| c.kept_share() < BORNE_OUT)
+    pub fn unreliable_counts(&self) -> Option<Counts> {
+        self.counts().filter(|c| c.kept_share() < KEPT_SHARE.reliable)
     }
 
     /// The part of the features that agreed (0 to 1); nothing where none was sought.
@@ -148,32 +154,33 @@ impl Begun {
     }
 
     /// Whether few of the features that were sought agree.
-    pub fn agrees_on_few(&self) -> bool {
-        self.counts().is_some_and(|c| c.kept_share() < FEW)
+    pub fn is_partial(&self) -> bool {
+        self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.in_range)
     }
 
     /// Whether a search within `range` (mm) leaves open what lies past it.
     pub fn leaves_open(&self, pair: &Pair<'_>, range: f64) -> bool {
-        self.agrees_on_few() || self.report.is_some() && level::lengths(pair, |p| self.motion.at(p))[1] > NEAR * range
+        self.is_partial()
+            || self.report.is_some() && level::lengths(pair, |p| self.motion.at(p))[1] > NEAR_RANGE_FRACTION * range
     }
 
     /// Whether a search twice as far found what the nearer one, `own`, did not: the volumes agree
     /// better, and hardly fewer features.
-    pub fn outdoes(&self, pair: &Pair<'_>, own: &Self) -> bool {
-        self.share() >= HARDLY_FEWER * own.share() && self.motion.agree_better(pair, &own.motion)
+    pub fn improves_on(&self, pair: &Pair<'_>, own: &Self) -> bool {
+        self.share() >= MIN_WIDE_SHARE_RATIO * own.share() && self.motion.agree_better(pair, &own.motion)
     }
 
     /// Of an unsure search and a wider one the one in which more of the features agreed: the
     /// agreement of the volumes does not tell a wrong island from the truth, neighbours do. Where
     /// there are too few features to count it is all there is.
-    pub fn surer(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
+    pub fn more_consistent(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
         let [few, many] = [&own, &wider].map(|s| s.counts().unwrap_or_default());
-        let wider_is_surer = match (few.kept < ENOUGH, many.kept < ENOUGH) {
+        let wider_is_better = match (few.kept < MIN_COUNTED_MATCHES, many.kept < MIN_COUNTED_MATCHES) {
             (false, false) => many.kept_share() > few.kept_share(),
-            (true, false) if many.kept_share() >= AGREED => true,
+            (true, false) if many.kept_share() >= KEPT_SHARE.confirmed => true,
             _ => wider.motion.agree_better(pair, &own.motion),
         };
-        if wider_is_surer { wider } else { own }
+        if wider_is_better { wider } else { own }
     }
 }
 
@@ -194,7 +201,7 @@ pub(super) struct Search<'a> {
 impl Search<'_> {
     /// How the matches of a level are sought within `reach_mm`, with at most `most` features.
     fn wide(&self, pair: &Pair<'_>, reach_mm: f64, most: usize) -> MatchParams {
-        let share = if self.flat { SHARE / 4 } else { SHARE };
+        let share = if self.flat { WHOLE_SEARCH.voxels_per_feature / 4 } else { WHOLE_SEARCH.voxels_per_feature };
         let points = pair.inside.div_ceil(share).min(most).max(40);
         MatchParams::new(self.params, points, false, reach_mm, 2, 0.3)
     }
@@ -222,7 +229,7 @@ impl Search<'_> {
         let refined = |motion| self.refined(pair, motion, passes);
         let better = |a, b| Bodies::better(pair, a, b);
         let course = known.iter().map(|s| s.on(lattice, factor)).reduce(better).map(refined);
-        let followed = known.first().and_then(|s| s.followed).filter(|&f| f < FOLLOWED);
+        let followed = known.first().and_then(|s| s.followed).filter(|&f| f < WHOLE_SEARCH.max_frames_followed);
         if let Some((motion, followed)) = course.as_ref().zip(followed)
             && timed(seconds, || self.is_confirmed(pair, motion))
         {
@@ -240,15 +247,15 @@ impl Search<'_> {
         let of_matches = found.clone();
         let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
         let own = refined(own.into());
-        let in_doubt = counts.kept_share() < LOOSE || counts.kept < ENOUGH;
+        let unconfirmed = counts.kept_share() < KEPT_SHARE.next_level || counts.kept < MIN_COUNTED_MATCHES;
         let given = known.iter().any(Start::is_given);
         // If few features agree, landmarks decide.
-        let marked = counts.kept_share() < BORNE_OUT && !pair.anchors.is_empty();
-        let beats = |known: &Bodies| match marked {
+        let landmarks_decide = counts.kept_share() < KEPT_SHARE.reliable && !pair.anchors.is_empty();
+        let beats = |known: &Bodies| match landmarks_decide {
             true => landmarks::gained(pair, &own, known) > 0.0,
             false => known.agree_better(pair, &own),
         };
-        let wins = |known: &Bodies| (in_doubt || given) && beats(known);
+        let wins = |known: &Bodies| (unconfirmed || given) && beats(known);
         let motion = course.filter(wins).map_or(own, refined);
         Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
     }
@@ -257,13 +264,16 @@ impl Search<'_> {
     /// agree they are sought again about the rigid motion that most agree on, for as long as no
     /// fewer agree there: patches that turned by much are hardly alike.
     fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
-        let wide = self.wide(pair, self.range, POINTS);
+        let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
         let agreed = |matches: &[LevelMatch]| matches.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
         let (matches, field, report) = level::matches(pair, None, wide);
         let (mut kept, mut best) = (agreed(&matches), (field, report, matches));
-        for _ in 0..TURNS {
+        for _ in 0..RIGID_SEARCH.max_count {
             let before = best.1.counts;
-            if before.kept_share() >= AGREED || kept.len() < FEWEST || !ablation::is_on("turned") {
+            if before.kept_share() >= KEPT_SHARE.confirmed
+                || kept.len() < WHOLE_SEARCH.min_matches
+                || !ablation::is_on("turned")
+            {
                 break;
             }
             let rigid = nearest_rigid(&kept);
@@ -274,12 +284,12 @@ impl Search<'_> {
             let now = report.counts.kept;
             if now > before.kept {
                 best = (field, report, matches);
-            } else if (now as f64) < KEPT * before.kept as f64 {
+            } else if (now as f64) < RIGID_SEARCH.min_kept_ratio * before.kept as f64 {
                 break;
             }
         }
         let (field, report, matches) = best;
-        let enough = report.counts.kept >= FEWEST;
+        let enough = report.counts.kept >= WHOLE_SEARCH.min_matches;
         (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
     }
 
@@ -290,20 +300,21 @@ impl Search<'_> {
 
     /// Whether the features of a level are found where the field has them.
     fn is_confirmed(&self, pair: &Pair<'_>, motion: &Bodies) -> bool {
-        let points = (pair.inside / self.params.voxels_per_point).max(CLOSER_LEAST);
+        let points = (pair.inside / self.params.voxels_per_point).max(NEXT_LEVEL.min_features);
         let near = MatchParams::near(self.params, pair, points, false);
-        motion.matches(pair, near).1.counts.kept_share() >= AGREED
+        motion.matches(pair, near).1.counts.kept_share() >= KEPT_SHARE.confirmed
     }
 
     /// What a search of the next level about its field finds, if the volumes agree better there:
     /// smaller patches are distorted less, and fine texture tells a wrong island from the truth.
-    pub fn closer(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
+    pub fn next_level(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
         let only = own.only().filter(|_| ablation::is_on("next-level"))?;
-        let most = (CLOSER_POINTS / self.params.voxels_per_point.max(1)).clamp(CLOSER_LEAST, POINTS);
-        let wide = self.wide(pair, CLOSER * self.range, most);
+        let most = (NEXT_LEVEL.features_times_voxels_per_point / self.params.voxels_per_point.max(1))
+            .clamp(NEXT_LEVEL.min_features, WHOLE_SEARCH.max_features);
+        let wide = self.wide(pair, NEXT_LEVEL.range_fraction * self.range, most);
         (self.matching)();
         let (matches, found, report) = timed(seconds, || level::matches_again(pair, only, wide));
-        let of_matches = found.filter(|_| report.counts.kept >= FEWEST)?;
+        let of_matches = found.filter(|_| report.counts.kept >= WHOLE_SEARCH.min_matches)?;
         let motion = self.refined(pair, of_matches.clone().into(), passes);
         let begun = |motion| Begun { motion, of_matches: Some(of_matches), report: Some(report), matches, followed: 0 };
         motion.agree_better(pair, own).then(|| begun(motion))

@@ -6,7 +6,7 @@ use crate::matching::levels::foreground;
 use crate::numerics::filters::mean_beside;
 use crate::numerics::statistics::{quantile, sampled, stands_for_all};
 use crate::pipeline::background::{self, Cut, hidden};
-use crate::pipeline::field::FEWEST;
+use crate::pipeline::field::MIN_MATCHES;
 use crate::pipeline::known::Known;
 use crate::types::params::{BodySource, Method};
 use crate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
@@ -83,7 +83,9 @@ pub fn inputs<'a>(
         empty = [None; 2];
     }
     // In one slice there are 8 around a voxel, not 26.
-    let least = |volume: &Voxels<'_>| if volume.grid().shape().contains(&1) { AROUND / 3 } else { AROUND };
+    let least = |volume: &Voxels<'_>| {
+        if volume.grid().shape().contains(&1) { MIN_FINITE_NEIGHBOURS / 3 } else { MIN_FINITE_NEIGHBOURS }
+    };
     let fill = |volume: Voxels<'a>, bad: bool| if bad { filled(&volume, least(&volume)) } else { volume };
     let hide = |volume: Voxels<'a>, empty: Option<f32>| match empty {
         Some(value) => drawn_on(hidden(volume, value)),
@@ -111,8 +113,8 @@ pub fn inputs<'a>(
     Ok(Checked { mask, initial, deformed, not_finite, lost, cut })
 }
 
-/// Largest number of slices in a row that may be lost: more of one value lie between two bodies.
-const IN_A_ROW: usize = 4;
+/// Most lost slices in a row: more of one value lie between two bodies.
+const MAX_LOST_SLICES: usize = 4;
 
 /// The voxels of slice `at` across an axis, in the order of memory.
 fn slice(shape: [usize; 3], axis: usize, at: usize) -> impl Iterator<Item = usize> {
@@ -136,7 +138,7 @@ fn lost_slices(volume: &Voxels<'_>) -> Vec<LostSlice> {
         let between = |at: usize| {
             let below = varies[..at].iter().rposition(|v| *v)?;
             let above = at + varies[at..].iter().position(|v| *v)?;
-            if above - below > IN_A_ROW + 1 {
+            if above - below > MAX_LOST_SLICES + 1 {
                 return None;
             }
             let background = value(at);
@@ -183,22 +185,27 @@ fn without<'a>(mut volume: Voxels<'a>, lost: &[LostSlice]) -> Voxels<'a> {
     volume
 }
 
-/// Soft tissue keeps its volume: that it came out as this part of what it was or less, or as its
-/// inverse or more, is reported.
-const KEPT: f64 = 0.75;
+/// Whether soft tissue keeps its volume.
+struct VolumeCheck {
+    /// Volume over the initial volume; a smaller ratio or a larger inverse earns a warning.
+    min_ratio: f64,
+    /// Approximate number of voxels at which it is measured.
+    sampled_voxels: usize,
+}
 
-/// Voxels that are looked at for it.
-const SAMPLED: usize = 5000;
+const VOLUME_CHECK: VolumeCheck = VolumeCheck { min_ratio: 0.75, sampled_voxels: 5000 };
 
 /// What to say where the tissue as a whole does not keep its volume: most often a header is wrong.
 /// Nothing of one slice.
 pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
     let inside = || (0..mask.as_slice().len()).filter(|&o| mask.as_slice()[o] != 0);
-    let share = SAMPLED as f64 / inside().count().max(1) as f64;
+    let share = VOLUME_CHECK.sampled_voxels as f64 / inside().count().max(1) as f64;
     let some = inside().enumerate().filter(|(i, _)| stands_for_all(*i, share));
     let volumes: Vec<f64> = some.map(|(_, o)| f64::from(determinant_at(field, o))).filter(|v| v.is_finite()).collect();
     let volume = volumes.iter().sum::<f64>() / volumes.len().max(1) as f64;
-    let kept = field.grid().is_single_slice() || volumes.is_empty() || (KEPT..=1.0 / KEPT).contains(&volume);
+    let kept = field.grid().is_single_slice()
+        || volumes.is_empty()
+        || (VOLUME_CHECK.min_ratio..=1.0 / VOLUME_CHECK.min_ratio).contains(&volume);
     (!kept).then(|| {
         format!(
             "the tissue as a whole comes out at {volume:.2} of its volume, which soft tissue keeps: check the voxel sizes in both headers \
@@ -238,8 +245,8 @@ pub fn no_line(volume: &'static str, grid: &Grid) -> Result<(), FieldError> {
     }
 }
 
-/// Voxels along an axis that the smallest patch and its surroundings take.
-const SLICES: usize = 5;
+/// Voxels along an axis that the smallest patch and its surroundings need.
+const MIN_SLICES: usize = 5;
 
 /// A volume has one slice, which is measured in its plane, or enough of them for a patch.
 ///
@@ -247,13 +254,13 @@ const SLICES: usize = 5;
 /// [`FieldError::TooFew`] when there are two to four along an axis: no match can be found.
 pub fn enough_slices(grid: &Grid) -> Result<(), FieldError> {
     let shape = grid.shape();
-    let Some(a) = (0..3).find(|&a| (2..SLICES).contains(&shape[a])) else { return Ok(()) };
+    let Some(a) = (0..3).find(|&a| (2..MIN_SLICES).contains(&shape[a])) else { return Ok(()) };
     let hint = format!(
-        "there are {} voxels along {}, and a patch needs {SLICES}: give more slices, or one alone, which is measured in its plane",
+        "there are {} voxels along {}, and a patch needs {MIN_SLICES}: give more slices, or one alone, which is measured in its plane",
         shape[a],
         ['x', 'y', 'z'][a]
     );
-    Err(FieldError::TooFew { found: 0, what: "matches survive", needed: FEWEST, hint })
+    Err(FieldError::TooFew { found: 0, what: "matches survive", needed: MIN_MATCHES, hint })
 }
 
 /// What a volume's voxels reach.
@@ -284,18 +291,16 @@ impl Range {
     }
 }
 
-/// Finite neighbours that a single voxel without a number needs to get one.
-const AROUND: usize = 13;
+/// Finite neighbours from which a single non-finite voxel is filled.
+const MIN_FINITE_NEIGHBOURS: usize = 13;
 
-/// Voxels by which tissue is drawn on past a cut, so that patches beside it can be matched and no
-/// edge stands there. Of five legs and small blocks that were cut, 0, 1, 2 and 3 left 0.13, 0.08,
-/// 0.12 and 0.34 mm of a press, 0.59, 0.49, 0.45 and 0.61 of 6 mm; without any of them small bodies
-/// keep too few matches.
-const DRAWN_ON: usize = 2;
+/// Voxels by which tissue is extended past a cut, for patches beside it. On five cut pairs 1 to 3
+/// left similar errors; without any, small bodies keep too few matches.
+const CUT_PADDING_VOXELS: usize = 2;
 
 /// The volume with what shows drawn on a little into what does not.
 pub(super) fn drawn_on(mut volume: Voxels<'_>) -> Voxels<'_> {
-    for _ in 0..DRAWN_ON {
+    for _ in 0..CUT_PADDING_VOXELS {
         volume = filled(&volume, 1);
     }
     volume
@@ -312,27 +317,34 @@ fn filled(volume: &Voxels<'_>, least: usize) -> Volume {
     out
 }
 
-/// Spreads of the intensities that are worked on as they are.
-const SPREADS: std::ops::Range<f64> = 1e-3..1e7;
-/// Distance from 0, in spreads, up to which they are.
-const FAR: f64 = 100.0;
+/// Intensities that are used as they are.
+struct UnscaledIntensities {
+    /// Their robust spread.
+    spreads: std::ops::Range<f64>,
+    /// Their largest absolute value, in spreads.
+    max_offset: f64,
+}
 
-/// Quantiles between which a volume's intensities are taken to lie.
-const ROBUST: [f64; 2] = [0.001, 0.999];
+const UNSCALED: UnscaledIntensities = UnscaledIntensities { spreads: 1e-3..1e7, max_offset: 100.0 };
+
+/// Which voxels are hot.
+struct HotVoxels {
+    /// Quantiles of a volume's intensities that span its robust range.
+    robust_quantiles: [f64; 2],
+    /// Distance beyond the robust range, in widths of that range.
+    margin: f32,
+    /// Most extreme neighbours that are ignored in a comparison: hot voxels come in short runs.
+    ignored_extremes: usize,
+}
+
+const HOT_VOXELS: HotVoxels = HotVoxels { robust_quantiles: [0.001, 0.999], margin: 3.0, ignored_extremes: 3 };
 
 /// The range of some intensities without far outliers (hot voxels, spikes); none where they are all
 /// alike.
 fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
-    let [low, high] = ROBUST.map(|q| quantile(sample, q));
+    let [low, high] = HOT_VOXELS.robust_quantiles.map(|q| quantile(sample, q));
     (high > low).then_some([low, high])
 }
-
-/// How far past its robust range a volume's intensities may lie, in widths of it.
-const PAST: f32 = 3.0;
-
-/// The most extreme neighbours that do not count when a voxel is compared with them: hot voxels
-/// come in short runs.
-const RUN: usize = 3;
 
 /// The volume with padding that lies far from its intensities as the darkest of these, lone far
 /// outliers as the median of their neighbours, and others drawn in to the end of the range.
@@ -343,7 +355,7 @@ pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
     sample.retain(|v| !padding.contains(&Some(*v)));
     let Some([low, high]) = robust_range(&mut sample) else { return volume.view() };
     let width = high - low;
-    let (least, most) = (low - PAST * width, high + PAST * width);
+    let (least, most) = (low - HOT_VOXELS.margin * width, high + HOT_VOXELS.margin * width);
     if least <= reached.low && reached.high <= most {
         return volume.view();
     }
@@ -355,7 +367,9 @@ pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
         }
         let mut beside = neighbours(values, shape, at);
         beside.sort_by(f32::total_cmp);
-        let lone = beside.len() > 2 * RUN && !far(beside[RUN]) && !far(beside[beside.len() - 1 - RUN]);
+        let lone = beside.len() > 2 * HOT_VOXELS.ignored_extremes
+            && !far(beside[HOT_VOXELS.ignored_extremes])
+            && !far(beside[beside.len() - 1 - HOT_VOXELS.ignored_extremes]);
         if lone { beside[beside.len() / 2] } else { values[at].clamp(least, most) }
     };
     let outliers: Vec<(usize, f32)> =
@@ -389,7 +403,7 @@ fn in_range<'a>(mut volume: Voxels<'a>, like: Option<f64>) -> (Voxels<'a>, f64) 
     let spread = high - low;
     let furthest = low.abs().max(high.abs());
     let alike = like.is_none_or(|l| (l / spread).log2().abs() < 0.5);
-    if SPREADS.contains(&spread) && furthest <= FAR * spread && alike {
+    if UNSCALED.spreads.contains(&spread) && furthest <= UNSCALED.max_offset * spread && alike {
         return (volume, spread);
     }
     let scale = (like.unwrap_or(1000.0) / spread).log2().round().exp2();

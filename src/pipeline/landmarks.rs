@@ -7,7 +7,7 @@ use crate::consistency::energy::distance;
 use crate::consistency::models::AffineMotion;
 use crate::consistency::pruning::{GATE, Measured};
 use crate::matching::pair::{Anchor, Pair};
-use crate::matching::residual::{NormalEquations, UNSURE};
+use crate::matching::residual::{MIN_POSITION_ERROR_VOXELS, NormalEquations};
 use crate::numerics::bspline::Lattice;
 use crate::numerics::statistics::median;
 use crate::pipeline::bodies::Bodies;
@@ -16,22 +16,27 @@ use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, SplineField};
 use crate::types::{Grid, Landmark, LandmarkReport};
 
-/// Squared distance, over the variance, at which a landmark's weight is a half in the end: three
-/// standard deviations, as for matches.
-const SCALE: f64 = 9.0;
+/// Graduated non-convexity of the landmarks' weights (Blake and Zisserman 1987).
+struct Annealing {
+    /// Squared distance over the variance at which the final weight is a half: three standard
+    /// deviations, as for matches.
+    final_scale_squared: f64,
+    /// Factor by which that scale falls from pass to pass.
+    decay: f64,
+    /// Passes at the end in which it holds.
+    final_passes: usize,
+}
 
-/// Factor by which that falls from pass to pass, and the passes at the end in which it holds.
-const FALLS: f64 = 4.0;
-const SETTLING: usize = 3;
+const ANNEALING: Annealing = Annealing { final_scale_squared: 9.0, decay: 4.0, final_passes: 3 };
 
 /// Landmarks from which a motion of their own may start the search: an affine map takes four.
-pub(super) const FEWEST: usize = 4;
+pub(super) const MIN_LANDMARKS: usize = 4;
 
 /// The landmarks on the initial volume's grid.
 pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
     let sd = if known.landmark_sd_mm > 0.0 { known.landmark_sd_mm } else { voxel(grid) };
     // Of no place more is known than interpolation leaves sure.
-    let sd = sd.max(UNSURE * voxel(grid));
+    let sd = sd.max(MIN_POSITION_ERROR_VOXELS * voxel(grid));
     let axes = grid.axes();
     let of = |l: &Landmark| {
         let d = l.deformed.minus(l.initial);
@@ -51,11 +56,11 @@ fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
 }
 
-/// The scale of the weights, by the passes `to_come` after this one: it falls by [`FALLS`] from
-/// pass to pass, so that at first all landmarks pull (graduated non-convexity; Blake and Zisserman
-/// 1987), and holds in the last [`SETTLING`].
+/// The squared scale of the weights, by the passes `to_come` after this one, as [`ANNEALING`] says:
+/// at first all landmarks pull.
 fn scale(to_come: usize) -> f64 {
-    SCALE * FALLS.powi(to_come.saturating_sub(SETTLING - 1).min(20) as i32)
+    ANNEALING.final_scale_squared
+        * ANNEALING.decay.powi(to_come.saturating_sub(ANNEALING.final_passes - 1).min(20) as i32)
 }
 
 /// How far the field is from most landmarks (mm, twice the median).
@@ -67,7 +72,7 @@ pub(super) fn reach(pair: &Pair<'_>, field: &SplineField) -> f64 {
 
 /// Whether the passes may end with `to_come` left: the weights are final.
 pub(super) fn are_settled(pair: &Pair<'_>, to_come: usize) -> bool {
-    pair.anchors.is_empty() || to_come < SETTLING
+    pair.anchors.is_empty() || to_come < ANNEALING.final_passes
 }
 
 /// Adds what the landmarks pull with to a pass with `to_come` passes after it.
@@ -84,7 +89,7 @@ pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalE
 
 /// What a squared distance over the variance costs: the logarithm of its density (Cauchy).
 fn cost(q: f64) -> f64 {
-    SCALE * (q / SCALE).ln_1p()
+    ANNEALING.final_scale_squared * (q / ANNEALING.final_scale_squared).ln_1p()
 }
 
 /// How much better the landmarks agree with one motion than with another.
@@ -126,7 +131,7 @@ pub(super) fn measured(pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
 /// The field through the landmarks alone on a level of `factor`, from which a search may start.
 pub(super) fn start(pair: &Pair<'_>, factor: [usize; 3]) -> Option<Start> {
     let thick: Vec<usize> = (0..3).filter(|&a| pair.shape[a] > 1).collect();
-    if pair.anchors.len() < FEWEST {
+    if pair.anchors.len() < MIN_LANDMARKS {
         return None;
     }
     let of = |a: &Anchor| {

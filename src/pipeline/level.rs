@@ -41,20 +41,45 @@ pub struct SplineField {
     pub blocks: Blocks,
 }
 
-/// Weight of the bending energy to start from at most, per mm^3 of lattice cell. A stiffer start
-/// holds a few moving parts to still ones around them for all passes.
-const STIFFNESS: f32 = 30.0;
+/// Iteration control of the residual passes.
+struct PassControl {
+    /// Largest initial weight of the bending energy per mm^3 of lattice cell: a larger one holds
+    /// small moving parts to the still tissue around them.
+    max_initial_smoothness: f32,
+    /// Initial weight over the one that matches suggest, until the evidence sets it after two
+    /// passes: a smaller one left a fifth more error on a thigh.
+    initial_stiffening: f32,
+    /// Part of the last step carried into the next (heavy ball, Polyak 1964; restart, O'Donoghue &
+    /// Candes 2015): 0.8 leaves 1 % less error over twelve pairs, but up to 5 % more.
+    momentum: f32,
+    /// Root mean square step (finest voxels) below which the passes end.
+    convergence_tolerance_voxels: f64,
+    /// Largest displacement of a node along an axis (finest voxels): beyond it, the residual of
+    /// smooth tissue does not point to the match.
+    max_displacement_voxels: f64,
+    /// Conjugate gradient iterations in a pass: each needs only an approximate step.
+    cg_iterations: usize,
+}
 
-/// How much stiffer passes start than matches alone suggest, up to [`STIFFNESS`]; the evidence
-/// takes over after two of them. A looser start follows false residuals where texture is weak:
-/// measured on a thigh, errors a fifth larger.
-const STIFFER: f32 = 30.0;
+const PASS: PassControl = PassControl {
+    max_initial_smoothness: 30.0,
+    initial_stiffening: 30.0,
+    momentum: 0.5,
+    convergence_tolerance_voxels: 0.008,
+    max_displacement_voxels: 2.0,
+    cg_iterations: 10,
+};
 
 impl SplineField {
     /// No motion, with a bending energy to start from.
     pub fn still(lattice: Lattice) -> Self {
         let n = 3 * lattice.len();
-        Self { lattice, coefficients: vec![0.0; n], smoothness: vec![STIFFNESS; n], blocks: Blocks::default() }
+        Self {
+            lattice,
+            coefficients: vec![0.0; n],
+            smoothness: vec![PASS.max_initial_smoothness; n],
+            blocks: Blocks::default(),
+        }
     }
 
     /// The same without the information at its nodes.
@@ -70,7 +95,7 @@ impl SplineField {
 
     /// Of matches alone, with a bending energy to start passes from.
     pub fn to_refine(mut self) -> Self {
-        self.smoothness.iter_mut().for_each(|s| *s = (STIFFER * *s).min(STIFFNESS));
+        self.smoothness.iter_mut().for_each(|s| *s = (PASS.initial_stiffening * *s).min(PASS.max_initial_smoothness));
         self
     }
 }
@@ -93,30 +118,15 @@ pub fn lattice(pair: &Pair<'_>, step: usize) -> Lattice {
 /// Information per voxel that noise correlated by the spline filter leaves: 1 / (2 along each
 /// axis).
 pub(super) fn independent(pair: &Pair<'_>) -> f32 {
-    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / least_squares_matching::CORRELATION as f32)
+    (0..3).filter(|&a| pair.shape[a] > 1).fold(1.0, |v, _| v / least_squares_matching::NOISE_CORRELATION_VOXELS as f32)
 }
 
-/// How much of the last step is carried into the next where that goes on the same way (heavy ball,
-/// Polyak 1964; restart, O'Donoghue & Candes 2015): the block diagonal is an upper bound, so plain
-/// steps are short. With .8 twelve pairs left 1 % less error, two of them 4 and 5 % more.
-const MOMENTUM: f32 = 0.5;
+/// Nodes of a lattice from which memory is saved at the cost of time: systems are solved one by
+/// one, and the warped volume is not kept.
+const MEMORY_SAVING_NODES: usize = 500_000;
 
-/// Steps shorter than this fraction of the finest voxel edge (root mean square) end the passes.
-const SETTLED: f64 = 0.008;
-
-/// How far passes take a node along an axis (voxels of the finest one): the residual of smooth
-/// tissue does not point the way further, and where texture is weak nothing else would hold it.
-const REACH: f64 = 2.0;
-
-/// Conjugate gradient iterations a pass: each pass needs only a fair step.
-const ITERATIONS: usize = 10;
-
-/// Nodes of a lattice from which memory goes before time: one system is solved after the other in
-/// place of beside it, and the warped volume is not kept meanwhile.
-const LARGE: usize = 500_000;
-
-/// What tissue is left of its volume at least; below it, the field is smoothed.
-const LEAST_VOLUME: f32 = 0.1;
+/// Least Jacobian determinant of tissue; a field below it is smoothed.
+pub(super) const MIN_JACOBIAN: f32 = 0.1;
 
 /// Passes: warp, measure gain and residual, couple; the weight of the bending energy follows the
 /// evidence by place and axis ([`coupling::supported`]). No node ends further than two voxels of
@@ -138,15 +148,15 @@ pub(super) fn refine_from(
     advance(pair, field, begun, Held::Whole, passes, seed, tick);
 }
 
-/// Passes of [`twice`]. With one, waves of 20 to 30 voxels stay 1 % lower and twelve pairs have 2 %
+/// Passes of [`twicing`]: one leaves waves of 20 to 30 voxels 1 % lower, and twelve pairs with 2 %
 /// more error.
-const TWICED: usize = 2;
+const TWICING_PASSES: usize = 2;
 
 /// Passes from a settled field in which the bending energy holds the change alone (twicing; Tukey
 /// 1977): what it flattened of long waves comes back, and short ones stay out.
-pub fn twice(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
+pub fn twicing(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
     let begun = field.coefficients.clone();
-    advance(pair, field, &begun, Held::Change, TWICED, seed, |_| ());
+    advance(pair, field, &begun, Held::Change, TWICING_PASSES, seed, |_| ());
 }
 
 /// What the bending energy is counted of.
@@ -158,7 +168,7 @@ enum Held {
     Change,
 }
 
-/// The passes of [`refine`] and [`twice`].
+/// The passes of [`refine`] and [`twicing`].
 fn advance(
     pair: &Pair<'_>,
     field: &mut SplineField,
@@ -174,10 +184,10 @@ fn advance(
     let weight = independent(pair);
     let finest = pyramid::finest(pair.shape, pair.spacing);
     // Landmarks hold what texture does not.
-    let reach = (REACH * finest).max(landmarks::reach(pair, field)) as f32;
+    let reach = (PASS.max_displacement_voxels * finest).max(landmarks::reach(pair, field)) as f32;
     let mut before = field.coefficients.clone();
     let mut probe = coupling::Probe::new(field.lattice.len(), seed);
-    let large = field.lattice.len() >= LARGE;
+    let large = field.lattice.len() >= MEMORY_SAVING_NODES;
     let mut warped = Vec::new();
     for pass in 0..passes {
         // Those of the pass before serve nobody any more.
@@ -204,7 +214,7 @@ fn advance(
             Held::Change => field.coefficients.iter().zip(begun).map(|(c, begun)| c - begun).collect(),
         };
         let rhs = equations.rhs;
-        let step = || coupling::step(&matrix, rhs, &bent, 0.02, ITERATIONS);
+        let step = || coupling::step(&matrix, rhs, &bent, 0.02, PASS.cg_iterations);
         // From the last pass's solution a few iterations suffice, though the blocks and weights
         // have changed.
         let informed = || Coupled::new(&energy, &weights, &information, false);
@@ -214,11 +224,11 @@ fn advance(
         let ((_, step, length), determined) = if large { (step(), determine()) } else { rayon::join(step, determine) };
         for (((c, d), before), begun) in field.coefficients.iter_mut().zip(step).zip(&mut before).zip(begun) {
             let last = *c - std::mem::replace(before, *c);
-            let carried = if d * last > 0.0 { MOMENTUM * last } else { 0.0 };
+            let carried = if d * last > 0.0 { PASS.momentum * last } else { 0.0 };
             *c = (*c + d + carried).clamp(begun - reach, begun + reach);
         }
         if ablation::is_on("unfold") {
-            unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
+            unfold(&field.lattice, pair.spacing, &mut field.coefficients, MIN_JACOBIAN);
         }
         field.blocks = information;
         if let Some(determined) = determined {
@@ -232,7 +242,10 @@ fn advance(
             }
         }
         tick(pass);
-        if f64::from(length) < SETTLED * finest && pass >= 3 && landmarks::are_settled(pair, to_come) {
+        if f64::from(length) < PASS.convergence_tolerance_voxels * finest
+            && pass >= 3
+            && landmarks::are_settled(pair, to_come)
+        {
             break;
         }
     }
@@ -247,14 +260,13 @@ pub fn determined(pair: &Pair<'_>, field: &SplineField, seed: u64) -> f64 {
     coupling::determined(&matrix, seed, 30).iter().sum::<f64>().max(12.0)
 }
 
-/// Voxels of the finest axis between the places about which a map is compared with the free field,
-/// and a field against stillness. Errors of 24 pairs were the same at 8, 12 and 16 within a
-/// hundredth.
-const WINDOW: usize = 12;
+/// Voxels of the finest axis between the places at which motion models are compared with the free
+/// field: 8, 12 and 16 leave the same errors over 24 pairs.
+const MODEL_NODE_SPACING_VOXELS: usize = 12;
 
 /// The places about which a map is compared with the free field.
 pub fn windows(pair: &Pair<'_>) -> Lattice {
-    lattice(pair, WINDOW)
+    lattice(pair, MODEL_NODE_SPACING_VOXELS)
 }
 
 /// The excess misfit of a map against the free field about each of [`windows`], which adds up to
@@ -284,15 +296,15 @@ pub fn excess<'a>(
     }
 }
 
-/// Random vectors from which the posterior's deviation is estimated.
-const DRAWS: usize = 6;
+/// Random vectors from which the posterior deviation is estimated.
+const POSTERIOR_DRAWS: usize = 6;
 
 /// What the data of the last pass leave open and what they determine, at the field's own nodes.
 pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> Posterior {
     let energy = smoothness(&field.lattice, spacing);
     let cell = cell_volume(&field.lattice, spacing) as f32;
     let weights: Vec<f32> = field.smoothness.iter().map(|s| s * cell).collect();
-    coupling::posterior(&energy, &weights, &field.blocks, field.lattice.nodes, DRAWS, seed)
+    coupling::posterior(&energy, &weights, &field.blocks, field.lattice.nodes, POSTERIOR_DRAWS, seed)
 }
 
 /// By how much the misfit shrinks from one warp to another, with the information that correlated
@@ -509,7 +521,7 @@ fn sought(pair: &Pair<'_>, warped: Option<&[f32]>, params: &MatchParams) -> Soug
         }
     };
     let room = pair.inside as f64 / params.points as f64;
-    let quick = !params.thorough && room >= BLOCKS;
+    let quick = !params.thorough && room >= BLOCKWISE_VOXELS_PER_POINT;
     let initial = corners(&pair.fixed_smooth, pair.shape, spacing, Some(&pair.mask), noise, room, quick, params.points);
     let within = warped.is_some().then_some(&pair.mask[..]);
     let room = if params.thorough && warped.is_some() { room / 5.0 } else { room };
@@ -677,8 +689,8 @@ fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
     inverse(&c)
 }
 
-/// Voxels a point from which on corners are sought on blocks of two voxels.
-const BLOCKS: f64 = 100.0;
+/// Voxels for each point from which corners are detected on blocks of two voxels.
+const BLOCKWISE_VOXELS_PER_POINT: f64 = 100.0;
 
 /// Corners of a smoothed volume. `room` is the number of voxels for each point wanted: with less of
 /// it the window is narrower, which has more maxima. `quick` works the structure tensor out on
@@ -710,15 +722,18 @@ fn corners(
     found
 }
 
-/// Rounds of the robust fit: its scale has then fallen to 3 standard deviations.
-const ROUNDS: usize = 7;
+/// The robust fit of a field to matches alone.
+struct MatchFit {
+    /// Iterations: the robust scale has then fallen to three standard deviations.
+    iterations: usize,
+    /// The same from a field that is nearly right.
+    refit_iterations: usize,
+    /// Voxels between nodes: over 37 pairs 3 to 6 left the same error to 0.1 %, and 6 needs an
+    /// eighth of the nodes of 3.
+    node_spacing_voxels: usize,
+}
 
-/// The same from a field that is nearly right.
-const AGAIN: usize = 3;
-
-/// Voxels between the nodes that matches alone are coupled on: about as far apart as they lie. Over
-/// 37 pairs 3, 4, 5 and 6 left the same error to 0.1 %, and 6 takes an eighth of the nodes of 3.
-const APART: usize = 6;
+const MATCH_FIT: MatchFit = MatchFit { iterations: 7, refit_iterations: 3, node_spacing_voxels: 6 };
 
 /// Couples the matches of a level into a spline field.
 fn fit(
@@ -758,15 +773,15 @@ pub(super) fn couple(
             Evidence { at, displacement, information }
         })
         .collect();
-    let lattice = known.map_or_else(|| lattice(pair, APART), |k| k.lattice.clone());
+    let lattice = known.map_or_else(|| lattice(pair, MATCH_FIT.node_spacing_voxels), |k| k.lattice.clone());
     let energy = smoothness(&lattice, pair.spacing);
     let cell = cell_volume(&lattice, pair.spacing) as f32;
     let (coefficients, weight) = match known {
         Some(known) => {
             let start = (&known.coefficients[..], known.smoothness[0] * cell);
-            coupling::fit_from(&lattice, &energy, &evidence, Some(start), AGAIN)
+            coupling::fit_from(&lattice, &energy, &evidence, Some(start), MATCH_FIT.refit_iterations)
         }
-        None => coupling::fit(&lattice, &energy, &evidence, ROUNDS),
+        None => coupling::fit(&lattice, &energy, &evidence, MATCH_FIT.iterations),
     };
     let smoothness = vec![weight / cell; 3 * lattice.len()];
     (SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }, evidence)

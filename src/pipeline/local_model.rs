@@ -17,31 +17,46 @@ use crate::numerics::symmetric3::inverse;
 use crate::pipeline::level::SplineField;
 use crate::types::{MotionModel, VoxelPoint};
 
-/// Excess misfit for each degree of freedom up to which tissue is at rest, and from which the free
-/// field stands (1). Calibrated: docs/lab/2026-11-expected-error.md.
-const AT_REST: [f32; 2] = [0.85, 2.2];
+/// When tissue is at rest or follows one rigid motion. The misfits are calibrated:
+/// docs/lab/2026-11-expected-error.md.
+struct RestTest {
+    /// Excess misfit per degree of freedom up to which tissue is at rest, and from which the free
+    /// field applies (1).
+    misfit_range: [f32; 2],
+    /// Excess misfit per degree of freedom from which tissue at rest is as uncertain as the free
+    /// field (1).
+    uncertain_misfit: f32,
+    /// Least uncertainty at rest over the free field's: how small a motion would show is not known
+    /// better.
+    min_uncertainty_ratio: f32,
+    /// Least part of the tissue at rest for it to be held there: 0 to 0.11 in 34 of 37 pairs that
+    /// moved smoothly or slid, 0.32 to 0.87 in 22 of 23 pressed ones.
+    min_fraction: f64,
+    /// Tissue at rest under a rigid motion over that under none, from which the rigid motion is
+    /// taken.
+    min_rigid_gain: f64,
+    /// Refits of a rigid motion to the tissue at rest under the one before.
+    rigid_refits: usize,
+}
 
-/// Excess misfit for each degree of freedom from which tissue at rest is as uncertain as the free
-/// field (1); below it, in proportion. Calibrated with [`AT_REST`].
-const NARROW: f32 = 1.7;
+const REST: RestTest = RestTest {
+    misfit_range: [0.85, 2.2],
+    uncertain_misfit: 1.7,
+    min_uncertainty_ratio: 1.0 / 3.0,
+    min_fraction: 0.15,
+    min_rigid_gain: 1.25,
+    rigid_refits: 2,
+};
 
-/// See [`NARROW`]: how well so little motion would have shown is not known better.
-const NARROWEST: f32 = 1.0 / 3.0;
+/// What windows around a place add to its misfit and degrees of freedom.
+struct Neighbourhood {
+    /// Weight: they decide only where the data determine little.
+    weight: f32,
+    /// Width (windows, one Gaussian standard deviation).
+    width_windows: f64,
+}
 
-/// What places about it add to the misfit and the degrees of freedom of a place, with a Gaussian of
-/// this number of windows: where little is determined (no texture, nothing in view) they decide.
-const LENT: (f32, f64) = (0.02, 3.0);
-
-/// Part of the tissue that must be at rest for any to be held there. Of 37 pairs that moved
-/// smoothly or slid 34 had 0 to 0.11 (one 0.16, slides up to 0.24), of 23 pressed ones all but one
-/// 0.32 to 0.87 (0.16 where the press went through the whole head).
-const LEAST: f64 = 0.15;
-
-/// How much more must be at rest under a rigid motion than where nothing moves at all.
-const WORTH: f64 = 1.25;
-
-/// Times that a rigid motion is fitted to the tissue that is at rest under the one before.
-const FITS: usize = 2;
+const NEIGHBOURHOOD: Neighbourhood = Neighbourhood { weight: 0.02, width_windows: 3.0 };
 
 /// A map that was compared with the free field.
 pub(super) struct Tried {
@@ -51,9 +66,8 @@ pub(super) struct Tried {
     pub excess: Vec<f32>,
 }
 
-/// Degrees of freedom that a place counts for at least when it speaks against a model: with fewer,
-/// chance decides.
-const FEWEST: f32 = 5.0;
+/// Least degrees of freedom of a place that contradicts a model: with fewer, chance decides.
+const MIN_LOCAL_DEGREES_OF_FREEDOM: f32 = 5.0;
 
 /// What each of the windows holds.
 pub(super) struct Places {
@@ -79,12 +93,12 @@ impl Places {
             }
             span
         });
-        Self { nodes: windows.nodes, tissue, determined: with_lent(determined, windows.nodes) }
+        Self { nodes: windows.nodes, tissue, determined: with_neighbours(determined, windows.nodes) }
     }
 
     /// Excess misfit for each degree of freedom about each of the windows.
     pub fn ratio(&self, excess: &[f32]) -> Vec<f32> {
-        let excess = with_lent(excess.to_vec(), self.nodes);
+        let excess = with_neighbours(excess.to_vec(), self.nodes);
         excess.iter().zip(&self.determined).map(|(q, d)| q / d.max(1e-9)).collect()
     }
 
@@ -92,8 +106,8 @@ impl Places {
     pub fn worst(&self, excess: &[f32]) -> f64 {
         let filled = self.tissue.iter().filter(|&&t| t > 0.0).count().max(1);
         let least = self.tissue.iter().sum::<f32>() / filled as f32;
-        let excess = with_lent(excess.to_vec(), self.nodes);
-        let ratios = excess.iter().zip(&self.determined).map(|(q, d)| q / d.max(FEWEST));
+        let excess = with_neighbours(excess.to_vec(), self.nodes);
+        let ratios = excess.iter().zip(&self.determined).map(|(q, d)| q / d.max(MIN_LOCAL_DEGREES_OF_FREEDOM));
         let held = ratios.zip(&self.tissue).filter(|(_, t)| **t >= least);
         held.map(|(r, _)| f64::from(r)).fold(0.0, f64::max)
     }
@@ -129,7 +143,7 @@ impl Rest {
         let all: f64 = tissue.iter().map(|&v| f64::from(v)).sum();
         let judged = |&Tried { model, motion, ref excess }: &Tried| {
             let ratio = places.ratio(excess);
-            let free: Vec<f32> = ratio.iter().map(|&r| stands(r)).collect();
+            let free: Vec<f32> = ratio.iter().map(|&r| free_share(r)).collect();
             let share: f64 = free.iter().zip(tissue).map(|(f, t)| f64::from((1.0 - f) * t)).sum();
             Self {
                 model,
@@ -145,12 +159,12 @@ impl Rest {
         let (still, rigid) = (of(MotionModel::Identity), of(MotionModel::Rigid));
         // What else moves draws the first fit of the whole to itself.
         let refit = |whole: Self| {
-            (0..FITS).fold(whole, |last, _| {
+            (0..REST.rigid_refits).fold(whole, |last, _| {
                 let motion = nearest_rigid(&last.at_rest(pair, field));
                 judged(&Tried { model: MotionModel::Rigid, motion, excess: excess(&motion) })
             })
         };
-        let more = |rigid: &Self| still.as_ref().is_none_or(|still| rigid.share > WORTH * still.share);
+        let more = |rigid: &Self| still.as_ref().is_none_or(|still| rigid.share > REST.min_rigid_gain * still.share);
         rigid.filter(more).map(refit).filter(more).or(still)
     }
 
@@ -167,12 +181,13 @@ impl Rest {
 
     /// The uncertainty at a place (voxels in which it was judged) as a part of the free field's.
     pub fn narrowed(&self, at: [f64; 3]) -> f32 {
-        (self.windows.stencil_near(at).gather(&self.ratio) / NARROW).clamp(NARROWEST, 1.0)
+        (self.windows.stencil_near(at).gather(&self.ratio) / REST.uncertain_misfit)
+            .clamp(REST.min_uncertainty_ratio, 1.0)
     }
 
     /// Whether so much is at rest that it is held there.
     pub fn is_taken(&self) -> bool {
-        self.share >= LEAST
+        self.share >= REST.min_fraction
     }
 
     /// What was found, in words.
@@ -183,7 +198,7 @@ impl Rest {
         };
         let held = match self.is_taken() {
             true => "it is held there".to_string(),
-            false => format!("too little to hold it there (at least {:.0} %)", 100.0 * LEAST),
+            false => format!("too little to hold it there (at least {:.0} %)", 100.0 * REST.min_fraction),
         };
         format!("at rest: {:.0} % of the tissue {how}, as far as the data tell; {held}", 100.0 * self.share)
     }
@@ -221,18 +236,16 @@ pub(super) fn shown(pair: &Pair<'_>, field: &SplineField, counts: impl Fn([f64; 
     field.blocks.iter().enumerate().filter_map(of).collect()
 }
 
-/// See [`LENT`].
-fn with_lent(mut values: Vec<f32>, nodes: [usize; 3]) -> Vec<f32> {
-    let (part, width) = LENT;
-    let about = filters::gaussian(&values, nodes, [width; 3]);
-    values.iter_mut().zip(about).for_each(|(v, about)| *v += part * about);
+/// Values with the weighted sum of their neighbourhood, see [`NEIGHBOURHOOD`].
+fn with_neighbours(mut values: Vec<f32>, nodes: [usize; 3]) -> Vec<f32> {
+    let about = filters::gaussian(&values, nodes, [NEIGHBOURHOOD.width_windows; 3]);
+    values.iter_mut().zip(about).for_each(|(v, about)| *v += NEIGHBOURHOOD.weight * about);
     values
 }
 
-/// How much of the free field stands at an excess misfit for each degree of freedom, without a
-/// step.
-fn stands(ratio: f32) -> f32 {
-    let [low, high] = AT_REST;
+/// Weight of the free field (0 to 1) at an excess misfit per degree of freedom: a smooth step.
+fn free_share(ratio: f32) -> f32 {
+    let [low, high] = REST.misfit_range;
     let t = ((ratio - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }

@@ -5,45 +5,49 @@ use crate::matching::pair::Pair;
 use crate::numerics::statistics::deviation;
 use crate::pipeline::level::{self, SplineField};
 
-/// Residual (in standard deviations of the noise) beyond which a closer lattice is tried. The
-/// spline filter leaves noise alone at about 0.5. Same tissue at 3 % noise: 0.5 to 0.75 where the
-/// motion was found, 0.95 at most where not; brains of two people, 1.4 to 12.
-const NOISY: f32 = 1.1;
+/// When a finer lattice is tried and accepted.
+struct LatticeTrial {
+    /// Residual over the noise beyond which it is tried: 0.5 to 0.75 where the motion was found, up
+    /// to 0.95 where not, 1.4 to 12 for brains of two people.
+    min_residual_to_noise: f32,
+    /// Misfit per degree of freedom that it must explain: superfluous lattices explained 0.3 to
+    /// 0.75 (docs/lab/2026-11-local-signal.md).
+    min_gain_per_degree_of_freedom: f64,
+    /// Passes on it, and again where it is accepted.
+    passes: usize,
+    /// Most nodes, to bound memory.
+    max_nodes: usize,
+}
 
-/// Misfit per degree of freedom that a closer lattice must explain. Past the spacing that a scene
-/// asks for lattices explained .3 to .75 of noise and interpolation
-/// (docs/lab/2026-11-local-signal.md).
-const WORTH: f64 = 0.8;
+const TRIAL: LatticeTrial =
+    LatticeTrial { min_residual_to_noise: 1.1, min_gain_per_degree_of_freedom: 0.8, passes: 4, max_nodes: 4_000_000 };
 
-/// Passes on each closer lattice, and again where it is taken.
-const TRIAL: usize = 4;
+/// Node spacing of the finest level at the start. Calibrated: docs/lab/2026-11-local-signal.md.
+struct InitialSpacing {
+    /// Nodes in the tissue beyond which their spacing exceeds the least.
+    max_nodes: f64,
+    /// Least spacing (voxels).
+    min_voxels: usize,
+}
 
-/// Nodes in the tissue from which on they lie further apart than [`APART`]: smoothness sets the
-/// scale of motion on any lattice, and bodies move on a scale of their own size. Calibrated:
-/// docs/lab/2026-11-local-signal.md.
-const ENOUGH: f64 = 6000.0;
+const INITIAL_SPACING: InitialSpacing = InitialSpacing { max_nodes: 6000.0, min_voxels: 4 };
 
-/// Voxels between nodes, at least, to begin with.
-const APART: usize = 4;
+/// Residuals that earn a warning.
+struct Warnings {
+    /// Residual over the standard deviation of the initial volume's tissue.
+    residual: f32,
+    /// Variation of the gain: 1.01 to 1.02 without a bias, 1.10 to 1.19 at 15 %, 1.26 to 1.49 at
+    /// 40 %, where errors grow by 19 to 31 %.
+    gain_variation: f32,
+}
 
-/// Residual, as a part of the standard deviation of the initial volume's tissue, up to which it is
-/// no matter.
-const UNLIKE: f32 = 0.05;
-
-/// Variation of the gain beyond which it is warned of. In phantoms of a block, a head and a calf
-/// (two sizes, two to five seeds) it is 1.01 to 1.02 without bias, 1.10 to 1.19 at 15 % and 1.26 to
-/// 1.49 at 40, where the error is larger by 19 to 31 %; in 14 pairs made from scans (15 %) 1.10 to
-/// 1.19. Between the second and the 98th percentile one of those, in thick slices, had 1.55.
-const UNEVEN: f32 = 1.25;
-
-/// Nodes at most, to bound memory.
-const NODES: usize = 4_000_000;
+const WARN: Warnings = Warnings { residual: 0.05, gain_variation: 1.25 };
 
 /// Voxels between the nodes of the finest level to begin with: as asked, or by the `inside` voxels
 /// of tissue.
 pub(super) fn apart(asked: usize, inside: usize) -> usize {
-    let wide = (inside as f64 / ENOUGH).cbrt().round() as usize;
-    if asked > 0 { asked } else { wide.max(APART) }
+    let wide = (inside as f64 / INITIAL_SPACING.max_nodes).cbrt().round() as usize;
+    if asked > 0 { asked } else { wide.max(INITIAL_SPACING.min_voxels) }
 }
 
 /// A field with what it leaves.
@@ -71,25 +75,26 @@ pub(super) fn finer(
     let mut best = Explained { field, apart, said: Vec::new() };
     for closer in (2..apart).rev() {
         let lattice = level::lattice(pair, closer);
-        if noisy < NOISY || lattice.len() > NODES || lattice == best.field.lattice {
+        if noisy < TRIAL.min_residual_to_noise || lattice.len() > TRIAL.max_nodes || lattice == best.field.lattice {
             break;
         }
         let mut next = level::carry(&best.field, lattice, |p| p);
-        refine(&mut next, TRIAL);
+        refine(&mut next, TRIAL.passes);
         let gain = level::gained(pair, &warped(&best.field), warped(&next));
         let [few, many] = [&best.field, &next].map(|f| level::determined(pair, f, seed));
-        let worth = gain / (many - few).max(1.0);
-        let taken = gain > 0.0 && worth > WORTH;
+        let gain_per_degree = gain / (many - few).max(1.0);
+        let taken = gain > 0.0 && gain_per_degree > TRIAL.min_gain_per_degree_of_freedom;
         best.said.push(format!(
             "nodes every {closer} voxels: {}; the residual is {noisy:.1} times the noise, and {:.0} degrees of freedom more explain \
-             {worth:.2} of the misfit each (chance: up to {WORTH})",
+             {gain_per_degree:.2} of the misfit each (chance: up to {})",
             if taken { "taken" } else { "not taken" },
-            many - few
+            many - few,
+            TRIAL.min_gain_per_degree_of_freedom
         ));
         if !taken {
             break;
         }
-        refine(&mut next, TRIAL);
+        refine(&mut next, TRIAL.passes);
         noisy = times(left(&next), pair.noise);
         (best.field, best.apart) = (next, closer);
     }
@@ -107,7 +112,7 @@ pub(super) fn unlike(pair: &Pair<'_>, left: f32) -> Option<String> {
     let tissue =
         pair.fixed_smooth.iter().zip(&pair.mask[..]).filter(|(v, m)| **m != 0 && v.is_finite()).map(|(v, _)| *v);
     let (times, part) = (times(left, pair.noise), left / deviation(tissue) as f32);
-    (times > NOISY && part > UNLIKE).then(|| {
+    (times > TRIAL.min_residual_to_noise && part > WARN.residual).then(|| {
         format!(
             "what is left of the difference is {times:.1} times the noise ({:.0} % of the contrast in the tissue): the volumes differ \
              by more than motion (contrast, brightness, missing tissue, another person), and the field may follow that; look at warped.nii.gz",
@@ -122,7 +127,7 @@ pub(super) fn uneven(gain: f32) -> Option<String> {
         g if g.is_infinite() => "changes its sign".into(),
         g => format!("varies by a factor of {g:.2} from its tenth to its 90th percentile"),
     };
-    (gain > UNEVEN).then(|| {
+    (gain > WARN.gain_variation).then(|| {
         format!(
             "the gain between the two volumes {how} in the tissue (a bias field, or another contrast): a part of it is taken for motion, and errors \
              grow by a fifth and more; take the bias out of both volumes first (N4, say)"

@@ -62,9 +62,18 @@ impl Effort {
 /// Nodes of the meshes along that axis, most first.
 const MESH_NODES: [f64; 2] = [8000.0, 500.0];
 
-/// Mean error beyond which a field is of no use, as a part of the mean motion (1): there trust is
-/// low.
-const USEFUL: f64 = 1.0 / 3.0;
+/// Largest errors of usable results.
+struct UsableResult {
+    /// Mean error of a field over the mean motion (1); trust is low beyond it.
+    field_error_ratio: f64,
+    /// Error of a modulus (per cent).
+    modulus_error_percent: f64,
+    /// Error of a posture (degrees).
+    posture_error_degrees: f64,
+}
+
+const USABLE: UsableResult =
+    UsableResult { field_error_ratio: 1.0 / 3.0, modulus_error_percent: 20.0, posture_error_degrees: 0.5 };
 
 /// The field on every body along every axis of `troubles`.
 pub fn field_curves(effort: &Effort, troubles: &[Trouble], progress: Progress<'_>) -> Vec<StressCurve> {
@@ -120,7 +129,7 @@ pub fn field_run(body: &PhantomParams, trouble: Trouble, severity: f64) -> Resul
         Err(e) => StressRun {
             severity,
             error: f64::NAN,
-            limit: USEFUL * p.description.mean_mm,
+            limit: USABLE.field_error_ratio * p.description.mean_mm,
             refused: Some(e.to_string()),
             said: Vec::new(),
             inside: None,
@@ -132,7 +141,7 @@ pub fn field_run(body: &PhantomParams, trouble: Trouble, severity: f64) -> Resul
             StressRun {
                 severity,
                 error: scored.as_ref().map_or(f64::NAN, |m| m.mean_mm),
-                limit: USEFUL * scored.as_ref().map_or(0.0, |m| m.identity_mm),
+                limit: USABLE.field_error_ratio * scored.as_ref().map_or(0.0, |m| m.identity_mm),
                 refused: None,
                 said: distrusted(&result).into_iter().collect(),
                 inside: coverage(&result.displacement, &p.truth, &sigma, &p.mask),
@@ -148,9 +157,6 @@ fn distrusted(result: &FieldResult) -> Option<String> {
     let low = expected.trust() == Trust::Low;
     low.then(|| format!("trust is low: the expected error is {:.0} % of the motion", 100.0 * expected.share()))
 }
-
-/// Error of a modulus beyond which it is of no use (per cent).
-const MODULUS: f64 = 20.0;
 
 /// What makes a stiffness worse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -243,7 +249,7 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
             return StressRun {
                 severity,
                 error: f64::NAN,
-                limit: MODULUS,
+                limit: USABLE.modulus_error_percent,
                 refused,
                 said: Vec::new(),
                 inside: None,
@@ -257,7 +263,7 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
         let band = 100.0 * BAND * r.sd / r.youngs_modulus;
         if !r.identifiable {
             said.push(format!("{} is not identifiable", r.name));
-        } else if band > MODULUS {
+        } else if band > USABLE.modulus_error_percent {
             said.push(format!("the 95 % band of {} is {band:.0} % wide to either side", r.name));
         }
     }
@@ -265,16 +271,13 @@ fn stiffness_run(body: &Pressed, severity: f64, found: Result<StiffnessResult, S
     StressRun {
         severity,
         error: errors.iter().copied().fold(0.0, f64::max),
-        limit: MODULUS,
+        limit: USABLE.modulus_error_percent,
         refused: None,
         inside: Some(inside.count() as f64 / result.regions.len() as f64),
         expected: None,
         said,
     }
 }
-
-/// Error of a posture beyond which it is of no use (degrees).
-const POSTURE: f64 = 0.5;
 
 /// What makes a grasp harder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -364,7 +367,7 @@ pub fn grasp_curves(effort: &Effort, axes: &[GraspAxis], progress: Progress<'_>)
 /// One scene against the same scene by the adaptive integrator. With `friction` the error is the
 /// largest share of the friction that the contacts ask for.
 fn grasp_run(scene: &Scene, severity: f64, friction: bool) -> StressRun {
-    let limit = if friction { 1.0 } else { POSTURE };
+    let limit = if friction { 1.0 } else { USABLE.posture_error_degrees };
     let (mut error, mut refused, mut said) = (f64::NAN, None, Vec::new());
     match simulate(scene, &|_| {}) {
         Err(e) => refused = Some(e.to_string()),

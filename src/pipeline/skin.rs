@@ -25,7 +25,7 @@ pub struct SkinOutcome {
 }
 
 /// Error of the column that earns a warning.
-const ROUGH: f64 = 1e-6;
+const WARN_COLUMN_ERROR: f64 = 1e-6;
 
 /// Refuses a scene of whose response rounding would leave no digit.
 ///
@@ -46,7 +46,7 @@ pub fn notes(scene: &SkinScene, outcome: &SkinOutcome) -> Vec<String> {
         out.push("the block has no solution; its values are too far apart".into());
     }
     let precision = column::precision(scene);
-    if precision > ROUGH {
+    if precision > WARN_COLUMN_ERROR {
         out.push(format!(
             "the column may be off by {precision:.0e} of its largest values by rounding: some layer yields faster than the load lasts by a factor of \
              {:.0e}; leave out the dashpot that does so",

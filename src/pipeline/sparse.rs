@@ -27,14 +27,14 @@ use crate::pipeline::background;
 use crate::pipeline::body_models;
 use crate::pipeline::clock::{Clock, noted};
 use crate::pipeline::coarse_to_fine;
-use crate::pipeline::field::{FEWEST, FieldResult, Progress, Start, lengths};
+use crate::pipeline::field::{FieldResult, MIN_MATCHES, Progress, Start, lengths};
 use crate::pipeline::field_warnings::{
     agreement, no_match, out_of_view, said_of_model, too_few, warnings, without_texture,
 };
-use crate::pipeline::hypotheses::{AGREED, Search};
+use crate::pipeline::hypotheses::{KEPT_SHARE, Search};
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::known::Known;
-use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::pipeline::level::{self, LevelMatch, MIN_JACOBIAN, MatchParams, SplineField};
 use crate::pipeline::local_model;
 use crate::pipeline::match_mesh::{Meshed, estimated, with_mesh, world_match};
 use crate::pipeline::refinement;
@@ -44,48 +44,48 @@ use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::*;
 use rayon::prelude::*;
 
-/// Patch radius (voxels of the finest axis). Five pairs (heads and calves, 3 to 16 mm): 3 leaves 7
-/// % more error, at more time.
-const PATCH: usize = 2;
+/// Search and fit of a level; pairs of values are for coarser levels and for the finest. Trade-offs
+/// are of five pairs of heads and calves that move by 3 to 16 mm.
+struct LevelSearch {
+    /// Patch radius (voxels of the finest axis): 3 leaves 7 % more error, at more time.
+    patch_radius_voxels: usize,
+    /// Strain between neighbours against the field of the level before (1).
+    max_strain: f64,
+    /// Reach about the field of the level before (voxels of the finest axis).
+    reach_voxels: [f64; 2],
+    /// Warping, least-squares matching and fitting: 1 and 5 on the finest level leave 13 % more and
+    /// 2 % less error.
+    iterations: [usize; 2],
+}
 
-/// Voxels of the finest axis between lattice nodes. The same five pairs: 4 and 6 leave 2 % less and
+const LEVEL_SEARCH: LevelSearch =
+    LevelSearch { patch_radius_voxels: 2, max_strain: 0.1, reach_voxels: [2.0, 1.0], iterations: [2, 3] };
+
+/// Voxels of the finest axis between lattice nodes: over the same pairs 4 and 6 leave 2 % less and
 /// 10 % more error.
-const APART: usize = 5;
+const NODE_SPACING_VOXELS: usize = 5;
 
-/// What a match may be off beyond its covariance (voxels). The same five pairs: 0.05 leaves 2 %
-/// more error, 0.3 a third more.
-const FLOOR: f64 = 0.02;
+/// Error of a match beyond its covariance; trade-offs are of the same five pairs.
+struct MatchError {
+    /// Its own error (voxels): 0.05 leaves 2 % more error, 0.3 a third more.
+    own_voxels: f64,
+    /// Error in common with its neighbours (voxels) in the choice of a motion model: a brightness
+    /// ramp of 15 % passes for an affine motion without it.
+    common_voxels: f64,
+}
 
-/// Strain that neighbours may show against the field of the level before (1).
-const STRAIN: f64 = 0.1;
+const MATCH_ERROR: MatchError = MatchError { own_voxels: 0.02, common_voxels: 0.1 };
 
-/// Reach of the search about the field of the level before (voxels of the finest axis), on coarser
-/// levels and on the finest. The same five pairs: 2 on the finest leaves 1 % less error.
-const REACH: [f64; 2] = [2.0, 1.0];
+/// Voxels of tissue for each point on coarser levels: over the same pairs 12 and 48 leave equal
+/// errors.
+const VOXELS_PER_COARSE_POINT: usize = 24;
 
-/// Rounds of warping, least-squares matching and fitting, on coarser levels and on the finest. The
-/// same five pairs: 1 and 5 on the finest leave 13 % more and 2 % less error.
-const ROUNDS: [usize; 2] = [2, 3];
+/// Points on the finest level over those of the full method: over the same pairs half as many leave
+/// 40 % more error, twice as many the same.
+const POINTS_RATIO: f64 = 2.5;
 
-/// What neighbouring matches may be off together (voxels), when a simpler motion is asked for: a
-/// block at rest whose brightness differs by 15 % across the volume passed for an affine motion
-/// without it.
-const SHARED: f64 = 0.1;
-
-/// Voxels of tissue for each point on coarser levels. The same five pairs: 12 and 48 leave the same
-/// error.
-const COARSE_ROOM: usize = 24;
-
-/// Points on the finest level, for each one of the full method, which needs them only to begin. The
-/// same five pairs: half as many leave 40 % more error, twice as many the same.
-const MORE: f64 = 2.5;
-
-/// Voxels of tissue that each point asked for needs at least: with less the next finer level is
-/// worked on.
-const ROOM: usize = 24;
-
-/// Least volume that tissue keeps (1); below it the field is smoothed.
-const LEAST_VOLUME: f32 = 0.1;
+/// Fewest voxels of tissue for each point asked for; with fewer, the next finer level is used.
+const MIN_VOXELS_PER_POINT: usize = 24;
 
 /// The finest level worked on: the coarsest with room for the points asked for, or the one with at
 /// most 600,000 voxels of tissue.
@@ -94,7 +94,7 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, params: &FieldParams) -> us
     let tissue = coarse_to_fine::inside(mask);
     let room = |f: usize| {
         let factor = coarse_to_fine::worked_on(grid, mask, f, 0.0);
-        tissue / factor.last().map_or(1, |f| f.iter().product::<usize>()) >= ROOM * params.points
+        tissue / factor.last().map_or(1, |f| f.iter().product::<usize>()) >= MIN_VOXELS_PER_POINT * params.points
     };
     [8, 4, 2, 1]
         .into_iter()
@@ -106,7 +106,7 @@ pub(super) fn finest_level(grid: &Grid, mask: &Mask, params: &FieldParams) -> us
 /// Points wanted on a finest level with `inside` voxels of tissue.
 pub(super) fn points(params: &FieldParams, inside: usize) -> usize {
     match params.points {
-        0 => ((MORE * inside as f64 / params.voxels_per_point as f64) as usize).max(200),
+        0 => ((POINTS_RATIO * inside as f64 / params.voxels_per_point as f64) as usize).max(200),
         asked => asked,
     }
 }
@@ -146,7 +146,7 @@ impl<'a> Levels<'a> {
             let pair = self.aligned.level(factor);
             clock.book("pyramid");
             (self.progress)("matching", 0.9 * l as f64 / self.factors.len() as f64);
-            let lattice = level::lattice(&pair, APART);
+            let lattice = level::lattice(&pair, NODE_SPACING_VOXELS);
             let begun = match &state {
                 None => Search { params, range, flat, matching: &|| (), tick: &|_| () }.by_matches(&pair, &lattice),
                 Some((found, _, from)) => {
@@ -162,7 +162,7 @@ impl<'a> Levels<'a> {
         }
         let (found, pair, factor) = state.ok_or_else(|| no_match(0, "check the mask".into()))?;
         let kept = found.matches.iter().filter(|m| m.kept).count();
-        if kept < FEWEST {
+        if kept < MIN_MATCHES {
             return Err(too_few(kept, &pair, range, params, known.start.is_some()));
         }
         Ok(Finest { found, pair, factor, reports, left })
@@ -267,7 +267,7 @@ pub(super) fn measure(
     let (full, mut variances) = variances(&pair, &field, &warped, &choice, factor, &grid, params.seed);
     let unlike = refinement::unlike(&pair, level::misfit(&pair, &warped)[0]);
     let searched = reports.first().map_or(1.0, |r| r.counts.kept_share());
-    if searched < AGREED && unlike.is_some() {
+    if searched < KEPT_SHARE.confirmed && unlike.is_some() {
         variances.set_other_motions(searched, search);
     }
     let coefficients = FieldSpline::new(grid, vec![full], Vec::new(), Vec::new());
@@ -343,7 +343,7 @@ const MADE_BY: &str =
 /// Where the number of points comes from.
 fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
     let source = match params.points {
-        0 => format!("{MORE} for {} voxels of tissue", params.voxels_per_point),
+        0 => format!("{POINTS_RATIO} for {} voxels of tissue", params.voxels_per_point),
         _ => "as asked".into(),
     };
     let limit = if found < wanted { "; no more corners stand out of the noise" } else { "" };
@@ -353,20 +353,20 @@ fn why_so_many(params: &FieldParams, wanted: usize, found: usize) -> String {
 /// What a level finds about the field it begins with.
 fn on_level(pair: &Pair<'_>, begun: SplineField, last: bool, params: &FieldParams) -> Found {
     let which = usize::from(last);
-    let wanted = if last { points(params, pair.inside) } else { (pair.inside / COARSE_ROOM).max(200) };
+    let wanted = if last { points(params, pair.inside) } else { (pair.inside / VOXELS_PER_COARSE_POINT).max(200) };
     let near = MatchParams {
-        reach_mm: REACH[which] * pyramid::finest(pair.shape, pair.spacing),
-        strain: STRAIN,
-        patch: PATCH,
+        reach_mm: LEVEL_SEARCH.reach_voxels[which] * pyramid::finest(pair.shape, pair.spacing),
+        strain: LEVEL_SEARCH.max_strain,
+        patch: LEVEL_SEARCH.patch_radius_voxels,
         ..MatchParams::near(params, pair, wanted, last && params.points > 0)
     };
     let (matches, _, report) = level::matches(pair, Some(&begun), near);
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.voxel).collect();
     let mut found = coupled(pair, &begun, matches, report, params);
     // Comparisons without sub-voxel matching have no use for it.
-    let rounds = if params.sub_voxel { ROUNDS[which] } else { 0 };
+    let rounds = if params.sub_voxel { LEVEL_SEARCH.iterations[which] } else { 0 };
     for _ in 0..rounds {
-        let matches = level::follow(pair, &found.field, places.par_iter().copied(), PATCH);
+        let matches = level::follow(pair, &found.field, places.par_iter().copied(), LEVEL_SEARCH.patch_radius_voxels);
         found = coupled(pair, &found.field, matches, found.report, params);
     }
     found
@@ -381,10 +381,10 @@ fn coupled(
     mut report: LevelReport,
     params: &FieldParams,
 ) -> Found {
-    let radius = pair.in_voxels(PATCH);
+    let radius = pair.in_voxels(LEVEL_SEARCH.patch_radius_voxels);
     let measured = matches.iter().map(|m| (m.voxel, m.measured.displacement, m.measured.covariance));
-    let (mut field, evidence) = level::couple(pair, measured, (&radius, FLOOR), Some(known));
-    unfold(&field.lattice, pair.spacing, &mut field.coefficients, LEAST_VOLUME);
+    let (mut field, evidence) = level::couple(pair, measured, (&radius, MATCH_ERROR.own_voxels), Some(known));
+    unfold(&field.lattice, pair.spacing, &mut field.coefficients, MIN_JACOBIAN);
     let at = |m: &LevelMatch| field.lattice.at(&field.coefficients, m.voxel);
     let mut measured: Vec<Measured> = matches.iter().map(|m| Measured { field: at(m), ..m.measured }).collect();
     let kept = match params.consistency {
@@ -425,7 +425,7 @@ fn smallest(matches: &[LevelMatch], pair: &Pair<'_>, field: &SplineField, seed: 
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let off = |m: &Measured, u: [f64; 3]| {
         let mut c = m.covariance;
-        c[..3].iter_mut().for_each(|v| *v += (SHARED * finest).powi(2));
+        c[..3].iter_mut().for_each(|v| *v += (MATCH_ERROR.common_voxels * finest).powi(2));
         inverse(&c).map_or(0.0, |i| quadratic(&i, std::array::from_fn(|a| m.displacement[a] - u[a])))
     };
     let excess = |_, motion: &AffineMotion| {

@@ -10,8 +10,8 @@ use crate::pipeline::uncertainty::evenly;
 use crate::types::{DenseField, Grid, Mask, StageReport};
 use rayon::prelude::*;
 
-/// Places at which stages are compared, about.
-const PLACES: usize = 5000;
+/// Approximate number of places at which stages are compared.
+const SAMPLED_PLACES: usize = 5000;
 
 /// A motion that a stage left, on a level of `factor`.
 pub(super) struct Left {
@@ -33,7 +33,7 @@ impl Stage {
     /// The report with the mean error (mm) against `truth` over `mask`.
     pub fn scored(&self, truth: &DenseField, mask: Option<&Mask>) -> StageReport {
         let inside = |at: usize| mask.is_none_or(|m| m.as_slice()[at] != 0);
-        let some: Vec<usize> = evenly(truth.grid().len(), inside, PLACES).collect();
+        let some: Vec<usize> = evenly(truth.grid().len(), inside, SAMPLED_PLACES).collect();
         let error = |&at: &usize| {
             let (u, t) = (self.field.at(at), truth.at(at));
             (0..3).map(|c| (u[c] - f64::from(t[c])).powi(2)).sum::<f64>().sqrt()
@@ -78,7 +78,7 @@ pub(super) fn account(
 fn places(pair: &Pair<'_>) -> Vec<[f64; 3]> {
     let [nx, ny, _] = pair.shape;
     let of = |at: usize| [at % nx, at / nx % ny, at / (nx * ny)].map(|v| v as f64);
-    evenly(pair.mask.len(), |at| pair.mask[at] != 0, PLACES).map(of).collect()
+    evenly(pair.mask.len(), |at| pair.mask[at] != 0, SAMPLED_PLACES).map(of).collect()
 }
 
 /// The part of the initial volume's variance at these places that the deformed volume, sampled

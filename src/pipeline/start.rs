@@ -9,14 +9,14 @@ use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, SpaceError};
 use crate::matching::contrast::Relation;
 use crate::matching::levels::foreground;
-use crate::matching::residual::UNSURE;
+use crate::matching::residual::MIN_POSITION_ERROR_VOXELS;
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::sampling::nearest;
 use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{full, inverse};
 use crate::pipeline::field::{FieldResult, lengths};
 use crate::pipeline::known::{Known, StartMap};
-use crate::pipeline::landmarks::FEWEST;
+use crate::pipeline::landmarks::MIN_LANDMARKS;
 use crate::pipeline::stages::Stage;
 use crate::types::space::{Matrix3, determinant, dot, length};
 use crate::types::{
@@ -35,13 +35,13 @@ pub enum Alignment {
     Principal,
 }
 
-/// Places at which a start is looked at, about.
-const PLACES: usize = 4000;
+/// Approximate number of places at which a start is examined.
+const SAMPLED_PLACES: usize = 4000;
 
 /// At a step in voxels of `grid`, places at which `mask` is not 0, in world mm.
 fn places(grid: &Grid, mask: Option<&Mask>) -> Vec<WorldPoint> {
     let inside: Vec<usize> = (0..grid.len()).filter(|&at| mask.is_none_or(|m| m.as_slice()[at] != 0)).collect();
-    inside.iter().step_by(inside.len().div_ceil(PLACES).max(1)).map(|&at| grid.centre(at)).collect()
+    inside.iter().step_by(inside.len().div_ceil(SAMPLED_PLACES).max(1)).map(|&at| grid.centre(at)).collect()
 }
 
 /// The mean of some places.
@@ -208,7 +208,7 @@ impl Compared {
         let grid = initial.grid();
         let tissue = foreground(initial);
         let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
-        let some = inside.iter().step_by(inside.len().div_ceil(10 * PLACES).max(1));
+        let some = inside.iter().step_by(inside.len().div_ceil(10 * SAMPLED_PLACES).max(1));
         Self(some.map(|&at| (grid.centre(at), initial.as_slice()[at])).collect())
     }
 
@@ -288,7 +288,7 @@ pub(super) fn rest<'a>(start: &'a StartMap<'a>) -> impl Fn(WorldPoint) -> [f64; 
 /// Whether a start whose affine part was taken out is more than that, by what interpolation leaves
 /// unsure of any place.
 pub(super) fn bends(rest: impl Fn(WorldPoint) -> [f64; 3], grid: &Grid, mask: Option<&Mask>) -> bool {
-    places(grid, mask).into_iter().any(|x| length(rest(x)) > UNSURE * grid.least_spacing())
+    places(grid, mask).into_iter().any(|x| length(rest(x)) > MIN_POSITION_ERROR_VOXELS * grid.least_spacing())
 }
 
 impl FieldResult {
@@ -320,7 +320,7 @@ impl FieldResult {
 /// The rigid motion nearest to landmarks most of which move further than `range` (mm).
 fn far_apart(landmarks: &[Landmark], range: f64) -> Option<AffineMap> {
     let mut lengths: Vec<f32> = landmarks.iter().map(|l| length(l.deformed.minus(l.initial)) as f32).collect();
-    if landmarks.len() < FEWEST || f64::from(median(&mut lengths)) <= range {
+    if landmarks.len() < MIN_LANDMARKS || f64::from(median(&mut lengths)) <= range {
         return None;
     }
     let middle = mean(landmarks.iter().map(|l| l.initial));
@@ -370,20 +370,21 @@ fn follow(field: &mut DenseField, map: &AffineMap) {
     });
 }
 
-/// Departure of a linear map from a rotation, and of a map from rest (mm over a metre), up to which
-/// it is one: what single precision leaves of a transform file.
-const NOTHING: f64 = 1e-6;
+/// Difference of a linear map from a rotation, or of a map from rest (mm over a metre), up to which
+/// they are equal: the rounding of a transform file in single precision.
+const MOTION_TOLERANCE: f64 = 1e-6;
 
 /// The smallest model that holds an affine map.
 fn model_of(map: &AffineMap) -> MotionModel {
     let rows = map.rows();
     let gram = |r: usize, c: usize| (0..3).map(|k| rows[k][r] * rows[k][c]).sum::<f64>();
     let unit = |r: usize, c: usize| f64::from(u8::from(r == c));
-    let all =
-        |of: &dyn Fn(usize, usize) -> f64| (0..3).all(|r| (0..3).all(|c| (of(r, c) - unit(r, c)).abs() < NOTHING));
+    let all = |of: &dyn Fn(usize, usize) -> f64| {
+        (0..3).all(|r| (0..3).all(|c| (of(r, c) - unit(r, c)).abs() < MOTION_TOLERANCE))
+    };
     match () {
         _ if !all(&gram) => MotionModel::Affine,
-        _ if all(&|r, c| rows[r][c]) && rows.iter().all(|row| row[3].abs() < NOTHING) => MotionModel::Identity,
+        _ if all(&|r, c| rows[r][c]) && rows.iter().all(|row| row[3].abs() < MOTION_TOLERANCE) => MotionModel::Identity,
         _ => MotionModel::Rigid,
     }
 }

@@ -70,10 +70,9 @@ impl FieldQuality<'_> {
     }
 }
 
-/// Matches that a body must hold for them to be taken unasked: what an identification needs, and a
-/// tenth that the mesh may leave out at the surface. Of fingertips with 104 to 134 the pulp came
-/// out right within its deviation, from their fields wrong by two to five of them.
-pub const ENOUGH: usize = 110;
+/// Fewest matches in a body for them to be used unasked: what an identification needs, and a tenth
+/// that the mesh may leave out at the surface.
+pub const MIN_MATCHES_IN_BODY: usize = 110;
 
 /// Kept matches in the body.
 pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
@@ -85,23 +84,35 @@ pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
     matches.kept().filter(|m| held(m.initial)).count()
 }
 
-/// Nodes of the coarse mesh over those of the fine one.
-const COARSE: f64 = 0.3;
-/// Nodes of the coarse mesh at most: a choice turns on the noise of the data long before, and the
-/// third of a change with the mesh that deviations take over is then too large, not too small.
-const COARSE_MOST: f64 = 12_000.0;
-/// Side of the mesh's cubes at the rim of a punch (voxels); nodes lie at half of it.
-const RIM: f64 = 2.0;
-/// Parts of the nodes that are tried for the rest of the body then.
-const ELSEWHERE: [f64; 5] = [0.7, 0.4, 0.25, 0.15, 0.08];
-/// Times that side, if the nodes do not suffice for it.
-const COARSER: [f64; 3] = [1.0, 1.5, 2.5];
-/// Nodes over the limit at most, where a mesh can be had.
-const OVER: f64 = 1.15;
-/// Moves of a punch's edge on the fine mesh at most: the coarse one has found most of the way.
-const FINE_MOVES: usize = 1;
-/// Precision of forward solutions on the fine mesh (mm).
-const PRECISION: f64 = 1e-5;
+/// Size of the coarse mesh, on which models are selected.
+struct CoarseMesh {
+    /// Nodes over those of the fine mesh.
+    node_fraction: f64,
+    /// Most nodes: the noise of the data decides a choice long before the mesh does.
+    max_nodes: f64,
+}
+
+const COARSE_MESH: CoarseMesh = CoarseMesh { node_fraction: 0.3, max_nodes: 12_000.0 };
+
+/// The mesh at the rim of a punch.
+struct RimMesh {
+    /// Edge of the cubes (voxels); nodes lie at half of it.
+    edge_voxels: f64,
+    /// Fractions of the nodes that are tried for the rest of the body.
+    elsewhere_fractions: [f64; 5],
+    /// Factors on the edge that are tried if the nodes do not suffice for it.
+    coarsening: [f64; 3],
+}
+
+const RIM_MESH: RimMesh =
+    RimMesh { edge_voxels: 2.0, elsewhere_fractions: [0.7, 0.4, 0.25, 0.15, 0.08], coarsening: [1.0, 1.5, 2.5] };
+
+/// Most nodes of a mesh over the requested number.
+const MAX_NODE_EXCESS: f64 = 1.15;
+/// Moves of a punch's edge on the fine mesh: the coarse mesh has found most of the way.
+const MAX_FINE_MOVES: usize = 1;
+/// Tolerance of forward solutions on a fine mesh (mm).
+pub(super) const FORWARD_TOLERANCE_MM: f64 = 1e-5;
 
 /// Young's modulus of each labelled region, or of the regions that the data support.
 ///
@@ -219,7 +230,7 @@ pub(super) fn coarse_fineness(labels: &Mask, params: &StiffnessParams) -> Finene
 
 /// Nodes of the mesh on which all is chosen.
 fn coarse_nodes(params: &StiffnessParams) -> f64 {
-    (COARSE * params.nodes as f64).min(COARSE_MOST)
+    (COARSE_MESH.node_fraction * params.nodes as f64).min(COARSE_MESH.max_nodes)
 }
 
 /// What [`run`] would refuse before it looks for moduli: told from a coarse mesh.
@@ -252,11 +263,11 @@ impl Meshed {
         let mut coarse = level(&mesher.mesh(&coarse_fineness(inputs.labels, params))?, None)?;
         let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
         let volume = fields::volume(inputs.labels);
-        let mesh = meshed(&mesher, volume, &rim, coarse.voxel, params.nodes as f64, RIM)?;
+        let mesh = meshed(&mesher, volume, &rim, coarse.voxel, params.nodes as f64, RIM_MESH.edge_voxels)?;
         let outline = rim.outline.as_ref();
         if !rim.places.is_empty() {
             let nodes = coarse_nodes(params);
-            coarse = level(&meshed(&mesher, volume, &rim, coarse.voxel, nodes, 2.0 * RIM)?, outline)?;
+            coarse = level(&meshed(&mesher, volume, &rim, coarse.voxel, nodes, 2.0 * RIM_MESH.edge_voxels)?, outline)?;
         }
         let mut fine = level(&mesh, outline)?;
         coarse.agree_on_shape(&mut fine)?;
@@ -273,7 +284,7 @@ pub(super) fn evenly_meshed(mesher: &Mesher, volume: f64, nodes: f64) -> Result<
     let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
     let count = mesh.nodes().len() as f64;
     // Thin layers and a rough surface take more than a block does.
-    match count <= OVER * nodes {
+    match count <= MAX_NODE_EXCESS * nodes {
         true => Ok(mesh),
         false => Ok(mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?),
     }
@@ -297,13 +308,13 @@ fn meshed(
     // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the
     // finest within the limit.
     let mut best: Option<(f64, Fineness, Detail<'_>)> = None;
-    for coarser in COARSER {
-        for elsewhere in ELSEWHERE {
+    for coarser in RIM_MESH.coarsening {
+        for elsewhere in RIM_MESH.elsewhere_fractions {
             let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
             let detail = detail(coarser * size);
             let Some(count) = mesher.nodes(&fineness, detail) else { continue };
             let count = count as f64 / nodes;
-            let rank = if count <= OVER { -count } else { count };
+            let rank = if count <= MAX_NODE_EXCESS { -count } else { count };
             if best.as_ref().is_none_or(|(least, ..)| rank < *least) {
                 best = Some((rank, fineness, detail));
             }
@@ -424,7 +435,7 @@ fn solved(
     clock.book("coarse");
 
     progress("fine", 0.4);
-    let mut estimate = identified(&coarse, &mut fine, &choice, params, reference, FINE_MOVES);
+    let mut estimate = identified(&coarse, &mut fine, &choice, params, reference, MAX_FINE_MOVES);
     if is_unsolved(&estimate) {
         // What the shape changes stays to first order then.
         fine.move_back();
@@ -443,7 +454,7 @@ fn solved(
              the field, the labels and the patches"
                 .into(),
         );
-        estimate = identified(&coarse, &mut fine, &choice, &linear, reference, FINE_MOVES);
+        estimate = identified(&coarse, &mut fine, &choice, &linear, reference, MAX_FINE_MOVES);
     }
     let estimate = estimate?;
     clock.book("fine");
@@ -590,8 +601,8 @@ fn identified(
     (fine.hidden, fine.known) = (coarse.hidden.clone(), coarse.known.clone());
     fine.touch_like(coarse)?;
     let start = State { plates: choice.estimate.state.plates.clone(), ..fine.carry(coarse, &choice.estimate.state) };
-    let estimate = fine.setup(choice.law, params, reference).run(start, 3, PRECISION)?;
-    settle(fine, choice.law, params, reference, estimate, moves, PRECISION)
+    let estimate = fine.setup(choice.law, params, reference).run(start, 3, FORWARD_TOLERANCE_MM)?;
+    settle(fine, choice.law, params, reference, estimate, moves, FORWARD_TOLERANCE_MM)
 }
 
 /// Draws of the field's error at the observations (mm, RAS); none where matches are taken in its

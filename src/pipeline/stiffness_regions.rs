@@ -5,7 +5,7 @@ use crate::mesh::tetrahedral::{Fineness, mesh_labels};
 use crate::pipeline::stiffness::{Inputs, Progress, coarse_fineness};
 use crate::stiffness::geometry;
 use crate::stiffness::identify::{Estimate, State};
-use crate::stiffness::inclusion::{Inclusion, SHAPES};
+use crate::stiffness::inclusion::{Inclusion, SHAPE_FUNCTIONS};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::model_selection::choose;
@@ -15,12 +15,17 @@ use crate::types::stiffness::{Detectable, Evidence, Law, LeftOver, StiffnessPara
 use crate::types::{Grid, Mask};
 use std::time::Instant;
 
-/// Times that found regions are drawn anew at most.
-const REDRAWN: usize = 5;
-/// Surfaces that move less than this stay (voxels).
-const STAYS: f64 = 0.2;
-/// Part of the residual that drawing anew must take away for another time.
-const WORTH: f64 = 0.002;
+/// Iterated redrawing of regions found without labels.
+struct RedrawControl {
+    /// Most redraws.
+    max_count: usize,
+    /// Surfaces that move less than this stay (voxels).
+    min_move_voxels: f64,
+    /// Relative reduction of the residual, below which no further redraw follows.
+    min_residual_gain: f64,
+}
+
+const REDRAW: RedrawControl = RedrawControl { max_count: 5, min_move_voxels: 0.2, min_residual_gain: 0.002 };
 
 /// Regions and why these.
 pub(super) struct Found {
@@ -83,11 +88,11 @@ impl Search<'_> {
         }
         let setup = old.level.setup(self.law, self.params, old.level.largest());
         let Some(fit) = geometry::fit(&setup, &old.estimate, grid, &[], &inclusions)? else { return Ok(None) };
-        if fit.shapes.iter().all(|offset| offset.abs() < STAYS) {
+        if fit.shapes.iter().all(|offset| offset.abs() < REDRAW.min_move_voxels) {
             return Ok(None);
         }
         let mut labels = old.labels.clone();
-        for (inclusion, offsets) in inclusions.iter().zip(fit.shapes.chunks_exact(SHAPES)) {
+        for (inclusion, offsets) in inclusions.iter().zip(fit.shapes.chunks_exact(SHAPE_FUNCTIONS)) {
             inclusion.draw(&mut labels, &std::array::from_fn(|k| offsets[k] * grid.least_spacing()));
         }
         self.candidate(labels, (&old.level, &old.estimate.state)).map(Some)
@@ -112,13 +117,13 @@ impl Search<'_> {
 
     /// Drawn anew as long as it helps. What cannot be drawn or solved anew stays as the map has it.
     fn settled(&self, mut candidate: Candidate) -> Candidate {
-        for _ in 0..REDRAWN {
+        for _ in 0..REDRAW.max_count {
             let Ok(Some(next)) = self.redrawn(&candidate) else { break };
             let gain = 1.0 - next.estimate.rms / candidate.estimate.rms;
             if gain > 0.0 {
                 candidate = next;
             }
-            if gain < WORTH {
+            if gain < REDRAW.min_residual_gain {
                 break;
             }
         }

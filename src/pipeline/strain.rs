@@ -5,7 +5,7 @@ use crate::field::jacobian;
 use crate::numerics::statistics::{median, noise_sigma};
 use crate::pipeline::clock::Clock;
 use crate::pipeline::field::{FieldResult, Progress};
-use crate::pipeline::uncertainty::evenly;
+use crate::pipeline::uncertainty::{SAMPLED_VOXELS, evenly};
 use crate::strain::StrainField;
 use crate::strain::deviation::{COMPONENTS, Draws, Gradients, StrainDeviation, apart, components};
 use crate::strain::directions::Directions;
@@ -68,11 +68,8 @@ pub struct StrainResult {
     pub summary: StrainSummary,
 }
 
-/// Gauges that are tried, in units of the shortest, which reaches a voxel's neighbours.
-const TRIED: [usize; 4] = [1, 2, 4, 8];
-
-/// Voxels from which means over the tissue are taken, about.
-const SAMPLED: usize = 25_000;
+/// Gauge lengths that are tried, in units of the shortest, which reaches a voxel's neighbours.
+const GAUGE_MULTIPLES: [usize; 4] = [1, 2, 4, 8];
 
 /// The strain of a displacement field.
 ///
@@ -136,7 +133,7 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
     // Of a field without draws only a part of the error is known.
     let known_best = if samples.is_some() { Trust::High } else { Trust::Moderate };
     let own = Trust::of(noise / size.max(f64::MIN_POSITIVE)).max(known_best);
-    let told = trust.map(|t| format!("trust in the field is {}", t.name()));
+    let field_trust = trust.map(|t| format!("trust in the field is {}", t.name()));
     let ratio = match noise / size.max(f64::MIN_POSITIVE) {
         share if share < 1.0 => format!("the deviation of a normal strain is {:.1} % of the strain", 100.0 * share),
         _ => "the deviation of a normal strain is as large as the strain".into(),
@@ -161,7 +158,7 @@ pub fn run(input: StrainInput<'_>, params: &StrainParams, progress: Progress<'_>
             deviation_from: known,
             regions,
             trust: trust.map_or(own, |field| field.max(own)),
-            trust_reasons: told.into_iter().chain([ratio]).chain(in_part).collect(),
+            trust_reasons: field_trust.into_iter().chain([ratio]).chain(in_part).collect(),
             seconds: clock.0,
             warnings: Vec::new(),
         },
@@ -259,16 +256,16 @@ fn width(tissue: &Mask) -> f64 {
     (0..3).filter(|&a| grid.shape()[a] > 1).map(along).fold(f64::INFINITY, f64::min)
 }
 
-/// Gauges to try: those of [`TRIED`] that are shorter than half of the tissue.
+/// Gauges to try: those of [`GAUGE_MULTIPLES`] that are shorter than half of the tissue.
 fn tried(tissue: &Mask) -> Vec<Gauge> {
     let grid = tissue.grid();
     let (least, width) = (Gauge::shortest(grid).finest_mm(grid), width(tissue));
-    let lengths = TRIED.into_iter().map(|times| times as f64 * least);
+    let lengths = GAUGE_MULTIPLES.into_iter().map(|times| times as f64 * least);
     lengths.filter(|&l| l == least || l < width / 2.0).map(|l| Gauge::of_length(grid, l)).collect()
 }
 
-/// Draws that give the noise of a gauge that is not taken.
-const FEW: usize = 2;
+/// Draws that give the noise of a gauge that is not chosen.
+const REJECTED_GAUGE_DRAWS: usize = 2;
 
 /// What each gauge would give, by draws of the field's error; `shortest` are the gradients of the
 /// first. The shortest has the least error to expect: the field is the mean of its posterior
@@ -281,7 +278,7 @@ fn by_draws(tissue: &Mask, draws: &Draws, shortest: &Gradients) -> Vec<GaugeTria
     };
     let least = noise(shortest);
     let longer = |&gauge: &Gauge| {
-        let own = draws.gradients(gauge, FEW);
+        let own = draws.gradients(gauge, REJECTED_GAUGE_DRAWS);
         let error = (apart(&own[0], &shortest[0]) + least).sqrt();
         GaugeTrial { gauge_mm: gauge.finest_mm(grid), noise: noise(&own).sqrt(), error }
     };
@@ -325,7 +322,7 @@ fn white_noise(field: &DenseField, bodies: &[u8]) -> f64 {
 fn sizes(strain: &StrainField, deviation: &StrainDeviation, bodies: &Mask) -> [f64; 2] {
     let grid = strain.grid();
     let inside = bodies.as_slice();
-    let picked: Vec<usize> = evenly(grid.len(), |at| inside[at] != 0, SAMPLED).collect();
+    let picked: Vec<usize> = evenly(grid.len(), |at| inside[at] != 0, SAMPLED_VOXELS).collect();
     let thick = (0..3).filter(|&a| grid.shape()[a] > 1).count().max(1) as f64;
     let normal = |e: [f64; 6]| (e[..3].iter().map(|v| v * v).sum::<f64>() / thick).sqrt();
     let mut noise: Vec<f32> = picked.iter().map(|&at| normal(deviation.at(grid.centre(at))) as f32).collect();

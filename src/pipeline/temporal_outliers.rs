@@ -12,28 +12,43 @@ use crate::types::space::length;
 use crate::types::{Displacement, Mask, Voxels};
 use rayon::prelude::*;
 
-/// How far apart the voxels that are looked at lie (the finest axis' voxels), and how many of them
-/// a block has along each axis, 64 in all; in one slice twice as many.
-const EVERY: usize = 2;
-const ALONG: usize = 4;
+/// The blocks of tissue that are compared in time.
+struct BlockSampling {
+    /// Distance of the samples (voxels of the finest axis).
+    step_voxels: usize,
+    /// Samples along each axis of a block, 64 in all; twice as many in one slice.
+    samples_per_edge: usize,
+    /// Fewest samples of a block in the mask.
+    min_samples: usize,
+    /// Least variation of the reference in a block over its noise.
+    min_contrast_to_noise: f64,
+}
 
-/// Voxels of a block for it to count, and how much more than its noise the reference must vary
-/// there.
-const FEWEST: usize = 16;
-const CONTRAST: f64 = 2.0;
+const BLOCKS: BlockSampling =
+    BlockSampling { step_voxels: 2, samples_per_edge: 4, min_samples: 16, min_contrast_to_noise: 2.0 };
 
-/// How far a block is from where its neighbours in time have it, to be out of line: in edges of a
-/// voxel, and in standard deviations of the difference.
-const APART: f64 = 0.5;
-const DEVIATIONS: f64 = 4.0;
+/// When a block of a frame is an outlier, and a frame earns a warning.
+struct OutlierTest {
+    /// Distance from the motion that the neighbours in time interpolate (voxel edges).
+    min_distance_voxels: f64,
+    /// The same in standard deviations of the difference.
+    min_distance_sd: f64,
+    /// Misfit (1 - correlation^2) under the frame's own field over that under its neighbours', up
+    /// to which its image confirms its field.
+    max_misfit_ratio: f64,
+    /// Part of the tissue in unconfirmed outliers that earns a warning.
+    min_tissue_fraction: f64,
+    /// Part of the outliers that must be unconfirmed.
+    min_outlier_fraction: f64,
+}
 
-/// Of the misfit (1 - correlation^2) under the neighbours' field, what a frame's own leaves at most
-/// where its image confirms it.
-const BORNE_OUT: f64 = 0.8;
-
-/// Part of the tissue that earns a warning, and part of what is out of line.
-const SHARE: f64 = 0.03;
-const OF_THOSE: f64 = 0.2;
+const OUTLIER: OutlierTest = OutlierTest {
+    min_distance_voxels: 0.5,
+    min_distance_sd: 4.0,
+    max_misfit_ratio: 0.8,
+    min_tissue_fraction: 0.03,
+    min_outlier_fraction: 0.2,
+};
 
 /// A frame at the voxels that are looked at.
 struct Seen {
@@ -73,7 +88,7 @@ impl<'a, 'v> Course<'a, 'v> {
         blocks.retain(|block| {
             let mean = block.iter().map(|&o| f64::from(values[o])).sum::<f64>() / block.len() as f64;
             let square = block.iter().map(|&o| (f64::from(values[o]) - mean).powi(2)).sum::<f64>() / block.len() as f64;
-            square.sqrt() > CONTRAST * noise
+            square.sqrt() > BLOCKS.min_contrast_to_noise * noise
         });
         let before = still(origin, &blocks);
         Self { reference, blocks, origin, before, last: None }
@@ -129,23 +144,24 @@ impl<'a, 'v> Course<'a, 'v> {
             let off: [f64; 3] = std::array::from_fn(|a| mean(&|i| f64::from(here[i].0[a] - there[i].0[a])));
             let sigma = mean(&|i| f64::from(here[i].1.hypot(there[i].1)));
             let apart = length(off);
-            if !(apart > APART * edge && apart > DEVIATIONS * sigma) {
+            if !(apart > OUTLIER.min_distance_voxels * edge && apart > OUTLIER.min_distance_sd * sigma) {
                 return (block.len(), None);
             }
             let [own, beside] = [here, there].map(|moved| self.misfit(block, moved, volume));
-            (block.len(), own.zip(beside).map(|(own, beside)| (apart, own > BORNE_OUT * beside)))
+            (block.len(), own.zip(beside).map(|(own, beside)| (apart, own > OUTLIER.max_misfit_ratio * beside)))
         };
-        let told: Vec<(usize, Option<(f64, bool)>)> = self.blocks.par_iter().zip(&starts).map(one).collect();
+        let tested: Vec<(usize, Option<(f64, bool)>)> = self.blocks.par_iter().zip(&starts).map(one).collect();
         let count = |keep: &dyn Fn(&Option<(f64, bool)>) -> bool| -> f64 {
-            told.iter().filter(|t| keep(&t.1)).map(|t| t.0 as f64).sum()
+            tested.iter().filter(|t| keep(&t.1)).map(|t| t.0 as f64).sum()
         };
         let (all, out) = (count(&|_| true), count(&Option::is_some));
         let alone = |t: &Option<(f64, bool)>| t.is_some_and(|t| t.1);
-        let unborne = count(&alone);
-        (unborne > SHARE * all && unborne > OF_THOSE * out).then(|| {
-            let sum: f64 = told.iter().filter(|t| alone(&t.1)).filter_map(|t| Some(t.0 as f64 * t.1?.0)).sum();
+        let unconfirmed = count(&alone);
+        let least = (OUTLIER.min_tissue_fraction * all).max(OUTLIER.min_outlier_fraction * out);
+        (unconfirmed > least).then(|| {
+            let sum: f64 = tested.iter().filter(|t| alone(&t.1)).filter_map(|t| Some(t.0 as f64 * t.1?.0)).sum();
             let beside = (before.number, next.map(|n| n.number));
-            (own.number, OutOfLine { share: unborne / all, apart_mm: sum / unborne, beside })
+            (own.number, OutOfLine { share: unconfirmed / all, apart_mm: sum / unconfirmed, beside })
         })
     }
 
@@ -200,8 +216,8 @@ fn correlation(pairs: &[[f64; 2]]) -> f64 {
 fn blocks(mask: &Mask) -> Vec<Vec<usize>> {
     let grid = mask.grid();
     let (shape, spacing) = (grid.shape(), grid.spacing());
-    let step = spacing.map(|s| ((EVERY as f64 * grid.least_spacing() / s).round() as usize).max(1));
-    let along = if grid.is_single_slice() { 2 * ALONG } else { ALONG };
+    let step = spacing.map(|s| ((BLOCKS.step_voxels as f64 * grid.least_spacing() / s).round() as usize).max(1));
+    let along = if grid.is_single_slice() { 2 * BLOCKS.samples_per_edge } else { BLOCKS.samples_per_edge };
     let side = step.map(|s| s * along);
     let count: [usize; 3] = std::array::from_fn(|a| shape[a].div_ceil(side[a]));
     let mut all = vec![Vec::new(); count.iter().product()];
@@ -214,7 +230,7 @@ fn blocks(mask: &Mask) -> Vec<Vec<usize>> {
             }
         }
     }
-    all.retain(|block| block.len() >= FEWEST);
+    all.retain(|block| block.len() >= BLOCKS.min_samples);
     all
 }
 

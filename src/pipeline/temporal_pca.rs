@@ -19,33 +19,40 @@ use crate::numerics::statistics::median;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Fewest frames beside the reference: with fewer a course is as many numbers as the frames
-/// themselves.
-const FEWEST: usize = 5;
+/// Fewest frames beside the reference: with fewer, a temporal mode has as many numbers as the
+/// frames.
+const MIN_FRAMES: usize = 5;
 
-/// A mode counts whose variance is this many times the mean of those after it. Noise alone has up
-/// to 3 (5 of 24 frames that follow each other).
-const STANDS_OUT: f64 = 4.0;
+/// Variance of a mode over the mean of those after it, from which it counts: noise alone reaches 3
+/// (5 of 24 consecutive frames).
+const MIN_MODE_VARIANCE_RATIO: f64 = 4.0;
 
-/// Least change of what is left from one frame to the next over that of white noise (1): motion
-/// that goes on from frame to frame has less.
-const WHITE: f64 = 0.75;
+/// What a number of modes may leave; beyond, another mode is taken.
+struct ResidualLimits {
+    /// Least change of the residual between frames over that of white noise (1): motion changes
+    /// less.
+    min_whiteness: f64,
+    /// Largest residual in the frames' stated variances, which include smoothing: noise has 0.01 to
+    /// 0.05.
+    max_level: f64,
+    /// Largest part of the nodes that keep their own field.
+    max_own_fraction: f64,
+}
 
-/// Most that is left, in variances of the frames' stated uncertainty, which holds what smoothing
-/// takes as well: noise has 0.01 to 0.05 of it.
-const UNCERTAIN: f64 = 0.08;
+const RESIDUAL_LIMITS: ResidualLimits = ResidualLimits { min_whiteness: 0.75, max_level: 0.08, max_own_fraction: 0.12 };
 
-/// A block of two nodes along each axis keeps a frame's own field where more than this many times
-/// the noise there is left; a block that has more than this many times the median of all in all
-/// frames does in each of them.
-const OWN: f32 = 4.0;
-const ALWAYS: f32 = 6.0;
+/// Where a block of two nodes along each axis keeps a frame's own field.
+struct OwnField {
+    /// Residual of the frame over the noise there, beyond which the frame keeps it.
+    frame_ratio: f32,
+    /// Mean residual over the median of all blocks, beyond which all frames keep it.
+    block_ratio: f32,
+}
 
-/// Part of the nodes that may keep their own field before one course more is taken.
-const KEPT: f64 = 0.12;
+const OWN_FIELD: OwnField = OwnField { frame_ratio: 4.0, block_ratio: 6.0 };
 
-/// Least variance of a coefficient's noise, in that of the mean one.
-const LEAST: f64 = 0.1;
+/// Least noise variance of a coefficient over the mean one.
+const MIN_COEFFICIENT_VARIANCE: f64 = 0.1;
 
 /// A measured frame.
 pub(super) struct Frame<'a> {
@@ -71,9 +78,9 @@ impl Modes {
     /// Of `frames`, measured against frame `origin`; `counts` says of a voxel of the fields' own
     /// grid whether it is tissue. Else why there are none, in words.
     pub fn find(frames: &[Frame<'_>], origin: usize, counts: impl Fn([usize; 3]) -> bool) -> Result<Self, String> {
-        if frames.len() < FEWEST {
+        if frames.len() < MIN_FRAMES {
             return Err(format!(
-                "each frame by itself: {FEWEST} beside the reference are needed to tell courses from noise"
+                "each frame by itself: {MIN_FRAMES} beside the reference are needed to tell courses from noise"
             ));
         }
         let fields: Option<Vec<&Spline>> = frames.iter().map(|f| f.field.only()).collect();
@@ -159,7 +166,9 @@ struct Left {
 
 impl Left {
     fn is_noise(&self) -> bool {
-        self.white >= WHITE && self.level <= UNCERTAIN && self.kept <= KEPT
+        self.white >= RESIDUAL_LIMITS.min_whiteness
+            && self.level <= RESIDUAL_LIMITS.max_level
+            && self.kept <= RESIDUAL_LIMITS.max_own_fraction
     }
 
     fn said(&self) -> String {
@@ -202,7 +211,8 @@ impl Data {
         }
         let mut noise: Vec<f32> =
             nodes.iter().flat_map(|&m| [0, 1, 2].map(|c| variance[c * all + m] / there[m])).collect();
-        let least = LEAST * noise.iter().map(|&v| f64::from(v)).sum::<f64>() / noise.len().max(1) as f64;
+        let least =
+            MIN_COEFFICIENT_VARIANCE * noise.iter().map(|&v| f64::from(v)).sum::<f64>() / noise.len().max(1) as f64;
         if !(least > 0.0 && least.is_finite()) {
             return None;
         }
@@ -217,7 +227,7 @@ impl Data {
     fn standing_out(&self, most: usize) -> usize {
         let n = self.courses.len() - 1;
         let after = |k: usize| self.courses[k..n].iter().map(|c| c.0).sum::<f64>() / (n - k) as f64;
-        (1..=most).rev().find(|&k| self.courses[k - 1].0 > STANDS_OUT * after(k)).unwrap_or(0)
+        (1..=most).rev().find(|&k| self.courses[k - 1].0 > MIN_MODE_VARIANCE_RATIO * after(k)).unwrap_or(0)
     }
 
     fn left_by(&self, count: usize) -> Left {
@@ -269,7 +279,8 @@ impl Data {
             let mut own = vec![false; all];
             for m in blocks() {
                 let others = (mean[m] * n as f32 - by_frame[t][m]) / (n - 1) as f32;
-                if mean[m] > ALWAYS * level || by_frame[t][m] > OWN * others.max(level) {
+                if mean[m] > OWN_FIELD.block_ratio * level || by_frame[t][m] > OWN_FIELD.frame_ratio * others.max(level)
+                {
                     block(m, self.sides).filter(|&at| nodes[at] > 0.0).for_each(|at| own[at] = true);
                 }
             }

@@ -273,7 +273,7 @@ fn regions(reference: &Voxels<'_>, mask: Option<&Mask>, labels: Option<&Mask>) -
 }
 
 /// Part of a label out of view that earns a warning.
-const OUT_OF_VIEW: f64 = 0.2;
+const WARN_OUT_OF_VIEW_FRACTION: f64 = 0.2;
 
 /// Names the labels of which much lies outside a frame: their strain there is what tissue in view
 /// carries over.
@@ -286,7 +286,7 @@ fn out_of_view(regions: &[(u8, Vec<usize>)], field: &DenseField, there: &Grid) -
     };
     let share = |(label, offsets): &(u8, Vec<usize>)| {
         let out = offsets.par_iter().filter(|at| outside(at)).count() as f64 / offsets.len() as f64;
-        (out > OUT_OF_VIEW).then(|| format!("label {label} ({:.0} %)", 100.0 * out))
+        (out > WARN_OUT_OF_VIEW_FRACTION).then(|| format!("label {label} ({:.0} %)", 100.0 * out))
     };
     let named: Vec<String> = regions.iter().filter_map(share).collect();
     (!named.is_empty()).then(|| {

@@ -4,8 +4,8 @@
 //! The posterior of the coupled field says what noise and smoothness leave open. It is widened
 //! where the volumes differ by more than noise, by the departure of the stated motion from the free
 //! field, where tissue is out of view or without texture, at borders between bodies, and by motions
-//! that the search could not rule out. One calibration ([`BAND`], [`MEAN`], [`SPREAD`]) is fitted
-//! on half of the scenes: docs/lab/2026-11-expected-error.md.
+//! that the search could not rule out. One calibration ([`CALIBRATION`]) is fitted on half of the
+//! scenes: docs/lab/2026-11-expected-error.md.
 
 use crate::consistency::coupling::Posterior;
 use crate::error::SpaceError;
@@ -19,34 +19,42 @@ use crate::types::{
 };
 use rayon::prelude::*;
 
-/// Standard deviation over the posterior's such that 95 % of the errors lie in the 95 % region (1).
-const BAND: f32 = 1.05;
+/// Calibration on half of the scenes of docs/lab/2026-11-expected-error.md.
+struct Calibration {
+    /// Standard deviation over the posterior's for which the 95 % region contains 95 % of the
+    /// errors (1).
+    region: f32,
+    /// Mean error over that of normal errors of the stated deviation (1): most places are better
+    /// than the deviation that contains 95 % of them.
+    mean_length: f64,
+    /// Factor around the expected error that contains the true mean error in nine of ten scenes
+    /// (1).
+    interval: f64,
+}
 
-/// Mean length of the error, over that of normal errors of the stated deviation (1): most places
-/// are better than the deviation says that holds 95 % of them.
-const MEAN: f64 = 0.63;
+const CALIBRATION: Calibration = Calibration { region: 1.05, mean_length: 0.63, interval: 2.0 };
 
-/// Factor within which the true mean error lies of the expected one in nine of ten scenes (1).
-const SPREAD: f64 = 2.0;
+/// Errors that the posterior does not contain.
+struct SourceErrors {
+    /// Position error of interpolation and a voxel's extent (voxels, one axis): affine motions
+    /// without noise come out 0.005 to 0.03 voxels off.
+    interpolation_voxels: f64,
+    /// Deviation of tissue out of view or without texture over what smoothness says (1).
+    /// Calibrated: docs/lab/2026-11-expected-error.md.
+    extrapolation: f32,
+    /// Deviation along an axis at a border between bodies over the jump there (1): one in ten such
+    /// voxels follows the wrong side (13 scenes).
+    side_fraction: f32,
+    /// Relative widening of the deviation per unexplained part of the variance between two
+    /// contrasts (1): 16 scenes, docs/lab/2026-11-inputs.md.
+    contrast: f64,
+}
 
-/// Place that interpolation and a voxel's extent hide from any match (voxels, one axis): affine
-/// motions without noise come out .005 to .03 of a voxel off.
-const INTERPOLATION: f64 = 0.015;
+const SOURCE: SourceErrors =
+    SourceErrors { interpolation_voxels: 0.015, extrapolation: 3.0, side_fraction: 0.18, contrast: 5.0 };
 
-/// How much more uncertain tissue is that the volumes do not show (out of view, without texture)
-/// than smoothness says (1). Calibrated: docs/lab/2026-11-expected-error.md.
-const EXTRAPOLATED: f32 = 3.0;
-
-/// Standard deviation along an axis that a voxel at a border between bodies adds, as a part of the
-/// jump there (1): one in ten such voxels goes with the wrong side (13 scenes).
-const SIDE: f32 = 0.18;
-
-/// Relative widening of the deviation for each part of the variance that the relation of two
-/// contrasts leaves (1): calibrated on 16 scenes, docs/lab/2026-11-inputs.md.
-const CONTRAST: f64 = 5.0;
-
-/// Voxels of the mask from which means over it are taken, about.
-const SAMPLED: usize = 25_000;
+/// Approximate number of voxels from which means over the mask are taken.
+pub(super) const SAMPLED_VOXELS: usize = 25_000;
 
 /// What one body's data say at the nodes of its lattice.
 pub(super) struct AtNodes<'a> {
@@ -78,15 +86,15 @@ impl Variances {
         let thick = || (0..3).filter(|&a| lattice.shape[a] > 1);
         let axes = thick().count().max(1) as f64;
         let edges = thick().map(|a| spacing[a].powi(2)).sum::<f64>();
-        let interpolation = (INTERPOLATION * INTERPOLATION * edges / axes) as f32;
+        let interpolation = (SOURCE.interpolation_voxels * SOURCE.interpolation_voxels * edges / axes) as f32;
         let mut parts: [Vec<f32>; 6] = std::array::from_fn(|_| vec![0.0; lattice.len()]);
         for m in 0..lattice.len() {
-            let narrowed = (BAND * nodes.narrowed[m]).powi(2);
+            let narrowed = (CALIBRATION.region * nodes.narrowed[m]).powi(2);
             let free = narrowed * nodes.posterior.deviation[m].powi(2);
             let model = narrowed * nodes.departure[m].powi(2) / axes as f32;
             let noise = free + interpolation;
             let misfit = free * (nodes.misfit[m] - 1.0).max(0.0);
-            let more = if nodes.hidden[m] { EXTRAPOLATED * EXTRAPOLATED - 1.0 } else { 0.0 };
+            let more = if nodes.hidden[m] { SOURCE.extrapolation * SOURCE.extrapolation - 1.0 } else { 0.0 };
             let all = [noise, misfit, model, more * (noise + misfit + model), 0.0, 0.0];
             all.into_iter().zip(&mut parts).for_each(|(v, part)| part[m] = v);
         }
@@ -137,7 +145,7 @@ impl Variances {
         let cell: usize = (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] * factor[a]).product();
         let borders = self.part(ErrorSource::Borders);
         for (voxel, jump) in jumps {
-            let square = (SIDE * jump).powi(2) / cell as f32;
+            let square = (SOURCE.side_fraction * jump).powi(2) / cell as f32;
             lattice.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| borders[node] += w * square);
         }
     }
@@ -157,7 +165,7 @@ impl Variances {
     /// Widens all where the volumes have different contrasts, of whose variance their relation
     /// leaves this part.
     pub fn add_contrast(&mut self, left: f64) {
-        let more = ((1.0 + CONTRAST * left).powi(2) - 1.0) as f32;
+        let more = ((1.0 + SOURCE.contrast * left).powi(2) - 1.0) as f32;
         for m in 0..self.lattice.len() {
             let all: f32 = self.parts.iter().map(|part| part[m]).sum();
             self.part(ErrorSource::Misfit)[m] += more * all;
@@ -240,10 +248,11 @@ impl Variances {
         let sigma: Vec<f32> = picked.iter().map(|&at| deviation.at(at)).collect();
         let count = picked.len().max(1) as f64;
         let motion = picked.iter().map(|&at| length(field, at)).sum::<f64>() / count;
-        let mean_mm = MEAN * mean_length(axes) * sigma.iter().map(|&s| f64::from(s)).sum::<f64>() / count;
+        let mean_mm =
+            CALIBRATION.mean_length * mean_length(axes) * sigma.iter().map(|&s| f64::from(s)).sum::<f64>() / count;
         ExpectedError {
             mean_mm,
-            interval_mm: [mean_mm / SPREAD, mean_mm * SPREAD],
+            interval_mm: [mean_mm / CALIBRATION.interval, mean_mm * CALIBRATION.interval],
             p95_mm: longest(axes, sigma),
             against_mm: match (model, rejected) {
                 (MotionModel::Identity, false) => edge(&grid),
@@ -272,7 +281,7 @@ fn variance_of(lattice: &Lattice, draws: &[Vec<f32>]) -> Vec<f32> {
 /// What the departure from the free field counts times where the evidence speaks against the stated
 /// motion: its mean is then the mean error, and not that of a random one.
 pub(super) fn left_out(axes: usize) -> f32 {
-    ((axes as f64).sqrt() / (MEAN * mean_length(axes) * f64::from(BAND))) as f32
+    ((axes as f64).sqrt() / (CALIBRATION.mean_length * mean_length(axes) * f64::from(CALIBRATION.region))) as f32
 }
 
 /// Displacement magnitude at a voxel (mm).
@@ -293,7 +302,7 @@ pub(super) fn by_label(deviation: &ScalarSpline, field: &DenseField, mask: &Mask
     }
     let of = |(label, &(count, sigma, moved)): (usize, &(usize, f64, f64))| LabelError {
         label: label as u8,
-        expected_error_mm: MEAN * mean_length(axes) * sigma / count as f64,
+        expected_error_mm: CALIBRATION.mean_length * mean_length(axes) * sigma / count as f64,
         displacement_mean_mm: moved / count as f64,
     };
     sums.iter().enumerate().filter(|(_, s)| s.0 > 0).map(of).collect()
@@ -321,23 +330,24 @@ fn mean_length(axes: usize) -> f64 {
     if axes == 2 { (PI / 2.0).sqrt() } else { (8.0 / PI).sqrt() }
 }
 
-/// Quantiles of the length of a normal error over its deviation along an axis: at 5, 15, ... 95 %.
-const LENGTHS: [[f32; 10]; 2] = [
+/// Quantiles at 5, 15, ... 95 % of the length of a normal error over its deviation along an axis,
+/// in two and three dimensions.
+const LENGTH_QUANTILES: [[f32; 10]; 2] = [
     [0.3203, 0.5701, 0.7585, 0.9282, 1.0935, 1.2637, 1.4490, 1.6651, 1.9479, 2.4477],
     [0.5932, 0.8932, 1.1012, 1.2812, 1.4524, 1.6257, 1.8119, 2.0269, 2.3059, 2.7955],
 ];
 
 /// 95th percentile of the length of normal errors of these deviations along an axis.
 fn longest(axes: usize, sigma: Vec<f32>) -> f64 {
-    let quantiles = LENGTHS[usize::from(axes == 3)];
+    let quantiles = LENGTH_QUANTILES[usize::from(axes == 3)];
     let mut all: Vec<f32> = sigma.iter().flat_map(|s| quantiles.map(|q| q * s)).collect();
     f64::from(quantile(&mut all, 0.95))
 }
 
-/// Voxels of the mask, evenly, at most about [`SAMPLED`].
+/// Voxels of the mask, evenly, at most about [`SAMPLED_VOXELS`].
 pub(super) fn some_of(mask: &Mask) -> impl Iterator<Item = usize> {
     let mask = mask.as_slice();
-    evenly(mask.len(), |at| mask[at] != 0, SAMPLED)
+    evenly(mask.len(), |at| mask[at] != 0, SAMPLED_VOXELS)
 }
 
 /// Of `count` voxels those that are `inside`, evenly, at most about `most`.
@@ -346,7 +356,7 @@ pub(super) fn evenly(count: usize, inside: impl Fn(usize) -> bool, most: usize) 
     (0..count).filter(move |&at| inside(at)).step_by(step.max(1))
 }
 
-/// Median over the mask, from at most about [`SAMPLED`] of its voxels.
+/// Median over the mask, from at most about [`SAMPLED_VOXELS`] of its voxels.
 pub(super) fn median_inside(values: &ScalarSpline, mask: &Mask) -> f64 {
     let mut picked: Vec<f32> = some_of(mask).map(|at| values.at(at)).collect();
     f64::from(median(&mut picked))

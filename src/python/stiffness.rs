@@ -3,7 +3,7 @@
 use super::arrays::{self, Callback, Image, Rows, told};
 use super::field::kept;
 use crate::io;
-use crate::pipeline::stiffness::{ENOUGH, FieldQuality, Inputs, inside, run};
+use crate::pipeline::stiffness::{FieldQuality, Inputs, MIN_MATCHES_IN_BODY, inside, run};
 use crate::report::stiffness::{InputNames, summary};
 use crate::stiffness::boundary_conditions::Place;
 use crate::types::stiffness::{LawChoice, Side};
@@ -99,7 +99,7 @@ pub fn stiffness<'py>(
     let (held, load) = (place(&held, field.grid(), "held")?, place(&load, field.grid(), "load")?);
     // Of too few matches in the body the field itself tells more, as on the command line.
     let matches = matches.map(|m| arrays::matches(&m)).transpose()?;
-    let matches = matches.filter(|m| !unasked || inside(m, &labels) >= ENOUGH);
+    let matches = matches.filter(|m| !unasked || inside(m, &labels) >= MIN_MATCHES_IN_BODY);
     let result = arrays::run(py, progress, threads, |tell| {
         let named = |label: u8| names.get(&label).cloned().unwrap_or_else(|| format!("region {label}"));
         let inputs = Inputs {

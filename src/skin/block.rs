@@ -13,14 +13,20 @@ use crate::numerics::banded::Band;
 use crate::skin::column::times;
 use crate::types::skin::{BlockRun, BlockShape, SkinSample, SkinScene};
 
-/// Cells along half the width, and for each layer along its thickness at least.
-const ACROSS: usize = 48;
-/// See [`ACROSS`].
-const LAYER_CELLS: usize = 4;
-/// Cells along the thickness of all layers, about.
-const DEEP: usize = 16;
-/// Places of the 2 x 2 Gauss points.
-const GAUSS: [f64; 2] = [-0.577_350_269_189_625_8, 0.577_350_269_189_625_8];
+/// Cells of the finite element mesh.
+struct BlockCells {
+    /// Cells along half the width.
+    half_width: usize,
+    /// Fewest cells along the thickness of a layer.
+    min_per_layer: usize,
+    /// Approximate number of cells along the thickness of all layers.
+    thickness: usize,
+}
+
+const BLOCK_CELLS: BlockCells = BlockCells { half_width: 48, min_per_layer: 4, thickness: 16 };
+
+/// Positions of the 2 x 2 Gauss points: 1 / sqrt(3).
+const GAUSS_POINTS: [f64; 2] = [-0.577_350_269_189_625_8, 0.577_350_269_189_625_8];
 
 /// Strain xx, yy, zz, xy (engineering shear).
 type Strain = [f64; 4];
@@ -40,10 +46,13 @@ struct Mesh {
 impl Mesh {
     fn new(scene: &SkinScene) -> Self {
         let (half, punch) = (scene.block.width / 2.0, scene.block.indenter / 2.0);
-        let inner =
-            if punch < half { ((ACROSS as f64 * (punch / half).sqrt()) as usize).clamp(8, ACROSS - 8) } else { ACROSS };
+        let inner = if punch < half {
+            ((BLOCK_CELLS.half_width as f64 * (punch / half).sqrt()) as usize).clamp(8, BLOCK_CELLS.half_width - 8)
+        } else {
+            BLOCK_CELLS.half_width
+        };
         let mut x: Vec<f64> = (0..=inner).map(|i| punch * i as f64 / inner as f64).collect();
-        let outer = ACROSS - inner;
+        let outer = BLOCK_CELLS.half_width - inner;
         // Growing outwards from the size under the punch.
         let mut steps = Vec::new();
         if outer > 0 {
@@ -66,7 +75,8 @@ impl Mesh {
         let (mut y, mut layer) = (vec![0.0], Vec::new());
         let all = scene.thickness();
         for (number, l) in scene.layers.iter().enumerate().rev() {
-            let cells = ((DEEP as f64 * l.thickness / all).round() as usize).max(LAYER_CELLS);
+            let cells =
+                ((BLOCK_CELLS.thickness as f64 * l.thickness / all).round() as usize).max(BLOCK_CELLS.min_per_layer);
             let base = y[y.len() - 1];
             y.extend((1..=cells).map(|k| base + l.thickness * k as f64 / cells as f64));
             layer.extend(std::iter::repeat_n(number, cells));
@@ -92,7 +102,7 @@ impl Mesh {
         };
         let mean = gradient(0.0, 0.0);
         let points = [0, 1, 2, 3].map(|g| {
-            let n = gradient(GAUSS[g % 2], GAUSS[g / 2]);
+            let n = gradient(GAUSS_POINTS[g % 2], GAUSS_POINTS[g / 2]);
             let mut b = [[0.0; 8]; 4];
             for k in 0..4 {
                 // The dilatation is that of the middle, spread over the three normal strains.

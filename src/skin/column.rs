@@ -12,8 +12,8 @@ use crate::numerics::dense::dot;
 use crate::skin::exponential::{exponential, rounding};
 use crate::types::skin::{Layer, SkinLoad, SkinSample, SkinScene};
 
-/// Samples in the ramp, the hold and the time after.
-const SAMPLES: [usize; 3] = [40, 80, 120];
+/// Samples during the ramp, the hold and the time after.
+const PHASE_SAMPLES: [usize; 3] = [40, 80, 120];
 
 /// A layer in one phase, with the places of its states.
 struct Part {
@@ -241,9 +241,9 @@ pub fn times(scene: &SkinScene) -> [Vec<f64>; 3] {
         let inner = (0..n - 1).map(|i| start + first * ratio.powi(i as i32));
         std::iter::once(start).chain(inner).chain([start + span]).collect()
     };
-    let ramp = (0..=SAMPLES[0]).map(|i| load.ramp * i as f64 / SAMPLES[0] as f64).collect();
+    let ramp = (0..=PHASE_SAMPLES[0]).map(|i| load.ramp * i as f64 / PHASE_SAMPLES[0] as f64).collect();
     let unload = load.ramp + load.hold;
-    [ramp, growing(load.ramp, load.hold, SAMPLES[1]), growing(unload, load.end - unload, SAMPLES[2])]
+    [ramp, growing(load.ramp, load.hold, PHASE_SAMPLES[1]), growing(unload, load.end - unload, PHASE_SAMPLES[2])]
 }
 
 /// The strain that stays after all time in a layer without a lone spring: the integral of the

@@ -38,9 +38,9 @@ fn norm(a: &[f64], n: usize) -> f64 {
     a.chunks_exact(n).map(|row| row.iter().map(|v| v.abs()).sum::<f64>()).fold(0.0, f64::max)
 }
 
-/// What is left of the size of a row or column of which nothing comes back: the sum that a quantity
-/// is, or a constant.
-const LOOSE: f64 = 0.0625;
+/// Size to which a row or column without a counterpart is scaled: an integral, which nothing
+/// depends on, or a constant.
+const UNCOUPLED_SIZE: f64 = 0.0625;
 
 /// Sizes (powers of two) of the quantities for which rows and columns of `a` are about as large as
 /// each other (Parlett & Reinsch 1969): else stresses of gigapascals over layers of micrometres set
@@ -55,8 +55,8 @@ fn balance(a: &[f64], n: usize) -> Vec<f64> {
             let column: f64 = others().map(|j| (a[j * n + i] * size[i] / size[j]).abs()).sum();
             let factor = match (row > 0.0, column > 0.0) {
                 (true, true) => (row / column).sqrt(),
-                (true, false) => row / LOOSE,
-                (false, true) => LOOSE / column,
+                (true, false) => row / UNCOUPLED_SIZE,
+                (false, true) => UNCOUPLED_SIZE / column,
                 (false, false) => 1.0,
             };
             let power = factor.log2().round();

@@ -10,14 +10,21 @@ use crate::numerics::dense::solve;
 use crate::skin::column;
 use crate::types::skin::{ElementKind, Layer, SkinSample, SkinScene};
 
-/// Parts of an element at most: spring or second branch, dashpots, and the factor of unloading.
-const PARTS: usize = 6;
-/// Rounds of the fit, and the change of a logarithm at which it has settled.
-const ROUNDS: usize = 60;
-const SETTLED: f64 = 1e-6;
-/// Change of a logarithm for a derivative, and the largest of a round.
-const PROBE: f64 = 1e-4;
-const LONGEST: f64 = 1.0;
+/// Most parameters of an element: spring or second branch, dashpots, and the factor of unloading.
+const MAX_PARAMETERS: usize = 6;
+/// Levenberg-Marquardt fit of the parameters' logarithms.
+struct FitControl {
+    /// Most iterations.
+    max_iterations: usize,
+    /// Step at which the fit has converged.
+    tolerance: f64,
+    /// Step of the central differences.
+    difference_step: f64,
+    /// Largest step of an iteration.
+    max_step: f64,
+}
+
+const FIT: FitControl = FitControl { max_iterations: 60, tolerance: 1e-6, difference_step: 1e-4, max_step: 1.0 };
 
 /// The scene with one layer, as thick as all.
 pub fn fitted(scene: &SkinScene) -> SkinScene {
@@ -36,7 +43,7 @@ pub fn fitted(scene: &SkinScene) -> SkinScene {
     let stiff = if first[0] > 0.0 { first[0] } else { spring };
     let slow = if first[1] > 0.0 { first[1] } else { stiff * scene.load.hold.max(scene.load.ramp) };
     let c0 = series(&|l| l.c0, 0.01 * stiff * scene.load.ramp);
-    let one = |p: &[f64; PARTS]| {
+    let one = |p: &[f64; MAX_PARAMETERS]| {
         let [a, c0, e1, c1, c2, unload] = p.map(f64::exp);
         let (element, e0, maxwell) = if stays {
             (ElementKind::FiveElement, 0.0, vec![[e1, c1], [a, c2]])
@@ -52,7 +59,7 @@ pub fn fitted(scene: &SkinScene) -> SkinScene {
     let truth = column::respond_at(scene, &times);
     let top = truth.iter().map(|s| s.stress.abs()).fold(f64::MIN_POSITIVE, f64::max);
     let unload = scene.load.ramp + scene.load.hold;
-    let off = |p: &[f64; PARTS]| -> Vec<f64> {
+    let off = |p: &[f64; MAX_PARAMETERS]| -> Vec<f64> {
         let of = |(a, b): (&SkinSample, &SkinSample)| {
             // The rate of the ramp is a step, which dashpots answer at once: its first sample says
             // nothing of the rest.
@@ -68,17 +75,19 @@ pub fn fitted(scene: &SkinScene) -> SkinScene {
     let squares = |r: &[f64]| r.iter().map(|v| v * v).sum::<f64>();
     let start = if stays { [stiff, c0, stiff, 0.1 * slow, slow, 1.0] } else { [spring, c0, stiff, slow, 1.0, 1.0] };
     let mut p = start.map(|v: f64| v.max(f64::MIN_POSITIVE).ln());
-    let used: Vec<usize> = (0..PARTS).filter(|k| (*k < 4) || (*k == 4 && stays) || (*k == 5 && dual)).collect();
+    let used: Vec<usize> =
+        (0..MAX_PARAMETERS).filter(|k| (*k < 4) || (*k == 4 && stays) || (*k == 5 && dual)).collect();
     let (mut r, mut weight) = (off(&p), 1e-2);
-    for _ in 0..ROUNDS {
-        let mut columns = vec![Vec::new(); PARTS];
+    for _ in 0..FIT.max_iterations {
+        let mut columns = vec![Vec::new(); MAX_PARAMETERS];
         for &k in &used {
             let moved = |sign: f64| {
                 let mut q = p;
-                q[k] += sign * PROBE;
+                q[k] += sign * FIT.difference_step;
                 off(&q)
             };
-            columns[k] = moved(1.0).iter().zip(moved(-1.0)).map(|(u, d)| (u - d) / (2.0 * PROBE)).collect();
+            columns[k] =
+                moved(1.0).iter().zip(moved(-1.0)).map(|(u, d)| (u - d) / (2.0 * FIT.difference_step)).collect();
         }
         let dot = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(a, b)| a * b).sum::<f64>();
         let mut settled = true;
@@ -91,13 +100,13 @@ pub fn fitted(scene: &SkinScene) -> SkinScene {
                 })
             });
             let right = std::array::from_fn(|i| if used.contains(&i) { -dot(&columns[i], &r) } else { 0.0 });
-            let Some(step) = solve::<PARTS>(&matrix, &right) else { break };
+            let Some(step) = solve::<MAX_PARAMETERS>(&matrix, &right) else { break };
             let size = step.iter().fold(0.0, |l: f64, v| l.max(v.abs()));
-            let part = (LONGEST / size.max(f64::MIN_POSITIVE)).min(1.0);
-            let next: [f64; PARTS] = std::array::from_fn(|k| p[k] + part * step[k]);
+            let part = (FIT.max_step / size.max(f64::MIN_POSITIVE)).min(1.0);
+            let next: [f64; MAX_PARAMETERS] = std::array::from_fn(|k| p[k] + part * step[k]);
             let found = off(&next);
             if squares(&found) < squares(&r) {
-                (p, r, weight, settled) = (next, found, (0.1 * weight).max(1e-9), size < SETTLED);
+                (p, r, weight, settled) = (next, found, (0.1 * weight).max(1e-9), size < FIT.tolerance);
                 break;
             }
             weight *= 10.0;

@@ -8,18 +8,23 @@
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::tetrahedron::EDGES;
 use crate::stiffness::fem_body::Body;
+use crate::stiffness::interface::MAX_EXAMINED;
 use crate::types::space::{cross, dot, length};
 use std::collections::{BTreeMap, HashMap};
 
-/// Borders that are looked at, the largest ones: each takes a solution.
-const MOST: usize = 12;
-/// The largest change of a node in the last sweep of the extension (parts of an offset).
-const SETTLED: f64 = 1e-3;
-/// Sweeps at most.
-const SWEEPS: usize = 2000;
-/// Part of the normals around a node from which a direction counts as across the surface there: a
-/// ridge of 120 degrees has a quarter, a ball of eight facets around under 0.05.
-const ACROSS: f64 = 0.1;
+/// Iteration control of the extension of offsets into the body.
+struct ExtensionControl {
+    /// Largest change of a node in the last sweep (parts of an offset).
+    tolerance: f64,
+    /// Most sweeps.
+    max_sweeps: usize,
+}
+
+const EXTENSION: ExtensionControl = ExtensionControl { tolerance: 1e-3, max_sweeps: 2000 };
+
+/// Part of the normals around a node, from which a direction is across the surface: a quarter at a
+/// ridge of 120 degrees, under 0.05 on a ball of eight facets around.
+const MIN_NORMAL_FRACTION: f64 = 0.1;
 
 /// The border between two labels.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,7 +50,7 @@ pub fn all(body: &Body) -> Vec<Border> {
     let mut largest: Vec<_> = met.iter().collect();
     let area = |faces: &[Face]| faces.iter().map(|f| length(f.1)).sum::<f64>();
     largest.sort_by(|a, b| area(b.1).total_cmp(&area(a.1)));
-    largest.truncate(MOST);
+    largest.truncate(MAX_EXAMINED);
     largest.sort_by_key(|b| b.0);
     let one = |(&(a, b), faces): (&(u16, u16), &Vec<Face>)| {
         let [first, second] = [a, b].map(|r| body.volumes[r as usize]);
@@ -124,7 +129,7 @@ fn across(body: &Body) -> BTreeMap<u32, Vec<[f64; 3]>> {
         }
     }
     let directions = |(m, area): ([[f64; 3]; 3], f64)| {
-        symmetric_eigen(&m).into_iter().filter(|e| e.0 > ACROSS * area).map(|e| e.1).collect()
+        symmetric_eigen(&m).into_iter().filter(|e| e.0 > MIN_NORMAL_FRACTION * area).map(|e| e.1).collect()
     };
     sums.into_iter().map(|(n, sum)| (n, directions(sum))).collect()
 }
@@ -149,7 +154,7 @@ fn extended(
     }
     let free: Vec<u32> =
         (0..out.len() as u32).filter(|n| !around[*n as usize].is_empty() && !fixed.contains_key(n)).collect();
-    for _ in 0..SWEEPS {
+    for _ in 0..EXTENSION.max_sweeps {
         let mut most = 0.0f64;
         for &n in &free {
             let near = &around[n as usize];
@@ -158,7 +163,7 @@ fn extended(
             let old = std::mem::replace(&mut out[n as usize], next);
             most = (0..3).fold(most, |m, a| m.max((next[a] - old[a]).abs()));
         }
-        if most < SETTLED {
+        if most < EXTENSION.tolerance {
             break;
         }
     }

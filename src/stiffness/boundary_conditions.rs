@@ -16,7 +16,7 @@ use crate::stiffness::contact;
 use crate::stiffness::fem_body::{Body, Facet, sorted};
 use crate::stiffness::forward::Tie;
 use crate::stiffness::indenter_outline::Outline;
-use crate::stiffness::observations::{REACH, at_surface};
+use crate::stiffness::observations::{SURFACE_REACH_VOXELS, at_surface};
 use crate::stiffness::patch_motion::Smoothed;
 use crate::types::space::{cross, dot};
 use crate::types::stiffness::{Contact, Side};
@@ -24,24 +24,27 @@ use crate::types::{Displacement, Grid, Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Voxels that are read to tell whether a node touches the plate: fewer, as the edge of a punch is
-/// sharp.
-const NEAR: f64 = 1.8;
+/// The reading of a surface's motion that tells whether a node touches the plate.
+struct SharpReading {
+    /// Reach (voxels): short, as the edge of a punch is sharp.
+    reach_voxels: f64,
+    /// Noise (voxels) beyond which the longer reach is used.
+    max_noise_voxels: f64,
+}
 
-/// Noise of that (voxels) beyond which it tells a touch worse than a reading from further around.
-const NOISY: f64 = 0.1;
+const SHARP_READING: SharpReading = SharpReading { reach_voxels: 1.8, max_noise_voxels: 0.1 };
 
-/// Error that a read displacement has at least (voxels).
-const LEAST_ERROR: f64 = 0.001;
+/// Least error of a displacement that is read from the field (voxels).
+const MIN_READING_ERROR_VOXELS: f64 = 0.001;
 
 /// Cosine of the angle to a side within which a facet faces it.
-const FACING: f64 = 0.3;
+const MIN_FACING_COSINE: f64 = 0.3;
 
-/// Least area of a patch (squares of the voxel's side): enough voxels to tell its six numbers.
-const LEAST_AREA: f64 = 9.0;
+/// Least area of a patch (voxel faces): enough to determine its six rigid motions.
+const MIN_PATCH_VOXELS: f64 = 9.0;
 
-/// What ends further beyond the plane of a plate (voxels) passes beside it.
-const BESIDE: f64 = 1.0;
+/// Facets that end further beyond the plane of a plate (voxels) pass beside it.
+const MAX_BEYOND_PLATE_VOXELS: f64 = 1.0;
 
 /// Where a patch is.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,13 +93,19 @@ impl SurfaceMotion {
             nodes.iter().zip(&values).for_each(|(&n, v)| displacement[n as usize] = v.map(|v| v.0));
             (displacement, percentile(&mut errors, 50.0))
         };
-        let (displacement, error) = all(REACH);
-        let (read, sharp_error) = all(NEAR);
-        if sharp_error > NOISY * field.grid().least_spacing() {
-            return Self { sharp: displacement.clone(), displacement, error, sharp_error: error, near: REACH };
+        let (displacement, error) = all(SURFACE_REACH_VOXELS);
+        let (read, sharp_error) = all(SHARP_READING.reach_voxels);
+        if sharp_error > SHARP_READING.max_noise_voxels * field.grid().least_spacing() {
+            return Self {
+                sharp: displacement.clone(),
+                displacement,
+                error,
+                sharp_error: error,
+                near: SURFACE_REACH_VOXELS,
+            };
         }
         let sharp = read.into_iter().zip(&displacement).map(|(n, d)| n.or(*d)).collect();
-        Self { displacement, error, sharp, sharp_error, near: NEAR }
+        Self { displacement, error, sharp, sharp_error, near: SHARP_READING.reach_voxels }
     }
 }
 
@@ -211,7 +220,7 @@ impl Patch {
     /// element.
     pub fn plate(&self, body: &Body, change: &[f64], modulus: impl Fn(usize) -> f64) -> Option<contact::Plate> {
         let Landing { plane: (q, _), facets } = self.landed().filter(|_| self.slides())?;
-        let stiffness = contact::STIFF * self.backing(body, modulus) / self.area(body);
+        let stiffness = contact::PENALTY_STIFFNESS * self.backing(body, modulus) / self.area(body);
         let facing = facets.iter().map(|&f| &body.surface[f]);
         let mut out = contact::Plate::touching(body, facing, self.normal, stiffness);
         let height = |p: [f64; 3]| {
@@ -344,7 +353,7 @@ pub fn find(
         Place::Mask(mask, _) => masked_facets(body, mask),
     };
     let area: f64 = base.iter().map(|&f| body.surface[f].area).sum();
-    if base.is_empty() || area < LEAST_AREA * voxel * voxel {
+    if base.is_empty() || area < MIN_PATCH_VOXELS * voxel * voxel {
         return Err(refuse("held", held, "is empty: no surface of the body lies there", hint_held));
     }
     let mut held_patch = build(body, motion, held.name(), base, None, voxel)
@@ -411,7 +420,7 @@ fn cut(body: &Body, motion: &SurfaceMotion, patches: &[Patch], grid: &Grid) -> O
     let beyond = |f: &usize| !taken.contains(f) && border_of(grid, body.surface[*f].centre).is_some();
     let facets: Vec<usize> = (0..body.surface.len()).filter(beyond).collect();
     let voxel = grid.least_spacing();
-    if facets.iter().map(|&f| body.surface[f].area).sum::<f64>() < LEAST_AREA * voxel * voxel {
+    if facets.iter().map(|&f| body.surface[f].area).sum::<f64>() < MIN_PATCH_VOXELS * voxel * voxel {
         return None;
     }
     let mut out = build(body, motion, "cut".into(), facets, None, voxel)?;
@@ -479,9 +488,9 @@ fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
     patch.rim = patch.nodes.iter().map(lag).collect();
 }
 
-/// Part of what faces a side from which its end is a flat face: of a ball of 20 voxels a sixth lies
-/// within a voxel of its end.
-const FLAT: f64 = 0.6;
+/// Part of the area facing a side at the body's end, beyond which the end is a flat face: a sixth
+/// of a ball of 20 voxels lies within a voxel of its end.
+pub const MIN_FLAT_FRACTION: f64 = 0.6;
 
 /// Facets whose nodes lie within a voxel of the end of the undeformed body. Of a flat face those of
 /// which half do: where the body lies askew in its voxels the mesh rounds its rims, and as a whole
@@ -496,7 +505,7 @@ pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
     let of = |least: usize| facing.iter().copied().filter(|&f| within(f) >= least).collect::<Vec<_>>();
     let area = |facets: &[usize]| facets.iter().map(|&f| body.surface[f].area).sum::<f64>();
     let half = of(3);
-    if area(&half) > FLAT * area(&facing) { half } else { of(6) }
+    if area(&half) > MIN_FLAT_FRACTION * area(&facing) { half } else { of(6) }
 }
 
 /// Facets whose middle, or a place just inside of it, lies in a mask.
@@ -517,7 +526,8 @@ fn masked_facets(body: &Body, mask: &Mask) -> Vec<usize> {
 /// Facets on a side whose middle lies within the outline of a punch.
 fn facets_within(body: &Body, side: Side, outline: &Outline) -> Vec<usize> {
     let d = side.direction();
-    let under = |f: &usize| dot(body.surface[*f].normal, d) > FACING && outline.holds(body.surface[*f].centre);
+    let under =
+        |f: &usize| dot(body.surface[*f].normal, d) > MIN_FACING_COSINE && outline.holds(body.surface[*f].centre);
     (0..body.surface.len()).filter(under).collect()
 }
 
@@ -535,11 +545,15 @@ pub fn deformation(seen: &[([f64; 3], [f64; 3])]) -> f64 {
 /// A plane: a point (mm) and its outward unit normal.
 type Plane = ([f64; 3], [f64; 3]);
 
-/// Steps in which nodes off a common plane are left out, at most, and the part that stays in each
-/// (as Rousseeuw and Van Driessen 1999).
-const CONCENTRATIONS: usize = 5;
-/// See [`CONCENTRATIONS`].
-const KEPT: f64 = 0.75;
+/// Least trimmed squares fit of a plane (Rousseeuw and Van Driessen 1999).
+struct ConcentrationSteps {
+    /// Most concentration steps.
+    max_steps: usize,
+    /// Part of the nodes that each step keeps.
+    kept_fraction: f64,
+}
+
+const CONCENTRATION: ConcentrationSteps = ConcentrationSteps { max_steps: 5, kept_fraction: 0.75 };
 
 /// The facets that come to lie on the plane of those pushed in the furthest, that plane, and how
 /// far they went in (mm).
@@ -551,7 +565,8 @@ fn pressed_facets(
     voxel: f64,
 ) -> Option<(Vec<usize>, Option<Plane>, f64)> {
     let d = side.direction();
-    let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > FACING).collect();
+    let facing: Vec<usize> =
+        (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > MIN_FACING_COSINE).collect();
     let mut nodes = body.nodes_on(facing.iter().copied());
     nodes.retain(|&n| against(n).is_some());
     if nodes.len() < 6 {
@@ -571,7 +586,7 @@ fn pressed_facets(
     let tolerance = on_plane(voxel, motion.sharp_error);
     // A rounded rim ends far below a face that is coarsely meshed, and draws the plane down with
     // it: then what lies together comes first.
-    for _ in 0..CONCENTRATIONS {
+    for _ in 0..CONCENTRATION.max_steps {
         let ends: Vec<[f64; 3]> = chosen.iter().filter_map(|&n| ended(n)).collect();
         let found = fit_plane(&ends, d)?;
         let height = |q: [f64; 3]| dot(sub(q, found.0), found.1);
@@ -582,7 +597,7 @@ fn pressed_facets(
         let middle = percentile(&mut ends.iter().map(|q| height(*q)).collect::<Vec<f64>>(), 50.0);
         let off = |n: &u32| ended(*n).map_or(f64::INFINITY, |q| (height(q) - middle).abs());
         chosen.sort_by(|a, b| off(a).total_cmp(&off(b)));
-        chosen.truncate((KEPT * chosen.len() as f64) as usize);
+        chosen.truncate((CONCENTRATION.kept_fraction * chosen.len() as f64) as usize);
         if chosen.len() < 6 {
             break;
         }
@@ -717,7 +732,7 @@ fn build(
     let besides =
         |(p, n): (&[f64; 3], &u32)| motion.sharp[*n as usize].map(|u| sub(u, rigid_motion(&rigid, middle, radius, *p)));
     let read: Vec<Option<[f64; 3]>> = places.iter().zip(&nodes).map(besides).collect();
-    let least = LEAST_ERROR * voxel;
+    let least = MIN_READING_ERROR_VOXELS * voxel;
     let measured = Smoothed::new(&places, &read, [least, motion.sharp_error.max(least)], independent);
     let landing = plane.map(|plane| Landing { plane, facets: facets_before(body, motion, plane, voxel) });
     let bends = plane
@@ -771,7 +786,7 @@ fn bent(
 
 /// Facets that may touch a plane: what was not seen to pass beside it.
 fn facets_before(body: &Body, motion: &SurfaceMotion, plane: Plane, voxel: f64) -> Vec<usize> {
-    let may = |n: &u32| beyond(body, motion, plane, *n).is_none_or(|h| h < BESIDE * voxel);
+    let may = |n: &u32| beyond(body, motion, plane, *n).is_none_or(|h| h < MAX_BEYOND_PLATE_VOXELS * voxel);
     (0..body.surface.len()).filter(|&f| body.surface[f].nodes.iter().all(may)).collect()
 }
 

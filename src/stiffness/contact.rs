@@ -9,26 +9,31 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::boundary_conditions::base_facets;
-use crate::stiffness::fem_body::{Body, Facet, SIDE, sorted};
+use crate::stiffness::fem_body::{Body, ELEMENT_UNKNOWNS, Facet, sorted};
 use crate::stiffness::forward::{Problem, Tie};
 use crate::stiffness::law::Material;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, Side};
 
-/// Pressure for a penetration of one element's size, over the shear modulus of what is touched (of
-/// a press: the softest part).
-pub const STIFF: f64 = 50.0;
-/// Penetration over which a plate comes to its stiffness (parts of an element's size).
-const ONSET: f64 = 0.02;
-/// The last step of a solution (mm): what is left is about a tenth of it.
-const PRECISION: f64 = 1e-3;
-/// Times the softest modulus, beyond which a part is as good as rigid.
-const RIGID: f64 = 500.0;
-/// Part of the way between two depths below which no shorter step is tried.
-const SHORTEST: f64 = 0.05;
+/// Pressure for a penetration of one element's size over the shear modulus of what is touched (of a
+/// press: the softest part).
+pub const PENALTY_STIFFNESS: f64 = 50.0;
+/// Penetration over which a plate reaches its stiffness (parts of an element's size).
+const ONSET_FRACTION: f64 = 0.02;
+/// Continuation of a solution over the depth of the press.
+struct Continuation {
+    /// Last Newton step of a solution (mm): the error left is about a tenth of it.
+    tolerance_mm: f64,
+    /// Shortest step that is tried, over the way between two depths.
+    min_step_fraction: f64,
+}
 
-/// Points in a facet: three in each of its quarters.
-const POINTS: usize = 12;
+const CONTINUATION: Continuation = Continuation { tolerance_mm: 1e-3, min_step_fraction: 0.05 };
+
+/// Largest modulus over the softest: a part beyond it is as good as rigid.
+const MAX_MODULUS_RATIO: f64 = 500.0;
+/// Contact points of a facet: three in each of its quarters.
+const POINTS_PER_FACET: usize = 12;
 
 /// A facet that the plate may touch.
 #[derive(Debug, Clone)]
@@ -58,15 +63,15 @@ pub struct Plate {
 }
 
 /// The six shape functions at the points of a facet.
-fn shapes() -> [[f64; 6]; POINTS] {
+fn shapes() -> [[f64; 6]; POINTS_PER_FACET] {
     // Corners of the quarters.
-    const H: f64 = 0.5;
-    const E: [[f64; 3]; 6] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [H, H, 0.0], [0.0, H, H], [H, 0.0, H]];
+    const NODES: [[f64; 3]; 6] =
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]];
     const QUARTERS: [[usize; 3]; 4] = [[0, 3, 5], [1, 4, 3], [2, 5, 4], [3, 4, 5]];
     std::array::from_fn(|p| {
         let corners = QUARTERS[p / 3];
         let weight = |i: usize| if i == p % 3 { 2.0 / 3.0 } else { 1.0 / 6.0 };
-        let l: [f64; 3] = std::array::from_fn(|a| (0..3).map(|i| weight(i) * E[corners[i]][a]).sum());
+        let l: [f64; 3] = std::array::from_fn(|a| (0..3).map(|i| weight(i) * NODES[corners[i]][a]).sum());
         let corner = |a: usize| l[a] * (2.0 * l[a] - 1.0);
         [corner(0), corner(1), corner(2), 4.0 * l[0] * l[1], 4.0 * l[1] * l[2], 4.0 * l[2] * l[0]]
     })
@@ -84,12 +89,18 @@ impl Plate {
         let spot = |f: &Facet| {
             let cell = &body.cells[f.element as usize];
             let local = f.nodes.map(|n| cell.iter().position(|c| *c == n).unwrap_or(0));
-            Spot { element: f.element as usize, local, nodes: f.nodes, area: f.area / POINTS as f64 }
+            Spot { element: f.element as usize, local, nodes: f.nodes, area: f.area / POINTS_PER_FACET as f64 }
         };
         let spots = facets.filter(|f| dot(f.normal, outward) > 0.0).map(spot).collect();
         let size = body.element_size();
-        let mut out =
-            Self { outward, height: 0.0, tilt: [0.0; 3], stiffness: stiffness / size, onset: ONSET * size, spots };
+        let mut out = Self {
+            outward,
+            height: 0.0,
+            tilt: [0.0; 3],
+            stiffness: stiffness / size,
+            onset: ONSET_FRACTION * size,
+            spots,
+        };
         out.height = out.first_touch(body);
         out
     }
@@ -150,7 +161,7 @@ impl Plate {
     /// Adds what the plate pushes with to the residual.
     pub(super) fn push(&self, body: &Body, x: &[f64], residual: &mut [f64]) {
         self.touched(body, x, |spot, shape, [_, force, _]| {
-            let mut out = [0.0; SIDE];
+            let mut out = [0.0; ELEMENT_UNKNOWNS];
             for k in 0..6 {
                 (0..3).for_each(|a| out[3 * spot.local[k] + a] += force * shape[k] * self.outward[a]);
             }
@@ -161,10 +172,10 @@ impl Plate {
     /// Calls `add` with an element and what the plate adds to its tangent.
     pub(super) fn stiffen(&self, body: &Body, x: &[f64], mut add: impl FnMut(usize, &[f64])) {
         self.touched(body, x, |spot, shape, [_, _, slope]| {
-            let mut out = [0.0; SIDE * SIDE];
+            let mut out = [0.0; ELEMENT_UNKNOWNS * ELEMENT_UNKNOWNS];
             for (k, a) in (0..6).flat_map(|k| (0..3).map(move |a| (k, a))) {
                 for (m, b) in (0..6).flat_map(|m| (0..3).map(move |b| (m, b))) {
-                    out[(3 * spot.local[k] + a) * SIDE + 3 * spot.local[m] + b] +=
+                    out[(3 * spot.local[k] + a) * ELEMENT_UNKNOWNS + 3 * spot.local[m] + b] +=
                         slope * shape[k] * shape[m] * self.outward[a] * self.outward[b];
                 }
             }
@@ -237,12 +248,13 @@ impl Press<'_> {
     pub fn forces(&self, depths: &[f64], progress: &dyn Fn(f64)) -> Result<Vec<[f64; 2]>, StiffnessError> {
         let body = self.body;
         let softest = self.moduli.iter().copied().filter(|e| *e > 0.0).fold(f64::INFINITY, f64::min);
-        let of =
-            |r: usize| Material::of_youngs_modulus(self.moduli[r].clamp(softest, RIGID * softest), self.poisson[r]);
+        let of = |r: usize| {
+            Material::of_youngs_modulus(self.moduli[r].clamp(softest, MAX_MODULUS_RATIO * softest), self.poisson[r])
+        };
         let still = |&node: &u32| Tie { node, direction: None, target: [0.0; 3], strength: 1.0 };
         let materials: Vec<Material> = body.region.iter().map(|&r| of(usize::from(r))).collect();
         let least = materials.iter().map(|m| m.mu).fold(f64::INFINITY, f64::min);
-        let plate = Plate::touching(body, body.surface.iter(), self.outward, STIFF * least);
+        let plate = Plate::touching(body, body.surface.iter(), self.outward, PENALTY_STIFFNESS * least);
         let top = plate.height;
         let held = self.held.iter().map(still).collect();
         let mut problem = Problem { plate: Some(plate), ..Problem::new(body, Law::NeoHookean, materials, held) };
@@ -261,14 +273,14 @@ impl Press<'_> {
                 let ahead = before.as_ref().and_then(|(y, from)| {
                     let part = (next - reached) / (reached - from);
                     let ahead: Vec<f64> = x.iter().zip(y).map(|(x, y)| x + part * (x - y)).collect();
-                    lowered.near(&ahead, PRECISION).ok()
+                    lowered.near(&ahead, CONTINUATION.tolerance_mm).ok()
                 });
-                match ahead.map_or_else(|| lowered.near(&x, PRECISION), Ok) {
+                match ahead.map_or_else(|| lowered.near(&x, CONTINUATION.tolerance_mm), Ok) {
                     Ok(found) => {
                         before = Some((std::mem::replace(&mut x, found), reached));
                         reached = next;
                     }
-                    Err(error) if step < SHORTEST * whole => {
+                    Err(error) if step < CONTINUATION.min_step_fraction * whole => {
                         return if out.is_empty() { Err(error) } else { Ok(out) };
                     }
                     Err(_) => step *= 0.5,

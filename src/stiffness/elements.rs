@@ -8,13 +8,18 @@
 use crate::numerics::tetrahedron::{self, slopes};
 use crate::types::space::{cross, determinant, dot};
 
-const A: f64 = 0.585_410_196_624_968_5;
-const B: f64 = 0.138_196_601_125_010_5;
+/// (5 + 3 sqrt 5) / 20 and (5 - sqrt 5) / 20: barycentric coordinates of [`RULE`].
+const KEAST_A: f64 = 0.585_410_196_624_968_5;
+const KEAST_B: f64 = 0.138_196_601_125_010_5;
 
 /// Quadrature of degree 2: barycentric coordinates and weight (sum 1) of each of four points (Keast
 /// 1986).
-pub const RULE: [([f64; 4], f64); 4] =
-    [([A, B, B, B], 0.25), ([B, A, B, B], 0.25), ([B, B, A, B], 0.25), ([B, B, B, A], 0.25)];
+pub const RULE: [([f64; 4], f64); 4] = [
+    ([KEAST_A, KEAST_B, KEAST_B, KEAST_B], 0.25),
+    ([KEAST_B, KEAST_A, KEAST_B, KEAST_B], 0.25),
+    ([KEAST_B, KEAST_B, KEAST_A, KEAST_B], 0.25),
+    ([KEAST_B, KEAST_B, KEAST_B, KEAST_A], 0.25),
+];
 
 /// Gradients of the ten shape functions (1/mm) and the Jacobian determinant (mm^3) at `l` in the
 /// element of nodes `p` (mm).
@@ -117,7 +122,7 @@ impl Mapping {
                 return None;
             }
             // Each step squares what is left.
-            if step.iter().all(|v| v.abs() < SETTLED) {
+            if step.iter().all(|v| v.abs() < NEWTON_TOLERANCE) {
                 return Some([1.0 - l[0] - l[1] - l[2], l[0], l[1], l[2]]);
             }
         }
@@ -125,8 +130,8 @@ impl Mapping {
     }
 }
 
-/// Step (1) after which a place is known to about its square.
-const SETTLED: f64 = 1e-5;
+/// Newton step (barycentric coordinates) after which a place is known to about its square.
+const NEWTON_TOLERANCE: f64 = 1e-5;
 
 /// Rows of the inverse of the matrix of these columns; not finite where they lie in a plane.
 fn across(columns: &[[f64; 3]; 3]) -> [[f64; 3]; 3] {

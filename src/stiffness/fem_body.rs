@@ -13,12 +13,12 @@ use std::sync::Arc;
 
 /// Nodes of an element: ten with a displacement, four with a pressure.
 pub const ELEMENT_NODES: usize = 14;
-/// Unknowns of an element.
-pub const SIDE: usize = 34;
+/// Unknowns of an element: three displacements at each of ten nodes, a pressure at each of four.
+pub const ELEMENT_UNKNOWNS: usize = 34;
 
-/// Nodes of a mesh up to which a factor solves its equations. Iterations need less time and memory,
-/// but more time where a plate presses a curved body (docs/lab/2026-11-solver.md).
-pub const DIRECT: usize = 46_000;
+/// Most nodes of a mesh that is solved by factorisation: iterations need less memory, but more time
+/// for a plate on a curved body (docs/lab/2026-11-solver.md).
+pub const MAX_DIRECT_NODES: usize = 46_000;
 
 /// A triangle of the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,7 +96,7 @@ impl Body {
             volumes[r as usize] += q.iter().map(|p| p.weight).sum::<f64>();
         }
         let surface = surface(&cells, &places);
-        let large = places.len() > DIRECT;
+        let large = places.len() > MAX_DIRECT_NODES;
         let out =
             Self { places, cells, pressures, region, labels, quadrature, pattern, levels: None, surface, volumes };
         if large { out.iterated() } else { Ok(out) }
@@ -159,8 +159,8 @@ impl Body {
     }
 
     /// The unknowns of an element: thirty displacements, four pressures.
-    pub fn gather(&self, x: &[f64], e: usize) -> [f64; SIDE] {
-        let mut out = [0.0; SIDE];
+    pub fn gather(&self, x: &[f64], e: usize) -> [f64; ELEMENT_UNKNOWNS] {
+        let mut out = [0.0; ELEMENT_UNKNOWNS];
         for (i, &n) in self.cells[e].iter().enumerate() {
             let at = self.pattern.first(n);
             out[3 * i..3 * i + 3].copy_from_slice(&x[at..at + 3]);
@@ -172,7 +172,7 @@ impl Body {
     }
 
     /// Adds an element's vector to one of unknowns.
-    pub fn scatter(&self, x: &mut [f64], e: usize, values: &[f64; SIDE]) {
+    pub fn scatter(&self, x: &mut [f64], e: usize, values: &[f64; ELEMENT_UNKNOWNS]) {
         for (i, &n) in self.cells[e].iter().enumerate() {
             let at = self.pattern.first(n);
             for a in 0..3 {

@@ -7,7 +7,7 @@ use crate::stiffness::forward::Tie;
 use crate::stiffness::identify::{Setup, State};
 use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::observations::Observation;
-use crate::stiffness::summary::{BEARS, Hidden};
+use crate::stiffness::summary::{Hidden, MIN_LOAD_SHARE};
 use crate::stiffness::verdict::Misfit;
 use crate::types::stiffness::{Contact, LeftOver, Prescribed, RegionStiffness, StiffnessParams};
 use crate::types::{Displacement, Mask, Trust, Volume, WorldPoint};
@@ -97,13 +97,28 @@ pub fn prescribed(setup: &Setup<'_>, state: &State, touching: &[Option<&[u32]>])
     out
 }
 
-/// Excess of the whole force over its part across the plate that earns a warning.
-const LEANING: f64 = 0.01;
+/// What earns a warning.
+struct Warnings {
+    /// Excess of the whole force over its part across the plate.
+    leaning_force: f64,
+    /// Part of the surface on the volume's border.
+    cut_fraction: f64,
+    /// Held over loaded area, below which they may have been mistaken for each other.
+    area_ratio: f64,
+    /// Area beside a patch that moves with it over the patch's: the rim is known to a voxel.
+    beside_fraction: f64,
+    /// Thickness (voxels) below which a measured field does not resolve a region: two lattice
+    /// steps.
+    region_voxels: usize,
+}
+
+const WARN: Warnings =
+    Warnings { leaning_force: 0.01, cut_fraction: 0.02, area_ratio: 0.1, beside_fraction: 0.07, region_voxels: 8 };
 
 /// Says so where the plate also pushes the body sideways, so that it matters which force is known;
 /// `whole` is it over its part across the plate.
 pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
-    (whole > 1.0 + LEANING).then(|| {
+    (whole > 1.0 + WARN.leaning_force).then(|| {
         format!(
             "the plate pushes sideways as well: {force_n} N are taken for the whole force, of which {:.4} N act across the plate; if a load cell along \
              its axis read {force_n} N, moduli are {:.1} % higher",
@@ -163,18 +178,15 @@ pub fn one_map(is_affine: bool, regions: usize) -> Option<String> {
     })
 }
 
-/// Part of the surface that may lie on the volume's border without a warning.
-const CUT_OFF: f64 = 0.02;
-
 /// Says so where the body ends with the volume, away from the held and the loaded patch.
 fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
     let cut = level.patches.get(2)?;
     let (body, grid) = (&level.body, labels.grid());
-    let side = |&f: &usize| border_of(grid, body.surface[f].centre).map(|(a, last)| SIDES[a][usize::from(last)]);
+    let side = |&f: &usize| border_of(grid, body.surface[f].centre).map(|(a, last)| BORDER_NAMES[a][usize::from(last)]);
     let sides: BTreeSet<&str> = cut.facets.iter().filter_map(side).collect();
     let all: f64 = body.surface.iter().map(|f| f.area).sum();
     let part = cut.area(body) / all;
-    (part > CUT_OFF).then(|| {
+    (part > WARN.cut_fraction).then(|| {
         format!(
             "the body ends at the volume's border ({} along the voxels' axes, {:.0} % of its surface) and is taken to go on beyond: there \
              it moves as measured; if it does end there, leave a voxel of background around it",
@@ -184,8 +196,8 @@ fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
     })
 }
 
-/// The borders of a volume.
-const SIDES: [[&str; 2]; 3] = [["first x", "last x"], ["first y", "last y"], ["first z", "last z"]];
+/// Names of the borders of a volume, by axis.
+const BORDER_NAMES: [[&str; 2]; 3] = [["first x", "last x"], ["first y", "last y"], ["first z", "last z"]];
 
 /// How the sentence on a region without a modulus begins.
 pub fn not_determined(name: &str) -> String {
@@ -203,7 +215,7 @@ pub fn warnings(
 ) -> Vec<String> {
     let mut out = Vec::new();
     for (r, voxels) in regions.iter().filter(|r| r.identifiable).map(|r| (r, thickness(labels, r.label))) {
-        if voxels < RESOLVED {
+        if voxels < WARN.region_voxels {
             out.push(format!(
                 "{} is {voxels} voxels thick: a displacement measured from images does not resolve its strain, and its \
                  modulus may be off by far more than stated; trust it only where the displacement is known better",
@@ -227,7 +239,7 @@ pub fn warnings(
         out.push(format!("the loaded patch is small ({area:.1} mm^2), so absolute moduli hang on its edge"));
     }
     let areas = [0, 1].map(|p| level.patches[p].area(&level.body));
-    if areas[0] < SMALL * areas[1] {
+    if areas[0] < WARN.area_ratio * areas[1] {
         out.push(format!(
             "the body is held at {:.1} mm^2 and loaded at {:.0} mm^2: is it the other way round? --held and --load say which side is which",
             areas[0], areas[1]
@@ -235,7 +247,7 @@ pub fn warnings(
     }
     for (patch, which) in level.patches.iter().zip(["held", "loaded"]) {
         let part = patch.beside / patch.area(&level.body);
-        if part > BESIDE {
+        if part > WARN.beside_fraction {
             out.push(format!(
                 "the surface beside the {which} patch moves with it, over {:.0} mm^2 or {:.0} % of its area: if that is {which} \
                  as well, widen the mask; moduli come out wrong otherwise",
@@ -263,7 +275,7 @@ pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usiz
     let one = |h: &Hidden| {
         let name = regions.iter().find(|r| r.label == h.label).map_or("a region", |r| &r.name);
         let why = match h.share {
-            share if share < BEARS => "it bears next to nothing of the load".to_string(),
+            share if share < MIN_LOAD_SHARE => "it bears next to nothing of the load".to_string(),
             _ => format!(
                 "it lies beside what else bears the load and gives way with it, so only their mean is known; label it together with {}",
                 regions[reference].name
@@ -276,15 +288,6 @@ pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usiz
     };
     hidden.iter().map(one).collect()
 }
-
-/// Held over loaded area below which it is asked whether they were mistaken for each other.
-const SMALL: f64 = 0.1;
-/// Part of a patch's area that may move with it beside it without a warning: its rim is known to a
-/// voxel.
-const BESIDE: f64 = 0.07;
-/// Thickness (voxels) from which a field measured from images resolves a region: two of its
-/// lattice's steps.
-const RESOLVED: usize = 8;
 
 /// Thickness of a region where it is thickest (voxels): of each of its voxels the shortest run
 /// through it along an axis of the grid.

@@ -8,26 +8,31 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::contact::Plate;
-use crate::stiffness::fem_body::{Body, SIDE};
+use crate::stiffness::fem_body::{Body, ELEMENT_UNKNOWNS};
 use crate::stiffness::law::{Material, residual, residual_by_modulus, tangent};
 use crate::stiffness::tangent::{Matrix, Tangent};
 use crate::types::stiffness::Law;
 use rayon::prelude::*;
 
 /// Stiffness of a tie over that of the tissue around it.
-const TIE: f64 = 1e6;
-/// Newton steps at most for one load.
-const STEPS: usize = 25;
-/// A tangent is kept while a step is at most this part of the one before.
-const CONTRACTS: f64 = 0.4;
-/// A tangent serves for derivatives at a solution this part of the largest displacement away: about
-/// their relative error.
-const STALE: f64 = 0.01;
-/// At a solution this part of the largest displacement away its factor still refines solutions of
-/// the tangent there quickly.
-const NEAR: f64 = 0.2;
+const TIE_STIFFNESS_RATIO: f64 = 1e6;
+/// Most Newton steps for one load.
+const MAX_NEWTON_STEPS: usize = 25;
+/// How long a tangent is kept; distances are from a solution, over the largest displacement.
+struct TangentReuse {
+    /// Largest step over the one before.
+    max_contraction: f64,
+    /// Distance up to which it serves for derivatives: about their relative error.
+    derivative_distance: f64,
+    /// Distance up to which its factor still refines solutions quickly.
+    refinable_distance: f64,
+}
+
+const TANGENT_REUSE: TangentReuse =
+    TangentReuse { max_contraction: 0.4, derivative_distance: 0.01, refinable_distance: 0.2 };
+
 /// Elements computed together.
-const CHUNK: usize = 256;
+const ELEMENTS_PER_CHUNK: usize = 256;
 
 /// A node whose displacement is prescribed along a direction, or wholly.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,7 +89,7 @@ impl<'a> Problem<'a> {
     pub fn new(body: &'a Body, law: Law, materials: Vec<Material>, ties: Vec<Tie>) -> Self {
         let mut springs = vec![0.0f64; body.places.len()];
         for (cell, material) in body.cells.iter().zip(&materials) {
-            let spring = TIE * material.mu * body.element_size();
+            let spring = TIE_STIFFNESS_RATIO * material.mu * body.element_size();
             cell.iter().for_each(|&n| springs[n as usize] = springs[n as usize].max(spring));
         }
         Self { body, law, materials, ties, springs, plate: None }
@@ -120,8 +125,8 @@ impl<'a> Problem<'a> {
         let mut out = vec![0.0; body.pattern.unknowns()];
         let one = |e: usize| residual(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e));
         let count = body.cells.len();
-        for start in (0..count).step_by(16 * CHUNK) {
-            let part: Vec<_> = (start..(start + 16 * CHUNK).min(count)).into_par_iter().map(one).collect();
+        for start in (0..count).step_by(16 * ELEMENTS_PER_CHUNK) {
+            let part: Vec<_> = (start..(start + 16 * ELEMENTS_PER_CHUNK).min(count)).into_par_iter().map(one).collect();
             for (e, r) in part.into_iter().enumerate() {
                 body.scatter(&mut out, start + e, &r?);
             }
@@ -148,8 +153,8 @@ impl<'a> Problem<'a> {
         let one = |&e: &usize| {
             residual_by_modulus(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e)).map(|r| (e, r))
         };
-        for part in chosen.chunks(16 * CHUNK) {
-            let done: Option<Vec<(usize, [f64; SIDE])>> = part.par_iter().map(one).collect();
+        for part in chosen.chunks(16 * ELEMENTS_PER_CHUNK) {
+            let done: Option<Vec<(usize, [f64; ELEMENT_UNKNOWNS])>> = part.par_iter().map(one).collect();
             for (e, r) in done.ok_or(StiffnessError::InsideOut)? {
                 body.scatter(&mut out, e, &r);
             }
@@ -161,14 +166,15 @@ impl<'a> Problem<'a> {
     fn tangent(&self, x: &[f64]) -> Option<Matrix> {
         let body = self.body;
         let mut values = body.pattern.zeros();
-        let mut levels = body.levels.as_ref().map(|l| (l, l.zeros(self.springs.iter().map(|k| k / TIE).collect())));
+        let mut levels =
+            body.levels.as_ref().map(|l| (l, l.zeros(self.springs.iter().map(|k| k / TIE_STIFFNESS_RATIO).collect())));
         let one = |e: usize| tangent(self.law, &body.quadrature[e], self.materials[e], &body.gather(x, e));
         let count = body.cells.len();
-        for start in (0..count).step_by(CHUNK) {
-            let part: Vec<_> = (start..(start + CHUNK).min(count)).into_par_iter().map(one).collect();
+        for start in (0..count).step_by(ELEMENTS_PER_CHUNK) {
+            let part: Vec<_> = (start..(start + ELEMENTS_PER_CHUNK).min(count)).into_par_iter().map(one).collect();
             for (e, k) in part.into_iter().enumerate() {
                 let (e, k) = (start + e, k?);
-                body.pattern.add(&mut values, e, &k[..], SIDE);
+                body.pattern.add(&mut values, e, &k[..], ELEMENT_UNKNOWNS);
                 if let Some((mesh, levels)) = &mut levels {
                     mesh.add(levels, e, &k[..], self.materials[e].poisson);
                 }
@@ -185,7 +191,7 @@ impl<'a> Problem<'a> {
         }
         if let Some(plate) = &self.plate {
             plate.stiffen(body, x, |e, k| {
-                body.pattern.add(&mut values, e, k, SIDE);
+                body.pattern.add(&mut values, e, k, ELEMENT_UNKNOWNS);
                 if let Some((mesh, levels)) = &mut levels {
                     mesh.add(levels, e, k, 0.0);
                 }
@@ -211,7 +217,7 @@ impl<'a> Problem<'a> {
     /// # Errors
     /// [`StiffnessError`] when no equilibrium is found.
     pub fn solve(&self, start: Option<&[f64]>, precision: f64) -> Result<Solution<'a>, StiffnessError> {
-        self.reach(start, precision, STALE)
+        self.reach(start, precision, TANGENT_REUSE.derivative_distance)
     }
 
     /// As [`Self::solve`], without a tangent for derivatives.
@@ -283,7 +289,7 @@ impl<'a> Problem<'a> {
     /// method); none where these do not contract. `precision` (mm) ends it.
     pub fn solve_near(&self, start: &[f64], factor: &Tangent<'_>, precision: f64) -> Option<Vec<f64>> {
         let (mut x, mut last) = (start.to_vec(), f64::INFINITY);
-        for _ in 0..STEPS {
+        for _ in 0..MAX_NEWTON_STEPS {
             let mut step = self.residual(&x)?;
             step.iter_mut().for_each(|v| *v = -*v);
             factor.step(&mut step).ok()?;
@@ -313,7 +319,7 @@ impl<'a> Problem<'a> {
         let (mut factorisations, mut last, mut fresh) = (1, f64::INFINITY, true);
         // Since the tangent, and since its factor was made as a whole.
         let (mut moved, mut far) = (0.0, 0.0);
-        for steps in 1..=STEPS {
+        for steps in 1..=MAX_NEWTON_STEPS {
             let Some(tangent) = &mut factor else { break };
             let mut step = self.residual(&x).ok_or(StiffnessError::InsideOut)?;
             step.iter_mut().for_each(|v| *v = -*v);
@@ -339,12 +345,13 @@ impl<'a> Problem<'a> {
                 break;
             }
             // Where a contact changes, yesterday's tangent leads astray.
-            let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > CONTRACTS * last);
+            let slow = part < 1.0 || self.plate.is_some() || (!fresh && size > TANGENT_REUSE.max_contraction * last);
             let stale = moved > stale * self.size(&x);
             fresh = if done { stale } else { slow };
             if fresh {
                 // Another contact is another matrix, except where it alone is worked out anew.
-                let near = far < NEAR * self.size(&x) && (done || self.body.pattern.renews());
+                let near =
+                    far < TANGENT_REUSE.refinable_distance * self.size(&x) && (done || self.body.pattern.renews());
                 let matrix = self.tangent(&x).ok_or(StiffnessError::InsideOut)?;
                 let renewed = factor.map(|f| f.renewed(self.body, matrix, near)).transpose();
                 factor = renewed.map_err(|_| StiffnessError::Unsolvable)?;

@@ -17,34 +17,46 @@ use crate::numerics::cholesky::within;
 use crate::stiffness::border::Border;
 use crate::stiffness::fem_body::Body;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
-use crate::stiffness::inclusion::{Inclusion, SHAPES};
+use crate::stiffness::inclusion::{Inclusion, SHAPE_FUNCTIONS};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::observations::{find, read};
 use crate::stiffness::punch_edge::Edge;
 use crate::stiffness::systematic_error::Fit;
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
-/// One standard deviation of a flat face (voxels): uniform over one voxel.
-const FACE: f64 = 0.288_675;
-/// One standard deviation of the edge of a punch (voxels).
-const EDGE: f64 = 3.0;
-/// The most standard deviations that an offset may come to.
-const MOST: f64 = 3.5;
-/// The same of the walls of a hole: a channel of 12 by 10 voxels came to 1.5 voxels.
-const MOST_OF_WALLS: f64 = 6.0;
-/// One standard deviation with which a mesh keeps to a flat interface (voxels): surfaces are moved
-/// by hundredths until volumes agree.
-const MESHED: f64 = 0.02;
+/// Prior of the offsets of surfaces.
+struct OffsetPrior {
+    /// Standard deviation of a flat face (voxels): uniform over one voxel, 1 / sqrt(12) rounded.
+    face_sd_voxels: f64,
+    /// Standard deviation of the edge of a punch (voxels).
+    punch_edge_sd_voxels: f64,
+    /// Largest offset (standard deviations).
+    max_sd: f64,
+    /// The same for the walls of a hole: a channel of 12 by 10 voxels reached 1.5 voxels.
+    max_wall_sd: f64,
+}
+
+const PRIOR: OffsetPrior =
+    OffsetPrior { face_sd_voxels: 0.288_675, punch_edge_sd_voxels: 3.0, max_sd: 3.5, max_wall_sd: 6.0 };
+
+/// Standard deviation of a mesh about a flat interface (voxels): calibration of the volumes moves
+/// surfaces by hundredths.
+const MESH_FACE_SD_VOXELS: f64 = 0.02;
 /// Least part of the box's face that a flat face fills.
-const FLAT: f64 = 0.2;
+const MIN_BOX_FACE_FRACTION: f64 = 0.2;
 /// Power of the distance from the middle with which an offset fades inwards: the outermost tenth
 /// moves by two thirds or more.
-const FADE: i32 = 4;
-/// Offsets over which a derivative is taken (voxels): the next one where the one before has no
-/// equilibrium.
-const STEPS: [f64; 2] = [FACE, 0.25 * FACE];
-/// Precision of the solutions (mm).
-const PRECISION: f64 = 1e-6;
+const FADE_EXPONENT: i32 = 4;
+/// Finite differences of solutions by an offset.
+struct Derivative {
+    /// Offsets (voxels); the second one where the first has no equilibrium.
+    steps_voxels: [f64; 2],
+    /// Tolerance of the solutions (mm).
+    tolerance_mm: f64,
+}
+
+const DERIVATIVE: Derivative =
+    Derivative { steps_voxels: [PRIOR.face_sd_voxels, 0.25 * PRIOR.face_sd_voxels], tolerance_mm: 1e-6 };
 
 /// A part of the body's shape that is known to a part of a voxel only.
 #[derive(Debug, Clone)]
@@ -62,14 +74,14 @@ pub struct Part {
 impl Part {
     /// The edge of a punch.
     pub fn edge(edge: &Edge, body: &Body, voxel: f64) -> Self {
-        Self::of(body, Some("edge".into()), EDGE, |p| edge.widened(p, voxel))
+        Self::of(body, Some("edge".into()), PRIOR.punch_edge_sd_voxels, |p| edge.widened(p, voxel))
     }
 
     /// The border between two labels, which moves along its normal as `border` says; `sigma` in
     /// voxels.
     pub fn border(border: Border, sigma: f64, voxel: f64) -> Self {
         let movement = border.normals.iter().map(|n| n.map(|v| voxel * v)).collect();
-        Self { name: Some(border.name), sigma, most: MOST, movement }
+        Self { name: Some(border.name), sigma, most: PRIOR.max_sd, movement }
     }
 
     /// A flat face of the box of the body: voxel axis, and whether it is the upper one.
@@ -77,12 +89,12 @@ impl Part {
         let name = format!("{}{axis}", if upper { '+' } else { '-' });
         let [low, high] = bounds(body, grid);
         let middle = 0.5 * (low[axis] + high[axis]);
-        Self::of(body, Some(name), FACE, |p| {
+        Self::of(body, Some(name), PRIOR.face_sd_voxels, |p| {
             let mut q = grid.affine().to_voxel(WorldPoint(p)).0;
             let part = (q[axis] - middle) / (high[axis] - middle);
             let part = if upper { part } else { -part };
             if part > 0.0 {
-                q[axis] += if upper { 1.0 } else { -1.0 } * part.powi(FADE);
+                q[axis] += if upper { 1.0 } else { -1.0 } * part.powi(FADE_EXPONENT);
             }
             grid.affine().to_world(VoxelPoint(q)).0
         })
@@ -91,8 +103,8 @@ impl Part {
     /// A flat border between two labels, or the wall of a hole. The mesh rounds the edges in which
     /// the walls of a hole meet, and the walls answer for that as well.
     fn interface(interface: &Interface, body: &Body, grid: &Grid) -> Self {
-        let part = Self::of(body, Some(interface.name()), FACE, |p| interface.moved(p, grid, 1.0));
-        Self { most: if interface.is_wall() { MOST_OF_WALLS } else { MOST }, ..part }
+        let part = Self::of(body, Some(interface.name()), PRIOR.face_sd_voxels, |p| interface.moved(p, grid, 1.0));
+        Self { most: if interface.is_wall() { PRIOR.max_wall_sd } else { PRIOR.max_sd }, ..part }
     }
 
     /// The shapes of a region that was found without labels.
@@ -100,9 +112,9 @@ impl Part {
         let shapes = inclusion.shapes(&body.places);
         let one = |k: usize| {
             let movement = shapes.iter().map(|s| s[k].map(|v| voxel * v)).collect();
-            Self { name: None, sigma: inclusion.prior() / voxel, most: MOST, movement }
+            Self { name: None, sigma: inclusion.prior() / voxel, most: PRIOR.max_sd, movement }
         };
-        (0..SHAPES).map(one).collect()
+        (0..SHAPE_FUNCTIONS).map(one).collect()
     }
 
     fn of(body: &Body, name: Option<String>, sigma: f64, moved: impl Fn([f64; 3]) -> [f64; 3]) -> Self {
@@ -110,7 +122,7 @@ impl Part {
             let q = moved(*p);
             std::array::from_fn(|a| q[a] - p[a])
         };
-        Self { name, sigma, most: MOST, movement: body.places.iter().map(one).collect() }
+        Self { name, sigma, most: PRIOR.max_sd, movement: body.places.iter().map(one).collect() }
     }
 
     /// The penalty of an offset (voxels) under its prior: squared standard deviations.
@@ -223,12 +235,12 @@ fn columns(
     let factor = setup.problem(&estimate.state).factorise(x)?;
     let (mut rows, mut force_slope) = (Vec::new(), Vec::new());
     for (part, _) in parts {
-        let column = STEPS.into_iter().find_map(|by| {
+        let column = DERIVATIVE.steps_voxels.into_iter().find_map(|by| {
             let body = part.moved(setup.body, by);
             let moved = Setup { body: &body, ..setup.clone() };
             let problem = moved.problem(&estimate.state);
-            let near = problem.solve_near(x, &factor, PRECISION);
-            let y = near.or_else(|| problem.solve(Some(x), PRECISION).ok().map(|s| s.x))?;
+            let near = problem.solve_near(x, &factor, DERIVATIVE.tolerance_mm);
+            let y = near.or_else(|| problem.solve(Some(x), DERIVATIVE.tolerance_mm).ok().map(|s| s.x))?;
             let found = find(&body, &places);
             let column = before.iter().zip(&found).map(|(before, now)| match (before, now) {
                 (Some(before), Some(now)) => {
@@ -254,7 +266,8 @@ fn columns(
 pub fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f64> {
     let mut out = by_data.clone();
     for k in first..p {
-        let follows: Vec<f64> = (0..p).map(|i| MESHED * voxel * by_data[i * p + k] / by_data[k * p + k]).collect();
+        let follows: Vec<f64> =
+            (0..p).map(|i| MESH_FACE_SD_VOXELS * voxel * by_data[i * p + k] / by_data[k * p + k]).collect();
         out.iter_mut().enumerate().for_each(|(at, v)| *v += follows[at / p] * follows[at % p]);
     }
     out
@@ -313,7 +326,8 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
     Ok(Some(Geometry { faces, shapes, step, covariance, force_slope, fit }))
 }
 
-/// Box faces (voxel axis, positive side) that the surface fills by [`FLAT`] or more.
+/// Box faces (voxel axis, positive side) that the surface fills by [`MIN_BOX_FACE_FRACTION`] or
+/// more.
 fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part> {
     let voxel = |p: [f64; 3]| grid.affine().to_voxel(WorldPoint(p)).0;
     let [low, high] = bounds(body, grid);
@@ -326,7 +340,7 @@ fn flat_faces(body: &Body, grid: &Grid) -> Vec<Part> {
             let end = if positive { high[axis] } else { low[axis] };
             let on = |n: &u32| (voxel(body.places[*n as usize])[axis] - end).abs() < 0.3;
             let flat: f64 = body.surface.iter().filter(|f| f.nodes[..3].iter().all(on)).map(|f| f.area).sum();
-            if flat > FLAT * area {
+            if flat > MIN_BOX_FACE_FRACTION * area {
                 out.push(Part::face(body, grid, axis, positive));
             }
         }

@@ -18,36 +18,48 @@ use crate::stiffness::tangent::Tangent;
 use crate::types::space::{dot, length};
 use crate::types::stiffness::{Contact, Law};
 
-/// Steps below this (in ln E, and of the plates over their travel) are taken to first order: what
-/// that leaves out is 0.1 %.
-const FIRST_ORDER: f64 = 0.03;
-/// A tangent serves while no ln mu changes by more than this: about the relative error of the
-/// sensitivities.
-const SAME_TANGENT: f64 = 0.05;
-/// Under the linear law its factor still refines solutions, and what it serves for is exact.
-const NEAR_TANGENT: f64 = 0.2;
-/// Steps that would lower the squares by less than this part of them are not worth a solution:
-/// about a third of a standard deviation. What the data hardly see (a rigid region) would else
-/// wander on.
-const SPENT: f64 = 1e-4;
-/// Largest change of ln mu in one step (contrasts of 0.02 to 600 converged from 1, in fewer steps
-/// than with half of it).
-const LONGEST: f64 = 3.0;
-/// Where a modulus still changes by more than this (ln mu) a forward solution need not be better
-/// than [`ROUGH`] times its precision.
-const FAR: f64 = 0.3;
-/// See [`FAR`].
-const ROUGH: f64 = 30.0;
-/// Bound of |ln(mu / mu_reference)| (200): beyond, a region is as good as rigid or empty.
-const BOUND: f64 = 5.3;
-/// Huber's constant (Huber 1981: 95 % efficiency for normal errors), times the root mean square
-/// length of three components.
-const HUBER: f64 = 1.345;
-/// Standard deviation of the prior of ln mu: weak, it only keeps what the data do not see from
-/// wandering.
-const PRIOR: f64 = 5.0;
-/// Blocks that the body is cut into for the covariance.
-const BLOCKS: f64 = 160.0;
+/// Iteration control of the identification; moduli in ln E or ln mu.
+struct StepControl {
+    /// Largest step (and plate motion over its travel) that is taken to first order: that omits
+    /// 0.1 %.
+    max_linear: f64,
+    /// Largest change of a modulus with which a tangent serves: about the relative error of
+    /// sensitivities.
+    same_tangent: f64,
+    /// The same under the linear law, where the tangent's factor only refines exact solutions.
+    linear_tangent: f64,
+    /// Least relative reduction of the squares (a third of a standard deviation): otherwise moduli
+    /// that the data do not determine drift.
+    min_gain: f64,
+    /// Largest change of a modulus in one step: contrasts of 0.02 to 600 converged from 1, in fewer
+    /// steps than with half of it.
+    max_change: f64,
+    /// Change of a modulus beyond which forward solutions may be coarse.
+    coarse_change: f64,
+    /// Tolerance of a coarse forward solution over the final one.
+    coarse_tolerance_ratio: f64,
+    /// Largest contrast to the reference (ln 200): a region beyond is as good as rigid or empty.
+    max_log_contrast: f64,
+}
+
+const STEP: StepControl = StepControl {
+    max_linear: 0.03,
+    same_tangent: 0.05,
+    linear_tangent: 0.2,
+    min_gain: 1e-4,
+    max_change: 3.0,
+    coarse_change: 0.3,
+    coarse_tolerance_ratio: 30.0,
+    max_log_contrast: 5.3,
+};
+
+/// Huber's constant (Huber 1981: 95 % efficiency for normal errors), in root mean square lengths of
+/// three components.
+const HUBER_THRESHOLD: f64 = 1.345;
+/// Prior standard deviation of ln mu: weak, it only holds moduli that the data do not determine.
+const PRIOR_SD_LN: f64 = 5.0;
+/// Blocks of the body over which the covariance sums residuals.
+const COVARIANCE_BLOCKS: f64 = 160.0;
 /// Median length of a vector of three independent unit normal numbers.
 const MAXWELL_MEDIAN: f64 = 1.538;
 
@@ -290,7 +302,7 @@ impl Setup<'_> {
     }
 
     pub(super) fn weights(&self, residuals: &[[f64; 3]], scale: f64) -> Vec<f64> {
-        let limit = HUBER * scale * 3f64.sqrt();
+        let limit = HUBER_THRESHOLD * scale * 3f64.sqrt();
         let one = |(r, o): (&[f64; 3], &Observation)| {
             let size = dot(*r, *r).sqrt() / o.sigma;
             let huber = if size > limit { limit / size } else { 1.0 };
@@ -304,7 +316,7 @@ impl Setup<'_> {
     }
 
     pub(super) fn prior(&self, state: &State) -> f64 {
-        let moduli: f64 = self.free().iter().map(|&r| (state.theta[r] / PRIOR).powi(2)).sum();
+        let moduli: f64 = self.free().iter().map(|&r| (state.theta[r] / PRIOR_SD_LN).powi(2)).sum();
         let plates: f64 = state.plates.iter().flatten().map(|c| (c / self.plate_prior).powi(2)).sum();
         moduli + plates
     }
@@ -320,7 +332,7 @@ impl Setup<'_> {
         let mut state = start;
         self.pinned.iter().for_each(|&(r, value)| state.theta[r] = value);
         let mut factorisations = 0;
-        let first = if state.x.is_none() { ROUGH * precision } else { precision };
+        let first = if state.x.is_none() { STEP.coarse_tolerance_ratio * precision } else { precision };
         let (mut problem, mut solution) = self.solve(&state, first)?;
         factorisations += solution.factorisations;
         let mut residuals = self.residuals(&solution.x);
@@ -346,7 +358,7 @@ impl Setup<'_> {
             let longest = step[..free.len()].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
             let mut part = 1.0;
             let plates = step[free.len()..].iter().fold(0.0, |m: f64, v| m.max(v.abs()));
-            if longest < FIRST_ORDER && plates < FIRST_ORDER * self.travel() {
+            if longest < STEP.max_linear && plates < STEP.max_linear * self.travel() {
                 let end = self.advanced(&state, &x, &columns, &step);
                 if problem.plate.is_some() {
                     // A contact is stiff: what is left out would show as a force.
@@ -366,7 +378,7 @@ impl Setup<'_> {
             }
             // What the step would still gain, to first order.
             let gain = (0..parameters).map(|k| step[k] * slope[k]).sum::<f64>();
-            if iterations > most || gain < SPENT * self.squares(&residuals, &weights) / variance {
+            if iterations > most || gain < STEP.min_gain * self.squares(&residuals, &weights) / variance {
                 state.x = Some(x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             }
@@ -378,8 +390,9 @@ impl Setup<'_> {
                 let change = trial.theta.iter().zip(&factorised).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 // A factor that is not good enough goes before the next one is made: two take twice
                 // the memory.
-                tangent.take_if(|_| change > if problem.is_linear() { NEAR_TANGENT } else { SAME_TANGENT });
-                let precision = if change > FAR { ROUGH * precision } else { precision };
+                tangent.take_if(|_| change > if problem.is_linear() { STEP.linear_tangent } else { STEP.same_tangent });
+                let precision =
+                    if change > STEP.coarse_change { STEP.coarse_tolerance_ratio * precision } else { precision };
                 if let Ok((p, s)) = self.follow(&trial, tangent.take(), problem.springs.clone(), precision) {
                     factorisations += s.factorisations;
                     if s.factorisations > 0 {
@@ -398,7 +411,7 @@ impl Setup<'_> {
                 state.x = Some(x);
                 return self.finish(state, &problem, columns, residuals, iterations, factorisations);
             };
-            let stalled = after > before * (1.0 - SPENT);
+            let stalled = after > before * (1.0 - STEP.min_gain);
             (state, problem, solution, residuals) = (trial, p, s, rest);
             if stalled {
                 let columns = self.sensitivities(&problem, &solution, Some(columns))?;
@@ -451,7 +464,8 @@ impl Setup<'_> {
         let mut out = State { x: None, ..state.clone() };
         let mut values = step.iter().copied();
         for r in self.free() {
-            out.theta[r] = (out.theta[r] + values.next().unwrap_or(0.0)).clamp(-BOUND, BOUND);
+            out.theta[r] =
+                (out.theta[r] + values.next().unwrap_or(0.0)).clamp(-STEP.max_log_contrast, STEP.max_log_contrast);
         }
         out.plates.iter_mut().flatten().for_each(|c| *c += values.next().unwrap_or(0.0));
         let mut x = x.to_vec();
@@ -470,7 +484,7 @@ impl Setup<'_> {
 
     /// 1 / variance and present distance of each parameter's prior.
     pub fn prior_terms(&self, state: &State) -> Vec<(f64, f64)> {
-        let moduli = self.free().into_iter().map(|r| (PRIOR.powi(-2), state.theta[r]));
+        let moduli = self.free().into_iter().map(|r| (PRIOR_SD_LN.powi(-2), state.theta[r]));
         let plates = state.plates.iter().flatten().map(|&c| (self.plate_prior.powi(-2), c));
         moduli.chain(plates).collect()
     }
@@ -479,7 +493,10 @@ impl Setup<'_> {
     fn room(&self, state: &State) -> Vec<[f64; 2]> {
         let moduli = self.free().into_iter().map(|r| {
             let at = state.theta[r];
-            [(-BOUND - at).clamp(-LONGEST, 0.0), (BOUND - at).clamp(0.0, LONGEST)]
+            [
+                (-STEP.max_log_contrast - at).clamp(-STEP.max_change, 0.0),
+                (STEP.max_log_contrast - at).clamp(0.0, STEP.max_change),
+            ]
         });
         let plates = state.plates.iter().flatten().map(|_| [f64::NEG_INFINITY, f64::INFINITY]);
         moduli.chain(plates).collect()
@@ -660,7 +677,7 @@ fn grouped(observations: &[Observation]) -> Vec<Vec<u32>> {
         }
     }
     let volume: f64 = (0..3).map(|a| (high[a] - low[a]).max(1e-3)).product();
-    let size = (volume / BLOCKS).cbrt();
+    let size = (volume / COVARIANCE_BLOCKS).cbrt();
     let count: [usize; 3] = std::array::from_fn(|a| ((high[a] - low[a]) / size) as usize + 1);
     let mut out = vec![Vec::new(); count.iter().product()];
     for (i, o) in observations.iter().enumerate() {

@@ -13,26 +13,29 @@ use crate::types::space::{dot, length};
 use crate::types::{Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
-/// Functions of the direction.
-pub const SHAPES: usize = 9;
-/// One standard deviation of each offset before anything is known (parts of the radius).
-const PRIOR: f64 = 0.25;
-/// Least distance (voxels) from another region, and from the surface of the body for a region
-/// inside it.
-const CLEAR: f64 = 2.0;
-/// Part of the reach that all offsets together may move the surface by at once: beyond, what is
-/// around it would fold.
-const ONCE: f64 = 0.4;
-/// Smoothing before a region is drawn anew (voxels): takes out stairs, and moves the surface of a
-/// ball of 14 voxels by 0.02.
-const SMOOTHED: f64 = 0.7;
-/// Faces of voxels whose mean is the normal without the stairs.
-const FACES: usize = 32;
-/// The same where the edges of a surface shall not be rounded.
-const FEW: usize = 9;
-/// Length of a mean of normals below which a surface has an edge there, and above which it has
-/// none.
-const SHARP: [f64; 2] = [0.85, 0.95];
+/// Functions of the direction that describe a shape.
+pub const SHAPE_FUNCTIONS: usize = 9;
+/// Prior standard deviation of each offset (radii).
+const PRIOR_SD_RADII: f64 = 0.25;
+/// Least distance (voxels) from another region, and from the body's surface for a region inside it.
+const MIN_CLEARANCE_VOXELS: f64 = 2.0;
+/// Largest move of the surface at once, as a part of the reach: a larger one folds the tissue
+/// around.
+const MAX_MOVE_FRACTION: f64 = 0.4;
+/// Smoothing before a region is redrawn (voxels): removes stairs, and moves the surface of a ball
+/// of 14 voxels by 0.02.
+const SMOOTHING_VOXELS: f64 = 0.7;
+/// How normals of a voxel surface are estimated.
+struct SurfaceNormals {
+    /// Voxel faces whose mean is the normal without the stairs.
+    faces: usize,
+    /// The same where the edges of a surface shall not be rounded.
+    sharp_faces: usize,
+    /// Length of a mean of normals below which a surface has an edge, and above which it has none.
+    edge_lengths: [f64; 2],
+}
+
+const NORMALS: SurfaceNormals = SurfaceNormals { faces: 32, sharp_faces: 9, edge_lengths: [0.85, 0.95] };
 
 fn apart(p: [f64; 3], q: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|a| p[a] - q[a])
@@ -65,7 +68,7 @@ impl Sheet {
 
     /// Distance (mm) of a place, and the mean of the normals nearest to it: as long as they agree.
     fn at(&self, p: [f64; 3]) -> (f64, [f64; 3]) {
-        self.around(p, FACES)
+        self.around(p, NORMALS.faces)
     }
 
     fn around(&self, p: [f64; 3], faces: usize) -> (f64, [f64; 3]) {
@@ -149,22 +152,31 @@ impl Inclusion {
                 }
             }
         }
-        if surface.len() < FACES {
+        if surface.len() < NORMALS.faces {
             return None;
         }
         let middle = sum.map(|s| s / count as f64);
         let volume = count as f64 * grid.spacing().iter().product::<f64>();
         let radius = (0.75 * volume / std::f64::consts::PI).cbrt();
         let voxel = grid.least_spacing();
-        let surface = Sheet::new(&surface, FACES);
+        let surface = Sheet::new(&surface, NORMALS.faces);
         let clear = |p: &[f64; 3]| surface.around(*p, 1).0;
         let within = skin.par_iter().map(|f| clear(&f.0)).reduce(|| f64::INFINITY, f64::min);
         let beside = others.par_iter().map(clear).reduce(|| f64::INFINITY, f64::min);
-        let open = within <= CLEAR * voxel;
+        let open = within <= MIN_CLEARANCE_VOXELS * voxel;
         let reach = radius.min(beside).min(if open { f64::INFINITY } else { within });
-        let skin = open.then(|| Sheet::new(&skin, FEW));
+        let skin = open.then(|| Sheet::new(&skin, NORMALS.sharp_faces));
         let furthest = surface.places.iter().map(|p| length(apart(*p, middle))).fold(0.0, f64::max);
-        (beside > CLEAR * voxel).then_some(Self { label, middle, radius, reach, furthest, voxel, surface, skin })
+        (beside > MIN_CLEARANCE_VOXELS * voxel).then_some(Self {
+            label,
+            middle,
+            radius,
+            reach,
+            furthest,
+            voxel,
+            surface,
+            skin,
+        })
     }
 
     /// Its label.
@@ -174,23 +186,23 @@ impl Inclusion {
 
     /// One standard deviation of each offset before anything is known (mm).
     pub fn prior(&self) -> f64 {
-        PRIOR * self.radius
+        PRIOR_SD_RADII * self.radius
     }
 
     /// How far each place (mm, RAS) moves (mm) for a unit of each offset.
-    pub fn shapes(&self, places: &[[f64; 3]]) -> Vec<[[f64; 3]; SHAPES]> {
+    pub fn shapes(&self, places: &[[f64; 3]]) -> Vec<[[f64; 3]; SHAPE_FUNCTIONS]> {
         places.par_iter().map(|p| self.shape(*p)).collect()
     }
 
-    fn shape(&self, p: [f64; 3]) -> [[f64; 3]; SHAPES] {
+    fn shape(&self, p: [f64; 3]) -> [[f64; 3]; SHAPE_FUNCTIONS] {
         let d = apart(p, self.middle);
         let from_middle = length(d);
         if from_middle < 1e-9 || from_middle > self.furthest + self.reach {
-            return [[0.0; 3]; SHAPES];
+            return [[0.0; 3]; SHAPE_FUNCTIONS];
         }
         let (distance, normal) = self.surface.at(p);
         if distance >= self.reach {
-            return [[0.0; 3]; SHAPES];
+            return [[0.0; 3]; SHAPE_FUNCTIONS];
         }
         let rest = (1.0 - (distance / self.reach).powi(2)).powi(2);
         let mut step = normal.map(|v| rest * v);
@@ -198,7 +210,8 @@ impl Inclusion {
             let (depth, out) = skin.at(p);
             let size = length(out);
             let bound = 1.0 - ((depth - self.voxel) / (0.5 * self.reach)).clamp(0.0, 1.0);
-            let smooth = ((size - SHARP[0]) / (SHARP[1] - SHARP[0])).clamp(0.0, 1.0);
+            let smooth = ((size - NORMALS.edge_lengths[0]) / (NORMALS.edge_lengths[1] - NORMALS.edge_lengths[0]))
+                .clamp(0.0, 1.0);
             let across = bound * dot(step, out) / (size * size).max(1e-9);
             let free = 1.0 - bound * (1.0 - smooth);
             step = std::array::from_fn(|a| free * (step[a] - across * out[a]));
@@ -210,14 +223,14 @@ impl Inclusion {
 
     /// Draws the region anew with its surface moved by all offsets (mm), as far as it may go at
     /// once; the other voxels of region 1 and of its own take each other's place.
-    pub fn draw(&self, labels: &mut Mask, offsets: &[f64; SHAPES]) {
+    pub fn draw(&self, labels: &mut Mask, offsets: &[f64; SHAPE_FUNCTIONS]) {
         let grid = *labels.grid();
         let shape = grid.shape();
         let all: f64 = offsets.iter().map(|v| v.abs()).sum();
-        let part = (ONCE * self.reach / all.max(1e-9)).min(1.0);
+        let part = (MAX_MOVE_FRACTION * self.reach / all.max(1e-9)).min(1.0);
         let part_of = |is: &dyn Fn(u8) -> bool| {
             let all: Vec<f32> = labels.as_slice().iter().map(|&l| f32::from(u8::from(is(l)))).collect();
-            gaussian(&all, shape, [SMOOTHED; 3])
+            gaussian(&all, shape, [SMOOTHING_VOXELS; 3])
         };
         let (own, both) = (part_of(&|l| l == self.label), part_of(&|l| l == self.label || l == 1));
         // How much of what is there of the two regions is its own.
@@ -243,7 +256,8 @@ impl Inclusion {
             }
             let p = grid.affine().to_world(VoxelPoint(grid.voxel(o).map(|v| v as f64))).0;
             let u = self.shape(p);
-            let from = std::array::from_fn(|a| p[a] - part * (0..SHAPES).map(|k| offsets[k] * u[k][a]).sum::<f64>());
+            let from =
+                std::array::from_fn(|a| p[a] - part * (0..SHAPE_FUNCTIONS).map(|k| offsets[k] * u[k][a]).sum::<f64>());
             if held(from) > 0.5 { self.label } else { 1 }
         };
         let drawn: Vec<u8> = (0..grid.len()).into_par_iter().map(drawn).collect();
@@ -284,7 +298,7 @@ mod tests {
         let before = ball(at, BALL);
         let found = Inclusion::all(&before);
         assert_eq!(found.len(), 1);
-        let mut offsets = [0.0; SHAPES];
+        let mut offsets = [0.0; SHAPE_FUNCTIONS];
         // A voxel larger, and a voxel and a half along x.
         (offsets[0], offsets[1]) = (0.5, 0.75);
         let mut drawn = before.clone();
@@ -294,7 +308,7 @@ mod tests {
         // A surface through 1,250 voxels of 4,200 that is off by 0.1 voxel changes 3 % of them.
         assert!(differ(&drawn, &wanted) < 0.05, "{}", differ(&drawn, &wanted));
         let mut same = before.clone();
-        found[0].draw(&mut same, &[0.0; SHAPES]);
+        found[0].draw(&mut same, &[0.0; SHAPE_FUNCTIONS]);
         assert!(differ(&same, &before) < 0.03, "{}", differ(&same, &before));
     }
 
@@ -343,7 +357,7 @@ mod tests {
         let before = disc([29.3, 30.6], 14.0);
         let found = Inclusion::all(&before);
         assert_eq!(found.len(), 1);
-        let mut offsets = [0.0; SHAPES];
+        let mut offsets = [0.0; SHAPE_FUNCTIONS];
         (offsets[0], offsets[2]) = (0.5, -0.75);
         let mut drawn = before.clone();
         found[0].draw(&mut drawn, &offsets);

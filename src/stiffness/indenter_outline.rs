@@ -15,25 +15,37 @@ use rayon::prelude::*;
 use std::f64::consts::TAU;
 
 /// Voxels on both sides of the rim, and below it, where the mesh is fine.
-const AROUND: i32 = 1;
-/// Columns of a patch beside a punch at least.
-const WIDE: usize = 25;
+const RIM_MARGIN_VOXELS: i32 = 1;
+/// Fewest columns of a patch beside a punch.
+const MIN_PATCH_COLUMNS: usize = 25;
 
-/// Directions in which an outline is looked for.
-const RAYS: usize = 256;
-/// From where to where beside a punch its outline is found by how the surface gives way (voxels).
-const SEEN: [f64; 2] = [1.0, 6.0];
-/// Half of the arc over which the outline's distance is the median (voxels).
-const ARC: f64 = 1.5;
-/// How far the outline may lie from the last voxel that moved with the punch (voxels): in noise
-/// much counts as moving with it that lies beside it.
-const OFF: f64 = 3.0;
-/// Times that the outline is fitted, each from where the one before put it.
-const ROUNDS: usize = 4;
-/// Largest standard deviation of an edge that is given (voxels).
-const SURE: f64 = 0.1;
-/// Part of the area of what moved with the punch by which the outline's may differ.
-const UNLIKE: f64 = 0.15;
+/// Directions in which an outline is searched.
+const DIRECTIONS: usize = 256;
+/// How the outline of a punch is fitted to the way the surface beside it gives way.
+struct OutlineFit {
+    /// Nearest and furthest distance beside the punch that is used (voxels).
+    range_voxels: [f64; 2],
+    /// Half of the arc over which the median of the outline's distance is taken (voxels).
+    median_half_arc_voxels: f64,
+    /// Largest distance of the outline from the last voxel that moved with the punch (voxels): in
+    /// noise many beside it seem to.
+    max_offset_voxels: f64,
+    /// Fits, each from the outline of the one before.
+    iterations: usize,
+    /// Largest standard deviation of an edge that is reported (voxels).
+    max_sd_voxels: f64,
+    /// Relative difference from the area that moved with the punch.
+    max_area_difference: f64,
+}
+
+const OUTLINE_FIT: OutlineFit = OutlineFit {
+    range_voxels: [1.0, 6.0],
+    median_half_arc_voxels: 1.5,
+    max_offset_voxels: 3.0,
+    iterations: 4,
+    max_sd_voxels: 0.1,
+    max_area_difference: 0.15,
+};
 
 /// The rim of a flat punch.
 #[derive(Debug, Clone, Default)]
@@ -58,9 +70,9 @@ impl Outline {
     /// How far (mm) a place (grid mm) lies within the curve, along the ray from the middle.
     pub fn within(&self, p: [f64; 3]) -> f64 {
         let [x, y]: [f64; 2] = std::array::from_fn(|k| p[self.plane[k]] - self.middle[k]);
-        let turn = (y.atan2(x) / TAU).rem_euclid(1.0) * RAYS as f64;
-        let (low, part) = (turn as usize % RAYS, turn.fract());
-        let radius = (1.0 - part) * self.radii[low] + part * self.radii[(low + 1) % RAYS];
+        let turn = (y.atan2(x) / TAU).rem_euclid(1.0) * DIRECTIONS as f64;
+        let (low, part) = (turn as usize % DIRECTIONS, turn.fract());
+        let radius = (1.0 - part) * self.radii[low] + part * self.radii[(low + 1) % DIRECTIONS];
         radius - x.hypot(y)
     }
 
@@ -73,9 +85,9 @@ impl Outline {
 
     /// Its area (mm^2).
     fn area(&self) -> f64 {
-        let next = |k: usize| self.radii[(k + 1) % RAYS];
-        let sine = (TAU / RAYS as f64).sin();
-        (0..RAYS).map(|k| 0.5 * sine * self.radii[k] * next(k)).sum()
+        let next = |k: usize| self.radii[(k + 1) % DIRECTIONS];
+        let sine = (TAU / DIRECTIONS as f64).sin();
+        (0..DIRECTIONS).map(|k| 0.5 * sine * self.radii[k] * next(k)).sum()
     }
 }
 
@@ -132,8 +144,10 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
         if !around(c, columns.len(), width, 1).any(next) {
             continue;
         }
-        for (di, dj) in (-AROUND..=AROUND).flat_map(|di| (-AROUND..=AROUND).map(move |dj| (di, dj))) {
-            for down in 0..=AROUND {
+        for (di, dj) in (-RIM_MARGIN_VOXELS..=RIM_MARGIN_VOXELS)
+            .flat_map(|di| (-RIM_MARGIN_VOXELS..=RIM_MARGIN_VOXELS).map(move |dj| (di, dj)))
+        {
+            for down in 0..=RIM_MARGIN_VOXELS {
                 let mut at = [0.0; 3];
                 at[axis] = top as f64 + f64::from(if up { -down } else { down });
                 (at[u], at[v]) = (f64::from(i + di), f64::from(j + dj));
@@ -164,7 +178,7 @@ pub fn rim(patch: &Patch, field: &Displacement<'_>, labels: &Mask, tolerance: f6
         radii,
     });
     let seen = face.with.iter().filter(|w| **w).count() as f64 * spacing[u] * spacing[v];
-    let outline = outline.filter(|o| (o.area() / seen - 1.0).abs() < UNLIKE);
+    let outline = outline.filter(|o| (o.area() / seen - 1.0).abs() < OUTLINE_FIT.max_area_difference);
     Rim { places, outline }
 }
 
@@ -190,57 +204,71 @@ impl Face {
         let step = 0.5 * self.spacing[0].min(self.spacing[1]);
         let voxel = 2.0 * step;
         let at = |k: usize, r: f64| {
-            let (sin, cos) = (TAU * k as f64 / RAYS as f64).sin_cos();
+            let (sin, cos) = (TAU * k as f64 / DIRECTIONS as f64).sin_cos();
             [middle[0] + r * cos / self.spacing[0], middle[1] + r * sin / self.spacing[1]]
         };
         let with = |k: usize| {
             let clear = |r: &f64| self.nearest(at(k, *r)).is_none_or(|c| !self.with[c]);
             (0..).map(|n| f64::from(n) * step).find(clear).filter(|last| *last > 0.0)
         };
-        let last: Vec<f64> = (0..RAYS).map(with).collect::<Option<_>>()?;
+        let last: Vec<f64> = (0..DIRECTIONS).map(with).collect::<Option<_>>()?;
         // Where the body ends before the punch does, there is no edge.
         let ended = |k: usize| self.nearest(at(k, last[k])).is_none_or(|c| self.lag[c].is_none());
-        let ended: Vec<bool> = (0..RAYS).map(ended).collect();
-        let arc = |r: f64| ((ARC * voxel / r / TAU * RAYS as f64) as usize).min(RAYS / 8);
+        let ended: Vec<bool> = (0..DIRECTIONS).map(ended).collect();
+        let arc = |r: f64| {
+            ((OUTLINE_FIT.median_half_arc_voxels * voxel / r / TAU * DIRECTIONS as f64) as usize).min(DIRECTIONS / 8)
+        };
         let medians = |raw: &[f64]| -> Vec<f64> {
             let median = |k: usize| {
                 let half = arc(raw[k]);
-                let mut near: Vec<f64> = (0..=2 * half).map(|n| raw[(k + RAYS + n - half) % RAYS]).collect();
+                let mut near: Vec<f64> =
+                    (0..=2 * half).map(|n| raw[(k + DIRECTIONS + n - half) % DIRECTIONS]).collect();
                 percentile(&mut near, 50.0)
             };
-            (0..RAYS).map(median).collect()
+            (0..DIRECTIONS).map(median).collect()
         };
         let mut edges = last.clone();
-        for _ in 0..ROUNDS {
+        for _ in 0..OUTLINE_FIT.iterations {
             // Samples of several directions only tell where all of their edges lie together.
             edges = medians(&edges);
-            let samples: Vec<Vec<[f64; 2]>> = (0..RAYS)
+            let samples: Vec<Vec<[f64; 2]>> = (0..DIRECTIONS)
                 .map(|k| {
-                    let places = (0..).map(|n| edges[k] + SEEN[0] * voxel + f64::from(n) * step);
-                    let places = places.take_while(|r| !ended[k] && *r < edges[k] + SEEN[1] * voxel);
+                    let places = (0..).map(|n| edges[k] + OUTLINE_FIT.range_voxels[0] * voxel + f64::from(n) * step);
+                    let places =
+                        places.take_while(|r| !ended[k] && *r < edges[k] + OUTLINE_FIT.range_voxels[1] * voxel);
                     places.map_while(|r| self.read(at(k, r)).map(|lag| [r - edges[k], lag * lag.abs()])).collect()
                 })
                 .collect();
             let next = |k: usize| {
                 let mut half = 0;
                 loop {
-                    let near: Vec<[f64; 2]> =
-                        (0..=2 * half).flat_map(|n| samples[(k + RAYS + n - half) % RAYS].iter().copied()).collect();
+                    let near: Vec<[f64; 2]> = (0..=2 * half)
+                        .flat_map(|n| samples[(k + DIRECTIONS + n - half) % DIRECTIONS].iter().copied())
+                        .collect();
                     let found = zero(&near);
                     match found {
-                        Some((end, open)) if open < SURE * voxel || half >= RAYS / 8 => return edges[k] + end,
-                        None if half >= RAYS / 8 => return edges[k],
-                        _ => half = (2 * half).clamp(arc(edges[k]).max(1), RAYS / 8),
+                        Some((end, open)) if open < OUTLINE_FIT.max_sd_voxels * voxel || half >= DIRECTIONS / 8 => {
+                            return edges[k] + end;
+                        }
+                        None if half >= DIRECTIONS / 8 => return edges[k],
+                        _ => half = (2 * half).clamp(arc(edges[k]).max(1), DIRECTIONS / 8),
                     }
                 }
             };
-            edges = (0..RAYS)
+            edges = (0..DIRECTIONS)
                 .map(|k| if ended[k] { last[k] } else { next(k) })
                 .zip(&last)
-                .map(|(edge, last)| edge.clamp((last - OFF * voxel).max(step), last + OFF * voxel))
+                .map(|(edge, last)| {
+                    edge.clamp(
+                        (last - OUTLINE_FIT.max_offset_voxels * voxel).max(step),
+                        last + OUTLINE_FIT.max_offset_voxels * voxel,
+                    )
+                })
                 .collect();
         }
-        let raw: Vec<f64> = (0..RAYS).map(|k| if ended[k] { last[k] + OFF * voxel } else { edges[k] }).collect();
+        let raw: Vec<f64> = (0..DIRECTIONS)
+            .map(|k| if ended[k] { last[k] + OUTLINE_FIT.max_offset_voxels * voxel } else { edges[k] })
+            .collect();
         Some(medians(&raw))
     }
 
@@ -338,7 +366,7 @@ fn clear_of(
             }
         }
         let mean = patch.iter().filter_map(|&c| short[c]).map(|s| s.1).sum::<f64>() / patch.len() as f64;
-        if patch.len() >= WIDE && mean > 2.0 * tolerance {
+        if patch.len() >= MIN_PATCH_COLUMNS && mean > 2.0 * tolerance {
             patch.iter().for_each(|&c| clear[c] = true);
         }
     }
@@ -398,14 +426,14 @@ mod tests {
             // 8.2 mm around a middle beside the one from which it is looked for.
             let far = |[i, j]: [f64; 2]| ((0.5 * (i - 29.1)).hypot(0.6 * (j - 25.2)) - 8.2) / 0.5;
             let radii = outline(far, noise);
-            assert_eq!(radii.len(), RAYS);
+            assert_eq!(radii.len(), DIRECTIONS);
             let off = |(k, r): (usize, &f64)| {
-                let (sin, cos) = (TAU * k as f64 / RAYS as f64).sin_cos();
+                let (sin, cos) = (TAU * k as f64 / DIRECTIONS as f64).sin_cos();
                 far([30.4 + r * cos / 0.5, 24.7 + r * sin / 0.6])
             };
-            let square = radii.iter().enumerate().map(|r| off(r).powi(2)).sum::<f64>() / RAYS as f64;
+            let square = radii.iter().enumerate().map(|r| off(r).powi(2)).sum::<f64>() / DIRECTIONS as f64;
             assert!(square.sqrt() < bar, "{noise} {}", square.sqrt());
-            let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / RAYS as f64;
+            let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / DIRECTIONS as f64;
             let exact = 0.5 * TAU * 8.2 * 8.2;
             assert!((area / exact - 1.0).abs() < part, "{noise} {area} {exact}");
         }
@@ -417,7 +445,7 @@ mod tests {
     fn noise_does_not_widen_the_outline_of_a_punch() {
         let far = |[i, j]: [f64; 2]| ((0.5 * (i - 29.1)).hypot(0.6 * (j - 25.2)) - 8.2) / 0.5;
         let radii = outline_of(far, 0.05, 2.5);
-        let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / RAYS as f64;
+        let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / DIRECTIONS as f64;
         let exact = 0.5 * TAU * 8.2 * 8.2;
         assert!((area / exact - 1.0).abs() < 0.1, "{area} {exact}");
     }
@@ -442,7 +470,7 @@ mod tests {
             if a > 0.0 && b > 0.0 { a.hypot(b) / 0.5 } else { a.max(b) / 0.5 }
         };
         let radii = outline(far, 0.0);
-        let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / RAYS as f64;
+        let area = 0.5 * radii.iter().map(|r| r * r).sum::<f64>() * TAU / DIRECTIONS as f64;
         assert!((area / 221.0 - 1.0).abs() < 0.02, "{area}");
     }
 }

@@ -10,15 +10,21 @@
 use crate::types::{Grid, Mask, VoxelPoint, WorldPoint};
 use std::collections::BTreeMap;
 
-/// Least part of the border between two regions, in faces between voxels, that lies in one plane.
-const FLAT: f64 = 0.04;
-/// How many times more of it lies there than in the planes next to it: of a ball about as much, of
-/// a cylinder along it 2.4 times.
-const STANDS_OUT: usize = 4;
-/// Faces between voxels that are fewer say nothing.
-const FEWEST: usize = 16;
-/// Planes that are examined, the largest ones: each takes a solution.
-const MOST: usize = 12;
+/// Which part of the border between two regions is a flat interface.
+struct PlaneTest {
+    /// Least part of the border's voxel faces in one plane.
+    min_fraction: f64,
+    /// Faces there over those in the adjacent planes: about one for a ball, 2.4 for a cylinder
+    /// along it.
+    min_ratio: usize,
+    /// Fewest voxel faces in the plane.
+    min_faces: usize,
+}
+
+const PLANE: PlaneTest = PlaneTest { min_fraction: 0.04, min_ratio: 4, min_faces: 16 };
+
+/// Most borders or planes between regions that are examined, largest first: each takes a solution.
+pub(super) const MAX_EXAMINED: usize = 12;
 
 /// A part of the border between two regions, or between one and a hole (label 0), that lies in one
 /// plane between voxels.
@@ -82,11 +88,13 @@ impl Interface {
         let flat = |&(pair, axis, at): &([u8; 2], usize, usize), m: &Met| {
             let beside =
                 in_plane(pair, axis, at + 1).max(at.checked_sub(1).map_or(0, |below| in_plane(pair, axis, below)));
-            m.count >= FEWEST && m.count as f64 >= FLAT * whole[&pair] as f64 && m.count >= STANDS_OUT * beside
+            m.count >= PLANE.min_faces
+                && m.count as f64 >= PLANE.min_fraction * whole[&pair] as f64
+                && m.count >= PLANE.min_ratio * beside
         };
         let mut kept: Vec<_> = met.iter().filter(|(k, m)| flat(k, m)).collect();
         kept.sort_by_key(|k| std::cmp::Reverse(k.1.count));
-        kept.truncate(MOST);
+        kept.truncate(MAX_EXAMINED);
         let one = |((labels, axis, at), met): &(&([u8; 2], usize, usize), &Met)| {
             let plane = *at as f64 + 0.5;
             let same = |k: &([u8; 2], usize, usize), m: &Met| {

@@ -6,10 +6,10 @@
 
 use crate::numerics::simd::dispatch;
 
-/// Vectors of one space at most: their memory, and the work of keeping them orthogonal.
-const SPACE: usize = 30;
-/// Numbers that are summed in single precision before they are added in double precision.
-const RUN: usize = 32;
+/// Most vectors of one Krylov space: bounds their memory and the work of orthogonalisation.
+const MAX_VECTORS: usize = 30;
+/// Numbers summed in single precision before they are added in double precision.
+const SINGLE_PRECISION_TERMS: usize = 32;
 
 /// `L` vectors, interleaved.
 pub type Block<const L: usize> = Vec<[f32; L]>;
@@ -20,7 +20,11 @@ fn products<const L: usize>(weights: &[f32], a: &[[f32; L]], b: &[[f32; L]]) -> 
         #[inline(always)]
         || {
             let mut out = [0.0f64; L];
-            for ((w, a), b) in weights.chunks(RUN).zip(a.chunks(RUN)).zip(b.chunks(RUN)) {
+            for ((w, a), b) in weights
+                .chunks(SINGLE_PRECISION_TERMS)
+                .zip(a.chunks(SINGLE_PRECISION_TERMS))
+                .zip(b.chunks(SINGLE_PRECISION_TERMS))
+            {
                 let mut part = [0.0f32; L];
                 for ((w, a), b) in w.iter().zip(a).zip(b) {
                     (0..L).for_each(|l| part[l] += w * a[l] * b[l]);
@@ -113,7 +117,7 @@ pub fn solve<const L: usize>(
         let size = norms(weights, &next);
         column.push(size);
         let left: [f64; L] = std::array::from_fn(|l| triangles[l].push(column.iter().map(|c| c[l]).collect()));
-        if space.len() == SPACE || (0..L).all(|l| left[l] <= goals[l]) || left.iter().any(|v| !v.is_finite()) {
+        if space.len() == MAX_VECTORS || (0..L).all(|l| left[l] <= goals[l]) || left.iter().any(|v| !v.is_finite()) {
             break;
         }
         scale(&mut next, size);

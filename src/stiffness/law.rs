@@ -13,7 +13,7 @@
 
 use crate::numerics::dense::symmetric_eigen;
 use crate::stiffness::elements::Point;
-use crate::stiffness::fem_body::SIDE;
+use crate::stiffness::fem_body::ELEMENT_UNKNOWNS;
 use crate::types::space::{Matrix3, determinant};
 use crate::types::stiffness::Law;
 
@@ -46,7 +46,7 @@ impl Material {
 }
 
 /// The displacement gradient at a quadrature point.
-fn gradient(q: &Point, x: &[f64; SIDE]) -> Matrix3 {
+fn gradient(q: &Point, x: &[f64; ELEMENT_UNKNOWNS]) -> Matrix3 {
     let mut g = [[0.0; 3]; 3];
     for k in 0..10 {
         for i in 0..3 {
@@ -97,8 +97,13 @@ fn state(law: Law, g: &Matrix3) -> Option<State> {
 }
 
 /// The element's residual; none where the material turns inside out.
-pub fn residual(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> Option<[f64; SIDE]> {
-    let mut r = [0.0; SIDE];
+pub fn residual(
+    law: Law,
+    points: &[Point; 4],
+    m: Material,
+    x: &[f64; ELEMENT_UNKNOWNS],
+) -> Option<[f64; ELEMENT_UNKNOWNS]> {
+    let mut r = [0.0; ELEMENT_UNKNOWNS];
     for q in points {
         let s = state(law, &gradient(q, x))?;
         let p: f64 = (0..4).map(|i| q.pressure[i] * x[30 + i]).sum();
@@ -115,8 +120,13 @@ pub fn residual(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> 
 }
 
 /// The derivative of the residual with respect to ln mu at fixed Poisson's ratio.
-pub fn residual_by_modulus(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> Option<[f64; SIDE]> {
-    let mut r = [0.0; SIDE];
+pub fn residual_by_modulus(
+    law: Law,
+    points: &[Point; 4],
+    m: Material,
+    x: &[f64; ELEMENT_UNKNOWNS],
+) -> Option<[f64; ELEMENT_UNKNOWNS]> {
+    let mut r = [0.0; ELEMENT_UNKNOWNS];
     for q in points {
         let s = state(law, &gradient(q, x))?;
         let p: f64 = (0..4).map(|i| q.pressure[i] * x[30 + i]).sum();
@@ -131,8 +141,13 @@ pub fn residual_by_modulus(law: Law, points: &[Point; 4], m: Material, x: &[f64;
 }
 
 /// The element's tangent, row by row, symmetric.
-pub fn tangent(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> Option<Box<[f64; SIDE * SIDE]>> {
-    let mut k = Box::new([0.0; SIDE * SIDE]);
+pub fn tangent(
+    law: Law,
+    points: &[Point; 4],
+    m: Material,
+    x: &[f64; ELEMENT_UNKNOWNS],
+) -> Option<Box<[f64; ELEMENT_UNKNOWNS * ELEMENT_UNKNOWNS]>> {
+    let mut k = Box::new([0.0; ELEMENT_UNKNOWNS * ELEMENT_UNKNOWNS]);
     for q in points {
         let s = state(law, &gradient(q, x))?;
         let p: f64 = match law {
@@ -147,7 +162,7 @@ pub fn tangent(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> O
                 let (ga, gb) = (&q.gradient[a], &q.gradient[b]);
                 let along = one * (ga[0] * gb[0] + ga[1] * gb[1] + ga[2] * gb[2]);
                 for i in 0..3 {
-                    let row = &mut k[(3 * a + i) * SIDE + 3 * b..][..3];
+                    let row = &mut k[(3 * a + i) * ELEMENT_UNKNOWNS + 3 * b..][..3];
                     for j in 0..3 {
                         row[j] += two * h[b][i] * h[a][j];
                     }
@@ -159,17 +174,17 @@ pub fn tangent(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> O
             let w = q.weight * q.pressure[i];
             for b in 0..10 {
                 for j in 0..3 {
-                    k[(30 + i) * SIDE + 3 * b + j] += w * h[b][j];
+                    k[(30 + i) * ELEMENT_UNKNOWNS + 3 * b + j] += w * h[b][j];
                 }
             }
             for j in 0..=i {
-                k[(30 + i) * SIDE + 30 + j] -= w * q.pressure[j] * m.compliance();
+                k[(30 + i) * ELEMENT_UNKNOWNS + 30 + j] -= w * q.pressure[j] * m.compliance();
             }
         }
     }
-    for r in 0..SIDE {
-        for c in r + 1..SIDE {
-            k[r * SIDE + c] = k[c * SIDE + r];
+    for r in 0..ELEMENT_UNKNOWNS {
+        for c in r + 1..ELEMENT_UNKNOWNS {
+            k[r * ELEMENT_UNKNOWNS + c] = k[c * ELEMENT_UNKNOWNS + r];
         }
     }
     Some(k)
@@ -177,7 +192,7 @@ pub fn tangent(law: Law, points: &[Point; 4], m: Material, x: &[f64; SIDE]) -> O
 
 /// The largest principal strain (1) at a point of the element, of the symmetric part of the
 /// displacement's gradient, by size.
-pub fn largest_principal_strain(q: &Point, x: &[f64; SIDE]) -> f64 {
+pub fn largest_principal_strain(q: &Point, x: &[f64; ELEMENT_UNKNOWNS]) -> f64 {
     let g = gradient(q, x);
     let strain: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (g[i][j] + g[j][i])));
     symmetric_eigen(&strain).iter().map(|e| e.0.abs()).fold(0.0, f64::max)

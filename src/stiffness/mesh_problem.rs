@@ -18,9 +18,9 @@ use crate::types::stiffness::{Law, StiffnessParams};
 use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPoint};
 
 /// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
-pub(super) const FLOOR: f64 = 0.005;
-/// Fewest observations of a body that are taken.
-pub const NEEDED: usize = 100;
+pub(super) const MESH_ERROR_VOXELS: f64 = 0.005;
+/// Fewest observations of a body.
+pub const MIN_OBSERVATIONS: usize = 100;
 
 /// One standard deviation of a plate's motion about the fitted one (mm), where that of a surface
 /// node is known to `error` mm and voxels are `voxel` mm wide.
@@ -94,8 +94,8 @@ impl Level {
             Some(m) => (from_matches(&body, field, m), 0),
             None => from_field(&body, field, labels),
         };
-        if observations.len() < NEEDED {
-            return Err(StiffnessError::TooFew { found: observations.len(), needed: NEEDED });
+        if observations.len() < MIN_OBSERVATIONS {
+            return Err(StiffnessError::TooFew { found: observations.len(), needed: MIN_OBSERVATIONS });
         }
         let mut out = Self {
             unmoved: body.places.clone(),
@@ -256,7 +256,7 @@ impl Level {
             observations: &self.observations,
             reference,
             plate_prior: plate_prior(self.voxel, self.surface_error),
-            floor: if self.block > 0 { FLOOR * self.voxel } else { 0.05 },
+            floor: if self.block > 0 { MESH_ERROR_VOXELS * self.voxel } else { 0.05 },
             noise: (self.block > 0).then_some(self.noise),
             open: &self.open,
             settled: self.settled,

@@ -9,32 +9,44 @@ use crate::stiffness::summary::{self, Scale};
 use crate::types::space::dot;
 use crate::types::stiffness::{Contact, Evidence, Law, LawChoice, StiffnessParams};
 
-/// A model must beat a smaller one by this much (Kass and Raftery 1995: more than 10 is very
-/// strong).
-pub const MARGIN: f64 = 10.0;
-/// Largest principal strain (95th percentile over the body) past which the linear law is off by
-/// more than a modulus is known to: what it leaves out is of the order of the strain.
-const SMALL_STRAIN: f64 = 0.05;
-/// Precision of forward solutions on the coarse mesh (mm).
-const COARSE: f64 = 1e-4;
-/// Iterations at most on the coarse mesh.
-const ITERATIONS: usize = 12;
+/// Decrease of the information criterion from which a larger model is chosen (Kass and Raftery
+/// 1995: more than 10 is very strong).
+pub const MIN_BIC_GAIN: f64 = 10.0;
+/// Largest principal strain (95th percentile) for the linear law: its error is of the order of the
+/// strain, and exceeds that of a modulus beyond.
+const MAX_LINEAR_STRAIN: f64 = 0.05;
+/// Identification on the coarse mesh.
+struct CoarseSolve {
+    /// Tolerance of forward solutions (mm).
+    tolerance_mm: f64,
+    /// Most iterations.
+    max_iterations: usize,
+}
 
-/// Moves of the open parts of the shape at most.
-const MOVES: usize = 4;
-/// Those of each law before the two are compared: the law that is chosen goes on.
-const LAW_MOVES: usize = 2;
-/// Length of one at most (voxels): the difference that it is taken from is linear about as far.
-const LONGEST: f64 = 2.0;
-/// Shorter ones are left to the last step with all offsets (voxels).
-const SETTLED: f64 = 0.1;
+const COARSE: CoarseSolve = CoarseSolve { tolerance_mm: 1e-4, max_iterations: 12 };
 
-/// A guided or measured patch takes over what the field says, with its errors: the squares beyond
-/// the noise must fall by so much (in ln).
-const DECISIVE: f64 = 0.2;
+/// How the open offsets of the shape are moved to the data.
+struct ShapeMoves {
+    /// Most moves.
+    max_count: usize,
+    /// Most moves of each law before the two are compared.
+    max_per_law: usize,
+    /// Largest step (voxels): the finite difference is linear about as far.
+    max_step_voxels: f64,
+    /// Smaller steps are left to the last step with all offsets (voxels).
+    tolerance_voxels: f64,
+}
 
-/// Part of the plates' motion by which a plate may miss a plane: strain is off by about as much.
-const PLANE: f64 = 0.02;
+const SHAPE_MOVES: ShapeMoves =
+    ShapeMoves { max_count: 4, max_per_law: 2, max_step_voxels: 2.0, tolerance_voxels: 0.1 };
+
+/// Reduction of the excess squares (ln) that a guided or measured patch must reach: it inherits the
+/// field's errors.
+const MIN_READ_GAIN_LN: f64 = 0.2;
+
+/// Bulge of a plate out of its plane over the plates' motion: the error of strain is about as
+/// large.
+const MAX_BULGE_FRACTION: f64 = 0.02;
 
 /// What was chosen on the coarse mesh.
 #[derive(Debug)]
@@ -82,7 +94,7 @@ fn candidates(level: &Level, patch: &Patch) -> Vec<Contact> {
         vec![Contact::Sliding, Contact::Guided]
     };
     // What keeps no plane is no plate.
-    if flat && patch.bulge() > PLANE * dot(travel, travel).sqrt() {
+    if flat && patch.bulge() > MAX_BULGE_FRACTION * dot(travel, travel).sqrt() {
         out.push(Contact::Measured);
     }
     out
@@ -126,7 +138,7 @@ impl Tried {
 
     /// The criterion, with what each contact that is read from the field must gain beyond it.
     fn rank(&self, samples: f64) -> f64 {
-        self.score(samples) + self.read as f64 * MARGIN.max(DECISIVE * samples * self.beyond)
+        self.score(samples) + self.read as f64 * MIN_BIC_GAIN.max(MIN_READ_GAIN_LN * samples * self.beyond)
     }
 
     fn name(&self) -> String {
@@ -170,7 +182,15 @@ impl Chooser<'_> {
             let (e, reason) = (&chosen.estimate, "as asked".to_string());
             self.show(shown("law", law.name().into(), e, bic(e.squares, e.effective, e.parameters), true, reason));
         }
-        let estimate = settle(self.level, law, self.params, self.reference, chosen.estimate, MOVES, COARSE)?;
+        let estimate = settle(
+            self.level,
+            law,
+            self.params,
+            self.reference,
+            chosen.estimate,
+            SHAPE_MOVES.max_count,
+            COARSE.tolerance_mm,
+        )?;
         Ok(Choice { law, estimate, evidence: self.evidence, warnings: self.warnings })
     }
 
@@ -192,7 +212,10 @@ impl Chooser<'_> {
             if let Some(last) = tried.last() {
                 (start.theta, start.x) = (last.estimate.state.theta.clone(), last.estimate.state.x.clone());
             }
-            match setup.run(start, ITERATIONS, COARSE).and_then(|e| Tried::new(self.level, &setup, e, rivals)) {
+            match setup
+                .run(start, COARSE.max_iterations, COARSE.tolerance_mm)
+                .and_then(|e| Tried::new(self.level, &setup, e, rivals))
+            {
                 Ok(one) => tried.push(one),
                 Err(e) => failure = Some(e),
             }
@@ -233,7 +256,15 @@ impl Chooser<'_> {
     /// The law that the data ask for, and the contact that holds under it.
     fn law(&mut self, mut tried: Vec<Tried>, best: usize) -> Result<(Law, Tried), StiffnessError> {
         let small = tried[best].estimate.clone();
-        let small = settle(self.level, Law::Linear, self.params, self.reference, small, LAW_MOVES, COARSE)?;
+        let small = settle(
+            self.level,
+            Law::Linear,
+            self.params,
+            self.reference,
+            small,
+            SHAPE_MOVES.max_per_law,
+            COARSE.tolerance_mm,
+        )?;
         let strain = summary::strain(&self.level.setup(Law::Linear, self.params, self.reference), &small.state);
         let setup = self.level.setup(Law::Linear, self.params, self.reference);
         let small = Tried::new(self.level, &setup, small, true)?;
@@ -249,7 +280,7 @@ impl Chooser<'_> {
             let criterion = bic(e.squares, e.effective, e.parameters);
             let reason = "no equilibrium was found under the neo-Hookean one".to_string();
             self.show(shown("law", Law::Linear.name().into(), e, criterion, true, reason));
-            if strain > SMALL_STRAIN {
+            if strain > MAX_LINEAR_STRAIN {
                 self.warnings.push(format!(
                     "strains reach {:.0} %, where the linear law is an approximation, but no equilibrium was found under the neo-Hookean one",
                     100.0 * strain
@@ -282,7 +313,7 @@ impl Chooser<'_> {
                     for e in self.evidence.iter_mut().filter(|e| e.question == "contact") {
                         e.chosen = e.model == asked[1];
                         if let Some(k) = asked.iter().position(|name| *name == e.model) {
-                            e.reason = UNDER_LAW[k].into();
+                            e.reason = LAW_CHANGED_REASONS[k].into();
                         }
                     }
                     return Ok((law, rival));
@@ -295,46 +326,56 @@ impl Chooser<'_> {
 
     fn large_strain_from(&mut self, from: &Tried) -> Result<Tried, StiffnessError> {
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
-        let large = setup.run(from.estimate.state.clone(), ITERATIONS, COARSE)?;
-        let large = settle(self.level, Law::NeoHookean, self.params, self.reference, large, LAW_MOVES, COARSE)?;
+        let large = setup.run(from.estimate.state.clone(), COARSE.max_iterations, COARSE.tolerance_mm)?;
+        let large = settle(
+            self.level,
+            Law::NeoHookean,
+            self.params,
+            self.reference,
+            large,
+            SHAPE_MOVES.max_per_law,
+            COARSE.tolerance_mm,
+        )?;
         let setup = self.level.setup(Law::NeoHookean, self.params, self.reference);
         Tried::new(self.level, &setup, large, true)
     }
 
     /// The law by what its criterion gains; where that does not tell, by the strain.
     fn judged(&mut self, strain: f64, gain: f64) -> Law {
-        let is_large = strain > SMALL_STRAIN;
+        let is_large = strain > MAX_LINEAR_STRAIN;
         let percent = 100.0 * strain;
-        if gain < -MARGIN && is_large {
+        if gain < -MIN_BIC_GAIN && is_large {
             self.warnings.push(format!(
                 "strains reach {percent:.0} %, where the linear law is an approximation, but the data prefer it: Poisson's ratio, \
                  patches or labels may not be as assumed, or the field is not measured; compare with --model neo-hookean"
             ));
-        } else if (-MARGIN..=MARGIN).contains(&gain) && is_large {
+        } else if (-MIN_BIC_GAIN..=MIN_BIC_GAIN).contains(&gain) && is_large {
             self.warnings.push(format!(
                 "the data do not tell the laws apart; as strains reach {percent:.0} % the neo-Hookean one is taken"
             ));
         }
-        if gain > MARGIN || (is_large && gain >= -MARGIN) { Law::NeoHookean } else { Law::Linear }
+        if gain > MIN_BIC_GAIN || (is_large && gain >= -MIN_BIC_GAIN) { Law::NeoHookean } else { Law::Linear }
     }
 }
 
-/// Why a contact gives way to another, and why that is taken, once the law is chosen.
-const UNDER_LAW: [&str; 2] = [
+/// Why a contact gives way to another once the law is chosen, and why the other is taken.
+const LAW_CHANGED_REASONS: [&str; 2] = [
     "explains the field best under small strain alone",
     "explains the field nearly as well under the law that is taken",
 ];
 
 fn reason(law: Law, gain: f64) -> String {
     match law {
-        Law::NeoHookean if gain > MARGIN => {
-            format!("the strain asks for it: the criterion falls by {gain:.0}, {MARGIN} are needed")
+        Law::NeoHookean if gain > MIN_BIC_GAIN => {
+            format!("the strain asks for it: the criterion falls by {gain:.0}, {MIN_BIC_GAIN} are needed")
         }
         Law::NeoHookean => "the data do not tell; the strain is past what the linear law bears".into(),
-        Law::Linear if gain < -MARGIN => {
+        Law::Linear if gain < -MIN_BIC_GAIN => {
             format!("the linear law explains the field better: the criterion differs by {:.0}", -gain)
         }
-        Law::Linear => format!("small strain suffices: the criterion would fall by {gain:.0}, {MARGIN} are needed"),
+        Law::Linear => {
+            format!("small strain suffices: the criterion would fall by {gain:.0}, {MIN_BIC_GAIN} are needed")
+        }
     }
 }
 
@@ -362,17 +403,23 @@ pub fn settle(
     for _ in 0..moves {
         let setup = level.setup(law, params, reference);
         let steps = open_steps(&setup, &estimate)?;
-        let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SETTLED)) else { break };
+        let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SHAPE_MOVES.tolerance_voxels)) else {
+            break;
+        };
         let variance = setup.variance(&estimate);
         let misfit = |level: &Level, e: &Estimate| {
             e.raw * e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.penalty()
         };
         let (before, least) = (level.offsets(), misfit(level, &estimate));
         let better = [1.0, 0.5].into_iter().find_map(|part| {
-            let moved = |(b, s): (&f64, &f64)| b + part * s.clamp(-LONGEST, LONGEST);
+            let moved =
+                |(b, s): (&f64, &f64)| b + part * s.clamp(-SHAPE_MOVES.max_step_voxels, SHAPE_MOVES.max_step_voxels);
             level.move_to(&before.iter().zip(&steps).map(moved).collect::<Vec<f64>>());
             // A shape that cannot be solved is left alone.
-            let found = level.setup(law, params, reference).run(estimate.state.clone(), ITERATIONS, precision).ok()?;
+            let found = level
+                .setup(law, params, reference)
+                .run(estimate.state.clone(), COARSE.max_iterations, precision)
+                .ok()?;
             (misfit(level, &found) < least).then_some(found)
         });
         let Some(better) = better else {
@@ -398,13 +445,18 @@ pub fn as_meshed(
 ) -> Result<Estimate, StiffnessError> {
     level.move_back();
     level.settled = false;
-    level.setup(law, params, reference).run(estimate.state.clone(), ITERATIONS, COARSE)
+    level.setup(law, params, reference).run(estimate.state.clone(), COARSE.max_iterations, COARSE.tolerance_mm)
 }
 
-/// Runs on which given moduli are settled at most: the scale moves little with what they change.
-const KNOWN_RUNS: usize = 3;
-/// Change of ln E under which they are settled.
-const KNOWN: f64 = 1e-3;
+/// How the scale of given moduli converges; it depends little on what they change.
+struct KnownModuli {
+    /// Most runs.
+    max_runs: usize,
+    /// Change of ln E at which they have converged.
+    tolerance_ln: f64,
+}
+
+const KNOWN_MODULI: KnownModuli = KnownModuli { max_runs: 3, tolerance_ln: 1e-3 };
 
 /// Identifies again with the moduli that are given, beside the one that sets the scale, where the
 /// scale puts them.
@@ -424,7 +476,7 @@ pub fn known_moduli(
     let labels = level.body.labels.clone();
     let others: Vec<(usize, f64)> =
         (0..labels.len()).filter(|&r| !sets(r)).filter_map(|r| Some((r, given(labels[r])?))).collect();
-    for _ in 0..KNOWN_RUNS {
+    for _ in 0..KNOWN_MODULI.max_runs {
         let setup = level.setup(law, params, reference);
         let found = summary::moduli(&setup, &estimate, None, scale).log;
         let off = |&(r, e): &(usize, f64)| (r, estimate.state.theta[r] + e - found[r]);
@@ -435,12 +487,12 @@ pub fn known_moduli(
             let r = labels.partition_point(|l| l < label);
             (t - estimate.state.theta[r]).abs()
         });
-        if change.fold(0.0, f64::max) < KNOWN {
+        if change.fold(0.0, f64::max) < KNOWN_MODULI.tolerance_ln {
             break;
         }
         level.known = known;
         let start = estimate.state.clone();
-        estimate = level.setup(law, params, reference).run(start, ITERATIONS, COARSE)?;
+        estimate = level.setup(law, params, reference).run(start, COARSE.max_iterations, COARSE.tolerance_mm)?;
     }
     Ok(estimate)
 }

@@ -7,18 +7,19 @@ use crate::stiffness::fem_body::Body;
 use crate::types::{Displacement, Mask, Match, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
-/// Barycentric coordinates down to this count as inside an element.
-const SLACK: f64 = 1e-6;
+/// Barycentric coordinates above minus this are inside an element.
+const BARYCENTRIC_TOLERANCE: f64 = 1e-6;
 
 /// Least barycentric coordinate in the straight element of a place that may lie in the curved one.
-const BESIDE: f64 = -0.3;
-/// Samples of a dense field at most; blocks of voxels are averaged so that there are fewer.
-const SAMPLES: usize = 60_000;
-/// Places of a match's patch along each axis, and in all.
-const ACROSS: usize = 3;
-const PLACES: usize = ACROSS * ACROSS * ACROSS;
+const MIN_STRAIGHT_BARYCENTRIC: f64 = -0.3;
+/// Most samples of a dense field: blocks of voxels are averaged to stay below.
+const MAX_DENSE_SAMPLES: usize = 60_000;
+/// Samples of a match's patch along each axis.
+const PATCH_SAMPLES_PER_AXIS: usize = 3;
+/// Samples of a match's patch.
+const PATCH_SAMPLES: usize = PATCH_SAMPLES_PER_AXIS * PATCH_SAMPLES_PER_AXIS * PATCH_SAMPLES_PER_AXIS;
 /// Every other corner of a cube.
-const SIDES: [[f64; 3]; 4] = [[-1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]];
+const CUBE_CORNERS: [[f64; 3]; 4] = [[-1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]];
 
 /// An element and the weights of its nodes.
 pub type Reading = (u32, [f64; 10]);
@@ -137,10 +138,10 @@ pub fn find(body: &Body, places: &[[f64; 3]]) -> Vec<Option<Reading>> {
                     for &i in &sorted[start[k] as usize..start[k + 1] as usize] {
                         let p = places[i as usize];
                         let is_beside = (0..3).any(|a| p[a] < l[a] - 0.1 || p[a] > h[a] + 0.1);
-                        if is_beside || mapping.straight(p).iter().any(|&v| v < BESIDE) {
+                        if is_beside || mapping.straight(p).iter().any(|&v| v < MIN_STRAIGHT_BARYCENTRIC) {
                             continue;
                         }
-                        if let Some(b) = mapping.locate(p).filter(|b| b.iter().all(|&v| v >= -SLACK)) {
+                        if let Some(b) = mapping.locate(p).filter(|b| b.iter().all(|&v| v >= -BARYCENTRIC_TOLERANCE)) {
                             found.push((i, shapes(b)));
                         }
                     }
@@ -174,7 +175,7 @@ fn spread(block: usize) -> f64 {
 
 /// Voxels along the edge of the blocks that a body of `voxels` voxels is averaged over.
 pub fn block_for(voxels: usize) -> usize {
-    (1..6).find(|b| voxels / (b * b * b) <= SAMPLES).unwrap_or(6)
+    (1..6).find(|b| voxels / (b * b * b) <= MAX_DENSE_SAMPLES).unwrap_or(6)
 }
 
 /// Samples of a dense field: means over blocks of voxels that lie in the mask as a whole. The
@@ -205,7 +206,7 @@ pub fn from_field(body: &Body, field: &Displacement<'_>, mask: &Mask) -> (Vec<Ob
                 let world = |[x, y, z]: [f64; 3]| {
                     grid.affine().to_world(VoxelPoint([i as f64 + x, j as f64 + y, k as f64 + z])).0
                 };
-                let corners = || SIDES.map(|side| world(side.map(|s| middle + s * spread(block))));
+                let corners = || CUBE_CORNERS.map(|side| world(side.map(|s| middle + s * spread(block))));
                 let mean = sum.map(|s| s / (block * block * block) as f64);
                 if mean.iter().all(|v| v.is_finite()) {
                     out.push(Observation {
@@ -239,10 +240,14 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
         let radius = ((SparseField::PATCH as f64 * finest / s).round() as usize).max(1);
         1.5f64.sqrt() * spread(2 * radius + 1)
     });
-    let patch = |m: &Match| -> [[f64; 3]; PLACES] {
+    let patch = |m: &Match| -> [[f64; 3]; PATCH_SAMPLES] {
         let middle = grid.affine().to_voxel(m.initial).0;
         std::array::from_fn(|n| {
-            let at = [n % ACROSS, n / ACROSS % ACROSS, n / (ACROSS * ACROSS)];
+            let at = [
+                n % PATCH_SAMPLES_PER_AXIS,
+                n / PATCH_SAMPLES_PER_AXIS % PATCH_SAMPLES_PER_AXIS,
+                n / (PATCH_SAMPLES_PER_AXIS * PATCH_SAMPLES_PER_AXIS),
+            ];
             let voxel = std::array::from_fn(|a| middle[a] + (at[a] as f64 - 1.0) * apart[a]);
             grid.affine().to_world(VoxelPoint(voxel)).0
         })
@@ -252,7 +257,7 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
     let found = find(body, &places);
     let one = |((m, places), found): ((&&Match, &[[f64; 3]]), &[Option<Reading>])| {
         // The one in the middle is the match's own.
-        let own = found[PLACES / 2]?;
+        let own = found[PATCH_SAMPLES / 2]?;
         let here = displacement(field, m.initial);
         let (mut around, mut readings, mut rest) = (Vec::new(), Vec::new(), [0.0; 3]);
         for (place, reading) in places.iter().zip(found).filter_map(|(p, f)| f.map(|f| (p, f))) {
@@ -277,12 +282,12 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
             sigma: m.sigma().max(1e-4),
         })
     };
-    let patches = kept.iter().zip(places.chunks_exact(PLACES)).zip(found.chunks_exact(PLACES));
+    let patches = kept.iter().zip(places.chunks_exact(PATCH_SAMPLES)).zip(found.chunks_exact(PATCH_SAMPLES));
     patches.filter_map(one).collect()
 }
 
-/// Voxels around a place of the surface that are read for its motion.
-pub const REACH: f64 = 3.0;
+/// Reach (voxels) within which the motion at a place of the surface is read.
+pub const SURFACE_REACH_VOXELS: f64 = 3.0;
 
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to
 /// the voxels of the mask within `reach` voxels, so that nothing outside the body is read and noise

@@ -8,10 +8,10 @@
 use crate::numerics::dense::symmetric_eigen;
 use crate::types::space::dot;
 
-/// Highest degree that is tried: 84 functions in space, 28 on a plane.
-const DEGREE: usize = 6;
-/// Part of a function that earlier ones must leave for it to count as another one.
-const NEW: f64 = 1e-3;
+/// Highest polynomial degree: 84 functions in space, 28 on a plane.
+const MAX_DEGREE: usize = 6;
+/// Part of a function that is orthogonal to those before it, from which it counts as another one.
+const MIN_INDEPENDENT_FRACTION: f64 = 1e-3;
 
 /// Displacements at the nodes of a patch.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -85,7 +85,7 @@ fn orthonormal(mut f: Vec<f64>, basis: &[Vec<f64>], read: &[Option<[f64; 3]>]) -
         f.iter_mut().zip(b).for_each(|(f, b)| *f -= along * b);
     }
     let length = inner(&f, read, |i| f[i]).sqrt();
-    (length > NEW * whole && length > 0.0).then(|| f.iter().map(|v| v / length).collect())
+    (length > MIN_INDEPENDENT_FRACTION * whole && length > 0.0).then(|| f.iter().map(|v| v / length).collect())
 }
 
 /// Products of Legendre polynomials of the places in their principal axes, degree by degree.
@@ -97,7 +97,7 @@ fn degrees(places: &[[f64; 3]]) -> Vec<Vec<Vec<f64>>> {
     let axes = symmetric_eigen(&std::array::from_fn(|a| std::array::from_fn(|b| moment(a, b)))).map(|e| e.1);
     // One scale for all axes: the thickness of an almost flat patch shall not decide.
     let reach = from.iter().map(|d| dot(*d, *d)).fold(0.0, f64::max).sqrt().max(f64::MIN_POSITIVE);
-    let tables: [Vec<[f64; DEGREE + 1]>; 3] =
+    let tables: [Vec<[f64; MAX_DEGREE + 1]>; 3] =
         axes.map(|axis| from.iter().map(|d| legendre(dot(*d, axis) / reach)).collect());
     let product = |powers: [usize; 3]| -> Vec<f64> {
         (0..places.len()).map(|i| (0..3).map(|a| tables[a][i][powers[a]]).product()).collect()
@@ -106,13 +106,13 @@ fn degrees(places: &[[f64; 3]]) -> Vec<Vec<Vec<f64>>> {
         let all = (0..=degree).flat_map(move |i| (0..=degree - i).map(move |j| [degree - i - j, j, i]));
         all.map(product).collect()
     };
-    (0..=DEGREE).map(of_degree).collect()
+    (0..=MAX_DEGREE).map(of_degree).collect()
 }
 
-fn legendre(x: f64) -> [f64; DEGREE + 1] {
-    let mut p = [1.0; DEGREE + 1];
+fn legendre(x: f64) -> [f64; MAX_DEGREE + 1] {
+    let mut p = [1.0; MAX_DEGREE + 1];
     p[1] = x;
-    for k in 1..DEGREE {
+    for k in 1..MAX_DEGREE {
         let n = k as f64;
         p[k + 1] = ((2.0 * n + 1.0) * x * p[k] - n * p[k - 1]) / (n + 1.0);
     }

@@ -5,8 +5,8 @@ use crate::stiffness::fem_body::Body;
 use crate::stiffness::interface::fade;
 use crate::types::space::{dot, length};
 
-/// Free surface beside a punch at least (voxels).
-const BESIDE: f64 = 3.0;
+/// Least free surface beside a punch (voxels).
+const MIN_FREE_SURFACE_VOXELS: f64 = 3.0;
 
 /// The edge of a flat punch.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,7 +34,7 @@ impl Edge {
         let places = upright.flat_map(|f| f.nodes).map(|n| body.places[n as usize]).filter(near);
         let end = places.map(|p| length(edge.apart(p).0)).fold(f64::INFINITY, f64::min);
         edge.beside = (end - edge.radius).min(edge.radius);
-        (edge.beside > BESIDE * voxel).then_some(edge)
+        (edge.beside > MIN_FREE_SURFACE_VOXELS * voxel).then_some(edge)
     }
 
     /// Of the punch (mm).

@@ -9,11 +9,11 @@ use crate::numerics::symmetric3::cholesky_solve;
 use crate::types::space::{Matrix3, cross, determinant, dot};
 use crate::types::{DenseField, Displacement, Mask, SparseField, WorldPoint};
 
-/// Turns that are left in (degrees): taken for small, one moves what lies 30 mm away by 5
-/// micrometres too far.
-const LEAST: f64 = 1.0;
-/// What an affine map leaves over of the deformation when it is all of it (1).
-const ROUNDING: f64 = 1e-4;
+/// Least rotation that is removed (degrees): the small-angle error of one degree is 5 micrometres
+/// at 30 mm.
+const MIN_ROTATION_DEGREES: f64 = 1.0;
+/// Relative residual of a deformation that is entirely affine (1).
+const RIGID_TOLERANCE: f64 = 1e-4;
 
 /// A rotation about the middle of a body after its motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,7 +77,7 @@ impl Affinity {
                 whole += (q[r] - self.after[r] - arm[r]).powi(2);
             }
         }
-        left < ROUNDING * ROUNDING * whole
+        left < RIGID_TOLERANCE * RIGID_TOLERANCE * whole
     }
 }
 
@@ -87,7 +87,7 @@ impl Turn {
     pub fn of(field: &Displacement<'_>, labels: &Mask) -> Option<Self> {
         let Affinity { after, gradient, .. } = Affinity::of(field, labels)?;
         let turn = Self { rotation: rotation(gradient)?, middle: after };
-        (turn.degrees() > LEAST).then_some(turn)
+        (turn.degrees() > MIN_ROTATION_DEGREES).then_some(turn)
     }
 
     /// Its angle.

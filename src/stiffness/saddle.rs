@@ -1,6 +1,6 @@
 //! Solves the equations of displacement and pressure, [A B^T; B -C], of meshes that are too large
-//! for a factor: minimal residuals, made fast by a block triangular preconditioner (Elman, Silvester
-//! and Wathen, Finite Elements and Fast Iterative Solvers, 2014, ch. 4).
+//! for a factor: minimal residuals, made fast by a block triangular preconditioner (Elman,
+//! Silvester and Wathen, Finite Elements and Fast Iterative Solvers, 2014, ch. 4).
 //!
 //! - A: a cycle of two levels. Gauss-Seidel sweeps, node by node, take what changes from node to
 //!   node; linear displacements of the same elements, whose matrix is factorised, take the rest.
@@ -13,23 +13,29 @@
 use crate::numerics::simd::dispatch;
 use crate::numerics::sparse::{Factor, Pattern, Singular};
 use crate::numerics::tetrahedron::EDGES;
-use crate::stiffness::fem_body::SIDE;
+use crate::stiffness::fem_body::ELEMENT_UNKNOWNS;
 use crate::stiffness::forward::Tie;
 use crate::stiffness::krylov::{self, Block};
 use crate::types::space::dot;
 use rayon::prelude::*;
 
 /// Right-hand sides in lockstep: as many as a vector register of AVX2 holds.
-const SIDES: usize = 8;
-/// What one Krylov space lowers an error to at most: single precision holds little more.
-const ROUND: f64 = 1e-5;
-/// Strength of a tie beyond which its node hardly moves under the tissue's forces.
-const FIRM: f64 = 1e-3;
-/// Part of the error that is left to be found by a first look at the refined solution.
-const SAFE: f64 = 0.5;
-/// Krylov spaces for one right-hand side at most.
-const ROUNDS: usize = 12;
+const LANES: usize = 8;
+/// Iteration control of the mixed-precision solution.
+struct KrylovControl {
+    /// Least error of one Krylov space over the error before it: the resolution of single
+    /// precision.
+    min_error_ratio: f64,
+    /// Goal of a Krylov space over the error allowed: it leaves a part for the refined solution.
+    goal_fraction: f64,
+    /// Most Krylov spaces for one right-hand side.
+    max_spaces: usize,
+}
 
+const KRYLOV: KrylovControl = KrylovControl { min_error_ratio: 1e-5, goal_fraction: 0.5, max_spaces: 12 };
+
+/// Strength of a tie beyond which its node hardly moves under the tissue's forces.
+const FIRM_TIE_STRENGTH: f64 = 1e-3;
 /// What belongs to a mesh: the linear elements of its corners, and its pressures.
 #[derive(Debug)]
 pub struct TwoLevel {
@@ -105,14 +111,14 @@ impl TwoLevel {
         for (i, k) in (0..10).flat_map(|i| (0..10).map(move |k| (i, k))) {
             for (p, q) in parents(i).into_iter().flat_map(|p| parents(k).map(|q| (p, q))) {
                 for (r, c) in (0..3).flat_map(|r| (0..3).map(move |c| (r, c))) {
-                    linear[(3 * p + r) * 12 + 3 * q + c] += 0.25 * tangent[(3 * i + r) * SIDE + 3 * k + c];
+                    linear[(3 * p + r) * 12 + 3 * q + c] += 0.25 * tangent[(3 * i + r) * ELEMENT_UNKNOWNS + 3 * k + c];
                 }
             }
         }
         self.coarse.add(&mut levels.coarse, e, &linear, 12);
         // 1 / lambda to 1 / (2 mu) + 1 / lambda.
         let over = -(1.0 - poisson) / (1.0 - 2.0 * poisson);
-        let mass: [f64; 16] = std::array::from_fn(|i| over * tangent[(30 + i / 4) * SIDE + 30 + i % 4]);
+        let mass: [f64; 16] = std::array::from_fn(|i| over * tangent[(30 + i / 4) * ELEMENT_UNKNOWNS + 30 + i % 4]);
         self.pressure.add(&mut levels.mass, e, &mass, 4);
     }
 
@@ -126,7 +132,7 @@ impl TwoLevel {
             }
         }
         self.coarse.add(&mut levels.coarse, e as usize, &linear, 12);
-        if tie.strength > FIRM {
+        if tie.strength > FIRM_TIE_STRENGTH {
             levels.ties.push((first, *tie));
         }
     }
@@ -357,8 +363,8 @@ impl<'a> Saddle<'a> {
             let pairs = x.par_chunks_mut(n).zip(start.par_chunks(n));
             return pairs.map(|(x, start)| self.lockstep::<1>(x, start, tolerance)).collect();
         }
-        let pairs = x.par_chunks_mut(SIDES * n).zip(start.par_chunks(SIDES * n));
-        pairs.map(|(x, start)| self.lockstep::<SIDES>(x, start, tolerance)).collect()
+        let pairs = x.par_chunks_mut(LANES * n).zip(start.par_chunks(LANES * n));
+        pairs.map(|(x, start)| self.lockstep::<LANES>(x, start, tolerance)).collect()
     }
 
     fn lockstep<const L: usize>(&self, right: &mut [f64], start: &[f64], tolerance: f64) -> Result<(), Singular> {
@@ -367,7 +373,7 @@ impl<'a> Saddle<'a> {
         let mut rest = self.rest(right, &x);
         self.close(&mut x, &mut rest);
         rest = self.rest(right, &x);
-        for _ in 0..ROUNDS {
+        for _ in 0..KRYLOV.max_spaces {
             let left = self.precondition(interleaved::<L>(&rest, self.pattern.unknowns()));
             let sizes = krylov::norms(&self.weights, &left);
             if sizes.iter().any(|v| !v.is_finite()) {
@@ -377,7 +383,8 @@ impl<'a> Saddle<'a> {
                 right.copy_from_slice(&x);
                 return Ok(());
             }
-            let goals = std::array::from_fn(|l| (SAFE * whole[l]).max(ROUND * sizes[l]));
+            let goals =
+                std::array::from_fn(|l| (KRYLOV.goal_fraction * whole[l]).max(KRYLOV.min_error_ratio * sizes[l]));
             let apply = |v: &[[f32; L]]| self.precondition(self.blocks.multiply(&self.levels.nodes, v));
             let change = krylov::solve(left, &self.weights, goals, apply);
             for (l, x) in x.chunks_mut(self.pattern.unknowns()).enumerate() {

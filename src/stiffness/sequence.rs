@@ -9,12 +9,12 @@
 
 use crate::types::stiffness::{Gain, RegionStiffness};
 
-/// Least relative standard deviation of one frame that is believed.
-const LEAST: f64 = 1e-4;
+/// Least relative standard deviation of one frame.
+const MIN_RELATIVE_SD: f64 = 1e-4;
 
-/// Common parts that differ by less than this factor count as the same: how large they are is
-/// itself known to about a tenth, and the frame that claims the least would count alone.
-const ALIKE: f64 = 1.1;
+/// Common errors that differ by less than this factor are equal: each is known to about a tenth,
+/// and the frame with the least would count alone.
+const EQUAL_ERROR_RATIO: f64 = 1.1;
 
 /// What a frame says of a region, and its mean motion (mm).
 pub type Said<'a> = (&'a RegionStiffness, f64);
@@ -25,7 +25,7 @@ pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
     let value = |r: &RegionStiffness| [r.youngs_modulus, r.ratio][which];
     let one = |&(r, motion): &Said<'_>| {
         let (value, sd) = [(r.youngs_modulus, r.sd), (r.ratio, r.ratio_sd)][which];
-        let data = r.data_sd[which].max(LEAST);
+        let data = r.data_sd[which].max(MIN_RELATIVE_SD);
         let model = ((sd / value).powi(2) - data * data).max(0.0).sqrt();
         Frame { log: value.ln(), data, model, weighed_as: model, motion }
     };
@@ -36,7 +36,7 @@ pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
 
 /// Puts what the common parts are by the frames' motion in the place of what each frame claims: a
 /// power of it from -1 (errors in mm) to 0 (errors in per cent) by least squares of
-/// logarithms, and the same for frames that differ by [`ALIKE`].
+/// logarithms, and the same for frames that differ by [`EQUAL_ERROR_RATIO`].
 fn even_out(frames: &mut [Frame]) {
     let is_known = |v: f64| v.is_finite() && v > 0.0;
     let known: Vec<[f64; 2]> = frames
@@ -52,7 +52,7 @@ fn even_out(frames: &mut [Frame]) {
         f.model = (middle[1] + power * (f.motion.ln() - middle[0])).exp();
     }
     let least = frames.iter().fold(f64::INFINITY, |m, f| m.min(f.model));
-    frames.iter_mut().for_each(|f| f.weighed_as = least.max(f.model / ALIKE));
+    frames.iter_mut().for_each(|f| f.weighed_as = least.max(f.model / EQUAL_ERROR_RATIO));
 }
 
 fn gain(frames: &[Frame]) -> Gain {

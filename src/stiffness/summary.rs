@@ -11,28 +11,32 @@ use crate::stiffness::model_selection::bic;
 use crate::types::space::dot;
 use crate::types::stiffness::{Law, StiffnessParams};
 
-/// A standard deviation of ln E beyond this says that the data do not tell (a factor of two lies
-/// within two of them).
-pub const VAGUE: f64 = 0.35;
-/// A region is looked at more closely where a modulus e times as large moves no tissue by this part
-/// of the plates' motion.
-const DOUBTED: f64 = 0.02;
-/// It is not seen where, all moduli alike, that is less than this (two halves side by side came to
-/// 0.0003, a rod along a limb to 0.001, all that is to be seen in phantoms to 0.027 and more), or
-/// where it is so at the modulus found and hardly more if all are alike (a skin along a limb, which
-/// the rounded rim of the mesh lets in).
-const SHOWN: f64 = 0.005;
-/// Part of the body that a region moves, at most.
-const MOST_MOVED: f64 = 0.02;
-/// Precision of the solution for that (part of the plates' motion).
-const ALIKE: f64 = 0.02;
-/// Part of the force from which a region that is not seen makes a bound of the others' moduli.
-pub const BEARS: f64 = 0.03;
-/// Contrasts beyond e^this are checked against a rigid region (12).
-const HIGH: f64 = 2.5;
-/// Contrasts beyond e^this (50) are bounds: what such a region gives way is less than what mesh and
-/// labels leave open.
-pub const SEEN: f64 = 3.9;
+/// Largest standard deviation of ln E of an identified modulus: two of them are a factor of two.
+pub const MAX_IDENTIFIED_SD_LN: f64 = 0.35;
+/// Motion of the tissue (parts of the plates' motion) for a modulus e times as large, below which
+/// the data do not show a region.
+struct Visibility {
+    /// Motion below which a region is examined with all moduli equal.
+    suspect_motion: f64,
+    /// Motion there below which it is hidden: 0.0003 for two halves side by side, 0.001 for a rod
+    /// along a limb, 0.027 and more for visible regions of phantoms.
+    min_motion: f64,
+    /// Largest part of the body over which the motion is taken.
+    max_body_fraction: f64,
+    /// Tolerance of the solution with equal moduli.
+    tolerance: f64,
+}
+
+const VISIBILITY: Visibility =
+    Visibility { suspect_motion: 0.02, min_motion: 0.005, max_body_fraction: 0.02, tolerance: 0.02 };
+
+/// Part of the force borne by a hidden region, from which the other moduli are bounds only.
+pub const MIN_LOAD_SHARE: f64 = 0.03;
+/// Contrast (ln 12) beyond which a region is compared with a rigid one.
+const MAX_UNCHECKED_CONTRAST_LN: f64 = 2.5;
+/// Contrast (ln 50) beyond which a modulus is a bound: mesh and labels leave more open than such a
+/// region deforms.
+pub const MAX_IDENTIFIED_CONTRAST_LN: f64 = 3.9;
 
 /// ln E of each region with gradient and covariance.
 #[derive(Debug, Clone)]
@@ -154,14 +158,17 @@ pub struct Hidden {
 pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
     let travel = setup.travel();
     let found = shown(setup, estimate);
-    if found.iter().all(|moved| *moved > DOUBTED * travel) {
+    if found.iter().all(|moved| *moved > VISIBILITY.suspect_motion * travel) {
         return None;
     }
     let equal = Setup { law: Law::Linear, ..setup.clone() };
     let start = State { theta: vec![0.0; estimate.state.theta.len()], ..estimate.state.clone() };
-    let estimate = equal.run(start, 0, ALIKE * travel).ok()?;
+    let estimate = equal.run(start, 0, VISIBILITY.tolerance * travel).ok()?;
     let shown = shown(&equal, &estimate);
-    let nothing = |&k: &usize| shown[k] < SHOWN * travel || (found[k] < SHOWN * travel && shown[k] < DOUBTED * travel);
+    let nothing = |&k: &usize| {
+        shown[k] < VISIBILITY.min_motion * travel
+            || (found[k] < VISIBILITY.min_motion * travel && shown[k] < VISIBILITY.suspect_motion * travel)
+    };
     let hidden = (0..shown.len()).filter(nothing).min_by(|&a, &b| shown[a].total_cmp(&shown[b]));
     hidden.map(|k| Hidden {
         label: setup.body.labels[setup.free()[k]],
@@ -198,7 +205,7 @@ fn shown(setup: &Setup<'_>, estimate: &Estimate) -> Vec<f64> {
         };
         let mut all: Vec<f64> = (0..estimate.residuals.len()).map(moved).collect();
         let part = setup.body.volumes[free[k]] / setup.body.volumes.iter().sum::<f64>();
-        percentile(&mut all, 100.0 * (1.0 - part.min(MOST_MOVED)))
+        percentile(&mut all, 100.0 * (1.0 - part.min(VISIBILITY.max_body_fraction)))
     };
     (0..free.len()).map(one).collect()
 }
@@ -216,11 +223,12 @@ pub fn unseen(
     variance: f64,
 ) -> Result<Option<&'static str>, StiffnessError> {
     let theta = estimate.state.theta[r];
-    if !setup.free().contains(&r) || (variance.sqrt() < VAGUE && theta.abs() < HIGH) {
+    if !setup.free().contains(&r) || (variance.sqrt() < MAX_IDENTIFIED_SD_LN && theta.abs() < MAX_UNCHECKED_CONTRAST_LN)
+    {
         return Ok(None);
     }
     let side = if theta >= 0.0 { "lower" } else { "upper" };
-    if variance.sqrt() > VAGUE || theta.abs() > SEEN {
+    if variance.sqrt() > MAX_IDENTIFIED_SD_LN || theta.abs() > MAX_IDENTIFIED_CONTRAST_LN {
         return Ok(Some(side));
     }
     // Far enough to be as good as rigid, near enough to be solved.

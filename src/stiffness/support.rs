@@ -13,21 +13,21 @@
 use crate::error::StiffnessError;
 use crate::stiffness::boundary_conditions::travel;
 use crate::stiffness::identify::{Estimate, State};
-use crate::stiffness::inclusion::SHAPES;
-use crate::stiffness::mesh_problem::{FLOOR, Level};
-use crate::stiffness::model_selection::{MARGIN, bic};
+use crate::stiffness::inclusion::SHAPE_FUNCTIONS;
+use crate::stiffness::mesh_problem::{Level, MESH_ERROR_VOXELS};
+use crate::stiffness::model_selection::{MIN_BIC_GAIN, bic};
 use crate::stiffness::systematic_error::Fit;
 use crate::types::space::dot;
 use crate::types::stiffness::{Evidence, Law, LeftOver, StiffnessParams};
 
-/// How far a residual must stand out of the noise of a sample (1).
-const DISCREPANCY: f64 = 1.1;
-/// The part of the power of a voxel's noise that a misfit must have (1).
-const TRACE: f64 = 0.1;
+/// Residual over the noise of a sample from which the misfit is significant (1).
+const MIN_DISCREPANCY: f64 = 1.1;
+/// Power of the misfit over that of a voxel's noise from which it is significant (1).
+const MIN_NOISE_POWER_FRACTION: f64 = 0.1;
 
-/// One standard deviation with which a mesh keeps to the surface of a body between its voxels: 0.04
-/// to 0.08 of balls and ellipsoids (voxels).
-const SURFACE: f64 = 0.1;
+/// Standard deviation of a mesh about the body's surface between voxels (voxels): 0.04 to 0.08 for
+/// balls and ellipsoids.
+const MESH_SURFACE_SD_VOXELS: f64 = 0.1;
 
 /// The case for more regions, so far.
 #[derive(Debug)]
@@ -65,8 +65,8 @@ pub fn identify(
 /// Why a model is not taken whose criterion falls by `gain`.
 fn too_little(gain: f64) -> String {
     match gain >= 0.0 {
-        true => format!("the criterion falls by {gain:.0} only, {MARGIN} are needed"),
-        false => format!("the criterion rises by {:.0}, and should fall by {MARGIN}", -gain),
+        true => format!("the criterion falls by {gain:.0} only, {MIN_BIC_GAIN} are needed"),
+        false => format!("the criterion rises by {:.0}, and should fall by {MIN_BIC_GAIN}", -gain),
     }
 }
 
@@ -82,8 +82,8 @@ impl Support {
         let misfit = (rms * rms - sample * sample).max(0.0).sqrt();
         let mut out = Self {
             noise: [noise, sample],
-            geometry: SURFACE * level.voxel * strain,
-            floor: FLOOR * level.voxel,
+            geometry: MESH_SURFACE_SD_VOXELS * level.voxel * strain,
+            floor: MESH_ERROR_VOXELS * level.voxel,
             squares: e.squares,
             misfit,
             effective: e.effective,
@@ -122,15 +122,15 @@ impl Support {
         if !self.stands_out() {
             let shown = sample.hypot(self.misfit) / sample.max(1e-12);
             return Some(format!(
-                "its misfit of {:.4} mm does not stand out of samples noisy by {sample:.4} mm ({shown:.2} times, {DISCREPANCY} needed)",
+                "its misfit of {:.4} mm does not stand out of samples noisy by {sample:.4} mm ({shown:.2} times, {MIN_DISCREPANCY} needed)",
                 self.misfit
             ));
         }
         let part = (self.misfit / voxel.max(1e-12)).powi(2);
-        if part <= TRACE {
+        if part <= MIN_NOISE_POWER_FRACTION {
             return Some(format!(
                 "its misfit of {:.4} mm stands out of samples noisy by {sample:.4} mm, but is {part:.2} of the power of what a voxel is \
-                 rough by, {voxel:.4} mm ({TRACE} needed)",
+                 rough by, {voxel:.4} mm ({MIN_NOISE_POWER_FRACTION} needed)",
                 self.misfit
             ));
         }
@@ -143,7 +143,7 @@ impl Support {
     }
 
     fn stands_out(&self) -> bool {
-        self.noise[1].hypot(self.misfit) > DISCREPANCY * self.noise[1]
+        self.noise[1].hypot(self.misfit) > MIN_DISCREPANCY * self.noise[1]
     }
 
     /// What the model that stands leaves over of the field, where that is more than noise.
@@ -179,17 +179,19 @@ impl Support {
     pub fn least_seen(&self) -> f64 {
         let [voxel, sample] = self.noise;
         let noise = sample.max(self.floor);
-        let stands_out = (DISCREPANCY * DISCREPANCY - 1.0).sqrt() * sample;
-        let asked = MARGIN + (1 + SHAPES) as f64 * self.effective.max(2.0).ln();
+        let stands_out = (MIN_DISCREPANCY * MIN_DISCREPANCY - 1.0).sqrt() * sample;
+        let asked = MIN_BIC_GAIN + (1 + SHAPE_FUNCTIONS) as f64 * self.effective.max(2.0).ln();
         let by_criterion = noise * (asked / self.effective.max(1.0)).exp_m1().sqrt();
-        [stands_out, TRACE.sqrt() * voxel, self.geometry, by_criterion].into_iter().fold(0.0, f64::max)
+        [stands_out, MIN_NOISE_POWER_FRACTION.sqrt() * voxel, self.geometry, by_criterion]
+            .into_iter()
+            .fold(0.0, f64::max)
     }
 
     /// Judges the estimate with `count` regions, which leaves over `rms` (mm) with the surface
     /// where the data put it; true makes it the model that stands.
     pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize, rms: f64) -> bool {
         let misfit = (rms * rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
-        let parameters = e.parameters + SHAPES * (count - 1);
+        let parameters = e.parameters + SHAPE_FUNCTIONS * (count - 1);
         let samples = self.effective.min(e.effective);
         let gain = bic(self.squares, samples, self.parameters) - bic(e.squares, samples, parameters);
         let setup = level.setup(Law::Linear, &StiffnessParams::default(), level.largest());
@@ -205,7 +207,7 @@ impl Support {
             })
             // The one that stands out least.
             .fold((f64::INFINITY, 1.0), |m, c| if c.0 / c.1 < m.0 / m.1 { c } else { m });
-        let why = if gain <= MARGIN {
+        let why = if gain <= MIN_BIC_GAIN {
             Some(too_little(gain))
         } else if misfit > 0.8 * self.misfit {
             Some(format!("the misfit falls from {:.4} to {misfit:.4} mm only", self.misfit))

@@ -6,14 +6,14 @@ use crate::numerics::cholesky::Cholesky;
 use crate::stiffness::identify::{Estimate, Setup};
 use crate::types::space::dot;
 
-/// Cosine of the angle between what a wrong model leaves over and what a modulus changes: from
-/// bodies of an independent solver, with shapes, patches and laws that the model does not have.
-const ALIGNED: f64 = 0.15;
+/// Cosine between a wrong model's residual and a modulus's sensitivity: from bodies of an
+/// independent solver with other shapes, patches and laws.
+const MODEL_ERROR_COSINE: f64 = 0.15;
 
 /// By how much less data tell whose error `share` (of its squares) is everywhere at once, of so
 /// many samples.
 pub fn dilution(share: f64, samples: f64) -> f64 {
-    ALIGNED * ALIGNED * samples * share
+    MODEL_ERROR_COSINE * MODEL_ERROR_COSINE * samples * share
 }
 
 impl Setup<'_> {

@@ -5,17 +5,22 @@ use crate::stiffness::fem_body::Body;
 use crate::stiffness::saddle::{Levels, Saddle};
 use rayon::prelude::*;
 
-/// Relative error of an iterative solution (weighted 2-norm).
-const SOLVED: f64 = 1e-7;
-/// Relative error of a step of Newton's method, which ends where a step is this much too large.
-const NEWTON: f64 = 1e-3;
-/// Relative error of sensitivities: what they are taken for is good to a few per cent.
-const SENSITIVE: f64 = 1e-3;
-/// Relative error of a step whose residual is worked out anew.
-const STEP: f64 = 1e-2;
+/// Relative errors (weighted 2-norm) of iterative solutions.
+struct Tolerances {
+    /// A solution.
+    solution: f64,
+    /// A step of Newton's method: the solution is off by this part of the last step.
+    newton_step: f64,
+    /// A sensitivity, which is needed to a few per cent.
+    sensitivity: f64,
+    /// A step whose residual is then computed exactly.
+    corrected_step: f64,
+}
 
-/// Right-hand sides that a factor solves for at a time: it is read once for all of them.
-const TOGETHER: usize = 32;
+const TOLERANCE: Tolerances = Tolerances { solution: 1e-7, newton_step: 1e-3, sensitivity: 1e-3, corrected_step: 1e-2 };
+
+/// Right-hand sides solved together: the factor is read once for all of them.
+const RHS_PER_SOLVE: usize = 32;
 
 /// The values of a tangent in a body's pattern, and on both levels of a large body.
 #[derive(Debug)]
@@ -56,7 +61,7 @@ impl<'a> Tangent<'a> {
     pub fn solve(&self, x: &mut [f64], start: Option<&[f64]>) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.solve(x),
-            Self::Iterative(saddle) => saddle.solve(x, start, SOLVED),
+            Self::Iterative(saddle) => saddle.solve(x, start, TOLERANCE.solution),
         }
     }
 
@@ -68,7 +73,7 @@ impl<'a> Tangent<'a> {
     pub fn sensitivities(&self, x: &mut [f64], start: Option<&[f64]>) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.solve(x),
-            Self::Iterative(saddle) => saddle.solve(x, start, SENSITIVE),
+            Self::Iterative(saddle) => saddle.solve(x, start, TOLERANCE.sensitivity),
         }
     }
 
@@ -79,7 +84,7 @@ impl<'a> Tangent<'a> {
     pub fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.solve_or_replace(x),
-            Self::Iterative(saddle) => saddle.solve(x, None, NEWTON),
+            Self::Iterative(saddle) => saddle.solve(x, None, TOLERANCE.newton_step),
         }
     }
 
@@ -90,7 +95,7 @@ impl<'a> Tangent<'a> {
     pub fn step(&self, x: &mut [f64]) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.step(x),
-            Self::Iterative(saddle) => saddle.solve(x, None, STEP),
+            Self::Iterative(saddle) => saddle.solve(x, None, TOLERANCE.corrected_step),
         }
     }
 
@@ -132,7 +137,7 @@ impl<'a> Tangent<'a> {
         match self {
             Self::Direct(factor) => {
                 let whole = factor.whole()?;
-                x.par_chunks_mut(TOGETHER * n).map(|part| whole.solve(part)).collect()
+                x.par_chunks_mut(RHS_PER_SOLVE * n).map(|part| whole.solve(part)).collect()
             }
             Self::Iterative(_) => self.sensitivities(x, None),
         }

@@ -19,26 +19,44 @@ use crate::types::space::dot;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Lattice nodes at most.
-const NODES: f64 = 420.0;
-/// Observations used for the map.
-const SAMPLES: usize = 5000;
-/// Differences of ln mu under this count as smooth.
-const SMOOTH: f64 = 0.05;
-/// Iterations at most.
-const ITERATIONS: usize = 9;
-/// Standard deviation of the Gaussian that rounds regions (lattice steps).
-const ROUND: f64 = 0.4;
-/// Percentile of the map that counts as its furthest value: a hundredth of the body may be the
-/// map's own corners.
-const FURTHEST: f64 = 99.0;
-/// Pieces of the map that are tried as the next region.
-const TRIED: usize = 3;
-/// Part of the map's furthest value down to which a region reaches: total variation flattens a
-/// region and lets its border lie about there.
-const HALF: f64 = 0.4;
-/// Parts of the body smaller than this are no region of their own.
-const SMALLEST: f64 = 0.004;
+/// Identification of a map of moduli with total variation.
+struct MapControl {
+    /// Most lattice nodes.
+    max_nodes: f64,
+    /// Most observations.
+    max_observations: usize,
+    /// Difference of ln mu between nodes up to which total variation is smoothed.
+    smooth_step_ln: f64,
+    /// Most iterations.
+    max_iterations: usize,
+}
+
+const MAP_CONTROL: MapControl =
+    MapControl { max_nodes: 420.0, max_observations: 5000, smooth_step_ln: 0.05, max_iterations: 9 };
+
+/// How regions are found in the map.
+struct Segmentation {
+    /// Smoothing of a region's border (lattice steps, one Gaussian standard deviation).
+    rounding_steps: f64,
+    /// Percentile of the map that stands for its extreme value: a hundredth of the body may be
+    /// artefacts in corners.
+    extreme_percentile: f64,
+    /// Most pieces of the map that are tried as the next region.
+    max_pieces: usize,
+    /// Value at a region's border over the extreme one: total variation flattens a region, and its
+    /// border lies about there.
+    edge_fraction: f64,
+    /// Smallest region, as a part of the body.
+    min_body_fraction: f64,
+}
+
+const SEGMENTATION: Segmentation = Segmentation {
+    rounding_steps: 0.4,
+    extreme_percentile: 99.0,
+    max_pieces: 3,
+    edge_fraction: 0.4,
+    min_body_fraction: 0.004,
+};
 
 /// A trilinear function on a lattice (grid of `count` nodes from `low`, `size` mm apart; mm, RAS).
 #[derive(Debug, Clone)]
@@ -64,7 +82,7 @@ impl Lattice {
             }
         }
         // The outer layer adds nodes: aim lower inside.
-        let size = (volume / (0.6 * NODES)).cbrt();
+        let size = (volume / (0.6 * MAP_CONTROL.max_nodes)).cbrt();
         let count = std::array::from_fn(|a| ((high[a] - low[a]) / size).ceil() as usize + 1);
         let low = std::array::from_fn(|a| 0.5 * (low[a] + high[a]) - 0.5 * size * (count[a] - 1) as f64);
         let mut out =
@@ -135,11 +153,11 @@ impl Lattice {
     /// functions over it; none where the ball reaches past the lattice.
     fn ball(&self, middle: [f64; 3], radius: f64) -> Option<BTreeMap<u32, f64>> {
         let volume = 4.0 / 3.0 * std::f64::consts::PI * radius.powi(3);
-        let share = volume / self.size.powi(3) / WITHIN as f64;
+        let share = volume / self.size.powi(3) / BALLS.samples as f64;
         let mut out = BTreeMap::new();
-        for k in 0..WITHIN {
+        for k in 0..BALLS.samples {
             // Evenly over the ball: shells of one volume, turned by the golden angle.
-            let t = (k as f64 + 0.5) / WITHIN as f64;
+            let t = (k as f64 + 0.5) / BALLS.samples as f64;
             let (height, turn) = (1.0 - 2.0 * ((k as f64 * 0.618_034).fract()), k as f64 * 2.399_963);
             let (r, flat) = (radius * t.cbrt(), (1.0 - height * height).sqrt());
             let d = [flat * turn.cos(), flat * turn.sin(), height].map(|v| r * v);
@@ -186,16 +204,21 @@ impl Basis {
         };
         let lattice = Lattice::new(&body.places, body.volumes.iter().sum());
         let weights = body.cells.iter().map(|c| lattice.weights(middle(c))).collect();
-        let step = setup.observations.len().div_ceil(SAMPLES).max(1);
+        let step = setup.observations.len().div_ceil(MAP_CONTROL.max_observations).max(1);
         let picked = setup.observations.iter().step_by(step).cloned().collect();
         Self { lattice, weights, picked }
     }
 }
 
-/// Parts of the body's least extent that are the diameters of balls whose limit is given.
-const DIAMETERS: [f64; 3] = [0.25, 0.35, 0.5];
-/// Places in a ball over which the lattice's functions are averaged.
-const WITHIN: usize = 200;
+/// Balls whose detection limit is reported.
+struct Balls {
+    /// Diameters over the body's least extent.
+    diameter_fractions: [f64; 3],
+    /// Places in a ball over which the lattice's functions are averaged.
+    samples: usize,
+}
+
+const BALLS: Balls = Balls { diameter_fractions: [0.25, 0.35, 0.5], samples: 200 };
 
 /// For balls of some diameters (mm): what one moves, the plates fitted again, for a unit of ln mu
 /// (mm, root mean square of one component), where it moves less than in three of four places.
@@ -231,7 +254,7 @@ pub fn shown_by_balls(setup: &Setup<'_>, identified: &State) -> Result<Vec<(f64,
         let mut found: Vec<f64> = lattice.places().into_par_iter().filter_map(moved).collect();
         (!found.is_empty()).then(|| (diameter, percentile(&mut found, 25.0)))
     };
-    Ok(DIAMETERS.into_iter().filter_map(|part| of(part * least)).collect())
+    Ok(BALLS.diameter_fractions.into_iter().filter_map(|part| of(part * least)).collect())
 }
 
 /// The vectors made orthogonal to each other, each of length 1; those that add nothing left out.
@@ -276,7 +299,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
     let mut values = vec![0.0; used];
     let mut state = identified.clone();
     let (mut kappa, mut best): (f64, Option<(f64, Vec<f64>)>) = (0.0, None);
-    for iteration in 0..ITERATIONS {
+    for iteration in 0..MAP_CONTROL.max_iterations {
         let mut problem = setup.problem(&state);
         for (m, w) in problem.materials.iter_mut().zip(&weights) {
             m.mu *= w.iter().map(|&(n, w)| w * values[n as usize]).sum::<f64>().exp();
@@ -293,7 +316,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         if best.as_ref().is_none_or(|b| rms < b.0) {
             best = Some((rms, values.clone()));
         }
-        if rms <= target || iteration + 1 == ITERATIONS {
+        if rms <= target || iteration + 1 == MAP_CONTROL.max_iterations {
             break;
         }
         let jacobian = jacobian(setup, &problem, &solution, &weights, &picked, used)?;
@@ -319,7 +342,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         let mean = (0..used).map(|k| normal[(k, k)]).sum::<f64>() / used as f64;
         if iteration == 0 {
             // A step of one in ln mu across an edge weighs as much as what one node can explain.
-            kappa = 0.3 * mean * SMOOTH.max(0.1);
+            kappa = 0.3 * mean * MAP_CONTROL.smooth_step_ln.max(0.1);
         } else {
             kappa *= 0.4;
         }
@@ -328,7 +351,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         for &(i, j) in &lattice.pairs {
             let (i, j) = (i as usize, j as usize);
             let difference = values[i] - values[j];
-            let w = kappa / (difference * difference + SMOOTH * SMOOTH).sqrt();
+            let w = kappa / (difference * difference + MAP_CONTROL.smooth_step_ln * MAP_CONTROL.smooth_step_ln).sqrt();
             a[i * p + i] += w;
             a[j * p + j] += w;
             a[i * p + j] -= w;
@@ -403,7 +426,7 @@ pub fn next_regions(map: &Map, labels: &Mask) -> Vec<Mask> {
     let mut pieces: Vec<(f64, Vec<usize>)> = Vec::new();
     for sign in [1.0, -1.0] {
         let above: Vec<f64> = values.iter().map(|v| sign * (v - middle)).collect();
-        let limit = HALF * percentile(&mut above.clone(), FURTHEST);
+        let limit = SEGMENTATION.edge_fraction * percentile(&mut above.clone(), SEGMENTATION.extreme_percentile);
         if limit <= 0.0 {
             continue;
         }
@@ -419,10 +442,12 @@ pub fn next_regions(map: &Map, labels: &Mask) -> Vec<Mask> {
             own.0 += weight[o];
             own.1.push(o);
         }
-        pieces.extend(found.into_iter().filter(|p| p.1.len() as f64 >= SMALLEST * inside.len() as f64));
+        pieces.extend(
+            found.into_iter().filter(|p| p.1.len() as f64 >= SEGMENTATION.min_body_fraction * inside.len() as f64),
+        );
     }
     pieces.sort_by(|a, b| b.0.total_cmp(&a.0));
-    pieces.truncate(TRIED);
+    pieces.truncate(SEGMENTATION.max_pieces);
     pieces.iter().filter_map(|(_, piece)| with_region(map, labels, piece)).collect()
 }
 
@@ -432,7 +457,7 @@ fn with_region(map: &Map, labels: &Mask, piece: &[usize]) -> Option<Mask> {
     let next = labels.as_slice().iter().copied().max()?.checked_add(1)?;
     let mut drawn = labels.as_slice().to_vec();
     piece.iter().for_each(|&o| drawn[o] = next);
-    let sigma = grid.spacing().map(|s| ROUND * map.lattice.size / s);
+    let sigma = grid.spacing().map(|s| SEGMENTATION.rounding_steps * map.lattice.size / s);
     let round = rounded(&drawn, grid.shape(), sigma, usize::from(next));
     // The regions that are there keep their shapes.
     let kept = |(old, new): (&u8, &u8)| if *old == 1 && *new == next { next } else { *old };

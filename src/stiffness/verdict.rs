@@ -1,21 +1,26 @@
 //! The verdict on each region, and on the result as a whole.
 
 use crate::stiffness::fem_body::Body;
-use crate::stiffness::summary::{BEARS, Hidden, Moduli, Scale, VAGUE};
+use crate::stiffness::summary::{Hidden, MAX_IDENTIFIED_SD_LN, MIN_LOAD_SHARE, Moduli, Scale};
 use crate::types::stiffness::{Determined, RegionStiffness};
 use crate::types::{MotionModel, Trust};
 
-/// Standard deviation of ln E for each unit of |ln contrast| where a region was found without
-/// labels and has the shape that the map gave it. From six phantoms.
-const CUT: f64 = 0.15;
-/// The same where its shape was drawn anew: nine functions leave more of it open than labels do.
-/// From bodies of an independent solver.
-const DRAWN: f64 = 0.02;
-/// A change of ln E with the mesh beyond this means that the fine mesh does not resolve it either.
-const RESOLVED: f64 = 0.1;
-/// The least misfit over the noise of a sample that stands out of it: together they are then 1.03
+/// Standard deviation of ln E per unit of |ln contrast| of a region found without labels.
+struct ShapeError {
+    /// With the shape that the map gave it: from six phantoms.
+    cut: f64,
+    /// With a redrawn shape: nine functions leave more open than labels. From bodies of an
+    /// independent solver.
+    redrawn: f64,
+}
+
+const SHAPE_ERROR: ShapeError = ShapeError { cut: 0.15, redrawn: 0.02 };
+
+/// Largest change of ln E between the meshes with which the fine one resolves it.
+const MAX_RESOLVED_CHANGE_LN: f64 = 0.1;
+/// Misfit over the noise of a sample from which it is significant: together they are then 1.03
 /// times that noise.
-const STANDS_OUT: f64 = 0.25;
+const MIN_MISFIT_TO_NOISE: f64 = 0.25;
 
 /// Where the shape of a region comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,8 +39,8 @@ impl Shape {
     fn slope(self) -> f64 {
         match self {
             Shape::Given => 0.0,
-            Shape::Cut => CUT,
-            Shape::Drawn => DRAWN,
+            Shape::Cut => SHAPE_ERROR.cut,
+            Shape::Drawn => SHAPE_ERROR.redrawn,
         }
     }
 }
@@ -54,7 +59,7 @@ pub struct Misfit {
 impl Misfit {
     /// As a part of the deformation; 0 where it does not stand out of the noise.
     pub fn share(&self) -> f64 {
-        let seen = self.mm > STANDS_OUT * self.noise_mm;
+        let seen = self.mm > MIN_MISFIT_TO_NOISE * self.noise_mm;
         if seen { self.mm / self.deformation_mm.max(f64::MIN_POSITIVE) } else { 0.0 }
     }
 
@@ -95,7 +100,7 @@ pub struct Found<'a> {
 
 /// The error of ln E on the fine mesh, of a `change` of it from the coarse to the fine one.
 pub fn mesh_error(change: f64) -> f64 {
-    if change.abs() < RESOLVED { change / 3.0 } else { change }
+    if change.abs() < MAX_RESOLVED_CHANGE_LN { change / 3.0 } else { change }
 }
 
 /// Which side of a modulus is open.
@@ -186,10 +191,12 @@ impl Found<'_> {
     /// The part of the force that a region bears at most, where regions that are not seen make that
     /// all that is known of it: those can bear anything from none to all of their share.
     fn at_most(&self, label: u8) -> Option<f64> {
-        let borne = self.hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
+        let hidden_share = self.hidden.iter().map(|h| h.share).sum::<f64>().min(1.0);
         match self.hides(label) {
             Some(h) => Some(h.share),
-            None => (matches!(self.scale, Scale::Force(_)) && borne > BEARS).then_some(1.0 - borne),
+            None => {
+                (matches!(self.scale, Scale::Force(_)) && hidden_share > MIN_LOAD_SHARE).then_some(1.0 - hidden_share)
+            }
         }
     }
 
@@ -202,14 +209,14 @@ impl Found<'_> {
         }
         if let Some(share) = self.at_most(label) {
             let by_force = matches!(self.scale, Scale::Force(_));
-            if !by_force || share < BEARS {
+            if !by_force || share < MIN_LOAD_SHARE {
                 return (Some(Side::Any), log);
             }
             let sd = self.moduli.covariance[reference * count + reference].max(0.0).sqrt();
             return (Some(Side::Upper), log - share.ln() + 2.0 * sd);
         }
         let against = log - self.moduli.log[reference];
-        let vague = (sd > VAGUE).then_some(if against >= 0.0 { "lower" } else { "upper" });
+        let vague = (sd > MAX_IDENTIFIED_SD_LN).then_some(if against >= 0.0 { "lower" } else { "upper" });
         // Two standard deviations from the estimate, towards the side that the data exclude. What
         // is all but rigid moves in proportion to its compliance, what is all but empty to its
         // modulus: there the deviation of the logarithm is a relative one.

@@ -157,9 +157,9 @@ fn taps(nodes: &Grid, place: WorldPoint) -> Vec<(usize, f32)> {
         .collect()
 }
 
-/// Width over which variances of a few draws are averaged (places, one standard deviation of a
-/// Gaussian): about a node to either side.
-const AVERAGED: f64 = 1.5;
+/// Width over which statistics of a few draws are smoothed (nodes, one Gaussian standard
+/// deviation).
+pub const DRAW_SMOOTHING_NODES: f64 = 1.5;
 
 /// Standard deviation of a strain by place.
 #[derive(Debug, Clone, PartialEq)]
@@ -186,7 +186,8 @@ impl StrainDeviation {
                 (0..6).for_each(|c| squares[c][at] += ((apart[c] - e[c]).powi(2) / drawn.len() as f64) as f32);
             }
         }
-        let smooth = |values: &[f32]| gaussian(values, shape, shape.map(|n| if n > 1 { AVERAGED } else { 0.0 }));
+        let smooth =
+            |values: &[f32]| gaussian(values, shape, shape.map(|n| if n > 1 { DRAW_SMOOTHING_NODES } else { 0.0 }));
         let share = smooth(&counts);
         let averaged = |values: Vec<f32>| smooth(&values).iter().zip(&share).map(|(v, s)| v / s.max(1e-6)).collect();
         Self::Drawn(Box::new(draws.grid), squares.into_iter().map(averaged).collect())

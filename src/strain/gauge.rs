@@ -72,11 +72,11 @@ impl Gauge {
 }
 
 /// Sums over a plane's window: of 1, x, y, xx, yy, xy, then of u, xu, yu for each component.
-const IN_PLANE: usize = 15;
+const PLANE_SUMS: usize = 15;
 /// The same with z: 1, x, y, z, xx, yy, zz, xy, xz, yz, then u, xu, yu, zu for each component.
-const IN_CUBE: usize = 22;
-/// Planes that one thread works on at a time.
-const PLANES: usize = 8;
+const CUBE_SUMS: usize = 22;
+/// Planes processed by one thread at a time.
+const PLANES_PER_TASK: usize = 8;
 
 /// What `f` makes of the displacement gradient at each voxel (rows: components of u, columns: world
 /// axes; 1), x fastest. `bodies` holds a label for each voxel; it is the default value where that
@@ -96,12 +96,12 @@ pub fn map_gradients<T: Clone + Default + Send + Sync>(
     let labels: Vec<u8> = (1..=255).filter(|&l| seen[usize::from(l)]).collect();
     let one = bodies.is_empty().then_some(1);
     let mut out = vec![T::default(); grid.len()];
-    out.par_chunks_mut(PLANES * plane).enumerate().for_each(|(slab, out)| {
+    out.par_chunks_mut(PLANES_PER_TASK * plane).enumerate().for_each(|(slab, out)| {
         for label in one.iter().chain(&labels) {
             let mut sums = Sums::new(field, bodies, *label, gauge);
             for (at, out) in out.chunks_exact_mut(plane).enumerate() {
-                sums.go_to(slab * PLANES + at);
-                sums.each(|within, gradient| out[within] = f((slab * PLANES + at) * plane + within, gradient));
+                sums.go_to(slab * PLANES_PER_TASK + at);
+                sums.each(|within, gradient| out[within] = f((slab * PLANES_PER_TASK + at) * plane + within, gradient));
             }
         }
     });
@@ -116,7 +116,7 @@ struct Sums<'a> {
     gauge: Gauge,
     /// The plane at hand, once there is one.
     plane: Option<usize>,
-    cube: Vec<[f64; IN_CUBE]>,
+    cube: Vec<[f64; CUBE_SUMS]>,
 }
 
 impl<'a> Sums<'a> {
@@ -142,7 +142,7 @@ impl<'a> Sums<'a> {
                 }
             }
             _ => {
-                self.cube = vec![[0.0; IN_CUBE]; nx * ny];
+                self.cube = vec![[0.0; CUBE_SUMS]; nx * ny];
                 (k.saturating_sub(half)..(k + half + 1).min(nz)).for_each(|k| self.add(k, 1.0));
             }
         }
@@ -157,9 +157,9 @@ impl<'a> Sums<'a> {
             return;
         }
         let [hx, hy, _] = self.gauge.half;
-        let rows: Vec<Vec<[f64; IN_PLANE]>> = (0..ny).map(|j| self.row(from + j * nx, j, hx)).collect();
+        let rows: Vec<Vec<[f64; PLANE_SUMS]>> = (0..ny).map(|j| self.row(from + j * nx, j, hx)).collect();
         let z = k as f64;
-        let mut window = vec![[0.0; IN_PLANE]; nx];
+        let mut window = vec![[0.0; PLANE_SUMS]; nx];
         rows[..hy.min(ny)].iter().for_each(|row| add_row(&mut window, row, 1.0));
         for j in 0..ny {
             if j + hy < ny {
@@ -181,11 +181,11 @@ impl<'a> Sums<'a> {
     }
 
     /// The sums of a row's windows along x.
-    fn row(&self, from: usize, j: usize, half: usize) -> Vec<[f64; IN_PLANE]> {
+    fn row(&self, from: usize, j: usize, half: usize) -> Vec<[f64; PLANE_SUMS]> {
         let nx = self.field.grid().shape()[0];
         let y = j as f64;
         let of = |i: usize| {
-            let mut out = [0.0; IN_PLANE];
+            let mut out = [0.0; PLANE_SUMS];
             if self.belongs(from + i) {
                 let x = i as f64;
                 let u = self.field.at(from + i).map(f64::from);
@@ -194,8 +194,8 @@ impl<'a> Sums<'a> {
             }
             out
         };
-        let single: Vec<[f64; IN_PLANE]> = (0..nx).map(of).collect();
-        let mut window = [0.0; IN_PLANE];
+        let single: Vec<[f64; PLANE_SUMS]> = (0..nx).map(of).collect();
+        let mut window = [0.0; PLANE_SUMS];
         single[..half.min(nx)].iter().for_each(|values| add_to(&mut window, values, 1.0));
         let mut out = Vec::with_capacity(nx);
         for i in 0..nx {
@@ -225,16 +225,16 @@ impl<'a> Sums<'a> {
     }
 }
 
-fn add_to(window: &mut [f64; IN_PLANE], values: &[f64; IN_PLANE], sign: f64) {
+fn add_to(window: &mut [f64; PLANE_SUMS], values: &[f64; PLANE_SUMS], sign: f64) {
     window.iter_mut().zip(values).for_each(|(w, v)| *w += sign * v);
 }
 
-fn add_row(window: &mut [[f64; IN_PLANE]], row: &[[f64; IN_PLANE]], sign: f64) {
+fn add_row(window: &mut [[f64; PLANE_SUMS]], row: &[[f64; PLANE_SUMS]], sign: f64) {
     window.iter_mut().zip(row).for_each(|(w, v)| add_to(w, v, sign));
 }
 
 /// The slopes of each component along the voxel axes (mm a voxel).
-fn slopes(s: &[f64; IN_CUBE]) -> Matrix3 {
+fn slopes(s: &[f64; CUBE_SUMS]) -> Matrix3 {
     let n = s[0].max(1.0);
     let [x, y, z] = [s[1] / n, s[2] / n, s[3] / n];
     let spread = [s[4] / n - x * x, s[5] / n - y * y, s[6] / n - z * z];

@@ -8,8 +8,6 @@ use crate::synth::body::{Body, Region, Superellipsoid, extent};
 use crate::synth::params::PhantomKind;
 use crate::types::Grid;
 
-const INFINITE: f64 = f64::INFINITY;
-
 /// The body of a kind, sized to the grid's field of view. (Those of known stiffness have a form of
 /// their own, see [`crate::synth::elastic`]; here they are blocks.)
 pub fn body(kind: PhantomKind, grid: &Grid, seed: u64) -> Body {
@@ -39,7 +37,7 @@ fn region(unit: [f64; 3], centre: [f64; 3], radii: [f64; 3], turn_degrees: f64, 
 /// vessels.
 fn leg(unit: [f64; 3]) -> Vec<Region> {
     let tube = |x: f64, y: f64, a: f64, b: f64, turn: f64, mean: f64, texture: f64| {
-        region(unit, [x, y, 0.0], [a, b, INFINITE], turn, mean, texture)
+        region(unit, [x, y, 0.0], [a, b, f64::INFINITY], turn, mean, texture)
     };
     let mut out = vec![
         tube(0.0, 0.0, 1.0, 1.0, 0.0, 480.0, 0.06),

@@ -7,7 +7,7 @@ use crate::error::SynthError;
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::synth::anatomy::body;
-use crate::synth::body::{BORDER, centre, cover, extent};
+use crate::synth::body::{BORDER_WIDTH_VOXELS, centre, cover, extent};
 use crate::synth::params::PhantomParams;
 use crate::synth::phantom::{Phantom, painted};
 use crate::types::space::length;
@@ -15,17 +15,17 @@ use crate::types::{Grid, Mask, WorldPoint};
 use rayon::prelude::*;
 use std::f64::consts::TAU;
 
-/// Contrast of the repeating pattern, as that of a muscle's own texture.
-pub(super) const PATTERN: f64 = 0.3;
+/// Contrast of the repeating pattern: that of a muscle's own texture.
+pub(super) const PATTERN_CONTRAST: f64 = 0.3;
 
 /// Mean intensity of fat, the brightest tissue.
-pub(super) const BRIGHTEST: f64 = 1000.0;
+pub(super) const FAT_INTENSITY: f64 = 1000.0;
 
 /// Intensity of dark tissue over that of bright tissue beside it (1).
-const DARK: f64 = 0.25;
+const DARK_INTENSITY_RATIO: f64 = 0.25;
 
-/// Width of the border between two contrasts (logistic, share of the field of view).
-const SMOOTH: f64 = 0.05;
+/// Width of the border between two contrasts (logistic, part of the field of view).
+const CONTRAST_BORDER_WIDTH: f64 = 0.05;
 
 /// What the body shows by itself.
 pub(super) fn unchanged(_: WorldPoint, seen: (f64, bool)) -> f64 {
@@ -45,7 +45,7 @@ pub(super) fn repetitive(
     let both = |p: WorldPoint, (v, inside): (f64, bool)| {
         let pattern: f64 = (0..3).map(|a| (wave[a] * p.0[a]).sin()).sum::<f64>() / 1.5f64.sqrt();
         let [part, factor] = by_place(p);
-        let shown = if inside { level * (1.0 + PATTERN * pattern) } else { 0.0 };
+        let shown = if inside { level * (1.0 + PATTERN_CONTRAST * pattern) } else { 0.0 };
         factor * (v + share * part * (shown - v))
     };
     painted(base, [grid; 2], &both, &unchanged)
@@ -54,10 +54,10 @@ pub(super) fn repetitive(
 /// The same in one half of the body: the bright one, to the right, or the dark one beside it.
 pub(super) fn repetitive_beside(base: &PhantomParams, share: f64, bright: bool) -> Result<Phantom, SynthError> {
     let grid = base.grid()?;
-    let right = right_half(&grid, BORDER * grid.spacing()[0]);
+    let right = right_half(&grid, BORDER_WIDTH_VOXELS * grid.spacing()[0]);
     repetitive(base, share, &|p| {
         let right = right(p);
-        [if bright { right } else { 1.0 - right }, DARK + (1.0 - DARK) * right]
+        [if bright { right } else { 1.0 - right }, DARK_INTENSITY_RATIO + (1.0 - DARK_INTENSITY_RATIO) * right]
     })
 }
 
@@ -95,7 +95,7 @@ pub(super) fn missing(base: &PhantomParams, share: f64) -> Result<Phantom, Synth
 
 /// The `exponent`-th root of the deformed volume's intensities; fat keeps its own.
 pub(super) fn root(base: &PhantomParams, exponent: f64) -> Result<Phantom, SynthError> {
-    let after = |_: WorldPoint, (v, _): (f64, bool)| BRIGHTEST * (v / BRIGHTEST).powf(1.0 / exponent);
+    let after = |_: WorldPoint, (v, _): (f64, bool)| FAT_INTENSITY * (v / FAT_INTENSITY).powf(1.0 / exponent);
     painted(base, [base.grid()?; 2], &unchanged, &after)
 }
 
@@ -105,7 +105,7 @@ pub(super) fn inverted(
     share: &(dyn Fn(WorldPoint) -> f64 + Sync),
 ) -> Result<Phantom, SynthError> {
     let after = |y: WorldPoint, (v, inside): (f64, bool)| {
-        if inside { (v + share(y) * (1.2 * BRIGHTEST - 2.0 * v)).max(0.0) } else { v }
+        if inside { (v + share(y) * (1.2 * FAT_INTENSITY - 2.0 * v)).max(0.0) } else { v }
     };
     painted(base, [base.grid()?; 2], &unchanged, &after)
 }
@@ -113,7 +113,7 @@ pub(super) fn inverted(
 /// The same with `share` in the right half alone, fading to none over the middle fifth.
 pub(super) fn inverted_on_the_right(base: &PhantomParams, share: f64) -> Result<Phantom, SynthError> {
     let grid = base.grid()?;
-    let right = right_half(&grid, SMOOTH * extent(&grid)[0]);
+    let right = right_half(&grid, CONTRAST_BORDER_WIDTH * extent(&grid)[0]);
     inverted(base, &|y| share * right(y))
 }
 

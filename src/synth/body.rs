@@ -7,7 +7,7 @@
 //! interpolated without much aliasing.
 
 use crate::numerics::random::Random;
-use crate::synth::noise::{COARSE, SmoothNoise, Texture};
+use crate::synth::noise::{SMOOTH_COEFFICIENTS, SmoothNoise, Texture};
 use crate::types::space::Matrix3;
 use crate::types::{Grid, WorldPoint};
 
@@ -24,8 +24,8 @@ pub struct Superellipsoid {
     pub power: i32,
 }
 
-/// Width of a border (logistic, voxels): 10 to 90 % in two.
-pub(super) const BORDER: f64 = 0.45;
+/// Width of a border (logistic, voxels): it rises from 10 to 90 % in two.
+pub(super) const BORDER_WIDTH_VOXELS: f64 = 0.45;
 
 /// 1 well inside a surface, 0 well outside, from the depth under it and the border's width (one
 /// unit).
@@ -90,7 +90,7 @@ impl Body {
             centre: shifted,
             edges: std::array::from_fn(|a| std::array::from_fn(|w| linear[w][a])),
             texture: Texture::new(grid, seed),
-            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3], COARSE),
+            bend: SmoothNoise::new(Random::new(seed, 20), [extent[0].max(extent[1]) / 4.0; 3], SMOOTH_COEFFICIENTS),
             bend_mm,
             taper,
         }
@@ -146,11 +146,11 @@ impl Body {
     /// How much of a voxel at `q` (body frame) the shape fills, 0 to 1; exactly 0 far outside.
     fn cover(&self, shape: &Superellipsoid, q: [f64; 3]) -> f64 {
         /// Beyond this number of voxels outside, the logistic is under 1e-9.
-        const FAR: f64 = 9.5;
+        const CUTOFF_VOXELS: f64 = 9.5;
         let d: [f64; 3] = std::array::from_fn(|a| q[a] - shape.centre[a]);
         // The voxel's extent in the plane is all that counts for a tube.
         let reach = shape.radii[0].max(shape.radii[1])
-            + FAR * if shape.radii[2].is_finite() { self.edge } else { self.edge_in_plane };
+            + CUTOFF_VOXELS * if shape.radii[2].is_finite() { self.edge } else { self.edge_in_plane };
         if d[0] * d[0] + d[1] * d[1] > reach * reach {
             return 0.0;
         }
@@ -159,7 +159,7 @@ impl Body {
         // changes the width.
         let rate = self.edges.iter().map(|e| (0..3).map(|w| e[w] * gradient[w]).sum::<f64>().powi(2)).sum::<f64>();
         let voxels = (1.0 - value) / rate.sqrt().max(1e-12);
-        if voxels < -FAR { 0.0 } else { cover(voxels, BORDER) }
+        if voxels < -CUTOFF_VOXELS { 0.0 } else { cover(voxels, BORDER_WIDTH_VOXELS) }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::numerics::random::Random;
 use crate::synth::body::{centre, extent, rotation};
-use crate::synth::noise::{COARSE, SmoothNoise};
+use crate::synth::noise::{SMOOTH_COEFFICIENTS, SmoothNoise};
 use crate::types::space::{Matrix3, cross, dot, length};
 use crate::types::{Grid, WorldPoint};
 use rayon::prelude::*;
@@ -83,7 +83,7 @@ impl Motion {
     /// Random cubic B-splines with control points every `spacing` and, at 35 %, every half
     /// `spacing` mm; to be scaled.
     pub fn smooth(grid: &Grid, spacing: f64, seed: u64) -> Self {
-        let noise = |stream, h| SmoothNoise::new(Random::new(seed, stream), [h; 3], COARSE);
+        let noise = |stream, h| SmoothNoise::new(Random::new(seed, stream), [h; 3], SMOOTH_COEFFICIENTS);
         Self::new(Law::Smooth { coarse: noise(40, spacing), fine: noise(41, spacing / 2.0) }, grid)
     }
 
@@ -135,7 +135,7 @@ impl Motion {
             across: cross(normal, along),
             offset: 0.05 * e[0].min(e[1]) * random.uniform(-1.0, 1.0),
             radius: 0.45 * length(e),
-            smooth: SmoothNoise::new(Random::new(seed, 31), [0.25 * e[0].max(e[1]); 3], COARSE),
+            smooth: SmoothNoise::new(Random::new(seed, 31), [0.25 * e[0].max(e[1]); 3], SMOOTH_COEFFICIENTS),
         };
         Self::new(law, grid)
     }

@@ -4,15 +4,15 @@ use crate::numerics::random::Random;
 use crate::numerics::sampling::cubic_bspline;
 use crate::types::{Grid, WorldPoint};
 
-/// Root of the integral of the squared three-dimensional cubic B-spline, (151/315)^(3/2): the
-/// function's deviation for independent coefficients of deviation 1.
-const DEVIATION: f64 = 0.331_893;
+/// Standard deviation of the function for independent unit coefficients: (151/315)^(3/2), the root
+/// of the integral of the squared three-dimensional cubic B-spline.
+const BSPLINE_SD: f64 = 0.331_893;
 
-/// Coefficients along each axis of a texture: it repeats after that many cells.
-const FINE: usize = 64;
+/// Coefficients along each axis of a texture, which repeats after that many cells.
+const TEXTURE_COEFFICIENTS: usize = 64;
 
 /// Coefficients along each axis of a function with at most a dozen cells in the field of view.
-pub const COARSE: usize = 16;
+pub const SMOOTH_COEFFICIENTS: usize = 16;
 
 /// N independent functions of position with mean 0 and standard deviation 1, twice continuously
 /// differentiable.
@@ -32,7 +32,7 @@ impl<const N: usize> SmoothNoise<N> {
     pub fn new(mut random: Random, cell: [f64; 3], side: usize) -> Self {
         let shift = std::array::from_fn(|_| random.uniform(0.0, side as f64));
         let pairs = (N * side.pow(3)).div_ceil(2);
-        let coefficients = (0..pairs).flat_map(|_| random.normals()).map(|v| (v / DEVIATION) as f32).collect();
+        let coefficients = (0..pairs).flat_map(|_| random.normals()).map(|v| (v / BSPLINE_SD) as f32).collect();
         Self { coefficients, side, cell, shift }
     }
 
@@ -83,7 +83,9 @@ impl Texture {
     pub fn new(grid: &Grid, seed: u64) -> Self {
         let linear = grid.affine().linear();
         let cell: [f64; 3] = std::array::from_fn(|a| 2.0 * linear[a].iter().map(|v| v * v).sum::<f64>().sqrt());
-        let noise = |n: usize| SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0), FINE);
+        let noise = |n: usize| {
+            SmoothNoise::new(Random::new(seed, 10 + n as u64), cell.map(|c| c * OCTAVES[n].0), TEXTURE_COEFFICIENTS)
+        };
         Self(std::array::from_fn(noise))
     }
 

@@ -18,7 +18,7 @@ use crate::synth::elastic::tissue::Tissue;
 use crate::synth::elastic::{ElasticDescription, press};
 use crate::synth::landmarks::landmarks;
 use crate::synth::motion::Motion;
-use crate::synth::noise::{COARSE, SmoothNoise};
+use crate::synth::noise::{SMOOTH_COEFFICIENTS, SmoothNoise};
 use crate::synth::params::{MotionKind, PhantomKind, PhantomParams};
 use crate::types::space::determinant;
 use crate::types::{DenseField, Grid, Landmark, Mask, Volume, VoxelPoint, WorldPoint};
@@ -398,7 +398,7 @@ fn mask(before: &Imaged, truth: &DenseField, deformed: &Grid) -> Mask {
 fn biased(clean: &Imaged, params: &PhantomParams) -> Volume {
     let grid = *clean.grid();
     let cell = extent(&grid).iter().fold(0.0, |m: f64, &e| m.max(e)) / 2.0;
-    let noise = SmoothNoise::<1>::new(Random::new(params.seed, 70), [cell; 3], COARSE);
+    let noise = SmoothNoise::<1>::new(Random::new(params.seed, 70), [cell; 3], SMOOTH_COEFFICIENTS);
     let slow = Volume::from_voxels(grid, |_, y| noise.at(y.0)[0]);
     let tissue: Vec<f64> = slow.as_slice().iter().zip(clean.as_slice()).filter(|v| v.1.1).map(|v| *v.0).collect();
     let mean = tissue.iter().sum::<f64>() / tissue.len().max(1) as f64;

@@ -7,8 +7,8 @@
 use crate::error::{ParamError, SynthError};
 use crate::numerics::random::Random;
 use crate::synth::anatomy::body;
-use crate::synth::appearance::{PATTERN, distance};
-use crate::synth::body::{BORDER, centre, cover, extent, rotation};
+use crate::synth::appearance::{PATTERN_CONTRAST, distance};
+use crate::synth::body::{BORDER_WIDTH_VOXELS, centre, cover, extent, rotation};
 use crate::synth::motion::{Motion, add};
 use crate::synth::noise::Texture;
 use crate::synth::params::{MotionKind, PhantomParams};
@@ -17,36 +17,69 @@ use crate::types::space::{Matrix3, dot, length};
 use crate::types::{Grid, WorldPoint};
 use std::f64::consts::PI;
 
-/// Radius of a limb, and of the muscle inside its ring (shares of the half side).
-const SKIN: f64 = 0.84;
-const MUSCLE: f64 = 0.65;
+/// A limb of muscle in a still ring.
+struct Limb {
+    /// Radius of the limb (half sides of the field of view).
+    radius: f64,
+    /// Radius of the muscle (half sides).
+    muscle_radius: f64,
+    /// Width over which the muscle's motion fades to rest at its ring (muscle radii).
+    muscle_fade: f64,
+}
 
-/// Where the muscle's motion fades to rest at its ring (share of the muscle's radius).
-const FADE: f64 = 0.6;
+const LIMB: Limb = Limb { radius: 0.84, muscle_radius: 0.65, muscle_fade: 0.6 };
 
-/// Radius of an organ (share of the half side).
-const ORGAN: f64 = 0.45;
+/// An organ with a wall.
+struct Organ {
+    /// Radius (half sides).
+    radius: f64,
+    /// Brightness over what lies around it (1).
+    gain: f64,
+    /// What the wall subtracts from the brightness (1).
+    wall_darkening: f64,
+}
 
-/// Brightness of an organ over what lies round it, and what its wall takes off (1).
-const ORGAN_GAIN: f64 = 1.3;
-const WALL: f64 = 0.5;
+const ORGAN_SHAPE: Organ = Organ { radius: 0.45, gain: 1.3, wall_darkening: 0.5 };
 
-/// Mean intensities of muscle, of a bone's cortex and of its marrow (fat is at 1000).
-const MUSCLE_LEVEL: f64 = 350.0;
-const CORTEX_LEVEL: f64 = 60.0;
-const MARROW_LEVEL: f64 = 900.0;
+/// Mean intensities of tissue (fat is at 1000).
+struct Intensity {
+    /// Of muscle.
+    muscle: f64,
+    /// Of a bone's cortex.
+    cortex: f64,
+    /// Of its marrow.
+    marrow: f64,
+}
 
-/// A jointed limb: its radius, its axis beside the middle, the bones' radius, the radius of the
-/// round end, the joint's gap, and the cortex (shares of the half side).
-const JOINT_SKIN: f64 = 0.55;
-const JOINT_ASIDE: f64 = 0.25;
-const BONE: f64 = 0.1;
-const ROUND: f64 = 0.18;
-const GAP: f64 = 0.16;
-const CORTEX: f64 = 0.05;
+const INTENSITY: Intensity = Intensity { muscle: 350.0, cortex: 60.0, marrow: 900.0 };
 
-/// Half the length of the round end along the joint's axis (share of the half side).
-const ROUND_LENGTH: f64 = 0.3;
+/// A jointed limb; lengths in half sides of the field of view.
+struct Joint {
+    /// Radius of the limb.
+    limb_radius: f64,
+    /// Distance of the joint's axis from the middle.
+    axis_offset: f64,
+    /// Radius of the bones.
+    bone_radius: f64,
+    /// Radius of the bone's round end.
+    end_radius: f64,
+    /// Gap of the joint.
+    gap: f64,
+    /// Thickness of the cortex.
+    cortex: f64,
+    /// Half the length of the round end along the joint's axis.
+    end_half_length: f64,
+}
+
+const JOINT: Joint = Joint {
+    limb_radius: 0.55,
+    axis_offset: 0.25,
+    bone_radius: 0.1,
+    end_radius: 0.18,
+    gap: 0.16,
+    cortex: 0.05,
+    end_half_length: 0.3,
+};
 
 /// 0 up to 0 and 1 from 1 on, twice continuously differentiable.
 fn step(t: f64) -> f64 {
@@ -67,7 +100,7 @@ fn plane(grid: &Grid) -> (usize, f64) {
 pub(super) fn still_ring(base: &PhantomParams, ratio: f64) -> Result<Phantom, SynthError> {
     let grid = base.grid()?;
     let (along, half) = plane(&grid);
-    let (middle, muscle, edge) = (centre(&grid), MUSCLE * half, BORDER * grid.least_spacing());
+    let (middle, muscle, edge) = (centre(&grid), LIMB.muscle_radius * half, BORDER_WIDTH_VOXELS * grid.least_spacing());
     let from_axis = move |p: WorldPoint| {
         let squares = (0..3).filter(|&a| a != along).map(|a| (p.0[a] - middle[a]).powi(2));
         squares.sum::<f64>().sqrt()
@@ -76,8 +109,8 @@ pub(super) fn still_ring(base: &PhantomParams, ratio: f64) -> Result<Phantom, Sy
     let look = |p: WorldPoint| {
         let radius = from_axis(p);
         let gain = ratio + (1.0 - ratio) * cover(muscle - radius, edge);
-        let shown = MUSCLE_LEVEL * (1.0 + PATTERN * texture.at(p)).max(0.0);
-        (gain * shown * cover(SKIN * half - radius, edge), radius < SKIN * half)
+        let shown = INTENSITY.muscle * (1.0 + PATTERN_CONTRAST * texture.at(p)).max(0.0);
+        (gain * shown * cover(LIMB.radius * half - radius, edge), radius < LIMB.radius * half)
     };
     let places: Vec<WorldPoint> = (0..grid.len())
         .map(|at| grid.voxel(at))
@@ -86,7 +119,7 @@ pub(super) fn still_ring(base: &PhantomParams, ratio: f64) -> Result<Phantom, Sy
         .collect();
     let smooth = Motion::smooth(&grid, 2.0 * muscle, base.seed).scaled(1.0, &places);
     let faded = move |x: WorldPoint| {
-        let share = step((muscle - from_axis(x)) / (FADE * muscle));
+        let share = step((muscle - from_axis(x)) / (LIMB.muscle_fade * muscle));
         smooth.at(x).map(|u| share * u)
     };
     let largest = places.iter().map(|&x| length(faded(x))).fold(1e-12, f64::max);
@@ -105,7 +138,7 @@ pub(super) fn organ(base: &PhantomParams, mm: f64) -> Result<Phantom, SynthError
         return Err(SynthError::NotElastic);
     }
     let (_, half) = plane(&grid);
-    let radius = ORGAN * half;
+    let radius = ORGAN_SHAPE.radius * half;
     if mm > 2.0 * radius {
         return Err(ParamError { name: "severity", value: mm, range: "up to the organ's diameter" }.into());
     }
@@ -121,8 +154,8 @@ pub(super) fn organ(base: &PhantomParams, mm: f64) -> Result<Phantom, SynthError
         let across = p.minus(WorldPoint(middle));
         let voxel = length(std::array::from_fn(|a| spacing[a] * across[a])) / length(across).max(1e-9);
         let depth = depth(p);
-        let wall = WALL * (-(depth / voxel).powi(2)).exp();
-        (v * (1.0 + (ORGAN_GAIN - 1.0) * cover(depth, BORDER * voxel)) * (1.0 - wall), inside)
+        let wall = ORGAN_SHAPE.wall_darkening * (-(depth / voxel).powi(2)).exp();
+        (v * (1.0 + (ORGAN_SHAPE.gain - 1.0) * cover(depth, BORDER_WIDTH_VOXELS * voxel)) * (1.0 - wall), inside)
     };
     let moved = move |x: WorldPoint| {
         let u = carried.at(x);
@@ -138,15 +171,15 @@ pub(super) fn joint(base: &PhantomParams, degrees: f64) -> Result<Phantom, Synth
     let grid = base.grid()?;
     let hinge = Hinge::new(&grid, degrees.to_radians(), base.seed);
     let texture = Texture::new(&grid, base.seed);
-    let edge = BORDER * grid.least_spacing();
+    let edge = BORDER_WIDTH_VOXELS * grid.least_spacing();
     let look = |y: WorldPoint| {
         let q = hinge.own(y);
         let q = hinge.turned(q, hinge.angle_before(q));
-        let (bone, skin) = (hinge.depth(q), JOINT_SKIN * hinge.half - q[0].hypot(q[2]));
-        let grain = PATTERN * texture.at(hinge.world(q));
-        let soft = MUSCLE_LEVEL * (1.0 + grain).max(0.0) * cover(skin, edge);
-        let marrow = cover(bone - CORTEX * hinge.half, edge);
-        let inner = CORTEX_LEVEL + marrow * (MARROW_LEVEL * (1.0 + grain / 3.0).max(0.0) - CORTEX_LEVEL);
+        let (bone, skin) = (hinge.depth(q), JOINT.limb_radius * hinge.half - q[0].hypot(q[2]));
+        let grain = PATTERN_CONTRAST * texture.at(hinge.world(q));
+        let soft = INTENSITY.muscle * (1.0 + grain).max(0.0) * cover(skin, edge);
+        let marrow = cover(bone - JOINT.cortex * hinge.half, edge);
+        let inner = INTENSITY.cortex + marrow * (INTENSITY.marrow * (1.0 + grain / 3.0).max(0.0) - INTENSITY.cortex);
         (soft + cover(bone, edge) * (inner - soft), skin > 0.0)
     };
     let moved = move |x: WorldPoint| {
@@ -185,7 +218,7 @@ impl Hinge {
         });
         let axes = rotation(tilt);
         let frame = [axes[(normal + 1) % 3], axes[(normal + 2) % 3], axes[normal]];
-        Self { frame, centre: add(centre(grid), frame[0], -JOINT_ASIDE * half), half, angle }
+        Self { frame, centre: add(centre(grid), frame[0], -JOINT.axis_offset * half), half, angle }
     }
 
     fn own(&self, p: WorldPoint) -> [f64; 3] {
@@ -210,9 +243,12 @@ impl Hinge {
     /// Share of the turn (1) at a distance from the axis (mm) and an angle from bone 2 (radians).
     fn share(&self, radius: f64, angle: f64) -> f64 {
         // Wedges that hold the bones, seen from the axis.
-        let (still, turning) = ((BONE / ROUND).asin(), (BONE / (ROUND + GAP)).asin());
+        let (still, turning) = (
+            (JOINT.bone_radius / JOINT.end_radius).asin(),
+            (JOINT.bone_radius / (JOINT.end_radius + JOINT.gap)).asin(),
+        );
         let between = (PI - still - angle.abs()) / (PI - still - turning);
-        step((radius / self.half - ROUND) / GAP) * step(between)
+        step((radius / self.half - JOINT.end_radius) / JOINT.gap) * step(between)
     }
 
     /// Angle (radians) of a place of the initial volume once it has moved.
@@ -235,10 +271,10 @@ impl Hinge {
     /// Depth (mm) in the nearer bone of a place in the unbent limb.
     fn depth(&self, q: [f64; 3]) -> f64 {
         let radius = q[0].hypot(q[1]);
-        let shaft = BONE * self.half - q[0].hypot(q[2]);
-        let end = (ROUND * self.half - radius).min(ROUND_LENGTH * self.half - q[2].abs());
+        let shaft = JOINT.bone_radius * self.half - q[0].hypot(q[2]);
+        let end = (JOINT.end_radius * self.half - radius).min(JOINT.end_half_length * self.half - q[2].abs());
         let first = shaft.min(q[1]).max(end);
-        let second = shaft.min(-q[1]).min(radius - (ROUND + GAP) * self.half);
+        let second = shaft.min(-q[1]).min(radius - (JOINT.end_radius + JOINT.gap) * self.half);
         first.max(second)
     }
 }

@@ -7,7 +7,7 @@ use crate::error::SynthError;
 use crate::numerics::random::Random;
 use crate::numerics::statistics::percentile;
 use crate::synth::anatomy::body;
-use crate::synth::appearance::{BRIGHTEST, PATTERN, unchanged};
+use crate::synth::appearance::{FAT_INTENSITY, PATTERN_CONTRAST, unchanged};
 use crate::synth::noise::Texture;
 use crate::synth::params::PhantomParams;
 use crate::synth::phantom::{Phantom, painted, phantom, phantom_on, rician};
@@ -15,7 +15,7 @@ use crate::types::{Affine, DenseField, Grid, Mask, Volume};
 use std::collections::BTreeSet;
 
 /// Intensity of a hot voxel over the largest of its volume (1).
-const HOT: f32 = 30.0;
+const HOT_VOXEL_RATIO: f32 = 30.0;
 
 /// Without `share` of the deformed volume, at its right end.
 pub(super) fn cropped(base: &PhantomParams, share: f64) -> Result<Phantom, SynthError> {
@@ -35,12 +35,12 @@ fn voxels(grid: &Grid, share: f64) -> usize {
     (share * grid.shape()[0] as f64).round() as usize
 }
 
-/// `count` random voxels of the deformed volume at [`HOT`] times its maximum; a larger count keeps
-/// those of a smaller one.
+/// `count` random voxels of the deformed volume at [`HOT_VOXEL_RATIO`] times its maximum; a larger
+/// count keeps those of a smaller one.
 pub(super) fn hot_voxels(base: &PhantomParams, count: usize) -> Result<Phantom, SynthError> {
     let mut made = phantom(base)?;
     let shown = made.deformed.as_mut_slice();
-    let hot = HOT * shown.iter().copied().fold(0.0, f32::max);
+    let hot = HOT_VOXEL_RATIO * shown.iter().copied().fold(0.0, f32::max);
     let mut random = Random::new(base.seed, 81);
     let mut places = BTreeSet::new();
     while places.len() < count.min(shown.len()) {
@@ -60,7 +60,9 @@ pub(super) fn background(base: &PhantomParams, ratio: f64) -> Result<Phantom, Sy
     let clean = PhantomParams { noise: 0.0, bias: 0.0, landmarks: 0, ..base.clone() };
     let filled = painted(&clean, [grid; 2], &|p, _| body.share(p), &unchanged)?;
     let texture = Texture::new(&grid, base.seed.wrapping_add(1));
-    let level = Volume::from_voxels(grid, |_, x| (ratio * BRIGHTEST * (1.0 + PATTERN * texture.at(x)).max(0.0)) as f32);
+    let level = Volume::from_voxels(grid, |_, x| {
+        (ratio * FAT_INTENSITY * (1.0 + PATTERN_CONTRAST * texture.at(x)).max(0.0)) as f32
+    });
     for (seen, filled) in [(&mut made.initial, &filled.initial), (&mut made.deformed, &filled.deformed)] {
         let behind = level.as_slice().iter().zip(filled.as_slice());
         seen.as_mut_slice().iter_mut().zip(behind).for_each(|(v, (level, filled))| *v += level * (1.0 - filled));

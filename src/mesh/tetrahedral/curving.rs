@@ -7,10 +7,10 @@ use crate::numerics::tetrahedron::{EDGES, jacobian, slopes};
 use crate::types::space::determinant;
 use std::collections::HashMap;
 
-/// Edges bend at most by this part of their length.
-const REACH: f64 = 0.2;
+/// Largest bend of an edge, over its length.
+const MAX_BEND_FRACTION: f64 = 0.2;
 /// Least Jacobian determinant over that of the straight element.
-const LEAST: f64 = 0.12;
+const MIN_JACOBIAN_RATIO: f64 = 0.12;
 
 /// Places of all nodes (corners first) and the ten nodes of each element.
 pub fn quadratic(cut: &Cut, part: &[u8], levels: &Levels) -> (Vec<[f64; 3]>, Vec<[u32; 10]>) {
@@ -64,7 +64,7 @@ fn bend(cut: &Cut, part: &[u8], levels: &Levels, number: &HashMap<(u32, u32), u3
     }
     for (edge, surface) in on {
         let node = number[&edge] as usize;
-        let reach = REACH * distance(places[edge.0 as usize], places[edge.1 as usize]);
+        let reach = MAX_BEND_FRACTION * distance(places[edge.0 as usize], places[edge.1 as usize]);
         let level = |p: [f64; 3]| match surface {
             Surface::Body => levels.body(p),
             Surface::Between(k, m) => levels.between(k as usize, m as usize, p),
@@ -108,7 +108,7 @@ fn straighten(cells: &[[u32; 10]], ends: &[(u32, u32)], corners: usize, places: 
         let mut bad = vec![false; places.len()];
         let mut any = false;
         for cell in cells {
-            if least_determinant(cell.map(|n| places[n as usize])) < LEAST {
+            if least_determinant(cell.map(|n| places[n as usize])) < MIN_JACOBIAN_RATIO {
                 cell[4..].iter().for_each(|&n| bad[n as usize] = true);
                 any = true;
             }

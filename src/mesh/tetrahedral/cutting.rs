@@ -7,12 +7,11 @@
 
 use std::collections::HashMap;
 
-/// A vertex is moved when a crossing is nearer than this part of the edge: with 0.25 the least
-/// dihedral angle of the balls, blocks and layers of the tests was largest (0.25 and 0.41 are the
-/// proven limits for one cut of an ungraded lattice).
-const NEAR: f64 = 0.25;
-/// Level values this near to zero are zero.
-const ZERO: f64 = 0.02;
+/// A vertex moves to a crossing nearer than this part of the edge: 0.25 gave the largest least
+/// dihedral angle in tests (0.25 and 0.41 are the proven limits for one cut).
+const SNAP_FRACTION: f64 = 0.25;
+/// Level values up to this are zero.
+const ZERO_LEVEL_VOXELS: f64 = 0.02;
 
 /// A mesh that is being cut.
 #[derive(Debug, Clone, Default)]
@@ -103,7 +102,7 @@ impl Cut {
             near.push((a, b, part, i));
             near.push((b, a, 1.0 - part, i));
         }
-        near.retain(|n| n.2 < NEAR);
+        near.retain(|n| n.2 < SNAP_FRACTION);
         near.sort_by(|x, y| x.0.cmp(&y.0).then(x.2.total_cmp(&y.2)).then(x.1.cmp(&y.1)));
         let mut last = u32::MAX;
         for (v, other, _, at) in near {
@@ -166,7 +165,7 @@ fn near_enough(v: [f64; 3], crossing: [f64; 3], other: [f64; 3]) -> bool {
 }
 
 fn sign_of(value: f64) -> i8 {
-    if value.abs() < ZERO {
+    if value.abs() < ZERO_LEVEL_VOXELS {
         0
     } else if value > 0.0 {
         1

@@ -7,7 +7,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-/// Halvings at most.
+/// Most halvings of a cube.
 pub const MAX_LEVEL: u32 = 5;
 
 /// Vertices (grid mm) and tetrahedra.
@@ -108,8 +108,8 @@ impl Octree {
     }
 }
 
-/// Units of the vertices' integer coordinates in a base cube.
-const UNIT: i32 = 2 << MAX_LEVEL;
+/// Units of the vertices' integer coordinates along the edge of a base cube.
+const UNITS_PER_CUBE: i32 = 2 << MAX_LEVEL;
 
 struct Builder<'a> {
     octree: &'a Octree,
@@ -120,7 +120,7 @@ struct Builder<'a> {
 
 impl Builder<'_> {
     fn place(&self, p: [i32; 3]) -> [f64; 3] {
-        std::array::from_fn(|a| self.octree.low[a] + f64::from(p[a]) / f64::from(UNIT) * self.octree.size[a])
+        std::array::from_fn(|a| self.octree.low[a] + f64::from(p[a]) / f64::from(UNITS_PER_CUBE) * self.octree.size[a])
     }
 
     fn vertex(&mut self, p: [i32; 3]) -> u32 {
@@ -148,7 +148,7 @@ impl Builder<'_> {
 
     fn cube(&mut self, cube: Cube) {
         let (level, at) = cube;
-        let side = UNIT >> level;
+        let side = UNITS_PER_CUBE >> level;
         let half = side / 2;
         let centre = at.map(|v| v * side + half);
         for axis in 0..3 {

@@ -9,10 +9,10 @@
 use super::rounding::signed_distance;
 use crate::types::Mask;
 
-/// Surfaces are moved by so much at most (voxels) so that volumes come out right.
-const MOST: f64 = 0.5;
+/// Largest shift of a surface (voxels) that corrects a volume.
+const MAX_SHIFT_VOXELS: f64 = 0.5;
 /// Voxels around the body's box.
-const PAD: usize = 6;
+const PADDING_VOXELS: usize = 6;
 
 /// The body and its parts.
 #[derive(Debug, Clone)]
@@ -49,13 +49,14 @@ impl Levels {
         if low[0] == usize::MAX {
             return None;
         }
-        let shape: [usize; 3] = std::array::from_fn(|a| high[a] - low[a] + 1 + 2 * PAD);
-        let first: [i64; 3] = std::array::from_fn(|a| low[a] as i64 - PAD as i64);
+        let shape: [usize; 3] = std::array::from_fn(|a| high[a] - low[a] + 1 + 2 * PADDING_VOXELS);
+        let first: [i64; 3] = std::array::from_fn(|a| low[a] as i64 - PADDING_VOXELS as i64);
         let mut map = vec![0u8; shape.iter().product()];
         for k in low[2]..=high[2] {
             for j in low[1]..=high[1] {
                 let from = grid.index(low[0], j, k);
-                let to = PAD + shape[0] * (j - low[1] + PAD + shape[1] * (k - low[2] + PAD));
+                let to = PADDING_VOXELS
+                    + shape[0] * (j - low[1] + PADDING_VOXELS + shape[1] * (k - low[2] + PADDING_VOXELS));
                 let run = high[0] - low[0] + 1;
                 map[to..to + run].copy_from_slice(&values[from..from + run]);
             }
@@ -83,8 +84,8 @@ impl Levels {
 
     /// The box of the body's voxels (grid mm): their outer faces.
     pub fn bounds(&self) -> [[f64; 3]; 2] {
-        let low = std::array::from_fn(|a| ((self.first[a] + PAD as i64) as f64 - 0.5) * self.spacing[a]);
-        let size = |a: usize| (self.shape[a] - 2 * PAD) as f64 * self.spacing[a];
+        let low = std::array::from_fn(|a| ((self.first[a] + PADDING_VOXELS as i64) as f64 - 0.5) * self.spacing[a]);
+        let size = |a: usize| (self.shape[a] - 2 * PADDING_VOXELS) as f64 * self.spacing[a];
         [low, std::array::from_fn(|a| low[a] + size(a))]
     }
 
@@ -98,9 +99,9 @@ impl Levels {
     /// Moves the surfaces outwards: that of the body by `body` mm, that of each part by `parts` mm.
     pub fn grow(&mut self, body: f64, parts: &[f64]) {
         let voxel = self.voxel();
-        self.shift = (self.shift + body / voxel).clamp(-MOST, MOST);
+        self.shift = (self.shift + body / voxel).clamp(-MAX_SHIFT_VOXELS, MAX_SHIFT_VOXELS);
         for (s, d) in self.shifts.iter_mut().zip(parts) {
-            *s = (*s + d / voxel).clamp(-MOST, MOST);
+            *s = (*s + d / voxel).clamp(-MAX_SHIFT_VOXELS, MAX_SHIFT_VOXELS);
         }
     }
 

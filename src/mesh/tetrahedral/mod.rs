@@ -196,7 +196,7 @@ impl Mesher {
         let mut levels = self.levels.clone();
         let lattice = self.lattice(fineness, detail, halvings);
         let mut made = build(&lattice, &levels, detail.wall)?;
-        for _ in 0..CALIBRATIONS {
+        for _ in 0..VOLUME_CALIBRATIONS {
             calibrate(&made, &mut levels);
             made = build(&lattice, &levels, detail.wall)?;
         }
@@ -213,9 +213,9 @@ impl Mesher {
 }
 
 /// The bit of vertices on the wall of a [`Detail`].
-const WALL: u32 = 1 << 31;
-/// Times that surfaces are moved so that volumes come out right.
-const CALIBRATIONS: usize = 2;
+const WALL_BIT: u32 = 1 << 31;
+/// Times that surfaces are shifted to correct volumes.
+const VOLUME_CALIBRATIONS: usize = 2;
 
 /// A mesh in grid mm.
 struct Made {
@@ -243,7 +243,7 @@ fn cut_up(lattice: &lattice::Lattice, levels: &Levels, wall: Option<Wall<'_>>) -
     cut.part.iter_mut().filter(|p| **p == cutting::NO_PART).for_each(|p| *p = parts as u8 - 1);
     if let Some(wall) = wall {
         let edges = boundary_edges(&cut.cells);
-        cut.along(wall, WALL, |a, b| cut_edge(&edges, a, b));
+        cut.along(wall, WALL_BIT, |a, b| cut_edge(&edges, a, b));
     }
     if cut.cells.len() < 4 {
         return Err(MeshError::TooFew { found: cut.places.len(), needed: 4 });

@@ -15,25 +15,40 @@ use crate::numerics::filters::gaussian;
 use crate::numerics::symmetric3::eigenvalues;
 use rayon::prelude::*;
 
-/// Half width of the band (voxels).
-const BAND: f32 = 4.0;
+/// Smoothing of the signed distance: its bending energy is minimised, except at edges.
+struct SurfaceSmoothing {
+    /// Half width of the band around the surface (voxels).
+    band_voxels: f32,
+    /// Projected gradient steps.
+    iterations: usize,
+    /// Smoothing before edges are detected (voxels): it leaves little of the stairs, and a right
+    /// angle then has a curvature of 0.47.
+    edge_sigma_voxels: f64,
+    /// Curvature (1/voxel) that is as likely an edge's as not: that of a ball of 3.2 voxels'
+    /// radius.
+    edge_curvature: f32,
+    /// Power of the curvature over that one, with which bending counts less.
+    edge_exponent: i32,
+    /// Length below which bending outweighs the fit to the stepped distance (voxels).
+    length_voxels: f32,
+    /// Least distance of a voxel's centre from the surface (voxels).
+    min_distance_voxels: f32,
+}
+
+const SMOOTHING: SurfaceSmoothing = SurfaceSmoothing {
+    band_voxels: 4.0,
+    iterations: 60,
+    edge_sigma_voxels: 1.2,
+    edge_curvature: 0.31,
+    edge_exponent: 16,
+    length_voxels: 2.0,
+    min_distance_voxels: 0.02,
+};
+
 /// Largest distance that is resolved (voxels).
-const FURTHEST: i32 = 6;
-/// Steps of the projected gradient.
-const STEPS: usize = 60;
-/// Smoothing before edges are looked for (voxels): of stairs it leaves little, a right angle bends
-/// by 0.47 then.
-const SMOOTHED: f64 = 1.2;
-/// Curvature (1/voxel) that is as likely an edge's as not: that of a ball of 3.2 voxels' radius.
-const CREASE: f32 = 0.31;
-/// Power of the curvature over that with which bending counts less.
-const SHARPNESS: i32 = 16;
-/// Length below which bending outweighs the pull to the middle (voxels).
-const LENGTH: f32 = 2.0;
-/// A voxel's centre lies at least so far from the surface (voxels).
-const CLEAR: f32 = 0.02;
-/// Voxels of the band at work together.
-const CHUNK: usize = 1 << 14;
+const MAX_DISTANCE_VOXELS: i32 = 6;
+/// Fewest voxels of the band that one thread processes at a time.
+const MIN_VOXELS_PER_TASK: usize = 1 << 14;
 
 /// Signed distance (voxels, positive inside) of each voxel's centre; x fastest. Voxels within two
 /// of the box's border keep the middle of their bounds, and no distance exceeds 6.
@@ -46,8 +61,11 @@ pub fn signed_distance(inside: &[bool], shape: [usize; 3]) -> Vec<f32> {
         let at = [o % shape[0], o / shape[0] % shape[1], o / stride[2]];
         (0..3).all(|a| (2..shape[a].saturating_sub(2)).contains(&at[a]))
     };
-    let band: Vec<u32> =
-        (0..x.len()).into_par_iter().filter(|&o| x[o].abs() < BAND && off_border(o)).map(|o| o as u32).collect();
+    let band: Vec<u32> = (0..x.len())
+        .into_par_iter()
+        .filter(|&o| x[o].abs() < SMOOTHING.band_voxels && off_border(o))
+        .map(|o| o as u32)
+        .collect();
     let mut near = vec![false; x.len()];
     for &o in &band {
         near[o as usize] = true;
@@ -55,32 +73,36 @@ pub fn signed_distance(inside: &[bool], shape: [usize; 3]) -> Vec<f32> {
     }
     let ring: Vec<u32> = (0..x.len() as u32).filter(|&o| near[o as usize]).collect();
     let laplacian = |v: &[f32], o: usize| stride.iter().map(|s| v[o - s] + v[o + s]).sum::<f32>() - 6.0 * v[o];
-    let pull = LENGTH.powi(-4);
+    let pull = SMOOTHING.length_voxels.powi(-4);
     let rate = 1.0 / (144.0 + pull);
     // Of the voxels in the ring: their curvature first, then their bending.
     let mut bent = vec![0.0f32; x.len()];
     let put = |all: Vec<f32>, bent: &mut [f32]| ring.iter().zip(all).for_each(|(&o, v)| bent[o as usize] = v);
-    let smoothed = gaussian(&x, shape, [SMOOTHED; 3]);
+    let smoothed = gaussian(&x, shape, [SMOOTHING.edge_sigma_voxels; 3]);
     let curved = |&o: &u32| curvature(&smoothed, o as usize, stride);
-    put(ring.par_iter().with_min_len(CHUNK).map(curved).collect(), &mut bent);
+    put(ring.par_iter().with_min_len(MIN_VOXELS_PER_TASK).map(curved).collect(), &mut bent);
     // An edge is as wide as the voxels next to it.
     let corner: usize = stride.iter().sum();
     let rows: [usize; 9] = std::array::from_fn(|k| k % 3 * stride[1] + k / 3 * stride[2]);
     let count = |&o: &u32| {
         let around = rows.iter().flat_map(|row| &bent[o as usize - corner + row..][..3]);
-        1.0 / (1.0 + (around.fold(0.0, |m: f32, v| m.max(*v)) / CREASE).powi(SHARPNESS))
+        1.0 / (1.0 + (around.fold(0.0, |m: f32, v| m.max(*v)) / SMOOTHING.edge_curvature).powi(SMOOTHING.edge_exponent))
     };
-    let counts: Vec<f32> = ring.par_iter().with_min_len(CHUNK).map(count).collect();
+    let counts: Vec<f32> = ring.par_iter().with_min_len(MIN_VOXELS_PER_TASK).map(count).collect();
     let (mut y, mut time) = (x.clone(), 1.0f32);
-    for _ in 0..STEPS {
+    for _ in 0..SMOOTHING.iterations {
         let bending = |(&o, c): (&u32, &f32)| c * laplacian(&y, o as usize);
-        put(ring.par_iter().zip(&counts).with_min_len(CHUNK).map(bending).collect(), &mut bent);
+        put(ring.par_iter().zip(&counts).with_min_len(MIN_VOXELS_PER_TASK).map(bending).collect(), &mut bent);
         let moved = |&o: &u32| {
             let o = o as usize;
-            let [low, high] = if inside[o] { [CLEAR, within[o]] } else { [-without[o], -CLEAR] };
+            let [low, high] = if inside[o] {
+                [SMOOTHING.min_distance_voxels, within[o]]
+            } else {
+                [-without[o], -SMOOTHING.min_distance_voxels]
+            };
             (y[o] - rate * (laplacian(&bent, o) + pull * (y[o] - middle(o)))).clamp(low, high)
         };
-        let all: Vec<f32> = band.par_iter().with_min_len(CHUNK).map(moved).collect();
+        let all: Vec<f32> = band.par_iter().with_min_len(MIN_VOXELS_PER_TASK).map(moved).collect();
         let next = 0.5 * (1.0 + (1.0 + 4.0 * time * time).sqrt());
         for (&o, &v) in band.iter().zip(&all) {
             let o = o as usize;
@@ -109,17 +131,17 @@ fn curvature(v: &[f32], o: usize, stride: [usize; 3]) -> f32 {
     most.abs().max(least.abs()) as f32
 }
 
-/// Distance (voxels) of each voxel on a side from the nearest centre on the other, [`FURTHEST`] at
-/// most.
+/// Distance (voxels) of each voxel on a side from the nearest centre on the other,
+/// [`MAX_DISTANCE_VOXELS`] at most.
 fn to_other(inside: &[bool], shape: [usize; 3], side: bool) -> Vec<f32> {
-    const FAR: i32 = FURTHEST * FURTHEST;
-    let mut square: Vec<i32> = inside.iter().map(|&v| if v == side { FAR } else { 0 }).collect();
+    const MAX_SQUARE: i32 = MAX_DISTANCE_VOXELS * MAX_DISTANCE_VOXELS;
+    let mut square: Vec<i32> = inside.iter().map(|&v| if v == side { MAX_SQUARE } else { 0 }).collect();
     let stride = [1, shape[0], shape[0] * shape[1]];
     for a in 0..3 {
         let from = square.clone();
         square.par_iter_mut().enumerate().for_each(|(o, v)| {
             let at = (o / stride[a] % shape[a]) as i32;
-            for k in 1..FURTHEST {
+            for k in 1..MAX_DISTANCE_VOXELS {
                 if k * k >= *v {
                     break;
                 }

@@ -3,8 +3,8 @@
 
 use super::cutting::{Cut, distance, volume};
 
-/// Passes over all inner vertices; more changed the worst angle by under half a degree.
-const PASSES: usize = 4;
+/// Passes over all inner vertices: more changed the worst angle by under half a degree.
+const SMOOTHING_PASSES: usize = 4;
 
 /// Shape of a tetrahedron, 1 for a regular one, 0 for a flat one: volume over the cube of the root
 /// mean square edge.
@@ -25,7 +25,7 @@ pub fn smooth(cut: &mut Cut) {
     for (e, c) in cut.cells.iter().enumerate() {
         c.iter().for_each(|&v| around[v as usize].push(e as u32));
     }
-    for _ in 0..PASSES {
+    for _ in 0..SMOOTHING_PASSES {
         for v in 0..cut.places.len() {
             if cut.surfaces[v] != 0 {
                 continue;

@@ -14,10 +14,10 @@ use crate::synth::elastic::tangent::Stiffness;
 use crate::synth::elastic::transfer::Transfer;
 use crate::synth::elastic::vectors::{Nodal, add, dot, scale_add, scale_add_product};
 
-/// Degree of the smoothing polynomial.
-const DEGREE: usize = 5;
-/// It damps the upper part of the spectrum, from the largest eigenvalue down to this share of it.
-const SHARE: f32 = 0.06;
+/// Degree of the Chebyshev smoothing polynomial.
+const SMOOTHER_DEGREE: usize = 5;
+/// Smallest eigenvalue that it damps, over the largest.
+const SMOOTHED_SPECTRUM_RATIO: f32 = 0.06;
 
 /// One level of the cycle.
 struct Level<'a> {
@@ -128,21 +128,21 @@ impl Level<'_> {
     /// Adds a Chebyshev polynomial of the residual `left` to x; `left` stays the residual if
     /// `keep`.
     fn smooth(&self, x: &mut [[f32; 3]], left: &mut [[f32; 3]], keep: bool) {
-        let (high, low) = (self.largest, SHARE * self.largest);
+        let (high, low) = (self.largest, SMOOTHED_SPECTRUM_RATIO * self.largest);
         let (middle, half) = ((high + low) / 2.0, (high - low) / 2.0);
         let sigma = middle / half;
         let mut rho = sigma.recip();
         let n = x.len();
         let (mut d, mut kd): (Nodal, Nodal) = (vec![[0.0; 3]; n], vec![[0.0; 3]; n]);
         scale_add_product(&mut d, 0.0, middle.recip(), &self.inverse_diagonal, left);
-        for step in 0..DEGREE {
+        for step in 0..SMOOTHER_DEGREE {
             if step > 0 {
                 let next = (2.0 * sigma - rho).recip();
                 scale_add_product(&mut d, next * rho, 2.0 * next / half, &self.inverse_diagonal, left);
                 rho = next;
             }
             add(x, 1.0, &d);
-            if step + 1 == DEGREE && !keep {
+            if step + 1 == SMOOTHER_DEGREE && !keep {
                 return;
             }
             self.stiffness.apply(&d, &self.free, &mut kd);

@@ -58,14 +58,27 @@ pub struct Equilibrium {
     pub levels: Vec<LevelReport>,
 }
 
-/// Largest free force against the norm of the others, on the finest level and on coarser ones.
-const TOLERANCE: [f64; 2] = [2e-6, 1e-4];
-/// Which nodes touch the plate is asked once the forces are in equilibrium to this part.
-const TOUCHING: f64 = 1e-2;
-/// Penetration (mm), and pull over the largest nodal force, that are let pass.
-const SLACK: f64 = 2e-4;
-const MOST_STEPS: usize = 60;
-const MOST_ITERATIONS: usize = 400;
+/// Iteration control of Newton's method with contact.
+struct NewtonControl {
+    /// Norm of the free forces over that of all forces: on the finest level and on coarser ones.
+    tolerance: [f64; 2],
+    /// The same, from which the nodes that touch the plate are updated.
+    contact_tolerance: f64,
+    /// Penetration (mm), and pull over the largest nodal force, that are accepted.
+    contact_slack: f64,
+    /// Most Newton steps.
+    max_steps: usize,
+    /// Most conjugate gradient iterations in a step.
+    max_iterations: usize,
+}
+
+const NEWTON: NewtonControl = NewtonControl {
+    tolerance: [2e-6, 1e-4],
+    contact_tolerance: 1e-2,
+    contact_slack: 2e-4,
+    max_steps: 60,
+    max_iterations: 400,
+};
 
 /// The displacement in equilibrium; `None` where Newton's method fails, because the tissue is
 /// pressed too far.
@@ -87,7 +100,7 @@ pub fn equilibrium(problem: &Problem<'_>) -> Option<Equilibrium> {
             0 => vec![[0.0; 4]; space.elements.len()],
             _ => pressure.iter().flat_map(|&p| [p; 8]).collect(),
         };
-        let tolerance = TOLERANCE[usize::from(n + 1 < spaces.len())];
+        let tolerance = NEWTON.tolerance[usize::from(n + 1 < spaces.len())];
         let mut solver = Newton::new(problem, space, &mut multigrid, start.clone(), pressure);
         let (steps, iterations) = solver.run(tolerance)?;
         let Newton { u, state, pressure: last, .. } = solver;
@@ -167,16 +180,16 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
     fn run(&mut self, tolerance: f64) -> Option<(usize, usize)> {
         let mut iterations = 0;
         self.state = state(self.space, &self.problem.lame, &self.u, &self.pressure);
-        self.touch(SLACK);
+        self.touch(NEWTON.contact_slack);
         self.multigrid.hold(&self.free);
-        for steps in 0..MOST_STEPS {
+        for steps in 0..NEWTON.max_steps {
             if !self.state.energy.is_finite() {
                 return None;
             }
             let (residual, lift) = (self.residual(), self.lift());
             let relative = norm(&residual) / norm(&self.state.forces).max(f64::MIN_POSITIVE);
             let on_plate = norm(&lift) <= 1e-9;
-            if relative <= tolerance.max(TOUCHING) && on_plate && self.touch(-SLACK) {
+            if relative <= tolerance.max(NEWTON.contact_tolerance) && on_plate && self.touch(-NEWTON.contact_slack) {
                 self.multigrid.hold(&self.free);
                 continue;
             }
@@ -212,7 +225,7 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
             residual.iter().zip(&answer).map(|(r, k)| std::array::from_fn(|c| r[c] - f64::from(k[c]))).collect();
         let size = norm(&load);
         let b: Nodal = load.iter().map(|r| r.map(|v| (v / size) as f32)).collect();
-        let (d, iterations) = self.multigrid.solve(&stiffness, &b, inner, MOST_ITERATIONS);
+        let (d, iterations) = self.multigrid.solve(&stiffness, &b, inner, NEWTON.max_iterations);
         drop(stiffness);
         let mut length = 1.0;
         while length > 1e-3 {
@@ -238,7 +251,7 @@ impl<'p, 'm, 's> Newton<'p, 'm, 's> {
     /// pull; whether anything changed.
     fn touch(&mut self, near: f64) -> bool {
         let Some(height) = self.problem.plate else { return false };
-        let slack = SLACK * self.state.forces.iter().fold(0.0, |m: f64, f| m.max(f[2]));
+        let slack = NEWTON.contact_slack * self.state.forces.iter().fold(0.0, |m: f64, f| m.max(f[2]));
         let mut changed = false;
         for n in 0..self.u.len() {
             if self.space.surfaces[n] & PRESSED == 0 || self.space.surfaces[n] & HELD != 0 {

@@ -11,8 +11,8 @@ use crate::types::{DenseField, Grid, WorldPoint};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// Voxels around the body where its motion is continued.
-const REACH: f64 = 5.0;
+/// Voxels around the body into which its motion is continued.
+const CONTINUATION_VOXELS: f64 = 5.0;
 
 /// Mechanics of a phantom, as its description says them.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -150,7 +150,7 @@ impl Pressed {
     /// The displacement at the voxels of `grid` (mm), continued around the body.
     pub fn field(&self, grid: Grid) -> DenseField {
         let space = &self.solved.space;
-        let places = Locator::new(&grid, &space.nodes, &space.elements, REACH).voxels(grid.shape());
+        let places = Locator::new(&grid, &space.nodes, &space.elements, CONTINUATION_VOXELS).voxels(grid.shape());
         let mut u: Vec<Option<[f64; 3]>> = places.into_par_iter().map(|p| p.map(|p| self.displacement(&p))).collect();
         fill(&mut u, grid.shape());
         DenseField::from_voxels(grid, |at, _| u[at].unwrap_or_default())
@@ -159,7 +159,7 @@ impl Pressed {
     /// Where the tissue at each voxel of `grid` was at rest; none away from the body.
     pub fn origins(&self, grid: &Grid) -> Vec<Option<WorldPoint>> {
         let space = &self.solved.space;
-        let places = Locator::new(grid, &self.moved, &space.elements, REACH).voxels(grid.shape());
+        let places = Locator::new(grid, &self.moved, &space.elements, CONTINUATION_VOXELS).voxels(grid.shape());
         let rest = |p: Place| WorldPoint(interpolate(&space.nodes, &space.elements[p.element as usize], p.local));
         places.into_par_iter().map(|p| p.map(rest)).collect()
     }
@@ -167,7 +167,7 @@ impl Pressed {
     /// The displacements of some world positions (mm); none away from the body.
     pub fn at(&self, grid: &Grid, points: &[WorldPoint]) -> Vec<Option<[f64; 3]>> {
         let space = &self.solved.space;
-        let locator = Locator::new(grid, &space.nodes, &space.elements, REACH);
+        let locator = Locator::new(grid, &space.nodes, &space.elements, CONTINUATION_VOXELS);
         let find = |p: &WorldPoint| locator.point(grid.affine().to_voxel(*p).0).map(|p| self.displacement(&p));
         points.par_iter().map(find).collect()
     }

@@ -5,12 +5,14 @@ use std::ops::{AddAssign, Mul};
 /// Nodes, and Gauss points, of an element.
 pub const NODES: usize = 27;
 
-const ROOT: f64 = 0.774_596_669_241_483_4;
+/// sqrt(3 / 5).
+const SQRT_3_5: f64 = 0.774_596_669_241_483_4;
 
 /// Gauss points on [-1, 1].
-pub const GAUSS: [f64; 3] = [-ROOT, 0.0, ROOT];
+pub const GAUSS: [f64; 3] = [-SQRT_3_5, 0.0, SQRT_3_5];
 
-const WEIGHT: [f64; 3] = [5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0];
+/// Their weights.
+const GAUSS_WEIGHTS: [f64; 3] = [5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0];
 
 /// A table, row by Gauss point (or node, transposed).
 pub type Table<T> = [[T; 3]; 3];
@@ -23,7 +25,7 @@ pub fn line(t: f64) -> [[f64; 3]; 2] {
 
 /// Weight of a Gauss point in the unit cell [-1, 1]^3.
 pub fn weight(point: usize) -> f64 {
-    WEIGHT[point % 3] * WEIGHT[point / 3 % 3] * WEIGHT[point / 9]
+    GAUSS_WEIGHTS[point % 3] * GAUSS_WEIGHTS[point / 3 % 3] * GAUSS_WEIGHTS[point / 9]
 }
 
 /// Values and derivatives at the Gauss points and their transposes.

@@ -1,7 +1,7 @@
 //! The bodies that are pressed: what they are made of, where, and how they look.
 
 use crate::numerics::random::Random;
-use crate::synth::body::{BORDER, centre, cover, extent};
+use crate::synth::body::{BORDER_WIDTH_VOXELS, centre, cover, extent};
 use crate::synth::elastic::blocks::{Ball, block_with_balls, dome, layered_block};
 use crate::synth::elastic::hexahedra::{CURVED, HexMesh, Surfaces};
 use crate::synth::noise::Texture;
@@ -155,7 +155,7 @@ impl Tissue {
 
     /// How much of a voxel lies inside, at `depth` mm.
     fn cover(&self, depth: f64) -> f64 {
-        cover(depth, BORDER * self.voxel)
+        cover(depth, BORDER_WIDTH_VOXELS * self.voxel)
     }
 
     /// Coarse hexahedra fitted to the regions.
@@ -217,11 +217,11 @@ impl Tissue {
 
 /// A block with one ball, two side by side, or none.
 fn inclusions(params: &PhantomParams, low: [f64; 3], high: [f64; 3], random: &mut Random) -> (Vec<Region>, Shape) {
-    const BACKGROUND: f64 = 20.0;
+    const BACKGROUND_MODULUS_KPA: f64 = 20.0;
     let side: [f64; 3] = std::array::from_fn(|a| high[a] - low[a]);
     let count = params.elastic.inclusions;
     let region = |label, name, e, look| Region { label, name, youngs_modulus_kpa: e, look };
-    let mut regions = vec![region(1, "background", BACKGROUND, [620.0, 0.3])];
+    let mut regions = vec![region(1, "background", BACKGROUND_MODULUS_KPA, [620.0, 0.3])];
     let mut balls = Vec::new();
     for n in 0..count {
         let across = if count == 1 { [0.42, 0.58] } else { [[0.25, 0.31], [0.69, 0.75]][n] };
@@ -233,7 +233,12 @@ fn inclusions(params: &PhantomParams, low: [f64; 3], high: [f64; 3], random: &mu
         balls.push(Ball { centre, radius: side[2].min(side[0] / 1.5) * random.uniform(share[0], share[1]) });
         let contrast = if count == 1 { params.elastic.contrast } else { [0.5, 4.0][n] };
         let look = if contrast < 1.0 { [330.0, 0.3] } else { [900.0, 0.2] };
-        regions.push(region(n as u8 + 2, ["inclusion", "second inclusion"][n], contrast * BACKGROUND, look));
+        regions.push(region(
+            n as u8 + 2,
+            ["inclusion", "second inclusion"][n],
+            contrast * BACKGROUND_MODULUS_KPA,
+            look,
+        ));
     }
     (regions, Shape::Balls { low, high, balls })
 }

@@ -53,7 +53,7 @@ pub struct Transfer {
 }
 
 /// Quadratic weights at -1, -1/2, 0, 1/2, 1.
-const HALVED: [[f64; 3]; 5] =
+const MIDPOINT_WEIGHTS: [[f64; 3]; 5] =
     [[1.0, 0.0, 0.0], [0.375, 0.75, -0.125], [0.0, 1.0, 0.0], [-0.125, 0.75, 0.375], [0.0, 0.0, 1.0]];
 
 impl Transfer {
@@ -65,7 +65,9 @@ impl Transfer {
             let at: [usize; 3] = std::array::from_fn(|a| 2 * child[a] + local[a]);
             let parent = &coarse[e / 8];
             (0..27).map(move |m| {
-                let w = HALVED[at[0]][m % 3] * HALVED[at[1]][m / 3 % 3] * HALVED[at[2]][m / 9];
+                let w = MIDPOINT_WEIGHTS[at[0]][m % 3]
+                    * MIDPOINT_WEIGHTS[at[1]][m / 3 % 3]
+                    * MIDPOINT_WEIGHTS[at[2]][m / 9];
                 (parent[m], w)
             })
         };
