@@ -401,7 +401,7 @@ impl Batch<'_> {
         let same = now.iter().zip(&records).take_while(|(s, old)| record(s).is_ok_and(|r| r == **old)).count();
         if same < records.len() {
             let seconds: Vec<f64> = seconds.iter().take(same).filter_map(Value::as_f64).collect();
-            // A folder that cannot be written cannot be gathered from as done either: its table fails.
+            // Where this cannot be written, neither can the table: that error is reported.
             let _ = io::write_json(folder.join(RECORD), &kept(&records[..same], &seconds));
         }
     }

@@ -42,8 +42,8 @@ impl Scan {
         Some(Self { path: path.into(), stem, session, run })
     }
 
-    /// Its place in time: session, then run, numbers as numbers. A session is a label in BIDS, a run
-    /// a number: ses-1 and ses-01 are two sessions, run-1 and run-01 one run.
+    /// Its place in time: session, then run, numbers as numbers. A session is a label in BIDS, a
+    /// run a number: ses-1 and ses-01 are two sessions, run-1 and run-01 one run.
     fn order(&self) -> [(u64, &str); 2] {
         let [session, run] = [&self.session, &self.run].map(|l| (l.parse().unwrap_or(u64::MAX), l.as_str()));
         [session, if run.0 < u64::MAX { (run.0, "") } else { run }]

@@ -2,10 +2,13 @@
 //!
 //! | convention | components | source |
 //! |---|---|---|
-//! | `lps` | displacement, mm, LPS | ITK's DisplacementFieldTransform; ANTs, greedy, Slicer, plastimatch |
+//! | `lps` | displacement, mm, LPS | ITK, ANTs, greedy, Slicer, plastimatch |
 //! | `ras` | displacement, mm, RAS | - |
-//! | `fsl`, `fsl-absolute` | displacement, or place, in FSL's scaled-voxel mm | FSL, FNIRT user guide; `applywarp --rel`, `--abs` |
-//! | `niftyreg` | displacement or place, mm, RAS, as the header says | `reg_transform -disp`, `-def`; _reg_maths.h |
+//! | `fsl` | displacement, FSL's scaled-voxel mm | FNIRT user guide; `applywarp --rel` |
+//! | `fsl-absolute` | place, FSL's scaled-voxel mm | the same; `applywarp --abs` |
+//! | `niftyreg` | displacement or place, mm, RAS | `reg_transform -disp`, `-def` |
+//!
+//! The header of a field of NiftyReg says which of both it holds.
 //!
 //! FSL's coordinates are voxels times the voxel size, with x counted from the far end where the
 //! affine has a positive determinant.

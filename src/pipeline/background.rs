@@ -10,7 +10,7 @@ use rayon::prelude::*;
 /// Smallest part of a volume that a background of one value fills.
 const MIN_BACKGROUND_FRACTION: f64 = 0.02;
 
-/// How a background that was cut from tissue is told from air.
+/// How a background that was cut from tissue differs from air.
 struct CutDetection {
     /// Part of the voxels beside the background that are as bright as tissue, beyond which all of
     /// it was cut: 0.1 to 0.25 beside padding, 0.48 to 0.91 where a mask cut tissue.

@@ -2,6 +2,7 @@
 //! measure them.
 
 use crate::error::{FieldError, StrainError};
+use crate::evaluate::coverage::BAND;
 use crate::evaluate::metrics;
 use crate::evaluate::waves::{Row, cut_off, gains, rows};
 use crate::field::jacobian::count_folds;
@@ -54,9 +55,6 @@ struct ImposedMotion {
 }
 
 const IMPOSED: ImposedMotion = ImposedMotion { wave_amplitude_voxels: 0.5, uniform_strain: 0.02 };
-
-/// Half the 95 % interval of a normal error (standard deviations).
-const NORMAL_95: f64 = 1.96;
 
 /// Gauge lengths whose noise is reported, in units of the shortest.
 const GAUGE_MULTIPLES: [usize; 7] = [1, 2, 3, 4, 6, 8, 12];
@@ -171,7 +169,7 @@ pub fn run(input: CertifyInput<'_>, params: &FieldParams, progress: Progress<'_>
     let detectable = Volume::from_voxels(grid, |at, _| match tissue.as_slice()[at] {
         0 => 0.0,
         // In waves: a field at rest is held smooth, and is sure of what it would not see.
-        _ => NORMAL_95 as f32 * variances.as_slice()[at].sqrt(),
+        _ => BAND as f32 * variances.as_slice()[at].sqrt(),
     });
     let inside: Vec<usize> = (0..grid.len()).filter(|&at| tissue.as_slice()[at] != 0).collect();
     let blind = inside
@@ -312,7 +310,7 @@ fn noise_by_gauge(noise: &[DenseField], tissue: &Mask) -> Vec<GaugeNoise> {
             normal_strain(&StrainField::of(f, tissue.as_slice(), gauge, StrainMeasure::Small), tissue).powi(2)
         };
         let noise = (noise.iter().map(square).sum::<f64>() / noise.len().max(1) as f64).sqrt();
-        GaugeNoise { gauge_mm, noise, detectable: NORMAL_95 * noise }
+        GaugeNoise { gauge_mm, noise, detectable: BAND * noise }
     };
     GAUGE_MULTIPLES.into_iter().filter(|&t| t == 1 || t as f64 * shortest <= widest).map(of).collect()
 }
@@ -338,7 +336,7 @@ fn compared(
         let (e, t) = (own.strain.at(at), exact.at(at));
         for c in (0..3).filter(|&c| sd[c] > 0.0) {
             square += (e[c] - t[c]).powi(2);
-            held += usize::from((e[c] - t[c]).abs() < NORMAL_95 * sd[c]);
+            held += usize::from((e[c] - t[c]).abs() < BAND * sd[c]);
             count += 1;
         }
     }

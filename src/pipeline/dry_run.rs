@@ -32,9 +32,9 @@ pub fn strain_memory(grid: &Grid) -> u64 {
     180 * grid.len() as u64 + 12_000_000
 }
 
-/// Memory of a phantom on a grid (bytes): 85 a voxel and 14 MB, measured on blocks, heads and calves
-/// of 0.3 to 8 million voxels. The finite elements of an elastic one take 60 MB more, and 300 MB
-/// from 64 voxels across on, where they are halved again.
+/// Memory of a phantom on a grid (bytes): 85 a voxel and 14 MB, measured on blocks, heads and
+/// calves of 0.3 to 8 million voxels. The finite elements of an elastic one take 60 MB more, and
+/// 300 MB from 64 voxels across on, where they are halved again.
 pub fn phantom_memory(grid: &Grid, elastic: bool) -> u64 {
     let fine = grid.shape().into_iter().max() >= Some(64);
     let elements = if elastic && fine { 300_000_000 } else { 60_000_000 * u64::from(elastic) };

@@ -342,7 +342,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         let mean = (0..used).map(|k| normal[(k, k)]).sum::<f64>() / used as f64;
         if iteration == 0 {
             // A step of one in ln mu across an edge weighs as much as what one node can explain.
-            kappa = 0.3 * mean * MAP_CONTROL.smooth_step_ln.max(0.1);
+            kappa = 0.03 * mean;
         } else {
             kappa *= 0.4;
         }

@@ -2,7 +2,7 @@
 //!
 //! | program | file | holds |
 //! |---|---|---|
-//! | ITK, SimpleITK, ANTs | `.tfm`, `.txt` | text: affine kinds, a displacement field, or a composite; LPS |
+//! | ITK, SimpleITK, ANTs | `.tfm`, `.txt` | affine kinds, a field, or a composite; LPS |
 //! | ANTs | `0GenericAffine.mat` | MATLAB level 4: an affine kind with its centre; LPS |
 //! | greedy, c3d_affine_tool | `.mat` | text: 4 x 4, RAS mm, fixed to moving |
 //! | NiftyReg | `.txt` | the same |
