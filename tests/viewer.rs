@@ -119,7 +119,8 @@ fn what_is_past_a_scale_or_unknown_is_said_and_what_ends_it_is_exact() {
     };
     let folder = TempDir::new().unwrap();
     let page = folder.path().join("page.html");
-    std::fs::write(&page, format!("<!doctype html><html><head></head><body>{}</body></html>", viewer.html())).unwrap();
+    let body = viewer.html().into_string();
+    std::fs::write(&page, format!("<!doctype html><html><head></head><body>{body}</body></html>")).unwrap();
     let said = all_is_well(&page, 5);
     if said.is_empty() {
         return;

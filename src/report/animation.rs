@@ -10,6 +10,7 @@ use crate::report::scale::Scale;
 use crate::report::section::Section;
 use crate::report::statistics::quantile;
 use crate::types::{DenseField, Grid, Mask, WorldPoint};
+use maud::{Markup, PreEscaped, html};
 use serde::Serialize;
 use std::fmt::Write;
 
@@ -85,38 +86,45 @@ impl Film {
     }
 
     /// The player: pictures, mesh and buttons, in the order of the frames' numbers.
-    pub fn player(&self, clock: &[String]) -> String {
+    pub(super) fn player(&self, clock: &[String]) -> Markup {
         let mut order: Vec<usize> = (0..self.frames.len()).collect();
         order.sort_by_key(|&at| self.frames[at]);
         let all = self.planes.iter().flat_map(|p| p.strain.iter().flatten()).map(|&v| f64::from(v));
         let scale = Scale::from_zero(quantile(all, 0.99), "", ColorMap::Magma);
+        html! {
+            div.film {
+                div.planes {
+                    @for p in &self.planes {
+                        (figure(p.section.plane, p.section.size_mm(), html! { canvas {} }))
+                    }
+                }
+                div.controls {
+                    button type="button" { "Play" }
+                    input type="range" aria-label="Frame" min="0" max=(order.len().saturating_sub(1)) value="0";
+                    output {}
+                    label { input type="checkbox" name="mesh" checked; " mesh" }
+                    label { input type="checkbox" name="strain" checked; " strain" }
+                }
+                (legend(Some(&scale)))
+                script type="application/json" { (PreEscaped(self.data(&order, &scale, clock))) }
+            }
+            script { (PreEscaped(include_str!("animation.js"))) }
+        }
+    }
+
+    /// The frames in `order` as JSON, as it is read: values of all nodes and frames would take many
+    /// times the room of their text.
+    fn data(&self, order: &[usize], scale: &Scale, clock: &[String]) -> String {
         let byte = |v: &f32| (255.0 * scale.position(f64::from(*v)).clamp(0.0, 1.0)).round() as u8;
-        let colours: Vec<String> = (0..=255).map(|i| scale.map.hex(f64::from(i) / 255.0)).collect();
-        let names: Vec<&String> = order.iter().filter_map(|&at| clock.get(self.frames[at])).collect();
-        let canvases: String =
-            self.planes.iter().map(|p| figure(p.section.plane, p.section.size_mm(), "<canvas></canvas>")).collect();
-        let mut out = format!(
-            "<div class=\"film\"><div class=\"planes\">{canvases}</div><div class=\"controls\"><button type=\"button\">Play</button>\
-             <input type=\"range\" aria-label=\"Frame\" min=\"0\" max=\"{}\" value=\"0\"><output></output>\
-             <label><input type=\"checkbox\" name=\"mesh\" checked> mesh</label>\
-             <label><input type=\"checkbox\" name=\"strain\" checked> strain</label></div>{}",
-            order.len().saturating_sub(1),
-            legend(Some(&scale))
-        );
-        // As it is read: values of all nodes and frames would take many times the room of their
-        // text.
-        out.push_str("<script type=\"application/json\">{\"planes\":[");
+        let mut out = String::from("{\"planes\":[");
         for (n, plane) in self.planes.iter().enumerate() {
             out.push_str(if n == 0 { "" } else { "," });
-            plane.write(&mut out, &order, &byte);
+            plane.write(&mut out, order, &byte);
         }
+        let colours: Vec<String> = (0..=255).map(|i| scale.map.hex(f64::from(i) / 255.0)).collect();
+        let names: Vec<&String> = order.iter().filter_map(|&at| clock.get(self.frames[at])).collect();
         let names = text(&names).replace("</", "<\\/");
-        let _ = write!(
-            out,
-            "],\"colours\":{},\"clock\":{names}}}</script></div><script>{}</script>",
-            text(&colours),
-            include_str!("animation.js")
-        );
+        let _ = write!(out, "],\"colours\":{},\"clock\":{names}}}", text(&colours));
         out
     }
 }

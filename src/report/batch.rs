@@ -7,6 +7,7 @@ use crate::report::scale::short;
 use crate::report::statistics::quantile;
 use crate::report::tables::table;
 use crate::types::batch::{PairOutcome, Status};
+use maud::{Markup, PreEscaped, html};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -227,59 +228,64 @@ fn strips(spreads: &[&Spread]) -> String {
     svg + "</svg>"
 }
 
+/// The regions of one unit, where there are any: their places and quartiles.
+fn moduli(unit: &str, spreads: &[Spread]) -> Markup {
+    let these: Vec<&Spread> = spreads.iter().filter(|s| s.unit == unit).collect();
+    if these.is_empty() {
+        return Markup::default();
+    }
+    let digits = |v: f64| if v.is_finite() { format!("{v:.3}") } else { "none".into() };
+    let rows = these.iter().map(|s| {
+        let [first, median, third] = [0.25, 0.5, 0.75].map(|q| digits(s.at(q)));
+        [s.region.clone(), s.values.len().to_string(), s.seen().to_string(), first, median, third]
+    });
+    let head = ["Region", "Pairs", "Determined", "First quartile", "Median", "Third quartile"];
+    html! {
+        section {
+            h2 { "Young's modulus, " (unit) }
+            article.wide {
+                (PreEscaped(strips(&these)))
+                p { "A dot a pair; hollow where the data give only a bound. The bar is the median of those determined." }
+                (table(&head, rows))
+            }
+        }
+    }
+}
+
+/// What a pair's field says, and a link to its page.
+fn pair(o: &PairOutcome) -> Vec<Markup> {
+    let mm = |key: &str| o.field[key].as_f64().map_or_else(String::new, |v| format!("{v:.3}"));
+    let mut cells = vec![html! { a href={ (o.folder) "/field/report.html" } { (o.name) } }];
+    cells.extend(["displacement_mean_mm", "displacement_max_mm", "expected_error_mm"].map(|key| html! { (mm(key)) }));
+    cells.extend([&o.field["trust"], &o.field["counts"]["kept"]].map(|v| html! { (text(v)) }));
+    cells.push(html! {
+        @for (i, flag) in flags(o).iter().enumerate() {
+            @if i > 0 { br; }
+            (flag)
+        }
+    });
+    cells
+}
+
 /// The group report.
 pub fn page(outcomes: &[PairOutcome]) -> String {
-    let mut body = format!("<header><h1>Cohort</h1><p class=\"lead\">{}</p></header>", verdict(outcomes));
-    let failed: Vec<Vec<String>> = outcomes
-        .iter()
-        .filter(|o| o.status == Status::Failed)
-        .map(|o| vec![escape(&o.name), o.stage.into(), escape(&o.reason)])
-        .collect();
-    if !failed.is_empty() {
-        let rows = table(&["Pair", "Stage", "Reason"], &failed);
-        let _ = write!(body, "<section><h2>What failed</h2><article class=\"wide words\">{rows}</article></section>");
-    }
+    let failed: Vec<[&str; 3]> =
+        outcomes.iter().filter(|o| o.status == Status::Failed).map(|o| [o.name.as_str(), o.stage, &o.reason]).collect();
     let spreads = spreads(outcomes);
-    for unit in ["kPa", "ratio"] {
-        let these: Vec<&Spread> = spreads.iter().filter(|s| s.unit == unit).collect();
-        if these.is_empty() {
-            continue;
-        }
-        let digits = |v: f64| if v.is_finite() { format!("{v:.3}") } else { "none".into() };
-        let rows: Vec<Vec<String>> = these
-            .iter()
-            .map(|s| {
-                let quartiles = [0.25, 0.5, 0.75].map(|q| digits(s.at(q)));
-                let mut row = vec![escape(&s.region), s.values.len().to_string(), s.seen().to_string()];
-                row.extend(quartiles);
-                row
-            })
-            .collect();
-        let head = ["Region", "Pairs", "Determined", "First quartile", "Median", "Third quartile"];
-        let _ = write!(
-            body,
-            "<section><h2>Young's modulus, {unit}</h2><article class=\"wide\">{}<p>A dot a pair; hollow where the data give only \
-             a bound. The bar is the median of those determined.</p>{}</article></section>",
-            strips(&these),
-            table(&head, &rows)
-        );
-    }
-    let with_field: Vec<&PairOutcome> = outcomes.iter().filter(|o| !o.field.is_null()).collect();
-    let rows: Vec<Vec<String>> = with_field
-        .iter()
-        .map(|o| {
-            let mm = |key: &str| o.field[key].as_f64().map_or_else(String::new, |v| format!("{v:.3}"));
-            let mut row = vec![format!("<a href=\"{}/field/report.html\">{}</a>", escape(&o.folder), escape(&o.name))];
-            row.extend(["displacement_mean_mm", "displacement_max_mm", "expected_error_mm"].map(mm));
-            row.push(text(&o.field["trust"]));
-            row.push(text(&o.field["counts"]["kept"]));
-            row.push(flags(o).iter().map(|f| escape(f)).collect::<Vec<_>>().join("<br>"));
-            row
-        })
-        .collect();
+    let pairs = outcomes.iter().filter(|o| !o.field.is_null()).map(pair);
     let head = ["Pair", "Mean, mm", "Largest, mm", "Expected error, mm", "Trust", "Matches kept", "To look at"];
-    let rows = table(&head, &rows);
-    let _ = write!(body, "<section><h2>Pairs</h2><article class=\"wide words\">{rows}</article></section>");
+    let body = html! {
+        header { h1 { "Cohort" } p.lead { (verdict(outcomes)) } }
+        @if !failed.is_empty() {
+            section {
+                h2 { "What failed" }
+                article.wide.words { (table(&["Pair", "Stage", "Reason"], failed)) }
+            }
+        }
+        (moduli("kPa", &spreads))
+        (moduli("ratio", &spreads))
+        section { h2 { "Pairs" } article.wide.words { (table(&head, pairs)) } }
+    };
     document("Cohort", &body)
 }
 

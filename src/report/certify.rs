@@ -3,16 +3,16 @@
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::grasp::tile;
-use crate::report::html::{card, document, escape, warned};
+use crate::report::html::{card, document, header, tiles, titled, warned};
 use crate::report::json::{grid, seconds};
 use crate::report::panels::{Panel, gray_range};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, percent, significant};
 use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
-use crate::report::tables::table;
+use crate::report::tables::{facts, table};
 use crate::types::{Certificate, FieldParams, Mask, VoxelPoint, Voxels};
+use maud::{Markup, html};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -127,91 +127,94 @@ pub fn text(report: &CertifyReport<'_>) -> String {
 /// [`ReportError`] when a picture cannot be encoded.
 pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
     let c = report.certificate;
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>certificate</span></h1><p class=\"verdict\">{}</p></header>\
-         <div class=\"tiles\">{}{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(report.names[0]),
-        escape(&headline(c)),
-        tile(&significant(c.displacement_noise_mm), "mm", "noise of a displacement along an axis"),
-        tile(&percent(c.strain_noise), "%", &format!("noise of strain at {} mm", significant(c.gauge_mm))),
-        wave(c.wavelength_90_mm, "90 %"),
-        wave(c.wavelength_50_mm, "50 %"),
-        tile(&percent(c.blind_share), "%", "of the tissue is blind"),
-    );
-    body += &warned(&c.warnings);
-    let gains: Vec<[f64; 2]> = c.gains.iter().map(|g| [g.wavelength_mm, g.gain]).collect();
-    let noise: Vec<[f64; 2]> = c.strain_noise_by_gauge.iter().map(|g| [g.gauge_mm, 100.0 * g.noise]).collect();
-    let marks: Vec<(f64, bool)> =
-        [c.wavelength_50_mm, c.wavelength_90_mm].into_iter().flatten().map(|w| (w, false)).collect();
-    let whole = gains.iter().map(|g| [g[0], 1.0]).collect();
-    let gain = Plot { title: "Share of a wave's amplitude that comes back", across: "wavelength, mm", marks: &marks }
-        .draw(&[Line::new("measured", 0, false, gains), Line::new("whole", 1, true, whole)]);
-    let strain = Plot { title: "Noise of a normal strain, %", across: "gauge, mm", marks: &[(c.gauge_mm, false)] }
-        .draw(&[Line::new("one standard deviation", 0, false, noise)]);
-    let gauges: Vec<Vec<String>> = c
-        .strain_noise_by_gauge
-        .iter()
-        .map(|g| vec![significant(g.gauge_mm), percent(g.noise), percent(g.detectable)])
-        .collect();
-    let imposed: Vec<Vec<String>> = c
-        .imposed
-        .iter()
-        .map(|i| {
-            let numbers = [i.motion_mm, i.error_mm, i.expected_mm].map(significant);
-            let strain = [percent(i.strain_error), format!("{:.1}", 100.0 * i.strain_held)];
-            [escape(&i.motion)].into_iter().chain(numbers).chain(strain).collect()
-        })
-        .collect();
-    let _ = write!(
-        body,
-        "<section><h2>Resolution and noise</h2><p class=\"lead\">Waves of {} mm were imposed on the scan, noise was added, and the same \
-         settings as those of a run measured them.</p><div class=\"grid\"><article>{gain}</article><article>{strain}</article>\
-         <article><h3>Strain by gauge</h3>{}</article>{}<article><h3>Settings</h3>{}</article><article class=\"wide\"><h3>Known motions</h3>{}</article></div></section>",
-        significant(c.amplitude_mm),
-        table(&["Gauge, mm", "Noise, %", "Told from noise from, %"], &gauges),
-        blind(report)?,
-        settings(report),
-        table(
-            &["Motion", "Mean, mm", "Error, mm", "Expected error, mm", "Error of strain, %", "In the 95 % band, %"],
-            &imposed
-        )
-    );
-    body += "<footer><p>A gauge is the side of the cube over which displacements give one strain. Waves are shears that keep the \
-             volume; a feature of half a wavelength is as wide as one crest. What moves during a scan, and what changes from scan \
-             to scan beside noise, is not in this certificate.</p></footer>";
-    Ok(document(&format!("Certificate of {}", escape(report.names[0])), &body))
+    let wave = |length: Option<f64>, name| match length {
+        Some(w) => (significant(w), "mm", name),
+        None => ("none".into(), "", name),
+    };
+    let at_gauge = format!("noise of strain at {} mm", significant(c.gauge_mm));
+    let gauges =
+        c.strain_noise_by_gauge.iter().map(|g| [significant(g.gauge_mm), percent(g.noise), percent(g.detectable)]);
+    let imposed = c.imposed.iter().map(|i| {
+        let [motion, error, expected] = [i.motion_mm, i.error_mm, i.expected_mm].map(significant);
+        [i.motion.clone(), motion, error, expected, percent(i.strain_error), format!("{:.1}", 100.0 * i.strain_held)]
+    });
+    let head = ["Motion", "Mean, mm", "Error, mm", "Expected error, mm", "Error of strain, %", "In the 95 % band, %"];
+    let body = html! {
+        (header(titled(report.names[0], "certificate"), &headline(c), ""))
+        (tiles([
+            (significant(c.displacement_noise_mm), "mm", "noise of a displacement along an axis"),
+            (percent(c.strain_noise), "%", &at_gauge),
+            wave(c.wavelength_90_mm, "wave that comes back to 90 %"),
+            wave(c.wavelength_50_mm, "wave that comes back to 50 %"),
+            (percent(c.blind_share), "%", "of the tissue is blind"),
+        ]))
+        (warned(&c.warnings))
+        section {
+            h2 { "Resolution and noise" }
+            p.lead {
+                "Waves of " (significant(c.amplitude_mm)) " mm were imposed on the scan, noise was added, and the same \
+                 settings as those of a run measured them."
+            }
+            div.grid {
+                article { (gain(c)) }
+                article { (strain(c)) }
+                article {
+                    h3 { "Strain by gauge" }
+                    (table(&["Gauge, mm", "Noise, %", "Told from noise from, %"], gauges))
+                }
+                (blind(report)?)
+                article { h3 { "Settings" } (settings(report)) }
+                article.wide { h3 { "Known motions" } (table(&head, imposed)) }
+            }
+        }
+        footer {
+            p {
+                "A gauge is the side of the cube over which displacements give one strain. Waves are shears that keep the \
+                 volume; a feature of half a wavelength is as wide as one crest. What moves during a scan, and what changes \
+                 from scan to scan beside noise, is not in this certificate."
+            }
+        }
+    };
+    Ok(document(&format!("Certificate of {}", report.names[0]), &body))
 }
 
-/// The tile of a cut-off.
-fn wave(length: Option<f64>, level: &str) -> String {
-    match length {
-        Some(w) => tile(&significant(w), "mm", &format!("wave that comes back to {level}")),
-        None => tile("none", "", &format!("wave that comes back to {level}")),
-    }
+/// Share of a wave that comes back, by its length.
+fn gain(c: &Certificate) -> Markup {
+    let gains: Vec<[f64; 2]> = c.gains.iter().map(|g| [g.wavelength_mm, g.gain]).collect();
+    let whole = gains.iter().map(|g| [g[0], 1.0]).collect();
+    let marks: Vec<(f64, bool)> =
+        [c.wavelength_50_mm, c.wavelength_90_mm].into_iter().flatten().map(|w| (w, false)).collect();
+    Plot { title: "Share of a wave's amplitude that comes back", across: "wavelength, mm", marks: &marks }
+        .shown(&[Line::new("measured", 0, false, gains), Line::new("whole", 1, true, whole)])
+}
+
+/// Noise of strain, by the gauge.
+fn strain(c: &Certificate) -> Markup {
+    let noise = c.strain_noise_by_gauge.iter().map(|g| [g.gauge_mm, 100.0 * g.noise]).collect();
+    Plot { title: "Noise of a normal strain, %", across: "gauge, mm", marks: &[(c.gauge_mm, false)] }
+        .shown(&[Line::new("one standard deviation", 0, false, noise)])
 }
 
 /// Where the noise comes from and what was asked for.
-fn settings(report: &CertifyReport<'_>) -> String {
+fn settings(report: &CertifyReport<'_>) -> Markup {
     let c = report.certificate;
     let noise = match c.image_noise_from {
-        "repeat" => format!("{} (from {})", significant(c.image_noise), escape(report.names[1])),
+        "repeat" => format!("{} (from {})", significant(c.image_noise), report.names[1]),
         _ => format!("{} (estimated from the scan alone, added to both volumes)", significant(c.image_noise)),
     };
-    let at_rest =
-        c.rest_mm.map(|moved| vec!["Motion between the two scans".into(), format!("{} mm", significant(moved))]);
+    let at_rest = c.rest_mm.map(|moved| ("Motion between the two scans", format!("{} mm", significant(moved))));
     let rows = [
-        vec!["Noise of the image".into(), noise],
-        vec!["Amplitude of the waves".into(), format!("{} mm", significant(c.amplitude_mm))],
-        vec!["Preset".into(), format!("{:?}", report.params.preset).to_lowercase()],
-        vec!["Motion model".into(), "free".into()],
-        vec!["Runs of field".into(), c.runs.to_string()],
+        ("Noise of the image", noise),
+        ("Amplitude of the waves", format!("{} mm", significant(c.amplitude_mm))),
+        ("Preset", format!("{:?}", report.params.preset).to_lowercase()),
+        ("Motion model", "free".into()),
+        ("Runs of field", c.runs.to_string()),
     ];
-    table(&[], &rows.into_iter().chain(at_rest).collect::<Vec<_>>())
+    facts(rows.into_iter().chain(at_rest))
 }
 
 /// The map of the smallest displacement above noise.
-fn blind(report: &CertifyReport<'_>) -> Result<String, ReportError> {
+fn blind(report: &CertifyReport<'_>) -> Result<Markup, ReportError> {
     let grid = report.initial.grid();
     let inside = sample(grid.len(), Some(report.tissue));
     let mut middle = [0.0; 3];

@@ -1,9 +1,9 @@
 //! The page of the whole chain: one table of errors, then each part's own page.
 
-use crate::report::html::{document, escape};
+use crate::report::html::{document, header};
 use crate::report::tables::table;
+use maud::{PreEscaped, html};
 use serde::Serialize;
-use std::fmt::Write;
 
 /// A quantity of one stage with its truth.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -113,27 +113,31 @@ pub fn text(rows: &[Row]) -> String {
     all.iter().map(line).collect()
 }
 
+/// Makes the frame of a part as tall as what is in it.
+const GROW: &str = "new ResizeObserver(()=>this.style.height=this.contentDocument.documentElement.offsetHeight+9+'px')\
+                    .observe(this.contentDocument.documentElement)";
+
 /// The page under a title, with what it is about; parts are embedded whole, so it needs no other
 /// file.
 pub fn page(title: &str, about: &str, rows: &[Row], parts: &[Part]) -> String {
-    let cells: Vec<Vec<String>> = rows.iter().map(|r| r.cells().iter().map(|c| escape(c)).collect()).collect();
-    let mut out = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{title}</h1><p class=\"verdict\">{about}</p></header>\
-         <section><h2>Errors</h2><div class=\"grid\"><article class=\"wide\">{}</article></div></section>",
-        env!("CARGO_PKG_VERSION"),
-        table(&HEAD, &cells)
-    );
-    for Part { title, file, content } in parts {
-        let inside = match file.ends_with(".svg") {
-            true => format!("<article class=\"wide\">{content}</article>"),
-            false => format!(
-                "<iframe title=\"{title}\" style=\"width:100%;height:46rem;border:1px solid #8884;border-radius:8px\" \
-                 onload=\"new ResizeObserver(()=>this.style.height=this.contentDocument.documentElement.offsetHeight+9+'px')\
-                 .observe(this.contentDocument.documentElement)\" srcdoc=\"{}\"></iframe>",
-                escape(content)
-            ),
-        };
-        let _ = write!(out, "<section><h2>{title}</h2>{inside}<p><small>{file}</small></p></section>");
-    }
-    document(title, &out)
+    let body = html! {
+        (header(title, about, ""))
+        section {
+            h2 { "Errors" }
+            div.grid { article.wide { (table(&HEAD, rows.iter().map(Row::cells))) } }
+        }
+        @for Part { title, file, content } in parts {
+            section {
+                h2 { (title) }
+                @if file.ends_with(".svg") {
+                    article.wide { (PreEscaped(content)) }
+                } @else {
+                    iframe title=(title) style="width:100%;height:46rem;border:1px solid #8884;border-radius:8px"
+                        onload=(GROW) srcdoc=(content) {}
+                }
+                p { small { (file) } }
+            }
+        }
+    };
+    document(title, &body)
 }

@@ -1,10 +1,11 @@
 //! `palpate chart`: error against CPU time, cost against size, as SVG, page, JSON and text.
 
 use crate::report::axes::{Axis, Panel, path, tiled};
-use crate::report::html::{document, escape};
+use crate::report::html::{document, escape, header};
 use crate::report::scale::significant;
 use crate::report::tables::table;
 use crate::types::{Part, Standing, Trial};
+use maud::{PreEscaped, html};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -253,41 +254,40 @@ fn number(v: f64) -> String {
 
 /// The page.
 pub fn page(groups: &[Group], trials: &[Trial]) -> String {
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>Speed against accuracy</h1><p class=\"verdict\">The line joins the \
-         settings that no other beats in both. Point at a place to see its settings. Hollow places are whole commands, with \
-         their start and their files; all others are the work alone. A method that has no result on some case is not on the line: \
-         there it counts as no registration, and its time is that of the others.</p></header><article class=\"wide\">{}</article>",
-        env!("CARGO_PKG_VERSION"),
-        svg(groups, trials)
-    );
-    for group in groups {
-        let row = |s: &Standing| {
-            vec![
-                escape(&s.method),
-                escape(&s.settings),
-                number(s.error),
-                number(s.cpu_s),
-                s.cases.to_string(),
-                if s.failures > 0 { s.failures.to_string() } else { String::new() },
-                if s.on_front { "front".into() } else { String::new() },
-            ]
-        };
-        let rows: Vec<_> = group.standings.iter().map(row).collect();
-        let error = format!("Error, {}", group.unit);
-        let head = ["Method", "Settings", &error, "CPU, s", "Cases", "No result", ""];
-        let rows = table(&head, &rows);
-        let _ = write!(body, "<section><h2>{}</h2><div class=\"two\">{rows}</div></section>", escape(&group.title));
-    }
-    let failed = |t: &Trial| t.failure.as_ref().map(|f| vec![escape(&t.method), escape(&t.case), escape(f)]);
+    let row = |s: &Standing| {
+        let failures = if s.failures > 0 { s.failures.to_string() } else { String::new() };
+        let front = if s.on_front { "front" } else { "" };
+        let [error, seconds] = [s.error, s.cpu_s].map(number);
+        [s.method.clone(), s.settings.clone(), error, seconds, s.cases.to_string(), failures, front.into()]
+    };
+    let failed = |t: &Trial| t.failure.as_ref().map(|f| [t.method.clone(), t.case.clone(), f.clone()]);
     let failures: Vec<_> = trials.iter().filter_map(failed).collect();
-    if !failures.is_empty() {
-        let _ = write!(
-            body,
-            "<section><h2>Without a result</h2><div class=\"two words\">{}</div></section>",
-            table(&["Method", "Case", "Why"], &failures)
-        );
-    }
+    let verdict = "The line joins the settings that no other beats in both. Point at a place to see its settings. Hollow \
+                   places are whole commands, with their start and their files; all others are the work alone. A method that \
+                   has no result on some case is not on the line: there it counts as no registration, and its time is that of \
+                   the others.";
+    let body = html! {
+        (header("Speed against accuracy", verdict, ""))
+        article.wide { (PreEscaped(svg(groups, trials))) }
+        @for group in groups {
+            @let error = format!("Error, {}", group.unit);
+            section {
+                h2 { (group.title) }
+                div.two {
+                    (table(
+                        &["Method", "Settings", &error, "CPU, s", "Cases", "No result", ""],
+                        group.standings.iter().map(row)
+                    ))
+                }
+            }
+        }
+        @if !failures.is_empty() {
+            section {
+                h2 { "Without a result" }
+                div.two.words { (table(&["Method", "Case", "Why"], failures)) }
+            }
+        }
+    };
     document("palpate: speed against accuracy", &body)
 }
 

@@ -1,13 +1,15 @@
 //! The report of `palpate grasp`: page, summary.json and the short summary.
 
+use crate::report::chart::stage_times;
 use crate::report::grasp_scene::{animation, largest_force, moment};
-use crate::report::html::{document, escape};
+use crate::report::html::{document, header, listed, tiles, titled};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
-use crate::report::tables::table;
+use crate::report::tables::{facts, table};
 use crate::types::Scene;
-use crate::types::grasp::{Bands, Event, EventKind, GraspRun, Sample, StableStep};
+use crate::types::grasp::{Bands, Event, EventKind, GraspRun, MotionRow, Sample, StableStep};
 use crate::types::scene::{Method, SweepCase};
+use maud::{Markup, PreEscaped, html};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 
@@ -226,51 +228,44 @@ fn both(report: &GraspReport<'_>, values: &[(&str, &dyn Fn(&Sample) -> f64)]) ->
 }
 
 /// Time plots, with motions and events marked.
-pub fn time_plots(report: &GraspReport<'_>) -> String {
+pub(super) fn time_plots(report: &GraspReport<'_>) -> Markup {
     let mut marks: Vec<(f64, bool)> = report.run.motions.iter().map(|m| (m.reached.time, false)).collect();
     marks.extend(report.run.events.iter().map(|e| (e.time, true)));
-    let plot = |title: &str, values: &[(&str, &dyn Fn(&Sample) -> f64)]| {
-        Plot { title, across: "s", marks: &marks }.draw(&both(report, values))
-    };
+    let plot = |title: &str, lines: &[Line]| Plot { title, across: "s", marks: &marks }.shown(lines);
     let mm = |v: f64| 1e3 * v;
-    let slid = report.run.samples.iter().any(|s| s.slip != [0.0; 2]);
-    let mut lines = both(report, &[("needed", &|s| s.required_friction)]);
-    if let (Some(given), Some(last)) = (report.scene.object.friction, report.run.samples.last()) {
-        lines.push(Line::new("given", 1, false, vec![[0.0, given], [last.time, given]]));
-    }
-    let friction = Plot { title: "Coefficient of friction", across: "s", marks: &marks }.draw(&lines);
-    [
-        plot("Object's angle, degrees", &[("theta", &|s| s.pose[2].to_degrees())]),
-        plot(
+    let pose: [(&str, &[(&str, &dyn Fn(&Sample) -> f64)]); 2] = [
+        ("Object's angle, degrees", &[("theta", &|s| s.pose[2].to_degrees())]),
+        (
             "Object's place, mm",
             &[("x", &|s| mm(s.pose[0])), ("y + link", &|s| mm(s.pose[1] + report.scene.finger.link))],
         ),
-        plot(
-            "Joint angles, degrees",
-            &[("finger 1", &|s| s.joints[0].to_degrees()), ("finger 2", &|s| s.joints[1].to_degrees())],
-        ),
-        plot("Normal displacement, mm", &[("finger 1", &|s| mm(s.normal[0])), ("finger 2", &|s| mm(s.normal[1]))]),
-        plot(
-            "Tangential displacement, mm",
-            &[("finger 1", &|s| mm(s.tangential[0])), ("finger 2", &|s| mm(s.tangential[1]))],
-        ),
-        plot("Normal force, N", &[("finger 1", &|s| s.normal_force[0]), ("finger 2", &|s| s.normal_force[1])]),
-        plot(
-            "Tangential force, N",
-            &[("finger 1", &|s| s.tangential_force[0]), ("finger 2", &|s| s.tangential_force[1])],
-        ),
-        friction,
-        if slid {
-            plot("Slip along the face, mm", &[("finger 1", &|s| mm(s.slip[0])), ("finger 2", &|s| mm(s.slip[1]))])
-        } else {
-            String::new()
-        },
-    ]
-    .concat()
+    ];
+    let of_fingers: [(&str, &dyn Fn(&Sample, usize) -> f64); 5] = [
+        ("Joint angles, degrees", &|s, i| s.joints[i].to_degrees()),
+        ("Normal displacement, mm", &|s, i| mm(s.normal[i])),
+        ("Tangential displacement, mm", &|s, i| mm(s.tangential[i])),
+        ("Normal force, N", &|s, i| s.normal_force[i]),
+        ("Tangential force, N", &|s, i| s.tangential_force[i]),
+    ];
+    let fingers = |value: &dyn Fn(&Sample, usize) -> f64| {
+        both(report, &[("finger 1", &|s| value(s, 0)), ("finger 2", &|s| value(s, 1))])
+    };
+    let mut friction = both(report, &[("needed", &|s| s.required_friction)]);
+    if let (Some(given), Some(last)) = (report.scene.object.friction, report.run.samples.last()) {
+        friction.push(Line::new("given", 1, false, vec![[0.0, given], [last.time, given]]));
+    }
+    html! {
+        @for (title, values) in pose { (plot(title, &both(report, values))) }
+        @for (title, value) in of_fingers { (plot(title, &fingers(value))) }
+        (plot("Coefficient of friction", &friction))
+        @if report.run.samples.iter().any(|s| s.slip != [0.0; 2]) {
+            (plot("Slip along the face, mm", &fingers(&|s, i| mm(s.slip[i]))))
+        }
+    }
 }
 
 /// The table of motions.
-fn motions(run: &GraspRun) -> String {
+fn motions(run: &GraspRun) -> Markup {
     let head = [
         "Motion",
         "theta 1, deg",
@@ -287,21 +282,22 @@ fn motions(run: &GraspRun) -> String {
         "f_t1, N",
         "f_t2, N",
     ];
-    let rows: Vec<Vec<String>> = run
-        .motions
-        .iter()
-        .map(|m| {
-            let s = &m.reached;
-            let mut row = vec![if m.step == 0 { "rest".into() } else { m.step.to_string() }];
-            row.extend(m.target.map(|v| short((v.to_degrees() * 1e6).round() / 1e6)));
-            let ([x, y, theta], [n1, n2], [t1, t2]) = (s.pose, s.normal, s.tangential);
-            row.extend([1e3 * x, 1e3 * y, theta.to_degrees()].map(fixed2));
-            row.extend([n1, n2, t1, t2].map(|v| fixed3(1e3 * v)));
-            row.extend(s.normal_force.into_iter().chain(s.tangential_force).map(fixed2));
-            row
-        })
-        .collect();
-    table(&head, &rows)
+    let row = |m: &MotionRow| {
+        let s = &m.reached;
+        let mut row = vec![if m.step == 0 { "rest".into() } else { m.step.to_string() }];
+        row.extend(m.target.map(degrees));
+        let ([x, y, theta], [n1, n2], [t1, t2]) = (s.pose, s.normal, s.tangential);
+        row.extend([1e3 * x, 1e3 * y, theta.to_degrees()].map(fixed2));
+        row.extend([n1, n2, t1, t2].map(|v| fixed3(1e3 * v)));
+        row.extend(s.normal_force.into_iter().chain(s.tangential_force).map(fixed2));
+        row
+    };
+    table(&head, run.motions.iter().map(row))
+}
+
+/// A joint angle (rad) in degrees, as it was given.
+pub(super) fn degrees(v: f64) -> String {
+    short((v.to_degrees() * 1e6).round() / 1e6)
 }
 
 /// A small number by its size.
@@ -320,18 +316,10 @@ fn fixed3(v: f64) -> String {
     if s == "-0.000" { "0.000".into() } else { s }
 }
 
-/// One tile of a page's head.
-pub(super) fn tile(value: &str, unit: &str, name: &str) -> String {
-    format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
-}
-
 /// Largest stable steps as a table.
-pub(super) fn steps_table(steps: &[StableStep]) -> String {
-    let rows: Vec<Vec<String>> = steps
-        .iter()
-        .map(|s| vec![s.method.name().into(), s.formulation.name().into(), format!("{:.2}", 1e3 * s.step)])
-        .collect();
-    table(&["Integrator", "Form", "Largest stable step, ms"], &rows)
+pub(super) fn steps_table(steps: &[StableStep]) -> Markup {
+    let row = |s: &StableStep| [s.method.name().into(), s.formulation.name().into(), format!("{:.2}", 1e3 * s.step)];
+    table(&["Integrator", "Form", "Largest stable step, ms"], steps.iter().map(row))
 }
 
 /// The page.
@@ -344,81 +332,98 @@ pub fn page(report: &GraspReport<'_>) -> String {
         Some(EventKind::ValidityRange) => ("moderate", "out of range"),
         Some(_) => ("moderate", "off its branch"),
     };
+    let held = html! { p class={ "trust " (class) } { b { (word) } } };
     let [low, high] = range(&run.samples, |s| s.pose[2].to_degrees());
     let simulated = run.samples.last().map_or(0.0, |s| s.time);
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>grasp</span></h1><p class=\"verdict\">{}</p>\
-         <p class=\"trust {class}\"><b>{word}</b></p></header><div class=\"tiles\">{}{}{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(report.name),
-        escape(&headline(report)),
-        tile(&short(simulated), "s", "simulated"),
-        tile(&format!("{low:.0} to {high:.0}"), "deg", "turn of the object"),
-        tile(&format!("{:.1}", largest_force(&run.samples)), "N", "largest contact force"),
-        tile(&tiny(run.energy_drift), "", "energy drift"),
-        tile(&tiny(run.constraint_drift.normal.max(run.constraint_drift.rolling)), "m", "constraint drift"),
-        tile(&own_stable_step(report).map_or("-".into(), |s| format!("{:.1}", 1e3 * s)), "ms", "largest stable step"),
-    );
-    let notes: Vec<String> = run.events.iter().map(event_line).chain(report.warnings.iter().cloned()).collect();
-    if !notes.is_empty() {
-        let items: String = notes.iter().take(40).map(|w| format!("<li>{}</li>", escape(w))).collect();
-        let _ = write!(body, "<article class=\"warnings\"><h3>Events and warnings</h3><ul>{items}</ul></article>");
-    }
-    if !report.sweep.is_empty() {
-        body.push_str(&ensemble(report.sweep));
-    }
-    let _ = write!(
-        body,
-        "<section><h2>The grasp</h2><p class=\"lead\">Arrows are the contact forces on the object; the line is the way of \
-         its centre.</p><div class=\"grid\"><article>{}</article>",
-        animation(scene, &run.samples)
-    );
+    let stable = own_stable_step(report).map_or("-".into(), |s| format!("{:.1}", 1e3 * s));
+    let events = run.events.iter().map(event_line).chain(report.warnings.iter().cloned());
+    let body = html! {
+        (header(titled(report.name, "grasp"), &headline(report), held))
+        (tiles([
+            (short(simulated), "s", "simulated"),
+            (format!("{low:.0} to {high:.0}"), "deg", "turn of the object"),
+            (format!("{:.1}", largest_force(&run.samples)), "N", "largest contact force"),
+            (tiny(run.energy_drift), "", "energy drift"),
+            (tiny(run.constraint_drift.normal.max(run.constraint_drift.rolling)), "m", "constraint drift"),
+            (stable, "ms", "largest stable step"),
+        ]))
+        (listed("Events and warnings", &events.take(40).collect::<Vec<_>>()))
+        @if !report.sweep.is_empty() { (ensemble(report.sweep)) }
+        section {
+            h2 { "The grasp" }
+            p.lead {
+                "Arrows are the contact forces on the object; the line is the way of its centre."
+            }
+            div.grid {
+                article { (animation(scene, &run.samples)) }
+                article {
+                    h3 { "Postures reached" }
+                    p { "At the end of each hold, with the desired joint angles." }
+                    (postures(scene, run))
+                }
+            }
+        }
+        section {
+            h2 { "Over time" }
+            p.lead {
+                (beside(report))
+                @if let Some(words) = bands_words(report) { " Shaded: moduli of the tips " (words) "." }
+                " Upright lines: ends of motions; red: events."
+            }
+            div.plots { (time_plots(report)) }
+        }
+        section {
+            h2 { "Numbers" }
+            div.grid {
+                article.wide { h3 { "Motions" } (motions(run)) }
+                article { h3 { "Scene" } (scene_table(scene)) }
+                article {
+                    h3 { "Stable steps" }
+                    p { "At the start and at all postures of the scene." }
+                    (steps_table(report.stable_steps))
+                }
+                article { h3 { "Time" } (stage_times(report.seconds)) }
+            }
+        }
+        footer {
+            p {
+                "SI units; angles counter-clockwise but for joint 2, so that a positive angle closes either finger. d_n and d_t \
+                 are the displacements of a tip along the face's normal and tangent. The object's pose is never fed back to the \
+                 joints."
+            }
+        }
+    };
+    document(&format!("{} grasp", report.name), &body)
+}
+
+/// Drawings of the grasp at the end of each motion.
+fn postures(scene: &Scene, run: &GraspRun) -> Markup {
     let largest = largest_force(&run.samples);
-    let postures: String = run
-        .motions
-        .iter()
-        .map(|m| {
-            let [a, b] = m.target.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
-            let name = if m.step == 0 { "rest".into() } else { format!("{}: {a}°, {b}°", m.step) };
-            format!("<div>{}<span>{name}</span></div>", moment(scene, &m.reached, largest, &[]))
-        })
-        .collect();
-    let _ = write!(
-        body,
-        "<article><h3>Postures reached</h3><p>At the end of each hold, with the desired joint angles.</p><div class=\"postures\">{postures}</div></article></div></section>"
-    );
-    let shaded = bands_words(report).map_or(String::new(), |w| format!(" Shaded: moduli of the tips {}.", escape(&w)));
-    let beside = match report.without_tangential {
+    html! {
+        div.postures {
+            @for m in &run.motions {
+                @let [a, b] = m.target.map(degrees);
+                div {
+                    (PreEscaped(moment(scene, &m.reached, largest, &[])))
+                    span { @if m.step == 0 { "rest" } @else { (m.step) ": " (a) "°, " (b) "°" } }
+                }
+            }
+        }
+    }
+}
+
+/// How the scene without tangential deformation went, where that was asked for.
+fn beside(report: &GraspReport<'_>) -> String {
+    match report.without_tangential {
         Some(Ok(other)) => match other.events.iter().find(|e| e.kind.ends_run()) {
-            Some(e) => format!(
-                "Dashed: the same scene without tangential deformation; that run ended at {}.",
-                escape(&event_line(e))
-            ),
+            Some(e) => {
+                format!("Dashed: the same scene without tangential deformation; that run ended at {}.", event_line(e))
+            }
             None => "Dashed: the same scene without tangential deformation.".into(),
         },
-        Some(Err(error)) => format!("Without tangential deformation the scene has no result: {}.", escape(error)),
+        Some(Err(error)) => format!("Without tangential deformation the scene has no result: {error}."),
         None => String::new(),
-    };
-    let _ = write!(
-        body,
-        "<section><h2>Over time</h2><p class=\"lead\">{beside}{shaded} Upright lines: ends of motions; red: events.</p><div class=\"plots\">{}</div></section>\
-         <section><h2>Numbers</h2><div class=\"grid\"><article class=\"wide\"><h3>Motions</h3>{}</article>",
-        time_plots(report),
-        motions(run)
-    );
-    let _ = write!(
-        body,
-        "<article><h3>Scene</h3>{}</article><article><h3>Stable steps</h3><p>At the start and at all postures of the scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
-        scene_table(scene),
-        steps_table(report.stable_steps),
-        crate::report::chart::stage_times(report.seconds)
-    );
-    body.push_str(
-        "<footer><p>SI units; angles counter-clockwise but for joint 2, so that a positive angle closes either finger. \
-         d_n and d_t are the displacements of a tip along the face's normal and tangent. The object's pose is never fed \
-         back to the joints.</p></footer>",
-    );
-    document(&format!("{} grasp", escape(report.name)), &body)
+    }
 }
 
 /// One case of an ensemble with its result.
@@ -471,7 +476,7 @@ pub fn counts(sweep: &[Case]) -> Vec<(String, usize)> {
 }
 
 /// A histogram of `value`, of the cases that held and of those that did not.
-fn histogram(title: &str, across: &str, sweep: &[Case], value: impl Fn(&GraspRun) -> Option<f64>) -> String {
+fn histogram(title: &str, across: &str, sweep: &[Case], value: impl Fn(&GraspRun) -> Option<f64>) -> Markup {
     let all: Vec<(f64, bool)> = sweep
         .iter()
         .filter_map(|(_, r)| r.as_ref().ok())
@@ -479,7 +484,7 @@ fn histogram(title: &str, across: &str, sweep: &[Case], value: impl Fn(&GraspRun
         .collect();
     let [low, high] = all.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |r, v| [r[0].min(v.0), r[1].max(v.0)]);
     if all.is_empty() {
-        return String::new();
+        return Markup::default();
     }
     let room = if high > low { 0.0 } else { 0.5 * high.abs().max(1e-9) };
     let (low, high) = (low - room, high + room);
@@ -497,61 +502,60 @@ fn histogram(title: &str, across: &str, sweep: &[Case], value: impl Fn(&GraspRun
             bars.iter().enumerate().flat_map(|(i, n)| [i, i + 1].map(|k| [low + k as f64 * wide, 0.0, *n as f64]));
         lines.push(Line::band(name, colour, &steps.collect::<Vec<_>>()));
     }
-    Plot { title, across, marks: &[] }.draw(&lines)
+    Plot { title, across, marks: &[] }.shown(&lines)
 }
 
 /// The ensemble: what share holds, how the results lie, and the worst case.
-fn ensemble(sweep: &[Case]) -> String {
+fn ensemble(sweep: &[Case]) -> Markup {
     let all = sweep.len();
     let held = sweep.iter().filter(|(_, r)| r.as_ref().is_ok_and(|r| r.flaw().is_none())).count();
     let most = |run: &GraspRun| run.samples.last().map(|s| 0.5 * (s.normal_force[0] + s.normal_force[1]));
+    let turn = |run: &GraspRun| run.samples.last().map(|s| s.pose[2].to_degrees());
     let mut order: Vec<&Case> = sweep.iter().collect();
     order.sort_by(|a, b| badness(a).partial_cmp(&badness(b)).unwrap_or(std::cmp::Ordering::Equal));
     let worst = order.first().map_or(String::new(), |(case, result)| {
-        format!("The worst: {}: {}.", escape(&values_words(case)), escape(&outcome_words(result)))
+        format!("The worst: {}: {}.", values_words(case), outcome_words(result))
     });
-    let tiles: String = counts(sweep)
-        .iter()
-        .take(5)
-        .map(|(name, n)| tile(&format!("{:.1}", 100.0 * *n as f64 / all as f64), "%", name))
-        .collect();
-    let mut head: Vec<String> =
-        sweep.first().map_or(Vec::new(), |(c, _)| c.values.iter().map(|v| escape(&v.0)).collect());
-    head.extend(["Outcome", "Motions", "theta, deg", "f_n, N", "f_t, N", "Friction needed"].map(String::from));
-    let rows: Vec<Vec<String>> = order
-        .iter()
-        .take(SHOWN)
-        .map(|(case, result)| {
-            let mut row: Vec<String> = case.values.iter().map(|v| escape(&v.1)).collect();
-            row.push(escape(&outcome_words(result)));
-            let run = result.as_ref().ok();
-            let last = run.and_then(|r| r.samples.last());
-            let cell = |v: Option<f64>| v.map_or("-".into(), fixed2);
-            row.push(run.map_or("0".into(), |r| r.motions.iter().filter(|m| m.step > 0).count().to_string()));
-            row.push(cell(last.map(|s| s.pose[2].to_degrees())));
-            row.push(cell(last.map(|s| s.normal_force[0].max(s.normal_force[1]))));
-            row.push(cell(last.map(|s| s.tangential_force[0].abs().max(s.tangential_force[1].abs()))));
-            row.push(cell(run.map(|r| r.required_friction)));
-            row
-        })
-        .collect();
-    let head: Vec<&str> = head.iter().map(String::as_str).collect();
-    format!(
-        "<section><h2>Ensemble</h2><p class=\"lead\">{held} of {all} runs held throughout. {worst}</p><div class=\"tiles\">{tiles}</div>\
-         <div class=\"plots\">{}{}{}</div><details><summary>The worst {} of {all} runs (all are in sweep.csv)</summary>{}</details></section>",
-        histogram("Object's angle at the end, runs", "degrees", sweep, |r| r
-            .samples
-            .last()
-            .map(|s| s.pose[2].to_degrees())),
-        histogram("Grip at the end, runs", "N", sweep, most),
-        histogram("Friction needed, runs", "coefficient", sweep, |r| Some(r.required_friction)),
-        rows.len(),
-        table(&head, &rows)
-    )
+    let counts = counts(sweep);
+    let shares =
+        counts.iter().take(5).map(|(name, n)| (format!("{:.1}", 100.0 * *n as f64 / all as f64), "%", &**name));
+    let varied = sweep.first().map_or(&[][..], |(case, _)| &case.values);
+    let mut head: Vec<&str> = varied.iter().map(|v| v.0.as_str()).collect();
+    head.extend(["Outcome", "Motions", "theta, deg", "f_n, N", "f_t, N", "Friction needed"]);
+    order.truncate(SHOWN);
+    let rows = order.iter().map(|(case, result)| {
+        let mut row: Vec<String> = case.values.iter().map(|v| v.1.to_string()).collect();
+        row.push(outcome_words(result));
+        let run = result.as_ref().ok();
+        let last = run.and_then(|r| r.samples.last());
+        let cell = |v: Option<f64>| v.map_or("-".into(), fixed2);
+        row.push(run.map_or("0".into(), |r| r.motions.iter().filter(|m| m.step > 0).count().to_string()));
+        row.push(cell(last.map(|s| s.pose[2].to_degrees())));
+        row.push(cell(last.map(|s| s.normal_force[0].max(s.normal_force[1]))));
+        row.push(cell(last.map(|s| s.tangential_force[0].abs().max(s.tangential_force[1].abs()))));
+        row.push(cell(run.map(|r| r.required_friction)));
+        row
+    });
+    html! {
+        section {
+            h2 { "Ensemble" }
+            p.lead { (held) " of " (all) " runs held throughout. " (worst) }
+            (tiles(shares))
+            div.plots {
+                (histogram("Object's angle at the end, runs", "degrees", sweep, turn))
+                (histogram("Grip at the end, runs", "N", sweep, most))
+                (histogram("Friction needed, runs", "coefficient", sweep, |r| Some(r.required_friction)))
+            }
+            details {
+                summary { "The worst " (order.len()) " of " (all) " runs (all are in sweep.csv)" }
+                (table(&head, rows))
+            }
+        }
+    }
 }
 
 /// What the scene says.
-pub(super) fn scene_table(scene: &Scene) -> String {
+pub(super) fn scene_table(scene: &Scene) -> Markup {
     let (tip, gains, object, i) = (&scene.fingertip, &scene.finger.gains, &scene.object, &scene.integrator);
     let mm = |v: f64| format!("{} mm", short(1e3 * v));
     // One value for fingers that are alike, both for others.
@@ -561,7 +565,7 @@ pub(super) fn scene_table(scene: &Scene) -> String {
     let links = scene.fingers().map(|f| mm(f.upper.unwrap_or(0.0) + f.link));
     let times: Vec<String> = tip.branches().iter().map(|b| format!("{} in {} s", short(b[0]), short(b[1]))).collect();
     let relaxation = if times.is_empty() { "none".into() } else { format!("parts of E: {}", times.join(", ")) };
-    let rows = [
+    facts([
         ("Fingertip", format!("{}, radius {}, E {}", tip.model.name(), each(&radii), each(&moduli))),
         ("Damping", format!("{} and {} N s/m", short(tip.damping[0]), short(tip.damping[1]))),
         ("Relaxation", relaxation),
@@ -571,6 +575,5 @@ pub(super) fn scene_table(scene: &Scene) -> String {
         ("First displacement", mm(scene.initial.normal_displacement)),
         ("Gains", format!("{}, {}, {}", short(gains.kp), short(gains.kd), short(gains.ki))),
         ("Integrator", format!("{}, {} form, step {} ms", i.method.name(), i.formulation.name(), short(1e3 * i.step))),
-    ];
-    table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+    ])
 }

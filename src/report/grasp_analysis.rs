@@ -1,17 +1,21 @@
 //! The report of `palpate grasp-analysis`: page, summary.json and the short summary.
 
 use crate::error::ReportError;
-use crate::report::grasp::{GraspReport, event_line, fixed2, scene_table, steps_table, tile, time_plots};
+use crate::report::chart::stage_times;
+use crate::report::grasp::{GraspReport, degrees, event_line, fixed2, scene_table, steps_table, time_plots};
 use crate::report::grasp_measured::{fitted_words, measured};
 use crate::report::grasp_scene::animation;
 use crate::report::grasp_surface::{pinch_map, state_colour, state_words, surface};
-use crate::report::html::{document, escape};
+use crate::report::html::{document, header, listed, tiles, titled};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
-use crate::types::grasp::{Freedom, GraspAnalysis, Hold, PinchState, PostureForce, Stability, StabilityRow};
+use crate::types::grasp::{
+    EnergySurface, Freedom, GraspAnalysis, Hold, PinchState, PostureForce, Stability, StabilityRow,
+};
 use crate::types::measured::{MeasuredFit, Measurements};
 use crate::types::{FingertipModel, Scene};
+use maud::{Markup, PreEscaped, html};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 
@@ -166,7 +170,7 @@ pub fn summary(report: &AnalysisReport<'_>) -> Value {
 }
 
 /// Force against displacement, and against tilt.
-fn force_plots(f: &PostureForce) -> String {
+fn force_plots(f: &PostureForce) -> Markup {
     let across = f.tilts.len();
     let tilt_at = |degrees: f64| (0..across).min_by_key(|&i| ((f.tilts[i].to_degrees() - degrees).abs() * 1e6) as u64);
     let mut against_d = Vec::new();
@@ -190,13 +194,14 @@ fn force_plots(f: &PostureForce) -> String {
         against_tilt.push(Line::new(&name, colour, false, points(&f.parallel)));
         against_tilt.push(Line::new("", colour, true, points(&f.radial)));
     }
-    let plot = |title, across, lines: &[Line]| Plot { title, across, marks: &[] }.draw(lines);
-    plot("Force against displacement, N", "d, mm", &against_d)
-        + &plot("Force against tilt, N", "tilt, degrees", &against_tilt)
+    html! {
+        (Plot { title: "Force against displacement, N", across: "d, mm", marks: &[] }.shown(&against_d))
+        (Plot { title: "Force against tilt, N", across: "tilt, degrees", marks: &[] }.shown(&against_tilt))
+    }
 }
 
 /// Stationary poses and Hessians as a table.
-fn stability_table(rows: &[StabilityRow]) -> String {
+fn stability_table(rows: &[StabilityRow]) -> Markup {
     let head = [
         "Posture",
         "theta 1, 2, deg",
@@ -208,9 +213,9 @@ fn stability_table(rows: &[StabilityRow]) -> String {
         "It is",
     ];
     let cells = |r: &StabilityRow| {
-        let [a, b] = r.joints.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
+        let [a, b] = r.joints.map(degrees);
         let eigenvalues: Vec<String> = r.eigenvalues.iter().map(|v| short((v * 10.0).round() / 10.0)).collect();
-        vec![
+        [
             if r.step == 0 { "pinch".into() } else { r.step.to_string() },
             format!("{a}, {b}"),
             r.hold.name().replace("-weightless", ", weightless"),
@@ -221,10 +226,10 @@ fn stability_table(rows: &[StabilityRow]) -> String {
             if r.class == Stability::None { "-".into() } else { r.class.name().into() },
         ]
     };
-    table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+    table(&head, rows.iter().map(cells))
 }
 
-fn freedom_table(rows: &[Freedom]) -> String {
+fn freedom_table(rows: &[Freedom]) -> Markup {
     let head = [
         "Tips",
         "Joints that move",
@@ -244,11 +249,11 @@ fn freedom_table(rows: &[Freedom]) -> String {
         row.extend([if f.stable { "yes" } else { "no" }, f.controls(), f.torque_controls()].map(String::from));
         row
     };
-    table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+    table(&head, rows.iter().map(cells))
 }
 
 /// The table of the source: rigid against soft tips on fingers of 1+1 and 1+2 joints.
-fn short_freedom_table(rows: &[Freedom]) -> String {
+fn short_freedom_table(rows: &[Freedom]) -> Markup {
     let head = ["Tips, joints", "Grasp stable", "Posture and grasp by angles", "by torques"];
     let yes = |v: bool| if v { "yes" } else { "no" }.to_string();
     let shown = [FingertipModel::Rigid, FingertipModel::Parallel]
@@ -256,31 +261,24 @@ fn short_freedom_table(rows: &[Freedom]) -> String {
         .flat_map(|m| rows.iter().filter(move |f| f.model == m && f.fingers == 2));
     let cells = |f: &Freedom| {
         let name = if f.model == FingertipModel::Rigid { "rigid" } else { "soft" };
-        vec![format!("{name}, {}", f.hand()), yes(f.stable), yes(f.both_rank == 2), yes(f.torque_rank == 2)]
+        [format!("{name}, {}", f.hand()), yes(f.stable), yes(f.both_rank == 2), yes(f.torque_rank == 2)]
     };
-    table(&head, &shown.map(cells).collect::<Vec<_>>())
+    table(&head, shown.map(cells))
+}
+
+/// The energy of both models at a posture along an axis, and the largest there is (J).
+fn energies<'a>(a: &'a GraspAnalysis, step: usize, axis: &str) -> (Vec<&'a EnergySurface>, f64) {
+    let both: Vec<_> = a.surfaces.iter().filter(|s| s.step == step && s.axis == axis).collect();
+    let finite = both.iter().flat_map(|s| &s.energy).filter(|e| e.is_finite());
+    let largest = finite.fold(1e-12, |l: f64, e| l.max(e.abs()));
+    (both, largest)
 }
 
 /// The surfaces of one posture: parallel and radial side by side.
-fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
-    let mut pictures = String::new();
-    for axis in ["y", "x"] {
-        let both: Vec<_> = a.surfaces.iter().filter(|s| s.step == step && s.axis == axis).collect();
-        let finite = both.iter().flat_map(|s| &s.energy).filter(|e| e.is_finite());
-        let largest = finite.fold(1e-12, |l: f64, e| l.max(e.abs()));
-        for s in both {
-            let _ = write!(
-                pictures,
-                "<div>{}<span>{}, to {} mJ</span></div>",
-                surface(s, largest)?,
-                s.model.name(),
-                short(1e3 * largest)
-            );
-        }
-    }
+fn surface_card(a: &GraspAnalysis, step: usize) -> Result<Markup, ReportError> {
     let title = match a.stability.iter().find(|r| r.step == step) {
         Some(r) if step > 0 => {
-            let [p, q] = r.joints.map(|v| short((v.to_degrees() * 1e6).round() / 1e6));
+            let [p, q] = r.joints.map(degrees);
             format!("Motion {step}: {p} and {q} degrees")
         }
         _ => "Pinch".into(),
@@ -294,10 +292,22 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<String, ReportError> {
             format!("{}: {} ({lowest})", r.model.name(), r.class.name())
         })
         .collect();
-    Ok(format!(
-        "<article><h3>{title}</h3><p>With friction, smallest eigenvalue at the own equilibrium: {}.</p><div class=\"surfaces\">{pictures}</div></article>",
-        classes.join("; ")
-    ))
+    Ok(html! {
+        article {
+            h3 { (title) }
+            p { "With friction, smallest eigenvalue at the own equilibrium: " (classes.join("; ")) "." }
+            div.surfaces {
+                @for (both, largest) in ["y", "x"].map(|axis| energies(a, step, axis)) {
+                    @for s in both {
+                        div {
+                            (PreEscaped(surface(s, largest)?))
+                            span { (s.model.name()) ", to " (short(1e3 * largest)) " mJ" }
+                        }
+                    }
+                }
+            }
+        }
+    })
 }
 
 /// The pinch and the scene's motions, with their joint angles (rad).
@@ -308,7 +318,7 @@ fn postures(scene: &Scene) -> Vec<(usize, [f64; 2])> {
 
 /// The first screen: the push with joints fixed, the energy of both models at one posture, rigid
 /// against soft tips, and the pinch map.
-fn at_a_glance(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
+fn at_a_glance(report: &AnalysisReport<'_>) -> Result<Markup, ReportError> {
     let a = report.analysis;
     let samples = &a.push.samples;
     let first = samples.first().map_or(0.0, |s| s.pose[2]);
@@ -316,28 +326,36 @@ fn at_a_glance(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     let marks: Vec<(f64, bool)> =
         report.pushed.pushes.iter().flat_map(|p| [(p.start, false), (p.start + p.duration, false)]).collect();
     let push = Plot { title: "Turn under the push, degrees", across: "s", marks: &marks }
-        .draw(&[Line::new("theta", 0, false, turn)]);
+        .shown(&[Line::new("theta", 0, false, turn)]);
     // Where both models have the most of their range in view, of two that have the same the later.
     let seen = |step: usize| {
         let of = a.surfaces.iter().filter(|s| s.step == step && s.axis == "y");
         of.flat_map(|s| &s.energy).filter(|e| e.is_finite()).count()
     };
     let step = a.surfaces.iter().map(|s| s.step).max_by_key(|step| seen(*step)).unwrap_or(0);
-    let both: Vec<_> = a.surfaces.iter().filter(|s| s.step == step && s.axis == "y").collect();
-    let largest = both.iter().flat_map(|s| &s.energy).filter(|e| e.is_finite()).fold(1e-12, |l: f64, e| l.max(e.abs()));
-    let mut surfaces = String::new();
-    for s in both {
-        let _ = write!(surfaces, "<div>{}<span>{}</span></div>", surface(s, largest)?, s.model.name());
-    }
-    let name = if step == 0 { "the pinch".into() } else { format!("motion {step}") };
-    Ok(format!(
-        "<section><div class=\"glance\"><article><h3>A push with both joints fixed</h3>{push}<p>The object {}.</p></article>\
-         <article><h3>Energy about {name}</h3><div class=\"surfaces\">{surfaces}</div></article>\
-         <article><h3>Rigid and soft tips</h3>{}</article><article><h3>Which joint angles hold</h3>{}</article></div></section>",
-        escape(&push_words(a, report.scene.object.friction.is_some())),
-        short_freedom_table(&a.freedom),
-        pinch_map(&a.pinch, &postures(report.scene))
-    ))
+    let (both, largest) = energies(a, step, "y");
+    Ok(html! {
+        section {
+            div.glance {
+                article {
+                    h3 { "A push with both joints fixed" }
+                    (push)
+                    p { "The object " (push_words(a, report.scene.object.friction.is_some())) "." }
+                }
+                article {
+                    h3 { "Energy about " @if step == 0 { "the pinch" } @else { "motion " (step) } }
+                    div.surfaces {
+                        @for s in both { div { (PreEscaped(surface(s, largest)?)) span { (s.model.name()) } } }
+                    }
+                }
+                article { h3 { "Rigid and soft tips" } (short_freedom_table(&a.freedom)) }
+                article {
+                    h3 { "Which joint angles hold" }
+                    (PreEscaped(pinch_map(&a.pinch, &postures(report.scene))))
+                }
+            }
+        }
+    })
 }
 
 /// The page.
@@ -348,61 +366,101 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
     let a = report.analysis;
     let (most, left) = push_turn(a);
     let minima = count(a, FingertipModel::Parallel, Hold::Friction, Stability::Minimum);
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>grasp analysis</span></h1><p class=\"verdict\">{}</p></header>\
-         <div class=\"tiles\">{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(report.name),
-        escape(&headline(report)),
-        tile(&minima.to_string(), "", "stable postures, parallel tips"),
-        tile(&format!("{:.0}", 100.0 * share(a, PinchState::Good)), "%", "of the pinch map holds"),
-        tile(&format!("{most:.2}"), "°", "turn under the push"),
-        tile(&format!("{left:.0e}"), "°", "left after it"),
-    );
-    if !a.lost.is_empty() {
-        let items: String = a.lost.iter().map(|(n, why)| format!("<li>Motion {n}: {}</li>", escape(why))).collect();
-        let _ =
-            write!(body, "<article class=\"warnings\"><h3>Not reached from the pinch</h3><ul>{items}</ul></article>");
+    let lost: Vec<String> = a.lost.iter().map(|(n, why)| format!("Motion {n}: {why}")).collect();
+    let body = html! {
+        (header(titled(report.name, "grasp analysis"), &headline(report), ""))
+        (tiles([
+            (minima.to_string(), "", "stable postures, parallel tips"),
+            (format!("{:.0}", 100.0 * share(a, PinchState::Good)), "%", "of the pinch map holds"),
+            (format!("{most:.2}"), "°", "turn under the push"),
+            (format!("{left:.0e}"), "°", "left after it"),
+        ]))
+        (listed("Not reached from the pinch", &lost))
+        (at_a_glance(report)?)
+        @if let Some((measurements, fit)) = report.measured { (measured(measurements, fit)) }
+        section {
+            h2 { "Force depends on posture" }
+            p.lead {
+                "Along the back plate's normal. Lines: springs in parallel; dashed: springs along radii, which know no posture."
+            }
+            div.plots { (force_plots(&a.force)) }
+        }
+        section {
+            h2 { "Energy about the postures" }
+            p.lead {
+                "Joints fixed, tips and gravity, less the energy at the posture (the cross). Red is more, blue is less, bands \
+                 are even in the root; gray is out of the model's range. Eigenvalues belong to (x, y, radius times theta)."
+            }
+            div.grid {
+                article.wide {
+                    details {
+                        summary { "Stationary poses and Hessians of both models, with friction and without" }
+                        (stability_table(&a.stability))
+                    }
+                }
+                @for row in of(a, FingertipModel::Parallel, Hold::Friction) { (surface_card(a, row.step)?) }
+            }
+        }
+        (holding(report))
+        (push(report))
+        section {
+            h2 { "Numbers" }
+            div.grid {
+                article {
+                    h3 { "Stable steps" }
+                    p { "At the pinch and at all postures of the scene." }
+                    (steps_table(&a.stable_steps))
+                }
+                article { h3 { "Time" } (stage_times(report.seconds)) }
+            }
+        }
+        footer {
+            p {
+                "Each model is judged at its own stationary pose next to the parallel model's equilibrium. Without friction \
+                 nothing carries the weight: both faces push along one line, so there is no such pose unless the weight is left \
+                 out too."
+            }
+        }
+    };
+    Ok(document(&format!("{} grasp analysis", report.name), &body))
+}
+
+/// Which postures hold, and what the joints can set.
+fn holding(report: &AnalysisReport<'_>) -> Markup {
+    let a = report.analysis;
+    html! {
+        section {
+            h2 { "Which postures hold" }
+            div.grid {
+                article {
+                    h3 { "Pinch map" }
+                    p { "Reached from the pinch step by step; numbers are the scene's motions." }
+                    (PreEscaped(pinch_map(&a.pinch, &postures(report.scene))))
+                    ul.legend {
+                        @for s in PinchState::ALL {
+                            li {
+                                i style={ "background:" (state_colour(s)) } {}
+                                (state_words(s)) " " b { (format_args!("{:.0} %", 100.0 * share(a, s))) }
+                            }
+                        }
+                    }
+                }
+                article {
+                    h3 { "Rigid and soft tips" }
+                    p {
+                        "Degrees of freedom by the rank of the constraints at the pinch; what joint angles can set by the rank \
+                         of d(theta, grip force)/d(joint angles)."
+                    }
+                    (freedom_table(&a.freedom))
+                }
+            }
+        }
     }
-    body.push_str(&at_a_glance(report)?);
-    if let Some((measurements, fit)) = report.measured {
-        body.push_str(&measured(measurements, fit));
-    }
-    let _ = write!(
-        body,
-        "<section><h2>Force depends on posture</h2><p class=\"lead\">Along the back plate's normal. Lines: springs in \
-         parallel; dashed: springs along radii, which know no posture.</p><div class=\"plots\">{}</div></section>",
-        force_plots(&a.force)
-    );
-    let _ = write!(
-        body,
-        "<section><h2>Energy about the postures</h2><p class=\"lead\">Joints fixed, tips and gravity, less the energy at the \
-         posture (the cross). Red is more, blue is less, bands are even in the root; gray is out of the model's range. \
-         Eigenvalues belong to (x, y, radius times theta).</p><div class=\"grid\"><article class=\"wide\"><details><summary>Stationary poses and Hessians of both models, with \
-         friction and without</summary>{}</details></article>",
-        stability_table(&a.stability)
-    );
-    let steps: Vec<usize> = of(a, FingertipModel::Parallel, Hold::Friction).map(|r| r.step).collect();
-    for &step in &steps {
-        body.push_str(&surface_card(a, step)?);
-    }
-    let postures = postures(report.scene);
-    let legend: String = PinchState::ALL
-        .iter()
-        .map(|s| {
-            let part = 100.0 * share(a, *s);
-            format!("<li><i style=\"background:{}\"></i>{} <b>{part:.0} %</b></li>", state_colour(*s), state_words(*s))
-        })
-        .collect();
-    let _ = write!(
-        body,
-        "</div></section><section><h2>Which postures hold</h2><div class=\"grid\"><article><h3>Pinch map</h3><p>Reached from \
-         the pinch step by step; numbers are the scene's motions.</p>{}<ul class=\"legend\">{legend}</ul></article>\
-         <article><h3>Rigid and soft tips</h3><p>Degrees of freedom by the rank of the constraints at the pinch; what joint \
-         angles can set by the rank of d(theta, grip force)/d(joint angles).</p>{}</article></div></section>",
-        pinch_map(&a.pinch, &postures),
-        freedom_table(&a.freedom)
-    );
+}
+
+/// The push with both joints fixed.
+fn push(report: &AnalysisReport<'_>) -> Markup {
+    let a = report.analysis;
     let pushed = GraspReport {
         name: report.name,
         scene: report.pushed,
@@ -414,22 +472,15 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         seconds: report.seconds,
         warnings: &[],
     };
-    let _ = write!(
-        body,
-        "<section><h2>A push with both joints fixed</h2><p class=\"lead\">The object {}.</p><div class=\"grid\"><article>{}</article>\
-         <article><h3>Scene</h3>{}</article></div><div class=\"plots\">{}</div></section>\
-         <section><h2>Numbers</h2><div class=\"grid\"><article><h3>Stable steps</h3><p>At the pinch and at all postures of the \
-         scene.</p>{}</article><article><h3>Time</h3>{}</article></div></section>",
-        escape(&push_words(a, report.scene.object.friction.is_some())),
-        animation(report.pushed, &a.push.samples),
-        scene_table(report.scene),
-        time_plots(&pushed),
-        steps_table(&a.stable_steps),
-        crate::report::chart::stage_times(report.seconds)
-    );
-    body.push_str(
-        "<footer><p>Each model is judged at its own stationary pose next to the parallel model's equilibrium. Without friction \
-         nothing carries the weight: both faces push along one line, so there is no such pose unless the weight is left out too.</p></footer>",
-    );
-    Ok(document(&format!("{} grasp analysis", escape(report.name)), &body))
+    html! {
+        section {
+            h2 { "A push with both joints fixed" }
+            p.lead { "The object " (push_words(a, report.scene.object.friction.is_some())) "." }
+            div.grid {
+                article { (animation(report.pushed, &a.push.samples)) }
+                article { h3 { "Scene" } (scene_table(report.scene)) }
+            }
+            div.plots { (time_plots(&pushed)) }
+        }
+    }
 }

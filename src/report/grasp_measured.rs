@@ -1,10 +1,10 @@
 //! Measurements beside the tip models: what was fitted, and how far each is off.
 
-use crate::report::html::escape;
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::short;
 use crate::report::tables::table;
-use crate::types::measured::{Estimate, ForcePoint, MeasuredFit, Measurements, ModelFit};
+use crate::types::measured::{CoursePoint, Estimate, ForcePoint, MeasuredFit, Measurements, ModelFit};
+use maud::{Markup, html};
 
 /// Tilts that the plot of forces shows at most.
 const TILTS: usize = 3;
@@ -35,51 +35,52 @@ pub fn fitted_words(model: &ModelFit) -> String {
 }
 
 /// The section of a page.
-pub fn measured(measurements: &Measurements, fit: &MeasuredFit) -> String {
+pub(super) fn measured(measurements: &Measurements, fit: &MeasuredFit) -> Markup {
     let head = ["Model", "E, kPa", "c_n, N s/m", "Misfit (rms)", "Log odds against the best"];
-    let unit = if fit.kind == "force" { (1.0, "N") } else { (1e3, "mm") };
-    let rows: Vec<Vec<String>> = fit
-        .models
-        .iter()
-        .map(|m| {
-            vec![
-                m.model.into(),
-                estimate(&m.youngs_modulus, 1e-3),
-                m.damping.map_or("not in the table".into(), |c| estimate(&c, 1.0)),
-                format!("{} {}", digits(unit.0 * m.rms), unit.1),
-                format!("{:.1}", m.log_evidence),
-            ]
-        })
-        .collect();
-    let plots = match measurements {
-        Measurements::Force(points) => presses(points, fit),
-        Measurements::Course(points) => {
-            let channel = |title: &str, k: usize, scale: f64| {
-                let own = Line::dots("measured", 3, points.iter().map(|p| [p.time, scale * p.pose[k]]).collect());
-                let models = fit.models.iter().enumerate().map(|(i, m)| {
-                    let line = points.iter().zip(&m.predicted).map(|(p, v)| [p.time, scale * v[k]]).collect();
-                    Line::new(m.model, i, i > 0, line)
-                });
-                let lines: Vec<Line> = models.chain([own]).collect();
-                Plot { title, across: "s", marks: &[] }.draw(&lines)
-            };
-            channel("Object's angle, degrees", 2, 1f64.to_degrees())
-                + &channel("x, mm", 0, 1e3)
-                + &channel("y, mm", 1, 1e3)
+    let (scale, unit) = if fit.kind == "force" { (1.0, "N") } else { (1e3, "mm") };
+    let rows = fit.models.iter().map(|m| {
+        [
+            m.model.into(),
+            estimate(&m.youngs_modulus, 1e-3),
+            m.damping.map_or("not in the table".into(), |c| estimate(&c, 1.0)),
+            format!("{} {unit}", digits(scale * m.rms)),
+            format!("{:.1}", m.log_evidence),
+        ]
+    });
+    html! {
+        section {
+            h2 { "Measured" }
+            p.lead {
+                (fit.rows) " rows, of which " (format_args!("{:.0}", fit.independent)) " numbers count as independent: "
+                (fit.verdict()) ". Deviations are one standard deviation, from the misfit itself."
+            }
+            div.plots {
+                @match measurements {
+                    Measurements::Force(points) => (presses(points, fit)),
+                    Measurements::Course(points) => {
+                        (channel("Object's angle, degrees", 2, 1f64.to_degrees(), points, fit))
+                        (channel("x, mm", 0, 1e3, points, fit))
+                        (channel("y, mm", 1, 1e3, points, fit))
+                    }
+                }
+            }
+            article.wide { (table(&head, rows)) }
         }
-    };
-    format!(
-        "<section><h2>Measured</h2><p class=\"lead\">{} rows, of which {:.0} numbers count as independent: {}. Deviations are one \
-         standard deviation, from the misfit itself.</p><div class=\"plots\">{plots}</div><article class=\"wide\">{}</article></section>",
-        fit.rows,
-        fit.independent,
-        escape(&fit.verdict()),
-        table(&head, &rows)
-    )
+    }
+}
+
+/// One coordinate of the pose over time, measured and fitted.
+fn channel(title: &str, k: usize, scale: f64, points: &[CoursePoint], fit: &MeasuredFit) -> Markup {
+    let own = Line::dots("measured", 3, points.iter().map(|p| [p.time, scale * p.pose[k]]).collect());
+    let models = fit.models.iter().enumerate().map(|(i, m)| {
+        let line = points.iter().zip(&m.predicted).map(|(p, v)| [p.time, scale * v[k]]).collect();
+        Line::new(m.model, i, i > 0, line)
+    });
+    Plot { title, across: "s", marks: &[] }.shown(&models.chain([own]).collect::<Vec<_>>())
 }
 
 /// Forces over displacement at some tilts, and misfits over tilt.
-fn presses(points: &[ForcePoint], fit: &MeasuredFit) -> String {
+fn presses(points: &[ForcePoint], fit: &MeasuredFit) -> Markup {
     let degrees = |p: &ForcePoint| p.tilt.to_degrees().abs().round();
     let mut tilts: Vec<f64> = points.iter().map(degrees).collect();
     tilts.sort_by(f64::total_cmp);
@@ -111,6 +112,8 @@ fn presses(points: &[ForcePoint], fit: &MeasuredFit) -> String {
             Line::dots(m.model, k, off.collect())
         })
         .collect();
-    Plot { title: &title, across: "d, mm", marks: &[] }.draw(&lines)
-        + &Plot { title: "Misfit, N", across: "tilt, degrees", marks: &[] }.draw(&off)
+    html! {
+        (Plot { title: &title, across: "d, mm", marks: &[] }.shown(&lines))
+        (Plot { title: "Misfit, N", across: "tilt, degrees", marks: &[] }.shown(&off))
+    }
 }

@@ -6,13 +6,13 @@
 
 use crate::types::Scene;
 use crate::types::grasp::Sample;
+use maud::{Markup, PreEscaped, html};
 use std::fmt::Write;
 
 /// Frames of an animation at most.
 const FRAMES: usize = 500;
 /// Length of the arrow for the largest force (mm).
 const ARROW: f64 = 26.0;
-const SCRIPT: &str = include_str!("grasp.js");
 
 /// Lengths of a scene in mm; index 0 is the left finger.
 struct Lengths {
@@ -129,8 +129,8 @@ pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> Stri
 
 /// An animation of samples at even times, with play, pause and a slider; without scripts it shows
 /// the first moment.
-pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
-    let Some(first) = samples.first() else { return String::new() };
+pub(super) fn animation(scene: &Scene, samples: &[Sample]) -> Markup {
+    let Some(first) = samples.first() else { return Markup::default() };
     let largest = largest_force(samples);
     let step = samples.len().div_ceil(FRAMES).max(1);
     let mut frames = String::new();
@@ -152,11 +152,17 @@ pub fn animation(scene: &Scene, samples: &[Sample]) -> String {
         let _ = write!(frames, "{}],", forces.join(","));
     }
     let [[ax, ay], [bx, by]] = lengths(scene).base;
-    format!(
-        r#"<div class="animation" data-bases="[[{ax:.3},{ay:.3}],[{bx:.3},{by:.3}]]" data-frames="[{}]">{}<div class="controls"><button type="button" aria-label="play or pause">Play</button><input type="range" min="0" max="{}" value="0" aria-label="time"><output>{:.2} s</output></div></div><script>{SCRIPT}</script>"#,
-        frames.trim_end_matches(','),
-        moment(scene, first, largest, samples),
-        samples.iter().step_by(step).count() - 1,
-        first.time
-    )
+    let last = samples.iter().step_by(step).count() - 1;
+    html! {
+        div.animation data-bases=(format_args!("[[{ax:.3},{ay:.3}],[{bx:.3},{by:.3}]]"))
+            data-frames={ "[" (frames.trim_end_matches(',')) "]" } {
+            (PreEscaped(moment(scene, first, largest, samples)))
+            div.controls {
+                button type="button" aria-label="play or pause" { "Play" }
+                input type="range" min="0" max=(last) value="0" aria-label="time";
+                output { (format_args!("{:.2} s", first.time)) }
+            }
+        }
+        script { (PreEscaped(include_str!("grasp.js"))) }
+    }
 }

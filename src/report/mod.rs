@@ -23,7 +23,7 @@ pub mod batch;
 
 pub mod chain;
 
-pub mod chart;
+mod chart;
 
 pub mod figure;
 
@@ -37,7 +37,7 @@ pub mod viewer;
 
 pub mod field;
 
-pub mod tables;
+mod tables;
 
 pub mod html;
 

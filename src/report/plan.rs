@@ -1,12 +1,12 @@
 //! report.html, summary.json and the sentences of `palpate plan`.
 
-use crate::report::grasp::tile;
-use crate::report::html::{document, escape, warned};
+use crate::report::html::{document, header, tiles, titled, warned};
 use crate::report::json::seconds;
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{percent, short, significant};
-use crate::report::tables::table;
+use crate::report::tables::{facts, table};
 use crate::types::plan::{Expected, LARGE_STRAIN, Plan, PlanParams, PlannedRegion};
+use maud::{Markup, html};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -197,7 +197,7 @@ pub fn text(report: &PlanReport<'_>) -> String {
 }
 
 /// The expected deviation of a region against press, a line a noise, at one voxel size.
-fn plot(plan: &Plan, region: &PlannedRegion, voxel: f64) -> String {
+fn plot(plan: &Plan, region: &PlannedRegion, voxel: f64) -> Markup {
     let title = format!("{}: expected deviation, %", region.name);
     let mut lines: Vec<Line> = noises(plan, Some(voxel))
         .into_iter()
@@ -215,7 +215,7 @@ fn plot(plan: &Plan, region: &PlannedRegion, voxel: f64) -> String {
     lines.push(Line::new("wanted", 3, true, wanted));
     let large = plan.presses.iter().find(|p| p.strain > LARGE_STRAIN).map(|p| (p.press_mm, true));
     let marks: Vec<(f64, bool)> = large.into_iter().collect();
-    Plot { title: &title, across: "press, mm", marks: &marks }.draw(&lines)
+    Plot { title: &title, across: "press, mm", marks: &marks }.shown(&lines)
 }
 
 /// The page.
@@ -224,76 +224,74 @@ pub fn page(report: &PlanReport<'_>) -> String {
     let labels: Vec<u8> = plan.determined().map(|r| r.label).collect();
     let all = plan.choice(&labels);
     let figure = |k: usize| all.map_or_else(|| "none".into(), |c| length(c[k]));
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>plan</span></h1><p class=\"verdict\">{}</p></header>\
-         <div class=\"tiles\">{}{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(report.labels),
-        escape(&sentences(plan).join(" ")),
-        tile(&want(plan), "%", "wanted deviation of each modulus"),
-        tile(&figure(0), "mm", "press"),
-        tile(&figure(1), "mm", "voxel"),
-        tile(&figure(2), "mm", "noise of a displacement"),
-        tile(&plan.undetermined().count().to_string(), "", "regions not determined"),
-    );
-    body += &warned(&plan.warnings);
-    for &voxel in &plan.voxel_mm {
-        let wanted = plan.regions.iter().filter(|r| r.wanted);
-        let plots: String = wanted.map(|r| format!("<article>{}</article>", plot(plan, r, voxel))).collect();
-        let _ = write!(
-            body,
-            "<section><h2>Voxels of {} mm</h2><p class=\"lead\">One standard deviation of the {}. A break in a line is a press that \
-             tells nothing; the upright line is where strain passes {} %.</p><div class=\"grid\">{plots}</div></section>",
-            length(voxel),
-            quantity(plan),
-            short(100.0 * LARGE_STRAIN),
-        );
-    }
-    let presses: Vec<Vec<String>> =
-        plan.presses.iter().map(|p| vec![length(p.press_mm), percent(p.strain), significant(p.force_n)]).collect();
-    let rows: Vec<Vec<String>> = plan
-        .expected
-        .iter()
-        .filter(|e| plan.regions.iter().any(|r| r.wanted && r.label == e.label))
-        .map(|e| {
-            let said = match (e.enough, e.determined, e.felt) {
-                (true, ..) => "yes",
-                (_, true, _) => "no",
-                (.., true) => "not determined",
-                _ => "lost in noise",
-            };
-            let lengths = [e.press_mm, e.voxel_mm, e.noise_mm].map(length);
-            let sds = [e.sd, e.scatter].map(|v| if v <= DRAWN { percent(v) } else { "over 100".into() });
-            lengths.into_iter().chain([escape(&e.name)]).chain(sds).chain([said.into()]).collect()
-        })
-        .collect();
-    let _ = write!(
-        body,
-        "<section><h2>All choices</h2><div class=\"grid\"><article><h3>Presses</h3>{}</article><article><h3>Settings</h3>{}</article>\
-         <article class=\"wide\"><h3>Deviations</h3>{}</article></div></section>",
-        table(&["Press, mm", "Strain, %", "Force, N"], &presses),
-        settings(report),
-        table(&["Press, mm", "Voxel, mm", "Noise, mm", "Region", "Deviation, %", "By noise alone, %", "Enough"], &rows)
-    );
-    body += "<footer><p>The deviation is what palpate stiffness would state: noise, the borders between labels, flat faces and plates \
-             that are known to a part of a voxel, and the mesh. Not in it: a wrong Poisson's ratio, wrong labels, and moduli far from the assumed \
-             ones. Noise is white; where it hangs together over c voxels along each axis, enter c^1.5 times as much.</p></footer>";
-    document(&format!("Plan for {}", escape(report.labels)), &body)
+    let presses = plan.presses.iter().map(|p| [length(p.press_mm), percent(p.strain), significant(p.force_n)]);
+    let wanted = |label: u8| plan.regions.iter().any(|r| r.wanted && r.label == label);
+    let rows = plan.expected.iter().filter(|e| wanted(e.label)).map(|e| {
+        let said = match (e.enough, e.determined, e.felt) {
+            (true, ..) => "yes",
+            (_, true, _) => "no",
+            (.., true) => "not determined",
+            _ => "lost in noise",
+        };
+        let [press, voxel, noise] = [e.press_mm, e.voxel_mm, e.noise_mm].map(length);
+        let [sd, scatter] = [e.sd, e.scatter].map(|v| if v <= DRAWN { percent(v) } else { "over 100".into() });
+        [press, voxel, noise, e.name.clone(), sd, scatter, said.into()]
+    });
+    let head = ["Press, mm", "Voxel, mm", "Noise, mm", "Region", "Deviation, %", "By noise alone, %", "Enough"];
+    let body = html! {
+        (header(titled(report.labels, "plan"), &sentences(plan).join(" "), ""))
+        (tiles([
+            (want(plan), "%", "wanted deviation of each modulus"),
+            (figure(0), "mm", "press"),
+            (figure(1), "mm", "voxel"),
+            (figure(2), "mm", "noise of a displacement"),
+            (plan.undetermined().count().to_string(), "", "regions not determined"),
+        ]))
+        (warned(&plan.warnings))
+        @for &voxel in &plan.voxel_mm {
+            section {
+                h2 { "Voxels of " (length(voxel)) " mm" }
+                p.lead {
+                    "One standard deviation of the " (quantity(plan)) ". A break in a line is a press that tells nothing; \
+                     the upright line is where strain passes " (short(100.0 * LARGE_STRAIN)) " %."
+                }
+                div.grid {
+                    @for r in plan.regions.iter().filter(|r| r.wanted) { article { (plot(plan, r, voxel)) } }
+                }
+            }
+        }
+        section {
+            h2 { "All choices" }
+            div.grid {
+                article { h3 { "Presses" } (table(&["Press, mm", "Strain, %", "Force, N"], presses)) }
+                article { h3 { "Settings" } (settings(report)) }
+                article.wide { h3 { "Deviations" } (table(&head, rows)) }
+            }
+        }
+        footer {
+            p {
+                "The deviation is what palpate stiffness would state: noise, the borders between labels, flat faces and plates \
+                 that are known to a part of a voxel, and the mesh. Not in it: a wrong Poisson's ratio, wrong labels, and \
+                 moduli far from the assumed ones. Noise is white; where it hangs together over c voxels along each axis, \
+                 enter c^1.5 times as much."
+            }
+        }
+    };
+    document(&format!("Plan for {}", report.labels), &body)
 }
 
 /// What the plan was made of.
-fn settings(report: &PlanReport<'_>) -> String {
+fn settings(report: &PlanReport<'_>) -> Markup {
     let plan = report.plan;
     let assumed: Vec<String> =
-        plan.regions.iter().map(|r| format!("{} {} kPa", escape(&r.name), short(r.youngs_modulus))).collect();
+        plan.regions.iter().map(|r| format!("{} {} kPa", r.name, short(r.youngs_modulus))).collect();
     let stiffness = &report.params.stiffness;
-    let rows = [
-        vec!["Model".into(), escape(&plate(plan))],
-        vec!["Assumed".into(), assumed.join(", ")],
-        vec!["Poisson's ratio".into(), short(stiffness.poisson)],
-        vec!["Deviation of borders".into(), format!("{} voxel", short(stiffness.label_sd))],
-        vec!["Extent along the load".into(), format!("{} mm", length(plan.extent_mm))],
-        vec!["Wanted".into(), format!("{} % of the {}", want(plan), quantity(plan))],
-    ];
-    table(&[], &rows)
+    facts([
+        ("Model", plate(plan)),
+        ("Assumed", assumed.join(", ")),
+        ("Poisson's ratio", short(stiffness.poisson)),
+        ("Deviation of borders", format!("{} voxel", short(stiffness.label_sd))),
+        ("Extent along the load", format!("{} mm", length(plan.extent_mm))),
+        ("Wanted", format!("{} % of the {}", want(plan), quantity(plan))),
+    ])
 }

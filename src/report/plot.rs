@@ -3,6 +3,7 @@
 
 use crate::report::html::escape;
 use crate::report::scale::short;
+use maud::{Markup, PreEscaped};
 use std::fmt::Write;
 
 const WIDTH: f64 = 520.0;
@@ -147,6 +148,11 @@ pub fn ticks(low: f64, high: f64, wanted: f64) -> Vec<f64> {
 }
 
 impl Plot<'_> {
+    /// The plot with `lines`, for a page.
+    pub(super) fn shown(&self, lines: &[Line]) -> Markup {
+        PreEscaped(self.draw(lines))
+    }
+
     /// The plot with `lines`.
     pub fn draw(&self, lines: &[Line]) -> String {
         let finite = || lines.iter().flat_map(|l| &l.points).filter(|p| p[0].is_finite() && p[1].is_finite());

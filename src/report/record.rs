@@ -1,9 +1,9 @@
 //! What a run was asked for and has read: at the end of its page, and in its summary.
 
-use crate::report::html::escape;
 use crate::report::scale::thousands;
-use crate::report::tables::table;
+use crate::report::tables::{facts, table};
 use crate::types::record::{InputFile, RunRecord};
+use maud::html;
 use serde_json::Value;
 
 /// Digits of a hash that a page shows.
@@ -40,19 +40,23 @@ pub fn on_page(mut page: String, record: &RunRecord) -> String {
         ("Version", format!("palpate {}", env!("CARGO_PKG_VERSION"))),
         ("Date", record.date.clone()),
     ];
-    let rows = rows.map(|(key, value)| vec![key.to_string(), escape(&value)]);
     let file = |f: &InputFile| {
         let digits = f.sha256.get(..DIGITS).unwrap_or(&f.sha256);
-        vec![escape(&f.role), escape(&f.path), thousands(f.bytes as usize), escape(digits)]
+        [f.role.clone(), f.path.clone(), thousands(f.bytes as usize), digits.into()]
     };
-    let files: Vec<Vec<String>> = record.files.iter().map(file).collect();
-    let section = format!(
-        "<section><h2>The run</h2><article class=\"wide words\">{}{}</article></section>",
-        table(&[], &rows),
-        if files.is_empty() { String::new() } else { table(&["Input", "File", "Bytes", "SHA-256"], &files) }
-    );
+    let section = html! {
+        section {
+            h2 { "The run" }
+            article.wide.words {
+                (facts(rows))
+                @if !record.files.is_empty() {
+                    (table(&["Input", "File", "Bytes", "SHA-256"], record.files.iter().map(file)))
+                }
+            }
+        }
+    };
     let end = page.rfind("<footer>").or_else(|| page.rfind("</main>")).unwrap_or(page.len());
-    page.insert_str(end, &section);
+    page.insert_str(end, &section.into_string());
     page
 }
 

@@ -1,10 +1,11 @@
 //! `palpate stress`: error against severity, where it breaks and where the program says so.
 
 use crate::report::axes::{Axis, Panel, path, tiled};
-use crate::report::html::{document, escape};
+use crate::report::html::{document, escape, header};
 use crate::report::scale::significant;
 use crate::report::tables::table;
 use crate::types::{Part, Stated, StressCurve, StressRun};
+use maud::{PreEscaped, html};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -155,27 +156,18 @@ pub fn bands_that_hold(curves: &[StressCurve], part: Part, share: f64) -> Option
     (all > 0).then(|| good as f64 / all as f64)
 }
 
-fn rows(curves: &[StressCurve]) -> Vec<Vec<String>> {
-    curves
-        .iter()
-        .map(|c| {
-            let held: Vec<f64> = c.runs.iter().filter(|r| !r.broken()).filter_map(|r| r.inside).collect();
-            let inside = if held.is_empty() {
-                String::new()
-            } else {
-                format!("{:.0} %", 100.0 * held.iter().sum::<f64>() / held.len() as f64)
-            };
-            let silent = c.silent().count();
-            vec![
-                format!("{}: {}", c.part.name(), escape(&c.axis)),
-                escape(&c.case),
-                breaks(c),
-                told(c),
-                if silent > 0 { format!("{silent} of {}", c.runs.len()) } else { "none".into() },
-                inside,
-            ]
-        })
-        .collect()
+fn row(c: &StressCurve) -> [String; 6] {
+    let held: Vec<f64> = c.runs.iter().filter(|r| !r.broken()).filter_map(|r| r.inside).collect();
+    let mean = held.iter().sum::<f64>() / held.len() as f64;
+    let silent = c.silent().count();
+    [
+        format!("{}: {}", c.part.name(), c.axis),
+        c.case.clone(),
+        breaks(c),
+        told(c),
+        if silent > 0 { format!("{silent} of {}", c.runs.len()) } else { "none".into() },
+        if held.is_empty() { String::new() } else { format!("{:.0} %", 100.0 * mean) },
+    ]
 }
 
 const HEAD: [&str; 6] =
@@ -183,21 +175,25 @@ const HEAD: [&str; 6] =
 
 /// The page.
 pub fn page(curves: &[StressCurve], stated: Option<&Stated>) -> String {
+    let runs: usize = curves.iter().map(|c| c.runs.len()).sum();
     let silent: usize = curves.iter().map(|c| c.silent().count()).sum();
     let broken: usize = curves.iter().flat_map(|c| &c.runs).filter(|r| r.broken()).count();
-    let stated = stated.map_or_else(String::new, |s| format!("<p>{}</p>", stated_in_words(s)));
-    let body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>Where it breaks</h1><p class=\"verdict\">{broken} of {} runs have no result \
-         or one of no use; {silent} of these without a word.</p></header><p class=\"lead\">Severity grows to the right. The dotted \
-         line is the limit. On the axis, an upright stroke marks where at least half of the runs break, a dashed one where \
-         at least half say that something is wrong. Hollow: refused. Red crosses: broken and silent. Errors below a thousandth of the limit are drawn at \
-         that, runs without a result at the top.</p><article \
-         class=\"wide\">{}</article><section><h2>Table</h2>{stated}<div class=\"four\">{}</div></section>",
-        env!("CARGO_PKG_VERSION"),
-        curves.iter().map(|c| c.runs.len()).sum::<usize>(),
-        svg(curves),
-        table(&HEAD, &rows(curves))
-    );
+    let verdict = format!("{broken} of {runs} runs have no result or one of no use; {silent} of these without a word.");
+    let body = html! {
+        (header("Where it breaks", &verdict, ""))
+        p.lead {
+            "Severity grows to the right. The dotted line is the limit. On the axis, an upright stroke marks where at least \
+             half of the runs break, a dashed one where at least half say that something is wrong. Hollow: refused. Red \
+             crosses: broken and silent. Errors below a thousandth of the limit are drawn at that, runs without a result at \
+             the top."
+        }
+        article.wide { (PreEscaped(svg(curves))) }
+        section {
+            h2 { "Table" }
+            @if let Some(stated) = stated { p { (stated_in_words(stated)) } }
+            div.four { (table(&HEAD, curves.iter().map(row))) }
+        }
+    };
     document("palpate: where it breaks", &body)
 }
 

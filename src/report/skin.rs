@@ -1,12 +1,12 @@
 //! report.html, summary.json and the short summary of `palpate skin`.
 
-use crate::report::grasp::tile;
-use crate::report::html::{document, escape, legend, warned};
+use crate::report::html::{document, header, legend, tiles, titled, warned};
 use crate::report::json::seconds;
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, short};
 use crate::report::tables::table;
 use crate::types::skin::{BlockRun, BlockShape, SkinSample, SkinScene};
+use maud::{Markup, PreEscaped, html};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -112,46 +112,37 @@ pub fn text(report: &SkinReport<'_>) -> String {
 pub fn page(report: &SkinReport<'_>) -> String {
     let scene = report.scene;
     let [peak, held, left] = figures(report.column, scene);
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>skin</span></h1><p class=\"verdict\">{}</p></header>\
-         <div class=\"tiles\">{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(report.name),
-        escape(&headline(report)),
-        tile(&short(peak / 1e3), "kPa", "largest stress"),
-        tile(&short(held / 1e3), "kPa", "stress at the end of the hold"),
-        tile(&short(1e3 * left), "mm", "left at the end"),
-        tile(&short(100.0 * left / scene.load.displacement), "%", "of the indentation"),
-    );
-    body.push_str(&warned(report.warnings));
-    let _ = write!(
-        body,
-        "<section><h2>Over time</h2><p class=\"lead\">The column is exact; the block has a punch and free skin beside it. {one}</p><div class=\"grid\">{}</div></section>",
-        curves(report),
-        one = one_layer(report)
-    );
-    body.push_str(&shapes(report));
-    let rows: Vec<Vec<String>> = scene
-        .layers
-        .iter()
-        .enumerate()
-        .map(|(at, l)| {
-            let strain = |time: f64| {
-                report.column.iter().rfind(|s| s.time <= time * (1.0 + 1e-12)).map_or(0.0, |s| s.strain[at])
-            };
-            vec![
-                escape(&l.name),
-                short(1e3 * l.thickness),
-                serde_json::to_value(l.element).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default(),
-                short(strain(scene.load.ramp)),
-                short(strain(scene.load.end)),
-                report.residual[at].map_or("0, in time".into(), short),
-            ]
-        })
-        .collect();
+    let rows = scene.layers.iter().enumerate().map(|(at, l)| {
+        let strain =
+            |time: f64| report.column.iter().rfind(|s| s.time <= time * (1.0 + 1e-12)).map_or(0.0, |s| s.strain[at]);
+        [
+            l.name.clone(),
+            short(1e3 * l.thickness),
+            serde_json::to_value(l.element).ok().and_then(|v| v.as_str().map(String::from)).unwrap_or_default(),
+            short(strain(scene.load.ramp)),
+            short(strain(scene.load.end)),
+            report.residual[at].map_or("0, in time".into(), short),
+        ]
+    });
     let head = ["Layer", "Thickness, mm", "Element", "Strain after the ramp", "Strain at the end", "Permanent strain"];
-    let _ = write!(body, "<section><h2>Layers</h2><article class=\"wide\">{}</article></section>", table(&head, &rows));
-    document(&escape(report.name), &body)
+    let body = html! {
+        (header(titled(report.name, "skin"), &headline(report), ""))
+        (tiles([
+            (short(peak / 1e3), "kPa", "largest stress"),
+            (short(held / 1e3), "kPa", "stress at the end of the hold"),
+            (short(1e3 * left), "mm", "left at the end"),
+            (short(100.0 * left / scene.load.displacement), "%", "of the indentation"),
+        ]))
+        (warned(report.warnings))
+        section {
+            h2 { "Over time" }
+            p.lead { "The column is exact; the block has a punch and free skin beside it. " (one_layer(report)) }
+            div.grid { (curves(report)) }
+        }
+        (shapes(report))
+        section { h2 { "Layers" } article.wide { (table(&head, rows)) } }
+    };
+    document(report.name, &body)
 }
 
 /// What the one layer is, in words.
@@ -163,7 +154,7 @@ fn one_layer(report: &SkinReport<'_>) -> &'static str {
     }
 }
 
-fn curves(report: &SkinReport<'_>) -> String {
+fn curves(report: &SkinReport<'_>) -> Markup {
     let load = &report.scene.load;
     let marks = [(load.ramp, false), (load.ramp + load.hold, false)];
     let of = |samples: &[SkinSample], f: &dyn Fn(&SkinSample) -> f64| samples.iter().map(|s| [s.time, f(s)]).collect();
@@ -178,26 +169,24 @@ fn curves(report: &SkinReport<'_>) -> String {
             kinds.iter().filter_map(|(name, samples, colour, dashed)| Some((name, (*samples)?, *colour, *dashed)));
         some.map(|(name, samples, colour, dashed)| Line::new(name, colour, dashed, of(samples, f))).collect()
     };
-    let draw = |title: &str, lines: &[Line]| {
-        format!("<article>{}</article>", Plot { title, across: "s", marks: &marks }.draw(lines))
+    let layers = |samples: &[SkinSample]| -> Vec<Line> {
+        let line = |at| of(samples, &|s| s.strain[at]);
+        report.scene.layers.iter().enumerate().map(|(at, l)| Line::new(&l.name, at, false, line(at))).collect()
     };
-    let mut out = draw("Stress, kPa", &lines(&|s| s.stress / 1e3));
-    out += &draw("Depth, mm", &lines(&|s| 1e3 * s.displacement));
-    let layers: Vec<Line> = (report.scene.layers.iter().enumerate())
-        .map(|(at, l)| Line::new(&l.name, at, false, of(report.column, &|s| s.strain[at])))
-        .collect();
-    out += &draw("Compression of each layer, column", &layers);
-    if let Some(block) = report.block {
-        let layers: Vec<Line> = (report.scene.layers.iter().enumerate())
-            .map(|(at, l)| Line::new(&l.name, at, false, of(&block.samples, &|s| s.strain[at])))
-            .collect();
-        out += &draw("Compression of each layer under the punch, block", &layers);
+    let draw =
+        |title: &str, lines: &[Line]| html! { article { (Plot { title, across: "s", marks: &marks }.shown(lines)) } };
+    html! {
+        (draw("Stress, kPa", &lines(&|s| s.stress / 1e3)))
+        (draw("Depth, mm", &lines(&|s| 1e3 * s.displacement)))
+        (draw("Compression of each layer, column", &layers(report.column)))
+        @if let Some(block) = report.block {
+            (draw("Compression of each layer under the punch, block", &layers(&block.samples)))
+        }
     }
-    out
 }
 
 /// The deformed blocks with and without layers, side by side.
-fn shapes(report: &SkinReport<'_>) -> String {
+fn shapes(report: &SkinReport<'_>) -> Markup {
     let runs: Vec<(&str, &BlockRun)> = [("With layers", report.block), ("One layer", report.single_block)]
         .into_iter()
         .filter_map(|(name, run)| Some((name, run?)))
@@ -205,28 +194,29 @@ fn shapes(report: &SkinReport<'_>) -> String {
     let largest =
         runs.iter().flat_map(|(_, r)| &r.shapes).flat_map(|s| &s.compression).fold(0.0f64, |m, v| m.max(v.abs()));
     if runs.is_empty() || largest <= 0.0 {
-        return String::new();
+        return Markup::default();
     }
     let scale = Scale::about(0.0, largest, "");
-    let mut out = String::from(
-        "<section><h2>The skin under the punch</h2><p class=\"lead\">Cells move with the skin, true to scale. Red: pressed \
-         together. Blue: pulled apart.</p><div class=\"grid\">",
-    );
-    let times = runs[0].1.shapes.len();
-    for at in 0..times {
-        for (name, run) in &runs {
-            let Some(shape) = run.shapes.get(at) else { continue };
-            let _ = write!(
-                out,
-                "<article><h3>{name}, at {} s</h3>{}{}</article>",
-                short(shape.time),
-                drawing(report.scene, run, shape, &scale),
-                legend(Some(&scale))
-            );
+    let times = 0..runs[0].1.shapes.len();
+    let at_times =
+        times.flat_map(|at| runs.iter().filter_map(move |(name, run)| Some((name, run, run.shapes.get(at)?))));
+    html! {
+        section {
+            h2 { "The skin under the punch" }
+            p.lead {
+                "Cells move with the skin, true to scale. Red: pressed together. Blue: pulled apart."
+            }
+            div.grid {
+                @for (name, run, shape) in at_times {
+                    article {
+                        h3 { (name) ", at " (short(shape.time)) " s" }
+                        (PreEscaped(drawing(report.scene, run, shape, &scale)))
+                        (legend(Some(&scale)))
+                    }
+                }
+            }
         }
     }
-    out.push_str("</div></section>");
-    out
 }
 
 /// Both halves of a block, with the lines between its layers.

@@ -3,7 +3,7 @@
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::html::{card, document, escape, warned};
+use crate::report::html::{card, document, header, tiles, warned};
 use crate::report::panels::{Panel, gray_range, length};
 use crate::report::plot::{Line, Plot};
 use crate::report::scale::{Scale, short, thousands};
@@ -14,9 +14,11 @@ use crate::report::verdict::short2;
 use crate::report::viewer::{Layer, Moment, Viewer};
 use crate::report::{chart, json};
 use crate::types::stiffness::{
-    Detectable, Determined, Evidence, FrameStiffness, Gain, LeftOver, RegionStiffness, SharedStiffness, StiffnessResult,
+    Detectable, Determined, Evidence, FrameStiffness, Gain, LeftOver, PatchReport, RegionStiffness, SharedStiffness,
+    StiffnessResult,
 };
 use crate::types::{DenseField, Mask, Volume, WorldPoint};
+use maud::{Markup, html};
 use serde_json::{Map, Value, json};
 use std::fmt::Write;
 
@@ -223,7 +225,7 @@ pub struct Shown<'a> {
 const STRIPES: usize = 3;
 
 /// Maps, displacement and mesh over the images in a viewer, with the scales of the pictures.
-fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Values<'_>, &Panel); 3]) -> String {
+fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Values<'_>, &Panel); 3]) -> Markup {
     let overlays: Vec<Layer<'_>> = maps
         .into_iter()
         .filter_map(|(values, panel)| Some(Layer { name: &panel.title, values, scale: panel.scale.clone()? }))
@@ -264,7 +266,7 @@ fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Valu
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
 pub fn page(result: &StiffnessResult, inputs: &InputNames, shown: &Shown<'_>) -> Result<String, ReportError> {
-    page_with(result, inputs, shown, "")
+    page_with(result, inputs, shown, &Markup::default())
 }
 
 /// The page of a map that the frames of a sequence share.
@@ -276,48 +278,49 @@ pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames, shown: &Show
 }
 
 /// The head of the page: what was found, and how far to rely on it.
-fn header(result: &StiffnessResult, body: &str) -> String {
+fn head(result: &StiffnessResult, body: &str) -> Markup {
     let total: f64 = result.seconds.iter().map(|s| s.1).sum();
-    let tile = |value: String, unit: &str, name: &str| {
-        format!("<div><b>{value}<small> {unit}</small></b><span>{name}</span></div>")
-    };
-    format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>Stiffness of {}</h1><p class=\"verdict\">{}</p></header>\
-         <div class=\"tiles\">{}{}{}{}{}</div>{}",
-        env!("CARGO_PKG_VERSION"),
-        escape(body),
-        escape(&verdict(result)),
-        tile(result.regions.len().to_string(), "", "regions"),
-        tile(format!("{:.4}", result.residual_mm), "mm", "residual"),
-        tile(format!("{:.1}", 100.0 * result.strain), "%", "strain, 95th percentile"),
-        tile(thousands(result.mesh.nodes().len()), "", "mesh nodes"),
-        tile(format!("{total:.1}"), "s", "total runtime"),
-        warned(&result.warnings)
-    )
+    html! {
+        (header(format_args!("Stiffness of {body}"), &verdict(result), ""))
+        (tiles([
+            (result.regions.len().to_string(), "", "regions"),
+            (format!("{:.4}", result.residual_mm), "mm", "residual"),
+            (format!("{:.1}", 100.0 * result.strain), "%", "strain, 95th percentile"),
+            (thousands(result.mesh.nodes().len()), "", "mesh nodes"),
+            (format!("{total:.1}"), "s", "total runtime"),
+        ]))
+        (warned(&result.warnings))
+    }
 }
 
 /// The models that were tried, the patches, the correlations and the time; then what all moduli
 /// assume.
-fn evidence(result: &StiffnessResult) -> String {
-    let force = result.force_n.map_or_else(String::new, |f| format!(" under a total force of {} N", short(f)));
-    format!(
-        "<section><h2>Evidence</h2><div class=\"grid\"><article class=\"wide\"><h3>Models tried</h3>{}</article>\
-         <article><h3>Patches</h3>{}</article><article><h3>Correlation of ln E</h3>{}</article><article><h3>Time</h3>{}</article></div></section>\
-         <footer><p>Moduli hold for a Poisson's ratio of {}, the same in all regions,{force} and for an isotropic elastic body \
-         whose skin is free but for the two patches. Positions are world mm, RAS.</p></footer>",
-        evidence_table(result),
-        patch_table(result),
-        correlation_table(result),
-        chart::stage_times(&result.seconds),
-        result.poisson
-    )
+fn evidence(result: &StiffnessResult) -> Markup {
+    html! {
+        section {
+            h2 { "Evidence" }
+            div.grid {
+                article.wide { h3 { "Models tried" } (evidence_table(result)) }
+                article { h3 { "Patches" } (patch_table(result)) }
+                article { h3 { "Correlation of ln E" } (correlation_table(result)) }
+                article { h3 { "Time" } (chart::stage_times(&result.seconds)) }
+            }
+        }
+        footer {
+            p {
+                "Moduli hold for a Poisson's ratio of " (result.poisson) ", the same in all regions,"
+                @if let Some(force) = result.force_n { " under a total force of " (short(force)) " N" }
+                " and for an isotropic elastic body whose skin is free but for the two patches. Positions are world mm, RAS."
+            }
+        }
+    }
 }
 
 fn page_with(
     result: &StiffnessResult,
     inputs: &InputNames,
     shown: &Shown<'_>,
-    extra: &str,
+    extra: &Markup,
 ) -> Result<String, ReportError> {
     let grid = *result.map.grid();
     let inside = Mask::from_vec(grid, result.map.as_slice().iter().map(|&v| u8::from(v > 0.0)).collect());
@@ -366,31 +369,35 @@ fn page_with(
         "Length of measured less modelled displacement, where one was taken. Structure here means that the model misses \
          something.",
     )?;
-    let mut out = header(result, &inputs.body);
-    let _ = write!(
-        out,
-        "<section><h2>Regions</h2><div class=\"grid\"><article class=\"wide\"><h3>Moduli</h3>{}</article></div></section>",
-        region_table(result)
-    );
-    out.push_str(extra);
     let maps = [(moduli, &map_panel), (deviations, &sd), (residuals, &rest)];
-    let viewer = look(result, &inside, shown, maps);
-    let _ = write!(out, "<section><h2>Look</h2><article class=\"wide\">{viewer}</article></section>");
     let some = sample(grid.len(), Some(&inside));
-    let distributions: String = maps
-        .into_iter()
-        .filter_map(|(values, panel)| Some(chart::distribution(&panel.title, values, panel.scale.as_ref()?, &some)))
-        .collect();
-    let _ = write!(
-        out,
-        "<section><h2>Maps</h2><div class=\"grid\">{}{}{}<article class=\"wide\"><h3>Distributions</h3><div class=\"charts\">\
-         {distributions}</div></article></div></section>",
-        card(&map_panel),
-        card(&sd),
-        card(&rest)
-    );
-    out.push_str(&evidence(result));
-    Ok(document(&format!("Stiffness of {}", escape(&inputs.body)), &out))
+    let body = html! {
+        (head(result, &inputs.body))
+        section {
+            h2 { "Regions" }
+            div.grid { article.wide { h3 { "Moduli" } (region_table(result)) } }
+        }
+        (extra)
+        section { h2 { "Look" } article.wide { (look(result, &inside, shown, maps)) } }
+        section {
+            h2 { "Maps" }
+            div.grid {
+                @for (_, panel) in maps { (card(panel)) }
+                article.wide {
+                    h3 { "Distributions" }
+                    div.charts {
+                        @for (values, panel) in maps {
+                            @if let Some(scale) = &panel.scale {
+                                (chart::distribution(&panel.title, values, scale, &some))
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        (evidence(result))
+    };
+    Ok(document(&format!("Stiffness of {}", inputs.body), &body))
 }
 
 /// The middle of what is stiffer or softer than the median, else of the body (mm, RAS).
@@ -409,65 +416,45 @@ fn centre(map: &Volume) -> WorldPoint {
     WorldPoint(sum.map(|s| s / chosen.len().max(1) as f64))
 }
 
-fn region_table(result: &StiffnessResult) -> String {
-    let rows: Vec<Vec<String>> = result
-        .regions
-        .iter()
-        .zip(&result.mesh_change)
-        .map(|(r, change)| {
-            vec![
-                escape(&r.name),
-                r.label.to_string(),
-                escape(&modulus(r, result.absolute)).replace("+-", "±"),
-                digits(r.ratio),
-                format!("{:.1} %", 100.0 * change.exp_m1()).replace("-0.0", "0.0"),
-                thousands(r.volume as usize),
-            ]
-        })
-        .collect();
-    table(&["Region", "Label", "Young's modulus", "Ratio", "Change with the mesh", "Volume, mm³"], &rows)
+fn region_table(result: &StiffnessResult) -> Markup {
+    let rows = result.regions.iter().zip(&result.mesh_change).map(|(r, change)| {
+        [
+            r.name.clone(),
+            r.label.to_string(),
+            modulus(r, result.absolute).replace("+-", "±"),
+            digits(r.ratio),
+            format!("{:.1} %", 100.0 * change.exp_m1()).replace("-0.0", "0.0"),
+            thousands(r.volume as usize),
+        ]
+    });
+    table(&["Region", "Label", "Young's modulus", "Ratio", "Change with the mesh", "Volume, mm³"], rows)
 }
 
-fn evidence_table(result: &StiffnessResult) -> String {
+fn evidence_table(result: &StiffnessResult) -> Markup {
     let row = |e: &Evidence| {
         let [residual, criterion] = figures(e);
-        vec![
-            format!("{}: {}", e.question, escape(&e.model)),
-            e.parameters.to_string(),
-            residual,
-            criterion,
-            if e.chosen { "chosen" } else { "" }.into(),
-            escape(&e.reason),
-        ]
+        let (model, chosen) = (format!("{}: {}", e.question, e.model), if e.chosen { "chosen" } else { "" });
+        [model, e.parameters.to_string(), residual, criterion, chosen.into(), e.reason.clone()]
     };
-    let rows: Vec<_> = result.evidence.iter().map(row).collect();
-    table(&["Model", "Parameters", "Residual, mm", "Criterion", "", "Why"], &rows)
+    table(&["Model", "Parameters", "Residual, mm", "Criterion", "", "Why"], result.evidence.iter().map(row))
 }
 
-fn patch_table(result: &StiffnessResult) -> String {
-    let row = |(which, p): (&str, &crate::types::stiffness::PatchReport)| {
-        vec![
-            format!("{which} ({})", escape(&p.name)),
-            p.contact.name().into(),
-            format!("{:.1} mm²", p.area),
-            p.translation.map(short2).join(", ") + " mm",
-        ]
+fn patch_table(result: &StiffnessResult) -> Markup {
+    let row = |(which, p): (&str, &PatchReport)| {
+        let motion = p.translation.map(short2).join(", ") + " mm";
+        [format!("{which} ({})", p.name), p.contact.name().into(), format!("{:.1} mm²", p.area), motion]
     };
-    let rows: Vec<_> = ["held", "loaded", "cut"].into_iter().zip(&result.patches).map(row).collect();
-    table(&["Patch", "Contact", "Area", "Motion"], &rows)
+    table(&["Patch", "Contact", "Area", "Motion"], ["held", "loaded", "cut"].into_iter().zip(&result.patches).map(row))
 }
 
-fn correlation_table(result: &StiffnessResult) -> String {
-    let head: Vec<String> =
-        std::iter::once(String::new()).chain(result.regions.iter().map(|r| escape(&r.name))).collect();
-    let head: Vec<&str> = head.iter().map(String::as_str).collect();
-    let rows: Vec<Vec<String>> = result
+fn correlation_table(result: &StiffnessResult) -> Markup {
+    let head: Vec<&str> = std::iter::once("").chain(result.regions.iter().map(|r| r.name.as_str())).collect();
+    let rows = result
         .regions
         .iter()
         .zip(&result.correlation)
-        .map(|(r, c)| std::iter::once(escape(&r.name)).chain(c.iter().map(|v| short2(*v))).collect())
-        .collect();
-    table(&head, &rows)
+        .map(|(r, c)| std::iter::once(r.name.clone()).chain(c.iter().map(|v| short2(*v))));
+    table(&head, rows)
 }
 
 /// What a shared map adds to summary.json under `sequence`.
@@ -504,37 +491,38 @@ pub fn sequence_text(shared: &SharedStiffness) -> String {
     out
 }
 
-fn sequence_section(shared: &SharedStiffness) -> String {
-    let mut cards = String::new();
-    for (r, gains) in shared.result.regions.iter().zip(&shared.gains) {
-        let Some(first) = gains.first().filter(|g| g.data_sd > 1e-3 * g.value) else { continue };
-        let line = |f: &dyn Fn(&Gain) -> f64| gains.iter().map(|g| [g.frames as f64, f(g)]).collect::<Vec<_>>();
-        let lines = [
-            Line::new("standard deviation, %", 0, false, line(&|g| 100.0 * g.sd / g.value)),
-            Line::new("its part that frames lower", 1, false, line(&|g| 100.0 * g.data_sd / g.value)),
-            Line::new(
-                "first over root of frames",
-                2,
-                true,
-                line(&|g| 100.0 * first.data_sd / first.value / (g.frames as f64).sqrt()),
-            ),
-        ];
-        let plot = Plot { title: &r.name, across: "frames, those that move most first", marks: &[] };
-        let _ = write!(cards, "<article>{}</article>", plot.draw(&lines));
+fn sequence_section(shared: &SharedStiffness) -> Markup {
+    let row = |f: &FrameStiffness| {
+        let said = match &f.regions {
+            Ok(all) => all.iter().map(|r| modulus(r, shared.result.absolute)).collect::<Vec<_>>().join("; "),
+            Err(why) => why.clone(),
+        };
+        [f.frame.to_string(), format!("{:.3}", f.motion_mm), format!("{:.4}", f.residual_mm), said]
+    };
+    html! {
+        section {
+            h2 { "Frames" }
+            div.grid {
+                @for (r, gains) in shared.result.regions.iter().zip(&shared.gains) { (gained(&r.name, gains)) }
+                article.wide {
+                    h3 { "Each alone" }
+                    (table(&["Frame", "Mean motion, mm", "Residual, mm", "Moduli"], shared.frames.iter().map(row)))
+                }
+            }
+        }
     }
-    let rows: Vec<Vec<String>> = shared
-        .frames
-        .iter()
-        .map(|f| {
-            let said = match &f.regions {
-                Ok(all) => all.iter().map(|r| modulus(r, shared.result.absolute)).collect::<Vec<_>>().join("; "),
-                Err(why) => why.clone(),
-            };
-            vec![f.frame.to_string(), format!("{:.3}", f.motion_mm), format!("{:.4}", f.residual_mm), escape(&said)]
-        })
-        .collect();
-    format!(
-        "<section><h2>Frames</h2><div class=\"grid\">{cards}<article class=\"wide\"><h3>Each alone</h3>{}</article></div></section>",
-        table(&["Frame", "Mean motion, mm", "Residual, mm", "Moduli"], &rows)
-    )
+}
+
+/// What each further frame adds to what is known of a region, where frames lower its deviation.
+fn gained(region: &str, gains: &[Gain]) -> Markup {
+    let Some(first) = gains.first().filter(|g| g.data_sd > 1e-3 * g.value) else { return Markup::default() };
+    let line = |f: &dyn Fn(&Gain) -> f64| gains.iter().map(|g| [g.frames as f64, f(g)]).collect::<Vec<_>>();
+    let root = |g: &Gain| 100.0 * first.data_sd / first.value / (g.frames as f64).sqrt();
+    let lines = [
+        Line::new("standard deviation, %", 0, false, line(&|g| 100.0 * g.sd / g.value)),
+        Line::new("its part that frames lower", 1, false, line(&|g| 100.0 * g.data_sd / g.value)),
+        Line::new("first over root of frames", 2, true, line(&root)),
+    ];
+    let plot = Plot { title: region, across: "frames, those that move most first", marks: &[] };
+    html! { article { (plot.shown(&lines)) } }
 }

@@ -4,8 +4,7 @@
 use crate::error::ReportError;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::grasp::tile;
-use crate::report::html::{card, document, escape, warned};
+use crate::report::html::{card, document, header, tiles, titled, trusted, warned};
 use crate::report::json::{grid, seconds};
 use crate::report::panels::{Panel, centre_of_motion, gray_range};
 use crate::report::scale::{Scale, percent, significant, thousands};
@@ -13,6 +12,7 @@ use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
 use crate::types::{DenseField, Mask, RegionStrain, StrainSummary, Voxels};
+use maud::{Markup, html};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -155,12 +155,12 @@ pub fn text(report: &StrainReport<'_>) -> String {
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn section(report: &StrainReport<'_>) -> Result<String, ReportError> {
+pub(super) fn section(report: &StrainReport<'_>) -> Result<Markup, ReportError> {
     pictures(report, &format!("{} ", headline(report)))
 }
 
 /// The same after other words.
-fn pictures(report: &StrainReport<'_>, lead: &str) -> Result<String, ReportError> {
+fn pictures(report: &StrainReport<'_>, lead: &str) -> Result<Markup, ReportError> {
     let s = report.summary;
     let grid = report.displacement.grid();
     let centre = centre_of_motion(report.displacement, Some(report.bodies));
@@ -203,27 +203,25 @@ fn pictures(report: &StrainReport<'_>, lead: &str) -> Result<String, ReportError
             "Of a normal strain, in the same places.",
         )?,
     ];
-    let gauges: Vec<Vec<String>> =
-        s.gauges.iter().map(|g| vec![significant(g.gauge_mm), percent(g.noise), percent(g.error)]).collect();
-    let chosen = match gauges.is_empty() {
-        true => String::new(),
-        false => format!(
-            "<article><h3>Gauges that were tried</h3><p>The error holds what a longer gauge smooths away.</p>{}</article>",
-            table(&["Gauge, mm", "Noise, %", "Error to expect, %"], &gauges)
-        ),
-    };
-    Ok(format!(
-        "<section><h2>Strain</h2><p class=\"lead\">{}Gauge {}. Deviation from {}.</p><div class=\"grid\">{}{chosen}\
-         <article class=\"wide\"><h3>Regions</h3>{}</article></div></section>",
-        escape(lead),
-        escape(&gauge(s)),
-        escape(s.deviation_from),
-        pictures.concat(),
-        table(
-            &["Label", "Component", "Mean, %", "Spread, %", "5th percentile, %", "95th percentile, %", "Voxels"],
-            &rows(&s.regions)
-        )
-    ))
+    let gauges = s.gauges.iter().map(|g| [significant(g.gauge_mm), percent(g.noise), percent(g.error)]);
+    let head = ["Label", "Component", "Mean, %", "Spread, %", "5th percentile, %", "95th percentile, %", "Voxels"];
+    Ok(html! {
+        section {
+            h2 { "Strain" }
+            p.lead { (lead) "Gauge " (gauge(s)) ". Deviation from " (s.deviation_from) "." }
+            div.grid {
+                @for picture in &pictures { (picture) }
+                @if !s.gauges.is_empty() {
+                    article {
+                        h3 { "Gauges that were tried" }
+                        p { "The error holds what a longer gauge smooths away." }
+                        (table(&["Gauge, mm", "Noise, %", "Error to expect, %"], gauges))
+                    }
+                }
+                article.wide { h3 { "Regions" } (table(&head, rows(&s.regions))) }
+            }
+        }
+    })
 }
 
 /// The page.
@@ -233,22 +231,22 @@ fn pictures(report: &StrainReport<'_>, lead: &str) -> Result<String, ReportError
 pub fn page(report: &StrainReport<'_>) -> Result<String, ReportError> {
     let s = report.summary;
     let voxels = report.bodies.as_slice().iter().filter(|l| **l != 0).count();
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>strain</span></h1><p class=\"verdict\">{}</p>\
-         <p class=\"trust {trust}\"><b>Trust is {trust}</b> {}.</p></header><div class=\"tiles\">{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(report.name),
-        escape(&headline(report)),
-        escape(&s.trust_reasons.join("; ")),
-        tile(&percent(s.noise), "%", "deviation of a normal strain"),
-        tile(&percent(s.strain), "%", "root mean square strain"),
-        tile(&significant(s.gauge_mm), "mm", "gauge length"),
-        tile(&thousands(voxels), "", "voxels"),
-        trust = s.trust.name()
-    );
-    body += &warned(&s.warnings);
-    body += &pictures(report, "")?;
-    body += "<footer><p>Strain is on the initial volume, axes right, anterior, superior. A gauge is the side of the cube over which \
-             displacements give one strain: what is finer is smoothed away.</p></footer>";
-    Ok(document(&format!("Strain of {}", escape(report.name)), &body))
+    let body = html! {
+        (header(titled(report.name, "strain"), &headline(report), trusted(s.trust, &s.trust_reasons)))
+        (tiles([
+            (percent(s.noise), "%", "deviation of a normal strain"),
+            (percent(s.strain), "%", "root mean square strain"),
+            (significant(s.gauge_mm), "mm", "gauge length"),
+            (thousands(voxels), "", "voxels"),
+        ]))
+        (warned(&s.warnings))
+        (pictures(report, "")?)
+        footer {
+            p {
+                "Strain is on the initial volume, axes right, anterior, superior. A gauge is the side of the cube over which \
+                 displacements give one strain: what is finer is smoothed away."
+            }
+        }
+    };
+    Ok(document(&format!("Strain of {}", report.name), &body))
 }

@@ -1,25 +1,29 @@
 //! Tables of the page.
 
 use crate::report::field::FieldReport;
-use crate::report::html::escape;
 use crate::report::scale::{short, thousands};
-use crate::types::{BodyReport, Metrics, MotionModel, StageReport};
-use std::fmt::Write;
+use crate::types::{BodyReport, Grid, Metrics, MotionModel, StageReport};
+use maud::{Markup, Render, html};
 
 /// A table from a head (may be empty) and rows; the first column is text, the others are numbers.
-pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
-    let mut out = String::from("<div class=\"scroll\"><table>");
-    if !head.is_empty() {
-        let cells: String = head.iter().map(|h| format!("<th>{h}</th>")).collect();
-        let _ = write!(out, "<thead><tr>{cells}</tr></thead>");
+pub(super) fn table<R: IntoIterator<Item: Render>>(head: &[&str], rows: impl IntoIterator<Item = R>) -> Markup {
+    html! {
+        div.scroll {
+            table {
+                @if !head.is_empty() {
+                    thead { tr { @for name in head { th { (name) } } } }
+                }
+                tbody {
+                    @for row in rows { tr { @for cell in row { td { (cell) } } } }
+                }
+            }
+        }
     }
-    out.push_str("<tbody>");
-    for row in rows {
-        let cells: String = row.iter().map(|c| format!("<td>{c}</td>")).collect();
-        let _ = write!(out, "<tr>{cells}</tr>");
-    }
-    out.push_str("</tbody></table></div>");
-    out
+}
+
+/// A table of names with their values.
+pub(super) fn facts<'a>(rows: impl IntoIterator<Item = (&'a str, String)>) -> Markup {
+    table(&[], rows.into_iter().map(|(name, value)| [name.to_string(), value]))
 }
 
 fn triple(v: [f64; 3]) -> String {
@@ -27,7 +31,7 @@ fn triple(v: [f64; 3]) -> String {
 }
 
 /// What was counted.
-pub fn counts(report: &FieldReport<'_>) -> String {
+pub(super) fn counts(report: &FieldReport<'_>) -> Markup {
     let (s, c) = (report.summary, report.summary.counts);
     let model = match s.model {
         MotionModel::Identity => "none",
@@ -50,15 +54,15 @@ pub fn counts(report: &FieldReport<'_>) -> String {
         (if s.start.is_some() { "Variance explained at the start" } else { "Variance explained at rest" }, at_rest),
         ("Variance explained under the field", found),
     ];
-    table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+    facts(rows)
 }
 
 /// The bodies of the scene.
-pub fn bodies(report: &FieldReport<'_>) -> String {
+pub(super) fn bodies(report: &FieldReport<'_>) -> Markup {
     let row = |b: &BodyReport| {
         let share = 100.0 * b.voxels as f64 / report.summary.mask_voxels.max(1) as f64;
         let model = b.model.name();
-        vec![
+        [
             b.label.to_string(),
             thousands(b.voxels),
             format!("{share:.1}"),
@@ -67,8 +71,8 @@ pub fn bodies(report: &FieldReport<'_>) -> String {
             format!("{:.3}", b.expected_error_mm),
         ]
     };
-    let rows: Vec<_> = report.summary.bodies.iter().map(row).collect();
-    table(&["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm", "Expected error, mm"], &rows)
+    let head = ["Label", "Voxels", "of the tissue, %", "Motion model", "Slides by, mm", "Expected error, mm"];
+    table(&head, report.summary.bodies.iter().map(row))
 }
 
 /// Landmarks drawn at most, the furthest first, and the length of its bar (em).
@@ -77,7 +81,7 @@ const BAR: f64 = 10.0;
 
 /// How far the deformed place of each landmark is from where the field leads, as bars; red where
 /// the field contradicts it.
-pub fn landmarks(report: &FieldReport<'_>) -> Option<String> {
+pub(super) fn landmarks(report: &FieldReport<'_>) -> Option<Markup> {
     let l = report.summary.landmarks.as_ref()?;
     let mut order: Vec<usize> = (0..l.distances_mm.len()).collect();
     order.sort_by(|&a, &b| l.distances_mm[b].total_cmp(&l.distances_mm[a]));
@@ -85,21 +89,20 @@ pub fn landmarks(report: &FieldReport<'_>) -> Option<String> {
     let row = |&i: &usize| {
         let (mm, colour) = (l.distances_mm[i], if l.wrong.contains(&(i + 1)) { "#d1495b" } else { "#2e86ab" });
         let width = BAR * mm / most;
-        let bar = format!("<div style=\"width:{width:.2}em;min-width:2px;height:.7em;background:{colour}\"></div>");
-        vec![format!("number {}", i + 1), format!("{mm:.2} mm"), bar]
+        let style = format!("width:{width:.2}em;min-width:2px;height:.7em;background:{colour}");
+        [html! { "number " (i + 1) }, html! { (format_args!("{mm:.2} mm")) }, html! { div style=(style) {} }]
     };
-    let rows: Vec<_> = order.iter().take(LANDMARKS).map(row).collect();
-    let note = format!(
-        "Distance of {} landmarks from where the field leads: {:.2} mm on average, for a deviation of {} mm along each axis.",
-        l.count,
-        l.mean_mm,
-        short(l.sd_mm)
-    );
-    Some(format!("<p>{note}</p>{}", table(&[], &rows)))
+    Some(html! {
+        p {
+            "Distance of " (l.count) " landmarks from where the field leads: " (format_args!("{:.2}", l.mean_mm))
+            " mm on average, for a deviation of " (short(l.sd_mm)) " mm along each axis."
+        }
+        (table(&[], order.iter().take(LANDMARKS).map(row)))
+    })
 }
 
 /// The field after each stage.
-pub fn stages(report: &FieldReport<'_>) -> String {
+pub(super) fn stages(report: &FieldReport<'_>) -> Markup {
     let row = |s: &StageReport| {
         let mut row = vec![
             s.name.clone(),
@@ -110,57 +113,53 @@ pub fn stages(report: &FieldReport<'_>) -> String {
         row.extend(s.error_mm.map(|error| format!("{error:.3}")));
         row
     };
-    let rows: Vec<_> = report.summary.stages.iter().map(row).collect();
     let mut head = vec!["Field after", "Voxel, mm", "Changed by, mm", "Variance unexplained, %"];
     if report.summary.stages.iter().any(|s| s.error_mm.is_some()) {
         head.push("Mean error, mm");
     }
-    table(&head, &rows)
+    table(&head, report.summary.stages.iter().map(row))
 }
 
 /// The levels, coarse to fine.
-pub fn levels(report: &FieldReport<'_>) -> String {
-    let rows: Vec<_> = report
-        .summary
-        .levels
-        .iter()
-        .map(|l| {
-            vec![
-                triple(l.spacing_mm),
-                thousands(l.counts.features_initial),
-                thousands(l.counts.candidates),
-                thousands(l.counts.kept),
-                format!("{:.4}", l.energy_before),
-                format!("{:.4}", l.energy_after),
-                format!("{:.3}", l.residual_mm),
-            ]
-        })
-        .collect();
-    table(&["Voxel, mm", "Features", "Candidates", "Kept", "Energy before", "after", "Residual, mm"], &rows)
+pub(super) fn levels(report: &FieldReport<'_>) -> Markup {
+    let rows = report.summary.levels.iter().map(|l| {
+        [
+            triple(l.spacing_mm),
+            thousands(l.counts.features_initial),
+            thousands(l.counts.candidates),
+            thousands(l.counts.kept),
+            format!("{:.4}", l.energy_before),
+            format!("{:.4}", l.energy_after),
+            format!("{:.3}", l.residual_mm),
+        ]
+    });
+    table(&["Voxel, mm", "Features", "Candidates", "Kept", "Energy before", "after", "Residual, mm"], rows)
 }
 
 /// The two volumes and what was asked for.
-pub fn inputs(report: &FieldReport<'_>) -> String {
-    let [initial, deformed, mask] = report.names.map(escape);
-    let grid = |g: &crate::types::Grid| {
-        format!("{} voxels of {} mm", g.shape().map(|n| n.to_string()).join(" × "), triple(g.spacing()))
+pub(super) fn inputs(report: &FieldReport<'_>) -> Markup {
+    let [initial, deformed, mask] = report.names;
+    let volume = |name: &str, g: &Grid| {
+        let shape = g.shape().map(|n| n.to_string()).join(" × ");
+        html! { (name) br; (shape) " voxels of " (triple(g.spacing())) " mm" }
     };
-    let automatic = |v: f64, unit: &str| if v == 0.0 { "automatic".into() } else { format!("{}{unit}", short(v)) };
+    let text = |text: String| html! { (text) };
+    let automatic = |v: f64, unit: &str| text(if v == 0.0 { "automatic".into() } else { short(v) + unit });
     let p = report.params;
     let rows = [
-        ("Initial volume", format!("{initial}<br>{}", grid(report.initial.grid()))),
-        ("Deformed volume", format!("{deformed}<br>{}", grid(report.deformed_grid))),
-        ("Mask", if report.mask.is_some() { mask } else { "none given".into() }),
-        ("Preset", format!("{:?}", p.preset).to_lowercase()),
+        ("Initial volume", volume(initial, report.initial.grid())),
+        ("Deformed volume", volume(deformed, report.deformed_grid)),
+        ("Mask", text(if report.mask.is_some() { mask } else { "none given" }.into())),
+        ("Preset", text(format!("{:?}", p.preset).to_lowercase())),
         ("Points", automatic(p.points as f64, "")),
         ("Search", automatic(p.search_mm, " mm")),
-        ("Seed", p.seed.to_string()),
+        ("Seed", text(p.seed.to_string())),
     ];
-    table(&[], &rows.map(|(name, value)| vec![name.into(), value]))
+    table(&[], rows.map(|(name, value)| [text(name.into()), value]))
 }
 
 /// The score against exact truth.
-pub fn metrics(m: &Metrics) -> String {
+pub(super) fn metrics(m: &Metrics) -> Markup {
     let mm = |v: f64| format!("{v:.3} mm");
     let mut rows = vec![
         ("Mean error", mm(m.mean_mm)),
@@ -172,5 +171,5 @@ pub fn metrics(m: &Metrics) -> String {
     ];
     rows.extend(m.still_mm.map(|v| ("Mean error where nothing moves", mm(v))));
     rows.extend(m.landmarks_mm.map(|v| ("Mean error at the landmarks", mm(v))));
-    table(&[], &rows.into_iter().map(|(name, value)| vec![name.into(), value]).collect::<Vec<_>>())
+    facts(rows)
 }

@@ -4,8 +4,7 @@ use crate::report::animation::Film;
 use crate::report::chart;
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::grasp::tile;
-use crate::report::html::{document, escape, warned};
+use crate::report::html::{document, header, tiles, trusted, warned};
 use crate::report::json::{grid, seconds};
 use crate::report::panels::{centre_of_motion, gray_range, length};
 use crate::report::plot::{Line, Plot};
@@ -16,9 +15,10 @@ use crate::report::verdict::{Verdict, judge_frames, named, short2};
 use crate::report::viewer::{Layer, Moment, PackedMoment, Viewer, elements};
 use crate::report::views::{Scales, matched};
 use crate::types::{
-    DenseField, FieldParams, FrameSummary, Grid, Mask, Mesh, PointState, SparseField, StrainRow, Tracked, Voxels,
-    WorldPoint,
+    DenseField, FieldParams, FrameSummary, Grid, Mask, Mesh, MotionModel, PointState, SparseField, StrainRow, Tracked,
+    Voxels, WorldPoint,
 };
+use maud::{Markup, html};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -111,7 +111,7 @@ struct Look {
     mean_mm: f64,
     centre: WorldPoint,
     moment: PackedMoment,
-    histograms: String,
+    histograms: Markup,
 }
 
 /// A frame to look at. All on the reference's grid.
@@ -181,11 +181,12 @@ impl Looks {
         ]
         .map(|(name, values, scale)| Layer { name, values, scale });
         let displacements = Layer { name: "Displacement", values: moved, scale: lengths.clone() };
-        let mut histograms: String = std::iter::once(&displacements)
-            .chain(&overlays)
-            .map(|l| chart::distribution(l.name, l.values, &l.scale, &inside))
-            .collect();
-        histograms += &chart::precision(matches, &precision);
+        let histograms = html! {
+            @for l in std::iter::once(&displacements).chain(&overlays) {
+                (chart::distribution(l.name, l.values, &l.scale, &inside))
+            }
+            (chart::precision(matches, &precision))
+        };
         let moment = Moment {
             name: Some(name),
             images: &images,
@@ -294,69 +295,68 @@ pub fn page(report: &TrackReport<'_>) -> String {
     let (all, measured) = (t.frames.len(), report.measured().count());
     let (trust, reasons) = judge_frames(&t.frames, report.judged);
     let largest = |f: &dyn Fn(&StrainRow) -> f64| t.strain.iter().map(f).fold(0.0, f64::max);
-    let mut body = format!(
-        "<header><p class=\"brand\">palpate {}</p><h1>{} <span>and {all} more</span></h1><p class=\"verdict\">{}</p>\
-         <p class=\"trust {trust}\"><b>Trust is {trust}</b> {}.</p></header>\
-         <div class=\"tiles\">{}{}{}{}{}</div>",
-        env!("CARGO_PKG_VERSION"),
-        escape(&report.names[report.reference]),
-        escape(&report.headline()),
-        escape(&reasons.join("; ")),
-        tile(&measured.to_string(), "", "frames measured"),
-        tile(&short2(t.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max)), "mm", "largest motion"),
-        tile(&short2(largest(&|s| s.peak[0])), "", "peak principal strain"),
-        tile(&thousands(t.trajectories.len()), "", "points followed"),
-        tile(&format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "total runtime"),
-        trust = trust.name(),
-    );
-    let warnings = warnings(report);
-    body.push_str(&warned(&warnings));
     let clock: Vec<String> = (0..=all).map(|f| report.clock(f)).collect();
-    let _ = write!(
-        body,
-        "<section><h2>The sequence</h2><p class=\"lead\">Sections of each frame; the mesh moves with the tissue, its colour is the \
-         largest principal strain.</p><article class=\"wide\">{}</article></section>",
-        report.film.player(&clock)
-    );
-    body.push_str(&look(report));
-    let _ = write!(
-        body,
-        "<section><h2>Over time</h2><p class=\"lead\">E1 and E3 are the largest and the smallest principal strain (Green-Lagrange), peaks their \
-         98th and 2nd percentile; volume is its relative change.{}</p><div class=\"grid\">{}</div></section>",
-        t.together.as_ref().map_or_else(String::new, |all| format!(" All frames together: {}.", escape(&all.why))),
-        curves(report)
-    );
-    let rows: Vec<Vec<String>> = t
-        .frames
-        .iter()
-        .map(|f| {
-            let name = escape(&report.names[f.frame]);
-            match &f.lost {
-                Some(why) => vec![f.frame.to_string(), name, format!("lost: {}", escape(why))],
-                None => vec![
-                    f.frame.to_string(),
-                    name,
-                    f.model.map_or("", crate::types::MotionModel::name).into(),
-                    short2(f.mean_mm),
-                    short2(f.max_mm),
-                    thousands(f.counts.kept),
-                    short2(f.residual_mm),
-                    short2(f.uncertainty_median_mm),
-                    f.folds.to_string(),
-                ],
-            }
-        })
-        .collect();
+    let title = &report.names[report.reference];
+    let heading = html! { (title) " " span { "and " (all) " more" } };
     let head =
         ["Frame", "Volume", "Motion", "Mean, mm", "Largest, mm", "Matches", "Residual, mm", "Uncertainty, mm", "Folds"];
-    let _ = write!(body, "<section><h2>Frames</h2><article class=\"wide\">{}</article></section>", table(&head, &rows));
-    document(&escape(&format!("{} and {all} more", report.names[report.reference])), &body)
+    let body = html! {
+        (header(heading, &report.headline(), trusted(trust, &reasons)))
+        (tiles([
+            (measured.to_string(), "", "frames measured"),
+            (short2(t.frames.iter().map(|f| f.max_mm).fold(0.0, f64::max)), "mm", "largest motion"),
+            (short2(largest(&|s| s.peak[0])), "", "peak principal strain"),
+            (thousands(t.trajectories.len()), "", "points followed"),
+            (format!("{:.1}", report.seconds.iter().map(|s| s.1).sum::<f64>()), "s", "total runtime"),
+        ]))
+        (warned(&warnings(report)))
+        section {
+            h2 { "The sequence" }
+            p.lead {
+                "Sections of each frame; the mesh moves with the tissue, its colour is the largest principal strain."
+            }
+            article.wide { (report.film.player(&clock)) }
+        }
+        (look(report))
+        section {
+            h2 { "Over time" }
+            p.lead {
+                "E1 and E3 are the largest and the smallest principal strain (Green-Lagrange), peaks their 98th and 2nd \
+                 percentile; volume is its relative change."
+                @if let Some(all) = &t.together { " All frames together: " (all.why) "." }
+            }
+            div.grid { (curves(report)) }
+        }
+        section {
+            h2 { "Frames" }
+            article.wide { (table(&head, t.frames.iter().map(|f| row(&report.names[f.frame], f)))) }
+        }
+    };
+    document(&format!("{title} and {all} more"), &body)
+}
+
+/// The line of a frame.
+fn row(name: &str, f: &FrameSummary) -> Vec<String> {
+    match &f.lost {
+        Some(why) => vec![f.frame.to_string(), name.into(), format!("lost: {why}")],
+        None => vec![
+            f.frame.to_string(),
+            name.into(),
+            f.model.map_or("", MotionModel::name).into(),
+            short2(f.mean_mm),
+            short2(f.max_mm),
+            thousands(f.counts.kept),
+            short2(f.residual_mm),
+            short2(f.uncertainty_median_mm),
+            f.folds.to_string(),
+        ],
+    }
 }
 
 /// The viewer, where a frame was measured.
-fn look(report: &TrackReport<'_>) -> String {
-    let Some((looks, reference, mask)) = report.look else { return String::new() };
-    let Some(first) = looks.first() else { return String::new() };
+fn look(report: &TrackReport<'_>) -> Markup {
+    let Some((looks, reference, mask)) = report.look else { return Markup::default() };
+    let Some(first) = looks.first() else { return Markup::default() };
     let mut held: Vec<&Look> = looks.held.iter().collect();
     held.sort_by_key(|l| l.frame);
     let values = reference.as_slice();
@@ -369,54 +369,52 @@ fn look(report: &TrackReport<'_>) -> String {
         moments: &held.iter().map(|l| &l.moment).collect::<Vec<_>>(),
         first: held.iter().position(|l| l.frame == first.frame).unwrap_or_default(),
     };
-    let (clock, measured) = (escape(&report.clock(first.frame)), report.measured().count());
+    let (clock, measured) = (report.clock(first.frame), report.measured().count());
     let held = match held.len() {
         1 if measured > 1 => format!("The frame that moves most, {clock}."),
         n if n < measured => format!("{n} of the {measured} frames, at first the one that moves most, {clock}."),
         _ => format!("Every frame measured, at first the one that moves most, {clock}."),
     };
-    format!(
-        "<section><h2>Look</h2><p class=\"lead\">{held} Click or drag in a picture to move the planes, scroll to go through the \
-         slices.</p><div class=\"grid\"><article class=\"wide\">{}</article><article class=\"wide\"><h3>Distributions, {clock}</h3>\
-         <div class=\"charts\">{}</div></article></div></section>",
-        viewer.html(),
-        first.histograms
-    )
+    html! {
+        section {
+            h2 { "Look" }
+            p.lead {
+                (held) " Click or drag in a picture to move the planes, scroll to go through the slices."
+            }
+            div.grid {
+                article.wide { (viewer.html()) }
+                article.wide { h3 { "Distributions, " (clock) } div.charts { (first.histograms) } }
+            }
+        }
+    }
 }
 
 /// Labels whose strain is drawn in sight; that of the others is folded away below.
 const IN_SIGHT: usize = 8;
 
 /// Motion and points over time, and strain of each region.
-fn curves(report: &TrackReport<'_>) -> String {
+fn curves(report: &TrackReport<'_>) -> Markup {
     let t = report.tracked;
     let across = if report.step_s.is_some() { "time, s" } else { "frame" };
-    let draw =
-        |title: &str, lines: &[Line]| format!("<article>{}</article>", Plot { title, across, marks: &[] }.draw(lines));
+    let draw = |title: &str, lines: &[Line]| html! { article { (Plot { title, across, marks: &[] }.shown(lines)) } };
     // A lost frame interrupts the lines.
     let frames = |still: f64, f: &dyn Fn(&FrameSummary) -> f64| {
         let value = |s: &FrameSummary| if s.lost.is_some() { f64::NAN } else { f(s) };
         over_time(report, still, t.frames.iter().map(|s| (s.frame, value(s))))
     };
-    let mut out = draw(
-        "Displacement, mm",
-        &[
-            Line::new("mean", 0, false, frames(0.0, &|s| s.mean_mm)),
-            Line::new("largest", 1, false, frames(0.0, &|s| s.max_mm)),
-            Line::new("uncertainty", 2, true, frames(0.0, &|s| s.uncertainty_median_mm)),
-        ],
-    );
+    let displacement = [
+        Line::new("mean", 0, false, frames(0.0, &|s| s.mean_mm)),
+        Line::new("largest", 1, false, frames(0.0, &|s| s.max_mm)),
+        Line::new("uncertainty", 2, true, frames(0.0, &|s| s.uncertainty_median_mm)),
+    ];
     let state = |frame: usize, state: PointState| {
         t.trajectories.iter().filter(|p| p.places[frame].is_some_and(|p| p.state == state)).count() as f64
     };
     let all = t.trajectories.len() as f64;
-    out += &draw(
-        "Points",
-        &[
-            Line::new("measured", 0, false, frames(all, &|s| state(s.frame, PointState::Measured))),
-            Line::new("carried", 1, false, frames(0.0, &|s| state(s.frame, PointState::Carried))),
-        ],
-    );
+    let points = [
+        Line::new("measured", 0, false, frames(all, &|s| state(s.frame, PointState::Measured))),
+        Line::new("carried", 1, false, frames(0.0, &|s| state(s.frame, PointState::Carried))),
+    ];
     let mut by_label: BTreeMap<u8, Vec<&StrainRow>> = BTreeMap::new();
     t.strain.iter().for_each(|s| by_label.entry(s.label).or_default().push(s));
     let strain = |(label, rows): (&u8, &Vec<&StrainRow>)| {
@@ -433,15 +431,18 @@ fn curves(report: &TrackReport<'_>) -> String {
         ];
         draw(&format!("Strain, label {label}"), &lines)
     };
-    out.extend(by_label.iter().take(IN_SIGHT).map(strain));
-    let rest: String = by_label.iter().skip(IN_SIGHT).map(strain).collect();
-    let Some(more) = by_label.len().checked_sub(IN_SIGHT).filter(|n| *n > 0) else { return out };
-    let _ = write!(
-        out,
-        "<details class=\"wide\"><summary>Strain of {more} more label{}</summary><div class=\"grid\">{rest}</div></details>",
-        if more == 1 { "" } else { "s" }
-    );
-    out
+    let more = by_label.len().saturating_sub(IN_SIGHT);
+    html! {
+        (draw("Displacement, mm", &displacement))
+        (draw("Points", &points))
+        @for label in by_label.iter().take(IN_SIGHT) { (strain(label)) }
+        @if more > 0 {
+            details.wide {
+                summary { "Strain of " (more) " more label" @if more > 1 { "s" } }
+                div.grid { @for label in by_label.iter().skip(IN_SIGHT) { (strain(label)) } }
+            }
+        }
+    }
 }
 
 /// Places of a line by frame; in the reference the value is `still`.
@@ -515,7 +516,7 @@ mod tests {
 
     #[test]
     fn all_labels_are_drawn_and_those_past_the_eighth_folded_away() {
-        let drawn = |labels: u8| told(&sequence(labels), curves);
+        let drawn = |labels: u8| told(&sequence(labels), curves).into_string();
         assert!(!drawn(8).contains("<details"));
         let many = drawn(30);
         let (open, folded) = many.split_once("<details").unwrap();
@@ -526,7 +527,7 @@ mod tests {
 
     #[test]
     fn a_lost_frame_interrupts_the_curves_and_frames_are_whole() {
-        let drawn = told(&sequence(1), curves);
+        let drawn = told(&sequence(1), curves).into_string();
         assert!(!drawn.contains("NaN") && !drawn.contains(">0.5<") && !drawn.contains(">1.5<"), "{drawn}");
         // Frame 0 to 1, and 3 to 4.
         let lines = drawn.split("class=\"line c").skip(1).map(|l| l.split('"').nth(2).unwrap_or_default());

@@ -8,12 +8,13 @@
 
 use crate::report::colormap::ColorMap;
 use crate::report::field::Values;
-use crate::report::html::{escape, figure};
+use crate::report::html::figure;
 use crate::report::scale::Scale;
-use crate::report::section::Canonical;
+use crate::report::section::{Canonical, Plane};
 use crate::types::{DenseField, Grid, Mask, Match, Mesh, WorldPoint};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use libdeflater::{CompressionLvl, Compressor};
+use maud::{Markup, PreEscaped, html};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -261,7 +262,7 @@ impl Moment<'_> {
 
 impl Viewer<'_> {
     /// Markup, data and script.
-    pub fn html(&self) -> String {
+    pub fn html(&self) -> Markup {
         let canonical = Canonical::of(self.grid);
         let (fine, coarse) = (Thinned::new(&canonical, IMAGE_VOXELS), Thinned::new(&canonical, SMOOTH_VOXELS[0]));
         let mask = self.mask.map(|mask| {
@@ -282,21 +283,6 @@ impl Viewer<'_> {
             "first": self.first,
             "colours": colours,
         });
-        let views: String = planes
-            .iter()
-            .map(|p| {
-                let size = canonical.size_mm(*p);
-                let [w, h] = size;
-                let canvas =
-                    format!("<canvas style=\"aspect-ratio:{w:.2}/{h:.2}\" aria-label=\"{}\"></canvas>", p.name());
-                format!(
-                    "<div style=\"flex:{:.2}\">{}<input type=\"range\" aria-label=\"slice of the {} plane\"></div>",
-                    size[0],
-                    figure(*p, size, &canvas),
-                    p.name()
-                )
-            })
-            .collect();
         // As large as fits on a laptop's screen in one piece.
         let sizes: Vec<[f64; 2]> = planes.iter().map(|p| canonical.size_mm(*p)).collect();
         let tallest = sizes.iter().map(|s| s[1]).fold(1e-9, f64::max);
@@ -306,65 +292,84 @@ impl Viewer<'_> {
         if text.as_bytes().contains(&b'<') {
             text = text.replace("</", "<\\/");
         }
-        format!(
-            "<div class=\"viewer\">{}<div class=\"planes\" style=\"max-width:{most:.0}px\">{views}</div><p><output></output></p>{}<p class=\"state\">The \
-             viewer needs JavaScript.</p><script type=\"application/json\">{text}</script></div><script>{}</script>",
-            self.choices(),
-            "<div class=\"bar\" hidden><i></i><span></span><span></span><span></span></div>",
-            include_str!("viewer.js")
-        )
+        html! {
+            div.viewer {
+                (self.choices())
+                div.planes style=(format_args!("max-width:{most:.0}px")) {
+                    @for (p, size) in planes.iter().zip(&sizes) { (view(*p, *size)) }
+                }
+                p { output {} }
+                div.bar hidden { i {} span {} span {} span {} }
+                p.state { "The viewer needs JavaScript." }
+                script type="application/json" { (PreEscaped(text)) }
+            }
+            script { (PreEscaped(include_str!("viewer.js"))) }
+        }
     }
 
     /// What can be chosen.
-    fn choices(&self) -> String {
-        let options = |names: &[&str], chosen: usize| -> String {
-            let one = |(i, n): (usize, &&str)| {
-                let selected = if i == chosen { " selected" } else { "" };
-                format!("<option value=\"{i}\"{selected}>{}</option>", escape(n))
-            };
-            names.iter().enumerate().map(one).collect()
-        };
+    fn choices(&self) -> Markup {
         let none = Value::Null;
         let now = self.moments.get(self.first).map_or(&none, |m| &m.data);
         let named = |list: &'static str| now[list].as_array().into_iter().flatten().filter_map(|l| l["name"].as_str());
         let [moves, matches, mesh] = ["field", "matches", "mesh"].map(|part| !now[part].is_null());
         let names: Vec<&str> = named("overlays").collect();
         let images: Vec<&str> = self.images.iter().map(|l| l.name).chain(named("images")).collect();
-        let check = |name: &str, words: &str, there: bool, on: bool| match there {
-            true => {
-                let checked = if on { " checked" } else { "" };
-                format!("<label><input type=\"checkbox\" name=\"{name}\"{checked}> {words}</label>")
+        let shown = self.shown.map_or(if moves { 0 } else { usize::MAX }, |n| n + usize::from(moves));
+        html! {
+            div.choices {
+                @if self.moments.len() > 1 {
+                    label {
+                        "moment "
+                        input type="range" name="moment" min="0" max=(self.moments.len() - 1) value=(self.first);
+                        b {}
+                    }
+                }
+                select name="image" aria-label="Image" { (options(&images, 0)) }
+                select name="compare" aria-label="Compare" hidden[images.len() < 2] {
+                    option value="alone" { "alone" }
+                    option value="flicker" { "flicker with" }
+                    option value="checkerboard" { "checkerboard with" }
+                }
+                select name="other" aria-label="Other image" hidden { (options(&images, images.len() - 1)) }
+                select name="colour" aria-label="Colour" {
+                    option value="-1" { "no colour" }
+                    (options(&names, shown))
+                }
+                label { "opacity " input type="range" name="opacity" min="0" max="100" value="60"; }
+                @if moves { (check("arrows", "arrows", true)) (check("grid", "grid", false)) }
+                label hidden[!moves] {
+                    "drawn longer "
+                    input type="range" name="factor" min="0" max="9" value="0";
+                    b {}
+                }
+                @if matches { (check("matches", "matches", false)) }
+                @if mesh { (check("tetrahedra", "mesh", false)) }
+                (check("cross", "cross", true))
             }
-            false => String::new(),
-        };
-        let compare = if images.len() > 1 { "" } else { " hidden" };
-        let moment = match self.moments.len() {
-            0 | 1 => String::new(),
-            n => format!(
-                "<label>moment <input type=\"range\" name=\"moment\" min=\"0\" max=\"{}\" value=\"{}\"><b></b></label>",
-                n - 1,
-                self.first
-            ),
-        };
-        format!(
-            "<div class=\"choices\">{moment}<select name=\"image\" aria-label=\"Image\">{}</select>\
-             <select name=\"compare\" aria-label=\"Compare\"{compare}><option value=\"alone\">alone</option>\
-             <option value=\"flicker\">flicker with</option><option value=\"checkerboard\">checkerboard with</option></select>\
-             <select name=\"other\" aria-label=\"Other image\" hidden>{}</select>\
-             <select name=\"colour\" aria-label=\"Colour\"><option value=\"-1\">no colour</option>{}</select>\
-             <label>opacity <input type=\"range\" name=\"opacity\" min=\"0\" max=\"100\" value=\"60\"></label>{}{}\
-             <label{}>drawn longer <input type=\"range\" name=\"factor\" min=\"0\" max=\"9\" value=\"0\"><b></b></label>{}{}{}</div>",
-            options(&images, 0),
-            options(&images, images.len() - 1),
-            options(&names, self.shown.map_or(if moves { 0 } else { usize::MAX }, |n| n + usize::from(moves))),
-            check("arrows", "arrows", moves, moves),
-            check("grid", "grid", moves, false),
-            if moves { "" } else { " hidden" },
-            check("matches", "matches", matches, false),
-            check("tetrahedra", "mesh", mesh, false),
-            check("cross", "cross", true, true)
-        )
+        }
     }
+}
+
+/// A picture of a plane (mm) with its slider.
+fn view(plane: Plane, [w, h]: [f64; 2]) -> Markup {
+    let canvas = html! { canvas style=(format_args!("aspect-ratio:{w:.2}/{h:.2}")) aria-label=(plane.name()) {} };
+    html! {
+        div style=(format_args!("flex:{w:.2}")) {
+            (figure(plane, [w, h], canvas))
+            input type="range" aria-label={ "slice of the " (plane.name()) " plane" };
+        }
+    }
+}
+
+/// Names to choose from.
+fn options(names: &[&str], chosen: usize) -> Markup {
+    html! { @for (i, name) in names.iter().enumerate() { option value=(i) selected[i == chosen] { (name) } } }
+}
+
+/// A box with its words.
+fn check(name: &str, words: &str, on: bool) -> Markup {
+    html! { label { input type="checkbox" name=(name) checked[on]; " " (words) } }
 }
 
 #[cfg(test)]
@@ -423,7 +428,7 @@ mod tests {
             moments: &[&moment.pack(&grid)],
             first: 0,
         };
-        let data = data(&viewer.html());
+        let data = data(&viewer.html().into_string());
         let moment = &data["moments"][0];
         assert_eq!(data["images"][0]["shape"], json!([4, 4, 5]));
         assert_eq!(unpack(&data["images"][0]["data"])[..8], [0, 3, 6, 9, 0, 3, 6, 9]);
