@@ -160,7 +160,7 @@ pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
                 article { (strain(c)) }
                 article {
                     h3 { "Strain by gauge" }
-                    (table(&["Gauge, mm", "Noise, %", "Told from noise from, %"], gauges))
+                    (table(&["Gauge, mm", "Noise, %", "Smallest strain seen, %"], gauges))
                 }
                 (blind(report)?)
                 article { h3 { "Settings" } (settings(report)) }

@@ -145,9 +145,10 @@ fn room(
 
 fn hover(s: &Standing, unit: &str) -> String {
     let failed = if s.failures > 0 { format!(", {} without a result", s.failures) } else { String::new() };
+    let plural = if s.cases == 1 { "" } else { "s" };
     let front = if s.on_front { "; on the front" } else { "" };
     format!(
-        "{}: {}\nerror {} {unit}, {} s of CPU time over {} cases{failed}{front}",
+        "{}: {}\nerror {} {unit}, {} s of CPU time over {} case{plural}{failed}{front}",
         s.method,
         s.settings,
         significant(s.error),
@@ -256,6 +257,7 @@ fn number(v: f64) -> String {
 pub fn page(groups: &[Group], trials: &[Trial]) -> String {
     let row = |s: &Standing| {
         let failures = if s.failures > 0 { s.failures.to_string() } else { String::new() };
+        let plural = if s.cases == 1 { "" } else { "s" };
         let front = if s.on_front { "front" } else { "" };
         let [error, seconds] = [s.error, s.cpu_s].map(number);
         [s.method.clone(), s.settings.clone(), error, seconds, s.cases.to_string(), failures, front.into()]

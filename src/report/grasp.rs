@@ -352,7 +352,7 @@ pub fn page(report: &GraspReport<'_>) -> String {
         section {
             h2 { "The grasp" }
             p.lead {
-                "Arrows are the contact forces on the object; the line is the way of its centre."
+                "Arrows are the contact forces on the object; the line is the path of its centre."
             }
             div.grid {
                 article { (animation(scene, &run.samples)) }

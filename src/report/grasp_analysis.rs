@@ -295,7 +295,7 @@ fn surface_card(a: &GraspAnalysis, step: usize) -> Result<Markup, ReportError> {
     Ok(html! {
         article {
             h3 { (title) }
-            p { "With friction, smallest eigenvalue at the own equilibrium: " (classes.join("; ")) "." }
+            p { "With friction, smallest eigenvalue at the equilibrium of each model: " (classes.join("; ")) "." }
             div.surfaces {
                 @for (both, largest) in ["y", "x"].map(|axis| energies(a, step, axis)) {
                     @for s in both {
@@ -381,15 +381,15 @@ pub fn page(report: &AnalysisReport<'_>) -> Result<String, ReportError> {
         section {
             h2 { "Force depends on posture" }
             p.lead {
-                "Along the back plate's normal. Lines: springs in parallel; dashed: springs along radii, which know no posture."
+                "Along the back plate's normal. Lines: springs in parallel; dashed: springs along radii, which do not depend on posture."
             }
             div.plots { (force_plots(&a.force)) }
         }
         section {
             h2 { "Energy about the postures" }
             p.lead {
-                "Joints fixed, tips and gravity, less the energy at the posture (the cross). Red is more, blue is less, bands \
-                 are even in the root; gray is out of the model's range. Eigenvalues belong to (x, y, radius times theta)."
+                "Joints fixed, tips and gravity, less the energy at the posture (the cross). Red is more, blue is less, in \
+                 bands even in the square root; gray is out of the model's range. Eigenvalues belong to (x, y, radius times theta)."
             }
             div.grid {
                 article.wide {

@@ -61,7 +61,7 @@ fn own(plan: &Plan, region: &PlannedRegion) -> String {
     let Some(best) = plan.best(region.label) else { return String::new() };
     let hint = match best.scatter < BY_NOISE * best.sd {
         true => {
-            "What limits it is how well its border and faces are known: smaller voxels or a smaller --label-sd help, less noise hardly."
+            "What limits it is how well its border and faces are known: use smaller voxels or a smaller --label-sd; less noise helps little."
         }
         false => "Press more, lower the noise, or load it from another side.",
     };

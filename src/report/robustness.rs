@@ -184,7 +184,7 @@ pub fn page(curves: &[StressCurve], stated: Option<&Stated>) -> String {
         p.lead {
             "Severity grows to the right. The dotted line is the limit. On the axis, an upright stroke marks where at least \
              half of the runs break, a dashed one where at least half say that something is wrong. Hollow: refused. Red \
-             crosses: broken and silent. Errors below a thousandth of the limit are drawn at that, runs without a result at \
+             crosses: broken and silent. Errors below a thousandth of the limit are drawn at that thousandth, runs without a result at \
              the top."
         }
         article.wide { (PreEscaped(svg(curves))) }
