@@ -6,7 +6,9 @@
 use palpate::evaluate;
 use palpate::numerics::random::Random;
 use palpate::pipeline::field::{FieldResult, run};
+use palpate::synth::MotionKind;
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, MotionModel, Volume};
+use palpate::{PhantomKind, PhantomParams, phantom};
 
 const SHAPE: [usize; 3] = [56, 56, 48];
 
@@ -158,6 +160,22 @@ fn hot_voxels_cost_no_accuracy() {
             let (_, error) = measured(&pair, false);
             assert!(error < 1.1 * least, "{count} at {times}, {run_of} in a row: {error} for {least}");
         }
+    }
+}
+
+#[test]
+fn a_body_that_turned_far_is_found() {
+    let turned = |kind, size, degrees| {
+        let params = PhantomParams::new(kind).sized(size).moving(MotionKind::Rotate);
+        let pair = phantom(&PhantomParams { amplitude: degrees, ..params }).unwrap();
+        let found = run(&pair.initial, &pair.deformed, Some(&pair.mask), &FieldParams::default(), &|_, _| {}).unwrap();
+        evaluate::metrics(&found.displacement, &pair.truth, Some(&pair.mask), &[]).unwrap()
+    };
+    for (kind, size, degrees) in
+        [(PhantomKind::Slice, 128, 50.0), (PhantomKind::Slice, 128, 70.0), (PhantomKind::Calf, 56, 45.0)]
+    {
+        let score = turned(kind, size, degrees);
+        assert!(score.mean_mm < 0.05 * score.identity_mm, "{kind:?} {degrees}: {score:?}");
     }
 }
 

@@ -29,6 +29,21 @@ impl AffineMotion {
     /// Nothing moves.
     pub const IDENTITY: Self = Self { linear: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], shift: [0.0; 3] };
 
+    /// The rotation by a vector (axis times angle, rad) about `centre` (mm).
+    ///
+    /// ```
+    /// use palpate::consistency::models::AffineMotion;
+    /// let quarter = std::f64::consts::FRAC_PI_2;
+    /// let motion = AffineMotion::rotation_about([0.0, 0.0, quarter], [1.0, 0.0, 0.0]);
+    /// let u = motion.displacement([2.0, 0.0, 7.0]);
+    /// assert!((u[0] + 1.0).abs() < 1e-12 && (u[1] - 1.0).abs() < 1e-12 && u[2].abs() < 1e-12);
+    /// ```
+    pub fn rotation_about(vector: [f64; 3], centre: [f64; 3]) -> Self {
+        let linear = rotation(vector);
+        let moved = matvec(&linear, centre);
+        Self { linear, shift: std::array::from_fn(|a| centre[a] - moved[a]) }
+    }
+
     /// Displacement at `x` (mm).
     ///
     /// ```

@@ -116,8 +116,14 @@ impl<'a> CoarseToFine<'a, '_> {
             account.matched = 0.0;
             let tick = |p: usize| self.tell("residual", place, 0.1 + 0.8 * (p + 1) as f64 / level.passes as f64);
             let matching = || self.tell("matching", place, 0.0);
-            let search =
-                Search { params: self.params, range: account.range, flat: self.flat, matching: &matching, tick: &tick };
+            let search = Search {
+                params: self.params,
+                range: account.range,
+                flat: self.flat,
+                turns: true,
+                matching: &matching,
+                tick: &tick,
+            };
             let mut entry = match coarser.take() {
                 Some(coarser) => self.carried(&search, &level, &pair, coarser, &mut account),
                 None => self.begun(&search, &level, &mut pair, &tissue, &mut account),
@@ -312,7 +318,7 @@ impl<'a> CoarseToFine<'a, '_> {
             found = Begun::more_consistent(pair, found, wider);
         }
         if self.params.search_mm == 0.0 && found.leaves_open(pair, search.range) {
-            let far = Search { range: WIDE_SEARCH_RATIO * search.range, ..*search };
+            let far = Search { range: WIDE_SEARCH_RATIO * search.range, turns: false, ..*search };
             let wide = far.begin((pair, factor), lattice, self.starts_given(), passes, matched);
             let taken = wide.improves_on(pair, &found);
             asked.push(noted(why_farther(search.range, &found, &wide, taken)));

@@ -113,7 +113,14 @@ impl<'a> Scene<'a> {
             }
             None => {
                 let flat = pair.shape.contains(&1);
-                let search = Search { params: self.params, range: self.range, flat, matching: &|| (), tick: &|_| () };
+                let search = Search {
+                    params: self.params,
+                    range: self.range,
+                    flat,
+                    turns: false,
+                    matching: &|| (),
+                    tick: &|_| (),
+                };
                 search.begin((pair, factor), &lattice, &[], passes, &mut 0.0).motion
             }
         }

@@ -1,7 +1,7 @@
 //! Where the passes begin: with what a search of the volume says, with a field known from the frame
 //! before, or at rest.
 
-use crate::consistency::models::nearest_rigid;
+use crate::consistency::models::{AffineMotion, nearest_rigid};
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::ablation;
@@ -114,6 +114,18 @@ struct RigidSearch {
     min_kept_ratio: f64,
 }
 
+/// Searches about rotations of the whole (docs/lab/2026-11-rotations.md).
+struct RotationSearch {
+    /// Step in one slice (degrees): half of it is found from the nearest start.
+    slice_degrees: f64,
+    /// Angle to either side about each axis of a volume (degrees), where more is found.
+    volume_degrees: f64,
+    /// Features of each: enough to tell the shares of two apart by a tenth.
+    features: usize,
+}
+
+const ROTATION_SEARCH: RotationSearch = RotationSearch { slice_degrees: 20.0, volume_degrees: 40.0, features: 200 };
+
 const RIGID_SEARCH: RigidSearch = RigidSearch { max_count: 3, min_kept_ratio: 0.9 };
 
 /// What the coarsest level found.
@@ -184,6 +196,37 @@ impl Begun {
     }
 }
 
+/// The matches of a search, their field, and what was counted.
+type Matched = (Vec<LevelMatch>, Option<SplineField>, LevelReport);
+
+/// The field of a rigid motion.
+fn on_lattice(lattice: &Lattice, pair: &Pair<'_>, motion: &AffineMotion) -> SplineField {
+    let moved = |p: [f64; 3]| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a]));
+    SplineField { coefficients: lattice.fit(moved), ..SplineField::still(lattice.clone()) }
+}
+
+/// Rotations about the centre of the tissue: all of them in one slice, to either side about each
+/// axis in a volume.
+fn rotations(pair: &Pair<'_>) -> Vec<AffineMotion> {
+    let [nx, ny, _] = pair.shape;
+    let inside = (0..pair.mask.len()).filter(|&at| pair.mask[at] != 0);
+    let sum = inside.fold([0.0; 3], |s, at| {
+        let p = [at % nx, at / nx % ny, at / (nx * ny)];
+        std::array::from_fn(|a| s[a] + p[a] as f64 * pair.spacing[a])
+    });
+    let centre = sum.map(|s| s / pair.inside.max(1) as f64);
+    let turned = |axis: usize, degrees: f64| {
+        let mut vector = [0.0; 3];
+        vector[axis] = degrees.to_radians();
+        AffineMotion::rotation_about(vector, centre)
+    };
+    let RotationSearch { slice_degrees: step, volume_degrees: side, .. } = ROTATION_SEARCH;
+    match (0..3).find(|&a| pair.shape[a] == 1) {
+        Some(axis) => (1..(360.0 / step) as usize).map(|n| turned(axis, n as f64 * step)).collect(),
+        None => (0..3).flat_map(|axis| [-side, side].map(|angle| turned(axis, angle))).collect(),
+    }
+}
+
 /// How a whole volume is searched.
 #[derive(Clone, Copy)]
 pub(super) struct Search<'a> {
@@ -192,6 +235,8 @@ pub(super) struct Search<'a> {
     pub range: f64,
     /// Whether the volumes are one slice.
     pub flat: bool,
+    /// Whether rotations of the whole are tried where few features agree.
+    pub turns: bool,
     /// Called as matching begins.
     pub matching: &'a dyn Fn(),
     /// Called after each pass with its number.
@@ -261,36 +306,54 @@ impl Search<'_> {
     }
 
     /// The field of the matches of a whole volume; none where these are too few. If few features
-    /// agree they are sought again about the rigid motion that most agree on, for as long as no
-    /// fewer agree there: patches that turned by much are hardly alike.
+    /// agree, they are sought again about the rigid motion that most agree on, then about rotations
+    /// of the whole: patches that turned by much are hardly alike.
     fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
         let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
-        let agreed = |matches: &[LevelMatch]| matches.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
-        let (matches, field, report) = level::matches(pair, None, wide);
-        let (mut kept, mut best) = (agreed(&matches), (field, report, matches));
+        let mut best = self.settled(pair, lattice, level::matches(pair, None, wide));
+        if self.turns && best.2.counts.kept_share() < KEPT_SHARE.in_range && ablation::is_on("rotations") {
+            let some = self.wide(pair, self.range, ROTATION_SEARCH.features);
+            let share = |found: &Matched| found.2.counts.kept_share();
+            let tried = rotations(pair).into_iter().map(|turn| {
+                let about = on_lattice(lattice, pair, &turn);
+                (share(&level::matches_again(pair, &about, some)), about)
+            });
+            let most = tried.max_by(|a, b| a.0.total_cmp(&b.0)).filter(|turned| turned.0 > share(&best));
+            let again = most.map(|(_, about)| level::matches_again(pair, &about, wide));
+            if let Some(found) = again.filter(|f| f.2.counts.kept > best.2.counts.kept) {
+                best = self.settled(pair, lattice, found);
+            }
+        }
+        let (matches, field, report) = best;
+        let enough = report.counts.kept >= WHOLE_SEARCH.min_matches;
+        (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
+    }
+
+    /// What a search found, or a further one about the rigid motion that most of its features agree
+    /// on, for as long as no fewer agree there.
+    fn settled(&self, pair: &Pair<'_>, lattice: &Lattice, found: Matched) -> Matched {
+        let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
+        let agreed = |found: &Matched| found.0.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
+        let (mut kept, mut best) = (agreed(&found), found);
         for _ in 0..RIGID_SEARCH.max_count {
-            let before = best.1.counts;
+            let before = best.2.counts;
             if before.kept_share() >= KEPT_SHARE.confirmed
                 || kept.len() < WHOLE_SEARCH.min_matches
                 || !ablation::is_on("turned")
             {
                 break;
             }
-            let rigid = nearest_rigid(&kept);
-            let moved = |p: [f64; 3]| rigid.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a]));
-            let about = SplineField { coefficients: lattice.fit(moved), ..SplineField::still(lattice.clone()) };
-            let (matches, field, report) = level::matches_again(pair, &about, wide);
-            kept = agreed(&matches);
-            let now = report.counts.kept;
+            let about = on_lattice(lattice, pair, &nearest_rigid(&kept));
+            let found = level::matches_again(pair, &about, wide);
+            kept = agreed(&found);
+            let now = found.2.counts.kept;
             if now > before.kept {
-                best = (field, report, matches);
+                best = found;
             } else if (now as f64) < RIGID_SEARCH.min_kept_ratio * before.kept as f64 {
                 break;
             }
         }
-        let (field, report, matches) = best;
-        let enough = report.counts.kept >= WHOLE_SEARCH.min_matches;
-        (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
+        best
     }
 
     /// The field of the matches of a whole volume on `lattice`; stillness where they are too few.

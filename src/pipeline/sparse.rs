@@ -148,7 +148,8 @@ impl<'a> Levels<'a> {
             (self.progress)("matching", 0.9 * l as f64 / self.factors.len() as f64);
             let lattice = level::lattice(&pair, NODE_SPACING_VOXELS);
             let begun = match &state {
-                None => Search { params, range, flat, matching: &|| (), tick: &|_| () }.by_matches(&pair, &lattice),
+                None => Search { params, range, flat, turns: true, matching: &|| (), tick: &|_| () }
+                    .by_matches(&pair, &lattice),
                 Some((found, _, from)) => {
                     level::carry(&found.field, lattice, |p| to_level(from_level(p, factor), *from))
                 }

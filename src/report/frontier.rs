@@ -257,7 +257,6 @@ fn number(v: f64) -> String {
 pub fn page(groups: &[Group], trials: &[Trial]) -> String {
     let row = |s: &Standing| {
         let failures = if s.failures > 0 { s.failures.to_string() } else { String::new() };
-        let plural = if s.cases == 1 { "" } else { "s" };
         let front = if s.on_front { "front" } else { "" };
         let [error, seconds] = [s.error, s.cpu_s].map(number);
         [s.method.clone(), s.settings.clone(), error, seconds, s.cases.to_string(), failures, front.into()]
