@@ -405,7 +405,6 @@ fn too_little_memory_is_refused_before_the_voxels_are_read() {
         ("phantom block --size 400", "--size"),
         ("demo --size 400", "--size"),
         ("stress --part stiffness --quick", "--part"),
-        ("stress --part field", "--threads"),
     ];
     for (command, named) in commands {
         let output = shell(folder.path(), "ulimit -v 150000", &format!("{command} -o results --threads 1"));
