@@ -114,6 +114,8 @@ struct RigidSearch {
     min_kept_ratio: f64,
 }
 
+const RIGID_SEARCH: RigidSearch = RigidSearch { max_count: 3, min_kept_ratio: 0.9 };
+
 /// Searches about rotations of the whole (docs/lab/2026-11-rotations.md).
 struct RotationSearch {
     /// Step in one slice (degrees): half of it is found from the nearest start.
@@ -125,8 +127,6 @@ struct RotationSearch {
 }
 
 const ROTATION_SEARCH: RotationSearch = RotationSearch { slice_degrees: 20.0, volume_degrees: 40.0, features: 200 };
-
-const RIGID_SEARCH: RigidSearch = RigidSearch { max_count: 3, min_kept_ratio: 0.9 };
 
 /// What the coarsest level found.
 pub(super) struct Begun {
@@ -205,6 +205,32 @@ fn on_lattice(lattice: &Lattice, pair: &Pair<'_>, motion: &AffineMotion) -> Spli
     SplineField { coefficients: lattice.fit(moved), ..SplineField::still(lattice.clone()) }
 }
 
+/// What a search found, or a further one about the rigid motion that most of its features agree
+/// on, for as long as no fewer agree there.
+fn settled(pair: &Pair<'_>, lattice: &Lattice, found: Matched, wide: MatchParams) -> Matched {
+    let agreed = |found: &Matched| found.0.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
+    let (mut kept, mut best) = (agreed(&found), found);
+    for _ in 0..RIGID_SEARCH.max_count {
+        let before = best.2.counts;
+        if before.kept_share() >= KEPT_SHARE.confirmed
+            || kept.len() < WHOLE_SEARCH.min_matches
+            || !ablation::is_on("turned")
+        {
+            break;
+        }
+        let about = on_lattice(lattice, pair, &nearest_rigid(&kept));
+        let found = level::matches_again(pair, &about, wide);
+        kept = agreed(&found);
+        let now = found.2.counts.kept;
+        if now > before.kept {
+            best = found;
+        } else if (now as f64) < RIGID_SEARCH.min_kept_ratio * before.kept as f64 {
+            break;
+        }
+    }
+    best
+}
+
 /// Rotations about the centre of the tissue: all of them in one slice, to either side about each
 /// axis in a volume.
 fn rotations(pair: &Pair<'_>) -> Vec<AffineMotion> {
@@ -235,7 +261,7 @@ pub(super) struct Search<'a> {
     pub range: f64,
     /// Whether the volumes are one slice.
     pub flat: bool,
-    /// Whether rotations of the whole are tried where few features agree.
+    /// Whether rotations of the whole are tried if few features agree.
     pub turns: bool,
     /// Called as matching begins.
     pub matching: &'a dyn Fn(),
@@ -310,7 +336,7 @@ impl Search<'_> {
     /// of the whole: patches that turned by much are hardly alike.
     fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
         let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
-        let mut best = self.settled(pair, lattice, level::matches(pair, None, wide));
+        let mut best = settled(pair, lattice, level::matches(pair, None, wide), wide);
         if self.turns && best.2.counts.kept_share() < KEPT_SHARE.in_range && ablation::is_on("rotations") {
             let some = self.wide(pair, self.range, ROTATION_SEARCH.features);
             let share = |found: &Matched| found.2.counts.kept_share();
@@ -321,39 +347,12 @@ impl Search<'_> {
             let most = tried.max_by(|a, b| a.0.total_cmp(&b.0)).filter(|turned| turned.0 > share(&best));
             let again = most.map(|(_, about)| level::matches_again(pair, &about, wide));
             if let Some(found) = again.filter(|f| f.2.counts.kept > best.2.counts.kept) {
-                best = self.settled(pair, lattice, found);
+                best = settled(pair, lattice, found, wide);
             }
         }
         let (matches, field, report) = best;
         let enough = report.counts.kept >= WHOLE_SEARCH.min_matches;
         (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
-    }
-
-    /// What a search found, or a further one about the rigid motion that most of its features agree
-    /// on, for as long as no fewer agree there.
-    fn settled(&self, pair: &Pair<'_>, lattice: &Lattice, found: Matched) -> Matched {
-        let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
-        let agreed = |found: &Matched| found.0.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
-        let (mut kept, mut best) = (agreed(&found), found);
-        for _ in 0..RIGID_SEARCH.max_count {
-            let before = best.2.counts;
-            if before.kept_share() >= KEPT_SHARE.confirmed
-                || kept.len() < WHOLE_SEARCH.min_matches
-                || !ablation::is_on("turned")
-            {
-                break;
-            }
-            let about = on_lattice(lattice, pair, &nearest_rigid(&kept));
-            let found = level::matches_again(pair, &about, wide);
-            kept = agreed(&found);
-            let now = found.2.counts.kept;
-            if now > before.kept {
-                best = found;
-            } else if (now as f64) < RIGID_SEARCH.min_kept_ratio * before.kept as f64 {
-                break;
-            }
-        }
-        best
     }
 
     /// The field of the matches of a whole volume on `lattice`; stillness where they are too few.

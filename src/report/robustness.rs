@@ -178,7 +178,7 @@ pub fn page(curves: &[StressCurve], stated: Option<&Stated>) -> String {
     let runs: usize = curves.iter().map(|c| c.runs.len()).sum();
     let silent: usize = curves.iter().map(|c| c.silent().count()).sum();
     let broken: usize = curves.iter().flat_map(|c| &c.runs).filter(|r| r.broken()).count();
-    let verdict = format!("{broken} of {runs} runs have no result or one of no use; {silent} of these without a word.");
+    let verdict = format!("{broken} of {runs} runs have no result or one of no use; {silent} of these silently.");
     let body = html! {
         (header("Where it breaks", &verdict, ""))
         p.lead {
@@ -285,7 +285,7 @@ mod tests {
         };
         let curves = [curve];
         assert_eq!(svg(&curves).matches(r#"class="x""#).count(), 1);
-        assert!(page(&curves, None).contains("2 of 3 runs have no result or one of no use; 1 of these without a word"));
+        assert!(page(&curves, None).contains("2 of 3 runs have no result or one of no use; 1 of these silently"));
         assert_eq!(summary(&curves, None, 1.0)["curves"][0]["silent"], 1);
         assert!(
             text(&curves, None).contains("breaks at 10 % (holds at 0)") && text(&curves, None).contains("1 silent")
