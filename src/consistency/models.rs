@@ -12,7 +12,7 @@ use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
 use crate::numerics::ablation;
 use crate::numerics::statistics::median;
-use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, multiply, quadratic};
+use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, multiply, quadratic, regularized_inverse};
 use crate::types::MotionModel;
 use crate::types::space::{Matrix3, matvec};
 
@@ -42,6 +42,18 @@ impl AffineMotion {
         let linear = rotation(vector);
         let moved = matvec(&linear, centre);
         Self { linear, shift: std::array::from_fn(|a| centre[a] - moved[a]) }
+    }
+
+    /// The angle (rad) by which it turns, where it is rigid.
+    ///
+    /// ```
+    /// use palpate::consistency::models::AffineMotion;
+    /// let motion = AffineMotion::rotation_about([0.3, 0.0, -0.4], [1.0, 2.0, 3.0]);
+    /// assert!((motion.angle() - 0.5).abs() < 1e-12);
+    /// ```
+    pub fn angle(&self) -> f64 {
+        let trace: f64 = (0..3).map(|a| self.linear[a][a]).sum();
+        ((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos()
     }
 
     /// Displacement at `x` (mm).
@@ -205,7 +217,7 @@ fn step<const N: usize>(
 }
 
 fn weights(measured: &[Measured]) -> Vec<Symmetric3> {
-    measured.iter().map(|m| inverse(&m.covariance).unwrap_or([0.0; 6])).collect()
+    measured.iter().map(|m| regularized_inverse(&m.covariance).unwrap_or([0.0; 6])).collect()
 }
 
 /// The rigid motion nearest to what was measured, robustly and weighed by the inverse covariances.

@@ -28,6 +28,14 @@ pub fn inverse(m: &Symmetric3) -> Option<Symmetric3> {
     (det > 1e-14 * scale && det.is_finite()).then(|| adjugate(m).map(|v| v / det))
 }
 
+/// Inverse of a covariance that may be flat along an axis (one slice): a millionth of its trace is
+/// added to its diagonal.
+pub fn regularized_inverse(m: &Symmetric3) -> Option<Symmetric3> {
+    let little = 1e-6 * (m[0] + m[1] + m[2]) + 1e-12;
+    let [a, b, c, d, e, f] = *m;
+    inverse(&[a + little, b + little, c + little, d, e, f])
+}
+
 /// Matrix times vector.
 #[inline(always)]
 pub fn multiply(m: &Symmetric3, v: [f64; 3]) -> [f64; 3] {

@@ -126,6 +126,10 @@ impl Concluded {
     }
 }
 
+/// Least part of the tissue that a field sees for a map to be compared with it: of less, what is not
+/// compared would decide.
+const MIN_SEEN_FRACTION: f64 = 0.5;
+
 /// Chooses the model from the kept matches and the free field; with what was tried.
 fn smallest(
     measured: &[Measured],
@@ -137,7 +141,12 @@ fn smallest(
 ) -> (Choice, Vec<Tried>) {
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let mut tried = Vec::new();
+    let seen_by_field = 1.0 - level::unseen(pair, |p| field.lattice.at(&field.coefficients, p));
     let excess = |model, motion: &AffineMotion| {
+        let moved = |p: [f64; 3]| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a]));
+        if 1.0 - level::unseen(pair, moved) < MIN_SEEN_FRACTION * seen_by_field {
+            return Excess { total: f64::INFINITY, worst: f64::INFINITY };
+        }
         let excess = by_place(motion);
         let found = Excess { total: excess.iter().map(|&v| f64::from(v)).sum(), worst: places.worst(&excess) };
         tried.push(Tried { model, motion: *motion, excess });

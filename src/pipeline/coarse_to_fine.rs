@@ -1,7 +1,6 @@
 //! The levels of the pyramid from the coarsest to the finest: where the passes begin, the passes
 //! themselves, and the matches about their field.
 
-use crate::error::FieldError;
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::bspline::Lattice;
@@ -16,7 +15,7 @@ use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
 use crate::pipeline::refinement::{self, finer};
 use crate::pipeline::stages::Left;
-use crate::pipeline::start;
+use crate::pipeline::start::{self, Halt};
 use crate::types::params::BodySource;
 use crate::types::*;
 
@@ -31,6 +30,8 @@ pub(super) struct CoarseToFine<'a, 'p> {
     pub given: Option<&'p Given>,
     pub params: &'p FieldParams,
     pub starts: &'p [Start],
+    /// The volumes' grid, where a large rotation ends the run, to be taken out of them.
+    pub turning: Option<&'p Grid>,
     pub progress: Progress<'p>,
 }
 
@@ -100,12 +101,7 @@ struct Entry {
 impl<'a> CoarseToFine<'a, '_> {
     /// From the coarsest level to the finest: where the passes begin, the passes, and the matches
     /// about their field. `tissue` gives the mask with all tissue around it, where that is another.
-    pub fn run(
-        &self,
-        range: f64,
-        tissue: impl Fn() -> Option<Vec<u8>>,
-        clock: &mut Clock,
-    ) -> Result<Found<'a>, FieldError> {
+    pub fn run(&self, range: f64, tissue: impl Fn() -> Option<Vec<u8>>, clock: &mut Clock) -> Result<Found<'a>, Halt> {
         let (reports, asked, stages) = (Vec::new(), Vec::new(), Vec::new());
         let mut account = Account { reports, asked, stages, light: Light::default(), range, matched: 0.0 };
         let mut coarser: Option<(Bodies, [usize; 3], Begun)> = None;
@@ -128,6 +124,9 @@ impl<'a> CoarseToFine<'a, '_> {
                 Some(coarser) => self.carried(&search, &level, &pair, coarser, &mut account),
                 None => self.begun(&search, &level, &mut pair, &tissue, &mut account),
             };
+            if let Some((turn, grid)) = entry.begun.turn.filter(|_| level.is_first()).zip(self.turning) {
+                return Err(Halt::turned(&turn, grid, (factor, pair.spacing)));
+            }
             self.divide(&search, &level, &pair, &mut entry, &mut account);
             let Entry { mut bodies, mut begun, .. } = entry;
             if let Some(field) = begun.of_matches.take() {
@@ -148,7 +147,7 @@ impl<'a> CoarseToFine<'a, '_> {
             account.stages.push(Left { name: "coarse level".into(), motion: bodies.without_blocks(), factor });
             coarser = Some((bodies, factor, begun));
         }
-        Err(no_match(0, "check the mask".into()))
+        Err(no_match(0, "check the mask".into()).into())
     }
 
     /// Tells the part of a level that is done.

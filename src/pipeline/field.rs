@@ -33,7 +33,7 @@ use crate::pipeline::match_mesh::{Meshed, estimated, interpolated, thinned, with
 use crate::pipeline::refinement::{uneven, unlike};
 use crate::pipeline::sparse;
 use crate::pipeline::stages::{self, Stage};
-use crate::pipeline::start::Begin;
+use crate::pipeline::start::{Begin, Halt};
 use crate::pipeline::uncertainty::{self, Variances};
 use crate::types::params::{BodySource, Interpolation, Method};
 use crate::types::*;
@@ -136,7 +136,7 @@ pub fn run(
     params: &FieldParams,
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    run_from(initial, deformed, &Known::mask(mask), params, &[], progress)
+    completed(initial, deformed, &Known::mask(mask), How { params, starts: &[], turns: true }, progress)
 }
 
 /// As [`run`], with all that is known of the pair, and with fields from which the search may start
@@ -152,15 +152,43 @@ pub fn run_from(
     starts: &[Start],
     progress: Progress<'_>,
 ) -> Result<FieldResult, FieldError> {
-    input_checks::known(initial, deformed, known, params)?;
-    let begun = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
-    let moved = deformed.view().placed(begun.grid(deformed.grid())?)?;
-    let orientations = [initial, &moved].map(|v| Orientation::of(v.grid()));
-    let (first, second) = (orientations[0].turned(initial), orientations[1].turned(&moved));
-    let turned = Turned::of(known, orientations);
-    let found = canonical(&first, &second, &begun.known(&turned.known(known)), params, starts, progress)?;
-    drop((first, second));
-    Ok(begun.end(stored(found, orientations[0], initial.grid())?))
+    completed(initial, deformed, known, How { params, starts, turns: false }, progress)
+}
+
+/// As [`run_from`]; where the whole turned far, once more with that rotation taken out.
+fn completed(
+    initial: &Voxels<'_>,
+    deformed: &Voxels<'_>,
+    known: &Known<'_>,
+    how: How<'_>,
+    progress: Progress<'_>,
+) -> Result<FieldResult, FieldError> {
+    input_checks::known(initial, deformed, known, how.params)?;
+    let mut begin = Begin::of(initial.grid(), known, search_mm(initial.grid(), how.params.search_mm))?;
+    loop {
+        let moved = deformed.view().placed(begin.grid(deformed.grid())?)?;
+        let orientations = [initial, &moved].map(|v| Orientation::of(v.grid()));
+        let (first, second) = (orientations[0].turned(initial), orientations[1].turned(&moved));
+        let turned = Turned::of(known, orientations);
+        let how = How { turns: how.turns && !begin.is_affine(), ..how };
+        let found = canonical(&first, &second, &begin.known(&turned.known(known)), how, progress);
+        drop((first, second));
+        match found {
+            Ok(found) => return Ok(begin.end(stored(found, orientations[0], initial.grid())?, known.mask)),
+            Err(Halt::Turned(map)) => begin = Begin::turned(*map, known),
+            Err(Halt::Error(error)) => return Err(error),
+        }
+    }
+}
+
+/// How a pair is measured.
+#[derive(Clone, Copy)]
+struct How<'a> {
+    params: &'a FieldParams,
+    /// Fields from which the search may start.
+    starts: &'a [Start],
+    /// Whether a large rotation of the whole is taken out first.
+    turns: bool,
 }
 
 /// As [`run`], of volumes that are lent and come back: where their axes run otherwise they are
@@ -176,20 +204,31 @@ pub fn run_lent(
     progress: Progress<'_>,
 ) -> Result<(FieldResult, [Volume; 2]), FieldError> {
     input_checks::known(&initial, &deformed, known, params)?;
-    let begun = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
+    let mut begin = Begin::of(initial.grid(), known, search_mm(initial.grid(), params.search_mm))?;
+    let (mut initial, mut deformed) = (initial, deformed);
     let placed = *deformed.grid();
-    let deformed = deformed.placed(begun.grid(&placed)?)?;
-    let grids = [*initial.grid(), *deformed.grid()];
-    let turns = grids.map(|g| Orientation::of(&g));
-    let [initial, deformed] = [turns[0].turn(initial), turns[1].turn(deformed)];
-    let turned = Turned::of(known, turns);
-    let found = canonical(&initial, &deformed, &begun.known(&turned.known(known)), params, &[], progress)?;
-    drop(turned);
-    let found = begun.end(stored(found, turns[0], &grids[0])?);
-    let back =
-        |turn: Orientation, volume: Volume, grid| if turn.is_canonical() { volume } else { turn.stored(&volume, grid) };
-    let deformed = back(turns[1], deformed, &grids[1]).placed(placed)?;
-    Ok((found, [back(turns[0], initial, &grids[0]), deformed]))
+    let back = |turn: Orientation, volume: Volume, grid: &Grid| {
+        if turn.is_canonical() { volume } else { turn.stored(&volume, grid) }
+    };
+    loop {
+        deformed = deformed.placed(begin.grid(&placed)?)?;
+        let grids = [*initial.grid(), *deformed.grid()];
+        let axes = grids.map(|g| Orientation::of(&g));
+        [initial, deformed] = [axes[0].turn(initial), axes[1].turn(deformed)];
+        let turned = Turned::of(known, axes);
+        let how = How { params, starts: &[], turns: !begin.is_affine() };
+        let found = match canonical(&initial, &deformed, &begin.known(&turned.known(known)), how, progress) {
+            Ok(found) => Ok(stored(found, axes[0], &grids[0])?),
+            Err(Halt::Turned(map)) => Err(Begin::turned(*map, known)),
+            Err(Halt::Error(error)) => return Err(error),
+        };
+        drop(turned);
+        [initial, deformed] = [back(axes[0], initial, &grids[0]), back(axes[1], deformed, &grids[1]).placed(placed)?];
+        match found {
+            Ok(found) => return Ok((begin.end(found, known.mask), [initial, deformed])),
+            Err(next) => begin = next,
+        }
+    }
 }
 
 /// A result on the grid that the initial volume is stored on.
@@ -213,13 +252,12 @@ fn canonical(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
     known: &Known<'_>,
-    params: &FieldParams,
-    starts: &[Start],
+    How { params, starts, turns }: How<'_>,
     progress: Progress<'_>,
-) -> Result<FieldResult, FieldError> {
+) -> Result<FieldResult, Halt> {
     let [initial, deformed] = known.counting(initial, deformed);
     if params.method == Method::Sparse {
-        return sparse::measure(&initial, &deformed, known, params, progress);
+        return sparse::measure(&initial, &deformed, known, params, turns, progress);
     }
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
@@ -265,6 +303,7 @@ fn canonical(
         common: common.as_ref(),
         cut,
         finest,
+        turns,
         progress,
     };
     let found = task.searched(&aligned, &clean, &factors, range, starts, &mut clock)?;
@@ -272,7 +311,7 @@ fn canonical(
     drop(aligned);
     let estimated = task.estimated(&mut concluded, &mut clock)?;
     let damage = input_checks::said_of(&lost);
-    task.result(concluded, estimated, not_finite, damage, starts.is_empty(), clock)
+    Ok(task.result(concluded, estimated, not_finite, damage, starts.is_empty(), clock)?)
 }
 
 /// What a run works on, beside the volumes.
@@ -288,6 +327,8 @@ struct Task<'a> {
     cut: [Option<Cut>; 2],
     /// The finest level that may be worked on, in voxels.
     finest: usize,
+    /// Whether a large rotation ends the run, to be taken out.
+    turns: bool,
     progress: Progress<'a>,
 }
 
@@ -346,7 +387,7 @@ impl Task<'_> {
         range: f64,
         starts: &[Start],
         clock: &mut Clock,
-    ) -> Result<Found<'b>, FieldError> {
+    ) -> Result<Found<'b>, Halt> {
         let Self { grid, mask, known, params, .. } = self;
         let bent = begun_from(known, aligned, factors[0], grid, Some(mask));
         let starts: Vec<Start> = starts.iter().cloned().chain(bent).collect();
@@ -359,12 +400,13 @@ impl Task<'_> {
             flat: grid.is_single_slice(),
             params,
             starts: &starts,
+            turning: self.turns.then_some(grid),
             progress: self.progress,
         };
         let found = chain.run(range, tissue, clock)?;
         let kept = found.matches.iter().filter(|m| m.kept).count();
         if kept < MIN_MATCHES {
-            return Err(too_few(kept, &found.pair, found.search, params, known.start.is_some()));
+            return Err(too_few(kept, &found.pair, found.search, params, known.start.is_some()).into());
         }
         Ok(found)
     }

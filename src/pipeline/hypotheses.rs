@@ -2,6 +2,7 @@
 //! before, or at rest.
 
 use crate::consistency::models::{AffineMotion, nearest_rigid};
+use crate::consistency::pruning::Measured;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
 use crate::numerics::ablation;
@@ -9,6 +10,7 @@ use crate::numerics::bspline::Lattice;
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
+use crate::types::space::length;
 use crate::types::{Counts, FieldParams, LevelReport};
 use std::time::Instant;
 
@@ -122,11 +124,15 @@ struct RotationSearch {
     slice_degrees: f64,
     /// Angle to either side about each axis of a volume (degrees), where more is found.
     volume_degrees: f64,
-    /// Features of each: enough to tell the shares of two apart by a tenth.
+    /// Features of each: the shares of two are told apart to 0.07.
     features: usize,
+    /// Rotation (degrees) from which a patch is hardly like itself, so that it is taken out of the
+    /// deformed volume's axes.
+    taken_out_degrees: f64,
 }
 
-const ROTATION_SEARCH: RotationSearch = RotationSearch { slice_degrees: 20.0, volume_degrees: 40.0, features: 200 };
+const ROTATION_SEARCH: RotationSearch =
+    RotationSearch { slice_degrees: 20.0, volume_degrees: 40.0, features: 100, taken_out_degrees: 30.0 };
 
 /// What the coarsest level found.
 pub(super) struct Begun {
@@ -138,6 +144,8 @@ pub(super) struct Begun {
     pub matches: Vec<LevelMatch>,
     /// Frames since the whole volume was searched.
     pub followed: usize,
+    /// The rigid motion of the matches, where it turns by so much that it is to be taken out.
+    pub turn: Option<AffineMotion>,
 }
 
 impl Begun {
@@ -199,6 +207,18 @@ impl Begun {
 /// The matches of a search, their field, and what was counted.
 type Matched = (Vec<LevelMatch>, Option<SplineField>, LevelReport);
 
+/// What was measured of the matches that agree.
+fn agreed(matches: &[LevelMatch]) -> Vec<Measured> {
+    matches.iter().filter(|m| m.kept).map(|m| m.measured).collect()
+}
+
+/// The rigid motion of the matches, where it turns by so much that it is to be taken out.
+fn far_turn((matches, _, report): &Matched) -> Option<AffineMotion> {
+    let enough = report.counts.kept >= WHOLE_SEARCH.min_matches && ablation::is_on("taken-out");
+    let rigid = enough.then(|| nearest_rigid(&agreed(matches)))?;
+    (rigid.angle().to_degrees() > ROTATION_SEARCH.taken_out_degrees).then_some(rigid)
+}
+
 /// The field of a rigid motion.
 fn on_lattice(lattice: &Lattice, pair: &Pair<'_>, motion: &AffineMotion) -> SplineField {
     let moved = |p: [f64; 3]| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a]));
@@ -208,8 +228,7 @@ fn on_lattice(lattice: &Lattice, pair: &Pair<'_>, motion: &AffineMotion) -> Spli
 /// What a search found, or a further one about the rigid motion that most of its features agree
 /// on, for as long as no fewer agree there.
 fn settled(pair: &Pair<'_>, lattice: &Lattice, found: Matched, wide: MatchParams) -> Matched {
-    let agreed = |found: &Matched| found.0.iter().filter(|m| m.kept).map(|m| m.measured).collect::<Vec<_>>();
-    let (mut kept, mut best) = (agreed(&found), found);
+    let (mut kept, mut best) = (agreed(&found.0), found);
     for _ in 0..RIGID_SEARCH.max_count {
         let before = best.2.counts;
         if before.kept_share() >= KEPT_SHARE.confirmed
@@ -220,7 +239,7 @@ fn settled(pair: &Pair<'_>, lattice: &Lattice, found: Matched, wide: MatchParams
         }
         let about = on_lattice(lattice, pair, &nearest_rigid(&kept));
         let found = level::matches_again(pair, &about, wide);
-        kept = agreed(&found);
+        kept = agreed(&found.0);
         let now = found.2.counts.kept;
         if now > before.kept {
             best = found;
@@ -231,8 +250,11 @@ fn settled(pair: &Pair<'_>, lattice: &Lattice, found: Matched, wide: MatchParams
     best
 }
 
+/// The body diagonals of a cube.
+const DIAGONALS: [[f64; 3]; 4] = [[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]];
+
 /// Rotations about the centre of the tissue: all of them in one slice, to either side about each
-/// axis in a volume.
+/// axis and each body diagonal in a volume.
 fn rotations(pair: &Pair<'_>) -> Vec<AffineMotion> {
     let [nx, ny, _] = pair.shape;
     let inside = (0..pair.mask.len()).filter(|&at| pair.mask[at] != 0);
@@ -241,15 +263,18 @@ fn rotations(pair: &Pair<'_>) -> Vec<AffineMotion> {
         std::array::from_fn(|a| s[a] + p[a] as f64 * pair.spacing[a])
     });
     let centre = sum.map(|s| s / pair.inside.max(1) as f64);
-    let turned = |axis: usize, degrees: f64| {
-        let mut vector = [0.0; 3];
-        vector[axis] = degrees.to_radians();
+    let unit = |axis: usize| std::array::from_fn(|a| f64::from(u8::from(a == axis)));
+    let turned = |along: [f64; 3], degrees: f64| {
+        let vector = along.map(|v| v / length(along) * degrees.to_radians());
         AffineMotion::rotation_about(vector, centre)
     };
     let RotationSearch { slice_degrees: step, volume_degrees: side, .. } = ROTATION_SEARCH;
     match (0..3).find(|&a| pair.shape[a] == 1) {
-        Some(axis) => (1..(360.0 / step) as usize).map(|n| turned(axis, n as f64 * step)).collect(),
-        None => (0..3).flat_map(|axis| [-side, side].map(|angle| turned(axis, angle))).collect(),
+        Some(axis) => (1..(360.0 / step) as usize).map(|n| turned(unit(axis), n as f64 * step)).collect(),
+        None => {
+            let along = (0..3).map(unit).chain(DIAGONALS);
+            along.flat_map(|along| [-side, side].map(|angle| turned(along, angle))).collect()
+        }
     }
 }
 
@@ -310,10 +335,13 @@ impl Search<'_> {
                 report: None,
                 matches: Vec::new(),
                 followed: followed + 1,
+                turn: None,
             };
         }
         (self.matching)();
-        let (found, report, matches) = timed(seconds, || self.matched(pair, lattice));
+        let matched = timed(seconds, || self.matched(pair, lattice));
+        let turn = far_turn(&matched);
+        let (matches, found, report) = matched;
         let counts = report.counts;
         let of_matches = found.clone();
         let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
@@ -328,18 +356,18 @@ impl Search<'_> {
         };
         let wins = |known: &Bodies| (unconfirmed || given) && beats(known);
         let motion = course.filter(wins).map_or(own, refined);
-        Begun { motion, of_matches, report: Some(report), matches, followed: 0 }
+        Begun { motion, of_matches, report: Some(report), matches, followed: 0, turn }
     }
 
     /// The field of the matches of a whole volume; none where these are too few. If few features
     /// agree, they are sought again about the rigid motion that most agree on, then about rotations
     /// of the whole: patches that turned by much are hardly alike.
-    fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> (Option<SplineField>, LevelReport, Vec<LevelMatch>) {
+    fn matched(&self, pair: &Pair<'_>, lattice: &Lattice) -> Matched {
         let wide = self.wide(pair, self.range, WHOLE_SEARCH.max_features);
         let mut best = settled(pair, lattice, level::matches(pair, None, wide), wide);
-        if self.turns && best.2.counts.kept_share() < KEPT_SHARE.in_range && ablation::is_on("rotations") {
+        let share = |found: &Matched| found.2.counts.kept_share();
+        if self.turns && share(&best) < KEPT_SHARE.in_range && ablation::is_on("rotations") {
             let some = self.wide(pair, self.range, ROTATION_SEARCH.features);
-            let share = |found: &Matched| found.2.counts.kept_share();
             let tried = rotations(pair).into_iter().map(|turn| {
                 let about = on_lattice(lattice, pair, &turn);
                 (share(&level::matches_again(pair, &about, some)), about)
@@ -352,12 +380,15 @@ impl Search<'_> {
         }
         let (matches, field, report) = best;
         let enough = report.counts.kept >= WHOLE_SEARCH.min_matches;
-        (field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report, matches)
+        (matches, field.filter(|_| enough).map(|f| level::carry(&f, lattice.clone(), |p| p)), report)
     }
 
-    /// The field of the matches of a whole volume on `lattice`; stillness where they are too few.
-    pub fn by_matches(&self, pair: &Pair<'_>, lattice: &Lattice) -> SplineField {
-        self.matched(pair, lattice).0.unwrap_or_else(|| SplineField::still(lattice.clone()))
+    /// The field of the matches of a whole volume on `lattice`, stillness where they are too few;
+    /// and their rigid motion, where it is to be taken out.
+    pub fn by_matches(&self, pair: &Pair<'_>, lattice: &Lattice) -> (SplineField, Option<AffineMotion>) {
+        let matched = self.matched(pair, lattice);
+        let turn = far_turn(&matched);
+        (matched.1.unwrap_or_else(|| SplineField::still(lattice.clone())), turn)
     }
 
     /// Whether the features of a level are found where the field has them.
@@ -378,7 +409,8 @@ impl Search<'_> {
         let (matches, found, report) = timed(seconds, || level::matches_again(pair, only, wide));
         let of_matches = found.filter(|_| report.counts.kept >= WHOLE_SEARCH.min_matches)?;
         let motion = self.refined(pair, of_matches.clone().into(), passes);
-        let begun = |motion| Begun { motion, of_matches: Some(of_matches), report: Some(report), matches, followed: 0 };
+        let of_matches = Some(of_matches);
+        let begun = |motion| Begun { motion, of_matches, report: Some(report), matches, followed: 0, turn: None };
         motion.agree_better(pair, own).then(|| begun(motion))
     }
 }

@@ -21,7 +21,7 @@ use crate::numerics::fold_removal::unfold;
 use crate::numerics::sampling::nearest;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
-use crate::numerics::symmetric3::{Symmetric3, inverse};
+use crate::numerics::symmetric3::{Symmetric3, inverse, quadratic, regularized_inverse};
 use crate::numerics::{ablation, filters, pyramid};
 use crate::pipeline::landmarks;
 use crate::types::{Candidate, Counts, FieldParams, GridVector, LevelReport, SparseField, VoxelPoint};
@@ -667,7 +667,7 @@ pub(super) fn calibrate(measured: &mut [Measured], kept: &[bool]) {
         .filter(|(_, k)| **k)
         .filter_map(|(m, _)| {
             let e = std::array::from_fn(|a| m.displacement[a] - m.field[a]);
-            Some(crate::numerics::symmetric3::quadratic(&in_plane(&m.covariance)?, e) as f32)
+            Some(quadratic(&regularized_inverse(&m.covariance)?, e) as f32)
         })
         .collect();
     if q.len() < 20 {
@@ -677,16 +677,6 @@ pub(super) fn calibrate(measured: &mut [Measured], kept: &[bool]) {
     for m in measured {
         m.covariance = m.covariance.map(|v| v * factor.max(0.05));
     }
-}
-
-/// Inverse of a covariance that may be flat along an axis (one slice).
-fn in_plane(c: &Symmetric3) -> Option<Symmetric3> {
-    let mut c = *c;
-    let top = c[0] + c[1] + c[2];
-    for v in &mut c[..3] {
-        *v += 1e-6 * top + 1e-12;
-    }
-    inverse(&c)
 }
 
 /// Voxels for each point from which corners are detected on blocks of two voxels.

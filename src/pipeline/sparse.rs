@@ -39,7 +39,7 @@ use crate::pipeline::local_model;
 use crate::pipeline::match_mesh::{Meshed, estimated, with_mesh, world_match};
 use crate::pipeline::refinement;
 use crate::pipeline::stages::{self, Left};
-use crate::pipeline::start;
+use crate::pipeline::start::{self, Halt};
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
 use crate::types::*;
 use rayon::prelude::*;
@@ -121,6 +121,8 @@ struct Levels<'a> {
     /// The range (mm) that is searched.
     search: f64,
     params: &'a FieldParams,
+    /// The volumes' grid, where a large rotation ends the run, to be taken out of them.
+    turning: Option<&'a Grid>,
     progress: Progress<'a>,
 }
 
@@ -138,7 +140,7 @@ impl<'a> Levels<'a> {
     ///
     /// # Errors
     /// Where too few matches survive.
-    fn run(&self, known: &Known<'_>, clock: &mut Clock) -> Result<Finest<'a>, FieldError> {
+    fn run(&self, known: &Known<'_>, clock: &mut Clock) -> Result<Finest<'a>, Halt> {
         let Self { params, flat, search: range, .. } = *self;
         let (mut reports, mut left) = (Vec::new(), Vec::new());
         let mut state: Option<(Found, Pair<'_>, [usize; 3])> = None;
@@ -148,8 +150,14 @@ impl<'a> Levels<'a> {
             (self.progress)("matching", 0.9 * l as f64 / self.factors.len() as f64);
             let lattice = level::lattice(&pair, NODE_SPACING_VOXELS);
             let begun = match &state {
-                None => Search { params, range, flat, turns: true, matching: &|| (), tick: &|_| () }
-                    .by_matches(&pair, &lattice),
+                None => {
+                    let search = Search { params, range, flat, turns: true, matching: &|| (), tick: &|_| () };
+                    let (field, turn) = search.by_matches(&pair, &lattice);
+                    if let Some((turn, grid)) = turn.zip(self.turning) {
+                        return Err(Halt::turned(&turn, grid, (factor, pair.spacing)));
+                    }
+                    field
+                }
                 Some((found, _, from)) => {
                     level::carry(&found.field, lattice, |p| to_level(from_level(p, factor), *from))
                 }
@@ -164,7 +172,7 @@ impl<'a> Levels<'a> {
         let (found, pair, factor) = state.ok_or_else(|| no_match(0, "check the mask".into()))?;
         let kept = found.matches.iter().filter(|m| m.kept).count();
         if kept < MIN_MATCHES {
-            return Err(too_few(kept, &pair, range, params, known.start.is_some()));
+            return Err(too_few(kept, &pair, range, params, known.start.is_some()).into());
         }
         Ok(Finest { found, pair, factor, reports, left })
     }
@@ -242,8 +250,9 @@ pub(super) fn measure(
     deformed: &Voxels<'_>,
     known: &Known<'_>,
     params: &FieldParams,
+    turns: bool,
     progress: Progress<'_>,
-) -> Result<FieldResult, FieldError> {
+) -> Result<FieldResult, Halt> {
     refuse_bent(known, initial.grid())?;
     progress("pyramid", 0.0);
     let mut clock = Clock::start();
@@ -256,8 +265,16 @@ pub(super) fn measure(
     let search = coarse_to_fine::search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
     let factors = coarse_to_fine::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
-    let levels =
-        Levels { aligned: &aligned, factors: &factors, flat: grid.is_single_slice(), search, params, progress };
+    let turning = turns.then_some(&grid);
+    let levels = Levels {
+        aligned: &aligned,
+        factors: &factors,
+        flat: grid.is_single_slice(),
+        search,
+        params,
+        turning,
+        progress,
+    };
     let Finest { found, pair, factor, mut reports, left } = levels.run(known, &mut clock)?;
     let Found { mut field, matches, .. } = found;
     progress("model", 0.9);

@@ -4,11 +4,11 @@
 //! interpolation; what is left of it is a field from which the search may begin. The result is then
 //! followed by the affine part.
 
-use crate::consistency::models::nearest_rigid;
+use crate::consistency::models::{AffineMotion, nearest_rigid};
 use crate::consistency::pruning::Measured;
 use crate::error::{FieldError, SpaceError};
 use crate::matching::contrast::Relation;
-use crate::matching::levels::foreground;
+use crate::matching::levels::{foreground, to_level};
 use crate::matching::residual::MIN_POSITION_ERROR_VOXELS;
 use crate::numerics::dense::symmetric_eigen;
 use crate::numerics::sampling::nearest;
@@ -18,6 +18,7 @@ use crate::pipeline::field::{FieldResult, lengths};
 use crate::pipeline::known::{Known, StartMap};
 use crate::pipeline::landmarks::MIN_LANDMARKS;
 use crate::pipeline::stages::Stage;
+use crate::pipeline::uncertainty;
 use crate::types::space::{Matrix3, determinant, dot, length};
 use crate::types::{
     AffineMap, DenseField, Grid, Landmark, Mask, MotionModel, SparseField, StartReport, VoxelPoint, Voxels, WorldPoint,
@@ -227,9 +228,37 @@ impl Compared {
     }
 }
 
+/// Why a run ends before its result.
+pub(super) enum Halt {
+    Error(FieldError),
+    /// The whole turned so far that patches are hardly alike: a rigid motion to begin again from.
+    Turned(Box<AffineMap>),
+}
+
+impl<E: Into<FieldError>> From<E> for Halt {
+    fn from(error: E) -> Self {
+        Self::Error(error.into())
+    }
+}
+
+impl Halt {
+    /// For a motion (mm) along the axes of a level of `grid`, with its factor and spacing.
+    pub fn turned(motion: &AffineMotion, grid: &Grid, (factor, spacing): ([usize; 3], [f64; 3])) -> Self {
+        let axes = grid.axes();
+        let moved = |x: WorldPoint| {
+            let p = to_level(grid.affine().to_voxel(x).0, factor);
+            let d = motion.displacement(std::array::from_fn(|a| p[a] * spacing[a]));
+            Some(x.moved(std::array::from_fn(|r| dot(axes[r], d))))
+        };
+        affine_part(&moved, grid, None).map_or_else(Self::Error, |map| Self::Turned(Box::new(map)))
+    }
+}
+
 /// A start as a run takes it: its affine part apart, and what is known with that taken out.
 pub(super) struct Begin<'a> {
     affine: Option<AffineMap>,
+    /// Whether a search found the affine part, rather than that it was given.
+    found: bool,
     rest: Option<Box<StartMap<'a>>>,
     landmarks: Vec<Landmark>,
 }
@@ -244,13 +273,24 @@ impl<'a> Begin<'a> {
         let Some(start) = known.start else {
             let affine = far_apart(known.landmarks, range);
             let landmarks = affine.map_or_else(Vec::new, |map| landmarks_before(&map, known.landmarks));
-            return Ok(Self { affine, rest: None, landmarks });
+            return Ok(Self { affine, found: false, rest: None, landmarks });
         };
         let affine = affine_part(start, grid, known.mask)?;
         let back = affine.inverse();
         let rest = move |x: WorldPoint| start(x).map(|y| back.at(y));
         let landmarks = landmarks_before(&affine, known.landmarks);
-        Ok(Self { affine: Some(affine), rest: Some(Box::new(rest)), landmarks })
+        Ok(Self { affine: Some(affine), found: false, rest: Some(Box::new(rest)), landmarks })
+    }
+
+    /// At a motion that a search found.
+    pub fn turned(map: AffineMap, known: &Known<'a>) -> Self {
+        let landmarks = landmarks_before(&map, known.landmarks);
+        Self { affine: Some(map), found: true, rest: None, landmarks }
+    }
+
+    /// Whether it begins anywhere but at rest.
+    pub fn is_affine(&self) -> bool {
+        self.affine.is_some()
     }
 
     /// The deformed volume's grid with the affine part taken out.
@@ -270,12 +310,18 @@ impl<'a> Begin<'a> {
         }
     }
 
-    /// The result with the affine part.
-    pub fn end(&self, found: FieldResult) -> FieldResult {
-        match &self.affine {
-            Some(map) => found.followed_by(map),
-            None => found,
+    /// The result with the affine part. An error is compared with the motion beyond a start that
+    /// was given, and with all of the motion where a search found the affine part.
+    pub fn end(&self, found: FieldResult, mask: Option<&Mask>) -> FieldResult {
+        let Some(map) = &self.affine else { return found };
+        let model_beyond = found.summary.model;
+        let mut found = found.followed_by(map);
+        found.summary.start = Some(StartReport { affine_ras: map.rows(), model_beyond, found: self.found });
+        found.summary.evidence.push(said_of(map, self.found));
+        if self.found {
+            uncertainty::compare_with(&mut found.summary.expected, &found.displacement, mask.unwrap_or(&found.bodies));
         }
+        found
     }
 }
 
@@ -299,8 +345,6 @@ impl FieldResult {
         let scale = determinant(&linear).cbrt();
         follow(&mut self.displacement, map);
         (self.summary.mean_mm, self.summary.max_mm, _) = lengths(&self.displacement, &self.bodies);
-        self.summary.start = Some(StartReport { affine_ras: map.rows(), model_beyond: self.summary.model });
-        self.summary.evidence.push(said_of(map));
         self.coefficients = self.coefficients.followed_by(map);
         self.uncertainty = self.uncertainty.scaled(scale as f32);
         self.samples = self.samples.turned(&linear);
@@ -335,13 +379,18 @@ fn far_apart(landmarks: &[Landmark], range: f64) -> Option<AffineMap> {
 }
 
 /// What was taken of a start, in words.
-fn said_of(map: &AffineMap) -> String {
+fn said_of(map: &AffineMap, found: bool) -> String {
     let rows: Vec<String> =
         map.rows().iter().map(|r| format!("[{:.4} {:.4} {:.4} {:.3}]", r[0], r[1], r[2], r[3])).collect();
-    format!(
-        "start: the search began at the affine map {} (world mm, RAS); models, ranges and the expected error are of the motion beyond it",
-        rows.join(" ")
-    )
+    let rows = rows.join(" ");
+    match found {
+        true => format!(
+            "start: most features agree on the rigid motion {rows} (world mm, RAS), which turns too far to refine; the search began again with it taken out"
+        ),
+        false => format!(
+            "start: the search began at the affine map {rows} (world mm, RAS); models, ranges and the expected error are of the motion beyond it"
+        ),
+    }
 }
 
 /// The affine map that a field is (least squares over its grid).

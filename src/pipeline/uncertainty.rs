@@ -308,6 +308,17 @@ pub(super) fn by_label(deviation: &ScalarSpline, field: &DenseField, mask: &Mask
     sums.iter().enumerate().filter(|(_, s)| s.0 > 0).map(of).collect()
 }
 
+/// Compares an error with the mean displacement magnitude of `field` in `mask`, whole and by label.
+pub(super) fn compare_with(expected: &mut ExpectedError, field: &DenseField, mask: &Mask) {
+    let moved = |label: Option<u8>| {
+        let here = |at: &usize| label.is_none_or(|l| mask.as_slice()[*at] == l);
+        let lengths: Vec<f64> = some_of(mask).filter(here).map(|at| length(field, at)).collect();
+        lengths.iter().sum::<f64>() / lengths.len().max(1) as f64
+    };
+    expected.against_mm = moved(None);
+    expected.labels.iter_mut().for_each(|l| l.displacement_mean_mm = moved(Some(l.label)));
+}
+
 /// Gives each body the error of its label; one too small to be sampled has that of the `whole`
 /// (mm).
 pub(super) fn tell_bodies(bodies: &mut [BodyReport], labels: &[LabelError], whole: f64) {

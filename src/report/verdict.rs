@@ -131,10 +131,11 @@ fn expected(s: &FieldSummary) -> String {
 
 /// The expected error as a part of the motion, or of a voxel where nothing moves.
 fn relative(s: &FieldSummary) -> String {
-    let beyond = s.start.map_or(s.model, |start| start.model_beyond);
+    let given = s.start.filter(|start| !start.found);
+    let beyond = given.map_or(s.model, |start| start.model_beyond);
     let what = match () {
         _ if beyond == MotionModel::Identity && !s.rejected => "a voxel",
-        _ if s.start.is_some() => "the motion beyond the start",
+        _ if given.is_some() => "the motion beyond the start",
         _ => "the motion",
     };
     format!("{} % of {what}", short1(100.0 * s.expected.share()))

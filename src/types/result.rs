@@ -66,6 +66,8 @@ pub struct StartReport {
     pub affine_ras: [[f64; 4]; 3],
     /// The model of the motion beyond it, which the expected error is compared with.
     pub model_beyond: MotionModel,
+    /// Whether a search found it, rather than that it was given.
+    pub found: bool,
 }
 
 /// What became of the landmarks in the fit.
