@@ -88,7 +88,7 @@ impl<T: Tip + ?Sized> Tip for &T {
 /// U = pi E (d^3 / (3 cos^2) + d^2 d_t tan + d d_t^2).
 ///
 /// The exact sum of linear springs that stand on the hemisphere along the back plate's normal,
-/// whose feet are pressed by d and dragged by d_t (tests/grasp.rs sums them).
+/// whose feet are pressed by d and dragged by d_t (tests/grasp/grasp.rs sums them).
 #[derive(Debug, Clone, Copy)]
 pub struct Parallel {
     /// pi E (Pa).
