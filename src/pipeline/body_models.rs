@@ -126,8 +126,8 @@ impl Concluded {
     }
 }
 
-/// Least part of the tissue that a field sees for a map to be compared with it: of less, what is not
-/// compared would decide.
+/// Least part of what a field sees that a map must see to be compared with it: of less, what is
+/// not compared would decide.
 const MIN_SEEN_FRACTION: f64 = 0.5;
 
 /// Chooses the model from the kept matches and the free field; with what was tried.

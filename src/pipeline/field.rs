@@ -155,7 +155,7 @@ pub fn run_from(
     completed(initial, deformed, known, How { params, starts, turns: false }, progress)
 }
 
-/// As [`run_from`]; where the whole turned far, once more with that rotation taken out.
+/// As [`run_from`]; where the whole turned far, again with that rotation taken out.
 fn completed(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,

@@ -124,7 +124,7 @@ struct RotationSearch {
     slice_degrees: f64,
     /// Angle to either side about each axis of a volume (degrees), where more is found.
     volume_degrees: f64,
-    /// Features of each: the shares of two are told apart to 0.07.
+    /// Features of each: two shares that differ by 0.07 are distinguished.
     features: usize,
     /// Rotation (degrees) from which a patch is hardly like itself, so that it is taken out of the
     /// deformed volume's axes.
@@ -213,7 +213,8 @@ fn agreed(matches: &[LevelMatch]) -> Vec<Measured> {
 }
 
 /// The rigid motion of the matches, where it turns by so much that it is to be taken out.
-fn far_turn((matches, _, report): &Matched) -> Option<AffineMotion> {
+fn far_turn(found: &Matched) -> Option<AffineMotion> {
+    let (matches, _, report) = found;
     let enough = report.counts.kept >= WHOLE_SEARCH.min_matches && ablation::is_on("taken-out");
     let rigid = enough.then(|| nearest_rigid(&agreed(matches)))?;
     (rigid.angle().to_degrees() > ROTATION_SEARCH.taken_out_degrees).then_some(rigid)

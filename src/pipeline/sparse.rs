@@ -265,16 +265,8 @@ pub(super) fn measure(
     let search = coarse_to_fine::search_mm(&grid, params.search_mm);
     let aligned = Aligned::new(&clean, &seen, &mask, search)?;
     let factors = coarse_to_fine::worked_on(&grid, &mask, finest_level(&grid, &mask, params), search);
-    let turning = turns.then_some(&grid);
-    let levels = Levels {
-        aligned: &aligned,
-        factors: &factors,
-        flat: grid.is_single_slice(),
-        search,
-        params,
-        turning,
-        progress,
-    };
+    let (flat, turning) = (grid.is_single_slice(), turns.then_some(&grid));
+    let levels = Levels { aligned: &aligned, factors: &factors, flat, search, params, turning, progress };
     let Finest { found, pair, factor, mut reports, left } = levels.run(known, &mut clock)?;
     let Found { mut field, matches, .. } = found;
     progress("model", 0.9);
@@ -297,7 +289,7 @@ pub(super) fn measure(
     let sparse = estimated(measured, &grid, &coefficients, &uncertainty);
     clock.book("uncertainty");
     progress("mesh", 0.92);
-    let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, grid.is_single_slice(), &mut clock)?;
+    let meshed = Meshed::of(&sparse, &coefficients, params.interpolation, flat, &mut clock)?;
     let displacement = &meshed.displacement;
     let (mean_mm, max_mm, mask_voxels) = lengths(displacement, &mask);
     let folds = jacobian::count_folds(displacement, Some(&mask))?;
