@@ -385,7 +385,7 @@ fn said_of(map: &AffineMap, found: bool) -> String {
     let rows = rows.join(" ");
     match found {
         true => format!(
-            "start: most features agree on the rigid motion {rows} (world mm, RAS), which turns too far to refine; the search began again with it taken out"
+            "start: the coarsest matches follow the rigid motion {rows} (world mm, RAS); it turns too far to be refined, so the search began again with it taken out"
         ),
         false => format!(
             "start: the search began at the affine map {rows} (world mm, RAS); models, ranges and the expected error are of the motion beyond it"

@@ -53,7 +53,7 @@ impl MotionModel {
 /// intensity explains (correlation ratio, 0 to 1).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Agreement {
-    /// Where nothing moves; from the start, where one was given.
+    /// Where nothing moves; from the start, where there is one.
     pub at_rest: f64,
     /// Under the displacement.
     pub found: f64,
@@ -64,7 +64,8 @@ pub struct Agreement {
 pub struct StartReport {
     /// Rows of the affine part (world mm, RAS, initial to deformed).
     pub affine_ras: [[f64; 4]; 3],
-    /// The model of the motion beyond it, which the expected error is compared with.
+    /// The model of the motion beyond it. The expected error of a given start is compared with
+    /// that motion.
     pub model_beyond: MotionModel,
     /// Whether a search found it, rather than that it was given.
     pub found: bool,
