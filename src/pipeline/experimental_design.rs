@@ -15,7 +15,7 @@ use crate::numerics::tetrahedron::shapes;
 use crate::pipeline::clock::Clock;
 use crate::pipeline::field::Progress;
 use crate::pipeline::stiffness::{FORWARD_TOLERANCE_MM, FieldQuality, Inputs, Meshed, evenly_meshed, whole};
-use crate::stiffness::boundary_conditions::{self, MIN_FLAT_FRACTION, Patch, Place, SurfaceMotion, least_travel};
+use crate::stiffness::boundary_conditions::{self, Patch, Place, SurfaceMotion, least_travel};
 use crate::stiffness::elements::Mapping;
 use crate::stiffness::fem_body::Body;
 use crate::stiffness::fields;
@@ -56,8 +56,6 @@ pub struct Simulated {
     pub strain: f64,
 }
 
-/// Cosine of the angle to the load within which a facet faces it.
-const MIN_FACING_COSINE: f64 = 0.7;
 /// Deepest press over the body's extent along the load: a linear law does not hold beyond.
 const MAX_PRESS_FRACTION: f64 = 0.5;
 
@@ -125,16 +123,8 @@ impl<'a> Bench<'a> {
         match self.inputs.load {
             Place::Side(side) => {
                 self.outward = side.direction();
-                let (d, voxel) = (self.outward, self.voxel());
-                let height = |n: u32| dot(body.places[n as usize], d);
-                let facing: Vec<usize> =
-                    (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > MIN_FACING_COSINE).collect();
-                let end =
-                    facing.iter().flat_map(|&f| body.surface[f].nodes).map(height).fold(f64::NEG_INFINITY, f64::max);
-                let near = |f: &usize| body.surface[*f].nodes.iter().filter(|n| height(**n) > end - voxel).count() >= 3;
-                let area = |all: &[usize]| all.iter().map(|&f| body.surface[f].area).sum::<f64>();
-                let at_end: Vec<usize> = facing.iter().copied().filter(near).collect();
-                self.flat = (area(&at_end) > MIN_FLAT_FRACTION * area(&facing)).then(|| body.nodes_on(at_end));
+                let flat = boundary_conditions::flat_end(body, *side, self.voxel());
+                self.flat = flat.map(|facets| body.nodes_on(facets));
             }
             Place::Mask(..) => {
                 // A push all over tells which surface the masks cover.

@@ -490,22 +490,42 @@ fn round_rim(body: &Body, patch: &mut Patch, other: &Patch, voxel: f64) {
 
 /// Part of the area facing a side at the body's end, beyond which the end is a flat face: a sixth
 /// of a ball of 20 voxels lies within a voxel of its end.
-pub const MIN_FLAT_FRACTION: f64 = 0.6;
+const MIN_FLAT_FRACTION: f64 = 0.6;
 
-/// Facets whose nodes lie within a voxel of the end of the undeformed body. Of a flat face those of
-/// which half do: where the body lies askew in its voxels the mesh rounds its rims, and as a whole
-/// only 1,034 of 1,440 mm^2 of a base turned by 35 degrees lay there.
-pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
+/// Cosine of the angle to a side within which a facet belongs to the face at its end.
+const MIN_FACE_COSINE: f64 = 0.7;
+
+/// Facets of the face at a side of the undeformed body, and how many nodes of each lie within a
+/// voxel of the body's end there.
+fn face(body: &Body, side: Side, voxel: f64) -> Vec<(usize, usize)> {
     let d = side.direction();
-    let facing: Vec<usize> = (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > 0.7).collect();
+    let facing: Vec<usize> =
+        (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > MIN_FACE_COSINE).collect();
     let height = |n: u32| dot(body.places[n as usize], d);
     let heights = facing.iter().flat_map(|&f| body.surface[f].nodes).map(height);
     let end = heights.fold(f64::NEG_INFINITY, f64::max);
     let within = |f: usize| body.surface[f].nodes.iter().filter(|&&n| height(n) > end - voxel).count();
-    let of = |least: usize| facing.iter().copied().filter(|&f| within(f) >= least).collect::<Vec<_>>();
+    facing.into_iter().map(|f| (f, within(f))).collect()
+}
+
+/// Facets with at least half of their nodes within a voxel of the end of the undeformed body at a
+/// side, if it ends in a flat face. Half: the mesh rounds the rims of a body askew in its voxels.
+pub fn flat_end(body: &Body, side: Side, voxel: f64) -> Option<Vec<usize>> {
+    let facing = face(body, side, voxel);
     let area = |facets: &[usize]| facets.iter().map(|&f| body.surface[f].area).sum::<f64>();
-    let half = of(3);
-    if area(&half) > MIN_FLAT_FRACTION * area(&facing) { half } else { of(6) }
+    let half: Vec<usize> =
+        facing.iter().filter(|(f, n)| 2 * n >= body.surface[*f].nodes.len()).map(|(f, _)| *f).collect();
+    let all: Vec<usize> = facing.iter().map(|(f, _)| *f).collect();
+    (area(&half) > MIN_FLAT_FRACTION * area(&all)).then_some(half)
+}
+
+/// Facets at the end of the undeformed body at a side: its flat face, or those that lie within a
+/// voxel of the end.
+pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
+    flat_end(body, side, voxel).unwrap_or_else(|| {
+        let whole = |(f, n): &(usize, usize)| *n == body.surface[*f].nodes.len();
+        face(body, side, voxel).into_iter().filter(whole).map(|(f, _)| f).collect()
+    })
 }
 
 /// Facets whose middle, or a place just inside of it, lies in a mask.
