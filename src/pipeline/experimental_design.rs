@@ -123,8 +123,8 @@ impl<'a> Bench<'a> {
         match self.inputs.load {
             Place::Side(side) => {
                 self.outward = side.direction();
-                let flat = boundary_conditions::flat_end(body, *side, self.voxel());
-                self.flat = flat.map(|facets| body.nodes_on(facets));
+                let (facets, is_flat) = boundary_conditions::end_facets(body, *side, self.voxel());
+                self.flat = is_flat.then(|| body.nodes_on(facets));
             }
             Place::Mask(..) => {
                 // A push all over tells which surface the masks cover.

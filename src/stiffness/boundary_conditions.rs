@@ -349,7 +349,7 @@ pub fn find(
     }
     let hint_held = "name the side where the tissue is fixed, as x-, x+ ... z+, or give a mask that covers it";
     let base = match held {
-        Place::Side(side) => base_facets(body, *side, voxel),
+        Place::Side(side) => end_facets(body, *side, voxel).0,
         Place::Mask(mask, _) => masked_facets(body, mask),
     };
     let area: f64 = base.iter().map(|&f| body.surface[f].area).sum();
@@ -495,9 +495,9 @@ const MIN_FLAT_FRACTION: f64 = 0.6;
 /// Cosine of the angle to a side within which a facet belongs to the face at its end.
 const MIN_FACE_COSINE: f64 = 0.7;
 
-/// Facets of the face at a side of the undeformed body, and how many nodes of each lie within a
-/// voxel of the body's end there.
-fn face(body: &Body, side: Side, voxel: f64) -> Vec<(usize, usize)> {
+/// Facets within a voxel of the end of the undeformed body at a side, and whether the end is a flat
+/// face. Of a flat face half of a facet's nodes suffice: a body askew in its voxels has round rims.
+pub(crate) fn end_facets(body: &Body, side: Side, voxel: f64) -> (Vec<usize>, bool) {
     let d = side.direction();
     let facing: Vec<usize> =
         (0..body.surface.len()).filter(|&f| dot(body.surface[f].normal, d) > MIN_FACE_COSINE).collect();
@@ -505,27 +505,11 @@ fn face(body: &Body, side: Side, voxel: f64) -> Vec<(usize, usize)> {
     let heights = facing.iter().flat_map(|&f| body.surface[f].nodes).map(height);
     let end = heights.fold(f64::NEG_INFINITY, f64::max);
     let within = |f: usize| body.surface[f].nodes.iter().filter(|&&n| height(n) > end - voxel).count();
-    facing.into_iter().map(|f| (f, within(f))).collect()
-}
-
-/// Facets with at least half of their nodes within a voxel of the end of the undeformed body at a
-/// side, if it ends in a flat face. Half: the mesh rounds the rims of a body askew in its voxels.
-pub fn flat_end(body: &Body, side: Side, voxel: f64) -> Option<Vec<usize>> {
-    let facing = face(body, side, voxel);
+    let of = |least: usize| facing.iter().copied().filter(|&f| within(f) >= least).collect::<Vec<_>>();
     let area = |facets: &[usize]| facets.iter().map(|&f| body.surface[f].area).sum::<f64>();
-    let half: Vec<usize> =
-        facing.iter().filter(|(f, n)| 2 * n >= body.surface[*f].nodes.len()).map(|(f, _)| *f).collect();
-    let all: Vec<usize> = facing.iter().map(|(f, _)| *f).collect();
-    (area(&half) > MIN_FLAT_FRACTION * area(&all)).then_some(half)
-}
-
-/// Facets at the end of the undeformed body at a side: its flat face, or those that lie within a
-/// voxel of the end.
-pub(super) fn base_facets(body: &Body, side: Side, voxel: f64) -> Vec<usize> {
-    flat_end(body, side, voxel).unwrap_or_else(|| {
-        let whole = |(f, n): &(usize, usize)| *n == body.surface[*f].nodes.len();
-        face(body, side, voxel).into_iter().filter(whole).map(|(f, _)| f).collect()
-    })
+    let half = of(3);
+    let is_flat = area(&half) > MIN_FLAT_FRACTION * area(&facing);
+    (if is_flat { half } else { of(6) }, is_flat)
 }
 
 /// Facets whose middle, or a place just inside of it, lies in a mask.

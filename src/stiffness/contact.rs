@@ -8,7 +8,7 @@
 //! equilibrium is found.
 
 use crate::error::StiffnessError;
-use crate::stiffness::boundary_conditions::base_facets;
+use crate::stiffness::boundary_conditions::end_facets;
 use crate::stiffness::fem_body::{Body, ELEMENT_UNKNOWNS, Facet, sorted};
 use crate::stiffness::forward::{Problem, Tie};
 use crate::stiffness::law::Material;
@@ -235,7 +235,7 @@ pub struct Press<'a> {
 
 /// Nodes of the flat end of a body on a side; `voxel` (mm) is the least of what it was meshed from.
 pub fn base(body: &Body, side: Side, voxel: f64) -> Vec<u32> {
-    body.nodes_on(base_facets(body, side, voxel))
+    body.nodes_on(end_facets(body, side, voxel).0)
 }
 
 impl Press<'_> {

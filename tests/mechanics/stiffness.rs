@@ -875,8 +875,7 @@ fn a_region_found_without_labels_is_drawn_to_its_size() {
     // As the map drew it, a fifth too small, it came out a fifth too stiff.
     let params = PhantomParams { seed: 64, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(48);
     let body = Pressed::new(&params).unwrap();
-    let two_at_most = StiffnessParams { regions: 2, ..unlabelled_params(&body, 7_000) };
-    let result = unlabelled(&body, &body.phantom.truth, &two_at_most);
+    let result = without_labels(&body, &body.phantom.truth, 7_000);
     let known = &body.phantom.stiffness.as_ref().unwrap().labels;
     let drawn = |label: u8| {
         result
