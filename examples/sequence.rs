@@ -38,6 +38,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             origin: 0,
             reference: &reference,
             known: Known::mask(mask),
+            landmarks: &[],
             labels: None,
             params: &field,
             together,

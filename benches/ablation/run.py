@@ -26,7 +26,7 @@ HERE = Path(__file__).resolve().parent
 FIELDS = ["case", "variant", "mean_mm", "p95_mm", "still_mm", "gradient", "folds", "inside", "motion_mm", "cpu_s", "memory_mb", "model", "trust", "expected_mm"]
 # What PALPATE_WITHOUT knows in a build with the feature `ablation`.
 MECHANISMS = (
-    "local-smoothness gradient-floor robust-range enclosed cut brightness consistency turned rotations taken-out next-level unfold "
+    "local-smoothness gradient-floor robust-range enclosed cut brightness consistency turned rotations taken-out look-ahead next-level unfold "
     "bodies rest model noise-gradient"
 ).split()
 

@@ -8,7 +8,7 @@
 use super::Usage;
 use super::console::Console;
 use super::field::Tuning;
-use super::inputs::{name, read_labels, same_grid};
+use super::inputs::{name, read_labels, read_mask};
 use super::limits::ATTENDED;
 use super::own;
 use super::record::{self, Recording};
@@ -344,10 +344,10 @@ impl Batch<'_> {
         let [initial, deformed] = grids;
         let (initial, deformed) = (initial?, deformed?);
         if let Some(labels) = &pair.labels {
-            read_labels(labels, &initial, &pair.initial)?;
+            read_labels(labels, &initial, &pair.initial, &mut Vec::new())?;
         }
         for patch in patches(pair) {
-            same_grid(&patch, &read_header(&patch)?.0.grid, &initial, &pair.initial)?;
+            read_mask(&patch, &initial, &pair.initial, &mut Vec::new())?;
         }
         if let Some(scene) = &pair.scene {
             io::read_text(scene)?;

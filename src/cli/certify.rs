@@ -61,7 +61,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if let (Some(path), Some(again)) = (second, &again) {
         same_grid(path, again.grid(), &grid, initial)?;
     }
-    let inside = mask.as_ref().map(|m| read_mask(m, &grid, initial)).transpose()?;
+    let inside = mask.as_ref().map(|m| read_mask(m, &grid, initial, &mut warnings)).transpose()?;
     let like = like
         .as_ref()
         .map(|path| {

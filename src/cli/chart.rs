@@ -73,7 +73,7 @@ fn read_case(folder: &Path, name: &str, warnings: &mut Vec<String>) -> Result<Ca
     if truth.is_none() && landmarks.is_none() {
         bail!("{}: holds neither truth.nii.gz nor landmarks.csv, so nothing can be scored", folder.shown());
     }
-    let mask = mask.map(|m| read_mask(&m, initial.grid(), &reference)).transpose()?;
+    let mask = mask.map(|m| read_mask(&m, initial.grid(), &reference, warnings)).transpose()?;
     let read_truth = |path: &PathBuf| -> Result<DenseField> {
         let field = io::read_field(path)?;
         same_grid(path, field.grid(), initial.grid(), &reference)?;

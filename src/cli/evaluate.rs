@@ -3,16 +3,14 @@
 
 use super::console::Console;
 use super::convention::Convention;
-use super::inputs::{Part, name, read_landmarks, read_mask, standing_for, warn_all};
-use anyhow::{Context, Result, bail};
+use super::inputs::{Part, name, read_landmarks, read_mask, some_labels, standing_for, warn_all};
+use anyhow::{Context, Result};
 use clap::Args;
-use palpate::error::Shown;
 use palpate::report::text;
-use palpate::types::Mask;
 use palpate::{evaluate, io};
 use serde::Serialize;
 use serde_json::{Map, Value};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -61,7 +59,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     if mask.is_some() && truth.is_none() && backward.is_none() {
         warnings.push("--mask changes nothing without --truth or --backward".into());
     }
-    let mask = mask.as_ref().map(|m| read_mask(m, grid, of)).transpose()?;
+    let mask = mask.as_ref().map(|m| read_mask(m, grid, of, &mut warnings)).transpose()?;
     let marks = read_landmarks(landmarks, grid, &mut warnings)?;
     let (mut told, mut values) = (String::new(), Map::new());
     if let Some((exact, truth)) = exact.as_ref().zip(truth.as_ref()) {
@@ -78,7 +76,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         values.insert("landmarks".into(), serde_json::to_value(&found)?);
     }
     if let [first, second] = &labels[..] {
-        let maps = [read_label_map(first)?, read_label_map(second)?];
+        let maps = [some_labels(first)?, some_labels(second)?];
         let found = evaluate::labels::label_scores(&measured, &maps[0], &maps[1])
             .with_context(|| format!("{} and {} by {}", name(first), name(second), name(field)))?;
         if found.outside > 0.0 {
@@ -104,15 +102,6 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     warn_all(console, &warnings);
     console.say(&if *json { serde_json::to_string_pretty(&values)? } else { told });
     Ok(())
-}
-
-/// A label map on a grid of its own, with a label at least.
-fn read_label_map(path: &Path) -> Result<Mask> {
-    let labels = io::read_labels(path)?;
-    if labels.as_slice().iter().all(|l| *l == 0) {
-        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.shown());
-    }
-    Ok(labels)
 }
 
 /// The keys and values of a struct.

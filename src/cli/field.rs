@@ -2,8 +2,10 @@
 
 use super::console::Console;
 use super::dry_run;
-use super::inputs::{Part, check_distinct, name, read_labels, read_volume, same_file, standing_for, warn_all};
-use super::known::{Knowledge, mask_on};
+use super::inputs::{
+    Part, check_distinct, name, read_labels, read_mask, read_volume, same_file, standing_for, warn_all,
+};
+use super::known::Knowledge;
 use super::limits::{cap_search, field_fits};
 use super::outputs::{AFFINE_FILE, FIELD_FILES, Measured, STRAIN_FILES, Target, write_field};
 use super::record::{self, Read, Recording};
@@ -229,9 +231,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let (fixed, moving) = rayon::join(|| read_volume(initial, &mut first), || read_volume(deformed, &mut second));
     let (fixed, moving) = (fixed?, moving?);
     warnings.extend(first.into_iter().chain(second).chain(cap_search(&mut params, fixed.grid(), initial)));
-    let mut inside = mask.as_ref().map(|m| mask_on(m, fixed.grid(), initial, &mut warnings)).transpose()?;
+    let mut inside = mask.as_ref().map(|m| read_mask(m, fixed.grid(), initial, &mut warnings)).transpose()?;
     if let Some(path) = bodies {
-        let labels = read_labels(path, fixed.grid(), initial)?;
+        let labels = read_labels(path, fixed.grid(), initial, &mut warnings)?;
         inside = Some(bodies_of(path, labels, inside.as_ref(), rigid)?);
         (params.bodies, params.rigid) = (BodySource::Given, rigid.clone());
     }

@@ -7,7 +7,7 @@ use clap::builder::{PathBufValueParser, TypedValueParser};
 use palpate::error::FieldError;
 use palpate::error::Shown;
 use palpate::evaluate;
-use palpate::field::warp::warp_image;
+use palpate::field::warp::{warp_image, warp_labels};
 use palpate::io::{self, ImageKind, Stored};
 use palpate::numerics::sampling::Interpolation;
 use palpate::types::{DenseField, Grid, Landmark, Mask, Volume, Voxels};
@@ -198,11 +198,10 @@ pub fn on_grid<'a>(volume: Voxels<'a>, grid: &Grid) -> Voxels<'a> {
     }
 }
 
-/// A mask on `grid`, which is that of `reference`.
-pub fn read_mask(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
-    let mask = some_mask(path)?;
-    same_grid(path, mask.grid(), grid, reference)?;
-    Ok(mask)
+/// A mask on `grid`, which is that of `reference`: resampled by nearest neighbour, with a note,
+/// where it lies on another one.
+pub fn read_mask(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
+    resampled(path, some_mask(path)?, grid, reference, warnings)
 }
 
 /// A mask on its own grid that is not empty.
@@ -214,14 +213,39 @@ pub fn some_mask(path: &Path) -> Result<Mask> {
     Ok(mask)
 }
 
-/// A label map on `grid`, which is that of `reference`.
-pub fn read_labels(path: &Path, grid: &Grid, reference: &Path) -> Result<Mask> {
+/// A label map on `grid`, in the same way.
+pub fn read_labels(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
+    resampled(path, some_labels(path)?, grid, reference, warnings)
+}
+
+/// A label map on its own grid, with a label at least.
+pub fn some_labels(path: &Path) -> Result<Mask> {
     let labels = io::read_labels(path)?;
-    same_grid(path, labels.grid(), grid, reference)?;
     if labels.as_slice().iter().all(|v| *v == 0) {
         bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.shown());
     }
     Ok(labels)
+}
+
+/// A label map or a mask that was read, in the same way.
+pub fn resampled(path: &Path, labels: Mask, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
+    if grid.same_as(labels.grid()) {
+        return Ok(labels);
+    }
+    let placed = warp_labels(&labels, &DenseField::zeros(*grid), None, 0);
+    if placed.as_slice().iter().all(|v| *v == 0) {
+        bail!(
+            "{}: does not overlap {} in world space; check both headers (palpate info)",
+            path.shown(),
+            reference.shown()
+        );
+    }
+    warnings.push(format!(
+        "{}: lies on another grid than {}; it was resampled onto that by nearest neighbour",
+        name(path),
+        name(reference)
+    ));
+    Ok(placed)
 }
 
 /// What was read from `path` must lie on `grid`, which is that of `reference`.

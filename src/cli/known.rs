@@ -1,17 +1,16 @@
 //! What a user knows of a pair: starts, masks and landmarks.
 
 use super::console::Console;
-use super::inputs::{Part, name, read_landmarks, some_mask, standing_for};
+use super::inputs::{Part, read_landmarks, read_mask, resampled, standing_for};
 use super::transform::{Given, read_chain};
 use anyhow::{Result, bail};
 use clap::Args;
 use palpate::error::Shown;
 use palpate::error::UnknownName;
-use palpate::field::warp::warp_labels;
 use palpate::io;
 use palpate::pipeline::known::{Known, StartMap};
 use palpate::pipeline::start::{Alignment, Compared, aligned};
-use palpate::types::{DenseField, Grid, Landmark, Mask, Voxels, WorldPoint};
+use palpate::types::{Landmark, Mask, Voxels, WorldPoint};
 use std::path::{Path, PathBuf};
 
 /// What `field`, `track` and `batch` share.
@@ -29,7 +28,8 @@ pub struct Knowledge {
     #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     ignore: Vec<PathBuf>,
     /// Places known in both volumes: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed),
-    /// world mm, RAS; or two files of points (.csv, .fcsv, .mrk.json), initial and deformed
+    /// world mm, RAS; or two files of points (.csv, .fcsv, .mrk.json), initial and deformed; of a
+    /// sequence one CSV with a column frame, counted from 0
     #[arg(long, value_name = "L", num_args = 1..=2, value_parser = standing_for(Part::Landmarks))]
     landmarks: Vec<PathBuf>,
     /// Standard deviation of a landmark along an axis [default: one voxel]
@@ -65,9 +65,28 @@ impl Knowledge {
         given.into_iter().filter(|g| g.1).map(|g| g.0).collect()
     }
 
-    /// Whether there are landmarks.
-    pub fn has_landmarks(&self) -> bool {
-        !self.landmarks.is_empty()
+    /// The landmarks of each frame of a sequence against `origin`, by its number: all those of a
+    /// pair, or what the table's column `frame` says; nothing where there are none.
+    pub fn by_frame(&self, all: &[Landmark], frames: usize, origin: usize) -> Result<Vec<Vec<Landmark>>> {
+        let path = match &self.landmarks[..] {
+            files if frames == 2 || files.is_empty() => return Ok(Vec::new()),
+            [one] => one,
+            _ => bail!(
+                "--landmarks: two lists of points belong to one pair; give a sequence one table with a column frame"
+            ),
+        };
+        let mut by_frame = vec![Vec::new(); frames];
+        for (&frame, &landmark) in io::read_landmark_frames(path)?.iter().zip(all) {
+            if frame >= frames || frame == origin {
+                bail!(
+                    "{}: has landmarks of frame {frame}; the frames are 0 to {}, without the reference {origin}",
+                    path.shown(),
+                    frames - 1
+                );
+            }
+            by_frame[frame].push(landmark);
+        }
+        Ok(by_frame)
     }
 
     /// The files among them, with what each is to the run.
@@ -99,7 +118,7 @@ impl Knowledge {
         }
         let grids = [initial.grid(), deformed.grid()];
         let deformed_mask = self.deformed_mask.as_ref();
-        let mut deformed_counts = deformed_mask.map(|m| mask_on(m, grids[1], names[1], warnings)).transpose()?;
+        let mut deformed_counts = deformed_mask.map(|m| read_mask(m, grids[1], names[1], warnings)).transpose()?;
         let mut initial_counts = None;
         for path in &self.ignore {
             let ignored = io::read_mask(path)?;
@@ -201,31 +220,4 @@ impl KnownInputs {
     pub fn mask(&self) -> Option<&Mask> {
         self.mask.as_ref()
     }
-}
-
-/// A mask on `grid`, which is that of `reference`: resampled by nearest neighbour, with a note,
-/// where it lies on another one.
-pub fn mask_on(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
-    resampled(path, some_mask(path)?, grid, reference, warnings)
-}
-
-/// The same of a label map or a mask that was read.
-pub fn resampled(path: &Path, labels: Mask, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
-    if grid.same_as(labels.grid()) {
-        return Ok(labels);
-    }
-    let placed = warp_labels(&labels, &DenseField::zeros(*grid), None, 0);
-    if placed.as_slice().iter().all(|v| *v == 0) {
-        bail!(
-            "{}: does not overlap {} in world space; check both headers (palpate info)",
-            path.shown(),
-            reference.shown()
-        );
-    }
-    warnings.push(format!(
-        "{}: lies on another grid than {}; it was resampled onto that by nearest neighbour",
-        name(path),
-        name(reference)
-    ));
-    Ok(placed)
 }

@@ -2,14 +2,13 @@
 
 use super::Usage;
 use super::console::Console;
-use super::inputs::{Part, check_distinct, file_of, name, standing_for, warn_all};
+use super::inputs::{Part, check_distinct, file_of, name, some_labels, standing_for, warn_all};
 use super::limits::mesh_fits;
 use super::outputs::Target;
 use super::record::{self, Recording};
 use super::stiffness::{names, number, place, put};
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use palpate::error::Shown;
 use palpate::io;
 use palpate::pipeline::experimental_design::{self, PlanInputs};
 use palpate::report::plan::{PlanReport, page, summary, text};
@@ -148,20 +147,19 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     inputs.extend(masks);
     let progress = console.progress();
     progress.set("read", 0.0);
-    let labels = io::read_labels(path)?;
-    if labels.as_slice().iter().all(|l| *l == 0) {
-        bail!("{}: no voxel has a label; give a label map that is 1 or more in each region", path.shown());
-    }
+    let labels = some_labels(path)?;
     check_labels(&labels, &params, path)?;
+    let mut warnings = Vec::new();
     let named = names(options.names.as_deref(), &labels)?;
-    let held = place(held, labels.grid(), path, "--held")?;
-    let load = place(load, labels.grid(), path, "--load")?;
+    let held = place(held, labels.grid(), path, "--held", &mut warnings)?;
+    let load = place(load, labels.grid(), path, "--load", &mut warnings)?;
     let mut folder = target.create()?;
     let record = Recording::start(console, inputs);
     let names = |label: u8| named[label as usize].clone();
     let inputs = PlanInputs { labels: &labels, held: &held, load: &load, names: &names };
-    let plan = experimental_design::run(&inputs, &params, &|stage, part| progress.set(stage, part))
+    let mut plan = experimental_design::run(&inputs, &params, &|stage, part| progress.set(stage, part))
         .with_context(|| name(path))?;
+    plan.warnings.splice(0..0, warnings);
 
     progress.set("write", 1.0);
     let file = name(path);

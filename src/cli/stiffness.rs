@@ -228,6 +228,7 @@ pub(super) fn plan(
         (true, true) => &[],
     };
     let files = [&FILES[..], more].concat();
+    warn_all(console, &setting.notes);
     console.say(&dry_run::stiffness(
         field,
         (&setting.labels, setting.labelled),
@@ -285,6 +286,7 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let result = setting.run(&field, matches.as_ref(), quality.told(), params, &|s, f| progress.set(s, f));
     let mut result = result.with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
     result.seconds.insert(0, ("read".into(), read));
+    result.warnings.splice(0..0, setting.notes.iter().cloned());
     progress.set("write", 1.0);
     let names = report::InputNames {
         field: name(&source.field),
@@ -390,6 +392,8 @@ pub(super) struct Setting {
     held: Place,
     load: Place,
     names: Vec<String>,
+    /// What was resampled.
+    pub(super) notes: Vec<String>,
 }
 
 impl Setting {
@@ -405,21 +409,22 @@ impl Setting {
         grid: &Grid,
         reference: &Path,
     ) -> Result<Self> {
+        let mut notes = Vec::new();
         let labels = match &options.labels {
-            Some(labels) => read_labels(labels, grid, reference)?,
+            Some(labels) => read_labels(labels, grid, reference, &mut notes)?,
             None => {
-                let mut mask = read_mask(body, grid, reference)?;
+                let mut mask = read_mask(body, grid, reference, &mut notes)?;
                 mask.as_mut_slice().iter_mut().for_each(|v| *v = u8::from(*v > 0));
                 mask
             }
         };
-        let held = place(&options.held, grid, reference, "--held")?;
-        let load = place(&options.load, grid, reference, "--load")?;
+        let held = place(&options.held, grid, reference, "--held", &mut notes)?;
+        let load = place(&options.load, grid, reference, "--load", &mut notes)?;
         let names = names(options.names.as_deref(), &labels)?;
         if let Some(label) = params.label_not_in(&labels).filter(|_| options.materials.is_none()) {
             bail!(Usage(format!("--poisson and --fixed: the label map holds no label {label}")));
         }
-        Ok(Self { labels, labelled: options.labels.is_some(), held, load, names })
+        Ok(Self { labels, labelled: options.labels.is_some(), held, load, names, notes })
     }
 
     /// The pipeline's view of it with `field`.
@@ -459,7 +464,7 @@ impl Setting {
     }
 }
 
-pub(super) fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Result<Place> {
+pub(super) fn place(text: &str, grid: &Grid, reference: &Path, flag: &str, notes: &mut Vec<String>) -> Result<Place> {
     match Side::parse(text) {
         Some(side) => Ok(Place::Side(side)),
         None => {
@@ -468,7 +473,7 @@ pub(super) fn place(text: &str, grid: &Grid, reference: &Path, flag: &str) -> Re
                 bail!("{flag} {text}: is neither a side (x-, x+, y-, y+, z-, z+) nor a file; check the spelling");
             }
             let path = &file_of(path, Part::Mask).with_context(|| format!("{flag} {text}"))?;
-            let mask = read_mask(path, grid, reference).with_context(|| format!("{flag} {text}"))?;
+            let mask = read_mask(path, grid, reference, notes).with_context(|| format!("{flag} {text}"))?;
             Ok(Place::Mask(Box::new(mask), name(path)))
         }
     }

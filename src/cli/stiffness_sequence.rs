@@ -86,6 +86,7 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
         sequence.add(*frame, moved, outcome);
     }
     let mut shared = sequence.finish(&setting.labels).with_context(|| format!("{} with {}", name(from), name(body)))?;
+    shared.result.warnings.splice(0..0, setting.notes.iter().cloned());
 
     progress.set("write", 1.0);
     write(&mut folder, &mut shared.result)?;

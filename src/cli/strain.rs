@@ -90,7 +90,7 @@ impl Source {
             }
         }
         let field = convention.read(path)?;
-        let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path)).transpose()?;
+        let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path, warnings)).transpose()?;
         let summary = there("summary.json").map(io::read_json).transpose()?;
         let trust = summary.and_then(|mut s| serde_json::from_value(s.get_mut("trust")?.take()).ok());
         let image = there("warped.nii.gz").map(io::read_volume).transpose()?;
@@ -139,8 +139,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let mut warnings = Vec::new();
     let source = Source::read(path, convention, &mut warnings)?;
     let grid = *source.field.grid();
-    let tissue = source.tissue(mask.as_ref().map(|m| read_mask(m, &grid, path)).transpose()?);
-    let labels = labels.as_ref().map(|l| read_labels(l, &grid, path)).transpose()?;
+    let tissue = source.tissue(mask.as_ref().map(|m| read_mask(m, &grid, path, &mut warnings)).transpose()?);
+    let labels = labels.as_ref().map(|l| read_labels(l, &grid, path, &mut warnings)).transpose()?;
     let directions = directions(fibres, tube, labels.as_ref().unwrap_or(&tissue), &grid)?;
     let mut folder = target.create()?;
     let record = Recording::start(console, inputs);

@@ -5,10 +5,10 @@ use super::console::Console;
 use super::dry_run;
 use super::field::Tuning;
 use super::inputs::{
-    Part, check_distinct, name, on_grid, read_labels, standing_for, usable, warn_all, warn_of_non_finite,
+    Part, check_distinct, name, on_grid, read_labels, read_mask, standing_for, usable, warn_all, warn_of_non_finite,
     warn_of_places, warn_of_two_places,
 };
-use super::known::{Knowledge, KnownInputs, mask_on};
+use super::known::{Knowledge, KnownInputs};
 use super::limits::{cap_search, grids_fit, same_unit};
 use super::outputs::Target;
 use super::record::{self, Read, Recording};
@@ -166,8 +166,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     let grid = *reference.grid();
     let first = source.path(origin);
     warnings.extend(cap_search(&mut params, &grid, first));
-    let inside = mask.as_ref().map(|m| mask_on(m, &grid, first, &mut warnings)).transpose()?;
-    let regions = labels.as_ref().map(|l| read_labels(l, &grid, first)).transpose()?;
+    let inside = mask.as_ref().map(|m| read_mask(m, &grid, first, &mut warnings)).transpose()?;
+    let regions = labels.as_ref().map(|l| read_labels(l, &grid, first, &mut warnings)).transpose()?;
     let known = match knowledge.is_empty() {
         true => KnownInputs::of_mask(inside),
         false => {
@@ -176,6 +176,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
             knowledge.read((&reference, &frame), [first, source.path(next)], inside, console, &mut warnings)?
         }
     };
+    let landmarks = knowledge.by_frame(known.known().landmarks, frames, origin)?;
     let inside = known.mask();
     warnings.extend(out_of_order(volumes));
     warnings.extend(inside.zip(regions.as_ref()).and_then(|(mask, labels)| outside_the_mask(mask, labels)));
@@ -210,6 +211,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         origin,
         reference: &reference,
         known: known.known(),
+        landmarks: &landmarks,
         labels: regions.as_ref(),
         params: &params,
         together: !options.frame_by_frame,
@@ -255,9 +257,6 @@ fn checked(options: &Options, source: &Source<'_>) -> Result<Read> {
     let (frames, origin) = (source.frames(), *origin);
     if origin >= frames {
         bail!(Usage(format!("--reference is {origin}, but there are {frames} volumes (counted from 0)")));
-    }
-    if knowledge.has_landmarks() && frames > 2 {
-        bail!(Usage("--landmarks belong to one pair; give palpate track two volumes, or take palpate field".into()));
     }
     let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
     inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));

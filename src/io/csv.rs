@@ -154,6 +154,33 @@ pub fn read_landmarks(path: impl AsRef<Path>) -> Result<Vec<Landmark>, IoError> 
     Ok(rows.into_iter().map(landmark).collect())
 }
 
+/// The frame that each landmark of a sequence belongs to, in the order of the rows: the column
+/// `frame` beside those of [`read_landmarks`], counted from 0.
+///
+/// # Errors
+/// As [`read_landmarks`]; also when a frame is no whole number.
+///
+/// ```
+/// use palpate::io;
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("landmarks.csv");
+/// std::fs::write(&path, "frame,fx,fy,fz,mx,my,mz\n1,0,0,0,1,0,0\n2,0,0,0,2,0,0\n")?;
+/// assert_eq!(io::read_landmark_frames(&path)?, [1, 2]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub fn read_landmark_frames(path: impl AsRef<Path>) -> Result<Vec<usize>, IoError> {
+    let rows = read_table(path.as_ref(), ["frame"])?.numbers;
+    some_rows(path.as_ref(), rows.len())?;
+    let frame = |(row, &[frame]): (usize, &[f64; 1])| {
+        let is_whole = frame.fract() == 0.0 && (0.0..=f64::from(u32::MAX)).contains(&frame);
+        is_whole.then_some(frame as usize).ok_or_else(|| {
+            let what = format!("row {}: frame is {frame}, not a whole number from 0 on", row + 1);
+            format(path.as_ref(), what, "give the number of the frame, counted from 0")
+        })
+    };
+    rows.iter().enumerate().map(frame).collect()
+}
+
 /// Landmarks from two files of points: the places in the initial volume and in the deformed one,
 /// paired by their labels where both files have all of them, else in order.
 ///

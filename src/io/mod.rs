@@ -94,8 +94,8 @@ pub use bids::{describe_derivative, is_bids, read_bids, write_derivative};
 pub use chain_errors::write_chain;
 pub use config::read_config;
 pub use csv::{
-    PointTable, TableKind, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches, table_kind,
-    write_landmarks, write_matches, write_points,
+    PointTable, TableKind, read_landmark_frames, read_landmark_pair, read_landmarks, read_matches, read_points,
+    stored_matches, table_kind, write_landmarks, write_matches, write_points,
 };
 pub use dicom::{Series as DicomSeries, series_in};
 pub use digest::{digest, files_of};

@@ -311,8 +311,9 @@ impl Bodies {
             return said;
         }
         while self.count() < TRIAL.max_bodies {
-            let tried = (0..self.count()).flat_map(|b| self.proposed(pair, matches, b));
-            let tried = tried.filter_map(|bodies| bodies.tried(pair, self, seed));
+            let proposed: Vec<Self> = (0..self.count()).flat_map(|b| self.proposed(pair, matches, b)).collect();
+            let proposals = proposed.len();
+            let tried = proposed.into_iter().filter_map(|bodies| bodies.tried(pair, self, seed));
             let rests = |t: &Trial| {
                 let own = matches.iter().filter(|m| t.bodies.label_near(m.voxel) == self.count());
                 own.count() >= TRIAL.min_matches
@@ -323,6 +324,13 @@ impl Bodies {
             };
             let Some(best) = tried.filter(|t| is_significant(t) && rests(t)).max_by(|a, b| a.gain.total_cmp(&b.gain))
             else {
+                if proposals > 0 {
+                    let s = if proposals == 1 { "" } else { "s" };
+                    let kept = self.count();
+                    said.push(format!(
+                        "bodies: {kept} kept; the volumes refuse {proposals} division{s} that the matches propose"
+                    ));
+                }
                 break;
             };
             said.push(best.why(self.count() + 1));

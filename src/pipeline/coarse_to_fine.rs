@@ -3,6 +3,7 @@
 
 use crate::matching::levels::{Aligned, factors, foreground, from_level, to_level};
 use crate::matching::pair::Pair;
+use crate::numerics::ablation;
 use crate::numerics::bspline::Lattice;
 use crate::pipeline::bodies::{Bodies, Given};
 use crate::pipeline::brightness::Light;
@@ -224,7 +225,19 @@ impl<'a> CoarseToFine<'a, '_> {
         } else if *sought && self.params.bodies == BodySource::Found {
             let edges = pair.spacing.into_iter().zip(*factor).map(|(s, f)| s / f as f64);
             let edge = edges.fold(f64::INFINITY, f64::min);
-            let said = bodies.divide(pair, &begun.matches, *passes, edge, self.params.seed);
+            let divide = |bodies: &mut Bodies, begun: &Begun| {
+                bodies.divide(pair, &begun.matches, *passes, edge, self.params.seed)
+            };
+            let mut said = divide(bodies, begun);
+            let is_open = level.is_first() && bodies.only().is_some() && begun.is_partial();
+            let next = self.factors.get(level.place + 1).filter(|_| is_open && ablation::is_on("look-ahead"));
+            if let Some(&next) = next {
+                let finer = account.light.level(self.aligned, next);
+                let search = Search { range: account.range, ..*search };
+                search.look_ahead((pair, *factor), (&finer, next), begun, *passes, &mut account.matched);
+                *bodies = begun.motion.clone();
+                said.extend(divide(bodies, begun));
+            }
             account.asked.extend(said.into_iter().map(noted));
         }
     }

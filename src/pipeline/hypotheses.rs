@@ -392,6 +392,38 @@ impl Search<'_> {
         (matched.1.unwrap_or_else(|| SplineField::still(lattice.clone())), turn)
     }
 
+    /// Searches the next level, `next`, within the same range, where few features of this one agree:
+    /// smaller patches tell parts that move apart. Where more of them agree, they take the place of
+    /// the matches, and their field goes on if the volumes agree better under it.
+    pub fn look_ahead(
+        &self,
+        (pair, factor): (&Pair<'_>, [usize; 3]),
+        (next, next_factor): (&Pair<'_>, [usize; 3]),
+        begun: &mut Begun,
+        passes: usize,
+        seconds: &mut f64,
+    ) {
+        let wide = self.wide(next, self.range, WHOLE_SEARCH.max_features);
+        (self.matching)();
+        let (matches, found, report) = timed(seconds, || level::matches(next, None, wide));
+        let more = report.counts.kept >= WHOLE_SEARCH.min_matches && report.counts.kept_share() > begun.share();
+        let Some(found) = found.filter(|_| more) else { return };
+        let here = |m: LevelMatch| {
+            let voxel = to_level(from_level(m.voxel, next_factor), factor);
+            let place = std::array::from_fn(|a| voxel[a] * pair.spacing[a]);
+            LevelMatch { voxel, measured: Measured { place, ..m.measured }, ..m }
+        };
+        begun.matches = matches.into_iter().map(here).collect();
+        begun.report = Some(report);
+        let lattice = begun.motion.fields[0].lattice.clone();
+        let field = level::carry(&found, lattice, |p| to_level(from_level(p, factor), next_factor));
+        let motion = self.refined(pair, field.clone().to_refine().into(), passes);
+        if motion.agree_better(pair, &begun.motion) {
+            begun.motion = motion;
+            begun.of_matches = Some(field);
+        }
+    }
+
     /// Whether the features of a level are found where the field has them.
     fn is_confirmed(&self, pair: &Pair<'_>, motion: &Bodies) -> bool {
         let points = (pair.inside / self.params.voxels_per_point).max(NEXT_LEVEL.min_features);
@@ -422,4 +454,50 @@ fn timed<T>(seconds: &mut f64, work: impl FnOnce() -> T) -> T {
     let out = work();
     *seconds += started.elapsed().as_secs_f64();
     out
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::matching::levels::Aligned;
+    use crate::synth::{PhantomKind, PhantomParams, phantom};
+
+    #[test]
+    fn matches_of_the_next_level_lie_where_they_do_on_this_one() {
+        let made = phantom(&PhantomParams::new(PhantomKind::Block).sized(48)).unwrap();
+        let aligned = Aligned::new(&made.initial, &made.deformed, &made.mask, 8.0).unwrap();
+        let (factor, next_factor) = ([2; 3], [1; 3]);
+        let (pair, next) = (aligned.level(factor), aligned.level(next_factor));
+        let params = FieldParams::default();
+        let search = Search { params: &params, range: 8.0, flat: false, turns: false, matching: &|| (), tick: &|_| () };
+        let still = SplineField::still(level::lattice(&pair, 3));
+        let mut begun = Begun {
+            motion: still.into(),
+            of_matches: None,
+            report: None,
+            matches: Vec::new(),
+            followed: 0,
+            turn: None,
+        };
+        search.look_ahead((&pair, factor), (&next, next_factor), &mut begun, 4, &mut 0.0);
+        let (grid, axes) = (made.initial.grid(), made.initial.grid().axes());
+        let exact = |p: [f64; 3]| -> [f64; 3] {
+            let v = from_level(p, factor).map(|v| v.round() as usize);
+            let d = made.truth.at(grid.index(v[0], v[1], v[2])).map(f64::from);
+            std::array::from_fn(|a| (0..3).map(|r| axes[r][a] * d[r]).sum())
+        };
+        let off = |u: [f64; 3], t: [f64; 3]| length(std::array::from_fn(|a| u[a] - t[a]));
+        let kept: Vec<&LevelMatch> = begun.matches.iter().filter(|m| m.kept).collect();
+        let within = kept.iter().filter(|m| off(m.measured.displacement, exact(m.voxel)) < 0.5).count();
+        assert!(kept.len() > 100 && 10 * within > 9 * kept.len(), "{within} of {}", kept.len());
+        let placed =
+            |m: &&LevelMatch| (0..3).all(|a| (m.measured.place[a] - m.voxel[a] * pair.spacing[a]).abs() < 1e-9);
+        assert!(kept.iter().all(placed));
+        // Their field goes on, as the volumes agree better under it than at rest.
+        let field = begun.of_matches.unwrap();
+        let carried = |m: &&&LevelMatch| off(field.lattice.at(&field.coefficients, m.voxel), m.measured.field) < 0.3;
+        let carried = kept.iter().filter(carried).count();
+        assert!(10 * carried > 9 * kept.len(), "{carried} of {}", kept.len());
+    }
 }

@@ -90,6 +90,9 @@ pub struct Sequence<'a> {
     pub reference: &'a Voxels<'a>,
     /// What is known of the reference and of each frame.
     pub known: Known<'a>,
+    /// The landmarks of each frame by its number, in the place of those that are known of every
+    /// frame; empty where there are none.
+    pub landmarks: &'a [Vec<Landmark>],
     /// Regions whose strain is worked out (on the reference's grid; 0 is left out). Without them
     /// the mask is one, and without either what stands out of the background.
     pub labels: Option<&'a Mask>,
@@ -124,6 +127,7 @@ pub struct Sequence<'a> {
 ///     origin: 0,
 ///     reference: &reference,
 ///     known: Known::mask(Some(&made.mask)),
+///     landmarks: &[],
 ///     labels: None,
 ///     params: &field,
 ///     together: false,
@@ -143,7 +147,7 @@ pub fn run<'v, E: From<FieldError>>(
     mut keep: impl FnMut(Frame<'_>) -> Result<(), E>,
     progress: Progress<'_>,
 ) -> Result<Tracked, E> {
-    let Sequence { frames, origin, reference, known, labels, params, together } = *sequence;
+    let Sequence { frames, origin, reference, known, landmarks, labels, params, together } = *sequence;
     let mask = known.mask;
     // Without a mask it is tissue that counts, not air.
     let tissue = mask.map_or_else(|| Cow::Owned(foreground(reference)), Cow::Borrowed);
@@ -159,6 +163,9 @@ pub fn run<'v, E: From<FieldError>>(
         if number + 1 == origin {
             tracker.restart();
             said.extend(course.end());
+        }
+        if let Some(own) = landmarks.get(number) {
+            tracker.known.landmarks = own;
         }
         let volume = read(number)?;
         let started = Instant::now();

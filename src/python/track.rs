@@ -58,6 +58,7 @@ pub fn track<'py>(
             origin: reference,
             reference: &all[reference],
             known: Known::mask(mask.as_ref()),
+            landmarks: &[],
             labels: labels.as_ref(),
             params: &params,
             together,

@@ -197,6 +197,7 @@ fn look(report: &FieldReport<'_>, views: &Views) -> Markup {
         name: None,
         images: &[],
         overlays: &overlays,
+        bounds: None,
         displacement: views.magnitude.scale.clone().map(|scale| (report.displacement, scale)),
         matches: Some((&report.matches.matches, views.matches.2.clone())),
         mesh: Some(elements(report.mesh)),

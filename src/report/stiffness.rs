@@ -224,8 +224,23 @@ pub struct Shown<'a> {
 /// Voxels from one stripe of a hatching to the next.
 const STRIPES: usize = 3;
 
+/// What a region's modulus is: the value itself (0), a lower bound of it (1) or an upper one (2).
+fn bound(region: &RegionStiffness) -> u8 {
+    match (region.state, region.bound) {
+        (Determined::Bound, Some("lower")) => 1,
+        (Determined::Bound, _) => 2,
+        _ => 0,
+    }
+}
+
 /// Maps, displacement and mesh over the images in a viewer, with the scales of the pictures.
-fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Values<'_>, &Panel); 3]) -> Markup {
+fn look(
+    result: &StiffnessResult,
+    inside: &Mask,
+    shown: &Shown<'_>,
+    maps: [(Values<'_>, &Panel); 3],
+    bound_at: &(dyn Fn(usize) -> u8 + Sync),
+) -> Markup {
     let overlays: Vec<Layer<'_>> = maps
         .into_iter()
         .filter_map(|(values, panel)| Some(Layer { name: &panel.title, values, scale: panel.scale.clone()? }))
@@ -253,6 +268,7 @@ fn look(result: &StiffnessResult, inside: &Mask, shown: &Shown<'_>, maps: [(Valu
         name: None,
         images: &[],
         overlays: &overlays,
+        bounds: Some(&|o| bound_at(o)),
         displacement,
         matches: None,
         mesh: Some((result.mesh.nodes(), corners, 4)),
@@ -345,10 +361,11 @@ fn page_with(
     };
     let seen = result.regions.iter().filter(|r| r.identifiable).map(|r| r.youngs_modulus).fold(0.0, f64::max);
     let seen = if seen > 0.0 { seen } else { top(moduli, 1.0) };
-    let bounds: Vec<f32> =
-        result.regions.iter().filter(|r| r.state == Determined::Bound).map(|r| r.youngs_modulus as f32).collect();
+    let bounds: Vec<(f32, u8)> =
+        result.regions.iter().map(|r| (r.youngs_modulus as f32, bound(r))).filter(|b| b.1 > 0).collect();
+    let bound_at = |o: usize| bounds.iter().find(|b| b.0 == map[o]).map_or(0, |b| b.1);
     // Stripes along a diagonal of the voxels show on sections along every axis.
-    let striped = |o: usize| bounds.contains(&map[o]) && grid.voxel(o).iter().sum::<usize>() % STRIPES == 0;
+    let striped = |o: usize| bound_at(o) > 0 && grid.voxel(o).iter().sum::<usize>() % STRIPES == 0;
     let hatched: Values<'_> = &|o| if striped(o) { f32::NAN } else { moduli(o) };
     let map_panel = panel(
         "Young's modulus",
@@ -378,7 +395,7 @@ fn page_with(
             div.grid { article.wide { h3 { "Moduli" } (region_table(result)) } }
         }
         (extra)
-        section { h2 { "Look" } article.wide { (look(result, &inside, shown, maps)) } }
+        section { h2 { "Look" } article.wide { (look(result, &inside, shown, maps, &bound_at)) } }
         section {
             h2 { "Maps" }
             div.grid {

@@ -191,6 +191,7 @@ impl Looks {
             name: Some(name),
             images: &images,
             overlays: &overlays,
+            bounds: None,
             displacement: Some((displacement, lengths)),
             matches: Some((&matches.matches, precision)),
             mesh: Some(elements(mesh)),

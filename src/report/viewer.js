@@ -93,11 +93,15 @@
     const one = cut(plane, first, first.values, grid, false);
     const two = compare === "alone" ? one : cut(plane, second, second.values, grid, false);
     const overlay = chosen("colour", overlays), opacity = $("opacity").value / 100;
-    let coloured = null, inside = null;
+    let coloured = null, inside = null, bounded = null;
     if (overlay) {
       coloured = overlay.vector ? length(plane, grid) : cut(plane, overlay, overlay.values, grid, true).map((b) => real(overlay, b));
       inside = data.mask.values ? cut(plane, data.mask, data.mask.values, grid, true) : null;
+      bounded = overlay.bounds ? cut(plane, overlay, overlay.bounds, grid, true) : null;
     }
+    // Stripes of a third of the colour are left out where a value is a bound.
+    const stripe = Math.max(3, Math.round(Math.max(width, height) / 40));
+    const isGap = (i) => bounded && bounded[i] > 0.5 && ((i % width) + Math.floor(i / width)) % (3 * stripe) < stripe;
     const table = overlay ? colours[overlay.map] : null;
     const square = Math.max(4, Math.round(Math.max(width, height) / 10));
     const picture = new ImageData(width, height), p = picture.data;
@@ -105,7 +109,7 @@
       const tile = ((i % width) / square ^ Math.floor(i / width) / square) & 1;
       const gray = compare === "flicker" ? (blink ? two[i] : one[i]) : compare === "checkerboard" && tile ? two[i] : one[i];
       let r = gray, g = gray, b = gray;
-      if (overlay && !isUnknown(coloured[i]) && (!inside || inside[i] > 0.5)) {
+      if (overlay && !isUnknown(coloured[i]) && (!inside || inside[i] > 0.5) && !isGap(i)) {
         const t = entry(overlay, coloured[i]);
         r += (table[t] - r) * opacity; g += (table[t + 1] - g) * opacity; b += (table[t + 2] - b) * opacity;
       }
@@ -238,7 +242,8 @@
 
   const reading = (layer, byte) => {
     if (isUnknown(byte)) return "unknown";
-    return `${byte > END + 0.5 ? "at least " : ""}${short(real(layer, byte))} ${layer.unit}`.trim();
+    const bound = layer.bounds ? Math.round(sample(layer, layer.bounds, cross)) : 0;
+    return `${bound === 2 ? "at most " : bound || byte > END + 0.5 ? "at least " : ""}${short(real(layer, byte))} ${layer.unit}`.trim();
   };
   const short = (v) => (Math.abs(v) >= 100 ? v.toFixed(0) : v.toFixed(2));
   const say = () => {
@@ -314,6 +319,7 @@
 
   const bytes = async (layer) => {
     if (layer.data) layer.values = new Uint8Array(await bytesOf(layer.data));
+    if (layer.bounds) layer.bounds = new Uint8Array(await bytesOf(layer.bounds));
   };
   const unpack = async (moment) => {
     await Promise.all(moment.images.map(bytes));

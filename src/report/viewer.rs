@@ -42,6 +42,9 @@ pub struct Layer<'a> {
     pub scale: Scale,
 }
 
+/// What the value at a voxel is: the value itself (0), a lower bound of it (1) or an upper one (2).
+pub type Bounds<'a> = &'a (dyn Fn(usize) -> u8 + Sync);
+
 /// What a viewer shows at one moment: all of it, or what changes over a sequence. On the viewer's
 /// grid.
 pub struct Moment<'a> {
@@ -52,6 +55,8 @@ pub struct Moment<'a> {
     pub images: &'a [Layer<'a>],
     /// In colour over an image.
     pub overlays: &'a [Layer<'a>],
+    /// Where values of the first overlay are bounds: hatched, and read so.
+    pub bounds: Option<Bounds<'a>>,
     /// Arrows, grid and magnitude, with the scale of its length.
     pub displacement: Option<(&'a DenseField, Scale)>,
     /// Dots with the scale of their precision.
@@ -222,7 +227,11 @@ impl Moment<'_> {
                 "high": scale.high, "unit": scale.unit, "map": map_name(scale.map) }));
         }
         maps.extend(self.overlays.iter().map(|l| l.scale.map));
-        overlays.extend(layers(&coarse, self.overlays, code));
+        let mut measured = layers(&coarse, self.overlays, code);
+        if let Some((bounds, first)) = self.bounds.zip(measured.first_mut()) {
+            first["bounds"] = json!(pack(&coarse.map(bounds)));
+        }
+        overlays.extend(measured);
         let field = self.displacement.as_ref().map(|(field, _)| {
             let moved = coarse.map(|o| canonical.direct(field.at(o).map(f64::from)));
             let hundredths =
@@ -415,6 +424,7 @@ mod tests {
             name: None,
             images: &[],
             overlays: &[],
+            bounds: None,
             displacement: Some((&field, length.clone())),
             matches: Some((&[at], length)),
             mesh: None,

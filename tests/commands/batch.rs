@@ -352,8 +352,10 @@ fn what_a_later_stage_would_refuse_is_found_before_the_first_one_runs() {
         "scene,initial.nii.gz,deformed.nii.gz,mask.nii.gz,y-,y+,absent.toml",
     ]);
     let at = |name: &str| folder.path().join(name);
-    fs::write(at("other.nii"), crate::fixtures::Nifti::filled([20, 20, 20], 1.0).bytes()).unwrap();
     let grid = *palpate::io::read_volume(at("initial.nii.gz")).unwrap().grid();
+    let far = palpate::types::Affine::scaled([1.0; 3], [5000.0; 3]).unwrap();
+    let far = palpate::types::Grid::new([20; 3], far).unwrap();
+    palpate::io::write_labels(at("other.nii"), &palpate::types::Mask::filled(far, 1), "").unwrap();
     for (name, value) in [("half.nii", 0.5), ("none.nii", 0.0)] {
         palpate::io::write_volume(at(name), &palpate::types::Volume::from_voxels(grid, |_, _| value), "").unwrap();
     }
@@ -364,7 +366,7 @@ fn what_a_later_stage_would_refuse_is_found_before_the_first_one_runs() {
     }
     let reasons: Vec<String> = rows(folder.path(), "out/batch.csv").into_iter().map(|r| r["reason"].clone()).collect();
     for (reason, part) in
-        reasons.iter().zip(["other.nii is on another grid", "0.5", "no voxel has a label", "other.nii", "absent.toml"])
+        reasons.iter().zip(["other.nii: does not overlap", "0.5", "no voxel has a label", "other.nii", "absent.toml"])
     {
         assert!(reason.contains(part), "{part}: {reason}");
     }

@@ -201,8 +201,26 @@ fn sequences_and_batches_take_what_a_pair_takes() {
     let mean = field.as_slice()[..n].iter().map(|v| f64::from(*v)).sum::<f64>() / n as f64;
     assert!((mean - 60.0).abs() < 2.0, "{mean}");
     fs::write(at.join("l.csv"), "fx,fy,fz,mx,my,mz\n0,0,0,60,0,0\n").unwrap();
-    let (_, said) = run(at, &[&frames[..], &["--landmarks", "l.csv", "-o", "b"]].concat(), 2);
-    assert!(said.contains("one pair"), "{said}");
+    let tracked = |table: &str, code: i32| {
+        fs::write(at.join("t.csv"), table).unwrap();
+        run(
+            at,
+            &[&frames[..], &["--initial", "centre", "--landmarks", "t.csv", "-o", "b", "--overwrite"]].concat(),
+            code,
+        )
+        .1
+    };
+    let said = tracked("fx,fy,fz,mx,my,mz\n0,0,0,60,0,0\n", 1);
+    assert!(said.contains("t.csv: line 1: there is no column \"frame\""), "{said}");
+    let said = tracked("frame,fx,fy,fz,mx,my,mz\n3,0,0,0,60,0,0\n", 1);
+    assert!(said.contains("t.csv: has landmarks of frame 3; the frames are 0 to 2, without the reference 0"), "{said}");
+    let said = tracked("frame,fx,fy,fz,mx,my,mz\n1.5,0,0,0,60,0,0\n", 1);
+    assert!(said.contains("row 1: frame is 1.5, not a whole number"), "{said}");
+    let said = tracked("frame,fx,fy,fz,mx,my,mz\n2,0,0,0,30,0,0\n", 0);
+    assert!(
+        said.contains("landmark") && summary(at, "b")["frames"][1]["warnings"].to_string().contains("landmark"),
+        "{said}"
+    );
 
     fs::write(
         at.join("pairs.csv"),

@@ -478,11 +478,27 @@ fn a_number_of_regions_beside_labels_is_said_to_change_nothing() {
 }
 
 #[test]
-fn labels_on_another_grid_are_refused() {
+fn labels_on_another_grid_are_resampled_or_refused() {
     let folder = folder();
-    let other = Mask::filled(grid([16, 16, 15]), 1);
-    io::write_labels(folder.path().join("labels.nii.gz"), &other, "").unwrap();
-    refused(folder.path(), &[], 1, &["labels.nii.gz", "another grid", "palpate warp --reference"]);
+    let (path, moduli) = (folder.path().join("labels.nii.gz"), folder.path().join("results/regions.csv"));
+    let (_, err) = run(folder.path(), &BASE, 0);
+    assert!(!err.contains("resampled"), "{err}");
+    let (own, expected) = (io::read_labels(&path).unwrap(), fs::read(&moduli).unwrap());
+    // The same labels with two voxels of air around them.
+    let wider = Grid::new([20; 3], Affine::scaled([1.0; 3], [-5.0, 3.0, -1.0]).unwrap()).unwrap();
+    let padded = Mask::from_voxels(wider, |at, _| {
+        let v = wider.voxel(at);
+        let [i, j, k] = v.map(|i| i.wrapping_sub(2));
+        if v.iter().all(|i| (2..18).contains(i)) { own.as_slice()[own.grid().index(i, j, k)] } else { 0 }
+    });
+    io::write_labels(&path, &padded, "").unwrap();
+    let (_, err) = run(folder.path(), &[&BASE[..], &["--overwrite"]].concat(), 0);
+    assert!(err.contains("labels.nii.gz: lies on another grid than field.nii.gz"), "{err}");
+    assert_eq!(fs::read(&moduli).unwrap(), expected);
+    fs::remove_dir_all(folder.path().join("results")).unwrap();
+    let far = Grid::new([16; 3], Affine::scaled([1.0; 3], [90.0; 3]).unwrap()).unwrap();
+    io::write_labels(&path, &Mask::filled(far, 1), "").unwrap();
+    refused(folder.path(), &[], 1, &["labels.nii.gz", "does not overlap field.nii.gz", "palpate info"]);
 }
 
 #[test]

@@ -168,7 +168,8 @@ fn what_cannot_be_tracked_is_refused() {
     fs::write(path("cut.nii"), &series(false)[..100_000]).unwrap();
     let flat = Nifti { times: 3, values: vec![1.0; 3 * 512], ..Nifti::filled([8, 8, 8], 1.0) };
     fs::write(path("flat.nii"), flat.bytes()).unwrap();
-    fs::write(path("other.nii"), Nifti::filled([5, 5, 5], 1.0).bytes()).unwrap();
+    let far = [[1.0, 0.0, 0.0, 5000.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+    fs::write(path("other.nii"), Nifti { sform: far, ..Nifti::filled([5, 5, 5], 1.0) }.bytes()).unwrap();
     let (a, b) = ("frame_000.nii.gz", "frame_001.nii.gz");
     let (short, cut, flat, other, out) =
         (path("short.nii.gz"), path("cut.nii"), path("flat.nii"), path("other.nii"), path("out"));
@@ -193,7 +194,7 @@ fn what_cannot_be_tracked_is_refused() {
         (vec![&short], 1, ["short.nii.gz", "cut short"]),
         (vec![&cut], 1, ["cut.nii", "cut short"]),
         (vec![&flat], 1, ["flat.nii", "same value"]),
-        (vec![a, b, "--labels", &other], 1, ["other.nii", "frame_000.nii.gz"]),
+        (vec![a, b, "--labels", &other], 1, ["other.nii: does not overlap", "frame_000.nii.gz"]),
         (vec!["truth_001.nii.gz"], 1, ["truth_001.nii.gz", "series of scalar volumes"]),
     ] {
         let all = [&["track"], &arguments[..], &["-o", &out]].concat();

@@ -12,7 +12,7 @@ use palpate::strain::gauge::Gauge;
 use palpate::strain::measure::green_lagrange;
 use palpate::strain::statistics::StrainStatistics;
 use palpate::synth::{Sequence, SequenceKind, SequenceParams};
-use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, PointState, StrainMeasure, Volume};
+use palpate::types::{Affine, DenseField, FieldParams, Grid, Landmark, Mask, PointState, StrainMeasure, Volume};
 
 fn sequence(kind: SequenceKind, frames: usize) -> Sequence {
     Sequence::new(&SequenceParams { frames, ..SequenceParams::new(kind).sized(40) }).unwrap()
@@ -27,7 +27,7 @@ fn volumes<'a>(
     params: &'a FieldParams,
     together: bool,
 ) -> Volumes<'a> {
-    Volumes { frames, origin, reference, known, labels, params, together }
+    Volumes { frames, origin, reference, known, landmarks: &[], labels, params, together }
 }
 
 /// Mean error over the tissue (mm).
@@ -159,6 +159,29 @@ fn principal_strains_come_back() {
             assert!(mean < 0.02, "{kind:?}, frame {t}: {mean:.4}");
         }
     }
+}
+
+/// Each frame takes its own landmarks, and one that has none takes none.
+#[test]
+fn landmarks_belong_to_their_frames() {
+    let s = sequence(SequenceKind::Pinch, 4);
+    let (params, reference) = (FieldParams::default(), s.frame(0));
+    let middle = reference.grid().world(20, 20, 20);
+    let landmark = |t: usize| {
+        let d = s.truth(t).at(reference.grid().index(20, 20, 20)).map(f64::from);
+        Landmark { initial: middle, deformed: middle.moved(d) }
+    };
+    let wrong = Landmark { deformed: middle.moved([9.0, 0.0, 0.0]), ..landmark(3) };
+    let own = [vec![], vec![landmark(1); 2], vec![], vec![wrong]];
+    let mut seen = Vec::new();
+    let keep = |f: palpate::pipeline::track::Frame<'_>| -> Result<(), FieldError> {
+        seen.push(f.result.summary.landmarks.as_ref().map(|l| (f.number, l.count, l.wrong.len())));
+        Ok(())
+    };
+    let known = Known { landmark_sd_mm: 0.5, ..Known::mask(Some(&s.mask)) };
+    let sequence = Volumes { landmarks: &own, ..volumes(4, 0, &reference, known, None, &params, false) };
+    run(&sequence, |t| Ok(s.frame(t)), keep, &|_, _| {}).unwrap();
+    assert_eq!(seen, [Some((1, 2, 0)), None, Some((3, 1, 1))]);
 }
 
 #[test]
