@@ -100,7 +100,7 @@
       bounded = overlay.bounds ? cut(plane, overlay, overlay.bounds, grid, true) : null;
     }
     // Stripes of a third of the colour are left out where a value is a bound.
-    const stripe = Math.max(3, Math.round(Math.max(width, height) / 40));
+    const stripe = Math.max(1, Math.round(Math.max(width, height) / 60));
     const isGap = (i) => bounded && bounded[i] > 0.5 && ((i % width) + Math.floor(i / width)) % (3 * stripe) < stripe;
     const table = overlay ? colours[overlay.map] : null;
     const square = Math.max(4, Math.round(Math.max(width, height) / 10));
