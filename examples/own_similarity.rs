@@ -1,68 +1,55 @@
-//! A similarity of one's own in place of correlation: pairs of features are scored by a closure.
+//! A similarity of one's own in place of correlation. The deformed volume is inverted, as T1 against
+//! T2: there the correlation of the right pair is near -1, and its square alike for either contrast.
 //!
 //!     cargo run --release --example own_similarity
-//!
-//! The deformed volume is shown in a contrast that is the other way round, as T1 against T2. There
-//! the correlation of the right pair is near -1; its square is alike for either contrast.
 
 use palpate::consistency::energy::{EnergyParams, Graph};
 use palpate::consistency::relaxation::relax;
 use palpate::features::detect;
-use palpate::matching::candidates::{CandidateParams, paired};
+use palpate::matching::candidates::{CandidateParams, Similarity, paired};
 use palpate::numerics::sampling::displacement;
 use palpate::types::space::length;
 use palpate::{FeaturePoint, PhantomKind, PhantomParams, Volume, phantom};
-use std::error::Error;
 
-/// Voxels between the middle of a patch and its faces.
-const RADIUS: i64 = 3;
+/// The squared correlation of patches of seven voxels.
+struct SquaredCorrelation<'a>([&'a Volume; 2]);
 
-/// The patch about a feature, less its mean and of unit length; zeros past the volume's border.
-fn patch(volume: &Volume, feature: &FeaturePoint) -> Vec<f32> {
-    let (grid, centre) = (volume.grid(), feature.voxel.0.map(|v| v.round() as i64));
-    let around = || -RADIUS..=RADIUS;
-    let offsets = around().flat_map(|k| around().flat_map(move |j| around().map(move |i| [i, j, k])));
-    let value = |d: [i64; 3]| {
-        let at: [i64; 3] = std::array::from_fn(|a| centre[a] + d[a]);
-        let within = (0..3).all(|a| (0..grid.shape()[a] as i64).contains(&at[a]));
-        if within { volume.as_slice()[grid.index(at[0] as usize, at[1] as usize, at[2] as usize)] } else { 0.0 }
-    };
-    let mut values: Vec<f32> = offsets.map(value).collect();
-    let mean = values.iter().sum::<f32>() / values.len() as f32;
-    values.iter_mut().for_each(|v| *v -= mean);
-    let norm = values.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
-    values.iter_mut().for_each(|v| *v /= norm);
-    values
+impl Similarity for SquaredCorrelation<'_> {
+    fn between(&self, initial: &FeaturePoint, deformed: &FeaturePoint) -> f32 {
+        let [a, b] = [(self.0[0], initial), (self.0[1], deformed)].map(|(volume, feature)| {
+            let centre = feature.voxel.0.map(|v| v.round() as usize);
+            let around = |n: usize| (0..343).map(move |i| i / 7usize.pow(n as u32) % 7);
+            let place = |(d, (e, f))| volume.grid().index(centre[0] + d - 3, centre[1] + e - 3, centre[2] + f - 3);
+            let values = around(0).zip(around(1).zip(around(2))).map(|d| volume.as_slice()[place(d)]);
+            let mean = values.clone().sum::<f32>() / 343.0;
+            values.map(|v| v - mean).collect::<Vec<f32>>()
+        });
+        let sum = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
+        sum(&a, &b).powi(2) / (sum(&a, &a) * sum(&b, &b)).max(f32::MIN_POSITIVE)
+    }
 }
 
-fn main() -> Result<(), Box<dyn Error>> {
+fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut pair = phantom(&PhantomParams::new(PhantomKind::Block).sized(48))?;
-    let brightest = pair.deformed.as_slice().iter().copied().fold(0.0, f32::max);
-    pair.deformed.as_mut_slice().iter_mut().for_each(|v| *v = brightest - *v);
-
-    let grid = *pair.initial.grid();
-    let here = detect(&pair.initial, Some(&pair.mask), 500)?;
-    let there = detect(&pair.deformed, None, 2_000)?;
-    let correlation = |a: &FeaturePoint, b: &FeaturePoint| -> f32 {
-        patch(&pair.initial, a).iter().zip(patch(&pair.deformed, b)).map(|(x, y)| x * y).sum()
+    pair.deformed.as_mut_slice().iter_mut().for_each(|v| *v = -*v);
+    let inner = |f: &FeaturePoint| {
+        f.voxel.0.iter().zip(pair.initial.grid().shape()).all(|(v, n)| (3.0..n as f64 - 4.0).contains(v))
     };
-    let own = |a: &FeaturePoint, b: &FeaturePoint| correlation(a, b).powi(2);
-
+    let [mut here, mut there] = [detect(&pair.initial, Some(&pair.mask), 500)?, detect(&pair.deformed, None, 2_000)?];
+    here.retain(inner);
+    there.retain(inner);
+    let own = SquaredCorrelation([&pair.initial, &pair.deformed]);
+    let candidates = paired(pair.initial.grid(), [&here, &there], CandidateParams::within(6.0), &own);
     let places: Vec<[f64; 3]> = here.iter().map(|f| f.world.0).collect();
-    let graph = Graph::new(&places, EnergyParams::new(2.0 * grid.least_spacing()));
-    let right = |similarity: &(dyn Fn(&FeaturePoint, &FeaturePoint) -> f32 + Sync)| {
-        let candidates = paired(&grid, [&here, &there], CandidateParams::within(6.0), similarity);
-        let chosen = relax(&graph, &candidates).chosen;
-        let near = |(i, feature): (usize, &FeaturePoint)| {
-            let candidate = candidates[i].get(chosen[i])?;
-            let (u, truth) = (grid.vector_to_world(candidate.displacement), displacement(&pair.truth, feature.world));
-            Some(length(std::array::from_fn(|a| u[a] - truth[a])) < 1.5)
-        };
-        let judged: Vec<bool> = here.iter().enumerate().filter_map(near).collect();
-        (judged.iter().filter(|r| **r).count(), judged.len())
+    let chosen =
+        relax(&Graph::new(&places, EnergyParams::new(2.0 * pair.initial.grid().least_spacing())), &candidates).chosen;
+    let error = |(i, feature): (usize, &FeaturePoint)| {
+        let found = pair.initial.grid().vector_to_world(candidates[i].get(chosen[i])?.displacement);
+        let truth = displacement(&pair.truth, feature.world);
+        Some(length(std::array::from_fn(|a| found[a] - truth[a])))
     };
-    for (name, (count, matched)) in [("correlation", right(&correlation)), ("own", right(&own))] {
-        println!("{name:>12}: {count} right of {matched} matches, {} features", here.len());
-    }
+    let errors: Vec<f64> = here.iter().enumerate().filter_map(error).collect();
+    let right = errors.iter().filter(|e| **e < 1.5).count();
+    println!("own: {right} right of {} matches, {} features", errors.len(), here.len());
     Ok(())
 }

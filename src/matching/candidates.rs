@@ -82,12 +82,35 @@ pub fn between(
     Ok(candidates(&initial, &deformed, spacing, params))
 }
 
+/// How alike two features are: 1 where they are the same, less for others. A closure is one too.
+///
+/// ```
+/// use palpate::FeaturePoint;
+/// use palpate::matching::candidates::Similarity;
+/// struct Strength;
+/// impl Similarity for Strength {
+///     fn between(&self, initial: &FeaturePoint, deformed: &FeaturePoint) -> f32 {
+///         1.0 - (initial.response - deformed.response).abs()
+///     }
+/// }
+/// ```
+pub trait Similarity: Sync {
+    /// Of a feature of the initial volume and one of the deformed volume.
+    fn between(&self, initial: &FeaturePoint, deformed: &FeaturePoint) -> f32;
+}
+
+impl<F: Fn(&FeaturePoint, &FeaturePoint) -> f32 + Sync> Similarity for F {
+    fn between(&self, initial: &FeaturePoint, deformed: &FeaturePoint) -> f32 {
+        self(initial, deformed)
+    }
+}
+
 /// Candidates of each initial feature among the deformed ones, by a similarity of the caller's
 /// own, best first.
 ///
 /// Looks at the `partners` nearest features within the reach (a distance here) and keeps the best
-/// of those that are at least `min_ncc` alike. `similarity` is 1 for features that are the same,
-/// and less for others; it stands as [`Candidate::ncc`]. `grid` is the initial volume's.
+/// of those that are at least `min_ncc` alike. The similarity stands as [`Candidate::ncc`]. `grid` is
+/// the initial volume's.
 ///
 /// ```
 /// use palpate::matching::candidates::{CandidateParams, paired};
@@ -101,7 +124,7 @@ pub fn between(
 /// let (here, there) = ([at(10.0, 2.0)], [at(11.0, 9.0), at(13.0, 2.1)]);
 /// // Alike are corners of like strength.
 /// let alike = |a: &FeaturePoint, b: &FeaturePoint| 1.0 - (a.response - b.response).abs();
-/// let lists = paired(&grid, [&here, &there], CandidateParams::within(5.0), alike);
+/// let lists = paired(&grid, [&here, &there], CandidateParams::within(5.0), &alike);
 /// assert_eq!(lists[0].len(), 1);
 /// assert_eq!(grid.vector_to_world(lists[0][0].displacement), [3.0, 0.0, 0.0]);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
@@ -110,7 +133,7 @@ pub fn paired(
     grid: &Grid,
     [initial, deformed]: [&[FeaturePoint]; 2],
     params: CandidateParams,
-    similarity: impl Fn(&FeaturePoint, &FeaturePoint) -> f32 + Sync,
+    similarity: &impl Similarity,
 ) -> Vec<Vec<Candidate>> {
     let places: Vec<[f64; 3]> = deformed.iter().map(|f| f.world.0).collect();
     let tree = Neighbours::new(&places);
@@ -118,7 +141,7 @@ pub fn paired(
         let near = tree.within(from.world.0, params.reach_mm, params.partners).into_iter().map(|j| &deformed[j]);
         let candidate = |to: &FeaturePoint| Candidate {
             displacement: grid.vector_from_world(to.world.minus(from.world)),
-            ncc: similarity(from, to),
+            ncc: similarity.between(from, to),
         };
         let mut list: Vec<Candidate> = near.map(candidate).filter(|c| c.ncc >= params.min_ncc).collect();
         list.sort_by(|a, b| b.ncc.total_cmp(&a.ncc));

@@ -1,12 +1,66 @@
 //! What is known of a pair beside its volumes: where to look, what counts, where to begin, and
 //! places that were marked in both.
 
+use crate::numerics::neighbours::Neighbours;
 use crate::numerics::orientation::Orientation;
 use crate::pipeline::input_checks::drawn_on;
 use crate::types::{Landmark, Mask, Voxels, WorldPoint};
+use std::fmt;
 
 /// A map from the initial to the deformed volume (world mm, RAS); none where it has no value.
 pub type StartMap<'a> = dyn Fn(WorldPoint) -> Option<WorldPoint> + Sync + 'a;
+
+/// Matches of one's own as a field in which the search may start ([`Known::start`]): the mean of
+/// the displacements of the nearest matches, weighted by the inverse square of their distance
+/// (Shepard 1968).
+///
+/// ```
+/// use palpate::pipeline::known::{InitialField, Known};
+/// use palpate::{Landmark, WorldPoint};
+/// let moved = |initial: WorldPoint| Landmark { initial, deformed: initial.moved([4.0, 0.0, 0.0]) };
+/// let matches: Vec<Landmark> = (0..5).map(|i| moved(WorldPoint([i as f64, 2.0, 3.0]))).collect();
+/// let field = InitialField::from_matches(&matches).ok_or("no match")?;
+/// let start = |place| Some(field.at(place));
+/// assert!((field.at(WorldPoint([1.5, 2.0, 9.0])).0[0] - 5.5).abs() < 1e-12);
+/// let known = Known { start: Some(&start), ..Known::default() };
+/// # assert!(known.start.is_some());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct InitialField {
+    tree: Neighbours,
+    matches: Vec<Landmark>,
+}
+
+/// Matches around a place that tell its displacement: one in each octant where they lie evenly.
+const NEAREST_MATCHES: usize = 8;
+
+impl fmt::Debug for InitialField {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("InitialField").field("matches", &self.matches).finish_non_exhaustive()
+    }
+}
+
+impl InitialField {
+    /// Through matches (world mm, RAS); nothing where there are none.
+    pub fn from_matches(matches: &[Landmark]) -> Option<Self> {
+        let places: Vec<[f64; 3]> = matches.iter().map(|m| m.initial.0).collect();
+        (!places.is_empty()).then(|| Self { tree: Neighbours::new(&places), matches: matches.to_vec() })
+    }
+
+    /// Where the tissue at a place of the initial volume goes (world mm, RAS).
+    pub fn at(&self, place: WorldPoint) -> WorldPoint {
+        let near = self.tree.within(place.0, f64::INFINITY, NEAREST_MATCHES);
+        let (mut sum, mut weights) = ([0.0; 3], 0.0);
+        for m in near.into_iter().map(|i| &self.matches[i]) {
+            let apart = m.initial.minus(place);
+            let weight = 1.0 / apart.iter().map(|d| d * d).sum::<f64>().max(f64::MIN_POSITIVE);
+            let displacement = m.deformed.minus(m.initial);
+            (0..3).for_each(|a| sum[a] += weight * displacement[a]);
+            weights += weight;
+        }
+        place.moved(sum.map(|s| s / weights))
+    }
+}
 
 /// What a user knows of a pair. All of it is optional: `Known::default()` is nothing.
 #[derive(Clone, Copy, Default)]
