@@ -107,8 +107,8 @@
 //! [`matching::candidates::between`], [`consistency::relaxation::relax`],
 //! [`mesh::delaunay3::delaunay3`] and [`field::interpolation::interpolate_tetrahedra`] are the
 //! source's chain. `examples/seed_chain.rs` joins them, and `examples/own_similarity.rs` replaces
-//! the measure in one of them ([`matching::candidates::Similarity`]). `examples/own_matches.rs` hands
-//! in matches of one's own ([`pipeline::known::InitialField`]).
+//! the measure in one of them ([`matching::candidates::Similarity`]). `examples/own_matches.rs`
+//! hands in matches of one's own ([`pipeline::known::InitialField`]).
 //!
 //! The modules stand in the order of the pipeline. The errors of [`error`] say what to do.
 

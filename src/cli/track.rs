@@ -188,11 +188,9 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         console.say(&dry_run::track(first, &grid, frames, origin, &plan, &params, target, &files)?);
         return Ok(());
     }
-    let mut folder = target.create()?;
-    let record = Recording::start(console, inputs);
+    let (mut folder, record) = (target.create()?, Recording::start(console, inputs));
     folder.supersede(of_a_frame)?;
-    let step_s = source.step_s();
-    let shown = inside.or(regions.as_ref());
+    let (step_s, shown) = (source.step_s(), inside.or(regions.as_ref()));
     let mut kept = Kept::new(folder, frames, &reference, shown, step_s);
     let mut reading = started.elapsed();
 

@@ -109,8 +109,8 @@ impl<F: Fn(&FeaturePoint, &FeaturePoint) -> f32 + Sync> Similarity for F {
 /// own, best first.
 ///
 /// Looks at the `partners` nearest features within the reach (a distance here) and keeps the best
-/// of those that are at least `min_ncc` alike. The similarity stands as [`Candidate::ncc`]. `grid` is
-/// the initial volume's.
+/// of those that are at least `min_ncc` alike. The similarity stands as [`Candidate::ncc`].
+/// `grid` is the initial volume's.
 ///
 /// ```
 /// use palpate::matching::candidates::{CandidateParams, paired};

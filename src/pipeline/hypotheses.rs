@@ -392,9 +392,9 @@ impl Search<'_> {
         (matched.1.unwrap_or_else(|| SplineField::still(lattice.clone())), turn)
     }
 
-    /// Searches the next level, `next`, within the same range, where few features of this one agree:
-    /// smaller patches tell parts that move apart. Where more of them agree, they take the place of
-    /// the matches, and their field goes on if the volumes agree better under it.
+    /// Searches the next level, `next`, within the same range: its smaller patches tell parts that
+    /// move apart. If more of its features agree, they replace the matches, and their field is kept
+    /// if the volumes agree better under it.
     pub fn look_ahead(
         &self,
         (pair, factor): (&Pair<'_>, [usize; 3]),

@@ -17,8 +17,11 @@ pub type StartMap<'a> = dyn Fn(WorldPoint) -> Option<WorldPoint> + Sync + 'a;
 /// ```
 /// use palpate::pipeline::known::{InitialField, Known};
 /// use palpate::{Landmark, WorldPoint};
-/// let moved = |initial: WorldPoint| Landmark { initial, deformed: initial.moved([4.0, 0.0, 0.0]) };
-/// let matches: Vec<Landmark> = (0..5).map(|i| moved(WorldPoint([i as f64, 2.0, 3.0]))).collect();
+/// let of = |i| {
+///     let initial = WorldPoint([f64::from(i), 2.0, 3.0]);
+///     Landmark { initial, deformed: initial.moved([4.0, 0.0, 0.0]) }
+/// };
+/// let matches: Vec<Landmark> = (0..5).map(of).collect();
 /// let field = InitialField::from_matches(&matches).ok_or("no match")?;
 /// let start = |place| Some(field.at(place));
 /// assert!((field.at(WorldPoint([1.5, 2.0, 9.0])).0[0] - 5.5).abs() < 1e-12);
