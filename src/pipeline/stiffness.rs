@@ -196,7 +196,12 @@ fn unturned(
         let Some(like) = result.regions.iter().find(|r| is_like_the_first(r)) else { break result };
         (labels, evidence) = without(&labels, like.label, evidence);
     };
-    result.warnings.extend(found.left_over.and_then(fields::left_over));
+    if let Some(why) = found.left_over.and_then(fields::left_over) {
+        // Something of another modulus may be hidden there.
+        result.trust = result.trust.max(Trust::Moderate);
+        result.trust_reasons.push("one modulus leaves more than noise, and no second region was made out".into());
+        result.warnings.push(why);
+    }
     result.left_over = found.left_over;
     result.detectable = found.detectable;
     result.found = Some(labels);

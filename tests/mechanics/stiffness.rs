@@ -15,7 +15,8 @@ use palpate::stiffness::observations::{find, from_field, from_matches, read};
 use palpate::synth::{PhantomKind, PhantomParams};
 use palpate::types::stiffness::{Contact, Evidence, Law, LawChoice, Side};
 use palpate::types::{
-    Affine, DenseField, Grid, Mask, Match, QuadraticMesh, SparseField, StiffnessParams, StiffnessResult, WorldPoint,
+    Affine, DenseField, Grid, Mask, Match, QuadraticMesh, SparseField, StiffnessParams, StiffnessResult, Trust,
+    WorldPoint,
 };
 use std::collections::HashSet;
 
@@ -968,6 +969,7 @@ fn an_inclusion_is_found_that_stands_out_of_the_noise_of_means_and_not_of_a_voxe
     let said = palpate::report::stiffness::verdict(&hidden);
     assert!(said.contains("do not support a second region") && said.contains("beyond the noise"), "{said}");
     assert!(hidden.warnings.iter().any(|w| w.contains("softer or stiffer")), "{:?}", hidden.warnings);
+    assert!(hidden.trust > Trust::High && found.trust == Trust::High, "{:?}", hidden.trust_reasons);
 }
 
 #[test]
