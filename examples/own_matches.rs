@@ -1,41 +1,50 @@
-//! Matches of one's own handed in, as the field in which the registration starts.
+//! Matches of one's own: a mesh through them, the dense field on it, and its strain.
 //!
-//!     cargo run --release --example own_matches -- [INITIAL DEFORMED MATCHES]
+//!     cargo run --release --example own_matches -- [VOLUME LANDMARKS]
 //!
-//! MATCHES is a table of places in both volumes (fx,fy,fz,mx,my,mz; world mm, RAS). Without files the
-//! pair is a synthetic block that lies 40 mm aside: the search alone does not reach so far.
+//! LANDMARKS is a table of places that are known in both volumes (see docs/reference), VOLUME gives
+//! the grid. Without files the landmarks of a synthetic block are taken.
 
-use palpate::evaluate::landmarks;
-use palpate::pipeline::field::run_from;
-use palpate::pipeline::known::{InitialField, Known};
-use palpate::types::space::length;
-use palpate::{Affine, FieldParams, Grid, Landmark, PhantomKind, PhantomParams, Volume, io, phantom};
+use palpate::field::interpolation::interpolate_tetrahedra;
+use palpate::field::jacobian::count_folds;
+use palpate::mesh::delaunay3::delaunay3;
+use palpate::pipeline::strain;
+use palpate::{DenseField, Grid, Landmark, PhantomKind, PhantomParams, StrainInput, StrainParams, WorldPoint};
+use palpate::{evaluate, io, phantom};
+use std::error::Error;
 
-fn main() -> Result<(), Box<dyn std::error::Error>> {
+fn main() -> Result<(), Box<dyn Error>> {
     let files: Vec<String> = std::env::args().skip(1).collect();
-    let (initial, deformed, matches): (Volume, Volume, Vec<Landmark>) = match &files[..] {
-        [a, b, matches] => (io::read_volume(a)?, io::read_volume(b)?, io::read_landmarks(matches)?),
+    let (grid, matches, truth): (Grid, Vec<Landmark>, Option<DenseField>) = match &files[..] {
+        [volume, landmarks] => (*io::read_volume(volume)?.grid(), io::read_landmarks(landmarks)?, None),
         [] => {
             let block = phantom(&PhantomParams::new(PhantomKind::Block).sized(48))?;
-            let (grid, aside) = (*block.deformed.grid(), [40.0, 0.0, 0.0]);
-            let rows = std::array::from_fn(|r| {
-                let [a, b, c, offset] = grid.affine().rows()[r];
-                [a, b, c, offset + aside[r]]
-            });
-            let deformed = block.deformed.placed(Grid::new(grid.shape(), Affine::new(rows)?)?)?;
-            let moved = |m: &Landmark| Landmark { deformed: m.deformed.moved(aside), ..*m };
-            (block.initial, deformed, block.landmarks.iter().map(moved).collect())
+            (*block.initial.grid(), block.landmarks, Some(block.truth))
         }
-        _ => return Err("give INITIAL, DEFORMED and MATCHES, or nothing".into()),
+        _ => return Err("give VOLUME and LANDMARKS, or nothing".into()),
     };
 
-    let field = InitialField::from_matches(&matches).ok_or("there are no matches")?;
-    let start = |place| Some(field.at(place));
-    let known = Known { start: Some(&start), ..Known::default() };
-    let found = run_from(&initial, &deformed, &known, &FieldParams::default(), &[], &|_, _| {})?;
-    let mean = |values: Vec<f64>| values.iter().sum::<f64>() / matches.len() as f64;
-    let error = mean(landmarks(&found.displacement, &matches));
-    let motion = mean(matches.iter().map(|m| length(m.deformed.minus(m.initial))).collect());
-    println!("mean error {error:.3} mm of a motion of {motion:.3} mm at {} matches", matches.len());
+    // Places and displacements are in world mm, whatever the grid.
+    let places: Vec<WorldPoint> = matches.iter().map(|m| m.initial).collect();
+    let delaunay = delaunay3(&places)?;
+    let of_node = |&match_number: &u32| {
+        let m = matches[match_number as usize];
+        m.deformed.minus(m.initial)
+    };
+    let at_nodes: Vec<[f64; 3]> = delaunay.source.iter().map(of_node).collect();
+    let found = interpolate_tetrahedra(&delaunay.mesh, &at_nodes, &grid)?;
+    println!("{} matches, {} tetrahedra", matches.len(), delaunay.mesh.tetrahedra().len());
+    println!("{} folds in the mesh", count_folds(&found.displacement, Some(&found.inside))?);
+    if let Some(truth) = truth {
+        let m = evaluate::metrics(&found.displacement, &truth, Some(&found.inside), &[])?;
+        println!("mean error {:.3} mm of a motion of {:.3} mm", m.mean_mm, m.identity_mm);
+    }
+
+    let input =
+        StrainInput { field: &found.displacement, bodies: &found.inside, labels: None, samples: None, trust: None };
+    let strain = strain::run(input, &StrainParams::default(), &|_, _| {})?.strain;
+    let inside = (0..grid.len()).filter(|&o| found.inside.as_slice()[o] != 0);
+    let largest = inside.map(|o| strain.principal(o)[0]).fold(f64::NEG_INFINITY, f64::max);
+    println!("largest principal strain {largest:.3}");
     Ok(())
 }

@@ -106,9 +106,9 @@
 //! The stages below the pipeline are public too: [`features::detect`],
 //! [`matching::candidates::between`], [`consistency::relaxation::relax`],
 //! [`mesh::delaunay3::delaunay3`] and [`field::interpolation::interpolate_tetrahedra`] are the
-//! source's chain. `examples/seed_chain.rs` joins them, and `examples/own_similarity.rs` replaces
-//! the measure in one of them ([`matching::candidates::Similarity`]). `examples/own_matches.rs`
-//! hands in matches of one's own ([`pipeline::known::InitialField`]).
+//! source's chain. `examples/seed_chain.rs` joins them; `examples/own_similarity.rs`
+//! ([`matching::candidates::Similarity`]) and `examples/own_matches.rs` replace one of them.
+//! `examples/initial_field.rs` begins with one's own matches ([`pipeline::known::InitialField`]).
 //!
 //! The modules stand in the order of the pipeline. The errors of [`error`] say what to do.
 
