@@ -234,9 +234,10 @@ impl<'a> CoarseToFine<'a, '_> {
             if let Some(&next) = next {
                 let finer = account.light.level(self.aligned, next);
                 let search = Search { range: account.range, ..*search };
-                search.look_ahead((pair, *factor), (&finer, next), begun, *passes, &mut account.matched);
-                *bodies = begun.motion.clone();
-                said.extend(divide(bodies, begun));
+                if search.look_ahead((pair, *factor), (&finer, next), begun, *passes, &mut account.matched) {
+                    *bodies = begun.motion.clone();
+                    said.extend(divide(bodies, begun));
+                }
             }
             account.asked.extend(said.into_iter().map(noted));
         }

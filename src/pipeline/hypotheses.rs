@@ -393,8 +393,8 @@ impl Search<'_> {
     }
 
     /// Searches the next level, `next`, within the same range: its smaller patches tell parts that
-    /// move apart. If more of its features agree, they replace the matches, and their field is kept
-    /// if the volumes agree better under it.
+    /// move apart. If more of its features agree, they replace the matches (true), and their field
+    /// is kept if the volumes agree better under it.
     pub fn look_ahead(
         &self,
         (pair, factor): (&Pair<'_>, [usize; 3]),
@@ -402,12 +402,12 @@ impl Search<'_> {
         begun: &mut Begun,
         passes: usize,
         seconds: &mut f64,
-    ) {
+    ) -> bool {
         let wide = self.wide(next, self.range, WHOLE_SEARCH.max_features);
         (self.matching)();
         let (matches, found, report) = timed(seconds, || level::matches(next, None, wide));
         let more = report.counts.kept >= WHOLE_SEARCH.min_matches && report.counts.kept_share() > begun.share();
-        let Some(found) = found.filter(|_| more) else { return };
+        let Some(found) = found.filter(|_| more) else { return false };
         let here = |m: LevelMatch| {
             let voxel = to_level(from_level(m.voxel, next_factor), factor);
             let place = std::array::from_fn(|a| voxel[a] * pair.spacing[a]);
@@ -422,6 +422,7 @@ impl Search<'_> {
             begun.motion = motion;
             begun.of_matches = Some(field);
         }
+        true
     }
 
     /// Whether the features of a level are found where the field has them.
@@ -480,7 +481,7 @@ mod tests {
             followed: 0,
             turn: None,
         };
-        search.look_ahead((&pair, factor), (&next, next_factor), &mut begun, 4, &mut 0.0);
+        assert!(search.look_ahead((&pair, factor), (&next, next_factor), &mut begun, 4, &mut 0.0));
         let (grid, axes) = (made.initial.grid(), made.initial.grid().axes());
         let exact = |p: [f64; 3]| -> [f64; 3] {
             let v = from_level(p, factor).map(|v| v.round() as usize);
