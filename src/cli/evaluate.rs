@@ -28,8 +28,7 @@ pub struct Options {
     /// where they started
     #[arg(long, value_name = "B", visible_alias = "inverse")]
     backward: Option<PathBuf>,
-    /// Where to compare with --truth and --backward, on the same grid, 0 outside [default:
-    /// everywhere]
+    /// Where to compare with --truth and --backward, 0 outside [default: everywhere]
     #[arg(long, value_name = "M", value_parser = standing_for(Part::Mask))]
     mask: Option<PathBuf>,
     /// Known places: CSV with columns fx,fy,fz (initial) and mx,my,mz (deformed), world mm, RAS; or

@@ -198,8 +198,7 @@ pub fn on_grid<'a>(volume: Voxels<'a>, grid: &Grid) -> Voxels<'a> {
     }
 }
 
-/// A mask on `grid`, which is that of `reference`: resampled by nearest neighbour, with a note,
-/// where it lies on another one.
+/// A mask on `grid`, which is that of `reference`, by [`resampled`].
 pub fn read_mask(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
     resampled(path, some_mask(path)?, grid, reference, warnings)
 }
@@ -213,7 +212,7 @@ pub fn some_mask(path: &Path) -> Result<Mask> {
     Ok(mask)
 }
 
-/// A label map on `grid`, in the same way.
+/// A label map on `grid`, which is that of `reference`, by [`resampled`].
 pub fn read_labels(path: &Path, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
     resampled(path, some_labels(path)?, grid, reference, warnings)
 }
@@ -227,7 +226,8 @@ pub fn some_labels(path: &Path) -> Result<Mask> {
     Ok(labels)
 }
 
-/// A label map or a mask that was read, in the same way.
+/// What was read from `path`, on `grid`: resampled by nearest neighbour, with a note, where it lies
+/// on another one.
 pub fn resampled(path: &Path, labels: Mask, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
     if grid.same_as(labels.grid()) {
         return Ok(labels);

@@ -65,21 +65,21 @@ impl Knowledge {
         given.into_iter().filter(|g| g.1).map(|g| g.0).collect()
     }
 
-    /// The landmarks of each frame of a sequence against `origin`, by its number: all those of a
-    /// pair, or what the table's column `frame` says; nothing where there are none.
+    /// Whether landmarks are two lists of points, which belong to one pair.
+    pub fn has_point_lists(&self) -> bool {
+        self.landmarks.len() > 1
+    }
+
+    /// The landmarks of each frame of a sequence against `origin`, by the table's column `frame`;
+    /// nothing of a pair, which takes them all.
     pub fn by_frame(&self, all: &[Landmark], frames: usize, origin: usize) -> Result<Vec<Vec<Landmark>>> {
-        let path = match &self.landmarks[..] {
-            files if frames == 2 || files.is_empty() => return Ok(Vec::new()),
-            [one] => one,
-            _ => bail!(
-                "--landmarks: two lists of points belong to one pair; give a sequence one table with a column frame"
-            ),
-        };
+        let Some(path) = self.landmarks.first().filter(|_| frames > 2) else { return Ok(Vec::new()) };
         let mut by_frame = vec![Vec::new(); frames];
         for (&frame, &landmark) in io::read_landmark_frames(path)?.iter().zip(all) {
             if frame >= frames || frame == origin {
                 bail!(
-                    "{}: has landmarks of frame {frame}; the frames are 0 to {}, without the reference {origin}",
+                    "{}: has landmarks of frame {frame}; the frames are 0 to {}, without the reference {origin}; correct its \
+                     column frame",
                     path.shown(),
                     frames - 1
                 );

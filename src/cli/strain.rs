@@ -3,7 +3,9 @@
 use super::Usage;
 use super::console::Console;
 use super::convention::Convention;
-use super::inputs::{Part, check_distinct, file_of, name, read_labels, read_mask, same_grid, standing_for, warn_all};
+use super::inputs::{
+    Part, check_distinct, file_of, name, read_labels, read_mask, same_grid, some_labels, standing_for, warn_all,
+};
 use super::limits::strain_fits;
 use super::outputs::{STRAIN_FILES, StrainMaps, Target, at_places, write_strain};
 use super::record::{self, Read, Recording};
@@ -90,7 +92,7 @@ impl Source {
             }
         }
         let field = convention.read(path)?;
-        let bodies = there("bodies.nii.gz").map(|p| read_labels(&p, field.grid(), path, warnings)).transpose()?;
+        let bodies = there("bodies.nii.gz").map(|p| own_bodies(&p, field.grid(), path)).transpose()?;
         let summary = there("summary.json").map(io::read_json).transpose()?;
         let trust = summary.and_then(|mut s| serde_json::from_value(s.get_mut("trust")?.take()).ok());
         let image = there("warped.nii.gz").map(io::read_volume).transpose()?;
@@ -116,6 +118,13 @@ impl Source {
             }),
         }
     }
+}
+
+/// The bodies of a results folder. On another grid than its field they are those of another run.
+fn own_bodies(file: &Path, grid: &Grid, folder: &Path) -> Result<Mask> {
+    let bodies = some_labels(file)?;
+    same_grid(file, bodies.grid(), grid, folder)?;
+    Ok(bodies)
 }
 
 pub fn run(options: &Options, console: &Console) -> Result<()> {

@@ -256,6 +256,9 @@ fn checked(options: &Options, source: &Source<'_>) -> Result<Read> {
     if origin >= frames {
         bail!(Usage(format!("--reference is {origin}, but there are {frames} volumes (counted from 0)")));
     }
+    if knowledge.has_point_lists() && frames > 2 {
+        bail!(Usage("--landmarks: two lists of points belong to one pair; give one table with a column frame".into()));
+    }
     let mut inputs: Read = volumes.iter().map(|v| ("volume", v.clone())).collect();
     inputs.extend(record::inputs(&[("mask", mask.as_ref()), ("labels", labels.as_ref()), ("config", tuning.config())]));
     inputs.extend(knowledge.inputs());

@@ -11,7 +11,7 @@ use crate::report::section::Section;
 use crate::report::statistics::{quantile, sample};
 use crate::report::tables::table;
 use crate::report::verdict::short2;
-use crate::report::viewer::{Layer, Moment, Viewer};
+use crate::report::viewer::{Bounds, Layer, Moment, Viewer};
 use crate::report::{chart, json};
 use crate::types::stiffness::{
     Detectable, Determined, Evidence, FrameStiffness, Gain, LeftOver, PatchReport, RegionStiffness, SharedStiffness,
@@ -239,7 +239,7 @@ fn look(
     inside: &Mask,
     shown: &Shown<'_>,
     maps: [(Values<'_>, &Panel); 3],
-    bound_at: &(dyn Fn(usize) -> u8 + Sync),
+    bound_at: Bounds<'_>,
 ) -> Markup {
     let overlays: Vec<Layer<'_>> = maps
         .into_iter()
@@ -268,7 +268,7 @@ fn look(
         name: None,
         images: &[],
         overlays: &overlays,
-        bounds: Some(&|o| bound_at(o)),
+        bounds: Some(bound_at),
         displacement,
         matches: None,
         mesh: Some((result.mesh.nodes(), corners, 4)),

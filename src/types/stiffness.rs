@@ -372,7 +372,8 @@ pub struct StiffnessResult {
     pub force_n: Option<f64>,
     /// One standard deviation of the borders between labels (voxels).
     pub label_sd: f64,
-    /// How far to rely on it: the worst of the field's trust and of what the model leaves over.
+    /// How far to rely on it: the worst of the field's trust and of what the model leaves over. At
+    /// most moderate where one modulus leaves more than noise and no region was found for it.
     pub trust: Trust,
     /// Why.
     pub trust_reasons: Vec<String>,

@@ -214,6 +214,9 @@ fn sequences_and_batches_take_what_a_pair_takes() {
     assert!(said.contains("t.csv: line 1: there is no column \"frame\""), "{said}");
     let said = tracked("frame,fx,fy,fz,mx,my,mz\n3,0,0,0,60,0,0\n", 1);
     assert!(said.contains("t.csv: has landmarks of frame 3; the frames are 0 to 2, without the reference 0"), "{said}");
+    let lists = [&frames[..], &["--landmarks", "l.csv", "l.csv", "-o", "b"]].concat();
+    let (_, said) = run(at, &lists, 2);
+    assert!(said.contains("two lists of points belong to one pair"), "{said}");
     let said = tracked("frame,fx,fy,fz,mx,my,mz\n1.5,0,0,0,60,0,0\n", 1);
     assert!(said.contains("row 1: frame is 1.5, not a whole number"), "{said}");
     let said = tracked("frame,fx,fy,fz,mx,my,mz\n2,0,0,0,30,0,0\n", 0);

@@ -271,6 +271,16 @@ fn strain_of_a_pair_and_of_its_folder_are_the_same() {
         assert!(error.contains(message), "{error}");
         assert!(!folder.path().join("g/summary.json").exists());
     }
+    // A mask may lie on another grid; bodies of the folder that do are of another run.
+    let grid = *io::read_labels(folder.path().join("f/bodies.nii.gz")).unwrap().grid();
+    let [nx, ny, nz] = grid.shape();
+    let shorter = Mask::filled(Grid::new([nx, ny, nz - 1], *grid.affine()).unwrap(), 1);
+    io::write_labels(folder.path().join("m.nii.gz"), &shorter, "").unwrap();
+    let (_, said) = run(folder.path(), &["strain", "f", "-o", "m", "--mask", "m.nii.gz"], 0);
+    assert!(said.contains("m.nii.gz: lies on another grid"), "{said}");
+    io::write_labels(folder.path().join("f/bodies.nii.gz"), &shorter, "").unwrap();
+    let (_, error) = run(folder.path(), &["strain", "f", "-o", "g"], 1);
+    assert!(error.contains("bodies.nii.gz is on another grid"), "{error}");
 }
 
 /// Of tissue that is still the strain is noise: the error bars of its means say so, of principal
