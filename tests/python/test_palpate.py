@@ -236,7 +236,9 @@ def test_errors_of_the_other_parts_are_those_of_the_command_line_too(shell, pair
     field = (lps(np.asarray(field.dataobj)[:, :, :, 0, :]), field.affine)
     far = tmp_path / "far.nii.gz"
     image = nibabel.load(labels)
-    nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj)[1:], image.affine), far)
+    moved = image.affine.copy()
+    moved[:3, 3] += 5000
+    nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj), moved), far)
 
     def refused(*arguments):
         return shell(*arguments, "-o", tmp_path / "none.toml", code=None).stderr
