@@ -7,8 +7,13 @@ use palpate::pipeline::field::{FieldResult, run};
 use palpate::pipeline::track::Tracker;
 use palpate::types::params::BodySource;
 use palpate::types::{Affine, DenseField, FieldParams, Grid, Mask, MotionModel, Volume};
+use std::sync::LazyLock;
 
-const SHAPE: [usize; 3] = [60, 56, 52];
+const SHAPE: [usize; 3] = [52, 48, 44];
+/// The middle of the volume (mm).
+const MIDDLE: [f64; 3] = [26.0, 24.0, 22.0];
+/// Radius of the ball that turns (mm).
+const BALL_RADIUS: f64 = 13.0;
 
 /// A pair of volumes with its truth, and the label of each voxel (1, 2, ...).
 struct Scene {
@@ -48,21 +53,21 @@ impl Scene {
         }
     }
 
-    /// A ball of 15 mm about the middle that turns by `angle` (radians) inside tissue at rest,
-    /// along its own wall.
+    /// A ball about the middle that turns by `angle` (radians) inside tissue at rest, along its own
+    /// wall.
     fn ball(angle: f64, seed: u64) -> Self {
-        let from = |p: [f64; 3]| [p[0] - 30.0, p[1] - 28.0, p[2] - 26.0];
-        let inside = move |p: [f64; 3]| from(p).iter().map(|v| v * v).sum::<f64>() < 15.0 * 15.0;
+        let from = |p: [f64; 3]| -> [f64; 3] { std::array::from_fn(|a| p[a] - MIDDLE[a]) };
+        let inside = move |p: [f64; 3]| from(p).iter().map(|v| v * v).sum::<f64>() < BALL_RADIUS * BALL_RADIUS;
         let turned = move |p: [f64; 3]| {
             let ([x, y, _], (s, c)) = (from(p), angle.sin_cos());
-            [30.0 + c * x - s * y, 28.0 + s * x + c * y, p[2]]
+            [MIDDLE[0] + c * x - s * y, MIDDLE[1] + s * x + c * y, p[2]]
         };
         Self::new(([1.0; 3], seed), move |p| 1 + u8::from(inside(p)), move |p| if inside(p) { turned(p) } else { p })
     }
 
     /// Two halves that move apart along an oblique plane by `mm` each.
     fn halves(mm: f64, seed: u64) -> Self {
-        let above = |p: [f64; 3]| p[2] - 26.0 > 0.4 * (p[0] - 30.0);
+        let above = |p: [f64; 3]| p[2] - MIDDLE[2] > 0.4 * (p[0] - MIDDLE[0]);
         let along = [1.0 / 1.16f64.sqrt(), 0.0, 0.4 / 1.16f64.sqrt()];
         let moved = move |p: [f64; 3]| {
             let by = if above(p) { mm } else { -mm };
@@ -105,18 +110,28 @@ impl Scene {
     }
 }
 
+/// A ball that has turned, and what is found of it.
+fn turned() -> &'static (Scene, FieldResult) {
+    static MEASURED: LazyLock<(Scene, FieldResult)> = LazyLock::new(|| {
+        let scene = Scene::ball(0.35, 3);
+        let two = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let found = two.install(|| scene.measured(None, &FieldParams::default()));
+        (scene, found)
+    });
+    &MEASURED
+}
+
 /// A smooth field across the wall lost the ball's motion: 2.9 of 3.4 mm.
 #[test]
 fn a_ball_that_turns_in_its_wall_is_a_body_of_its_own() {
-    let scene = Scene::ball(0.35, 1);
-    let found = scene.measured(None, &FieldParams::default());
+    let (scene, found) = turned();
     assert_eq!(found.summary.bodies.len(), 2, "{:?}", found.summary.evidence);
-    assert!(scene.dice(&found, 1) > 0.9 && scene.dice(&found, 2) > 0.9, "{:?}", found.summary.bodies);
+    assert!(scene.dice(found, 1) > 0.9 && scene.dice(found, 2) > 0.9, "{:?}", found.summary.bodies);
     assert_eq!(found.summary.folds, 0);
     let bonded = FieldParams { bodies: BodySource::Bonded, ..FieldParams::default() };
     let one = scene.measured(None, &bonded);
     assert_eq!(one.summary.bodies.len(), 1);
-    let [own, rest] = [2, 1].map(|label| scene.error(&found, label));
+    let [own, rest] = [2, 1].map(|label| scene.error(found, label));
     assert!(own < 0.4 && own < scene.error(&one, 2) / 3.0, "{own} for {}", scene.error(&one, 2));
     assert!(rest < scene.error(&one, 1), "{rest} for {}", scene.error(&one, 1));
 }
@@ -164,12 +179,9 @@ fn one_body_is_not_split() {
 
 #[test]
 fn bodies_are_the_same_whatever_the_number_of_threads_and_the_order_of_storage() {
-    let scene = Scene::ball(0.35, 2);
-    let with = |threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| scene.measured(None, &FieldParams::default()))
-    };
-    let (one, two) = (with(1), with(2));
+    let (scene, two) = turned();
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let one = one.install(|| scene.measured(None, &FieldParams::default()));
     assert_eq!(one.summary.bodies.len(), 2);
     assert!(one.displacement == two.displacement && one.bodies == two.bodies);
     // The same volumes stored from right to left.
@@ -191,7 +203,7 @@ fn bodies_are_the_same_whatever_the_number_of_threads_and_the_order_of_storage()
 /// Voxels shared out wrongly at the wall passed for crusts of bodies of their own.
 #[test]
 fn a_wall_makes_no_further_bodies() {
-    for seed in [3, 4, 9] {
+    for seed in [1, 4, 9] {
         let found = Scene::ball(0.35, seed).measured(None, &FieldParams::default());
         assert_eq!(found.summary.bodies.len(), 2, "seed {seed}: {:?}", found.summary.evidence);
     }
