@@ -18,7 +18,17 @@ pub fn shapes(l: [f64; 4]) -> [f64; 10] {
     })
 }
 
-/// Their derivatives with respect to the barycentric coordinates 1, 2 and 3.
+/// The barycentric coordinates at which the shape functions are these.
+pub fn barycentric(shapes: &[f64; 10]) -> [f64; 4] {
+    let mut out = [shapes[0], shapes[1], shapes[2], shapes[3]];
+    for ([i, j], s) in EDGES.into_iter().zip(&shapes[4..]) {
+        out[i] += 0.5 * s;
+        out[j] += 0.5 * s;
+    }
+    out
+}
+
+/// Derivatives of the shape functions with respect to the barycentric coordinates 1, 2 and 3.
 pub fn slopes(l: [f64; 4]) -> [[f64; 3]; 10] {
     let d = |i: usize, b: usize| if i == 0 { -1.0 } else { f64::from(u8::from(i == b + 1)) };
     std::array::from_fn(|k| {

@@ -42,7 +42,7 @@ pub struct PlanInputs<'a> {
     /// Where it is to be pressed.
     pub load: &'a Place,
     /// A name for each label.
-    pub names: &'a dyn Fn(u8) -> String,
+    pub names: &'a (dyn Fn(u8) -> String + Sync),
 }
 
 /// What a press does to a body of the assumed moduli.

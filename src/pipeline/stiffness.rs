@@ -47,7 +47,7 @@ pub struct Inputs<'a> {
     /// Where it is pressed.
     pub load: &'a Place,
     /// A name for each label.
-    pub names: &'a dyn Fn(u8) -> String,
+    pub names: &'a (dyn Fn(u8) -> String + Sync),
     /// What is known of the field's own error.
     pub quality: FieldQuality<'a>,
 }

@@ -13,6 +13,7 @@ use crate::stiffness::support::{Support, identify};
 use crate::stiffness::unlabelled;
 use crate::types::stiffness::{Detectable, Evidence, Law, LeftOver, StiffnessParams};
 use crate::types::{Grid, Mask};
+use rayon::prelude::*;
 use std::time::Instant;
 
 /// Iterated redrawing of regions found without labels.
@@ -161,9 +162,9 @@ pub(super) fn regions(
         let setup = best.level.setup(search.law, params, best.level.largest());
         let map = unlabelled::map(&setup, &best.estimate.state, support.target())?;
         let from = (&best.level, &best.estimate.state);
-        let tried = unlabelled::next_regions(&map, &best.labels).into_iter();
-        let tried = tried.filter_map(|labels| search.candidate(labels, from).ok());
-        let Some(next) = tried.min_by(|a, b| a.estimate.rms.total_cmp(&b.estimate.rms)) else {
+        let tried = unlabelled::next_regions(&map, &best.labels).into_par_iter();
+        let tried: Vec<Candidate> = tried.filter_map(|labels| search.candidate(labels, from).ok()).collect();
+        let Some(next) = tried.into_iter().min_by(|a, b| a.estimate.rms.total_cmp(&b.estimate.rms)) else {
             support.none(count + 1, "not tried: no piece of the map stands out");
             break;
         };

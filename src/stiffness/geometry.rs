@@ -5,8 +5,7 @@
 //! deviation (a curved one crosses the voxels at all heights, and is known much better). A plate
 //! half a voxel away from where the mesh has it changes strain and modulus by a percent or two. So
 //! each such face gets an offset of its own, with that prior, and is fitted together with moduli
-//! and plates in one Gauss-Newton step on the coarse mesh; its columns are differences of two
-//! solutions.
+//! and plates in one Gauss-Newton step on the coarse mesh.
 //!
 //! Where the surface beside a flat punch is free, strain under its edge is singular, and a thin
 //! layer there hangs on where the edge is. A field tells that to half a voxel at best, and rounds
@@ -16,13 +15,16 @@ use crate::error::StiffnessError;
 use crate::numerics::cholesky::within;
 use crate::stiffness::border::Border;
 use crate::stiffness::fem_body::Body;
+use crate::stiffness::forward::Problem;
 use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
 use crate::stiffness::inclusion::{Inclusion, SHAPE_FUNCTIONS};
 use crate::stiffness::interface::Interface;
-use crate::stiffness::observations::{find, read};
+use crate::stiffness::observations::{Reading, find, gradient, read};
 use crate::stiffness::punch_edge::Edge;
 use crate::stiffness::systematic_error::Fit;
+use crate::types::space::dot;
 use crate::types::{Grid, VoxelPoint, WorldPoint};
+use rayon::prelude::*;
 
 /// Prior of the offsets of surfaces.
 struct OffsetPrior {
@@ -47,16 +49,9 @@ const MIN_BOX_FACE_FRACTION: f64 = 0.2;
 /// Power of the distance from the middle with which an offset fades inwards: the outermost tenth
 /// moves by two thirds or more.
 const FADE_EXPONENT: i32 = 4;
-/// Finite differences of solutions by an offset.
-struct Derivative {
-    /// Offsets (voxels); the second one where the first has no equilibrium.
-    steps_voxels: [f64; 2],
-    /// Tolerance of the solutions (mm).
-    tolerance_mm: f64,
-}
-
-const DERIVATIVE: Derivative =
-    Derivative { steps_voxels: [PRIOR.face_sd_voxels, 0.25 * PRIOR.face_sd_voxels], tolerance_mm: 1e-6 };
+/// Offset (voxels) by which forces are compared, to either side: small beside an element, and far
+/// above what rounding changes.
+const DIFFERENCE_VOXELS: f64 = 0.02;
 
 /// A part of the body's shape that is known to a part of a voxel only.
 #[derive(Debug, Clone)]
@@ -133,6 +128,12 @@ impl Part {
     /// Adds what an offset (voxels) moves to the nodes' places (mm, RAS).
     pub fn shift(&self, places: &mut [[f64; 3]], offset: f64) {
         places.iter_mut().zip(&self.movement).for_each(|(p, m)| (0..3).for_each(|a| p[a] += offset * m[a]));
+    }
+
+    /// How a place in the body moves for an offset of a voxel (mm, RAS).
+    fn movement_at(&self, (element, weights): &Reading, body: &Body) -> [f64; 3] {
+        let nodes = body.cells[*element as usize].iter().zip(weights);
+        nodes.fold([0.0; 3], |sum, (n, w)| std::array::from_fn(|a| sum[a] + w * self.movement[*n as usize][a]))
     }
 
     /// The body with this part moved outwards by `offset` voxels.
@@ -223,41 +224,56 @@ pub fn open_steps(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Vec<f
 }
 
 /// What the offsets of some parts change at the observations (mm/voxel), and of ln force (1/voxel).
+///
+/// A node that moves by m for an offset takes its displacement along. With the forces r(x, s) of
+/// the displacement x and the offset s, equilibrium asks for dx/ds = -K^-1 dr/ds, and a place that
+/// stays sees dx/ds less m along the gradient of x.
 fn columns(
     setup: &Setup<'_>,
     estimate: &Estimate,
     x: &[f64],
     parts: &[(&Part, f64)],
 ) -> Result<(Vec<Vec<[f64; 3]>>, Vec<f64>), StiffnessError> {
+    let (body, h) = (setup.body, DIFFERENCE_VOXELS);
+    let problem = setup.problem(&estimate.state);
+    let factor = problem.factorise(x)?;
+    // Of each part what it gives for an offset by `by`; none where an element turns inside out.
+    let with = |part: &Part, by: f64, give: &dyn Fn(&Setup<'_>, &Problem<'_>) -> Option<Vec<f64>>| {
+        let body = part.moved(body, by);
+        let moved = Setup { body: &body, ..setup.clone() };
+        let problem = Problem { springs: problem.springs.clone(), ..moved.problem(&estimate.state) };
+        give(&moved, &problem)
+    };
+    let side = |(part, _): &(&Part, f64)| {
+        let forces = |by| with(part, by, &|_, problem| problem.residual(x));
+        let (out, back) = forces(h).zip(forces(-h))?;
+        Some(out.into_iter().zip(back).map(|(o, b)| (b - o) / (2.0 * h)).collect())
+    };
+    let sides: Vec<Option<Vec<f64>>> = parts.par_iter().map(side).collect();
+    // A shape that turns elements inside out gives nothing.
+    let mut changes: Vec<f64> = sides.into_iter().flat_map(|s| s.unwrap_or_else(|| vec![0.0; x.len()])).collect();
+    factor.sensitivities(&mut changes, None).map_err(|_| StiffnessError::Unsolvable)?;
+
     let places: Vec<[f64; 3]> = setup.observations.iter().map(|o| o.place).collect();
     // What an offset changes is smooth: it is read in the middle of a block.
-    let before = find(setup.body, &places);
-    let factor = setup.problem(&estimate.state).factorise(x)?;
-    let (mut rows, mut force_slope) = (Vec::new(), Vec::new());
-    for (part, _) in parts {
-        let column = DERIVATIVE.steps_voxels.into_iter().find_map(|by| {
-            let body = part.moved(setup.body, by);
-            let moved = Setup { body: &body, ..setup.clone() };
-            let problem = moved.problem(&estimate.state);
-            let near = problem.solve_near(x, &factor, DERIVATIVE.tolerance_mm);
-            let y = near.or_else(|| problem.solve(Some(x), DERIVATIVE.tolerance_mm).ok().map(|s| s.x))?;
-            let found = find(&body, &places);
-            let column = before.iter().zip(&found).map(|(before, now)| match (before, now) {
-                (Some(before), Some(now)) => {
-                    let (old, new) = (read(&[*before], setup.body, x), read(&[*now], &body, &y));
-                    std::array::from_fn(|a| (new[a] - old[a]) / by)
-                }
-                _ => [0.0; 3],
-            });
-            let force = moved.forces(&problem, &estimate.state, &y)[0];
-            Some((column.collect(), (force / estimate.force[0]).ln() / by))
-        });
-        // A shape without equilibrium gives nothing.
-        let (row, slope) = column.unwrap_or_else(|| (vec![[0.0; 3]; places.len()], 0.0));
-        rows.push(row);
-        force_slope.push(slope);
-    }
-    Ok((rows, force_slope))
+    let readings = find(body, &places);
+    let gradients: Vec<Option<[[f64; 3]; 3]>> =
+        readings.par_iter().map(|r| r.as_ref().map(|r| gradient(r, body, x))).collect();
+    let column = |((part, _), change): (&(&Part, f64), &[f64])| {
+        let at = |(reading, gradient): (&Option<Reading>, &Option<[[f64; 3]; 3]>)| {
+            let Some((reading, gradient)) = reading.as_ref().zip(gradient.as_ref()) else { return [0.0; 3] };
+            let (own, moved) = (read(&[*reading], body, change), part.movement_at(reading, body));
+            std::array::from_fn(|a| own[a] - dot(gradient[a], moved))
+        };
+        let row: Vec<[f64; 3]> = readings.iter().zip(&gradients).map(at).collect();
+        let force = |by: f64| {
+            let y: Vec<f64> = x.iter().zip(change).map(|(x, c)| x + by * c).collect();
+            with(part, by, &|moved, problem| Some(vec![moved.forces(problem, &estimate.state, &y)[0]]))
+        };
+        let slope = force(h).zip(force(-h)).map_or(0.0, |(out, back)| (out[0] / back[0]).ln() / (2.0 * h));
+        (row, slope)
+    };
+    Ok(parts.par_iter().zip(changes.par_chunks_exact(x.len())).map(column).unzip())
 }
 
 /// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh

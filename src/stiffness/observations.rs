@@ -1,8 +1,8 @@
 //! What was measured inside the body: places with a displacement, and how a solution is read there.
 
 use crate::numerics::sampling::displacement;
-use crate::numerics::tetrahedron::shapes;
-use crate::stiffness::elements::Mapping;
+use crate::numerics::tetrahedron::{barycentric, shapes};
+use crate::stiffness::elements::{Mapping, jacobian};
 use crate::stiffness::fem_body::Body;
 use crate::types::{Displacement, Mask, Match, SparseField, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
@@ -65,6 +65,19 @@ pub fn read(readings: &[Reading], body: &Body, x: &[f64]) -> [f64; 3] {
         }
     }
     u
+}
+
+/// The gradient of the displacement of a vector of unknowns where it is read so: each component by
+/// each coordinate.
+pub fn gradient((element, weights): &Reading, body: &Body, x: &[f64]) -> [[f64; 3]; 3] {
+    let cell = body.cells[*element as usize];
+    let (by_node, _) = jacobian(&cell.map(|n| body.places[n as usize]), barycentric(weights));
+    let mut out = [[0.0; 3]; 3];
+    for (n, slope) in cell.iter().zip(by_node) {
+        let u = body.displacement(x, *n);
+        (0..3).for_each(|a| (0..3).for_each(|b| out[a][b] += u[a] * slope[b]));
+    }
+    out
 }
 
 /// How each observation is read in a body; none where a part of it lies outside.

@@ -128,8 +128,8 @@ impl<'a> Tangent<'a> {
         }
     }
 
-    /// As [`Self::sensitivities`], in parallel, for as many as make a factor of the matrix itself
-    /// worth it; each has `n` numbers.
+    /// Solves for so many right-hand sides that a factor of the matrix itself is worth it, in
+    /// parallel, each of `n` numbers: to about five digits.
     ///
     /// # Errors
     /// As [`Self::solve`].
@@ -137,7 +137,7 @@ impl<'a> Tangent<'a> {
         match self {
             Self::Direct(factor) => {
                 let whole = factor.whole()?;
-                x.par_chunks_mut(RHS_PER_SOLVE * n).map(|part| whole.solve(part)).collect()
+                x.par_chunks_mut(RHS_PER_SOLVE * n).map(|part| whole.step(part)).collect()
             }
             Self::Iterative(_) => self.sensitivities(x, None),
         }

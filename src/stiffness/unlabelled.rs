@@ -58,6 +58,9 @@ const SEGMENTATION: Segmentation = Segmentation {
     min_body_fraction: 0.004,
 };
 
+/// Columns that one thread multiplies at a time.
+const PRODUCT_STRIP: usize = 48;
+
 /// A trilinear function on a lattice (grid of `count` nodes from `low`, `size` mm apart; mm, RAS).
 #[derive(Debug, Clone)]
 pub struct Lattice {
@@ -322,16 +325,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         let jacobian = jacobian(setup, &problem, &solution, &weights, &picked, used)?;
         let variance = target * target;
         let rows = 3 * picked.len();
-        let flat = faer::MatRef::from_column_major_slice(&jacobian, rows, p);
-        let mut normal = faer::Mat::<f64>::zeros(p, p);
-        faer::linalg::matmul::matmul(
-            normal.as_mut(),
-            faer::Accum::Replace,
-            flat.transpose(),
-            flat,
-            1.0 / variance,
-            faer::Par::Seq,
-        );
+        let normal = normal_matrix(&jacobian, rows, 1.0 / variance);
         let right: Vec<f64> = (0..p)
             .into_par_iter()
             .map(|k| {
@@ -339,15 +333,14 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
                 column.iter().zip(residuals.as_flattened()).map(|(a, b)| a * b).sum::<f64>() / variance
             })
             .collect();
-        let mean = (0..used).map(|k| normal[(k, k)]).sum::<f64>() / used as f64;
+        let mean = (0..used).map(|k| normal[k * p + k]).sum::<f64>() / used as f64;
         if iteration == 0 {
             // A step of one in ln mu across an edge weighs as much as what one node can explain.
             kappa = 0.03 * mean;
         } else {
             kappa *= 0.4;
         }
-        let mut a: Vec<f64> = (0..p * p).map(|i| normal[(i / p, i % p)]).collect();
-        let mut b = right;
+        let (mut a, mut b) = (normal, right);
         for &(i, j) in &lattice.pairs {
             let (i, j) = (i as usize, j as usize);
             let difference = values[i] - values[j];
@@ -384,6 +377,29 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
     }
     let (rms, values) = best.unwrap_or((f64::INFINITY, values));
     Ok(Map { lattice, values, rms })
+}
+
+/// `scale` times the products of all columns of `rows` numbers with each other, row by row: what lies
+/// below the diagonal, in strips.
+fn normal_matrix(columns: &[f64], rows: usize, scale: f64) -> Vec<f64> {
+    let p = columns.len() / rows;
+    let mut out = vec![0.0; p * p];
+    out.par_chunks_mut(PRODUCT_STRIP * p).enumerate().for_each(|(strip, out)| {
+        let (first, own) = (strip * PRODUCT_STRIP, out.len() / p);
+        let of = |from: usize, to: usize| {
+            faer::MatRef::from_column_major_slice(&columns[from * rows..to * rows], rows, to - from)
+        };
+        let last = first + own;
+        let out = faer::MatMut::from_column_major_slice_mut(out, p, own).subrows_mut(0, last);
+        let (left, right) = (of(0, last).transpose(), of(first, last));
+        faer::linalg::matmul::matmul(out, faer::Accum::Replace, left, right, scale, faer::Par::Seq);
+    });
+    for r in 0..p {
+        for c in r + 1..p {
+            out[r * p + c] = out[c * p + r];
+        }
+    }
+    out
 }
 
 /// Rows of H y, column by column: lattice nodes, then plates.
