@@ -251,6 +251,7 @@ fn columns(
     };
     let sides: Vec<Option<Vec<f64>>> = parts.par_iter().map(side).collect();
     // A shape that turns elements inside out gives nothing.
+    let whole: Vec<bool> = sides.iter().map(Option::is_some).collect();
     let mut changes: Vec<f64> = sides.into_iter().flat_map(|s| s.unwrap_or_else(|| vec![0.0; x.len()])).collect();
     factor.sensitivities(&mut changes, None).map_err(|_| StiffnessError::Unsolvable)?;
 
@@ -259,7 +260,10 @@ fn columns(
     let readings = find(body, &places);
     let gradients: Vec<Option<[[f64; 3]; 3]>> =
         readings.par_iter().map(|r| r.as_ref().map(|r| gradient(r, body, x))).collect();
-    let column = |((part, _), change): (&(&Part, f64), &[f64])| {
+    let column = |((part, _), change, whole): (&(&Part, f64), &[f64], &bool)| {
+        if !whole {
+            return (vec![[0.0; 3]; places.len()], 0.0);
+        }
         let at = |(reading, gradient): (&Option<Reading>, &Option<[[f64; 3]; 3]>)| {
             let Some((reading, gradient)) = reading.as_ref().zip(gradient.as_ref()) else { return [0.0; 3] };
             let (own, moved) = (read(&[*reading], body, change), part.movement_at(reading, body));
@@ -273,7 +277,7 @@ fn columns(
         let slope = force(h).zip(force(-h)).map_or(0.0, |(out, back)| (out[0] / back[0]).ln() / (2.0 * h));
         (row, slope)
     };
-    Ok(parts.par_iter().zip(changes.par_chunks_exact(x.len())).map(column).unzip())
+    Ok((parts, changes.par_chunks_exact(x.len()), &whole).into_par_iter().map(column).unzip())
 }
 
 /// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh

@@ -31,7 +31,7 @@ struct ShapeMoves {
     max_count: usize,
     /// Most moves of each law before the two are compared.
     max_per_law: usize,
-    /// Largest step (voxels): the finite difference is linear about as far.
+    /// Largest step (voxels): the derivative holds about as far.
     max_step_voxels: f64,
     /// Smaller steps are left to the last step with all offsets (voxels).
     tolerance_voxels: f64,

@@ -128,8 +128,8 @@ impl<'a> Tangent<'a> {
         }
     }
 
-    /// Solves for so many right-hand sides that a factor of the matrix itself is worth it, in
-    /// parallel, each of `n` numbers: to about five digits.
+    /// Solves for hundreds of right-hand sides, each of `n` numbers, in parallel and to about five
+    /// digits.
     ///
     /// # Errors
     /// As [`Self::solve`].

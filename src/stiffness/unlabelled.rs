@@ -379,8 +379,7 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
     Ok(Map { lattice, values, rms })
 }
 
-/// `scale` times the products of all columns of `rows` numbers with each other, row by row: what lies
-/// below the diagonal, in strips.
+/// `scale` times the products of all columns of `rows` numbers with each other, row by row.
 fn normal_matrix(columns: &[f64], rows: usize, scale: f64) -> Vec<f64> {
     let p = columns.len() / rows;
     let mut out = vec![0.0; p * p];
