@@ -343,6 +343,14 @@ pub enum FieldError {
         /// What to try.
         hint: String,
     },
+    /// A label map of which nothing lies on the grid that it is for.
+    #[error("{what}: does not overlap {reference} in world space; check both headers (palpate info)")]
+    Elsewhere {
+        /// What.
+        what: String,
+        /// Of what the grid is.
+        reference: String,
+    },
     /// Two grids that had to be the same are not.
     #[error(
         "{what} is on another grid ({found:?}) than {reference} ({expected:?}{}); if both lie in the same \

@@ -7,7 +7,7 @@ use clap::builder::{PathBufValueParser, TypedValueParser};
 use palpate::error::FieldError;
 use palpate::error::Shown;
 use palpate::evaluate;
-use palpate::field::warp::{warp_image, warp_labels};
+use palpate::field::warp::{labels_onto, warp_image};
 use palpate::io::{self, ImageKind, Stored};
 use palpate::numerics::sampling::Interpolation;
 use palpate::types::{DenseField, Grid, Landmark, Mask, Volume, Voxels};
@@ -229,22 +229,9 @@ pub fn some_labels(path: &Path) -> Result<Mask> {
 /// What was read from `path`, on `grid`: resampled by nearest neighbour, with a note, where it lies
 /// on another one.
 pub fn resampled(path: &Path, labels: Mask, grid: &Grid, reference: &Path, warnings: &mut Vec<String>) -> Result<Mask> {
-    if grid.same_as(labels.grid()) {
-        return Ok(labels);
-    }
-    let placed = warp_labels(&labels, &DenseField::zeros(*grid), None, 0);
-    if placed.as_slice().iter().all(|v| *v == 0) {
-        bail!(
-            "{}: does not overlap {} in world space; check both headers (palpate info)",
-            path.shown(),
-            reference.shown()
-        );
-    }
-    warnings.push(format!(
-        "{}: lies on another grid than {}; it was resampled onto that by nearest neighbour",
-        name(path),
-        name(reference)
-    ));
+    let elsewhere = |_| FieldError::Elsewhere { what: path.shown(), reference: reference.shown() };
+    let (placed, note) = labels_onto(labels, grid, [&name(path), &name(reference)]).map_err(elsewhere)?;
+    warnings.extend(note);
     Ok(placed)
 }
 

@@ -5,10 +5,11 @@
 //! any grid. Where x lies outside the field's grid the field says nothing: such voxels get the
 //! background value, such points `None`.
 
+use crate::error::FieldError;
 use crate::numerics::cubic::LANES;
 use crate::numerics::sampling::{Interpolation, Sampler, displacement, inside, nearest};
 use crate::numerics::simd::dispatch;
-use crate::types::{Displacement, Grid, Volume, Voxels, WorldPoint};
+use crate::types::{Displacement, Grid, Mask, Volume, Voxels, WorldPoint};
 
 /// `image` at x + u(x) for each x of `reference` (the field's own grid when `None`); `background`
 /// outside the image.
@@ -109,6 +110,55 @@ pub fn warp_labels<T: Copy + Default + Send + Sync>(
     warp_with(field, reference, background, |target| {
         nearest(grid.shape(), grid.affine().to_voxel(target)).map_or(background, |at| values[at])
     })
+}
+
+/// A label map (`what`) on the grid of `reference`, by nearest neighbour in world space. Where the
+/// grids differ, a note says so, and which labels fall between the voxels.
+///
+/// # Errors
+/// [`FieldError::Elsewhere`] when no label lands on the grid.
+///
+/// ```
+/// use palpate::field::warp::labels_onto;
+/// use palpate::{Affine, Grid, Mask};
+/// let fine = Grid::new([8; 3], Affine::scaled([1.0; 3], [0.0; 3])?)?;
+/// let coarse = Grid::new([4; 3], Affine::scaled([2.0; 3], [0.0; 3])?)?;
+/// let labels = Mask::from_voxels(fine, |_, p| if p.0 == [3.0; 3] { 7 } else { 1 });
+/// let (on_coarse, note) = labels_onto(labels, &coarse, ["labels", "the field"])?;
+/// assert_eq!(on_coarse.grid(), &coarse);
+/// assert!(note.unwrap().contains("label 7 is lost"));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub fn labels_onto(
+    labels: Mask,
+    grid: &Grid,
+    [what, reference]: [&str; 2],
+) -> Result<(Mask, Option<String>), FieldError> {
+    if grid.same_as(labels.grid()) {
+        return Ok((labels, None));
+    }
+    let (own, values) = (labels.grid(), labels.as_slice());
+    let label = |_, p| nearest(own.shape(), own.affine().to_voxel(p)).map_or(0, |at| values[at]);
+    let placed = Mask::from_voxels(*grid, label);
+    let within = |map: &Mask| {
+        map.as_slice().iter().fold([false; 256], |mut held, l| {
+            held[usize::from(*l)] = true;
+            held
+        })
+    };
+    let (before, after) = (within(&labels), within(&placed));
+    if after[1..].iter().all(|held| !held) {
+        return Err(FieldError::Elsewhere { what: what.into(), reference: reference.into() });
+    }
+    let mut note =
+        format!("{what}: lies on another grid than {reference}; it was resampled onto that by nearest neighbour");
+    let lost: Vec<String> = (1..256).filter(|&l| before[l] && !after[l]).map(|l| l.to_string()).collect();
+    match &lost[..] {
+        [] => (),
+        [one] => note.push_str(&format!(", and label {one} is lost")),
+        _ => note.push_str(&format!(", and labels {} are lost", lost.join(", "))),
+    }
+    Ok((placed, Some(note)))
 }
 
 /// p + u(p) with u trilinear at each point (world mm), `None` for a point outside the field's grid.

@@ -1,6 +1,7 @@
 //! Arrays in and out, errors, progress and threads.
 
-use crate::error::{FieldError, IoError};
+use crate::error::IoError;
+use crate::field::warp::labels_onto;
 use crate::io;
 use crate::python::PalpateError;
 use crate::types::{
@@ -11,8 +12,10 @@ use numpy::{
     IntoPyArray, PyArray2, PyArray3, PyArray4, PyArray5, PyReadonlyArray, PyReadonlyArray2, PyReadonlyArray3,
     PyReadonlyArray4, PyReadonlyArray5, PyUntypedArrayMethods,
 };
+use pyo3::exceptions::PyUserWarning;
 use pyo3::prelude::*;
 use serde_json::Value;
+use std::ffi::CString;
 use std::path::Path;
 use std::sync::Mutex;
 
@@ -57,17 +60,14 @@ pub fn labels(image: &Image<'_>, name: &str) -> PyResult<Mask> {
     io::labels_of(&volume(image)?, Path::new(name)).map_err(told)
 }
 
-/// The same if it is there, on the grid of `reference`, which is called `of`.
+/// The same if it is there, on the grid of `reference`, which is called `of`: resampled, with a
+/// warning, where it lies on another.
 pub fn mask(image: Option<&Image<'_>>, name: &str, reference: &Grid, of: &str) -> PyResult<Option<Mask>> {
     let Some(image) = image else { return Ok(None) };
-    let mask = labels(image, name)?;
-    if !reference.same_as(mask.grid()) {
-        return Err(told(FieldError::GridMismatch {
-            what: name.into(),
-            found: mask.grid().shape(),
-            reference: of.into(),
-            expected: reference.shape(),
-        }));
+    let (mask, note) = labels_onto(labels(image, name)?, reference, [name, of]).map_err(told)?;
+    if let Some(note) = note.and_then(|n| CString::new(n).ok()) {
+        let py = image.0.py();
+        PyErr::warn(py, &py.get_type::<PyUserWarning>(), &note, 1)?;
     }
     Ok(Some(mask))
 }

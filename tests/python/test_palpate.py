@@ -215,7 +215,7 @@ def test_errors_are_those_of_the_command_line(shell, pair):
         (lambda: palpate.field(initial, deformed, points=5), "points is 5"),
         (lambda: palpate.field(initial, deformed, params={"pases": 3}), "pases"),
         (lambda: palpate.field(initial, deformed, preset="quick"), "balanced"),
-        (lambda: palpate.field(initial, deformed, mask=(np.ones((4, 4, 4)), np.eye(4))), "mask"),
+        (lambda: palpate.field(initial, deformed, mask=(np.ones((4, 4, 4)), far)), "mask: does not overlap"),
         (lambda: palpate.field(initial, 3), "deformed: is no volume"),
         (lambda: palpate.field((np.ones((4, 4)), np.eye(4)), deformed), "3 axes"),
         (lambda: palpate.field((np.ones((4, 4, 4)), np.eye(2)), deformed), "4 x 4"),
@@ -299,6 +299,27 @@ def test_what_is_known_by_label_equals_the_command_line(shell, pad, tmp_path):
         palpate.stiffness((lps(np.asarray(data.dataobj)[:, :, :, 0, :]), data.affine), labels=labels, fixed={99: 1.0})
 
 
+def test_labels_on_another_grid_are_resampled_as_on_the_command_line(shell, pad, tmp_path):
+    folder, elastic = pad
+    alone, cropped = tmp_path / "alone.nii.gz", tmp_path / "cropped.nii.gz"
+    alone.write_bytes((shell.folder / "pad-field/displacement.nii.gz").read_bytes())
+    data, labels = nibabel.load(alone), nibabel.load(folder / "labels.nii.gz")
+    # Behind the first slice, in the same place.
+    affine = labels.affine.copy()
+    affine[:, 3] += affine[:, 0]
+    nibabel.save(nibabel.Nifti1Image(np.asarray(labels.dataobj)[1:], affine), cropped)
+    held = {"held": elastic["held"], "load": elastic["load"]}
+    said = shell(
+        "stiffness", "--field", alone, "--labels", cropped, "--nodes=500", *[f"--{k}={v}" for k, v in held.items()],
+        "-o", tmp_path / "known",
+    ).stderr
+    assert "cropped.nii.gz: lies on another grid than alone.nii.gz" in said
+    field = (lps(np.asarray(data.dataobj)[:, :, :, 0, :]), data.affine)
+    with pytest.warns(UserWarning, match="lies on another grid than"):
+        found = palpate.stiffness(field, labels=cropped, nodes=500, **held)
+    assert found.summary["regions"] == json.loads((tmp_path / "known/summary.json").read_text())["regions"]
+
+
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc to know the peak of memory")
 def test_arrays_are_worked_on_where_they_lie():
     """Volumes and a displacement of hundreds of MB, of which no voxel is ever written, take no memory unless they are copied."""
@@ -315,11 +336,12 @@ def test_arrays_are_worked_on_where_they_lie():
         "    raise AssertionError('a constant volume is measured')\n"
         "try:\n"
         "    field = np.zeros((512, 512, 100, 3), np.float32, order='F')\n"
-        "    palpate.stiffness((field, np.eye(4)), labels=(np.ones((2, 2, 2)), np.eye(4)))\n"
+        "    far = np.array([[1, 0, 0, 5000], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])\n"
+        "    palpate.stiffness((field, np.eye(4)), labels=(np.ones((2, 2, 2)), far))\n"
         "except palpate.PalpateError as error:\n"
-        "    assert 'grid' in str(error)\n"
+        "    assert 'overlap' in str(error)\n"
         "else:\n"
-        "    raise AssertionError('labels on another grid are taken')\n"
+        "    raise AssertionError('labels that lie elsewhere are taken')\n"
         "print(peak() - start)\n"
     )
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
