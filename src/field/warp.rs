@@ -106,10 +106,13 @@ pub fn warp_labels<T: Copy + Default + Send + Sync>(
     reference: Option<&Grid>,
     background: T,
 ) -> Volume<T> {
-    let (grid, values) = (*labels.grid(), labels.as_slice());
-    warp_with(field, reference, background, |target| {
-        nearest(grid.shape(), grid.affine().to_voxel(target)).map_or(background, |at| values[at])
-    })
+    warp_with(field, reference, background, |target| label_at(labels, target).unwrap_or(background))
+}
+
+/// The label of the voxel that holds a place.
+fn label_at<T: Copy>(labels: &Volume<T>, place: WorldPoint) -> Option<T> {
+    let grid = labels.grid();
+    nearest(grid.shape(), grid.affine().to_voxel(place)).map(|at| labels.as_slice()[at])
 }
 
 /// A label map (`what`) on the grid of `reference`, by nearest neighbour in world space. Where the
@@ -137,9 +140,7 @@ pub fn labels_onto(
     if grid.same_as(labels.grid()) {
         return Ok((labels, None));
     }
-    let (own, values) = (labels.grid(), labels.as_slice());
-    let label = |_, p| nearest(own.shape(), own.affine().to_voxel(p)).map_or(0, |at| values[at]);
-    let placed = Mask::from_voxels(*grid, label);
+    let placed = Mask::from_voxels(*grid, |_, place| label_at(&labels, place).unwrap_or(0));
     let within = |map: &Mask| {
         map.as_slice().iter().fold([false; 256], |mut held, l| {
             held[usize::from(*l)] = true;

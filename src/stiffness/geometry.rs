@@ -16,7 +16,7 @@ use crate::numerics::cholesky::within;
 use crate::stiffness::border::Border;
 use crate::stiffness::fem_body::Body;
 use crate::stiffness::forward::Problem;
-use crate::stiffness::identify::{Estimate, Setup, covariance, grouped_normal};
+use crate::stiffness::identify::{Estimate, Setup, State, covariance, grouped_normal};
 use crate::stiffness::inclusion::{Inclusion, SHAPE_FUNCTIONS};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::observations::{Reading, find, gradient, read};
@@ -136,11 +136,22 @@ impl Part {
         nodes.fold([0.0; 3], |sum, (n, w)| std::array::from_fn(|a| sum[a] + w * self.movement[*n as usize][a]))
     }
 
-    /// The body with this part moved outwards by `offset` voxels.
-    fn moved(&self, body: &Body, offset: f64) -> Body {
-        let mut places = body.places.clone();
+    /// What `give` tells of the problem with this part moved outwards by `offset` voxels, on the
+    /// springs of `problem`.
+    fn shifted<T>(
+        &self,
+        setup: &Setup<'_>,
+        state: &State,
+        problem: &Problem<'_>,
+        offset: f64,
+        give: impl FnOnce(&Setup<'_>, &Problem<'_>) -> T,
+    ) -> T {
+        let mut places = setup.body.places.clone();
         self.shift(&mut places, offset);
-        body.with_places(places)
+        let body = setup.body.with_places(places);
+        let moved = Setup { body: &body, ..setup.clone() };
+        let problem = Problem { springs: problem.springs.clone(), ..moved.problem(state) };
+        give(&moved, &problem)
     }
 }
 
@@ -237,15 +248,8 @@ fn columns(
     let (body, h) = (setup.body, DIFFERENCE_VOXELS);
     let problem = setup.problem(&estimate.state);
     let factor = problem.factorise(x)?;
-    // Of each part what it gives for an offset by `by`; none where an element turns inside out.
-    let with = |part: &Part, by: f64, give: &dyn Fn(&Setup<'_>, &Problem<'_>) -> Option<Vec<f64>>| {
-        let body = part.moved(body, by);
-        let moved = Setup { body: &body, ..setup.clone() };
-        let problem = Problem { springs: problem.springs.clone(), ..moved.problem(&estimate.state) };
-        give(&moved, &problem)
-    };
     let side = |(part, _): &(&Part, f64)| {
-        let forces = |by| with(part, by, &|_, problem| problem.residual(x));
+        let forces = |by| part.shifted(setup, &estimate.state, &problem, by, |_, problem| problem.residual(x));
         let (out, back) = forces(h).zip(forces(-h))?;
         Some(out.into_iter().zip(back).map(|(o, b)| (b - o) / (2.0 * h)).collect())
     };
@@ -272,9 +276,10 @@ fn columns(
         let row: Vec<[f64; 3]> = readings.iter().zip(&gradients).map(at).collect();
         let force = |by: f64| {
             let y: Vec<f64> = x.iter().zip(change).map(|(x, c)| x + by * c).collect();
-            with(part, by, &|moved, problem| Some(vec![moved.forces(problem, &estimate.state, &y)[0]]))
+            let of = |moved: &Setup<'_>, problem: &Problem<'_>| moved.forces(problem, &estimate.state, &y)[0];
+            part.shifted(setup, &estimate.state, &problem, by, of)
         };
-        let slope = force(h).zip(force(-h)).map_or(0.0, |(out, back)| (out[0] / back[0]).ln() / (2.0 * h));
+        let slope = (force(h) / force(-h)).ln() / (2.0 * h);
         (row, slope)
     };
     Ok((parts, changes.par_chunks_exact(x.len()), &whole).into_par_iter().map(column).unzip())

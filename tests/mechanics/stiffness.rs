@@ -304,15 +304,20 @@ fn sensitivities_are_those_of_finite_differences() {
     }
 }
 
+/// A pressed body on a mesh of about `nodes` nodes, with what `field` shows of it.
+fn meshed(body: &Pressed, field: &DenseField, nodes: usize, sides: [&str; 2]) -> Level {
+    let map = &body.phantom.stiffness.as_ref().unwrap().labels;
+    let volume = palpate::stiffness::fields::volume(map);
+    let mesh = mesh_labels(map, &Fineness::for_nodes(volume, nodes)).unwrap();
+    let [held, load] = sides.map(|side| Place::Side(Side::parse(side).unwrap()));
+    Level::new(&mesh, field, None, map, &held, &load, None).unwrap()
+}
+
 #[test]
 fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
     let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
     let body = Pressed::new(&params).unwrap();
-    let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
-    let volume = palpate::stiffness::fields::volume(&map);
-    let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, 2500)).unwrap();
-    let [held, load] = ["z+", "z-"].map(|side| Place::Side(Side::parse(side).unwrap()));
-    let mut level = Level::new(&mesh, &body.phantom.truth, None, &map, &held, &load, None).unwrap();
+    let mut level = meshed(&body, &body.phantom.truth, 2500, ["z+", "z-"]);
     assert!(level.patches[1].curved());
     level.patches[1].contact = Contact::Sliding;
     let setup = level.setup(Law::NeoHookean, &StiffnessParams::default(), level.largest());
@@ -354,17 +359,13 @@ fn sensitivities_to_a_plate_on_a_curved_body_are_those_of_finite_differences() {
 fn what_an_offset_of_the_shape_changes_is_what_solutions_of_moved_bodies_differ_by() {
     let params = PhantomParams { seed: 64, ..PhantomParams::new(PhantomKind::Inclusion) }.sized(24);
     let body = Pressed::new(&params).unwrap();
-    let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
-    let volume = palpate::stiffness::fields::volume(&map);
-    let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, 2500)).unwrap();
-    let [held, load] = ["z-", "z+"].map(|side| Place::Side(Side::parse(side).unwrap()));
-    let mut level = Level::new(&mesh, &body.phantom.truth, None, &map, &held, &load, None).unwrap();
+    let mut level = meshed(&body, &body.phantom.truth, 2500, ["z-", "z+"]);
     level.open_borders(0.5);
     let setup = level.setup(Law::NeoHookean, &StiffnessParams::default(), level.largest());
     let mut state = setup.start();
     state.theta[1] = 1.6;
     let here = setup.run(state, 0, 1e-9).unwrap();
-    let found = geometry::open(&setup, &here, map.grid(), &[]).unwrap();
+    let found = geometry::open(&setup, &here, &level.grid, &[]).unwrap();
     // The border of the inclusion is open, and comes last.
     let (part, _) = setup.open.last().unwrap();
     let (row, slope) = (found.rows.last().unwrap(), found.force_slope.last().unwrap());
@@ -404,14 +405,10 @@ fn what_an_offset_of_the_shape_changes_is_what_solutions_of_moved_bodies_differ_
 fn meshes_of_a_body_agree_on_what_is_curved_as_the_finer_sees_it() {
     let params = PhantomParams { seed: 5, ..PhantomParams::new(PhantomKind::Fingertip) }.sized(32);
     let body = Pressed::new(&params).unwrap();
-    let map = body.phantom.stiffness.as_ref().unwrap().labels.clone();
-    let volume = palpate::stiffness::fields::volume(&map);
-    let [held, load] = ["z+", "z-"].map(|side| Place::Side(Side::parse(side).unwrap()));
     let level = |nodes: usize, part: f32| {
-        let mesh = mesh_labels(&map, &Fineness::for_nodes(volume, nodes)).unwrap();
         let mut field = body.phantom.truth.clone();
         field.as_mut_slice().iter_mut().for_each(|v| *v *= part);
-        let mut level = Level::new(&mesh, &field, None, &map, &held, &load, None).unwrap();
+        let mut level = meshed(&body, &field, nodes, ["z+", "z-"]);
         level.patches[1].contact = Contact::Sliding;
         level
     };
