@@ -5,8 +5,9 @@ use super::limits::bytes;
 use super::outputs::Target;
 use anyhow::Result;
 use palpate::error::Shown;
-use palpate::pipeline::dry_run::{FieldPlan, stiffness_memory};
+use palpate::pipeline::dry_run::FieldPlan;
 use palpate::report::scale::{short, thousands};
+use palpate::types::stiffness::Forecast;
 use palpate::types::{FieldParams, Grid, Mask, StiffnessParams};
 use std::path::{Path, PathBuf};
 
@@ -99,6 +100,12 @@ fn body(labels: &Mask, labelled: bool, most: usize) -> (&'static str, String) {
     ("labels", regions.join(", "))
 }
 
+/// Seconds to two digits.
+fn rounded(seconds: f64) -> f64 {
+    let unit = 10f64.powf(seconds.max(1e-3).log10().floor() - 1.0);
+    (seconds / unit).round() * unit
+}
+
 /// The plan of `palpate stiffness` for labels, or a mask where not `labelled`; `frames` are the
 /// forces of a sequence, whose first field `path` is.
 pub fn stiffness(
@@ -107,6 +114,7 @@ pub fn stiffness(
     params: &StiffnessParams,
     [held, load]: [&str; 2],
     frames: &[Option<f64>],
+    forecast: &Forecast,
     output: &Path,
     files: &[&str],
 ) -> String {
@@ -129,8 +137,12 @@ pub fn stiffness(
     };
     line(&mut out, "force", &force);
     line(&mut out, "law", &format!("{:?}, Poisson's ratio {}", params.model, params.poisson).to_lowercase());
-    line(&mut out, "mesh", &format!("about {} nodes", thousands(params.nodes)));
-    line(&mut out, "memory", &format!("about {}", bytes(stiffness_memory(params.nodes))));
+    line(&mut out, "mesh", &format!("{} nodes", thousands(forecast.nodes)));
+    line(&mut out, "memory", &format!("about {}", bytes(forecast.memory)));
+    if let Some(seconds) = forecast.seconds {
+        let each = if frames.is_empty() { "" } else { " for each field" };
+        line(&mut out, "time", &format!("about {} s of one core{each}", short(rounded(seconds))));
+    }
     end(&mut out, output, files);
     out
 }

@@ -18,7 +18,7 @@ use palpate::pipeline::stiffness::{FieldQuality, Inputs, MIN_MATCHES_IN_BODY, in
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
 use palpate::stiffness::boundary_conditions::Place;
-use palpate::types::stiffness::{LawChoice, Side};
+use palpate::types::stiffness::{Forecast, LawChoice, Side};
 use palpate::types::{
     DenseField, ErrorSamples, Grid, Mask, MotionModel, SparseField, StiffnessParams, StiffnessResult, Trust, Volume,
 };
@@ -218,6 +218,7 @@ pub(super) fn plan(
     field: &Path,
     setting: &Setting,
     frames: &[Option<f64>],
+    forecast: &Forecast,
     console: &Console,
 ) -> Result<()> {
     OutputFolder::check(&options.output, options.overwrite)?;
@@ -235,6 +236,7 @@ pub(super) fn plan(
         params,
         sides,
         frames,
+        forecast,
         &options.output,
         &files,
     ));
@@ -266,9 +268,10 @@ fn one(options: &Options, params: &StiffnessParams, field: &Path, body: &Path, c
     let images = images(options, source.image.as_deref(), field.grid())?;
     let on_mesh = options.mesh.measure(&field, &setting.labels, &source.field)?;
     if options.dry_run {
-        setting.check(&field, params).with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
+        let forecast = setting.forecast(&field, params);
+        let forecast = forecast.with_context(|| format!("{} with {}", name(&source.field), name(body)))?;
         drop(progress);
-        return plan(options, params, &source.field, &setting, &[], console);
+        return plan(options, params, &source.field, &setting, &[], &forecast, console);
     }
     let mut folder = OutputFolder::create(&options.output, options.overwrite)?;
     let mut inputs = record::inputs(&[("field", Some(&source.field)), ("matches", source.matches.as_ref())]);
@@ -439,9 +442,9 @@ impl Setting {
         self.with(field, matches, quality, |inputs| pipeline::stiffness::run(inputs, params, progress))
     }
 
-    /// What [`Self::run`] would refuse at its start.
-    pub(super) fn check(&self, field: &DenseField, params: &StiffnessParams) -> Result<(), StiffnessError> {
-        self.with(field, None, FieldQuality::default(), |inputs| pipeline::stiffness::check(inputs, params))
+    /// What [`Self::run`] would take.
+    pub(super) fn forecast(&self, field: &DenseField, params: &StiffnessParams) -> Result<Forecast, StiffnessError> {
+        self.with(field, None, FieldQuality::default(), |inputs| pipeline::stiffness::forecast(inputs, params))
     }
 
     fn with<T>(

@@ -13,6 +13,7 @@ use palpate::pipeline::stiffness::FieldQuality;
 use palpate::pipeline::stiffness_sequence::{Sequence, motion};
 use palpate::report::record::{in_summary, on_page};
 use palpate::report::stiffness as report;
+use palpate::types::stiffness::Forecast;
 use palpate::types::{SparseField, StiffnessParams, Trust};
 use std::path::{Path, PathBuf};
 
@@ -36,10 +37,10 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     let setting = Setting::read(options, params, body, &grid, &frames[0].1)?;
     let images = images(options, None, &grid)?;
     if options.dry_run {
-        one_is_usable(&frames, &setting, params, body)?;
+        let forecast = forecast(&frames, &setting, params, body)?;
         drop(progress);
         let forces: Vec<Option<f64>> = frames.iter().map(|f| f.2).collect();
-        return plan(options, params, &frames[0].1, &setting, &forces, console);
+        return plan(options, params, &frames[0].1, &setting, &forces, &forecast, console);
     }
     let mut order = Vec::new();
     for (at, (_, path, _)) in frames.iter().enumerate() {
@@ -114,17 +115,19 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
 }
 
 /// Frames at rest are left out: one that can be used is enough.
-fn one_is_usable(frames: &[Frame], setting: &Setting, params: &StiffnessParams, body: &Path) -> Result<()> {
-    let mut refused = Ok(());
-    for (_, path, _) in frames {
-        refused = setting
-            .check(&io::read_field(path)?, params)
-            .with_context(|| format!("{} with {}", name(path), name(body)));
-        if refused.is_ok() {
+fn forecast(frames: &[Frame], setting: &Setting, params: &StiffnessParams, body: &Path) -> Result<Forecast> {
+    let one = |(_, path, _): &Frame| {
+        let found = setting.forecast(&io::read_field(path)?, params);
+        found.with_context(|| format!("{} with {}", name(path), name(body)))
+    };
+    let mut found = one(&frames[0]);
+    for frame in &frames[1..] {
+        if found.is_ok() {
             break;
         }
+        found = one(frame);
     }
-    refused
+    found
 }
 
 /// What the summary of a track says.

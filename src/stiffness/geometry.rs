@@ -169,6 +169,8 @@ pub struct Geometry {
     pub covariance: Vec<f64>,
     /// Derivative of ln force by each offset (1/voxel).
     pub force_slope: Vec<f64>,
+    /// The solution's derivative by each offset (1/voxel), nodes moving along, one after the other.
+    pub changes: Vec<f64>,
     /// What all parameters are known to.
     pub fit: Fit,
 }
@@ -219,22 +221,50 @@ pub fn open(
     fixed.extend(interfaces.iter().map(|i| Part::interface(i, setup.body, grid)));
     let parts: Vec<(&Part, f64)> = fixed.iter().chain(setup.open.iter().map(|o| &o.0)).map(|p| (p, 0.0)).collect();
     let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(Open::default()) };
-    let (rows, force_slope) = columns(setup, estimate, x, &parts)?;
+    let (rows, force_slope, _) = columns(setup, estimate, x, &parts)?;
     Ok(Open { rows, force_slope, sigma: parts.iter().map(|p| p.0.sigma).collect() })
 }
 
-/// How much further outwards each of the open parts lies (voxels), for all that the data say; none
-/// where there is none.
-///
-/// # Errors
-/// As [`Setup::run`].
-pub fn open_steps(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Vec<f64>>, StiffnessError> {
-    let parts: Vec<(&Part, f64)> = setup.open.iter().map(|(p, moved)| (p, *moved)).collect();
-    let found = offsets(setup, estimate, &parts)?;
-    Ok(found.map(|g| g.step[g.step.len() - parts.len()..].to_vec()))
+/// A step of moduli, plates and the open parts of the shape together.
+#[derive(Debug, Clone)]
+pub struct JointStep {
+    /// How much further outwards each open part lies (voxels), for all that the data say.
+    pub offsets: Vec<f64>,
+    /// Change of the moduli and the plates.
+    parameters: Vec<f64>,
+    changes: Vec<f64>,
 }
 
-/// What the offsets of some parts change at the observations (mm/voxel), and of ln force (1/voxel).
+impl JointStep {
+    /// The step from an estimate; none where nothing is open.
+    ///
+    /// # Errors
+    /// As [`Setup::run`].
+    pub fn of(setup: &Setup<'_>, estimate: &Estimate) -> Result<Option<Self>, StiffnessError> {
+        let parts: Vec<(&Part, f64)> = setup.open.iter().map(|(p, moved)| (p, *moved)).collect();
+        let one = |g: Geometry| {
+            let (parameters, offsets) = g.step.split_at(g.step.len() - parts.len());
+            Self { offsets: offsets.to_vec(), parameters: parameters.to_vec(), changes: g.changes }
+        };
+        Ok(offsets(setup, estimate, &parts)?.map(one))
+    }
+
+    /// The same with no offset larger than `most` (voxels).
+    pub fn limited(self, most: f64) -> Self {
+        Self { offsets: self.offsets.iter().map(|s| s.clamp(-most, most)).collect(), ..self }
+    }
+
+    /// The state that a part of the step leads to, to first order.
+    pub fn state(&self, setup: &Setup<'_>, estimate: &Estimate, part: f64) -> State {
+        let Some(x) = estimate.state.x.as_deref() else { return estimate.state.clone() };
+        let step: Vec<f64> = self.parameters.iter().chain(&self.offsets).map(|s| part * s).collect();
+        let columns = [&estimate.columns[..], &self.changes].concat();
+        setup.advanced(&estimate.state, x, &columns, &step)
+    }
+}
+
+/// What the offsets of some parts change at the observations (mm/voxel), of ln force (1/voxel), and
+/// of the solution.
 ///
 /// A node that moves by m for an offset takes its displacement along. With the forces r(x, s) of
 /// the displacement x and the offset s, equilibrium asks for dx/ds = -K^-1 dr/ds, and a place that
@@ -244,7 +274,7 @@ fn columns(
     estimate: &Estimate,
     x: &[f64],
     parts: &[(&Part, f64)],
-) -> Result<(Vec<Vec<[f64; 3]>>, Vec<f64>), StiffnessError> {
+) -> Result<(Vec<Vec<[f64; 3]>>, Vec<f64>, Vec<f64>), StiffnessError> {
     let (body, h) = (setup.body, DIFFERENCE_VOXELS);
     let problem = setup.problem(&estimate.state);
     let factor = problem.factorise(x)?;
@@ -282,7 +312,8 @@ fn columns(
         let slope = (force(h) / force(-h)).ln() / (2.0 * h);
         (row, slope)
     };
-    Ok((parts, changes.par_chunks_exact(x.len()), &whole).into_par_iter().map(column).unzip())
+    let (rows, slopes) = (parts, changes.par_chunks_exact(x.len()), &whole).into_par_iter().map(column).unzip();
+    Ok((rows, slopes, changes))
 }
 
 /// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh
@@ -301,7 +332,7 @@ pub fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f
 /// Fits the offsets of some parts about an estimate.
 fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Result<Option<Geometry>, StiffnessError> {
     let Some(x) = estimate.state.x.as_deref().filter(|_| !parts.is_empty()) else { return Ok(None) };
-    let (columns, force_slope) = columns(setup, estimate, x, parts)?;
+    let (columns, force_slope, changes) = columns(setup, estimate, x, parts)?;
     let rows: Vec<Vec<[f64; 3]>> = estimate.rows.iter().cloned().chain(columns).collect();
     let p = rows.len();
     let mut prior = setup.prior_terms(&estimate.state);
@@ -348,7 +379,7 @@ fn offsets(setup: &Setup<'_>, estimate: &Estimate, parts: &[(&Part, f64)]) -> Re
     let shapes = found().filter(|(part, _)| part.name.is_none()).map(|(_, offset)| offset).collect();
     let rms = (rest.iter().flatten().map(|r| r * r).sum::<f64>() / samples).sqrt();
     let fit = Fit { rows, information, prior, rms, squares, raw: raw / squares.max(f64::MIN_POSITIVE) };
-    Ok(Some(Geometry { faces, shapes, step, covariance, force_slope, fit }))
+    Ok(Some(Geometry { faces, shapes, step, covariance, force_slope, changes, fit }))
 }
 
 /// Box faces (voxel axis, positive side) that the surface fills by [`MIN_BOX_FACE_FRACTION`] or

@@ -2,7 +2,7 @@
 
 use crate::error::StiffnessError;
 use crate::stiffness::boundary_conditions::{Patch, travel};
-use crate::stiffness::geometry::{self, open_steps};
+use crate::stiffness::geometry::{self, JointStep};
 use crate::stiffness::identify::{Estimate, Setup};
 use crate::stiffness::mesh_problem::Level;
 use crate::stiffness::summary::{self, Scale};
@@ -98,6 +98,12 @@ fn candidates(level: &Level, patch: &Patch) -> Vec<Contact> {
         out.push(Contact::Measured);
     }
     out
+}
+
+/// How many contacts of the two patches would be tried.
+pub fn contacts(level: &Level) -> usize {
+    let [held, loaded] = [0, 1].map(|i| candidates(level, &level.patches[i]).len());
+    held + loaded - 1
 }
 
 /// Lets both patches touch so.
@@ -402,24 +408,19 @@ pub fn settle(
     level.settled = false;
     for _ in 0..moves {
         let setup = level.setup(law, params, reference);
-        let steps = open_steps(&setup, &estimate)?;
-        let Some(steps) = steps.filter(|all| all.iter().any(|step| step.abs() > SHAPE_MOVES.tolerance_voxels)) else {
-            break;
-        };
+        let far = |step: &JointStep| step.offsets.iter().any(|step| step.abs() > SHAPE_MOVES.tolerance_voxels);
+        let Some(step) = JointStep::of(&setup, &estimate)?.filter(far) else { break };
+        let step = step.limited(SHAPE_MOVES.max_step_voxels);
+        let starts = [1.0, 0.5].map(|part| (part, step.state(&setup, &estimate, part)));
         let variance = setup.variance(&estimate);
         let misfit = |level: &Level, e: &Estimate| {
             e.raw * e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.penalty()
         };
         let (before, least) = (level.offsets(), misfit(level, &estimate));
-        let better = [1.0, 0.5].into_iter().find_map(|part| {
-            let moved =
-                |(b, s): (&f64, &f64)| b + part * s.clamp(-SHAPE_MOVES.max_step_voxels, SHAPE_MOVES.max_step_voxels);
-            level.move_to(&before.iter().zip(&steps).map(moved).collect::<Vec<f64>>());
+        let better = starts.into_iter().find_map(|(part, start)| {
+            level.move_to(&before.iter().zip(&step.offsets).map(|(b, s)| b + part * s).collect::<Vec<f64>>());
             // A shape that cannot be solved is left alone.
-            let found = level
-                .setup(law, params, reference)
-                .run(estimate.state.clone(), COARSE.max_iterations, precision)
-                .ok()?;
+            let found = level.setup(law, params, reference).run(start, COARSE.max_iterations, precision).ok()?;
             (misfit(level, &found) < least).then_some(found)
         });
         let Some(better) = better else {

@@ -305,6 +305,18 @@ impl fmt::Display for Evidence {
     }
 }
 
+/// What a run would take, told before it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Forecast {
+    /// Nodes of the fine mesh.
+    pub nodes: usize,
+    /// Largest memory (bytes).
+    pub memory: u64,
+    /// CPU time (s), as fast as this machine is now; none without labels, and where equations are
+    /// solved by iterations.
+    pub seconds: Option<f64>,
+}
+
 /// From which contrast on a ball would be found without labels, in three of four places.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Detectable {
