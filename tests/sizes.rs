@@ -1,5 +1,9 @@
-//! Texts of any shape take at most 64 times their size of memory, little time, and short messages.
+//! Texts of any shape take at most 64 times their size of memory, little time, and short messages,
+//! and slices no more memory than their bytes stand for.
 #![allow(clippy::unwrap_used)]
+
+#[path = "fixtures/slices.rs"]
+mod slices;
 
 use palpate::io::{self, SceneOverrides};
 use peak_alloc::PeakAlloc;
@@ -24,7 +28,26 @@ fn told<T>(found: Result<T, impl std::fmt::Display>) -> Result<(), String> {
 
 // One test: the memory of all threads is counted.
 #[test]
-fn a_text_of_any_shape_takes_64_times_its_size_and_a_short_message() {
+fn sizes_that_are_claimed_take_no_memory() {
+    texts_of_any_shape();
+    slices_that_claim_to_be_large();
+}
+
+fn slices_that_claim_to_be_large() {
+    let folder = TempDir::new().unwrap();
+    for syntax in [slices::IMPLICIT, slices::EXPLICIT, slices::BIG_ENDIAN, slices::RLE] {
+        let slice = slices::Slice { syntax, ..slices::Slice::new(0) };
+        let path = folder.path().join("slice.dcm");
+        fs::write(&path, slice.claiming(16_387, 32_772)).unwrap();
+        let before = MEMORY.current_usage();
+        MEMORY.reset_peak_usage();
+        let said = io::read_volume(&path).unwrap_err().to_string();
+        assert!(MEMORY.peak_usage() - before < SLACK, "{syntax}: memory is taken");
+        assert!(said.contains("slice.dcm") && said.contains("1074069528 bytes for the voxels"), "{said}");
+    }
+}
+
+fn texts_of_any_shape() {
     let folder = TempDir::new().unwrap();
     let long = |piece: &str, bytes: usize| piece.repeat(bytes / piece.len());
     let readers: [(&str, Reader); 9] = [

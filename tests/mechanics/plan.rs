@@ -133,7 +133,8 @@ fn table() {
 #[test]
 fn deviations_are_those_of_simulated_measurements() {
     let (labels, sides) = (ball(), [side("z-"), side("z+")]);
-    let found = compared(&labels, &params(&[(1, 20.0), (2, 60.0)]), [0.8, 0.08], 8, [&sides[0], &sides[1]]);
+    // The scatter of 24 is known to 15 %.
+    let found = compared(&labels, &params(&[(1, 20.0), (2, 60.0)]), [0.8, 0.08], 24, [&sides[0], &sides[1]]);
     for [sd, scatter, stated, scattered, bias] in found {
         let near = |a: f64, b: f64| (1.0 / 1.5..1.5).contains(&(a / b));
         assert!(near(stated, sd), "stated {stated} for {sd}");

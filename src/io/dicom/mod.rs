@@ -259,6 +259,7 @@ pub(super) fn series(path: &Path, values: bool) -> Result<(Stored, Vec<f32>), Io
     let grid = grid_from_lps(shape, steps, slices[0].position).map_err(|flaw| flaw.at(path))?;
     let mut all = Vec::new();
     if values {
+        files.iter().try_for_each(|f| f.pixels.held().map_err(|flaw| flaw.at(&f.path)))?;
         let largest = files.iter().map(|f| f.pixels.shape[0] * f.pixels.shape[1] * f.pixels.frames).max().unwrap_or(0);
         fits(4 * (grid.len() + 4 * largest) as u64).map_err(|flaw| flaw.at(path))?;
         all = vec![0.0; grid.len()];

@@ -34,6 +34,23 @@ enum Packing {
     Jpeg,
 }
 
+impl Packing {
+    /// What packed bytes stand for at most (bytes), of numbers of `size` bytes.
+    fn most(self, packed: usize, size: usize) -> usize {
+        let ratio = match self {
+            Self::None => 1,
+            Self::Rle => RLE_RATIO,
+            Self::Jpeg => JPEG_RATIO * size,
+        };
+        packed.saturating_mul(ratio)
+    }
+}
+
+fn cut(of: &str, needed: usize, holds: usize) -> Flaw {
+    let what = format!("needs {needed} bytes for the voxels of {of} but holds {holds}");
+    Flaw::new(what, "the file is cut short: copy or export it again")
+}
+
 /// Transfer syntaxes that are not read (PS3.6, table A-1).
 const NOT_READ: [(&str, &str); 14] = [
     ("1.2.840.10008.1.2.4.51", "JPEG extended, 12 bits"),
@@ -104,10 +121,7 @@ impl<'a> Source<'a> {
     pub(super) fn frames(&self, elements: &Elements<'_>, pixels: &Pixels) -> Result<Vec<Vec<u8>>, Flaw> {
         let [columns, rows] = pixels.shape;
         let needed = columns * rows * pixels.kind.size();
-        let cut = |holds: usize| {
-            let what = format!("needs {needed} bytes for the voxels of a frame but holds {holds}");
-            Flaw::new(what, "the file is cut short: copy or export it again")
-        };
+        let cut = |holds: usize| cut("a frame", needed, holds);
         if self.packing == Packing::None {
             let all = elements.get(PIXELS).unwrap_or_default();
             let frame = |k: usize| all.get(k * needed..(k + 1) * needed).map(<[u8]>::to_vec);
@@ -117,9 +131,9 @@ impl<'a> Source<'a> {
         joined(&pieces, pixels.frames, self.form)?
             .iter()
             .map(|piece| {
-                let ratio = if self.packing == Packing::Rle { RLE_RATIO } else { JPEG_RATIO * pixels.kind.size() };
-                if needed > piece.len().saturating_mul(ratio) {
-                    return Err(cut(piece.len().saturating_mul(ratio)));
+                let most = self.packing.most(piece.len(), pixels.kind.size());
+                if needed > most {
+                    return Err(cut(most));
                 }
                 match self.packing {
                     Packing::Rle => rle(piece, columns * rows, pixels.kind.size()),
@@ -224,6 +238,8 @@ pub(super) struct Pixels {
     /// Highest bits of a number that are none of it (PS3.5, 8.1.1): whatever stands there.
     unused: usize,
     pub(super) frames: usize,
+    /// What the packed numbers stand for at most (bytes).
+    most: usize,
     big_endian: bool,
 }
 
@@ -259,9 +275,24 @@ impl Pixels {
                 .ok_or_else(|| Flaw::new(format!("says that it has {n} frames"), CONVERT))?,
         };
         let shape = [side(COLUMNS, "Columns")?, side(ROWS, "Rows")?];
+        let packed = match source.packing {
+            Packing::None => stored.len(),
+            _ => elements.pieces(PIXELS).map(<[u8]>::len).sum(),
+        };
+        let most = source.packing.most(packed, kind.size());
         // Packed numbers have an order of their own.
         let big_endian = source.packing == Packing::None && source.form.big_endian;
-        Ok(Some(Self { shape, kind, unused: bits - used, frames, big_endian }))
+        Ok(Some(Self { shape, kind, unused: bits - used, frames, most, big_endian }))
+    }
+
+    /// Refuses frames that are larger than what the file holds, before memory is taken for them.
+    pub(super) fn held(&self) -> Result<(), Flaw> {
+        let needed = (self.shape[0] * self.shape[1] * self.kind.size()).saturating_mul(self.frames);
+        match self.most {
+            0 => Err(Flaw::new("holds neither numbers nor a packed image", CONVERT)),
+            most if needed > most => Err(cut("its frames", needed, most)),
+            _ => Ok(()),
+        }
     }
 
     /// The numbers of a frame.
