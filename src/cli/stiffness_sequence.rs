@@ -114,18 +114,19 @@ pub fn run(options: &Options, params: &StiffnessParams, from: &Path, body: &Path
     strict(options, &shared.result)
 }
 
-/// Frames at rest are left out: one that can be used is enough.
+/// What the first frame that can be used would take: frames at rest are left out. A frame that
+/// cannot be read is an error.
 fn forecast(frames: &[Frame], setting: &Setting, params: &StiffnessParams, body: &Path) -> Result<Forecast> {
-    let one = |(_, path, _): &Frame| {
+    let one = |(_, path, _): &Frame| -> Result<Result<Forecast>> {
         let found = setting.forecast(&io::read_field(path)?, params);
-        found.with_context(|| format!("{} with {}", name(path), name(body)))
+        Ok(found.with_context(|| format!("{} with {}", name(path), name(body))))
     };
-    let mut found = one(&frames[0]);
+    let mut found = one(&frames[0])?;
     for frame in &frames[1..] {
         if found.is_ok() {
             break;
         }
-        found = one(frame);
+        found = one(frame)?;
     }
     found
 }

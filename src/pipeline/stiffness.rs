@@ -13,7 +13,7 @@ use crate::stiffness::inclusion::Inclusion;
 use crate::stiffness::indenter_outline::{Outline, Rim, rim};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::mesh_problem::Level;
-use crate::stiffness::model_selection::{Choice, as_meshed, choose, contacts, known_moduli, settle};
+use crate::stiffness::model_selection::{Choice, as_meshed, choose, has_rivals, known_moduli, settle};
 use crate::stiffness::observations::Observation;
 use crate::stiffness::rigid_rotation::{Affinity, Turn};
 use crate::stiffness::summary::{Hidden, Moduli, Scale};
@@ -90,7 +90,8 @@ pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
 struct CoarseMesh {
     /// Nodes over those of the fine mesh.
     node_fraction: f64,
-    /// Most nodes: the noise of the data decides a choice long before the mesh does.
+    /// Most nodes asked for (edges of a punch and thin layers take more): the noise of the data
+    /// decides a choice long before the mesh does.
     max_nodes: f64,
 }
 
@@ -288,7 +289,7 @@ pub fn forecast(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<Forecas
         let started = Instant::now();
         setup.problem(&setup.start()).factorise(&vec![0.0; coarse.body.pattern.unknowns()])?;
         let unit = started.elapsed().as_secs_f64();
-        let [few, many] = if contacts(&coarse) > 1 { COST.contacts } else { COST.one_contact };
+        let [few, many] = if has_rivals(&coarse) { COST.contacts } else { COST.one_contact };
         let seconds = COST.time_ratio * unit * (few + many * (large / small).powf(COST.time_exponent));
         let memory = (COST.base_bytes + COST.bytes_per_number * (small + large)) as u64;
         Ok(Forecast { nodes, memory, seconds: inputs.labelled.then_some(seconds) })

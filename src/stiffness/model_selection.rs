@@ -100,10 +100,14 @@ fn candidates(level: &Level, patch: &Patch) -> Vec<Contact> {
     out
 }
 
-/// How many contacts of the two patches would be tried.
-pub fn contacts(level: &Level) -> usize {
-    let [held, loaded] = [0, 1].map(|i| candidates(level, &level.patches[i]).len());
-    held + loaded - 1
+/// How the held and the loaded patch may touch.
+fn contacts(level: &Level) -> [Vec<Contact>; 2] {
+    [0, 1].map(|i| candidates(level, &level.patches[i]))
+}
+
+/// Whether several contacts would be tried.
+pub fn has_rivals(level: &Level) -> bool {
+    contacts(level).iter().any(|c| c.len() > 1)
 }
 
 /// Lets both patches touch so.
@@ -207,7 +211,7 @@ impl Chooser<'_> {
 
     /// Tries every contact under a law, and says which ranks first.
     fn contact(&mut self, law: Law) -> Result<(Vec<Tried>, usize), StiffnessError> {
-        let [held, loaded] = [0, 1].map(|i| candidates(self.level, &self.level.patches[i]));
+        let [held, loaded] = contacts(self.level);
         let rivals = held.len() * loaded.len() > 1;
         let mut tried: Vec<Tried> = Vec::new();
         let mut failure = None;
@@ -411,16 +415,17 @@ pub fn settle(
         let far = |step: &JointStep| step.offsets.iter().any(|step| step.abs() > SHAPE_MOVES.tolerance_voxels);
         let Some(step) = JointStep::of(&setup, &estimate)?.filter(far) else { break };
         let step = step.limited(SHAPE_MOVES.max_step_voxels);
-        let starts = [1.0, 0.5].map(|part| (part, step.state(&setup, &estimate, part)));
         let variance = setup.variance(&estimate);
         let misfit = |level: &Level, e: &Estimate| {
             e.raw * e.squares / variance + level.setup(law, params, reference).prior(&e.state) + level.penalty()
         };
         let (before, least) = (level.offsets(), misfit(level, &estimate));
-        let better = starts.into_iter().find_map(|(part, start)| {
+        let better = [1.0, 0.5].into_iter().find_map(|part| {
             level.move_to(&before.iter().zip(&step.offsets).map(|(b, s)| b + part * s).collect::<Vec<f64>>());
             // A shape that cannot be solved is left alone.
-            let found = level.setup(law, params, reference).run(start, COARSE.max_iterations, precision).ok()?;
+            let setup = level.setup(law, params, reference);
+            let start = step.state(&setup, &estimate, part);
+            let found = setup.run(start, COARSE.max_iterations, precision).ok()?;
             (misfit(level, &found) < least).then_some(found)
         });
         let Some(better) = better else {

@@ -311,6 +311,12 @@ fn a_dry_run_of_a_sequence_bears_frames_at_rest() {
     io::write_field(folder.path().join("displacement_2.nii.gz"), &rest).unwrap();
     let (_, err) = run(folder.path(), &base, 1);
     assert!(err.contains("no load"), "{err}");
+    // A damaged frame is named, though the one after it could be used.
+    let folder = tracked(5);
+    io::write_field(folder.path().join("displacement_0.nii.gz"), &rest).unwrap();
+    fs::write(folder.path().join("displacement_2.nii.gz"), "cut").unwrap();
+    let (_, err) = run(folder.path(), &base, 1);
+    assert!(err.contains("displacement_2.nii.gz"), "{err}");
 }
 
 /// The sections of a FEBio 4 file, in the order its manual gives, each opened and closed.
