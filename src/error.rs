@@ -30,7 +30,7 @@ fn escape(out: &mut String, c: char) {
 }
 
 /// How a name that someone else gave is shown.
-pub trait Shown {
+pub(crate) trait Shown {
     /// As [`plain`] text.
     fn shown(&self) -> String;
 }

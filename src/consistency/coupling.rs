@@ -173,7 +173,7 @@ pub fn fit(lattice: &Lattice, smoothness: &Smoothness, evidence: &[Evidence], ro
 /// As [`fit`], from coefficients (mm, planar) and a weight (per lattice cell) that are nearly
 /// right: a few rounds of few iterations then suffice, the scale of `rho` starts low enough to end
 /// at 3 standard deviations, and `lambda` is set once.
-pub fn fit_from(
+pub(crate) fn fit_from(
     lattice: &Lattice,
     smoothness: &Smoothness,
     evidence: &[Evidence],

@@ -63,7 +63,7 @@ const SPLIT_TEST: SplitTest = SplitTest { min_matches_explained: 3.0, min_mean_c
 /// The second side of each split of `matches` that two motions explain better than one: at most
 /// two, the first against what is known of them ([`Measured::field`]), the other against the affine
 /// motion that explains most of them. `voxel` is the level's finest edge (mm).
-pub fn splits(matches: &[Measured], voxel: f64) -> Vec<Vec<bool>> {
+pub(crate) fn splits(matches: &[Measured], voxel: f64) -> Vec<Vec<bool>> {
     let places: Vec<[f64; 3]> = matches.iter().map(|m| m.place).collect();
     let tree = Neighbours::new(&places);
     let near: Vec<Vec<usize>> =

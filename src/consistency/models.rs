@@ -103,7 +103,7 @@ pub const CHANCE: f64 = 1.7;
 
 /// Least number of degrees of freedom in a ratio of misfits: with fewer, chance and the rounding of
 /// the noise model dominate.
-pub const MIN_DEGREES_OF_FREEDOM: f64 = 100.0;
+pub(crate) const MIN_DEGREES_OF_FREEDOM: f64 = 100.0;
 
 /// When matches reject a model, whatever the misfit: a small mask overrates the degrees of freedom.
 struct Contradiction {

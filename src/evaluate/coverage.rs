@@ -4,7 +4,7 @@ use crate::types::{DenseField, Mask};
 use rayon::prelude::*;
 
 /// Half width of the band that holds 95 % of a normal distribution, in standard deviations.
-pub const BAND: f64 = 1.959_964;
+pub(crate) const BAND: f64 = 1.959_964;
 
 /// Squared radius of the region that holds 95 % of a normal distribution in two and in three axes,
 /// in variances along an axis (chi-square's quantile).

@@ -8,7 +8,7 @@ const NONE_MM: f64 = 1e-3;
 
 /// Whether errors are given as a part of the motion: where every case has one. Else they are
 /// means as they are.
-pub fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
+pub(crate) fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
     trials.into_iter().all(|t| t.nothing.is_some_and(|n| n > NONE_MM))
 }
 
@@ -20,7 +20,7 @@ pub fn is_relative<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> bool {
 /// result: what ends early was not faster. A method that has failed on some case is not on the
 /// front, since it stands there for other cases than the rest do, and one that has failed on all
 /// has neither error nor time (NaN).
-pub fn standings<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> Vec<Standing> {
+pub(crate) fn standings<'a>(trials: impl IntoIterator<Item = &'a Trial>) -> Vec<Standing> {
     let trials: Vec<&Trial> = trials.into_iter().collect();
     let relative = is_relative(trials.iter().copied());
     let mut groups: Vec<Vec<&Trial>> = Vec::new();

@@ -13,9 +13,9 @@ pub mod frontier;
 
 pub mod labels;
 
-pub mod stated;
+pub(crate) mod stated;
 
-pub mod waves;
+pub(crate) mod waves;
 
 use crate::error::FieldError;
 use crate::numerics::differences::{deformation_gradient, displacement_gradient};
@@ -235,7 +235,7 @@ pub fn beyond(grid: &Grid, landmarks: &[Landmark]) -> Vec<usize> {
 ///
 /// # Errors
 /// [`FieldError::Volume`] tells how many voxels of `mask` are not (of all when `None`).
-pub fn check_numbers(volume: &'static str, field: &DenseField, mask: Option<&Mask>) -> Result<(), FieldError> {
+pub(crate) fn check_numbers(volume: &'static str, field: &DenseField, mask: Option<&Mask>) -> Result<(), FieldError> {
     let used = |at: &usize| mask.is_none_or(|m| m.as_slice()[*at] != 0);
     let bad = |at: &usize| used(at) && field.at(*at).iter().any(|c| !c.is_finite());
     match (0..field.grid().len()).into_par_iter().filter(bad).count() {

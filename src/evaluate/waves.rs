@@ -74,7 +74,7 @@ pub fn gains(rows: &[Row]) -> Vec<[f64; 2]> {
 
 /// The wavelength (mm) where the best rising fit of the gain (isotonic, pool adjacent violators)
 /// reaches `level`: none where it does not, the first where it is above from the start.
-pub fn cut_off(gains: &[[f64; 2]], level: f64) -> Option<f64> {
+pub(crate) fn cut_off(gains: &[[f64; 2]], level: f64) -> Option<f64> {
     let mut blocks: Vec<(f64, usize)> = Vec::new();
     for &[_, gain] in gains {
         blocks.push((gain, 1));

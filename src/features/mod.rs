@@ -3,9 +3,9 @@
 //! Needs texture: a constant volume has no features, which the caller must report. Positions are
 //! sub-voxel.
 
-pub mod harris;
+mod harris;
 
-pub mod suppression;
+mod suppression;
 
 pub use harris::{HarrisParams, block_response, response};
 pub use suppression::{Corner, corners, spread};

@@ -1,7 +1,7 @@
 //! The field that undoes a field.
 //!
 //! For each y the inverse v solves v = -u(y + v), u being trilinear: see
-//! [`crate::numerics::inversion`]. Beyond its grid, u is held at the value of the nearest edge.
+//! `crate::numerics::inversion`. Beyond its grid, u is held at the value of the nearest edge.
 //! Where u folds there is no inverse or more than one: folds are counted, since each y may still
 //! have an x that leads to it.
 

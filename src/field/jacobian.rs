@@ -28,7 +28,7 @@ pub fn jacobian_determinant(field: &DenseField) -> Volume {
 }
 
 /// [`jacobian_determinant`] of whole rows of voxels, from row `first` of the grid on (`j + ny k`).
-pub fn determinant_rows(field: &DenseField, first: usize, out: &mut [f32]) {
+pub(crate) fn determinant_rows(field: &DenseField, first: usize, out: &mut [f32]) {
     let derivative = Derivative::new(field);
     let [nx, ny, _] = derivative.shape;
     for (row, out) in (first..).zip(out.chunks_exact_mut(nx)) {
@@ -114,7 +114,7 @@ const FOLD_DETERMINANTS: [f32; 2] = [0.01, 0.02];
 ///
 /// Each step is the shortest along which the determinant, linear in the displacement of the voxels
 /// on both sides, rises to a little above zero (Kaczmarz's method on one constraint after another).
-pub fn unfold(field: &mut DenseField, count: &[u8]) {
+pub(crate) fn unfold(field: &mut DenseField, count: &[u8]) {
     let counts = |at: usize| count.get(at).is_none_or(|c| *c != 0);
     let mut folds: Vec<usize> = up_to(field, None, FOLD_DETERMINANTS[0]).into_iter().filter(|&at| counts(at)).collect();
     let shape = field.grid().shape();

@@ -2,7 +2,7 @@
 
 pub mod interpolation;
 
-pub mod spline;
+pub(crate) mod spline;
 
 pub mod jacobian;
 

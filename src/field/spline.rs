@@ -60,7 +60,7 @@ fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
 ///
 /// # Errors
 /// [`SpaceError`] when they have no place.
-pub fn node_grid(grid: &Grid, lattice: &Lattice) -> Result<Grid, SpaceError> {
+pub(crate) fn node_grid(grid: &Grid, lattice: &Lattice) -> Result<Grid, SpaceError> {
     let linear = grid.affine().linear();
     // The only node of a flat axis lies in its plane.
     let place = lattice.place(0);
@@ -104,7 +104,7 @@ impl FieldSpline {
     }
 
     /// The same, to be asked for on the grid `stored` of the same voxels.
-    pub fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
+    pub(crate) fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
         Self { stored: Some((stored, orientation)), ..self }
     }
 
@@ -212,7 +212,7 @@ impl ScalarSpline {
     }
 
     /// The same, to be asked for on the grid `stored` of the same voxels.
-    pub fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
+    pub(crate) fn stored_on(self, stored: Grid, orientation: Orientation) -> Self {
         Self { stored: Some((stored, orientation)), ..self }
     }
 

@@ -44,12 +44,12 @@ pub fn warp_image(
 
 /// As [`warp_image`] on the field's own grid, of an image on the grid `image` that is ready to be
 /// sampled.
-pub fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>) -> Volume {
+pub(crate) fn warp_sampled(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>) -> Volume {
     Volume::by_rows(*field.grid(), |first, out| warp_rows(sampler, image, field, first, out))
 }
 
 /// [`warp_sampled`] at whole rows of voxels, from row `first` of the field's grid on (`j + ny k`).
-pub fn warp_rows(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, first: usize, out: &mut [f32]) {
+pub(crate) fn warp_rows(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, first: usize, out: &mut [f32]) {
     let grid = field.grid();
     let [nx, ny, _] = grid.shape();
     let components: [&[f32]; 3] = std::array::from_fn(|c| field.component(c));
@@ -81,7 +81,7 @@ pub fn warp_rows(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, 
 }
 
 /// [`warp_sampled`] at one voxel offset (x fastest).
-pub fn warped_at(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, offset: usize) -> f32 {
+pub(crate) fn warped_at(sampler: &Sampler<'_>, image: &Grid, field: &Displacement<'_>, offset: usize) -> f32 {
     let [i, j, k] = field.grid().voxel(offset);
     let to = field.grid().world(i, j, k).moved(field.at(offset).map(f64::from));
     sampler.at(image.affine().to_voxel(to))

@@ -208,7 +208,12 @@ fn tip(depths: &[f64], force: &[f64], curved: bool) -> Tip {
 
 /// The reduction of `columns` with its hemispheres fitted to the finite element forces `curve` (mm,
 /// N) of the same map, which was solved on `nodes` nodes.
-pub fn against_plate(mut pad: PadReduction, columns: &[Column], curve: Vec<[f64; 2]>, nodes: usize) -> PadReduction {
+pub(crate) fn against_plate(
+    mut pad: PadReduction,
+    columns: &[Column],
+    curve: Vec<[f64; 2]>,
+    nodes: usize,
+) -> PadReduction {
     let (depths, forces): (Vec<f64>, Vec<f64>) = curve.iter().map(|c| (c[0], c[1])).unzip();
     let springs: Vec<f64> = depths.iter().map(|&d| force(columns, d)).collect();
     let factor = dot(&springs, &forces) / dot(&springs, &springs).max(f64::MIN_POSITIVE);

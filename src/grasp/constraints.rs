@@ -20,7 +20,7 @@ use crate::numerics::trig::sin_cos;
 use crate::types::Scene;
 
 /// Pose and joint angles (m, rad): x, y, theta, theta_1, theta_2.
-pub type Coordinates = [f64; 5];
+pub(crate) type Coordinates = [f64; 5];
 
 /// Lengths of a scene (m); index 0 is the left finger.
 #[derive(Debug, Clone, Copy, PartialEq)]

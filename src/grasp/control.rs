@@ -83,11 +83,11 @@ impl Phase {
 }
 
 /// Times closer than this are equal (s).
-pub const TIME_TOLERANCE_S: f64 = 1e-9;
+pub(crate) const TIME_TOLERANCE_S: f64 = 1e-9;
 
 /// The times of a run (s).
 #[derive(Debug, Clone)]
-pub struct Schedule {
+pub(crate) struct Schedule {
     /// Rising from 0: where motions, holds and pushes begin and end, and samples; between them the
     /// inputs are smooth.
     pub times: Vec<f64>,

@@ -98,7 +98,7 @@ impl<T: Tip> Plant<T> {
 
     /// Whether any row is.
     #[inline(always)]
-    pub fn holds_any(&self) -> bool {
+    pub(crate) fn holds_any(&self) -> bool {
         self.tips[0].holds_normal() || self.tips[0].holds_tangent()
     }
 
@@ -186,7 +186,7 @@ impl<T: Tip> Plant<T> {
     }
 
     /// Brings `q` and `v` back onto the held constraints, along the directions of least mass.
-    pub fn settle(&self, q: &mut Coordinates, v: &mut Coordinates) {
+    pub(crate) fn settle(&self, q: &mut Coordinates, v: &mut Coordinates) {
         if !self.holds_any() {
             return;
         }

@@ -4,7 +4,7 @@ use crate::grasp::constraints::Coordinates;
 use crate::grasp::statics::{Equilibrium, Lost, Statics};
 
 /// Step along the branch of equilibria (rad).
-pub const BRANCH_STEP_RAD: f64 = 0.05;
+pub(crate) const BRANCH_STEP_RAD: f64 = 0.05;
 /// When an object at rest has left the branch.
 struct RestTest {
     /// Largest speed of an object at rest (m/s, and rad/s times the tip's radius).
@@ -17,7 +17,7 @@ const REST: RestTest = RestTest { max_speed: 1e-4, max_distance_m: 1e-4 };
 
 /// The branch behind a run.
 #[derive(Debug, Clone)]
-pub struct Branch<'a> {
+pub(crate) struct Branch<'a> {
     statics: Statics<'a>,
     /// The last equilibrium that was followed to; none while there is none to follow.
     at: Option<Equilibrium>,
@@ -29,7 +29,7 @@ pub struct Branch<'a> {
 
 /// What a look at the branch shows.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Look {
+pub(crate) enum Look {
     /// The state is on its branch, or on its way along it.
     On,
     /// The branch ends before the present joint angles; in words.

@@ -156,11 +156,11 @@ const DORMAND_PRINCE: DormandPrince = DormandPrince {
 /// Size below which a coordinate's error is relative to this (m, rad, and their rates).
 const MIN_ERROR_SCALE: f64 = 1e-3;
 /// Shortest step that is tried (s).
-pub const MIN_STEP_S: f64 = 1e-8;
+pub(crate) const MIN_STEP_S: f64 = 1e-8;
 
 /// A step with control from `state`, whose rates are `first`: the state, the step taken and the one
 /// to try next (s). None where no step down to [`MIN_STEP_S`] meets the tolerance.
-pub fn dormand_prince<const N: usize, S: System<N>>(
+pub(crate) fn dormand_prince<const N: usize, S: System<N>>(
     system: &S,
     phase: &Phase,
     t: f64,

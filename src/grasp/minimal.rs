@@ -13,7 +13,7 @@ use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
 /// Entries of a state: q, q', integral of the joint errors (rad s), work done on the grasp (J).
-pub const STATE: usize = 13;
+pub(crate) const STATE: usize = 13;
 
 /// The minimal form of a plant.
 #[derive(Debug, Clone)]

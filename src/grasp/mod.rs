@@ -5,10 +5,10 @@
 //! docs/reference/grasp.md has every equation and two signs of the slides that had to be settled.
 //! Order: [`models`] (fingertips), [`constraints`] (where they touch), [`statics`] (equilibria),
 //! [`control`], [`dynamics`] (forces), [`minimal`] and [`multipliers`] (equations of motion),
-//! [`relaxing`] (tips that relax), [`friction`] and [`sliding`] (tips that slide), [`integrators`],
-//! [`stepping`] (which step is stable), [`run_checks`] and [`equilibrium_branch`] (what can fail),
+//! `relaxing` (tips that relax), `friction` and `sliding` (tips that slide), [`integrators`],
+//! [`stepping`] (which step is stable), `run_checks` and `equilibrium_branch` (what can fail),
 //! [`simulate`] (the loop), then the analyses: [`stability`], [`degrees_of_freedom`], [`pinch`],
-//! [`posture`], [`measured`].
+//! `posture`, [`measured`].
 //!
 //! Promises: SI units and radians everywhere; the same bits for the same scene; the object's pose
 //! is never fed back. Needs a scene that passes [`crate::types::Scene::check`]. Fails by name:
@@ -29,11 +29,11 @@ pub mod dynamics;
 
 pub mod minimal;
 
-pub mod relaxing;
+mod relaxing;
 
-pub mod friction;
+mod friction;
 
-pub mod sliding;
+mod sliding;
 
 pub mod multipliers;
 
@@ -41,9 +41,9 @@ pub mod integrators;
 
 pub mod stepping;
 
-pub mod run_checks;
+mod run_checks;
 
-pub mod equilibrium_branch;
+mod equilibrium_branch;
 
 pub mod simulate;
 
@@ -53,6 +53,6 @@ pub mod degrees_of_freedom;
 
 pub mod pinch;
 
-pub mod posture;
+pub(crate) mod posture;
 
 pub mod measured;

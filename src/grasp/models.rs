@@ -38,7 +38,7 @@ pub struct Gradient {
 }
 
 /// Second derivatives of the energy in (d, d_t, tilt), row by row (N/m, N, N m).
-pub type Curvature = [[f64; 3]; 3];
+pub(crate) type Curvature = [[f64; 3]; 3];
 
 /// A fingertip that answers to displacement with energy.
 pub trait Tip: std::fmt::Debug + Sync {
@@ -235,7 +235,7 @@ pub fn tips(scene: &Scene) -> [Box<dyn Tip>; 2] {
 }
 
 /// The tips of a scene with another model.
-pub fn tips_of(scene: &Scene, model: FingertipModel) -> [Box<dyn Tip>; 2] {
+pub(crate) fn tips_of(scene: &Scene, model: FingertipModel) -> [Box<dyn Tip>; 2] {
     scene.fingertips().map(|tip| tip_of(tip, model))
 }
 

@@ -19,7 +19,7 @@ use crate::types::scene::Rolling;
 
 /// Entries of a state: those of the minimal form, then d_n1, d_n2, d_t1, d_t2 (m) and their rates
 /// (m/s).
-pub const STATE: usize = 21;
+pub(crate) const STATE: usize = 21;
 
 /// The multiplier form of a plant.
 #[derive(Debug, Clone)]

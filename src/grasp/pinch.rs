@@ -9,7 +9,7 @@ use crate::types::{FingertipModel, Scene};
 use std::collections::VecDeque;
 
 /// Called with the fraction that is done (0 to 1).
-pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
+pub(crate) type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 
 /// The map of `model` with `side` angles along each side from `-most` to `most` (rad); `side` is
 /// made odd, so that the pinch lies on it. Postures are reached from neighbour to neighbour,

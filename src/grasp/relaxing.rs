@@ -15,15 +15,15 @@ use crate::grasp::statics::Equilibrium;
 use crate::types::grasp::ConstraintDrift;
 
 /// Most branches of a tip.
-pub const MAX_BRANCHES: usize = 3;
+pub(crate) const MAX_BRANCHES: usize = 3;
 /// Forces and moments that a branch follows: d_n and d_t of both tips, and their tilts.
 const BRANCH_ENTRIES: usize = 6;
 /// Entries of a state: those of the minimal form, then what each branch follows.
-pub const STATE: usize = minimal::STATE + MAX_BRANCHES * BRANCH_ENTRIES;
+pub(crate) const STATE: usize = minimal::STATE + MAX_BRANCHES * BRANCH_ENTRIES;
 
 /// What the branches carry at a contact, and how they go on.
 #[derive(Debug, Clone, Copy)]
-pub struct Carried {
+pub(crate) struct Carried {
     /// Forces (N) and moments (N m) of all branches together.
     pub forces: [f64; BRANCH_ENTRIES],
     /// Rates of what they follow.
@@ -69,7 +69,7 @@ pub fn followed<const N: usize>(s: &[f64; N]) -> [f64; MAX_BRANCHES * BRANCH_ENT
 
 /// The minimal form of a plant whose tips relax.
 #[derive(Debug, Clone)]
-pub struct Relaxing<T>(pub Plant<T>);
+pub(crate) struct Relaxing<T>(pub Plant<T>);
 
 impl<T: Tip> System<STATE> for Relaxing<T> {
     fn rate(&self, inputs: &Inputs, s: &[f64; STATE]) -> ([f64; STATE], Reading) {

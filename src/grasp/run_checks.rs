@@ -8,7 +8,7 @@ use crate::types::{FingertipModel, Scene};
 
 /// Watches the contacts of one run.
 #[derive(Debug, Clone)]
-pub struct Watch {
+pub(crate) struct Watch {
     radius: [f64; 2],
     half_height: f64,
     /// What holds the tips.
@@ -21,11 +21,11 @@ pub struct Watch {
 }
 
 /// Events with a duration, by place in [`Watch`]'s and a run's tables.
-pub const LASTING_EVENTS: [EventKind; 2] = [EventKind::Slip, EventKind::ValidityRange];
+pub(crate) const LASTING_EVENTS: [EventKind; 2] = [EventKind::Slip, EventKind::ValidityRange];
 
 /// What a look at the contacts shows.
 #[derive(Debug, Clone, Default)]
-pub struct Findings {
+pub(crate) struct Findings {
     /// What ends the run: what, which tip (0 or 1), in words.
     pub fatal: Option<(EventKind, usize, String)>,
     /// What begins now: place in [`LASTING_EVENTS`], tip, in words.
@@ -48,7 +48,7 @@ impl Watch {
     }
 
     /// Whether a tip slips.
-    pub fn slipping(&self) -> bool {
+    pub(crate) fn slipping(&self) -> bool {
         self.ongoing[0] != [false; 2]
     }
 
@@ -74,12 +74,12 @@ impl Watch {
     }
 
     /// Whether both tips touch the object between the ends of its faces.
-    pub fn on_faces(&self, r: &Reading) -> bool {
+    pub(crate) fn on_faces(&self, r: &Reading) -> bool {
         r.places.iter().all(|p| p.abs() <= self.half_height)
     }
 
     /// What is wrong.
-    pub fn findings(&mut self, r: &Reading) -> Findings {
+    pub(crate) fn findings(&mut self, r: &Reading) -> Findings {
         let mut found = Findings::default();
         let along = self.friction.along(&r.forces, &r.displacements);
         for i in 0..2 {

@@ -23,7 +23,7 @@ use crate::types::{FingertipModel, Scene};
 use std::f64::consts::PI;
 
 /// Called with the fraction of the run that is done (0 to 1).
-pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
+pub(crate) type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 
 /// Most events that are kept: a tip at the edge may begin to slip in every step.
 const MAX_EVENTS: usize = 1000;

@@ -16,7 +16,7 @@ use crate::grasp::relaxing;
 
 /// Entries of a state: those of the form with branches, then the places from which d_t is counted
 /// (m).
-pub const STATE: usize = relaxing::STATE + 2;
+pub(crate) const STATE: usize = relaxing::STATE + 2;
 /// The first of these places.
 const ORIGIN: usize = relaxing::STATE;
 
@@ -85,6 +85,6 @@ pub fn joined(core: &[f64; relaxing::STATE], origin: [f64; 2]) -> [f64; STATE] {
 }
 
 /// Both parts of it.
-pub fn parted(s: &[f64; STATE]) -> ([f64; relaxing::STATE], [f64; 2]) {
+pub(crate) fn parted(s: &[f64; STATE]) -> ([f64; relaxing::STATE], [f64; 2]) {
     (std::array::from_fn(|k| s[k]), [s[ORIGIN], s[ORIGIN + 1]])
 }

@@ -16,7 +16,7 @@ const ZERO_EIGENVALUE_RATIO: f64 = 1e-9;
 /// Points along each side of an energy surface.
 const POINTS_PER_SIDE: usize = 41;
 /// Models that are compared.
-pub const COMPARED_MODELS: [FingertipModel; 2] = [FingertipModel::Parallel, FingertipModel::Radial];
+pub(crate) const COMPARED_MODELS: [FingertipModel; 2] = [FingertipModel::Parallel, FingertipModel::Radial];
 
 /// The equilibria of the pinch (step 0) and of each motion's target, on the branch from the pinch,
 /// with the model `model`; where one cannot be reached, the reason.

@@ -84,7 +84,7 @@ impl<'a> Statics<'a> {
     }
 
     /// Whether the tips hold d_n at 0.
-    pub fn holds_normal(&self) -> bool {
+    pub(crate) fn holds_normal(&self) -> bool {
         self.tips[0].holds_normal()
     }
 
@@ -174,7 +174,7 @@ impl<'a> Statics<'a> {
     }
 
     /// Eigenvalues of the Hessian along what the held constraints leave free, rising (N/m).
-    pub fn free_eigenvalues(&self, q: &Coordinates, f: &[f64; 4]) -> Vec<f64> {
+    pub(crate) fn free_eigenvalues(&self, q: &Coordinates, f: &[f64; 4]) -> Vec<f64> {
         if self.holds_normal() {
             return Vec::new();
         }
@@ -201,7 +201,7 @@ impl<'a> Statics<'a> {
 
     /// Whether the smallest eigenvalue is above `limit` (N/m), by the leading minors: much quicker
     /// than the value.
-    pub fn stiffer_than(&self, limit: f64, q: &Coordinates, f: &[f64; 4]) -> bool {
+    pub(crate) fn stiffer_than(&self, limit: f64, q: &Coordinates, f: &[f64; 4]) -> bool {
         if self.holds_normal() || self.holds_tangent() {
             return self.smallest_eigenvalue(q, f) > limit;
         }
@@ -411,7 +411,7 @@ impl<'a> Statics<'a> {
     }
 
     /// The first tip that has left the object or the model's range at `q`.
-    pub fn out_of_range(&self, q: &Coordinates) -> Option<Lost> {
+    pub(crate) fn out_of_range(&self, q: &Coordinates) -> Option<Lost> {
         if self.holds_normal() {
             return None;
         }

@@ -16,7 +16,7 @@ use crate::types::scene::{Formulation, Method};
 
 /// Largest growth of a stable step: far above the rounding of the derivatives, a factor e in
 /// 100,000 steps.
-pub const MAX_STABLE_GROWTH: f64 = 1.0 + 1e-5;
+pub(crate) const MAX_STABLE_GROWTH: f64 = 1.0 + 1e-5;
 
 /// Spectral radius of one step of `h` seconds about `state`, from central differences of the step
 /// itself.
@@ -80,7 +80,7 @@ fn own_growth<const N: usize, S: Form<N>>(system: &S, phase: &Phase, h: f64, sta
 /// The same for a named method; 0 for the adaptive one, which finds its own steps. Where the grasp
 /// itself is unstable (an object that falls, or by its control) and the step follows that growth,
 /// the step is not to blame, and 1 is given back.
-pub fn growth_of<const N: usize, S: Form<N>>(
+pub(crate) fn growth_of<const N: usize, S: Form<N>>(
     method: Method,
     system: &S,
     phase: &Phase,
@@ -143,7 +143,7 @@ pub fn stable_step(scene: &Scene, method: Method, formulation: Formulation, at: 
 
 /// Largest stable gain of the constraint stabilisation (1/s) at an equilibrium, for the scene's
 /// step, to 1 %.
-pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
+pub(crate) fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
     let (method, step, tips) = (scene.integrator.method, scene.integrator.step, tips(scene));
     let tips = [tips[0].as_ref(), tips[1].as_ref()];
     largest(1e-3, 1e9, |g| growth_at(scene, tips, method, Formulation::Multipliers, [step, g], at) <= MAX_STABLE_GROWTH)
@@ -151,7 +151,7 @@ pub fn stable_gain(scene: &Scene, at: &Equilibrium) -> f64 {
 
 /// Spectral radius of one step of `h` seconds about an equilibrium of `scene` with `tips`, with the
 /// gain `gain` (1/s) in the multiplier form.
-pub fn growth_at(
+pub(crate) fn growth_at(
     scene: &Scene,
     tips: [&dyn Tip; 2],
     method: Method,

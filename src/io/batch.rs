@@ -14,7 +14,7 @@ use std::time::UNIX_EPOCH;
 const RESERVED: [&str; 4] = ["batch.csv", "regions.csv", "summary.json", "report.html"];
 
 /// Columns of a table of pairs; the first two are needed.
-pub const PAIR_COLUMNS: [&str; 16] = [
+pub(crate) const PAIR_COLUMNS: [&str; 16] = [
     "initial",
     "deformed",
     "mask",
@@ -36,7 +36,7 @@ pub const PAIR_COLUMNS: [&str; 16] = [
 /// No table has more: each takes some hundred bytes of memory, whatever its line.
 const MOST_PAIRS: usize = 100_000;
 
-/// Reads a table of pairs: comma-separated, one header line with some of [`PAIR_COLUMNS`] in any
+/// Reads a table of pairs: comma-separated, one header line with some of `PAIR_COLUMNS` in any
 /// order, `initial` and `deformed` among them. Paths count from the table's folder. An empty place
 /// is as a column left out. Without a name a pair is called `sub-<subject>_ses-<session>`, or
 /// `pair-<line>` without a subject. Whether the files are there is not looked at.
@@ -143,7 +143,7 @@ fn start(folder: &Path, text: &str) -> String {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String>>) -> Result<(), IoError> {
+pub(crate) fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String>>) -> Result<(), IoError> {
     write_table(path.as_ref(), columns, rows.into_iter())
 }
 
@@ -152,7 +152,7 @@ pub fn write_rows(path: impl AsRef<Path>, columns: &[&str], rows: Vec<Vec<String
 ///
 /// # Errors
 /// [`IoError`] when it is not there or cannot be read.
-pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
+pub(crate) fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
     let path = path.as_ref();
     let beside = super::image::others(path);
     let own = if path.is_dir() { super::list(path)? } else { vec![path.to_path_buf()] };
@@ -171,6 +171,6 @@ pub fn stamp(path: impl AsRef<Path>) -> Result<(u64, u64), IoError> {
 ///
 /// # Errors
 /// [`IoError`] when that is refused.
-pub fn make_folder(path: impl AsRef<Path>) -> Result<(), IoError> {
+pub(crate) fn make_folder(path: impl AsRef<Path>) -> Result<(), IoError> {
     fs::create_dir_all(path.as_ref()).map_err(os(path.as_ref(), "create the folder"))
 }

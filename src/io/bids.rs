@@ -54,7 +54,7 @@ impl Scan {
 type Series = BTreeMap<(String, String), Vec<Scan>>;
 
 /// Whether a folder is a BIDS data set.
-pub fn is_bids(folder: impl AsRef<Path>) -> bool {
+pub(crate) fn is_bids(folder: impl AsRef<Path>) -> bool {
     folder.as_ref().join(DESCRIPTION).is_file()
 }
 
@@ -65,7 +65,7 @@ pub fn is_bids(folder: impl AsRef<Path>) -> bool {
 /// # Errors
 /// [`IoError`] when a folder or the description cannot be read, the data set has no name, two files
 /// are one image, or no subject has two runs or sessions.
-pub fn read_bids(folder: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
+pub(crate) fn read_bids(folder: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     let folder = folder.as_ref();
     name(folder)?;
     let mut series = Series::new();
@@ -141,7 +141,7 @@ fn pair(initial: &Scan, deformed: &Scan) -> Pair {
 ///
 /// # Errors
 /// [`IoError`] when a file cannot be written.
-pub fn describe_derivative(output: impl AsRef<Path>, source: impl AsRef<Path>) -> Result<(), IoError> {
+pub(crate) fn describe_derivative(output: impl AsRef<Path>, source: impl AsRef<Path>) -> Result<(), IoError> {
     let (output, source) = (output.as_ref(), source.as_ref());
     let description = json!({
         "Name": format!("palpate: {}", name(source)?),
@@ -168,7 +168,7 @@ pub fn describe_derivative(output: impl AsRef<Path>, source: impl AsRef<Path>) -
 ///
 /// # Errors
 /// [`IoError`] when a file cannot be written.
-pub fn write_derivative(
+pub(crate) fn write_derivative(
     output: impl AsRef<Path>,
     source: impl AsRef<Path>,
     pair: &Pair,

@@ -13,7 +13,7 @@ const COLUMNS: [&str; 7] = ["stage", "quantity", "unit", "found", "truth", "erro
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_chain(path: impl AsRef<Path>, rows: &[impl Serialize]) -> Result<(), IoError> {
+pub(crate) fn write_chain(path: impl AsRef<Path>, rows: &[impl Serialize]) -> Result<(), IoError> {
     let text = |v: &serde_json::Value| match v {
         serde_json::Value::String(s) => s.clone(),
         serde_json::Value::Null => String::new(),

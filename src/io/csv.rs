@@ -31,7 +31,7 @@ pub struct PointTable {
 
 /// What a table of places holds, by its columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TableKind {
+pub(crate) enum TableKind {
     /// As [`write_matches`].
     Matches,
     /// As [`write_landmarks`].
@@ -44,7 +44,7 @@ pub enum TableKind {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read or has none of the known columns.
-pub fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
+pub(crate) fn table_kind(path: impl AsRef<Path>) -> Result<TableKind, IoError> {
     let path = path.as_ref();
     if markups::is_slicer(path) {
         return Ok(TableKind::Points);
@@ -126,7 +126,7 @@ pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
 
 /// What [`read_matches`] would read after [`write_matches`]: six decimals, one precision along all
 /// axes.
-pub fn stored_matches(field: &SparseField) -> SparseField {
+pub(crate) fn stored_matches(field: &SparseField) -> SparseField {
     let kept = |v: f64| decimal(v).parse().unwrap_or(v);
     let one = |m: &Match| {
         let sigma = kept(m.sigma());

@@ -36,7 +36,7 @@ pub enum Form {
 ///
 /// # Errors
 /// [`IoError`] when it is not there or cannot be read.
-pub fn form_of(path: impl AsRef<Path>) -> Result<Form, IoError> {
+pub(crate) fn form_of(path: impl AsRef<Path>) -> Result<Form, IoError> {
     let path = path.as_ref();
     if path.is_dir() {
         return Ok(Form::Other);

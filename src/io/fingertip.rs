@@ -92,7 +92,7 @@ fn told(path: &Path, text: &str, map: impl FnOnce() -> Result<Volume, IoError>) 
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be read or has none.
-pub fn read_fingertip_modulus(path: impl AsRef<Path>) -> Result<f64, IoError> {
+pub(crate) fn read_fingertip_modulus(path: impl AsRef<Path>) -> Result<f64, IoError> {
     found_in(path.as_ref(), "youngs_modulus", |table| table.get("youngs_modulus")?.as_float())
 }
 

@@ -31,7 +31,7 @@ fn nano(v: f64) -> f64 {
 }
 
 /// [`Sample::COLUMNS`] as trajectory.csv keeps them: the time to the nanosecond.
-pub fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
+pub(crate) fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
     let mut row = sample.row();
     row[0] = nano(row[0]);
     row
@@ -39,7 +39,7 @@ pub fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
 
 /// [`MotionRow::COLUMNS`] behind the step as motions.csv keeps them: desired angles as they were
 /// written, without the rounding of degrees to radians and back.
-pub fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] {
+pub(crate) fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] {
     let mut row = motion.row();
     row[..2].iter_mut().for_each(|v| *v = nano(*v));
     row
@@ -49,7 +49,7 @@ pub fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] 
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<(), IoError> {
+pub(crate) fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<(), IoError> {
     let rows = samples.iter().map(|s| {
         let [time, rest @ ..] = stored_sample(s);
         std::iter::once(seconds(time)).chain(rest.map(number)).collect()
@@ -61,7 +61,7 @@ pub fn write_trajectory(path: impl AsRef<Path>, samples: &[Sample]) -> Result<()
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_bands(path: impl AsRef<Path>, bands: &Bands) -> Result<(), IoError> {
+pub(crate) fn write_bands(path: impl AsRef<Path>, bands: &Bands) -> Result<(), IoError> {
     let names = Sample::COLUMNS[1..].iter().flat_map(|c| [format!("{c}_low"), format!("{c}_high")]);
     let header: Vec<String> = std::iter::once("time".to_string()).chain(names).collect();
     let header: Vec<&str> = header.iter().map(String::as_str).collect();
@@ -81,7 +81,7 @@ fn motion_row(m: &MotionRow) -> Vec<String> {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_motions(path: impl AsRef<Path>, motions: &[MotionRow]) -> Result<(), IoError> {
+pub(crate) fn write_motions(path: impl AsRef<Path>, motions: &[MotionRow]) -> Result<(), IoError> {
     write_table(path.as_ref(), &MotionRow::COLUMNS, motions.iter().map(motion_row))
 }
 
@@ -91,7 +91,7 @@ pub fn write_motions(path: impl AsRef<Path>, motions: &[MotionRow]) -> Result<()
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_sweep(
+pub(crate) fn write_sweep(
     path: impl AsRef<Path>,
     cases: &[SweepCase],
     results: &[Result<GraspRun, GraspError>],
@@ -132,7 +132,7 @@ pub fn write_sweep(
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_posture_force(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
+pub(crate) fn write_posture_force(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
     let f = &analysis.force;
     let rows = (0..f.parallel.len()).map(|k| {
         let (d, tilt) = (f.displacements[k / f.tilts.len()], f.tilts[k % f.tilts.len()]);
@@ -145,7 +145,7 @@ pub fn write_posture_force(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> 
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_energy(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
+pub(crate) fn write_energy(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
     let rows = analysis.surfaces.iter().flat_map(|s| {
         (0..s.energy.len()).map(move |k| {
             let (theta, other) = (s.theta[k % s.theta.len()], s.other[k / s.theta.len()]);
@@ -163,7 +163,7 @@ pub fn write_energy(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
+pub(crate) fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
     let columns = [
         "step",
         "theta1_deg",
@@ -201,7 +201,7 @@ pub fn write_stability(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Resu
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_pinch_map(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
+pub(crate) fn write_pinch_map(path: impl AsRef<Path>, analysis: &GraspAnalysis) -> Result<(), IoError> {
     let columns = [
         "theta1_deg",
         "theta2_deg",

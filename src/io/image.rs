@@ -215,7 +215,7 @@ pub fn read_volume(path: impl AsRef<Path>) -> Result<Volume, IoError> {
 ///
 /// # Errors
 /// As [`read_volume`].
-pub fn read_integers(path: impl AsRef<Path>) -> Result<Option<Vec<i64>>, IoError> {
+pub(crate) fn read_integers(path: impl AsRef<Path>) -> Result<Option<Vec<i64>>, IoError> {
     let path = path.as_ref();
     match Format::of(path)? {
         Format::Nifti => nifti::read::integers(path).map(|(_, values)| values),
@@ -245,7 +245,7 @@ pub fn read_labels(path: impl AsRef<Path>) -> Result<Mask, IoError> {
 }
 
 /// From here on single precision has not all whole numbers.
-pub const WHOLE: f32 = 16_777_216.0;
+pub(crate) const WHOLE: f32 = 16_777_216.0;
 
 const LABELS: &str = "give a mask or label map, resampled with nearest neighbour";
 
@@ -253,7 +253,7 @@ const LABELS: &str = "give a mask or label map, resampled with nearest neighbour
 ///
 /// # Errors
 /// [`IoError`] when a value is no whole number from 0 to 255.
-pub fn labels_of(volume: &Voxels<'_>, path: &Path) -> Result<Mask, IoError> {
+pub(crate) fn labels_of(volume: &Voxels<'_>, path: &Path) -> Result<Mask, IoError> {
     let grid = *volume.grid();
     let odd = volume.as_slice().iter().position(|&v| !(0.0..=255.0).contains(&v) || v.fract() != 0.0);
     if let Some(at) = odd {

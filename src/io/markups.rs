@@ -38,7 +38,7 @@ struct ControlPoint {
 }
 
 /// Whether `path` is one of Slicer's formats, by its name.
-pub fn is_slicer(path: &Path) -> bool {
+pub(crate) fn is_slicer(path: &Path) -> bool {
     let name = path.to_string_lossy().to_lowercase();
     name.ends_with(".fcsv") || name.ends_with(".json")
 }

@@ -111,7 +111,11 @@ fn presses(path: &Path) -> Result<Vec<ForcePoint>, IoError> {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_measured(path: impl AsRef<Path>, measured: &Measurements, fit: &MeasuredFit) -> Result<(), IoError> {
+pub(crate) fn write_measured(
+    path: impl AsRef<Path>,
+    measured: &Measurements,
+    fit: &MeasuredFit,
+) -> Result<(), IoError> {
     let (own, each): (&[&str], &[&str]) = match measured {
         Measurements::Force(_) => (&FORCE, &["force"]),
         Measurements::Course(_) => (&COURSE, &["x", "y", "theta_deg"]),

@@ -7,7 +7,7 @@ use std::path::Path;
 /// Bytes that can still be taken: the least of what the machine has available, what each control
 /// group above the process leaves, and what its own limit on addresses leaves. None where the
 /// system does not tell.
-pub fn memory_left() -> Option<u64> {
+pub(crate) fn memory_left() -> Option<u64> {
     let machine = meminfo(&fs::read_to_string("/proc/meminfo").ok()?);
     let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     machine.into_iter().chain(group_left(Path::new("/sys/fs/cgroup"), &groups)).chain(addresses_left()).min()

@@ -5,7 +5,7 @@
 //! (each file is written under a temporary name in the same folder, then renamed; [`OutputFolder`]
 //! does the same for a whole folder). Nothing here prints.
 
-pub mod image;
+mod image;
 
 pub mod field;
 
@@ -31,13 +31,13 @@ mod format_error;
 
 pub mod csv;
 
-pub mod markups;
+mod markups;
 
-pub mod vtu;
+mod vtu;
 
 pub mod scene;
 
-pub mod config;
+mod config;
 
 pub mod grasp;
 
@@ -49,7 +49,7 @@ pub mod skin;
 
 pub mod track;
 
-pub mod transform;
+mod transform;
 
 pub mod strain;
 
@@ -57,29 +57,29 @@ pub mod stiffness;
 
 mod simulators;
 
-pub mod sofa;
+mod sofa;
 
-pub mod mujoco;
+mod mujoco;
 
-pub mod solid;
+mod solid;
 
 pub mod speed_accuracy;
 
-pub mod batch;
+mod batch;
 
-pub mod bids;
+mod bids;
 
-pub mod text;
+mod text;
 
-pub mod output;
+mod output;
 
-pub mod scratch;
+mod scratch;
 
 mod temporary_files;
 
 mod file_kind;
 
-pub mod memory;
+mod memory;
 
 mod atomic;
 
@@ -89,52 +89,64 @@ mod digest;
 
 mod gzip;
 
-pub use batch::{make_folder, read_pairs, stamp, write_rows};
-pub use bids::{describe_derivative, is_bids, read_bids, write_derivative};
-pub use chain_errors::write_chain;
+pub use batch::read_pairs;
+pub(crate) use batch::{make_folder, stamp, write_rows};
+pub(crate) use bids::{describe_derivative, is_bids, read_bids, write_derivative};
+pub(crate) use chain_errors::write_chain;
 pub use config::read_config;
 pub use csv::{
-    PointTable, TableKind, read_landmark_frames, read_landmark_pair, read_landmarks, read_matches, read_points,
-    stored_matches, table_kind, write_landmarks, write_matches, write_points,
+    PointTable, read_landmark_frames, read_landmark_pair, read_landmarks, read_matches, read_points, write_landmarks,
+    write_matches, write_points,
 };
+pub(crate) use csv::{TableKind, stored_matches, table_kind};
 pub use dicom::{Series as DicomSeries, series_in};
 pub use digest::{digest, files_of};
-pub use field::{FieldConvention, read_field, read_field_as, read_samples};
-pub use file_kind::{Form, columns_of, form_of};
-pub use fingertip::{read_fingertip_modulus, read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
-pub use grasp::{
+pub(crate) use field::read_samples;
+pub use field::{FieldConvention, read_field, read_field_as};
+pub(crate) use file_kind::form_of;
+pub use file_kind::{Form, columns_of};
+pub(crate) use fingertip::read_fingertip_modulus;
+pub use fingertip::{read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
+pub(crate) use grasp::{
     stored_motion, stored_sample, write_bands, write_energy, write_motions, write_pinch_map, write_posture_force,
     write_stability, write_sweep, write_trajectory,
 };
-pub use image::{
-    ImageKind, Stored, WHOLE, count_non_finite, labels_of, read_header, read_integers, read_labels, read_mask,
-    read_volume, read_volume_header,
-};
-pub use markups::{is_slicer, write_markups};
-pub use measured::{read_measured, write_measured};
-pub use memory::memory_left;
+pub use image::{ImageKind, count_non_finite, read_header, read_labels, read_mask, read_volume, read_volume_header};
+pub(crate) use image::{Stored, WHOLE, labels_of, read_integers};
+pub(crate) use markups::is_slicer;
+pub use markups::write_markups;
+pub use measured::read_measured;
+pub(crate) use measured::write_measured;
+pub(crate) use memory::memory_left;
 pub use mujoco::{write_mjcf, write_msh};
+pub(crate) use nifti::{
+    PackedField, STRAIN_BITS, length_bits, stored_length, stored_steps, write_codes, write_field_series, write_samples,
+    write_series_field, write_tensor_deviations,
+};
 pub use nifti::{
-    PackedField, STRAIN_BITS, Series, length_bits, stored, stored_length, stored_steps, write_by_rows, write_codes,
-    write_exact, write_field, write_field_series, write_integers, write_labels, write_samples, write_series_field,
-    write_steps, write_tensor_deviations, write_tensors, write_vectors, write_volume,
+    Series, stored, write_by_rows, write_exact, write_field, write_integers, write_labels, write_steps, write_tensors,
+    write_vectors, write_volume,
 };
 pub use output::{OutputFolder, hold};
-pub use scene::{SceneFile, SceneOverrides, read_scene};
-pub use scratch::Scratch;
-pub use skin::{read_skin_scene, write_response};
+pub(crate) use scene::SceneFile;
+pub use scene::{SceneOverrides, read_scene};
+pub(crate) use scratch::Scratch;
+pub use skin::read_skin_scene;
+pub(crate) use skin::write_response;
 pub use sofa::write_sofa;
 pub use solid::{SolidFile, write_boundary, write_element_moduli};
-pub use speed_accuracy::{write_stress, write_trials};
-pub use stiffness::{KnownMaterial, read_materials, write_feb, write_frames, write_inp, write_plan, write_regions};
-pub use strain::write_region_strains;
-pub use temporary_files::{Hold, abandon};
+pub(crate) use speed_accuracy::{write_stress, write_trials};
+pub(crate) use stiffness::{read_materials, write_frames, write_plan, write_regions};
+pub use stiffness::{write_feb, write_inp};
+pub(crate) use strain::write_region_strains;
+pub use temporary_files::Hold;
+pub(crate) use temporary_files::abandon;
 pub use text::{copy, list, read_json, read_text, write_bytes, write_json, write_text};
-pub use track::{read_trajectories, write_strain, write_trajectories};
-pub use transform::{
-    AffineFormat, FieldFormat, StoredTransforms, TransformSource, read_transform, write_affine, write_field_as,
-};
-pub use vtu::{write_match_mesh, write_quadratic_mesh, write_tet_mesh, write_tri_mesh};
+pub(crate) use track::write_strain;
+pub use track::{read_trajectories, write_trajectories};
+pub use transform::{AffineFormat, FieldFormat, TransformSource, read_transform, write_affine, write_field_as};
+pub(crate) use vtu::{write_match_mesh, write_quadratic_mesh};
+pub use vtu::{write_tet_mesh, write_tri_mesh};
 
 use crate::error::IoError;
 use std::path::Path;

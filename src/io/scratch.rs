@@ -8,7 +8,7 @@ use tempfile::{Builder, TempDir};
 
 /// A folder of its own under the system's folder for temporary files.
 #[derive(Debug)]
-pub struct Scratch(TempDir, #[expect(dead_code, reason = "held for its drop")] Live);
+pub(crate) struct Scratch(TempDir, #[expect(dead_code, reason = "held for its drop")] Live);
 
 impl Scratch {
     /// Makes it.

@@ -125,7 +125,7 @@ pub fn read_skin_scene(path: impl AsRef<Path>) -> Result<SkinScene, IoError> {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_response(path: impl AsRef<Path>, scene: &SkinScene, samples: &[SkinSample]) -> Result<(), IoError> {
+pub(crate) fn write_response(path: impl AsRef<Path>, scene: &SkinScene, samples: &[SkinSample]) -> Result<(), IoError> {
     let mut columns: Vec<String> = ["time", "stress_pa", "displacement_m"].map(String::from).to_vec();
     columns.extend(scene.layers.iter().map(|l| format!("strain_{}", l.name)));
     let columns: Vec<&str> = columns.iter().map(String::as_str).collect();

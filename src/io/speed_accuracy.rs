@@ -15,7 +15,7 @@ fn number(v: Option<f64>) -> String {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_trials(path: impl AsRef<Path>, trials: &[Trial]) -> Result<(), IoError> {
+pub(crate) fn write_trials(path: impl AsRef<Path>, trials: &[Trial]) -> Result<(), IoError> {
     let columns = [
         "part",
         "varied",
@@ -55,7 +55,7 @@ pub fn write_trials(path: impl AsRef<Path>, trials: &[Trial]) -> Result<(), IoEr
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_stress(path: impl AsRef<Path>, curves: &[StressCurve]) -> Result<(), IoError> {
+pub(crate) fn write_stress(path: impl AsRef<Path>, curves: &[StressCurve]) -> Result<(), IoError> {
     let columns = [
         "part",
         "axis",

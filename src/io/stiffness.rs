@@ -24,7 +24,7 @@ const COLUMNS: [&str; 8] = ["label", "name", "youngs_modulus_kpa", "sd_kpa", "ra
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<(), IoError> {
+pub(crate) fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<(), IoError> {
     const COLUMNS: [&str; 9] =
         ["frame", "motion_mm", "residual_mm", "label", "name", "value", "sd", "identifiable", "why"];
     let number = |v: f64| if v.is_finite() { format!("{v:.6}") } else { String::new() };
@@ -52,7 +52,7 @@ pub fn write_frames(path: impl AsRef<Path>, shared: &SharedStiffness) -> Result<
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_plan(path: impl AsRef<Path>, plan: &Plan) -> Result<(), IoError> {
+pub(crate) fn write_plan(path: impl AsRef<Path>, plan: &Plan) -> Result<(), IoError> {
     const COLUMNS: [&str; 9] = [
         "press_mm",
         "voxel_mm",
@@ -80,7 +80,11 @@ pub fn write_plan(path: impl AsRef<Path>, plan: &Plan) -> Result<(), IoError> {
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_regions(path: impl AsRef<Path>, regions: &[RegionStiffness], absolute: bool) -> Result<(), IoError> {
+pub(crate) fn write_regions(
+    path: impl AsRef<Path>,
+    regions: &[RegionStiffness],
+    absolute: bool,
+) -> Result<(), IoError> {
     let number = |v: f64| if v.is_finite() { format!("{v:.6}") } else { String::new() };
     let kpa = |v: f64| if absolute { number(v) } else { String::new() };
     let row = |r: &RegionStiffness| {
@@ -100,7 +104,7 @@ pub fn write_regions(path: impl AsRef<Path>, regions: &[RegionStiffness], absolu
 
 /// What is known of a label's material.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct KnownMaterial {
+pub(crate) struct KnownMaterial {
     /// The label.
     pub label: u8,
     /// Its Poisson's ratio, where it is given.
@@ -114,7 +118,7 @@ pub struct KnownMaterial {
 ///
 /// # Errors
 /// [`IoError`] names the line that cannot be read, and a table without these columns.
-pub fn read_materials(path: impl AsRef<Path>) -> Result<Vec<KnownMaterial>, IoError> {
+pub(crate) fn read_materials(path: impl AsRef<Path>) -> Result<Vec<KnownMaterial>, IoError> {
     let path = path.as_ref();
     let table = read_table(path, ["label"])?;
     let column = |name: &str| table.other_columns.iter().position(|c| c.eq_ignore_ascii_case(name));

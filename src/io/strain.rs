@@ -11,7 +11,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_region_strains(path: impl AsRef<Path>, regions: &[RegionStrain]) -> Result<(), IoError> {
+pub(crate) fn write_region_strains(path: impl AsRef<Path>, regions: &[RegionStrain]) -> Result<(), IoError> {
     const COLUMNS: [&str; 11] =
         ["label", "component", "mean", "sd", "p5", "p95", "mean_sd", "sd_sd", "p5_sd", "p95_sd", "voxels"];
     let number = |v: f64| if v.is_finite() { decimal(v) } else { String::new() };

@@ -128,7 +128,7 @@ pub(super) fn as_a_whole<R>(work: impl FnOnce() -> R) -> R {
 
 /// Removes all that is unfinished, for a program that stops at once: what is being moved to its
 /// final name is still moved, and nothing is made or moved after it.
-pub fn abandon() {
+pub(crate) fn abandon() {
     let live = live();
     for entry in live.iter().rev() {
         let _ = match entry {

@@ -74,7 +74,7 @@ pub fn read_trajectories(path: impl AsRef<Path>, reference: usize) -> Result<BTr
 ///
 /// # Errors
 /// [`IoError`] when the file cannot be written.
-pub fn write_strain(path: impl AsRef<Path>, rows: &[StrainRow], step_s: Option<f64>) -> Result<(), IoError> {
+pub(crate) fn write_strain(path: impl AsRef<Path>, rows: &[StrainRow], step_s: Option<f64>) -> Result<(), IoError> {
     const COLUMNS: [&str; 12] = [
         "frame",
         "time_s",

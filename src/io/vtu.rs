@@ -54,7 +54,7 @@ pub fn write_tet_mesh(
 ///
 /// # Errors
 /// As [`write_tet_mesh`].
-pub fn write_match_mesh(
+pub(crate) fn write_match_mesh(
     path: impl AsRef<Path>,
     mesh: &Mesh,
     matches: &[&Match],
@@ -77,7 +77,7 @@ pub fn write_match_mesh(
 ///
 /// # Errors
 /// As [`write_tet_mesh`].
-pub fn write_quadratic_mesh(
+pub(crate) fn write_quadratic_mesh(
     path: impl AsRef<Path>,
     mesh: &QuadraticMesh,
     displacement: &[[f64; 3]],

@@ -19,7 +19,7 @@ const MIN_VOXELS_PER_BIN: usize = 8;
 
 /// The joint histogram of two volumes.
 #[derive(Debug, Clone)]
-pub struct Relation {
+pub(crate) struct Relation {
     /// Share of the voxels with each pair of intensities, those of the first volume fastest.
     joint: Vec<f64>,
     /// Lowest and highest intensity of the two.
@@ -105,7 +105,7 @@ impl Relation {
 
     /// The part that a straight rising line explains, either way round: one contrast, whatever its
     /// gain and offset. Negative where the line falls (-1 to 1).
-    pub fn explained_by_gain(&self) -> f64 {
+    pub(crate) fn explained_by_gain(&self) -> f64 {
         let mean = |v: &dyn Fn(usize) -> f64| self.joint.iter().enumerate().map(|(at, p)| p * v(at)).sum::<f64>();
         let (first, second) = (|at: usize| (at % INTENSITY_BINS) as f64, |at: usize| (at / INTENSITY_BINS) as f64);
         let (a, b) = (mean(&first), mean(&second));

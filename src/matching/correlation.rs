@@ -46,7 +46,7 @@ pub struct Peak {
 }
 
 /// Patch radius for a shape: none along a side of one voxel.
-pub fn patch_radius(shape: [usize; 3], radius: [usize; 3]) -> [usize; 3] {
+pub(crate) fn patch_radius(shape: [usize; 3], radius: [usize; 3]) -> [usize; 3] {
     std::array::from_fn(|a| if shape[a] == 1 { 0 } else { radius[a] })
 }
 

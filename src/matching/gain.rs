@@ -4,7 +4,7 @@
 //! In blocks of voxels the deformed volume's mean and spread are brought to the initial one's
 //! (ratio of standard deviations, signed by the correlation: unlike a regression it is not biased
 //! by noise or by what motion is left). A voxel counts the less the steeper the volume is there:
-//! what is left of the motion shows in proportion to that ([`weigh`]). The sums of the blocks are
+//! what is left of the motion shows in proportion to that (`weigh`). The sums of the blocks are
 //! smoothed over their neighbours and interpolated linearly. For the passes, what smoothing
 //! flattens of a bias is measured again on the corrected blocks and put back (twicing; Tukey 1977):
 //! what was left of it looked like motion.
@@ -53,7 +53,7 @@ const WEIGHTS: VoxelWeights =
 /// A voxel's weight in [`GainField`] in place of each that is set in `mask`, 1 to 255: the inverse
 /// variance of the difference there, noise and the gradient times what is left of the motion.
 /// `smooth` is the initial volume (smoothed), `noise` its noise.
-pub fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 3], noise: f32) {
+pub(crate) fn weigh(mask: &mut [u8], smooth: &[f32], shape: [usize; 3], spacing: [f64; 3], noise: f32) {
     let [nx, ny, _] = shape;
     let finest = pyramid::finest(shape, spacing);
     let scale = spacing.map(|s| (finest / s) as f32);

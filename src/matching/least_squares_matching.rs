@@ -13,7 +13,7 @@ use crate::types::GridVector;
 
 /// Voxels per independent sample along an axis: the cubic B-spline correlates the noise of
 /// neighbours. 1 / sum(k^2) of its kernel.
-pub const NOISE_CORRELATION_VOXELS: f64 = 2.0;
+pub(crate) const NOISE_CORRELATION_VOXELS: f64 = 2.0;
 
 /// A match found.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -53,7 +53,7 @@ impl<'a> Aligned<'a> {
 
     /// With landmarks, in voxels of the initial grid.
     #[must_use]
-    pub fn with_anchors(self, anchors: Vec<Anchor>) -> Self {
+    pub(crate) fn with_anchors(self, anchors: Vec<Anchor>) -> Self {
         Self { anchors, ..self }
     }
 
@@ -83,7 +83,7 @@ impl<'a> Aligned<'a> {
     }
 
     /// The same inside another mask on the initial volume's grid.
-    pub fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
+    pub(crate) fn level_within(&self, mask: &[u8], factor: [usize; 3]) -> Pair<'_> {
         let shape = pyramid::reduced_shape(self.shape, factor);
         let fixed = pyramid::reduce(&self.fixed, self.shape, factor);
         let mut mask = pyramid::reduce_mask(mask, self.shape, factor).into_owned();

@@ -23,7 +23,7 @@ pub mod least_squares_matching;
 
 pub mod brightness;
 
-pub mod contrast;
+pub(crate) mod contrast;
 
 pub mod gain;
 

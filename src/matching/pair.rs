@@ -40,7 +40,7 @@ pub struct Pair<'a> {
     /// The same, smoothed by the cubic B-spline (see [`SmoothSampler`]).
     pub fixed_smooth: Cow<'a, [f32]>,
     /// Where matches are wanted (not 0), on the initial lattice; the value is the voxel's weight in
-    /// the local gain ([`crate::matching::gain::weigh`]).
+    /// the local gain (`crate::matching::gain::weigh`).
     pub mask: Cow<'a, [u8]>,
     /// Voxels of the mask.
     pub inside: usize,
@@ -106,7 +106,7 @@ impl<'a> Pair<'a> {
 
     /// About as far along every axis (mm) as `n` of the finest axis' voxels, in voxels of each: at
     /// least one.
-    pub fn in_voxels(&self, n: usize) -> [usize; 3] {
+    pub(crate) fn in_voxels(&self, n: usize) -> [usize; 3] {
         let finest = pyramid::finest(self.shape, self.spacing);
         self.spacing.map(|s| ((n as f64 * finest / s).round() as usize).max(1))
     }
@@ -120,7 +120,7 @@ impl<'a> Pair<'a> {
     }
 
     /// Whether a place (voxels) lies in such a block, with none that has texture beside it.
-    pub fn is_plain(&self) -> impl Fn([f64; 3]) -> bool + Sync + use<> {
+    pub(crate) fn is_plain(&self) -> impl Fn([f64; 3]) -> bool + Sync + use<> {
         let side = self.in_voxels(TEXTURE_BLOCK_VOXELS);
         let [nx, ny, nz] = std::array::from_fn(|a| self.shape[a].div_ceil(side[a]));
         let textured: Vec<bool> = self.blocks().into_iter().map(|(textured, inside)| textured && inside > 0).collect();
@@ -182,7 +182,7 @@ impl<'a> Pair<'a> {
 
     /// The deformed volume sampled within the pair's own spans. The rest is 0 and takes no memory;
     /// nothing may be read there.
-    pub fn warp_sparsely(&self, lattice: &Lattice, coefficients: &[f32]) -> Vec<f32> {
+    pub(crate) fn warp_sparsely(&self, lattice: &Lattice, coefficients: &[f32]) -> Vec<f32> {
         let mut out = vec![0.0; self.fixed.len()];
         self.warp_again(lattice, coefficients, &self.spans, &mut out);
         out
@@ -194,7 +194,7 @@ impl<'a> Pair<'a> {
     }
 
     /// As [`Pair::warp`], into `out`; what lies outside `spans` stays as it is there.
-    pub fn warp_again(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans, out: &mut [f32]) {
+    pub(crate) fn warp_again(&self, lattice: &Lattice, coefficients: &[f32], spans: &Spans, out: &mut [f32]) {
         let [nx, ny, _] = self.shape;
         let sampler = self.sampler();
         let scale: [f32; 3] = std::array::from_fn(|a| (1.0 / self.spacing[a]) as f32);
@@ -228,7 +228,7 @@ impl<'a> Pair<'a> {
 }
 
 /// Mean of the finite values among at most about 100,000.
-pub fn about_mean(values: &[f32]) -> f32 {
+pub(crate) fn about_mean(values: &[f32]) -> f32 {
     let sample = values.iter().step_by((values.len() / 100_000).max(1)).filter(|v| v.is_finite());
     let (sum, n) = sample.fold((0.0, 0usize), |(s, n), v| (s + f64::from(*v), n + 1));
     (sum / n.max(1) as f64) as f32

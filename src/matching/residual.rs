@@ -22,11 +22,11 @@ use rayon::prelude::*;
 
 /// Cauchy's tuning constant (standard deviations): 95 % efficiency for Gaussian noise (Holland &
 /// Welsch 1977).
-pub const CAUCHY_TUNING: f32 = 2.385;
+pub(crate) const CAUCHY_TUNING: f32 = 2.385;
 
 /// Position error that interpolation leaves at any voxel, however steep (finest voxels): affine
 /// motions without noise come out 0.005 to 0.03 voxels off.
-pub const MIN_POSITION_ERROR_VOXELS: f64 = 0.02;
+pub(crate) const MIN_POSITION_ERROR_VOXELS: f64 = 0.02;
 
 /// Gradient variance of white noise along an axis (voxel^-2) over that of the residual: smoothing
 /// by (1, 4, 1) / 6 correlates voxels two apart by 1/18; then (1 - 1/18) / 2 / 4.
@@ -41,7 +41,7 @@ const RESIDUAL_CLIP_SD: f32 = 5.0;
 /// Mean square of the residual about each node of `lattice`, over the robust variance of the whole
 /// (1): squares of 5 deviations at most, and 1 where no tissue is near. `warped` is the deformed
 /// volume, warped.
-pub fn misfit_by_place(pair: &Pair<'_>, warped: &[f32], lattice: &Lattice) -> Vec<f32> {
+pub(crate) fn misfit_by_place(pair: &Pair<'_>, warped: &[f32], lattice: &Lattice) -> Vec<f32> {
     let gain = GainField::sharpened(pair, warped);
     let scale = 1.0 / residual_sigma(pair, warped, &gain).max(f32::MIN_POSITIVE);
     let [nx, ny, _] = pair.shape;
@@ -276,7 +276,7 @@ pub fn excess(pair: &Pair<'_>, a: &[f32], b: &Baseline) -> f64 {
 
 /// [`excess`] by place: of each voxel times each basis function of `windows`. The functions add up
 /// to one, so the places add up to the whole.
-pub fn excess_by_place(pair: &Pair<'_>, a: &[f32], b: &Baseline, windows: &Lattice) -> Vec<f32> {
+pub(crate) fn excess_by_place(pair: &Pair<'_>, a: &[f32], b: &Baseline, windows: &Lattice) -> Vec<f32> {
     let compared = Compared::new(pair, a, b);
     windows.accumulate::<1>(|j, k, [row]| {
         let span = pair.spans.row(j, k);

@@ -2,7 +2,7 @@
 
 /// The lower band of a symmetric matrix: entry (i, j) for `i - width <= j <= i`.
 #[derive(Debug, Clone)]
-pub struct Band {
+pub(crate) struct Band {
     width: usize,
     rows: Vec<f64>,
 }
@@ -33,7 +33,7 @@ impl Band {
 
     /// Fixes the unknowns that `fixed` gives a value: their rows and columns become those of the
     /// identity, and what they did to the others goes to the right-hand side.
-    pub fn fix(&mut self, rhs: &mut [f64], fixed: &[Option<f64>]) {
+    pub(crate) fn fix(&mut self, rhs: &mut [f64], fixed: &[Option<f64>]) {
         for i in 0..self.size() {
             for j in i.saturating_sub(self.width)..i {
                 let at = self.at(i, j);

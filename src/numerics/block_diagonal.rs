@@ -6,7 +6,7 @@ pub struct Blocks(Vec<f32>);
 
 impl Blocks {
     /// From all xx, all yy, zz, xy, xz and yz, one after the other: a multiple of six values.
-    pub fn from_planar(values: Vec<f32>) -> Self {
+    pub(crate) fn from_planar(values: Vec<f32>) -> Self {
         assert!(values.len().is_multiple_of(6), "{} values are no six a node", values.len());
         Self(values)
     }
@@ -39,7 +39,7 @@ impl Blocks {
     }
 
     /// All xx, all yy and so on, to be changed.
-    pub fn planar_mut(&mut self) -> &mut [f32] {
+    pub(crate) fn planar_mut(&mut self) -> &mut [f32] {
         &mut self.0
     }
 }

@@ -123,7 +123,7 @@ impl Lattice {
 
     /// The nodes that act at a fractional voxel position (clamped to the grid), to be used many
     /// times.
-    pub fn stencil_near(&self, p: [f64; 3]) -> Stencil {
+    pub(crate) fn stencil_near(&self, p: [f64; 3]) -> Stencil {
         let s: [(usize, [f32; 4]); 3] = std::array::from_fn(|a| self.stencil_at(a, p[a]));
         let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
         let base = (0..3).map(|a| s[a].0 * stride[a]).sum();
@@ -246,7 +246,7 @@ impl Lattice {
     }
 
     /// The same for some planes: three planar components.
-    pub fn evaluate_planes(&self, coefficients: &[f32], planes: Range<usize>) -> Vec<f32> {
+    pub(crate) fn evaluate_planes(&self, coefficients: &[f32], planes: Range<usize>) -> Vec<f32> {
         let [nx, ny, _] = self.shape;
         let total = nx * ny * planes.len();
         let mut out = vec![0.0f32; 3 * total];
@@ -441,7 +441,7 @@ impl Lattice {
 
 /// The at most 64 nodes of a lattice that act at one place, with their weights.
 #[derive(Debug, Clone, Copy)]
-pub struct Stencil {
+pub(crate) struct Stencil {
     base: usize,
     stride: [usize; 3],
     taps: [usize; 3],
@@ -451,7 +451,7 @@ pub struct Stencil {
 impl Stencil {
     /// The value there of one planar component.
     #[inline(always)]
-    pub fn gather(&self, component: &[f32]) -> f32 {
+    pub(crate) fn gather(&self, component: &[f32]) -> f32 {
         let [wx, wy, wz] = &self.weights;
         let mut sum = 0.0;
         for c in 0..self.taps[2] {

@@ -2,7 +2,7 @@
 
 /// The lower triangular factor of a symmetric positive definite matrix.
 #[derive(Debug, Clone)]
-pub struct Cholesky {
+pub(crate) struct Cholesky {
     n: usize,
     factor: Vec<f64>,
 }

@@ -7,7 +7,7 @@
 use crate::numerics::bspline::weights;
 
 /// Positions processed together.
-pub const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 
 /// Most adjacent positions computed together: most runs are shorter where tissue is strained.
 const MAX_RUN: usize = 8;
@@ -24,7 +24,7 @@ pub struct Places {
 
 impl Places {
     /// All at the origin.
-    pub const ORIGIN: Self = Self { cell: [[0; LANES]; 3], fraction: [[0.0; LANES]; 3] };
+    pub(crate) const ORIGIN: Self = Self { cell: [[0; LANES]; 3], fraction: [[0.0; LANES]; 3] };
 
     /// Sets places `p` (voxels) along axis `a`. Places beyond 2^31 go to cell `i32::MIN` or
     /// `i32::MAX`, NaN to 0 with a fraction that is NaN.
@@ -39,7 +39,7 @@ impl Places {
 
     /// As [`Places::set`] in double precision.
     #[inline(always)]
-    pub fn set_f64(&mut self, a: usize, p: &[f64; LANES]) {
+    pub(crate) fn set_f64(&mut self, a: usize, p: &[f64; LANES]) {
         for l in 0..LANES {
             let floor = p[l].floor();
             self.cell[a][l] = floor as i32;

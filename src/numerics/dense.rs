@@ -103,7 +103,7 @@ pub fn symmetric_eigen<const N: usize>(a: &Square<N>) -> [(f64, [f64; N]); N] {
 /// Spectral radius of a square matrix: the growth of its powers, by repeated squaring (Gelfand's
 /// formula at the power 2^24, so a factor K that powers keep is felt as `K^(1/2^24)`). Infinite
 /// where the matrix holds NaN or infinity.
-pub fn spectral_radius<const N: usize>(a: &Square<N>) -> f64 {
+pub(crate) fn spectral_radius<const N: usize>(a: &Square<N>) -> f64 {
     const SQUARINGS: i32 = 24;
     let mut m = *a;
     let mut log = 0.0;

@@ -12,7 +12,7 @@ fn series<const N: usize>(x: f32, terms: [f32; N]) -> f32 {
 }
 
 /// 1.5 * 2^23: adding it rounds a small number to an integer, which then stands in the lowest bits.
-pub const ROUND_TO_INTEGER: f32 = 12_582_912.0;
+pub(crate) const ROUND_TO_INTEGER: f32 = 12_582_912.0;
 
 /// ln 2 as a sum of two: the first has so few digits that its products with exponents are exact.
 const LN_2_PARTS: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];

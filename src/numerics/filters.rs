@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 /// Mean and number of the finite values among the 26 around place `at` (8 in one slice); none where
 /// there is no such value.
-pub fn mean_beside(data: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Option<(f32, usize)> {
+pub(crate) fn mean_beside(data: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Option<(f32, usize)> {
     let near = |v: usize, n: usize| v.saturating_sub(1)..(v + 2).min(n);
     let (mut sum, mut count) = (0.0, 0);
     for (j, k) in near(at / (nx * ny), nz).flat_map(|k| near(at / nx % ny, ny).map(move |j| (j, k))) {
@@ -18,7 +18,7 @@ pub fn mean_beside(data: &[f32], [nx, ny, nz]: [usize; 3], at: usize) -> Option<
 }
 
 /// A symmetric kernel, centre first: `[c0, c1, c2 ...]` stands for `... c2 c1 c0 c1 c2 ...`.
-pub type HalfKernel = Vec<f32>;
+pub(crate) type HalfKernel = Vec<f32>;
 
 /// Sampled Gaussian of standard deviation `sigma` (voxels), cut at 3 sigma, sum 1; the identity for
 /// `sigma` <= 0.

@@ -204,7 +204,7 @@ impl<'a> Knots<'a> {
 /// Smooths the coefficients (planar, mm) about every knot where the volume shrinks below `least` of
 /// what it was, until there is none, twenty rounds at most. `spacing` is that of the lattice's
 /// voxels (mm).
-pub fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
+pub(crate) fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f32], least: f32) {
     let knots = Knots::new(lattice, spacing);
     let mut folded = knots.folded(coefficients, knots.suspects(coefficients, least).into_par_iter(), least);
     for _ in 0..MAX_ITERATIONS {

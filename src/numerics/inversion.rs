@@ -12,7 +12,7 @@ use crate::types::{DenseField, WorldPoint};
 
 /// From y, steps towards the x with x + u(x) = y (world mm), until x is off by less than
 /// `tolerance` (mm) in y. [`residual`] tells whether it got there.
-pub fn origin_of(field: &DenseField, y: WorldPoint, tolerance: f64) -> WorldPoint {
+pub(crate) fn origin_of(field: &DenseField, y: WorldPoint, tolerance: f64) -> WorldPoint {
     const MAX_ITERATIONS: usize = 60;
     let mut x = y;
     let mut r = residual(field, x, y);

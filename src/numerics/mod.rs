@@ -4,9 +4,9 @@
 //! Everything here works on plain slices with x fastest and gives the same bits for any number of
 //! threads: work is cut into pieces by the data's shape alone, and sums are taken in a fixed order.
 //! Inner loops are plain multiplies and adds that the compiler vectorises for the machine at hand
-//! ([`simd::dispatch`]).
+//! (`simd::dispatch`).
 
-pub mod simd;
+pub(crate) mod simd;
 
 pub mod filters;
 
@@ -20,15 +20,15 @@ pub mod pyramid;
 
 pub mod symmetric3;
 
-pub mod eigen;
+pub(crate) mod eigen;
 
 pub mod bspline;
-pub mod cubic;
+pub(crate) mod cubic;
 mod multilevel;
 
-pub mod ablation;
+pub(crate) mod ablation;
 
-pub mod banded;
+pub(crate) mod banded;
 
 pub mod block_diagonal;
 
@@ -36,7 +36,7 @@ pub mod bending;
 
 pub mod statistics;
 
-pub mod surface;
+pub(crate) mod surface;
 
 pub mod tetrahedron;
 
@@ -47,12 +47,12 @@ pub mod neighbours;
 pub mod dense;
 
 mod partial_refactorisation;
-pub mod sparse;
+pub(crate) mod sparse;
 
-pub mod cholesky;
+pub(crate) mod cholesky;
 
-pub mod exponential;
-pub mod fold_removal;
-pub mod inversion;
+pub(crate) mod exponential;
+pub(crate) mod fold_removal;
+pub(crate) mod inversion;
 pub mod label_detection;
-pub mod trig;
+pub(crate) mod trig;

@@ -31,12 +31,12 @@ impl Orientation {
     }
 
     /// Whether the axes run right, anterior and superior, in this order, as they are stored.
-    pub fn is_canonical(&self) -> bool {
+    pub(crate) fn is_canonical(&self) -> bool {
         *self == Self { axis: [0, 1, 2], backwards: [false; 3] }
     }
 
     /// The grid of the same voxels with canonical axes.
-    pub fn canonical(&self, stored: &Grid) -> Grid {
+    pub(crate) fn canonical(&self, stored: &Grid) -> Grid {
         let shape = stored.shape();
         let backwards = self.inverse().backwards;
         let first = [0, 1, 2].map(|s| if backwards[s] { (shape[s] - 1) as f64 } else { 0.0 });
@@ -81,7 +81,7 @@ impl Orientation {
     }
 
     /// The canonical axis along which the stored rows (x) run, and whether they run backwards.
-    pub fn along_rows(&self) -> (usize, bool) {
+    pub(crate) fn along_rows(&self) -> (usize, bool) {
         let Self { axis, backwards } = self.inverse();
         (axis[0], backwards[0])
     }
@@ -114,7 +114,7 @@ impl Orientation {
     ///
     /// # Errors
     /// [`SpaceError`] when the grids have different numbers of voxels.
-    pub fn stored_field(&self, canonical: DenseField, grid: &Grid) -> Result<DenseField, SpaceError> {
+    pub(crate) fn stored_field(&self, canonical: DenseField, grid: &Grid) -> Result<DenseField, SpaceError> {
         let mut values = canonical.into_vec();
         for part in values.chunks_exact_mut(grid.len()) {
             let before = part.to_vec();

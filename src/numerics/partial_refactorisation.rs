@@ -55,7 +55,7 @@ impl Tail {
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes; the factor is spoilt then.
-    pub fn renew(
+    pub(crate) fn renew(
         &self,
         symbolic: &SymbolicCholesky<u32>,
         values: &mut [f32],

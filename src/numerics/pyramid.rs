@@ -22,7 +22,7 @@ pub fn reduce(data: &[f32], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [f
 }
 
 /// Blocks of which at least half the voxels are set.
-pub fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [u8]> {
+pub(crate) fn reduce_mask(mask: &[u8], shape: [usize; 3], factor: [usize; 3]) -> Cow<'_, [u8]> {
     if factor == [1, 1, 1] {
         return Cow::Borrowed(mask);
     }

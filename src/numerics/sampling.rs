@@ -89,7 +89,7 @@ fn cell(n: usize, p: f64) -> (usize, usize, f64) {
 
 /// The eight voxels around a position and their trilinear weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Stencil {
+pub(crate) struct Stencil {
     /// Offsets, x fastest.
     pub index: [usize; 8],
     /// Weights; they sum to 1.
@@ -140,7 +140,7 @@ pub fn displacement(field: &Displacement<'_>, p: WorldPoint) -> [f64; 3] {
 /// The four weights of the cubic B-spline at fraction `t` of a cell, for the samples at -1, 0, 1,
 /// 2.
 #[inline]
-pub fn cubic_bspline(t: f64) -> [f64; 4] {
+pub(crate) fn cubic_bspline(t: f64) -> [f64; 4] {
     let s = 1.0 - t;
     [s * s * s / 6.0, 2.0 / 3.0 - t * t * (2.0 - t) / 2.0, 2.0 / 3.0 - s * s * (2.0 - s) / 2.0, t * t * t / 6.0]
 }
@@ -214,7 +214,7 @@ impl<'a> Sampler<'a> {
         around.index.iter().zip(around.weight).any(|(&at, w)| w > POSITION_TOLERANCE_VOXELS && self.missing[at])
     }
 
-    /// The values at the first `out.len()` (at most [`LANES`]) of some places (voxels), fast where
+    /// The values at the first `out.len()` (at most `LANES`) of some places (voxels), fast where
     /// they follow each other along x.
     #[inline(always)]
     pub fn block(&self, p: &[[f64; LANES]; 3], out: &mut [f32]) {

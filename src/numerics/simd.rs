@@ -11,7 +11,7 @@ static LEVEL: OnceLock<Arch> = OnceLock::new();
 /// The code inside must be inlined to profit. No fused multiply-add is used, so the result is the
 /// same for each.
 #[inline(always)]
-pub fn dispatch<R>(work: impl FnOnce() -> R) -> R {
+pub(crate) fn dispatch<R>(work: impl FnOnce() -> R) -> R {
     LEVEL.get_or_init(level).dispatch(work)
 }
 

@@ -84,7 +84,7 @@ impl Pattern {
     }
 
     /// The same without a symbolic factorisation until one is needed.
-    pub fn unfactorised(elements: Vec<u32>, per: usize, places: &[[f64; 3]], width: Vec<u8>) -> Self {
+    pub(crate) fn unfactorised(elements: Vec<u32>, per: usize, places: &[[f64; 3]], width: Vec<u8>) -> Self {
         let order = dissection(&elements, per, places, &width);
         Self::ordered(elements, per, width, &order)
     }
@@ -93,7 +93,7 @@ impl Pattern {
     ///
     /// # Errors
     /// As [`Self::new`].
-    pub fn eliminating_last(&self, nodes: &[u32]) -> Result<Self, Singular> {
+    pub(crate) fn eliminating_last(&self, nodes: &[u32]) -> Result<Self, Singular> {
         let mut late = vec![false; self.first.len()];
         nodes.iter().for_each(|&n| late[n as usize] = true);
         let mut order: Vec<u32> = (0..late.len() as u32).collect();
@@ -185,7 +185,7 @@ impl Pattern {
     }
 
     /// Whether some nodes come last, so that a factor can be renewed there.
-    pub fn renews(&self) -> bool {
+    pub(crate) fn renews(&self) -> bool {
         self.tail.is_some()
     }
 
@@ -249,7 +249,7 @@ impl Pattern {
     }
 
     /// Adds `value` at two unknowns of one node (counted within the node).
-    pub fn add_at_node(&self, values: &mut [f64], node: u32, r: usize, c: usize, value: f64) {
+    pub(crate) fn add_at_node(&self, values: &mut [f64], node: u32, r: usize, c: usize, value: f64) {
         let (r, c) = (r.max(c), r.min(c));
         values[self.column[self.first(node) + c] + r - c] += value;
     }
@@ -276,7 +276,7 @@ impl Pattern {
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes or is not finite.
-    pub fn factorise(&self, matrix: Vec<f64>) -> Result<Factor<'_>, Singular> {
+    pub(crate) fn factorise(&self, matrix: Vec<f64>) -> Result<Factor<'_>, Singular> {
         self.factor(Arc::new(matrix))
     }
 
@@ -398,7 +398,7 @@ impl<'a> Factor<'a> {
     ///
     /// # Errors
     /// [`Singular`] when a pivot vanishes or is not finite.
-    pub fn renewed(mut self, matrix: Vec<f64>, near: bool) -> Result<Self, Singular> {
+    pub(crate) fn renewed(mut self, matrix: Vec<f64>, near: bool) -> Result<Self, Singular> {
         let pattern = self.pattern;
         if let Some(Ok(better)) = self.better.take() {
             self = *better;
@@ -453,7 +453,7 @@ impl<'a> Factor<'a> {
     ///
     /// # Errors
     /// As [`Factor::solve`].
-    pub fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
+    pub(crate) fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
         if let (Values::Single(values), true) = (&self.values, self.is_nearby()) {
             if let Some(solved) = self.refined(values, x) {
                 x.copy_from_slice(&solved);

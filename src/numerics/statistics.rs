@@ -28,7 +28,7 @@ pub fn deviation(values: impl Iterator<Item = f32> + Clone) -> f64 {
 }
 
 /// Robust standard deviation (1.4826 times the median distance from the median); NaN for no values.
-pub fn robust_deviation(values: impl Iterator<Item = f64>) -> f64 {
+pub(crate) fn robust_deviation(values: impl Iterator<Item = f64>) -> f64 {
     let mut off: Vec<f32> = values.map(|v| v as f32).collect();
     let middle = median(&mut off);
     off.iter_mut().for_each(|v| *v = (*v - middle).abs());
@@ -37,7 +37,7 @@ pub fn robust_deviation(values: impl Iterator<Item = f64>) -> f64 {
 
 /// Whether number `i` is among the `share` (1) that stands for all: multiples of the golden ratio,
 /// which meet rows and slices alike.
-pub fn stands_for_all(i: usize, share: f64) -> bool {
+pub(crate) fn stands_for_all(i: usize, share: f64) -> bool {
     const GOLDEN: f64 = 0.618_033_988_749_894_9;
     (i as f64 * GOLDEN).fract() < share
 }
@@ -61,7 +61,7 @@ pub fn percentile(values: &mut [f64], q: f64) -> f64 {
 
 /// Spearman's rank correlation of two lists of one length (-1 to 1); equal values share their mean
 /// rank. None of fewer than two, or where a list holds one value.
-pub fn rank_correlation(a: &[f64], b: &[f64]) -> Option<f64> {
+pub(crate) fn rank_correlation(a: &[f64], b: &[f64]) -> Option<f64> {
     let ranks = |v: &[f64]| -> Vec<f64> {
         let below = |x: f64| v.iter().filter(|w| **w < x).count() as f64;
         let equal = |x: f64| v.iter().filter(|w| **w == x).count() as f64;

@@ -7,7 +7,7 @@
 
 /// Value, first derivatives (x, y) and second derivatives (xx, xy, yy).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Jet {
+pub(crate) struct Jet {
     /// The value.
     pub value: f64,
     /// Derivatives by x and y.

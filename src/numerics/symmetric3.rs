@@ -4,7 +4,7 @@ use crate::numerics::dense::symmetric_eigen;
 use crate::types::space::{cross, dot};
 
 /// A symmetric 3 x 3 matrix as `[xx, yy, zz, xy, xz, yz]`.
-pub type Symmetric3 = [f64; 6];
+pub(crate) type Symmetric3 = [f64; 6];
 
 /// Determinant.
 #[inline(always)]
@@ -15,7 +15,7 @@ pub fn determinant(m: &Symmetric3) -> f64 {
 
 /// Adjugate (the inverse times the determinant).
 #[inline(always)]
-pub fn adjugate(m: &Symmetric3) -> Symmetric3 {
+pub(crate) fn adjugate(m: &Symmetric3) -> Symmetric3 {
     let [a, b, c, d, e, f] = *m;
     [b * c - f * f, a * c - e * e, a * b - d * d, e * f - d * c, d * f - b * e, d * e - a * f]
 }
@@ -30,7 +30,7 @@ pub fn inverse(m: &Symmetric3) -> Option<Symmetric3> {
 
 /// Inverse of a covariance that may be flat along an axis (one slice): a millionth of its trace is
 /// added to its diagonal.
-pub fn regularized_inverse(m: &Symmetric3) -> Option<Symmetric3> {
+pub(crate) fn regularized_inverse(m: &Symmetric3) -> Option<Symmetric3> {
     let little = 1e-6 * (m[0] + m[1] + m[2]) + 1e-12;
     let [a, b, c, d, e, f] = *m;
     inverse(&[a + little, b + little, c + little, d, e, f])

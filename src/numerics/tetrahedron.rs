@@ -19,7 +19,7 @@ pub fn shapes(l: [f64; 4]) -> [f64; 10] {
 }
 
 /// The barycentric coordinates at which the shape functions are these.
-pub fn barycentric(shapes: &[f64; 10]) -> [f64; 4] {
+pub(crate) fn barycentric(shapes: &[f64; 10]) -> [f64; 4] {
     let mut out = [shapes[0], shapes[1], shapes[2], shapes[3]];
     for ([i, j], s) in EDGES.into_iter().zip(&shapes[4..]) {
         out[i] += 0.5 * s;

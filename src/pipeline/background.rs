@@ -69,7 +69,7 @@ pub fn empty(volume: &Voxels<'_>, least: f32) -> Option<f32> {
 }
 
 /// Whether enough voxels hold a value to be a background.
-pub fn filled_with(values: &[f32], value: f32) -> bool {
+pub(crate) fn filled_with(values: &[f32], value: f32) -> bool {
     held(values, value) as f64 >= MIN_BACKGROUND_FRACTION * values.len() as f64
 }
 
@@ -84,7 +84,7 @@ pub fn hidden(mut volume: Voxels<'_>, empty: f32) -> Voxels<'_> {
 }
 
 /// What to say of backgrounds that were cut.
-pub fn why_unseen(cut: [Option<Cut>; 2]) -> Option<String> {
+pub(crate) fn why_unseen(cut: [Option<Cut>; 2]) -> Option<String> {
     let of = |(cut, volume): (Option<Cut>, &str)| {
         cut.map(|Cut { lit, places }| match lit > CUT_DETECTION.min_lit_fraction {
             true => format!("{:.0} % of what borders on it in the {volume} volume is as bright as tissue", 100.0 * lit),

@@ -79,7 +79,7 @@ const TRIAL: TrialControl = TrialControl {
 
 /// Tissue shared out among bodies, with their motions.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Bodies {
+pub(crate) struct Bodies {
     /// The body of each voxel of the level; empty where there is one.
     labels: Vec<u8>,
     /// Whether the labels stay as they are.
@@ -177,7 +177,7 @@ impl Bodies {
     }
 
     /// The same without the information at the nodes, from which no search starts.
-    pub fn without_blocks(&self) -> Self {
+    pub(crate) fn without_blocks(&self) -> Self {
         let fields = self.fields.iter().map(SplineField::without_blocks).collect();
         Self { labels: self.labels.clone(), fixed: self.fixed, fields }
     }
@@ -198,7 +198,7 @@ impl Bodies {
     }
 
     /// The body at a place of the level, or the nearest to it (voxels).
-    pub fn label_near(&self, p: [f64; 3]) -> usize {
+    pub(crate) fn label_near(&self, p: [f64; 3]) -> usize {
         if self.labels.is_empty() {
             return 0;
         }
@@ -221,7 +221,7 @@ impl Bodies {
 
     /// The body of each voxel of another volume of `shape`, none where there is one body; `place`
     /// maps its voxels to those here.
-    pub fn labels_on(&self, shape: [usize; 3], place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<u8> {
+    pub(crate) fn labels_on(&self, shape: [usize; 3], place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<u8> {
         let [nx, ny, nz] = shape;
         let label = |at: usize| {
             let v = [at % nx, at / nx % ny, at / (nx * ny)];
@@ -275,7 +275,7 @@ impl Bodies {
     }
 
     /// Brings back what the bending energy flattened of each body's field.
-    pub fn twicing(&mut self, pair: &Pair<'_>, seed: u64) {
+    pub(crate) fn twicing(&mut self, pair: &Pair<'_>, seed: u64) {
         for b in 0..self.count() {
             level::twicing(&self.part(pair, b), &mut self.fields[b], seed);
         }
@@ -298,7 +298,7 @@ impl Bodies {
 
     /// Divides bodies for as long as `matches` propose it and the volumes agree so much better;
     /// says of each what it explains.
-    pub fn divide(
+    pub(crate) fn divide(
         &mut self,
         pair: &Pair<'_>,
         matches: &[LevelMatch],
@@ -375,7 +375,7 @@ impl Bodies {
                 .map(|(m, _)| (m.voxel, m.measured.displacement, m.measured.covariance))
                 .collect();
             let (field, _) = level::couple(pair, own.into_iter(), (&pair.in_voxels(2), 0.3), None);
-            level::carry(&field, self.fields[body].lattice.clone(), |p| p).to_refine()
+            level::carry(&field, self.fields[body].lattice.clone(), |p| p).before_passes()
         };
         let mut fields = self.fields.clone();
         fields[body] = side(false);
@@ -384,7 +384,7 @@ impl Bodies {
     }
 
     /// Whether the two volumes agree better under these than under `other`.
-    pub fn agree_better(&self, pair: &Pair<'_>, other: &Self) -> bool {
+    pub(crate) fn agree_better(&self, pair: &Pair<'_>, other: &Self) -> bool {
         let gained = level::gained(pair, &other.warp(pair, &pair.spans), self.warp(pair, &pair.spans));
         gained + landmarks::gained(pair, other, self) > 0.0
     }

@@ -87,7 +87,7 @@ impl Concluded {
     /// The spline of each body over `grid`, and how sure they are together. The bodies' fields lie
     /// on `pair`, a level of `factor`; this was concluded on one of `judged`. With a seed the
     /// posterior is made again.
-    pub fn on_grid(
+    pub(crate) fn on_grid(
         all: Vec<Self>,
         bodies: &mut Bodies,
         (pair, factor): (&Pair<'_>, [usize; 3]),

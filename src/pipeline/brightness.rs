@@ -46,7 +46,7 @@ impl Light {
     }
 
     /// The same inside another mask on the initial volume's grid.
-    pub fn level_within<'a>(&self, aligned: &'a Aligned<'_>, mask: &[u8], factor: [usize; 3]) -> Pair<'a> {
+    pub(crate) fn level_within<'a>(&self, aligned: &'a Aligned<'_>, mask: &[u8], factor: [usize; 3]) -> Pair<'a> {
         self.out_of(aligned.level_within(mask, factor), factor)
     }
 
@@ -58,7 +58,7 @@ impl Light {
     }
 
     /// Whether no level had tissue enough to look at.
-    pub fn is_unknown(&self) -> bool {
+    pub(crate) fn is_unknown(&self) -> bool {
         self.taken.is_none() && self.left.is_none()
     }
 
@@ -75,7 +75,7 @@ impl Light {
     }
 
     /// The same before the motion is known.
-    pub fn look_at_rest<'a>(
+    pub(crate) fn look_at_rest<'a>(
         &mut self,
         pair: &mut Pair<'a>,
         (aligned, factor): (&'a Aligned<'_>, [usize; 3]),

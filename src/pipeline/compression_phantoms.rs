@@ -83,7 +83,11 @@ impl Pressed {
 ///
 /// # Errors
 /// As [`phantom()`].
-pub fn stiffness_trials(side: usize, budgets: &[usize], progress: &dyn Fn(f64)) -> Result<Vec<Trial>, SynthError> {
+pub(crate) fn stiffness_trials(
+    side: usize,
+    budgets: &[usize],
+    progress: &dyn Fn(f64),
+) -> Result<Vec<Trial>, SynthError> {
     let mut out = Vec::new();
     let kinds = [PhantomKind::Inclusion, PhantomKind::Slab];
     for (k, kind) in kinds.into_iter().enumerate() {

@@ -28,14 +28,14 @@ pub struct FieldPlan {
 
 /// Memory that a command holds for strain on a grid (bytes): 174 a voxel were measured from 80 to
 /// 120 voxels a side, and 12 MB besides.
-pub fn strain_memory(grid: &Grid) -> u64 {
+pub(crate) fn strain_memory(grid: &Grid) -> u64 {
     180 * grid.len() as u64 + 12_000_000
 }
 
 /// Memory of a phantom on a grid (bytes): 85 a voxel and 14 MB, measured on blocks, heads and
 /// calves of 0.3 to 8 million voxels. The finite elements of an elastic one take 60 MB more, and
 /// 300 MB from 64 voxels across on, where they are halved again.
-pub fn phantom_memory(grid: &Grid, elastic: bool) -> u64 {
+pub(crate) fn phantom_memory(grid: &Grid, elastic: bool) -> u64 {
     let fine = grid.shape().into_iter().max() >= Some(64);
     let elements = if elastic && fine { 300_000_000 } else { 60_000_000 * u64::from(elastic) };
     14_000_000 + 85 * grid.len() as u64 + elements
@@ -137,7 +137,7 @@ pub fn memory(initial: &Grid, deformed: &Grid) -> u64 {
 /// a punch and inclusions with and without labels: 0.15 to 0.23 GB at 2,000 nodes, 0.27 to 0.43 at
 /// 8,000, 0.69 to 0.85 at 20,000, 1.7 to 1.9 at 40,000. With iterations: 150 MB and 10 kB a node
 /// (2.8 GB at 300,000; docs/lab/2026-11-solver.md).
-pub fn stiffness_memory(nodes: usize) -> u64 {
+pub(crate) fn stiffness_memory(nodes: usize) -> u64 {
     let n = nodes as f64;
     let each = if nodes <= MAX_DIRECT_NODES { 40_000.0 * (n / 20_000.0).cbrt().max(1.0) } else { 10_000.0 };
     150_000_000 + (each * n) as u64

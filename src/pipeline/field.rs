@@ -21,14 +21,14 @@ use crate::pipeline::field_warnings::{
     why_so_many, without_texture,
 };
 use crate::pipeline::hypotheses::Begun;
-pub use crate::pipeline::hypotheses::Start;
+pub(crate) use crate::pipeline::hypotheses::Start;
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::known::{Known, Turned};
 use crate::pipeline::landmarks;
 use crate::pipeline::last_passes;
 use crate::pipeline::level;
 use crate::pipeline::local_model::Rest;
-pub use crate::pipeline::match_mesh::mesh_of;
+pub(crate) use crate::pipeline::match_mesh::mesh_of;
 use crate::pipeline::match_mesh::{Meshed, estimated, interpolated, thinned, with_mesh, world_match};
 use crate::pipeline::refinement::{uneven, unlike};
 use crate::pipeline::sparse;
@@ -41,7 +41,7 @@ use rayon::prelude::*;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
 /// from any thread.
-pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
+pub(crate) type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
 /// The result of `palpate field`, on the initial volume's grid.
 ///

@@ -28,7 +28,7 @@ pub const NODES: usize = 2000;
 ///
 /// # Errors
 /// [`ParamError`] where it is out of range.
-pub fn check_nodes(nodes: usize) -> Result<(), ParamError> {
+pub(crate) fn check_nodes(nodes: usize) -> Result<(), ParamError> {
     match nodes {
         0 | 500..=200_000 => Ok(()),
         _ => Err(ParamError { name: "nodes", value: nodes as f64, range: "0, or 500 to 200,000" }),
@@ -69,7 +69,7 @@ impl PadOutcome {
 
     /// The measured force (N) over the model's at the same press (1); 1 where one of them is not
     /// known.
-    pub fn calibration(&self, force_n: Option<f64>) -> f64 {
+    pub(crate) fn calibration(&self, force_n: Option<f64>) -> f64 {
         self.at_press.zip(force_n).map_or(1.0, |([_, model], measured)| measured / model)
     }
 

@@ -15,7 +15,7 @@ use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
 /// from any thread.
-pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
+pub(crate) type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
 /// The map of pinch equilibria.
 struct PinchMap {
@@ -108,7 +108,7 @@ fn bands(scene: &Scene, run: &GraspRun) -> Result<Option<Bands>, GraspError> {
 }
 
 /// Largest distance of a joint from its target at the end of a hold (rad): half a degree.
-pub const JOINT_TOLERANCE_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
+pub(crate) const JOINT_TOLERANCE_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
 /// Deepest press of a tabulated tip over the end of its profile.
 const MAX_PROFILE_EXTRAPOLATION: f64 = 1.02;
@@ -175,7 +175,10 @@ pub fn ensemble(cases: &[SweepCase], progress: Progress<'_>) -> Vec<Result<Grasp
 ///
 /// # Errors
 /// [`GraspError`] where the pinch or the posture for the push is no stable equilibrium.
-pub fn analyse(scene: &Scene, progress: Progress<'_>) -> Result<(GraspAnalysis, Vec<(String, f64)>), GraspError> {
+pub(crate) fn analyse(
+    scene: &Scene,
+    progress: Progress<'_>,
+) -> Result<(GraspAnalysis, Vec<(String, f64)>), GraspError> {
     scene.check()?;
     let mut clock = (Vec::new(), Instant::now());
     let mut book = |stage: &str, fraction: f64| {

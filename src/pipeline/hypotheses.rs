@@ -36,7 +36,7 @@ impl Start {
     }
 
     /// As far again as from `before` to here: where steady motion would be next.
-    pub fn extrapolated(&self, before: &Self) -> Self {
+    pub(crate) fn extrapolated(&self, before: &Self) -> Self {
         let mut next = self.clone();
         for field in &mut next.motion.fields {
             // Where the frame before had other bodies, this one's own places tell how it moved.
@@ -154,17 +154,17 @@ impl Begun {
     }
 
     /// Whether all was searched and few features agreed with their neighbours.
-    pub fn is_unconfirmed(&self) -> bool {
+    pub(crate) fn is_unconfirmed(&self) -> bool {
         self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.confirmed || c.kept < MIN_COUNTED_MATCHES)
     }
 
     /// Whether so few features agreed that the next level is to be searched as well.
-    pub fn needs_next_level(&self) -> bool {
+    pub(crate) fn needs_next_level(&self) -> bool {
         self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.next_level)
     }
 
     /// The features and those that agreed, where these are too few to go by.
-    pub fn unreliable_counts(&self) -> Option<Counts> {
+    pub(crate) fn unreliable_counts(&self) -> Option<Counts> {
         self.counts().filter(|c| c.kept_share() < KEPT_SHARE.reliable)
     }
 
@@ -174,26 +174,26 @@ impl Begun {
     }
 
     /// Whether few of the features that were sought agree.
-    pub fn is_partial(&self) -> bool {
+    pub(crate) fn is_partial(&self) -> bool {
         self.counts().is_some_and(|c| c.kept_share() < KEPT_SHARE.in_range)
     }
 
     /// Whether a search within `range` (mm) leaves open what lies past it.
-    pub fn leaves_open(&self, pair: &Pair<'_>, range: f64) -> bool {
+    pub(crate) fn leaves_open(&self, pair: &Pair<'_>, range: f64) -> bool {
         self.is_partial()
             || self.report.is_some() && level::lengths(pair, |p| self.motion.at(p))[1] > NEAR_RANGE_FRACTION * range
     }
 
     /// Whether a search twice as far found what the nearer one, `own`, did not: the volumes agree
     /// better, and hardly fewer features.
-    pub fn improves_on(&self, pair: &Pair<'_>, own: &Self) -> bool {
+    pub(crate) fn improves_on(&self, pair: &Pair<'_>, own: &Self) -> bool {
         self.share() >= MIN_WIDE_SHARE_RATIO * own.share() && self.motion.agree_better(pair, &own.motion)
     }
 
     /// Of an unsure search and a wider one the one in which more of the features agreed: the
     /// agreement of the volumes does not tell a wrong island from the truth, neighbours do. Where
     /// there are too few features to count it is all there is.
-    pub fn more_consistent(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
+    pub(crate) fn more_consistent(pair: &Pair<'_>, own: Self, wider: Self) -> Self {
         let [few, many] = [&own, &wider].map(|s| s.counts().unwrap_or_default());
         let wider_is_better = match (few.kept < MIN_COUNTED_MATCHES, many.kept < MIN_COUNTED_MATCHES) {
             (false, false) => many.kept_share() > few.kept_share(),
@@ -345,7 +345,7 @@ impl Search<'_> {
         let (matches, found, report) = matched;
         let counts = report.counts;
         let of_matches = found.clone();
-        let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::to_refine);
+        let own = found.map_or_else(|| SplineField::still(lattice.clone()), SplineField::before_passes);
         let own = refined(own.into());
         let unconfirmed = counts.kept_share() < KEPT_SHARE.next_level || counts.kept < MIN_COUNTED_MATCHES;
         let given = known.iter().any(Start::is_given);
@@ -386,7 +386,7 @@ impl Search<'_> {
 
     /// The field of the matches of a whole volume on `lattice`, stillness where they are too few;
     /// and their rigid motion, where it is to be taken out.
-    pub fn by_matches(&self, pair: &Pair<'_>, lattice: &Lattice) -> (SplineField, Option<AffineMotion>) {
+    pub(crate) fn by_matches(&self, pair: &Pair<'_>, lattice: &Lattice) -> (SplineField, Option<AffineMotion>) {
         let matched = self.matched(pair, lattice);
         let turn = far_turn(&matched);
         (matched.1.unwrap_or_else(|| SplineField::still(lattice.clone())), turn)
@@ -395,7 +395,7 @@ impl Search<'_> {
     /// Searches the next level, `next`, within the same range: its smaller patches tell parts that
     /// move apart. If more of its features agree, they replace the matches (true), and their field
     /// is kept if the volumes agree better under it.
-    pub fn look_ahead(
+    pub(crate) fn look_ahead(
         &self,
         (pair, factor): (&Pair<'_>, [usize; 3]),
         (next, next_factor): (&Pair<'_>, [usize; 3]),
@@ -417,7 +417,7 @@ impl Search<'_> {
         begun.report = Some(report);
         let lattice = begun.motion.fields[0].lattice.clone();
         let field = level::carry(&found, lattice, |p| to_level(from_level(p, factor), next_factor));
-        let motion = self.refined(pair, field.clone().to_refine().into(), passes);
+        let motion = self.refined(pair, field.clone().before_passes().into(), passes);
         if motion.agree_better(pair, &begun.motion) {
             begun.motion = motion;
             begun.of_matches = Some(field);
@@ -434,7 +434,7 @@ impl Search<'_> {
 
     /// What a search of the next level about its field finds, if the volumes agree better there:
     /// smaller patches are distorted less, and fine texture tells a wrong island from the truth.
-    pub fn next_level(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
+    pub(crate) fn next_level(&self, pair: &Pair<'_>, own: &Bodies, passes: usize, seconds: &mut f64) -> Option<Begun> {
         let only = own.only().filter(|_| ablation::is_on("next-level"))?;
         let most = (NEXT_LEVEL.features_times_voxels_per_point / self.params.voxels_per_point.max(1))
             .clamp(NEXT_LEVEL.min_features, WHOLE_SEARCH.max_features);

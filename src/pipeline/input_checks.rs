@@ -13,7 +13,7 @@ use crate::types::{DenseField, FieldParams, Grid, Mask, Volume, Voxels};
 use rayon::prelude::*;
 
 /// What a measurement works on.
-pub struct Checked<'a> {
+pub(crate) struct Checked<'a> {
     /// The given mask or the foreground, less the voxels that are not finite.
     pub mask: Mask,
     /// The initial volume with numbers everywhere, in a range that can be squared.
@@ -30,7 +30,7 @@ pub struct Checked<'a> {
 
 /// A slice that holds one value throughout, with tissue going on at both its sides.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LostSlice {
+pub(crate) struct LostSlice {
     /// Across which axis it lies.
     pub axis: usize,
     /// Its number along that axis.
@@ -215,7 +215,7 @@ pub(super) fn squeezed(field: &DenseField, mask: &Mask) -> Option<String> {
 }
 
 /// What to say of lost slices.
-pub fn said_of(lost: &[Vec<LostSlice>; 2]) -> Vec<String> {
+pub(crate) fn said_of(lost: &[Vec<LostSlice>; 2]) -> Vec<String> {
     let of = |(lost, volume): (&Vec<LostSlice>, &str)| {
         let first = lost.first()?;
         let (what, holds) = if lost.len() == 1 { ("slice", "holds") } else { ("slices", "hold") };
@@ -235,7 +235,7 @@ pub fn said_of(lost: &[Vec<LostSlice>; 2]) -> Vec<String> {
 ///
 /// # Errors
 /// [`FieldError::Volume`] when it has not.
-pub fn no_line(volume: &'static str, grid: &Grid) -> Result<(), FieldError> {
+pub(crate) fn no_line(volume: &'static str, grid: &Grid) -> Result<(), FieldError> {
     match grid.shape().iter().filter(|&&n| n < 2).count() {
         0 | 1 => Ok(()),
         _ => {
@@ -252,7 +252,7 @@ const MIN_SLICES: usize = 5;
 ///
 /// # Errors
 /// [`FieldError::TooFew`] when there are two to four along an axis: no match can be found.
-pub fn enough_slices(grid: &Grid) -> Result<(), FieldError> {
+pub(crate) fn enough_slices(grid: &Grid) -> Result<(), FieldError> {
     let shape = grid.shape();
     let Some(a) = (0..3).find(|&a| (2..MIN_SLICES).contains(&shape[a])) else { return Ok(()) };
     let hint = format!(
@@ -348,7 +348,7 @@ fn robust_range(sample: &mut [f32]) -> Option<[f32; 2]> {
 
 /// The volume with padding that lies far from its intensities as the darkest of these, lone far
 /// outliers as the median of their neighbours, and others drawn in to the end of the range.
-pub fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
+pub(crate) fn tamed<'a>(volume: &'a Voxels<'a>) -> Voxels<'a> {
     let reached = Range::of(volume);
     let mut sample = sampled(volume.as_slice());
     let padding = [reached.low, reached.high].map(|v| background::filled_with(&sample, v).then_some(v));
@@ -443,7 +443,7 @@ pub fn known(
 ///
 /// # Errors
 /// [`FieldError::GridMismatch`] when it does not.
-pub fn mask_grid(initial: &Voxels<'_>, mask: Option<&Mask>) -> Result<(), FieldError> {
+pub(crate) fn mask_grid(initial: &Voxels<'_>, mask: Option<&Mask>) -> Result<(), FieldError> {
     on_grid("the mask", mask, "the initial volume", initial.grid())
 }
 

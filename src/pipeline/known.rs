@@ -8,7 +8,7 @@ use crate::types::{Landmark, Mask, Voxels, WorldPoint};
 use std::fmt;
 
 /// A map from the initial to the deformed volume (world mm, RAS); none where it has no value.
-pub type StartMap<'a> = dyn Fn(WorldPoint) -> Option<WorldPoint> + Sync + 'a;
+pub(crate) type StartMap<'a> = dyn Fn(WorldPoint) -> Option<WorldPoint> + Sync + 'a;
 
 /// Matches of one's own as a field in which the search may start ([`Known::start`]): the mean of
 /// the displacements of the nearest matches, weighted by the inverse square of their distance

@@ -139,7 +139,7 @@ pub(super) fn start(pair: &Pair<'_>, factor: [usize; 3]) -> Option<Start> {
         (a.at, a.displacement, [variance(0), variance(1), variance(2), 0.0, 0.0, 0.0])
     };
     let (field, _) = level::couple(pair, pair.anchors.iter().map(of), (&[0; 3], 0.3), None);
-    Some(Start { motion: Bodies::from(field.to_refine()), factor, followed: None })
+    Some(Start { motion: Bodies::from(field.before_passes()), factor, followed: None })
 }
 
 /// What became of the landmarks under a motion `at` a place of the full-resolution grid (voxels, mm

@@ -30,7 +30,7 @@ use std::borrow::Cow;
 
 /// A spline field on one level, with the state of its coupling.
 #[derive(Debug, Clone, PartialEq)]
-pub struct SplineField {
+pub(crate) struct SplineField {
     /// Nodes over the level's initial lattice.
     pub lattice: Lattice,
     /// Displacement (mm along the lattice's axes), planar.
@@ -83,7 +83,7 @@ impl SplineField {
     }
 
     /// The same without the information at its nodes.
-    pub fn without_blocks(&self) -> Self {
+    pub(crate) fn without_blocks(&self) -> Self {
         let Self { lattice, coefficients, smoothness, .. } = self;
         Self {
             lattice: lattice.clone(),
@@ -94,7 +94,7 @@ impl SplineField {
     }
 
     /// Of matches alone, with a bending energy to start passes from.
-    pub fn to_refine(mut self) -> Self {
+    pub(crate) fn before_passes(mut self) -> Self {
         self.smoothness.iter_mut().for_each(|s| *s = (PASS.initial_stiffening * *s).min(PASS.max_initial_smoothness));
         self
     }
@@ -154,7 +154,7 @@ const TWICING_PASSES: usize = 2;
 
 /// Passes from a settled field in which the bending energy holds the change alone (twicing; Tukey
 /// 1977): what it flattened of long waves comes back, and short ones stay out.
-pub fn twicing(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
+pub(crate) fn twicing(pair: &Pair<'_>, field: &mut SplineField, seed: u64) {
     let begun = field.coefficients.clone();
     advance(pair, field, &begun, Held::Change, TWICING_PASSES, seed, |_| ());
 }
@@ -309,7 +309,7 @@ pub fn posterior(field: &SplineField, spacing: [f64; 3], seed: u64) -> Posterior
 
 /// By how much the misfit shrinks from one warp to another, with the information that correlated
 /// noise leaves.
-pub fn gained(pair: &Pair<'_>, from: &[f32], to: Vec<f32>) -> f64 {
+pub(crate) fn gained(pair: &Pair<'_>, from: &[f32], to: Vec<f32>) -> f64 {
     residual::excess(pair, from, &Baseline::new(pair, to)) * f64::from(independent(pair))
 }
 
@@ -378,7 +378,7 @@ fn resampled(from: &Lattice, values: &[f32], to: &Lattice, place: impl Fn([f64; 
 
 /// What the feature stages need to know.
 #[derive(Debug, Clone, Copy)]
-pub struct MatchParams {
+pub(crate) struct MatchParams {
     /// Features wanted in the initial volume; up to five times as many in the deformed one.
     pub points: usize,
     /// Whether the number was asked for: then corners are sought voxel by voxel even where there
@@ -413,7 +413,7 @@ impl MatchParams {
 
 /// One feature's match on a level.
 #[derive(Debug, Clone, Copy)]
-pub struct LevelMatch {
+pub(crate) struct LevelMatch {
     /// Place (voxels of the level's initial lattice).
     pub voxel: [f64; 3],
     /// Displacement, covariance and the coupled field's displacement (mm along the lattice's axes).
@@ -626,7 +626,7 @@ fn template<'a>(pair: &'a Pair<'_>, radius: [usize; 3]) -> Template<'a> {
 /// The field that matches suggest once the deformed volume is warped by `field`: where that one is
 /// right their patches are no longer sheared, and where it is wrong what is missing has neighbours
 /// that are in place.
-pub fn matches_again(
+pub(crate) fn matches_again(
     pair: &Pair<'_>,
     field: &SplineField,
     params: MatchParams,

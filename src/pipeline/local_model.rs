@@ -180,13 +180,13 @@ impl Rest {
     }
 
     /// The uncertainty at a place (voxels in which it was judged) as a part of the free field's.
-    pub fn narrowed(&self, at: [f64; 3]) -> f32 {
+    pub(crate) fn narrowed(&self, at: [f64; 3]) -> f32 {
         (self.windows.stencil_near(at).gather(&self.ratio) / REST.uncertain_misfit)
             .clamp(REST.min_uncertainty_ratio, 1.0)
     }
 
     /// Whether so much is at rest that it is held there.
-    pub fn is_taken(&self) -> bool {
+    pub(crate) fn is_taken(&self) -> bool {
         self.share >= REST.min_fraction
     }
 

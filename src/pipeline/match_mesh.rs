@@ -52,7 +52,7 @@ pub(super) fn thinned(sparse: SparseField, wanted: usize) -> SparseField {
 ///
 /// # Errors
 /// [`FieldError`] when they do not span the space, or the plane of a `flat` volume.
-pub fn mesh_of(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
+pub(crate) fn mesh_of(sparse: &SparseField, flat: bool) -> Result<(Mesh, Vec<u32>), FieldError> {
     let places: Vec<WorldPoint> = sparse.kept().map(|m| m.initial).collect();
     if !flat {
         match delaunay3(&places) {

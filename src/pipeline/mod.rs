@@ -1,20 +1,20 @@
 //! The chains of stages that a library user calls.
 //!
-//! [`field`] is the page to read first: it calls the stages in order and times them. [`level`]
-//! holds what is done on one level of the pyramid, [`input_checks`] what is refused before any
+//! [`field`] is the page to read first: it calls the stages in order and times them. `level`
+//! holds what is done on one level of the pyramid, `input_checks` what is refused before any
 //! work, [`dry_run`] what a run would do; [`grasp`] is the grasp simulator's page.
 
 pub mod field;
 
-pub mod level;
+mod level;
 
-pub mod input_checks;
+mod input_checks;
 
 pub mod known;
 
 pub mod start;
 
-pub mod stages;
+mod stages;
 
 pub mod dry_run;
 

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Called with the fraction that is done (0 to 1); may be called from any thread.
-pub type Progress<'a> = &'a (dyn Fn(f64) + Sync);
+pub(crate) type Progress<'a> = &'a (dyn Fn(f64) + Sync);
 
 /// How thorough a search is.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,7 +53,7 @@ impl Effort {
     ///
     /// # Errors
     /// [`SynthError`] where the body is out of range.
-    pub fn stiffness_memory(&self) -> Result<u64, SynthError> {
+    pub(crate) fn stiffness_memory(&self) -> Result<u64, SynthError> {
         let grid = PhantomParams::new(PhantomKind::Inclusion).sized(self.side).grid()?;
         Ok(phantom_memory(&grid, true) + stiffness_memory(MESH_NODES[0] as usize))
     }
@@ -160,7 +160,7 @@ fn distrusted(result: &FieldResult) -> Option<String> {
 
 /// What makes a stiffness worse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum StiffnessAxis {
+pub(crate) enum StiffnessAxis {
     /// Noise of the displacement (per cent of the mean motion).
     Noise,
     /// Contrast of the ball.
@@ -189,7 +189,7 @@ impl StiffnessAxis {
 ///
 /// # Errors
 /// As [`Pressed::new`].
-pub fn stiffness_curves(
+pub(crate) fn stiffness_curves(
     effort: &Effort,
     quick: bool,
     axes: &[StiffnessAxis],

@@ -173,7 +173,7 @@ impl Case {
     }
 
     /// A trial without a result yet.
-    pub fn trial(&self, variant: &Variant, cpu_s: f64) -> Trial {
+    pub(crate) fn trial(&self, variant: &Variant, cpu_s: f64) -> Trial {
         Trial {
             part: Part::Field,
             varied: variant.varied,
@@ -241,7 +241,7 @@ pub fn exact(scene: &Scene) -> Scene {
 ///
 /// # Errors
 /// [`GraspError`] when the exact run cannot be made.
-pub fn grasp_trials(least_s: f64, progress: &dyn Fn(f64)) -> Result<Vec<Trial>, GraspError> {
+pub(crate) fn grasp_trials(least_s: f64, progress: &dyn Fn(f64)) -> Result<Vec<Trial>, GraspError> {
     let truth = simulate(&exact(&Scene::reference()), &|_| {})?;
     let steps = [4e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4];
     let fixed = [Method::Rk4, Method::SemiImplicitEuler]

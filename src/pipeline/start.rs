@@ -56,7 +56,7 @@ fn mean(places: impl Iterator<Item = WorldPoint>) -> [f64; 3] {
 ///
 /// # Errors
 /// [`FieldError::Start`] where the start has no value in the tissue, or turns it inside out.
-pub fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Result<AffineMap, FieldError> {
+pub(crate) fn affine_part(start: &StartMap<'_>, grid: &Grid, mask: Option<&Mask>) -> Result<AffineMap, FieldError> {
     let refuse = |what: &str, hint: &str| FieldError::Start { what: format!("the start {what}"), hint: hint.into() };
     let pairs: Vec<(WorldPoint, WorldPoint)> =
         places(grid, mask).into_iter().filter_map(|x| Some((x, start(x)?))).collect();
@@ -201,7 +201,7 @@ impl Moments {
 }
 
 /// The initial volume's tissue at places to compare with a deformed volume.
-pub struct Compared(Vec<(WorldPoint, f32)>);
+pub(crate) struct Compared(Vec<(WorldPoint, f32)>);
 
 impl Compared {
     /// From foreground voxels at a fixed step.
@@ -289,7 +289,7 @@ impl<'a> Begin<'a> {
     }
 
     /// Whether it begins anywhere but at rest.
-    pub fn is_affine(&self) -> bool {
+    pub(crate) fn is_affine(&self) -> bool {
         self.affine.is_some()
     }
 
@@ -397,7 +397,7 @@ fn said_of(map: &AffineMap, found: bool) -> String {
 ///
 /// # Errors
 /// As [`affine_part`].
-pub fn affine_of(field: &DenseField) -> Result<AffineMap, FieldError> {
+pub(crate) fn affine_of(field: &DenseField) -> Result<AffineMap, FieldError> {
     let grid = field.grid();
     let moved = |p: WorldPoint| {
         let at = nearest(grid.shape(), grid.affine().to_voxel(p))?;

@@ -31,7 +31,7 @@ use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
 /// from any thread.
-pub type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
+pub(crate) type Progress<'a> = &'a (dyn Fn(&str, f64) + Sync);
 
 /// What is given.
 #[derive(Clone, Copy)]
@@ -74,7 +74,7 @@ impl FieldQuality<'_> {
 
 /// Fewest matches in a body for them to be used unasked: what an identification needs, and a tenth
 /// that the mesh may leave out at the surface.
-pub const MIN_MATCHES_IN_BODY: usize = 110;
+pub(crate) const MIN_MATCHES_IN_BODY: usize = 110;
 
 /// Kept matches in the body.
 pub fn inside(matches: &SparseField, labels: &Mask) -> usize {

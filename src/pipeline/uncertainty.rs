@@ -108,7 +108,7 @@ impl Variances {
     }
 
     /// On the closest lattice of all bodies, each node's from the body there.
-    pub fn by_place(mut all: Vec<Self>, bodies: &Bodies) -> Self {
+    pub(crate) fn by_place(mut all: Vec<Self>, bodies: &Bodies) -> Self {
         if all.len() == 1 {
             return all.remove(0);
         }
@@ -140,7 +140,7 @@ impl Variances {
 
     /// Adds the doubt beside borders between bodies: voxels of the full-resolution grid with
     /// the jump there (mm). The lattice lies on a level of `factor`.
-    pub fn add_borders(&mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) {
+    pub(crate) fn add_borders(&mut self, jumps: Vec<([usize; 3], f32)>, factor: [usize; 3]) {
         let lattice = self.lattice.clone();
         let cell: usize = (0..3).filter(|&a| lattice.shape[a] > 1).map(|a| lattice.step[a] * factor[a]).product();
         let borders = self.part(ErrorSource::Borders);
@@ -152,19 +152,19 @@ impl Variances {
 
     /// Adds what other motions within the range of the search leave open (mm), where only this part
     /// of the features agree on the one that was found: the rest may be anywhere in that ball.
-    pub fn set_other_motions(&mut self, agreeing: f64, range: f64) {
+    pub(crate) fn set_other_motions(&mut self, agreeing: f64, range: f64) {
         let variance = ((1.0 - agreeing) * range * range / 5.0) as f32;
         self.part(ErrorSource::OtherMotions).fill(variance);
     }
 
     /// Adds the variance along an axis (mm^2) that landmarks show where most contradict the field.
-    pub fn add_landmarks(&mut self, variance: f64) {
+    pub(crate) fn add_landmarks(&mut self, variance: f64) {
         self.part(ErrorSource::OtherMotions).iter_mut().for_each(|v| *v += variance as f32);
     }
 
     /// Widens all where the volumes have different contrasts, of whose variance their relation
     /// leaves this part.
-    pub fn add_contrast(&mut self, left: f64) {
+    pub(crate) fn add_contrast(&mut self, left: f64) {
         let more = ((1.0 + SOURCE.contrast * left).powi(2) - 1.0) as f32;
         for m in 0..self.lattice.len() {
             let all: f32 = self.parts.iter().map(|part| part[m]).sum();

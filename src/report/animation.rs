@@ -19,7 +19,7 @@ const ACROSS: usize = 36;
 
 /// Pictures and meshes of the frames so far.
 #[derive(Debug)]
-pub struct Film {
+pub(crate) struct Film {
     grid: Grid,
     range: [f64; 2],
     planes: Vec<Plane>,

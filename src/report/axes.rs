@@ -191,7 +191,7 @@ pub fn document(width: f64, height: f64, content: &str) -> String {
 }
 
 /// Groups side by side, `columns` to a row, each of `size` px, as one SVG.
-pub fn tiled(columns: usize, size: [f64; 2], panels: &[(Panel, String)]) -> String {
+pub(crate) fn tiled(columns: usize, size: [f64; 2], panels: &[(Panel, String)]) -> String {
     let (gap, rows) = (24.0, panels.len().div_ceil(columns));
     let columns = columns.min(panels.len().max(1));
     let at = |i: usize| [gap + (i % columns) as f64 * (size[0] + gap), gap + (i / columns) as f64 * (size[1] + gap)];

@@ -37,7 +37,7 @@ pub const COLUMNS: [&str; 21] = [
 ];
 
 /// Columns of regions.csv over all pairs.
-pub const REGION_COLUMNS: [&str; 11] =
+pub(crate) const REGION_COLUMNS: [&str; 11] =
     ["name", "subject", "session", "label", "region", "youngs_modulus", "sd", "unit", "identifiable", "bound", "state"];
 
 /// A value as text; nothing where there is none.
@@ -99,7 +99,7 @@ pub fn row(o: &PairOutcome) -> Vec<String> {
 }
 
 /// Its lines of regions.csv.
-pub fn region_rows(o: &PairOutcome) -> Vec<Vec<String>> {
+pub(crate) fn region_rows(o: &PairOutcome) -> Vec<Vec<String>> {
     let one = |r: &Value| {
         let mut row = vec![o.name.clone(), o.subject.clone(), o.session.clone()];
         row.extend(["label", "name", "youngs_modulus", "sd"].map(|k| text(&r[k])));

@@ -18,7 +18,7 @@ use std::fmt::Write;
 
 /// A certificate with the scan that it is about.
 #[derive(Clone, Copy)]
-pub struct CertifyReport<'a> {
+pub(crate) struct CertifyReport<'a> {
     /// The scan and the second one (empty without), as they are called.
     pub names: [&'a str; 2],
     /// The scan.
@@ -51,7 +51,7 @@ pub fn headline(c: &Certificate) -> String {
 }
 
 /// The keys are those of docs/reference/file-formats.md.
-pub fn summary(report: &CertifyReport<'_>) -> Value {
+pub(crate) fn summary(report: &CertifyReport<'_>) -> Value {
     let c = report.certificate;
     let mut out = json!({
         "version": env!("CARGO_PKG_VERSION"),
@@ -77,7 +77,7 @@ fn comes_back(level: &str, from: Option<f64>) -> String {
 }
 
 /// What was found, a few lines.
-pub fn text(report: &CertifyReport<'_>) -> String {
+pub(crate) fn text(report: &CertifyReport<'_>) -> String {
     let c = report.certificate;
     let mut out = format!("{}\n", headline(c));
     let from = match c.image_noise_from {
@@ -125,7 +125,7 @@ pub fn text(report: &CertifyReport<'_>) -> String {
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
+pub(crate) fn page(report: &CertifyReport<'_>) -> Result<String, ReportError> {
     let c = report.certificate;
     let wave = |length: Option<f64>, name| match length {
         Some(w) => (significant(w), "mm", name),

@@ -22,7 +22,7 @@ fn over(picture: &Picture, label: &str, content: &str) -> String {
 
 /// The part of the displacement that lies in the section, as arrows `factor` times as long as in
 /// truth, coloured by the whole length. `background` must be of the same section.
-pub fn arrows(
+pub(crate) fn arrows(
     section: &Section,
     background: &Picture,
     field: &DenseField,
@@ -70,7 +70,7 @@ pub fn arrows(
 
 /// How many times longer than in truth arrows should be, so that one of `length` mm fills about two
 /// lattice steps.
-pub fn arrow_factor(sections: &[Section], length: f64) -> f64 {
+pub(crate) fn arrow_factor(sections: &[Section], length: f64) -> f64 {
     let step = sections.iter().map(|s| s.lattice(ACROSS).1).fold(f64::INFINITY, f64::min);
     let wanted = 2.0 * step / length.max(1e-6);
     [1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0].into_iter().rfind(|f| *f <= wanted).unwrap_or(1.0)

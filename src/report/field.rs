@@ -9,7 +9,7 @@ pub type Values<'a> = &'a (dyn Fn(usize) -> f32 + Sync);
 
 /// A result with the volumes it came from. All on the initial volume's grid.
 #[derive(Clone, Copy)]
-pub struct FieldReport<'a> {
+pub(crate) struct FieldReport<'a> {
     /// The subcommand, "field" or "demo".
     pub command: &'a str,
     /// Initial volume, deformed volume and mask, as they are called.

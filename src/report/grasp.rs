@@ -37,7 +37,7 @@ pub struct GraspReport<'a> {
 }
 
 /// An event in one line: time, kind, finger, what.
-pub fn event_line(e: &Event) -> String {
+pub(crate) fn event_line(e: &Event) -> String {
     let finger = e.finger.map_or(String::new(), |f| format!(" of finger {f}"));
     let until = e.until.filter(|u| *u > e.time).map_or(String::new(), |u| format!(" to {u:.3}"));
     format!("{:.3}{until} s: {}{finger}: {}", e.time, e.kind.name(), e.what)

@@ -21,7 +21,7 @@ use std::fmt::Write;
 
 /// An analysis with what it came from.
 #[derive(Debug, Clone, Copy)]
-pub struct AnalysisReport<'a> {
+pub(crate) struct AnalysisReport<'a> {
     /// The scene file's name.
     pub name: &'a str,
     /// The scene.

@@ -25,7 +25,7 @@ fn estimate(e: &Estimate, scale: f64) -> String {
 }
 
 /// What was fitted of one model, in a line.
-pub fn fitted_words(model: &ModelFit) -> String {
+pub(crate) fn fitted_words(model: &ModelFit) -> String {
     let damping = model.damping.map_or(String::new(), |c| format!(", c_n {} N s/m", estimate(&c, 1.0)));
     let evidence = match model.log_evidence {
         0.0 => "the best".into(),

@@ -35,7 +35,7 @@ fn lengths(scene: &Scene) -> Lengths {
 }
 
 /// The largest contact force over samples (N), at least 1e-9.
-pub fn largest_force(samples: &[Sample]) -> f64 {
+pub(crate) fn largest_force(samples: &[Sample]) -> f64 {
     let force = |s: &Sample| (0..2).map(|i| s.normal_force[i].hypot(s.tangential_force[i])).fold(0.0, f64::max);
     samples.iter().map(force).filter(|f| f.is_finite()).fold(1e-9, f64::max)
 }

@@ -78,7 +78,7 @@ pub fn surface(s: &EnergySurface, largest: f64) -> Result<String, ReportError> {
 }
 
 /// The colour of a state in the pinch map.
-pub fn state_colour(state: PinchState) -> &'static str {
+pub(crate) fn state_colour(state: PinchState) -> &'static str {
     match state {
         PinchState::Good => "#3c9a5f",
         PinchState::Slip => "#e3b341",
@@ -90,7 +90,7 @@ pub fn state_colour(state: PinchState) -> &'static str {
 }
 
 /// In words, for a legend.
-pub fn state_words(state: PinchState) -> &'static str {
+pub(crate) fn state_words(state: PinchState) -> &'static str {
     match state {
         PinchState::Good => "stable, no slip, in range",
         PinchState::Slip => "friction too low",

@@ -112,7 +112,7 @@ pub(super) fn listed(title: &str, all: &[String]) -> Markup {
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
+pub(crate) fn page(report: &FieldReport<'_>) -> Result<String, ReportError> {
     let views = Views::of(report)?;
     let body = html! {
         (head(report))

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 /// A file's name, kind, facts in order, and the commands that take it.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Facts {
+pub(crate) struct Facts {
     name: String,
     kind: String,
     /// Key, words (none where empty), value.
@@ -19,7 +19,7 @@ pub struct Facts {
 const LABELS: usize = 12;
 
 /// Whether all values are whole numbers from 0 to 255, and few of them.
-pub fn looks_like_labels(volume: &Volume) -> bool {
+pub(crate) fn looks_like_labels(volume: &Volume) -> bool {
     let mut seen = [false; 256];
     for &v in volume.as_slice() {
         if !(0.0..=255.0).contains(&v) || v.fract() != 0.0 {

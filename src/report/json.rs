@@ -18,7 +18,7 @@ pub fn seconds(stages: &[(String, f64)]) -> Map<String, Value> {
 }
 
 /// The keys are those of docs/reference/file-formats.md.
-pub fn field_summary(report: &FieldReport<'_>) -> Value {
+pub(crate) fn field_summary(report: &FieldReport<'_>) -> Value {
     let (s, judged) = (report.summary, verdict(report));
     let [initial, deformed, mask] = report.names;
     let mut out = json!({

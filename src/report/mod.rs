@@ -11,27 +11,27 @@ pub mod scale;
 
 pub mod statistics;
 
-pub mod section;
+pub(crate) mod section;
 
-pub mod picture;
+mod picture;
 
-pub mod drawing;
+mod drawing;
 
 pub mod node_plot;
 
-pub mod batch;
+pub(crate) mod batch;
 
-pub mod chain;
+pub(crate) mod chain;
 
 mod chart;
 
 pub mod figure;
 
-pub mod verdict;
+pub(crate) mod verdict;
 
-pub mod panels;
+pub(crate) mod panels;
 
-pub mod views;
+mod views;
 
 pub mod viewer;
 
@@ -41,11 +41,11 @@ mod tables;
 
 pub mod html;
 
-pub mod record;
+pub(crate) mod record;
 
-pub mod text;
+pub(crate) mod text;
 
-pub mod json;
+pub(crate) mod json;
 
 pub mod plot;
 
@@ -53,19 +53,19 @@ pub mod skin;
 
 pub mod info;
 
-pub mod animation;
+pub(crate) mod animation;
 
 pub mod track;
 
-pub mod grasp_measured;
+mod grasp_measured;
 
-pub mod grasp_scene;
+mod grasp_scene;
 
 pub mod grasp;
 
-pub mod grasp_surface;
+mod grasp_surface;
 
-pub mod grasp_analysis;
+pub(crate) mod grasp_analysis;
 
 pub mod strain;
 
@@ -75,11 +75,11 @@ pub mod plan;
 
 pub mod stiffness;
 
-pub mod axes;
+mod axes;
 
 pub mod frontier;
 
 pub mod robustness;
 
-pub use field::FieldReport;
+pub(crate) use field::FieldReport;
 pub use grasp::GraspReport;

@@ -40,7 +40,7 @@ impl Panel {
     ///
     /// # Errors
     /// As [`Panel::gray`].
-    pub fn coloured(
+    pub(crate) fn coloured(
         title: &str,
         sections: &[Section],
         base: (&Voxels<'_>, [f64; 2]),
@@ -57,14 +57,14 @@ impl Panel {
     }
 
     /// With a sentence on what to look for.
-    pub fn with_note(mut self, note: impl Into<String>) -> Self {
+    pub(crate) fn with_note(mut self, note: impl Into<String>) -> Self {
         self.note = note.into();
         self
     }
 }
 
 /// Gray levels for a volume: its 0.5th to its 99.7th percentile.
-pub fn gray_range(volume: &Voxels<'_>) -> [f64; 2] {
+pub(crate) fn gray_range(volume: &Voxels<'_>) -> [f64; 2] {
     let values = volume.as_slice();
     let picked = sample(values.len(), None);
     let at = |q| quantile(picked.iter().map(|&o| f64::from(values[o])), q);
@@ -79,7 +79,7 @@ pub fn length(field: &DenseField, offset: usize) -> f32 {
 
 /// Where to cut: the centre of the motion inside the mask (weights are squared lengths), the grid's
 /// middle when nothing moves.
-pub fn centre_of_motion(field: &DenseField, mask: Option<&Mask>) -> WorldPoint {
+pub(crate) fn centre_of_motion(field: &DenseField, mask: Option<&Mask>) -> WorldPoint {
     let grid = field.grid();
     let (mut sum, mut weight) = ([0.0; 3], 0.0);
     for o in sample(grid.len(), mask) {
@@ -99,7 +99,7 @@ pub fn centre_of_motion(field: &DenseField, mask: Option<&Mask>) -> WorldPoint {
 ///
 /// # Errors
 /// As [`Panel::gray`].
-pub fn synthetic_pair(
+pub(crate) fn synthetic_pair(
     initial: &Voxels<'_>,
     deformed: &Voxels<'_>,
     truth: &DenseField,

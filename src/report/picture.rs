@@ -61,7 +61,7 @@ impl Picture {
     }
 
     /// The picture as a `data:` address, for a page or drawing that stands alone.
-    pub fn data_uri(&self) -> String {
+    pub(crate) fn data_uri(&self) -> String {
         format!("data:image/png;base64,{}", STANDARD.encode(&self.png))
     }
 }

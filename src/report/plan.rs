@@ -12,7 +12,7 @@ use std::fmt::Write;
 
 /// A plan with what it was made of.
 #[derive(Debug, Clone, Copy)]
-pub struct PlanReport<'a> {
+pub(crate) struct PlanReport<'a> {
     /// The label map, as it is called.
     pub labels: &'a str,
     /// What was asked for.
@@ -103,7 +103,7 @@ fn quantity(plan: &Plan) -> &'static str {
 }
 
 /// The keys are those of docs/reference/file-formats.md.
-pub fn summary(report: &PlanReport<'_>) -> Value {
+pub(crate) fn summary(report: &PlanReport<'_>) -> Value {
     let plan = report.plan;
     let region = |r: &PlannedRegion| {
         let best = plan.best(r.label);
@@ -165,7 +165,7 @@ fn noises(plan: &Plan, voxel: Option<f64>) -> Vec<f64> {
 }
 
 /// What was found, a few lines.
-pub fn text(report: &PlanReport<'_>) -> String {
+pub(crate) fn text(report: &PlanReport<'_>) -> String {
     let plan = report.plan;
     let mut out = format!("{}\n", sentences(plan).join("\n"));
     let _ = writeln!(out, "  model        {}", plate(plan));
@@ -219,7 +219,7 @@ fn plot(plan: &Plan, region: &PlannedRegion, voxel: f64) -> Markup {
 }
 
 /// The page.
-pub fn page(report: &PlanReport<'_>) -> String {
+pub(crate) fn page(report: &PlanReport<'_>) -> String {
     let plan = report.plan;
     let labels: Vec<u8> = plan.determined().map(|r| r.label).collect();
     let all = plan.choice(&labels);

@@ -53,7 +53,7 @@ impl Line {
     }
 
     /// Dots called `name`.
-    pub fn dots(name: &str, colour: usize, points: Vec<[f64; 2]>) -> Self {
+    pub(crate) fn dots(name: &str, colour: usize, points: Vec<[f64; 2]>) -> Self {
         Self { shape: Shape::Dots, ..Self::new(name, colour, false, points) }
     }
 

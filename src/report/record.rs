@@ -25,7 +25,7 @@ pub fn command_line(record: &RunRecord) -> String {
 }
 
 /// `summary` with the keys of `record` added.
-pub fn in_summary(mut summary: Value, record: &RunRecord) -> Value {
+pub(crate) fn in_summary(mut summary: Value, record: &RunRecord) -> Value {
     if let (Value::Object(all), Ok(Value::Object(keys))) = (&mut summary, serde_json::to_value(record)) {
         all.extend(keys);
     }
@@ -33,7 +33,7 @@ pub fn in_summary(mut summary: Value, record: &RunRecord) -> Value {
 }
 
 /// `page` with the run at its end, above the footer.
-pub fn on_page(mut page: String, record: &RunRecord) -> String {
+pub(crate) fn on_page(mut page: String, record: &RunRecord) -> String {
     let rows = [
         ("Command line", command_line(record)),
         ("Run from", record.working_folder.clone()),

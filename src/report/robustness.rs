@@ -148,7 +148,7 @@ fn told(c: &StressCurve) -> String {
 }
 
 /// Share of the runs with a usable result whose 95 % band holds at least `share` of the errors.
-pub fn bands_that_hold(curves: &[StressCurve], part: Part, share: f64) -> Option<f64> {
+pub(crate) fn bands_that_hold(curves: &[StressCurve], part: Part, share: f64) -> Option<f64> {
     let sound = curves.iter().filter(|c| c.part == part).flat_map(|c| &c.runs).filter(|r| !r.broken());
     let (good, all) = sound
         .filter_map(|r| r.inside)

@@ -43,7 +43,7 @@ impl Scale {
     }
 
     /// Nine colours from the lower to the upper end.
-    pub fn stops(&self) -> [String; 9] {
+    pub(crate) fn stops(&self) -> [String; 9] {
         std::array::from_fn(|i| self.map.hex(i as f64 / 8.0))
     }
 }

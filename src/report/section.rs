@@ -83,7 +83,7 @@ fn canonical_axes(grid: &Grid) -> [Axis; 3] {
 /// A grid seen along right, front and up: places are mm from its first corner along the voxel axes
 /// nearest to these.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Canonical {
+pub(crate) struct Canonical {
     grid: Grid,
     axes: [Axis; 3],
 }
@@ -105,7 +105,7 @@ impl Canonical {
     }
 
     /// The whole extent (mm).
-    pub fn extent_mm(&self) -> [f64; 3] {
+    pub(crate) fn extent_mm(&self) -> [f64; 3] {
         self.axes.map(|a| a.len as f64 * a.spacing)
     }
 
@@ -131,7 +131,7 @@ impl Canonical {
     }
 
     /// Three rows of the matrix from a place to the world (mm, RAS).
-    pub fn to_world(&self) -> [[f64; 4]; 3] {
+    pub fn to_world(self) -> [[f64; 4]; 3] {
         let affine = self.grid.affine();
         let mut first = [0.0; 3];
         for a in &self.axes {
@@ -147,13 +147,13 @@ impl Canonical {
     }
 
     /// The planes that are more than one voxel wide and high.
-    pub fn planes(&self) -> Vec<Plane> {
+    pub(crate) fn planes(&self) -> Vec<Plane> {
         let thick = |p: &Plane| p.axes()[..2].iter().all(|&w| self.axes[w].len > 1);
         [Plane::Axial, Plane::Coronal, Plane::Sagittal].into_iter().filter(thick).collect()
     }
 
     /// Extent of a plane to the right and down (mm).
-    pub fn size_mm(&self, plane: Plane) -> [f64; 2] {
+    pub(crate) fn size_mm(&self, plane: Plane) -> [f64; 2] {
         let [h, v, _] = plane.axes();
         [h, v].map(|w| self.extent_mm()[w])
     }
@@ -195,7 +195,7 @@ impl Section {
     }
 
     /// Extent to the right and down (mm).
-    pub fn size_mm(&self) -> [f64; 2] {
+    pub(crate) fn size_mm(&self) -> [f64; 2] {
         let pixels = [self.width, self.height];
         [0, 1].map(|i| (pixels[i] * self.step) as f64 * self.axes[i].spacing)
     }
@@ -266,7 +266,7 @@ impl Section {
     }
 
     /// Thickness of the plane (mm).
-    pub fn thickness_mm(&self) -> f64 {
+    pub(crate) fn thickness_mm(&self) -> f64 {
         self.axes[2].spacing
     }
 }

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 
 /// What a skin scene gave.
-pub struct SkinReport<'a> {
+pub(crate) struct SkinReport<'a> {
     /// The scene file.
     pub name: &'a str,
     /// The scene.
@@ -41,7 +41,7 @@ fn figures(samples: &[SkinSample], scene: &SkinScene) -> [f64; 3] {
 }
 
 /// The keys are those of docs/reference/file-formats.md.
-pub fn summary(report: &SkinReport<'_>) -> Value {
+pub(crate) fn summary(report: &SkinReport<'_>) -> Value {
     let figures = |samples: Option<&[SkinSample]>| {
         samples.map(|s| {
             let [peak, held, left] = figures(s, report.scene);
@@ -87,7 +87,7 @@ fn headline(report: &SkinReport<'_>) -> String {
 }
 
 /// What was found, a few lines.
-pub fn text(report: &SkinReport<'_>) -> String {
+pub(crate) fn text(report: &SkinReport<'_>) -> String {
     let mut out = format!("{}\n", headline(report));
     let end = report.column.last();
     if let Some(single) = report.single {
@@ -109,7 +109,7 @@ pub fn text(report: &SkinReport<'_>) -> String {
 }
 
 /// The page.
-pub fn page(report: &SkinReport<'_>) -> String {
+pub(crate) fn page(report: &SkinReport<'_>) -> String {
     let scene = report.scene;
     let [peak, held, left] = figures(report.column, scene);
     let rows = scene.layers.iter().enumerate().map(|(at, l)| {

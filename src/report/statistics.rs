@@ -38,7 +38,7 @@ pub fn quantile(values: impl IntoIterator<Item = f64>, q: f64) -> f64 {
 /// Counts in equal bins between `low` and `high`; what lies outside counts in the end bins, NaN
 /// nowhere.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Histogram {
+pub(crate) struct Histogram {
     /// Lower edge of the first bin.
     pub low: f64,
     /// Upper edge of the last bin.

@@ -214,7 +214,7 @@ pub fn summary(result: &StiffnessResult, inputs: &InputNames) -> Value {
 
 /// What the page shows beside its maps, all on their grid.
 #[derive(Debug, Clone, Copy)]
-pub struct Shown<'a> {
+pub(crate) struct Shown<'a> {
     /// The displacement that the moduli came from.
     pub field: Option<&'a DenseField>,
     /// Volumes with what they are called, the first behind the maps.
@@ -281,7 +281,7 @@ fn look(
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn page(result: &StiffnessResult, inputs: &InputNames, shown: &Shown<'_>) -> Result<String, ReportError> {
+pub(crate) fn page(result: &StiffnessResult, inputs: &InputNames, shown: &Shown<'_>) -> Result<String, ReportError> {
     page_with(result, inputs, shown, &Markup::default())
 }
 
@@ -289,7 +289,11 @@ pub fn page(result: &StiffnessResult, inputs: &InputNames, shown: &Shown<'_>) ->
 ///
 /// # Errors
 /// As [`page`].
-pub fn sequence_page(shared: &SharedStiffness, inputs: &InputNames, shown: &Shown<'_>) -> Result<String, ReportError> {
+pub(crate) fn sequence_page(
+    shared: &SharedStiffness,
+    inputs: &InputNames,
+    shown: &Shown<'_>,
+) -> Result<String, ReportError> {
     page_with(&shared.result, inputs, shown, &sequence_section(shared))
 }
 
@@ -475,7 +479,7 @@ fn correlation_table(result: &StiffnessResult) -> Markup {
 }
 
 /// What a shared map adds to summary.json under `sequence`.
-pub fn sequence_summary(shared: &SharedStiffness) -> Value {
+pub(crate) fn sequence_summary(shared: &SharedStiffness) -> Value {
     let frame = |f: &FrameStiffness| {
         let (regions, why) = match &f.regions {
             Ok(r) => (json!(r), Value::Null),
@@ -489,7 +493,7 @@ pub fn sequence_summary(shared: &SharedStiffness) -> Value {
 }
 
 /// The lines that a shared map adds to the text.
-pub fn sequence_text(shared: &SharedStiffness) -> String {
+pub(crate) fn sequence_text(shared: &SharedStiffness) -> String {
     let tells = |f: &&FrameStiffness| f.regions.as_ref().is_ok_and(|all| all.iter().any(|r| r.identifiable));
     let told = shared.frames.iter().filter(tells).count();
     let mut out = format!("  frames       {told} of {} share these moduli", shared.frames.len());

@@ -19,7 +19,7 @@ use std::fmt::Write;
 
 /// Strain with what it was taken from, all on one grid.
 #[derive(Clone, Copy)]
-pub struct StrainReport<'a> {
+pub(crate) struct StrainReport<'a> {
     /// The field, as it is called.
     pub name: &'a str,
     /// The displacement (mm, RAS).
@@ -51,7 +51,7 @@ fn measure(report: &StrainReport<'_>) -> &'static str {
 }
 
 /// The result in a sentence.
-pub fn headline(report: &StrainReport<'_>) -> String {
+pub(crate) fn headline(report: &StrainReport<'_>) -> String {
     let s = report.summary;
     if !s.drawn {
         return format!(
@@ -77,7 +77,7 @@ fn gauge(s: &StrainSummary) -> String {
 }
 
 /// The keys are those of docs/reference/file-formats.md.
-pub fn summary(report: &StrainReport<'_>) -> Value {
+pub(crate) fn summary(report: &StrainReport<'_>) -> Value {
     let s = report.summary;
     let mut regions: BTreeMap<String, Map<String, Value>> = BTreeMap::new();
     for r in &s.regions {
@@ -129,7 +129,7 @@ fn rows(regions: &[RegionStrain]) -> Vec<Vec<String>> {
 }
 
 /// What was found, a few lines.
-pub fn text(report: &StrainReport<'_>) -> String {
+pub(crate) fn text(report: &StrainReport<'_>) -> String {
     let s = report.summary;
     let mut out = format!("{}\n", headline(report));
     let _ = writeln!(out, "  measure      {}", measure(report));
@@ -228,7 +228,7 @@ fn pictures(report: &StrainReport<'_>, lead: &str) -> Result<Markup, ReportError
 ///
 /// # Errors
 /// [`ReportError`] when a picture cannot be encoded.
-pub fn page(report: &StrainReport<'_>) -> Result<String, ReportError> {
+pub(crate) fn page(report: &StrainReport<'_>) -> Result<String, ReportError> {
     let s = report.summary;
     let voxels = report.bodies.as_slice().iter().filter(|l| **l != 0).count();
     let body = html! {

@@ -8,7 +8,7 @@ use crate::types::{BodyReport, Distances, InverseConsistency, LabelScore, LabelS
 use std::fmt::Write;
 
 /// What a field run found, a few lines.
-pub fn field_summary(report: &FieldReport<'_>) -> String {
+pub(crate) fn field_summary(report: &FieldReport<'_>) -> String {
     let (s, v) = (report.summary, verdict(report));
     let c = s.counts;
     let mut out = format!("{}\n", v.headline);

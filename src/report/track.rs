@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 /// A tracked sequence.
-pub struct TrackReport<'a> {
+pub(crate) struct TrackReport<'a> {
     /// What the volumes are called, by number.
     pub names: &'a [String],
     /// Number of the reference.
@@ -100,7 +100,7 @@ const WORTH_A_LOOK: f64 = 1.1;
 
 /// The frames that the viewer holds: as many as the page has room for, evenly spread, and the one
 /// that moves most.
-pub struct Looks {
+pub(crate) struct Looks {
     frames: usize,
     room: usize,
     held: Vec<Look>,
@@ -115,7 +115,7 @@ struct Look {
 }
 
 /// A frame to look at. All on the reference's grid.
-pub struct Seen<'a> {
+pub(crate) struct Seen<'a> {
     /// Its number.
     pub frame: usize,
     /// What it is called.
@@ -153,7 +153,7 @@ impl Looks {
     }
 
     /// Whether a frame of so much motion (mm, mean) is to be added.
-    pub fn wants(&self, frame: usize, mean_mm: f64) -> bool {
+    pub(crate) fn wants(&self, frame: usize, mean_mm: f64) -> bool {
         self.regular(frame) || self.held.iter().all(|l| mean_mm > WORTH_A_LOOK * l.mean_mm)
     }
 
@@ -213,7 +213,7 @@ fn gray([low, high]: [f64; 2]) -> Scale {
 }
 
 /// The keys are those of docs/reference/file-formats.md.
-pub fn summary(report: &TrackReport<'_>) -> Value {
+pub(crate) fn summary(report: &TrackReport<'_>) -> Value {
     let t = report.tracked;
     let each = of_frames(t).map(|(frame, text)| format!("frame {frame}: {text}"));
     let (trust, reasons) = judge_frames(&t.frames, report.judged);
@@ -236,7 +236,7 @@ pub fn summary(report: &TrackReport<'_>) -> Value {
 }
 
 /// What was found, a few lines.
-pub fn text(report: &TrackReport<'_>) -> String {
+pub(crate) fn text(report: &TrackReport<'_>) -> String {
     let t = report.tracked;
     let mut out = format!("{}\n", report.headline());
     for f in &t.frames {
@@ -272,7 +272,7 @@ fn of_frames(tracked: &Tracked) -> impl Iterator<Item = (usize, &str)> {
 
 /// All that a reader is to be warned of: what the volumes gave rise to, then frame by frame, where
 /// what differs in its numbers alone appears once, for the first of the frames.
-pub fn warnings(report: &TrackReport<'_>) -> Vec<String> {
+pub(crate) fn warnings(report: &TrackReport<'_>) -> Vec<String> {
     let wording = |text: &str| -> String { text.chars().filter(|c| !c.is_ascii_digit()).collect() };
     let mut kinds: Vec<(String, &str, Vec<usize>)> = Vec::new();
     for (frame, text) in of_frames(report.tracked) {
@@ -291,7 +291,7 @@ pub fn warnings(report: &TrackReport<'_>) -> Vec<String> {
 }
 
 /// The page.
-pub fn page(report: &TrackReport<'_>) -> String {
+pub(crate) fn page(report: &TrackReport<'_>) -> String {
     let t = report.tracked;
     let (all, measured) = (t.frames.len(), report.measured().count());
     let (trust, reasons) = judge_frames(&t.frames, report.judged);

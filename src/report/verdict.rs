@@ -8,7 +8,7 @@ use crate::types::{ErrorSource, FieldSummary, FrameSummary, Mask, MotionModel};
 
 /// A judgement with its reasons.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Verdict {
+pub(crate) struct Verdict {
     /// What was found, one or two sentences.
     pub headline: String,
     /// How far to rely on it.
@@ -33,7 +33,7 @@ pub fn verdict(report: &FieldReport<'_>) -> Verdict {
 
 /// As [`verdict`], from the bodies (0 where nothing was measured), the uncertainty by voxel (mm)
 /// and the summary alone.
-pub fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
+pub(crate) fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &FieldSummary) -> Verdict {
     let edge = bodies.grid().spacing().iter().product::<f64>().cbrt();
     let motion = match s.model {
         MotionModel::Identity if s.rejected => "Held still, as asked, though the volumes show motion".into(),
@@ -150,7 +150,7 @@ const OUT_OF_LINE: f64 = 0.25;
 /// Trust in the sequence is low where more than half of the frames are lost or of low trust, high
 /// where each frame is of high trust, else moderate. A frame in which more than a quarter of the
 /// tissue is out of line with the frames beside it is of low trust.
-pub fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
+pub(crate) fn judge_frames(frames: &[FrameSummary], judged: &[(usize, Verdict)]) -> (Trust, Vec<String>) {
     let of = |f: &FrameSummary| judged.iter().find(|j| j.0 == f.frame).map(|j| &j.1);
     let trust = |f: &FrameSummary| match f.trust {
         Some(trust) if f.out_of_line <= OUT_OF_LINE => trust,

@@ -261,7 +261,7 @@ impl Moment<'_> {
 
     /// How many moments of this number of images and overlays (with a field) a page has room for;
     /// at least one.
-    pub fn room(grid: &Grid, images: usize, overlays: usize) -> usize {
+    pub(crate) fn room(grid: &Grid, images: usize, overlays: usize) -> usize {
         let canonical = Canonical::of(grid);
         let voxels = |most| Thinned::new(&canonical, most).shape.iter().product::<usize>();
         let bytes = images * voxels(IMAGE_VOXELS) + (overlays + 6) * voxels(SMOOTH_VOXELS[1]);

@@ -13,7 +13,7 @@ use crate::types::{MotionModel, SparseField, Voxels, WorldPoint};
 
 /// Everything that is cut from the volumes, and the scales that go with it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Views {
+pub(crate) struct Views {
     /// Where the planes cross (mm, RAS).
     pub centre: WorldPoint,
     /// Initial, deformed and warped volume in gray.

@@ -2,12 +2,12 @@
 //!
 //! [`mod@column`] is exact: the laws are linear between the corners of the load, so the matrix
 //! exponential solves them, however stiff. [`block`] is a plane-strain finite element model with
-//! the same laws; [`single`] is one layer in place of several that are not alike.
+//! the same laws; `single` is one layer in place of several that are not alike.
 
 pub mod block;
 
 pub mod column;
 
-pub mod single;
+pub(crate) mod single;
 
 mod exponential;

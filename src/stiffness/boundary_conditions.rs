@@ -5,7 +5,7 @@
 //! comes to lie on one plane: the surface that is pushed in the furthest gives the plane, by least
 //! squares on its deformed places, and the patch is the surface that ends within a tolerance of it.
 //! On a curved body that is where the contact is looked for first only: a plate that nothing goes
-//! through, and that pulls nothing, finds it with the solution ([`crate::stiffness::contact`]). The
+//! through, and that pulls nothing, finds it with the solution (`crate::stiffness::contact`). The
 //! displacement of a patch is that of a plate, six numbers fitted to all its nodes, and these are
 //! fitted again with the moduli: no node's own noise is imposed on the solution.
 
@@ -167,7 +167,7 @@ impl Patch {
     }
 
     /// The displacement (mm) at `p` for a unit of plate parameter `k`.
-    pub fn basis(&self, k: usize, p: [f64; 3]) -> [f64; 3] {
+    pub(crate) fn basis(&self, k: usize, p: [f64; 3]) -> [f64; 3] {
         let r: [f64; 3] = std::array::from_fn(|a| (p[a] - self.middle[a]) / self.radius);
         let mut e = [0.0; 3];
         if self.contact == Contact::Sliding {
@@ -233,7 +233,7 @@ impl Patch {
     }
 
     /// Sum over its facets of their area (mm^2) times a value of the element behind.
-    pub fn backing(&self, body: &Body, value: impl Fn(usize) -> f64) -> f64 {
+    pub(crate) fn backing(&self, body: &Body, value: impl Fn(usize) -> f64) -> f64 {
         self.facets.iter().map(|&f| value(body.surface[f].element as usize) * body.surface[f].area).sum()
     }
 
@@ -261,7 +261,7 @@ impl Patch {
 
     /// Nodes that may touch the plate, where it is curved: those that were seen to, and of the
     /// facets beside them (ascending).
-    pub fn near_contact(&self, body: &Body) -> Option<Vec<u32>> {
+    pub(crate) fn near_contact(&self, body: &Body) -> Option<Vec<u32>> {
         let Landing { facets, .. } = self.landed()?;
         let touches = |n: &u32| self.nodes.binary_search(n).is_ok();
         let beside = facets.iter().map(|&f| body.surface[f].nodes).filter(|nodes| nodes.iter().any(touches));
@@ -270,13 +270,13 @@ impl Patch {
 
     /// Takes over from the same patch of another mesh whether it is curved: near the limit, facets
     /// that end elsewhere say otherwise, and the two would solve different problems.
-    pub fn bend_like(&mut self, other: &Self) {
+    pub(crate) fn bend_like(&mut self, other: &Self) {
         self.bends = other.curved();
     }
 
     /// How far inwards its foremost place goes (mm): the largest motion of its nodes against the
     /// normal.
-    pub fn travelled(&self, body: &Body) -> f64 {
+    pub(crate) fn travelled(&self, body: &Body) -> f64 {
         let inward = |p: [f64; 3]| match self.landed() {
             Some(Landing { plane: (q, normal), .. }) => dot(sub(p, *q), *normal),
             None => -dot(self.motion(p), self.normal),
@@ -325,7 +325,7 @@ pub fn travel(patches: &[Patch]) -> [f64; 3] {
 
 /// How far the loaded patch must go in against the held one to count as pressed (mm), where the
 /// motion of a surface node is known to `error` mm and voxels are `voxel` mm wide.
-pub fn least_travel(error: f64, voxel: f64) -> f64 {
+pub(crate) fn least_travel(error: f64, voxel: f64) -> f64 {
     (4.0 * error).max(0.02 * voxel)
 }
 

@@ -17,7 +17,7 @@ use crate::types::stiffness::{Law, Side};
 
 /// Pressure for a penetration of one element's size over the shear modulus of what is touched (of a
 /// press: the softest part).
-pub const PENALTY_STIFFNESS: f64 = 50.0;
+pub(crate) const PENALTY_STIFFNESS: f64 = 50.0;
 /// Penetration over which a plate reaches its stiffness (parts of an element's size).
 const ONSET_FRACTION: f64 = 0.02;
 /// Continuation of a solution over the depth of the press.

@@ -14,7 +14,7 @@ const KEAST_B: f64 = 0.138_196_601_125_010_5;
 
 /// Quadrature of degree 2: barycentric coordinates and weight (sum 1) of each of four points (Keast
 /// 1986).
-pub const RULE: [([f64; 4], f64); 4] = [
+pub(crate) const RULE: [([f64; 4], f64); 4] = [
     ([KEAST_A, KEAST_B, KEAST_B, KEAST_B], 0.25),
     ([KEAST_B, KEAST_A, KEAST_B, KEAST_B], 0.25),
     ([KEAST_B, KEAST_B, KEAST_A, KEAST_B], 0.25),
@@ -60,7 +60,7 @@ pub fn points(p: &[[f64; 3]; 10]) -> [Point; 4] {
 /// An element's places as a polynomial of the second to fourth barycentric coordinate `l`, and the
 /// straight element of its corners.
 #[derive(Debug, Clone, Copy)]
-pub struct Mapping {
+pub(crate) struct Mapping {
     origin: [f64; 3],
     /// What stands beside each `l_b`.
     linear: [[f64; 3]; 3],

@@ -12,13 +12,13 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 /// Nodes of an element: ten with a displacement, four with a pressure.
-pub const ELEMENT_NODES: usize = 14;
+pub(crate) const ELEMENT_NODES: usize = 14;
 /// Unknowns of an element: three displacements at each of ten nodes, a pressure at each of four.
-pub const ELEMENT_UNKNOWNS: usize = 34;
+pub(crate) const ELEMENT_UNKNOWNS: usize = 34;
 
 /// Most nodes of a mesh that is solved by factorisation: iterations need less memory, but more time
 /// for a plate on a curved body (docs/lab/2026-11-solver.md).
-pub const MAX_DIRECT_NODES: usize = 46_000;
+pub(crate) const MAX_DIRECT_NODES: usize = 46_000;
 
 /// A triangle of the surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -117,7 +117,7 @@ impl Body {
     ///
     /// # Errors
     /// As [`Self::new`].
-    pub fn eliminate_last(&mut self, nodes: &[u32]) -> Result<(), StiffnessError> {
+    pub(crate) fn eliminate_last(&mut self, nodes: &[u32]) -> Result<(), StiffnessError> {
         if self.levels.is_some() {
             return Ok(());
         }
@@ -136,7 +136,7 @@ impl Body {
     }
 
     /// Mean side of an element (mm).
-    pub fn element_size(&self) -> f64 {
+    pub(crate) fn element_size(&self) -> f64 {
         (self.volumes.iter().sum::<f64>() / self.cells.len() as f64).cbrt()
     }
 
@@ -146,7 +146,7 @@ impl Body {
     }
 
     /// Nodes of the elements of some regions, ascending.
-    pub fn nodes_in(&self, region: impl Fn(usize) -> bool) -> Vec<u32> {
+    pub(crate) fn nodes_in(&self, region: impl Fn(usize) -> bool) -> Vec<u32> {
         let inside = self.cells.iter().zip(&self.region).filter(|(_, r)| region(**r as usize));
         sorted(inside.flat_map(|(c, _)| *c))
     }
@@ -159,7 +159,7 @@ impl Body {
     }
 
     /// The unknowns of an element: thirty displacements, four pressures.
-    pub fn gather(&self, x: &[f64], e: usize) -> [f64; ELEMENT_UNKNOWNS] {
+    pub(crate) fn gather(&self, x: &[f64], e: usize) -> [f64; ELEMENT_UNKNOWNS] {
         let mut out = [0.0; ELEMENT_UNKNOWNS];
         for (i, &n) in self.cells[e].iter().enumerate() {
             let at = self.pattern.first(n);

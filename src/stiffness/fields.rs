@@ -28,7 +28,7 @@ pub fn volume(labels: &Mask) -> f64 {
 }
 
 /// The value of each voxel's region; 0 outside.
-pub fn by_label(labels: &Mask, known: &[u8], value: &dyn Fn(usize) -> f64) -> Volume {
+pub(crate) fn by_label(labels: &Mask, known: &[u8], value: &dyn Fn(usize) -> f64) -> Volume {
     let mut table = [0.0f32; 256];
     for (r, &label) in known.iter().enumerate() {
         table[label as usize] = value(r) as f32;
@@ -117,7 +117,7 @@ const WARN: Warnings =
 
 /// Says so where the plate also pushes the body sideways, so that it matters which force is known;
 /// `whole` is it over its part across the plate.
-pub fn leaning(force_n: f64, whole: f64) -> Option<String> {
+pub(crate) fn leaning(force_n: f64, whole: f64) -> Option<String> {
     (whole > 1.0 + WARN.leaning_force).then(|| {
         format!(
             "the plate pushes sideways as well: {force_n} N are taken for the whole force, of which {:.4} N act across the plate; if a load cell along \
@@ -140,7 +140,7 @@ pub fn left_over(left: LeftOver) -> Option<String> {
 }
 
 /// What of the field was left out, and whether the model leaves over much more than its noise.
-pub fn unfit(field: &Displacement<'_>, labels: &Mask, misfit: &Misfit) -> Vec<String> {
+pub(crate) fn unfit(field: &Displacement<'_>, labels: &Mask, misfit: &Misfit) -> Vec<String> {
     let mut out = Vec::new();
     let body = labels.as_slice().iter().enumerate().filter(|(_, l)| **l > 0);
     let empty = body.filter(|(o, _)| field.at(*o).iter().any(|v| !v.is_finite())).count();
@@ -170,7 +170,7 @@ pub fn unfit(field: &Displacement<'_>, labels: &Mask, misfit: &Misfit) -> Vec<St
 }
 
 /// Says so where the field is one affine map and there are regions to distinguish.
-pub fn one_map(is_affine: bool, regions: usize) -> Option<String> {
+pub(crate) fn one_map(is_affine: bool, regions: usize) -> Option<String> {
     (is_affine && regions > 1).then(|| {
         "the displacement field is one affine map: either all regions are equally stiff, or the registration was limited to affine maps \
          and shows no contrast. Measure with a free field"
@@ -200,7 +200,7 @@ fn cut_off(level: &Level, labels: &Mask) -> Option<String> {
 const BORDER_NAMES: [[&str; 2]; 3] = [["first x", "last x"], ["first y", "last y"], ["first z", "last z"]];
 
 /// How the sentence on a region without a modulus begins.
-pub fn not_determined(name: &str) -> String {
+pub(crate) fn not_determined(name: &str) -> String {
     format!("the data do not determine the modulus of {name}:")
 }
 
@@ -271,7 +271,7 @@ pub fn warnings(
 }
 
 /// Says which regions' moduli leave no trace in the field.
-pub fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usize) -> Vec<String> {
+pub(crate) fn not_shown(hidden: &[Hidden], regions: &[RegionStiffness], reference: usize) -> Vec<String> {
     let one = |h: &Hidden| {
         let name = regions.iter().find(|r| r.label == h.label).map_or("a region", |r| &r.name);
         let why = match h.share {

@@ -100,7 +100,7 @@ impl<'a> Problem<'a> {
     }
 
     /// Brings its plate to a height (mm).
-    pub fn lowered(&mut self, height: f64) -> &Self {
+    pub(crate) fn lowered(&mut self, height: f64) -> &Self {
         self.plate.iter_mut().for_each(|p| p.height = height);
         self
     }
@@ -220,14 +220,6 @@ impl<'a> Problem<'a> {
         self.reach(start, precision, TANGENT_REUSE.derivative_distance)
     }
 
-    /// As [`Self::solve`], without a tangent for derivatives.
-    ///
-    /// # Errors
-    /// As [`Self::solve`].
-    pub fn displaced(&self, start: Option<&[f64]>, precision: f64) -> Result<Vec<f64>, StiffnessError> {
-        Ok(self.reach(start, precision, f64::INFINITY)?.x)
-    }
-
     /// Solves by Newton's method from a solution nearby. `precision` (mm) ends it.
     ///
     /// # Errors
@@ -237,7 +229,7 @@ impl<'a> Problem<'a> {
     }
 
     /// Whether it is one linear system: a plate that is touched here and there makes it none.
-    pub fn is_linear(&self) -> bool {
+    pub(crate) fn is_linear(&self) -> bool {
         self.law == Law::Linear && self.plate.is_none()
     }
 
@@ -246,7 +238,7 @@ impl<'a> Problem<'a> {
     ///
     /// # Errors
     /// [`StiffnessError`] when the body can move freely.
-    pub fn solve_with(
+    pub(crate) fn solve_with(
         &self,
         start: Option<&[f64]>,
         factor: impl FnOnce(Matrix) -> Result<Tangent<'a>, StiffnessError>,
@@ -287,7 +279,7 @@ impl<'a> Problem<'a> {
 
     /// Solves from `start` by steps with the factorised tangent of a problem nearby (the chord
     /// method); none where these do not contract. `precision` (mm) ends it.
-    pub fn solve_near(&self, start: &[f64], factor: &Tangent<'_>, precision: f64) -> Option<Vec<f64>> {
+    pub(crate) fn solve_near(&self, start: &[f64], factor: &Tangent<'_>, precision: f64) -> Option<Vec<f64>> {
         let (mut x, mut last) = (start.to_vec(), f64::INFINITY);
         for _ in 0..MAX_NEWTON_STEPS {
             let mut step = self.residual(&x)?;

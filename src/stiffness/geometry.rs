@@ -158,7 +158,7 @@ impl Part {
 /// What the offsets change.
 #[derive(Debug, Clone, Default)]
 pub struct Geometry {
-    /// Faces, as `+0` ... by voxel axis, `edge`, and interfaces ([`Interface::name`]), and their
+    /// Faces, as `+0` ... by voxel axis, `edge`, and interfaces (`Interface::name`), and their
     /// offsets outwards or up the axis (voxels).
     pub faces: Vec<(String, f64)>,
     /// Offsets of the inclusions' shapes (voxels), one inclusion after the other.
@@ -227,7 +227,7 @@ pub fn open(
 
 /// A step of moduli, plates and the open parts of the shape together.
 #[derive(Debug, Clone)]
-pub struct JointStep {
+pub(crate) struct JointStep {
     /// How much further outwards each open part lies (voxels), for all that the data say.
     pub offsets: Vec<f64>,
     /// Change of the moduli and the plates.
@@ -319,7 +319,7 @@ fn columns(
 /// A covariance (row by row) of `p` parameters, those from `first` on offsets, with what the mesh
 /// is off by in each, however well the data tell the place: all else follows it as it would another
 /// place. `voxel` is that of the image over the one that offsets count in.
-pub fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f64> {
+pub(crate) fn with_mesh(by_data: Vec<f64>, p: usize, first: usize, voxel: f64) -> Vec<f64> {
     let mut out = by_data.clone();
     for k in first..p {
         let follows: Vec<f64> =

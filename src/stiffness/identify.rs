@@ -192,7 +192,7 @@ impl Setup<'_> {
     ///
     /// # Errors
     /// [`StiffnessError`] when no equilibrium is found.
-    pub fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
+    pub(crate) fn solve(&self, state: &State, precision: f64) -> Result<(Problem<'_>, Solution<'_>), StiffnessError> {
         let problem = self.problem(state);
         // What was measured to touch is nearer to the truth than what a body as it was would touch.
         let plate = problem.plate.as_ref().filter(|_| state.x.is_none());
@@ -228,7 +228,7 @@ impl Setup<'_> {
     }
 
     /// Right-hand sides for the plates' parameters, one after the other.
-    pub fn plate_sides(&self, problem: &Problem<'_>, x: &[f64]) -> Vec<f64> {
+    pub(crate) fn plate_sides(&self, problem: &Problem<'_>, x: &[f64]) -> Vec<f64> {
         let (body, n) = (self.body, self.body.pattern.unknowns());
         let (mut out, zero) = (Vec::new(), vec![0.0; n]);
         for (i, patch) in self.patches.iter().enumerate() {
@@ -280,7 +280,7 @@ impl Setup<'_> {
 
     /// By how many times the whole force on the loaded plate is more than its part across it (1 at
     /// least), told as in `forces`.
-    pub fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
+    pub(crate) fn leaning(&self, problem: &Problem<'_>, state: &State, x: &[f64]) -> f64 {
         let whole = self.whole_force(problem, state, x);
         length(whole) / dot(whole, self.patches[1].normal).abs().max(f64::MIN_POSITIVE)
     }
@@ -460,7 +460,7 @@ impl Setup<'_> {
 
     /// The state a step further: moduli and plates by the step, the solution to first order by its
     /// derivatives.
-    pub fn advanced(&self, state: &State, x: &[f64], columns: &[f64], step: &[f64]) -> State {
+    pub(crate) fn advanced(&self, state: &State, x: &[f64], columns: &[f64], step: &[f64]) -> State {
         let mut out = State { x: None, ..state.clone() };
         let mut values = step.iter().copied();
         for r in self.free() {
@@ -483,7 +483,7 @@ impl Setup<'_> {
     }
 
     /// 1 / variance and present distance of each parameter's prior.
-    pub fn prior_terms(&self, state: &State) -> Vec<(f64, f64)> {
+    pub(crate) fn prior_terms(&self, state: &State) -> Vec<(f64, f64)> {
         let moduli = self.free().into_iter().map(|r| (PRIOR_SD_LN.powi(-2), state.theta[r]));
         let plates = state.plates.iter().flatten().map(|&c| (self.plate_prior.powi(-2), c));
         moduli.chain(plates).collect()

@@ -14,7 +14,7 @@ use crate::types::{Mask, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// Functions of the direction that describe a shape.
-pub const SHAPE_FUNCTIONS: usize = 9;
+pub(crate) const SHAPE_FUNCTIONS: usize = 9;
 /// Prior standard deviation of each offset (radii).
 const PRIOR_SD_RADII: f64 = 0.25;
 /// Least distance (voxels) from another region, and from the body's surface for a region inside it.
@@ -185,7 +185,7 @@ impl Inclusion {
     }
 
     /// One standard deviation of each offset before anything is known (mm).
-    pub fn prior(&self) -> f64 {
+    pub(crate) fn prior(&self) -> f64 {
         PRIOR_SD_RADII * self.radius
     }
 

@@ -49,7 +49,7 @@ const OUTLINE_FIT: OutlineFit = OutlineFit {
 
 /// The rim of a flat punch.
 #[derive(Debug, Clone, Default)]
-pub struct Rim {
+pub(crate) struct Rim {
     /// Places around it (grid mm: voxel index times spacing).
     pub places: Vec<[f64; 3]>,
     /// Where it runs; none where it is not seen all around the middle of the patch.

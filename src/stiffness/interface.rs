@@ -118,7 +118,7 @@ impl Interface {
     }
 
     /// Whether it is the wall of a hole.
-    pub fn is_wall(&self) -> bool {
+    pub(crate) fn is_wall(&self) -> bool {
         self.labels[0] == 0
     }
 

@@ -37,7 +37,7 @@ fn products<const L: usize>(weights: &[f32], a: &[[f32; L]], b: &[[f32; L]]) -> 
 }
 
 /// Norms under `weights`, side by side.
-pub fn norms<const L: usize>(weights: &[f32], a: &[[f32; L]]) -> [f64; L] {
+pub(crate) fn norms<const L: usize>(weights: &[f32], a: &[[f32; L]]) -> [f64; L] {
     products(weights, a, a).map(f64::sqrt)
 }
 

@@ -192,7 +192,7 @@ pub fn tangent(
 
 /// The largest principal strain (1) at a point of the element, of the symmetric part of the
 /// displacement's gradient, by size.
-pub fn largest_principal_strain(q: &Point, x: &[f64; ELEMENT_UNKNOWNS]) -> f64 {
+pub(crate) fn largest_principal_strain(q: &Point, x: &[f64; ELEMENT_UNKNOWNS]) -> f64 {
     let g = gradient(q, x);
     let strain: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| 0.5 * (g[i][j] + g[j][i])));
     symmetric_eigen(&strain).iter().map(|e| e.0.abs()).fold(0.0, f64::max)

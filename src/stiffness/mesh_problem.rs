@@ -20,11 +20,11 @@ use crate::types::{Displacement, Grid, Mask, QuadraticMesh, SparseField, WorldPo
 /// Error of the finite elements on smooth fields (voxels): a few micrometres at half a millimetre.
 pub(super) const MESH_ERROR_VOXELS: f64 = 0.005;
 /// Fewest observations of a body.
-pub const MIN_OBSERVATIONS: usize = 100;
+pub(crate) const MIN_OBSERVATIONS: usize = 100;
 
 /// One standard deviation of a plate's motion about the fitted one (mm), where that of a surface
 /// node is known to `error` mm and voxels are `voxel` mm wide.
-pub fn plate_prior(voxel: f64, error: f64) -> f64 {
+pub(crate) fn plate_prior(voxel: f64, error: f64) -> f64 {
     // The surface motion is extrapolated by half a voxel; the plate may be off by as much of the
     // motion's change.
     0.25 * voxel + 3.0 * error
@@ -143,7 +143,7 @@ impl Level {
     }
 
     /// Moves the open parts, each by its offset in voxels outwards from where the voxels put it.
-    pub fn move_to(&mut self, offsets: &[f64]) {
+    pub(crate) fn move_to(&mut self, offsets: &[f64]) {
         if self.offsets() == offsets {
             return;
         }
@@ -163,7 +163,7 @@ impl Level {
     }
 
     /// Moves the open parts back to where the voxels put them.
-    pub fn move_back(&mut self) {
+    pub(crate) fn move_back(&mut self) {
         self.move_to(&vec![0.0; self.open.len()]);
     }
 
@@ -185,7 +185,7 @@ impl Level {
     ///
     /// # Errors
     /// As [`Body::new`].
-    pub fn contact_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
+    pub(crate) fn contact_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
         for (own, theirs) in self.patches.iter_mut().zip(&other.patches) {
             own.bend_like(theirs);
             own.contact = theirs.contact;
@@ -198,7 +198,7 @@ impl Level {
     ///
     /// # Errors
     /// As [`Body::new`].
-    pub fn settle_shape(&mut self) -> Result<(), StiffnessError> {
+    pub(crate) fn settle_shape(&mut self) -> Result<(), StiffnessError> {
         self.open_parts();
         if let Some(nodes) = self.patches[1].near_contact(&self.body).filter(|_| !self.ordered) {
             self.body.eliminate_last(&nodes)?;
@@ -223,7 +223,7 @@ impl Level {
     ///
     /// # Errors
     /// As [`Body::new`].
-    pub fn touch_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
+    pub(crate) fn touch_like(&mut self, other: &Level) -> Result<(), StiffnessError> {
         self.contact_like(other)?;
         let [own, asked] = [&*self, other].map(|l| l.patches[1].area(&l.body));
         let of = |part: &Part| other.open.iter().find(|(p, _)| p.name == part.name).map_or(0.0, |o| o.1);

@@ -6,7 +6,7 @@
 //! field that covers it, and two patches of the surface that move against each other. Fails with a
 //! [`StiffnessError`](crate::error::StiffnessError).
 
-pub mod elements;
+pub(crate) mod elements;
 
 pub mod law;
 
@@ -14,21 +14,21 @@ pub mod fem_body;
 
 pub mod forward;
 
-pub mod krylov;
+mod krylov;
 
-pub mod saddle;
+mod saddle;
 
-pub mod tangent;
+mod tangent;
 
 pub mod observations;
 
 pub mod boundary_conditions;
 
-pub mod contact;
+pub(crate) mod contact;
 
-pub mod patch_motion;
+mod patch_motion;
 
-pub mod indenter_outline;
+pub(crate) mod indenter_outline;
 
 pub mod identify;
 
@@ -36,28 +36,28 @@ pub mod mesh_problem;
 
 pub mod model_selection;
 
-pub mod summary;
+pub(crate) mod summary;
 
-pub mod verdict;
+pub(crate) mod verdict;
 
 pub mod fields;
 
-pub mod sequence;
+pub(crate) mod sequence;
 
-pub mod unlabelled;
+pub(crate) mod unlabelled;
 
-pub mod support;
+pub(crate) mod support;
 
 pub mod geometry;
 
-pub mod systematic_error;
+pub(crate) mod systematic_error;
 
-pub mod punch_edge;
+mod punch_edge;
 
-pub mod border;
+mod border;
 
-pub mod inclusion;
+pub(crate) mod inclusion;
 
-pub mod interface;
+pub(crate) mod interface;
 
-pub mod rigid_rotation;
+pub(crate) mod rigid_rotation;

@@ -11,7 +11,7 @@ use crate::types::stiffness::{Contact, Evidence, Law, LawChoice, StiffnessParams
 
 /// Decrease of the information criterion from which a larger model is chosen (Kass and Raftery
 /// 1995: more than 10 is very strong).
-pub const MIN_BIC_GAIN: f64 = 10.0;
+pub(crate) const MIN_BIC_GAIN: f64 = 10.0;
 /// Largest principal strain (95th percentile) for the linear law: its error is of the order of the
 /// strain, and exceeds that of a modulus beyond.
 const MAX_LINEAR_STRAIN: f64 = 0.05;
@@ -106,7 +106,7 @@ fn contacts(level: &Level) -> [Vec<Contact>; 2] {
 }
 
 /// Whether several contacts would be tried.
-pub fn has_rivals(level: &Level) -> bool {
+pub(crate) fn has_rivals(level: &Level) -> bool {
     contacts(level).iter().any(|c| c.len() > 1)
 }
 
@@ -400,7 +400,7 @@ fn shown(question: &'static str, model: String, e: &Estimate, bic: f64, chosen: 
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-pub fn settle(
+pub(crate) fn settle(
     level: &mut Level,
     law: Law,
     params: &StiffnessParams,
@@ -442,7 +442,7 @@ pub fn settle(
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-pub fn as_meshed(
+pub(crate) fn as_meshed(
     level: &mut Level,
     law: Law,
     params: &StiffnessParams,
@@ -469,7 +469,7 @@ const KNOWN_MODULI: KnownModuli = KnownModuli { max_runs: 3, tolerance_ln: 1e-3 
 ///
 /// # Errors
 /// As [`crate::stiffness::identify::Setup::run`].
-pub fn known_moduli(
+pub(crate) fn known_moduli(
     level: &mut Level,
     law: Law,
     params: &StiffnessParams,

@@ -81,7 +81,7 @@ pub fn gradient((element, weights): &Reading, body: &Body, x: &[f64]) -> [[f64; 
 }
 
 /// How each observation is read in a body; none where a part of it lies outside.
-pub fn readings(body: &Body, observations: &[Observation]) -> Vec<Option<Vec<Reading>>> {
+pub(crate) fn readings(body: &Body, observations: &[Observation]) -> Vec<Option<Vec<Reading>>> {
     let places: Vec<[f64; 3]> = observations.iter().flat_map(Observation::places).copied().collect();
     let mut rest = find(body, &places).into_iter();
     let one = |o: &Observation| {
@@ -187,7 +187,7 @@ fn spread(block: usize) -> f64 {
 }
 
 /// Voxels along the edge of the blocks that a body of `voxels` voxels is averaged over.
-pub fn block_for(voxels: usize) -> usize {
+pub(crate) fn block_for(voxels: usize) -> usize {
     (1..6).find(|b| voxels / (b * b * b) <= MAX_DENSE_SAMPLES).unwrap_or(6)
 }
 
@@ -300,12 +300,12 @@ pub fn from_matches(body: &Body, field: &Displacement<'_>, matches: &SparseField
 }
 
 /// Reach (voxels) within which the motion at a place of the surface is read.
-pub const SURFACE_REACH_VOXELS: f64 = 3.0;
+pub(crate) const SURFACE_REACH_VOXELS: f64 = 3.0;
 
 /// The field and its standard error (mm, a component) at a place of the surface: an affine fit to
 /// the voxels of the mask within `reach` voxels, so that nothing outside the body is read and noise
 /// is averaged.
-pub fn at_surface(field: &Displacement<'_>, mask: &Mask, p: [f64; 3], reach: f64) -> Option<([f64; 3], f64)> {
+pub(crate) fn at_surface(field: &Displacement<'_>, mask: &Mask, p: [f64; 3], reach: f64) -> Option<([f64; 3], f64)> {
     let grid = field.grid();
     let (shape, at) = (grid.shape(), grid.affine().to_voxel(WorldPoint(p)).0);
     let range = |a: usize| {

@@ -15,7 +15,7 @@ const MIN_INDEPENDENT_FRACTION: f64 = 1e-3;
 
 /// Displacements at the nodes of a patch.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Smoothed {
+pub(crate) struct Smoothed {
     /// Displacement of each node (mm, RAS).
     pub values: Vec<[f64; 3]>,
     /// Functions that each component took.

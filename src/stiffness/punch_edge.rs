@@ -51,7 +51,7 @@ impl Edge {
 
     /// Where `p` comes to lie when the punch is wider by `offset` (mm) all around: what is below
     /// moves less and less.
-    pub fn widened(&self, p: [f64; 3], offset: f64) -> [f64; 3] {
+    pub(crate) fn widened(&self, p: [f64; 3], offset: f64) -> [f64; 3] {
         let (across, height) = self.apart(p);
         let beyond = ((length(across) - self.radius) / self.beside).max(0.0);
         let below = (height.abs() / self.radius).min(1.0);

@@ -17,7 +17,7 @@ const RIGID_TOLERANCE: f64 = 1e-4;
 
 /// A rotation about the middle of a body after its motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Turn {
+pub(crate) struct Turn {
     rotation: Matrix3,
     /// Mean place of the body after the motion (mm, RAS).
     middle: [f64; 3],
@@ -25,7 +25,7 @@ pub struct Turn {
 
 /// The affine motion nearest to a field over a body: q = after + gradient (p - before).
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Affinity {
+pub(crate) struct Affinity {
     before: [f64; 3],
     after: [f64; 3],
     gradient: Matrix3,
@@ -68,7 +68,7 @@ impl Affinity {
 
     /// Whether it is all of the field but for rounding: free registrations leave a hundredth of the
     /// deformation and more, those limited to affine maps what single precision does, 1e-6.
-    pub fn is_all_of(&self, field: &Displacement<'_>, labels: &Mask) -> bool {
+    pub(crate) fn is_all_of(&self, field: &Displacement<'_>, labels: &Mask) -> bool {
         let (mut left, mut whole) = (0.0, 0.0);
         for (p, q) in moved(field, labels) {
             let arm: [f64; 3] = std::array::from_fn(|a| p[a] - self.before[a]);
@@ -103,12 +103,12 @@ impl Turn {
     }
 
     /// The field without it.
-    pub fn undone(&self, field: &Displacement<'_>) -> DenseField {
+    pub(crate) fn undone(&self, field: &Displacement<'_>) -> DenseField {
         DenseField::from_voxels(*field.grid(), |o, p| self.without(p.0, field.at(o).map(f64::from)))
     }
 
     /// The matches without it.
-    pub fn undone_matches(&self, matches: &SparseField) -> SparseField {
+    pub(crate) fn undone_matches(&self, matches: &SparseField) -> SparseField {
         let mut out = matches.clone();
         for m in &mut out.matches {
             let WorldPoint(p) = m.initial;

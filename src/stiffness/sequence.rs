@@ -17,11 +17,11 @@ const MIN_RELATIVE_SD: f64 = 1e-4;
 const EQUAL_ERROR_RATIO: f64 = 1.1;
 
 /// What a frame says of a region, and its mean motion (mm).
-pub type Said<'a> = (&'a RegionStiffness, f64);
+pub(crate) type Said<'a> = (&'a RegionStiffness, f64);
 
 /// Combines what frames say of one region, in the order given; element 1 of `which` is the ratio, 0
 /// the modulus. The last entry holds all frames; empty where none determines the region.
-pub fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
+pub(crate) fn combine(frames: &[Said<'_>], which: usize) -> Vec<Gain> {
     let value = |r: &RegionStiffness| [r.youngs_modulus, r.ratio][which];
     let one = |&(r, motion): &Said<'_>| {
         let (value, sd) = [(r.youngs_modulus, r.sd), (r.ratio, r.ratio_sd)][which];

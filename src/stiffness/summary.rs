@@ -12,7 +12,7 @@ use crate::types::space::dot;
 use crate::types::stiffness::{Law, StiffnessParams};
 
 /// Largest standard deviation of ln E of an identified modulus: two of them are a factor of two.
-pub const MAX_IDENTIFIED_SD_LN: f64 = 0.35;
+pub(crate) const MAX_IDENTIFIED_SD_LN: f64 = 0.35;
 /// Motion of the tissue (parts of the plates' motion) for a modulus e times as large, below which
 /// the data do not show a region.
 struct Visibility {
@@ -31,12 +31,12 @@ const VISIBILITY: Visibility =
     Visibility { suspect_motion: 0.02, min_motion: 0.005, max_body_fraction: 0.02, tolerance: 0.02 };
 
 /// Part of the force borne by a hidden region, from which the other moduli are bounds only.
-pub const MIN_LOAD_SHARE: f64 = 0.03;
+pub(crate) const MIN_LOAD_SHARE: f64 = 0.03;
 /// Contrast (ln 12) beyond which a region is compared with a rigid one.
 const MAX_UNCHECKED_CONTRAST_LN: f64 = 2.5;
 /// Contrast (ln 50) beyond which a modulus is a bound: mesh and labels leave more open than such a
 /// region deforms.
-pub const MAX_IDENTIFIED_CONTRAST_LN: f64 = 3.9;
+pub(crate) const MAX_IDENTIFIED_CONTRAST_LN: f64 = 3.9;
 
 /// ln E of each region with gradient and covariance.
 #[derive(Debug, Clone)]
@@ -52,7 +52,7 @@ pub struct Moduli {
 impl Moduli {
     /// With the covariance of `data` more.
     #[must_use]
-    pub fn widened(mut self, data: &Moduli) -> Self {
+    pub(crate) fn widened(mut self, data: &Moduli) -> Self {
         let add = |own: &mut Vec<f64>, more: &[f64]| own.iter_mut().zip(more).for_each(|(a, b)| *a += b);
         add(&mut self.covariance, &data.covariance);
         add(&mut self.ratio_variance, &data.ratio_variance);
@@ -90,7 +90,7 @@ pub fn moduli(setup: &Setup<'_>, estimate: &Estimate, geometry: Option<&Geometry
 }
 
 /// The same with another covariance of the parameters and offsets.
-pub fn with_covariance(
+pub(crate) fn with_covariance(
     setup: &Setup<'_>,
     estimate: &Estimate,
     geometry: Option<&Geometry>,
@@ -139,7 +139,7 @@ pub fn with_covariance(
 
 /// A region of whose modulus the data show nothing.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hidden {
+pub(crate) struct Hidden {
     /// Its label.
     pub label: u8,
     /// By how much a modulus e times as large moves the tissue where it moves it most, the others
@@ -155,7 +155,7 @@ pub struct Hidden {
 ///
 /// It is looked for where all moduli are alike, under the linear law: a modulus that went astray
 /// would hide itself. None as well where that cannot be solved.
-pub fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
+pub(crate) fn least_seen(setup: &Setup<'_>, estimate: &Estimate) -> Option<Hidden> {
     let travel = setup.travel();
     let found = shown(setup, estimate);
     if found.iter().all(|moved| *moved > VISIBILITY.suspect_motion * travel) {

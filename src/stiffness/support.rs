@@ -31,7 +31,7 @@ const MESH_SURFACE_SD_VOXELS: f64 = 0.1;
 
 /// The case for more regions, so far.
 #[derive(Debug)]
-pub struct Support {
+pub(crate) struct Support {
     /// Roughness of a voxel and of a sample (mm).
     noise: [f64; 2],
     /// What geometry alone may do (mm).
@@ -152,7 +152,7 @@ impl Support {
     }
 
     /// Whether a further region is worth a search.
-    pub fn may_hold_more(&self) -> bool {
+    pub(crate) fn may_hold_more(&self) -> bool {
         self.refusal().is_none()
     }
 
@@ -176,7 +176,7 @@ impl Support {
     }
 
     /// The least misfit (mm) that would lead to a second region.
-    pub fn least_seen(&self) -> f64 {
+    pub(crate) fn least_seen(&self) -> f64 {
         let [voxel, sample] = self.noise;
         let noise = sample.max(self.floor);
         let stands_out = (MIN_DISCREPANCY * MIN_DISCREPANCY - 1.0).sqrt() * sample;
@@ -189,7 +189,7 @@ impl Support {
 
     /// Judges the estimate with `count` regions, which leaves over `rms` (mm) with the surface
     /// where the data put it; true makes it the model that stands.
-    pub fn accept(&mut self, level: &Level, e: &Estimate, count: usize, rms: f64) -> bool {
+    pub(crate) fn accept(&mut self, level: &Level, e: &Estimate, count: usize, rms: f64) -> bool {
         let misfit = (rms * rms - self.noise[1] * self.noise[1]).max(0.0).sqrt();
         let parameters = e.parameters + SHAPE_FUNCTIONS * (count - 1);
         let samples = self.effective.min(e.effective);

@@ -12,7 +12,7 @@ const MODEL_ERROR_COSINE: f64 = 0.15;
 
 /// By how much less data tell whose error `share` (of its squares) is everywhere at once, of so
 /// many samples.
-pub fn dilution(share: f64, samples: f64) -> f64 {
+pub(crate) fn dilution(share: f64, samples: f64) -> f64 {
     MODEL_ERROR_COSINE * MODEL_ERROR_COSINE * samples * share
 }
 
@@ -75,7 +75,7 @@ impl Fit {
     ///
     /// # Errors
     /// [`StiffnessError::Unsolvable`] where the data leave a parameter open.
-    pub fn coherent(
+    pub(crate) fn coherent(
         &self,
         setup: &Setup<'_>,
         estimate: &Estimate,

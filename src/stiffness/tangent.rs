@@ -81,7 +81,7 @@ impl<'a> Tangent<'a> {
     ///
     /// # Errors
     /// As [`Self::solve`].
-    pub fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
+    pub(crate) fn solve_or_replace(&mut self, x: &mut [f64]) -> Result<(), Singular> {
         match self {
             Self::Direct(factor) => factor.solve_or_replace(x),
             Self::Iterative(saddle) => saddle.solve(x, None, TOLERANCE.newton_step),
@@ -116,7 +116,7 @@ impl<'a> Tangent<'a> {
     ///
     /// # Errors
     /// As [`Self::new`].
-    pub fn renewed(self, body: &'a Body, matrix: Matrix, near: bool) -> Result<Self, Singular> {
+    pub(crate) fn renewed(self, body: &'a Body, matrix: Matrix, near: bool) -> Result<Self, Singular> {
         match self {
             Self::Direct(factor) => Ok(Self::Direct(Box::new(factor.renewed(matrix.values, near)?))),
             Self::Iterative(_) if near => self.near(matrix),

@@ -228,7 +228,7 @@ const BALLS: Balls = Balls { diameter_fractions: [0.25, 0.35, 0.5], samples: 200
 ///
 /// # Errors
 /// As [`Setup::run`].
-pub fn shown_by_balls(setup: &Setup<'_>, identified: &State) -> Result<Vec<(f64, f64)>, StiffnessError> {
+pub(crate) fn shown_by_balls(setup: &Setup<'_>, identified: &State) -> Result<Vec<(f64, f64)>, StiffnessError> {
     let Basis { lattice, weights, picked } = Basis::new(setup);
     let problem = setup.problem(identified);
     let solution = problem.solve(identified.x.as_deref(), 1e-4)?;
@@ -284,8 +284,6 @@ pub struct Map {
     pub lattice: Lattice,
     /// ln mu.
     pub values: Vec<f64>,
-    /// Root mean square residual with it (mm, one component).
-    pub rms: f64,
 }
 
 /// Finds the map of ln mu beyond that of the regions, from the state in which these are identified.
@@ -375,8 +373,8 @@ pub fn map(setup: &Setup<'_>, identified: &State, target: f64) -> Result<Map, St
         values.iter_mut().for_each(|v| *v -= shift);
         state.x = Some(solution.x);
     }
-    let (rms, values) = best.unwrap_or((f64::INFINITY, values));
-    Ok(Map { lattice, values, rms })
+    let values = best.map_or(values, |best| best.1);
+    Ok(Map { lattice, values })
 }
 
 /// `scale` times the products of all columns of `rows` numbers with each other, row by row.
@@ -429,7 +427,7 @@ fn jacobian(
 
 /// `labels` with one region more, taken from the first one: the pieces of it in which the map lies
 /// far above or below its middle value, the ones that weigh most first.
-pub fn next_regions(map: &Map, labels: &Mask) -> Vec<Mask> {
+pub(crate) fn next_regions(map: &Map, labels: &Mask) -> Vec<Mask> {
     let grid = *labels.grid();
     let inside: Vec<usize> = (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0).collect();
     let value = |&o: &usize| {

@@ -71,7 +71,7 @@ impl Misfit {
 
 /// What was found, region by region in the order of the body's.
 #[derive(Debug, Clone, Copy)]
-pub struct Found<'a> {
+pub(crate) struct Found<'a> {
     /// The moduli.
     pub moduli: &'a Moduli,
     /// The moduli as if the surface were known: the part of the uncertainty that more data of the
@@ -99,7 +99,7 @@ pub struct Found<'a> {
 }
 
 /// The error of ln E on the fine mesh, of a `change` of it from the coarse to the fine one.
-pub fn mesh_error(change: f64) -> f64 {
+pub(crate) fn mesh_error(change: f64) -> f64 {
     if change.abs() < MAX_RESOLVED_CHANGE_LN { change / 3.0 } else { change }
 }
 
@@ -231,7 +231,7 @@ impl Found<'_> {
     }
 
     /// Says so where the field cannot tell regions apart.
-    pub fn no_contrast(&self) -> Option<String> {
+    pub(crate) fn no_contrast(&self) -> Option<String> {
         let model = self.flat_model.filter(|_| self.shows_no_contrast())?;
         Some(format!(
             "the field is one {} motion of the whole body (its model says), which shows no difference between regions whatever they are: \
@@ -243,7 +243,7 @@ impl Found<'_> {
 
 /// How far to rely on a result, and why.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Verdict {
+pub(crate) struct Verdict {
     /// The worst of what is known.
     pub trust: Trust,
     /// Why.

@@ -26,7 +26,7 @@ pub struct Draws {
 ///
 /// # Errors
 /// [`SpaceError`] when the places have no grid.
-pub fn error_draws(full: &Grid, samples: &ErrorSamples) -> Result<Vec<DenseField>, SpaceError> {
+pub(crate) fn error_draws(full: &Grid, samples: &ErrorSamples) -> Result<Vec<DenseField>, SpaceError> {
     errors_on(&thinned(full, samples)?.1, samples)
 }
 
@@ -53,7 +53,7 @@ fn thinned(full: &Grid, samples: &ErrorSamples) -> Result<([usize; 3], Grid), Sp
 
 /// Displacement gradients by place: as measured, then with each draw of the error; none outside the
 /// bodies.
-pub type Gradients = Vec<Vec<Option<Matrix3>>>;
+pub(crate) type Gradients = Vec<Vec<Option<Matrix3>>>;
 
 impl Draws {
     /// Places half as far apart as the nodes of the samples.
@@ -128,7 +128,7 @@ fn drawn(grid: &Grid, samples: &ErrorSamples) -> impl Iterator<Item = Vec<f32>> 
 }
 
 /// What each sample says the error is at a place (mm, RAS).
-pub fn errors_at(samples: &ErrorSamples, place: WorldPoint) -> Vec<[f64; 3]> {
+pub(crate) fn errors_at(samples: &ErrorSamples, place: WorldPoint) -> Vec<[f64; 3]> {
     let nodes = samples.nodes().len();
     let taps = taps(samples.nodes(), place);
     let of = |component: &[f32]| taps.iter().map(|&(node, w)| f64::from(w * component[node])).sum::<f64>();
@@ -159,7 +159,7 @@ fn taps(nodes: &Grid, place: WorldPoint) -> Vec<(usize, f32)> {
 
 /// Width over which statistics of a few draws are smoothed (nodes, one Gaussian standard
 /// deviation).
-pub const DRAW_SMOOTHING_NODES: f64 = 1.5;
+pub(crate) const DRAW_SMOOTHING_NODES: f64 = 1.5;
 
 /// Standard deviation of a strain by place.
 #[derive(Debug, Clone, PartialEq)]

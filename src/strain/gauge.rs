@@ -49,7 +49,7 @@ impl Gauge {
     }
 
     /// Its side along the finest thick axis (mm).
-    pub fn finest_mm(&self, grid: &Grid) -> f64 {
+    pub(crate) fn finest_mm(&self, grid: &Grid) -> f64 {
         let sides = self.length_mm(grid);
         (0..3).filter(|&a| self.half[a] > 0).map(|a| sides[a]).fold(f64::INFINITY, f64::min)
     }
@@ -61,7 +61,7 @@ impl Gauge {
 
     /// Standard deviation of a slope along an axis (1/mm), over that of white noise in the values:
     /// of the axis where it is largest.
-    pub fn slope_noise(&self, grid: &Grid) -> f64 {
+    pub(crate) fn slope_noise(&self, grid: &Grid) -> f64 {
         let spacing = grid.spacing();
         let along = |a: usize| {
             let h = self.half[a] as f64;

@@ -119,4 +119,4 @@ fn fingertip(half: [f64; 3]) -> Vec<Region> {
 }
 
 /// Outline of the fingertip, in half fields of view; the pulp's lowest point lies under its centre.
-pub const FINGERTIP_RADII: [f64; 3] = [0.82, 1.76, 0.80];
+pub(crate) const FINGERTIP_RADII: [f64; 3] = [0.82, 1.76, 0.80];

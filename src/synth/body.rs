@@ -13,7 +13,7 @@ use crate::types::{Grid, WorldPoint};
 
 /// (|x/a|^n + |y/b|^n + |z/c|^n)^(1/n) <= 1 in its own axes. A radius may be infinite: a tube.
 #[derive(Debug, Clone)]
-pub struct Superellipsoid {
+pub(crate) struct Superellipsoid {
     /// Centre (mm, in the body's frame).
     pub centre: [f64; 3],
     /// Semi-axes (mm).

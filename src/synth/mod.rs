@@ -29,11 +29,11 @@ pub mod phantom;
 
 mod scenes;
 
-pub mod sequence;
+mod sequence;
 
 pub mod degradation;
 
 pub use degradation::{Trouble, troubled};
 pub use params::{ElasticParams, MotionKind, PhantomKind, PhantomParams};
-pub use phantom::{Description, MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
+pub use phantom::{MIN_JACOBIAN, Phantom, Stiffness, phantom, phantom_on};
 pub use sequence::{Sequence, SequenceKind, SequenceParams};

@@ -52,7 +52,7 @@ impl Motion {
     }
 
     /// `amplitude` mm in a random direction (of the plane, for a single slice).
-    pub fn translate(grid: &Grid, amplitude: f64, mut random: Random) -> Self {
+    pub(crate) fn translate(grid: &Grid, amplitude: f64, mut random: Random) -> Self {
         let mut motion = Self::new(Law::Linear { m: [[0.0; 3]; 3], shift: random.direction() }, grid);
         motion.scale = amplitude / length(motion.planar([0.0; 3])).max(1e-9);
         motion
@@ -166,7 +166,7 @@ impl Motion {
 
     /// The x with x + u(x) = y, by fixed point to 1e-9 mm; for motions whose gradient stays under
     /// 1, as a press has.
-    pub fn origin_of(&self, y: WorldPoint) -> WorldPoint {
+    pub(crate) fn origin_of(&self, y: WorldPoint) -> WorldPoint {
         let mut x = y;
         for _ in 0..200 {
             let r = y.minus(x.moved(self.at(x)));
@@ -180,7 +180,7 @@ impl Motion {
 
     /// Whether neighbouring places may part (a jump, so that difference quotients are not the
     /// Jacobian).
-    pub fn is_discontinuous(&self) -> bool {
+    pub(crate) fn is_discontinuous(&self) -> bool {
         matches!(self.law, Law::Slide { .. })
     }
 

@@ -12,14 +12,14 @@ const BSPLINE_SD: f64 = 0.331_893;
 const TEXTURE_COEFFICIENTS: usize = 64;
 
 /// Coefficients along each axis of a function with at most a dozen cells in the field of view.
-pub const SMOOTH_COEFFICIENTS: usize = 16;
+pub(crate) const SMOOTH_COEFFICIENTS: usize = 16;
 
 /// N independent functions of position with mean 0 and standard deviation 1, twice continuously
 /// differentiable.
 ///
 /// Nearly all power lies below one cycle in two cells, so cells of two voxels survive sampling.
 #[derive(Debug, Clone)]
-pub struct SmoothNoise<const N: usize> {
+pub(crate) struct SmoothNoise<const N: usize> {
     /// N for each control point, x fastest.
     coefficients: Vec<f32>,
     side: usize,

@@ -44,7 +44,7 @@ pub struct Pair {
 
 /// How a pair ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Status {
+pub(crate) enum Status {
     /// Not yet looked at.
     Waiting,
     /// Measured in this run.
@@ -69,7 +69,7 @@ impl Status {
 
 /// What came of a pair. Summaries are the `summary.json` of its stages, null where there is none.
 #[derive(Debug, Clone, PartialEq)]
-pub struct PairOutcome {
+pub(crate) struct PairOutcome {
     /// The pair's name.
     pub name: String,
     /// The folder of its results, from that of the batch.

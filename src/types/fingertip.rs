@@ -49,10 +49,10 @@ impl FromStr for FingertipModel {
 }
 
 /// Maxwell branches of a fingertip at most.
-pub const MOST_BRANCHES: usize = 3;
+pub(crate) const MOST_BRANCHES: usize = 3;
 
 /// Least Young's modulus of a fingertip (Pa): brain and fat, the softest tissues, have about 1 kPa.
-pub const SOFTEST: f64 = 1e3;
+pub(crate) const SOFTEST: f64 = 1e3;
 
 /// A hemispherical soft fingertip.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -362,7 +362,7 @@ pub struct EnergySurface {
 
 /// Force along the normal against displacement and tilt, for two models.
 #[derive(Debug, Clone, PartialEq)]
-pub struct PostureForce {
+pub(crate) struct PostureForce {
     /// Tilts (rad), columns.
     pub tilts: Vec<f64>,
     /// Displacements (m), rows.
@@ -493,7 +493,7 @@ pub struct PinchMap {
 
 /// All that `palpate grasp-analysis` finds.
 #[derive(Debug, Clone, PartialEq)]
-pub struct GraspAnalysis {
+pub(crate) struct GraspAnalysis {
     /// Force against displacement and tilt.
     pub force: PostureForce,
     /// Energy surfaces.

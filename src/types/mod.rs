@@ -9,7 +9,7 @@ pub mod space;
 
 pub mod volume;
 
-pub mod points;
+pub(crate) mod points;
 
 pub mod field;
 
@@ -19,27 +19,27 @@ pub mod params;
 
 pub mod metrics;
 
-pub mod certificate;
+mod certificate;
 
-pub mod expected;
+mod expected;
 
-pub mod record;
+pub(crate) mod record;
 
-pub mod result;
+mod result;
 
-pub mod samples;
+mod samples;
 
 pub mod strain;
 
 pub mod track;
 
-pub mod transform;
+mod transform;
 
-pub mod names;
+pub(crate) mod names;
 
 pub mod stiffness;
 
-pub mod solid;
+mod solid;
 
 pub mod plan;
 
@@ -53,9 +53,9 @@ pub mod measured;
 
 pub mod skin;
 
-pub mod trial;
+mod trial;
 
-pub mod batch;
+pub(crate) mod batch;
 
 pub use certificate::{Certificate, Gain, GaugeNoise, Imposed};
 pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};

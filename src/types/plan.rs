@@ -11,7 +11,7 @@ pub struct PlanParams {
     pub moduli: Vec<(u8, f64)>,
     /// Wanted standard deviation of each modulus over the modulus (1).
     pub want: f64,
-    /// How far the plate goes in (mm); empty for [`Self::PRESS`] of the body's extent.
+    /// How far the plate goes in (mm); empty for `Self::PRESS` of the body's extent.
     pub press_mm: Vec<f64>,
     /// Edge of a voxel (mm, the finest axis); empty for that of the labels.
     pub voxel_mm: Vec<f64>,
@@ -44,12 +44,12 @@ impl Default for PlanParams {
 impl PlanParams {
     /// Presses that are tried, over the body's extent along the load (1): from what shows at all to
     /// what the linear law bears.
-    pub const PRESS: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
+    pub(crate) const PRESS: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
     /// Noise that is tried, over the edge of a voxel (1): of correlation on good images to poor
     /// ones.
     pub const NOISE: [f64; 3] = [0.05, 0.1, 0.2];
     /// Largest number of presses, voxel sizes or noises.
-    pub const MOST: usize = 20;
+    pub(crate) const MOST: usize = 20;
 
     /// Assumed Young's modulus of a label (kPa).
     pub fn modulus(&self, label: u8) -> Option<f64> {
@@ -171,7 +171,7 @@ pub struct Plan {
 
 /// Largest principal strain (1) past which a planned press is warned of: the plan's law is linear,
 /// and leaves out of a deviation about as much as the strain.
-pub const LARGE_STRAIN: f64 = 0.1;
+pub(crate) const LARGE_STRAIN: f64 = 0.1;
 
 impl Plan {
     /// The expectations of a region.

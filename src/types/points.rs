@@ -90,7 +90,7 @@ impl Match {
 }
 
 /// A covariance (xx, yy, zz, xy, xz, yz) after a linear map.
-pub fn covariance_after(linear: &Matrix3, [xx, yy, zz, xy, xz, yz]: &[f64; 6]) -> [f64; 6] {
+pub(crate) fn covariance_after(linear: &Matrix3, [xx, yy, zz, xy, xz, yz]: &[f64; 6]) -> [f64; 6] {
     let c = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
     let after = |r: usize, s: usize| -> f64 {
         (0..3).map(|a| (0..3).map(|b| linear[r][a] * c[a][b] * linear[s][b]).sum::<f64>()).sum()
@@ -109,7 +109,7 @@ impl SparseField {
     /// Voxels of the finest axis between the middle one of a match's patch and its outermost ones:
     /// a match tells the mean over 7 x 7 x 7 (over fewer along the normal of thick slices, at least
     /// 3).
-    pub const PATCH: usize = 3;
+    pub(crate) const PATCH: usize = 3;
 
     /// The matches that consistency kept.
     ///

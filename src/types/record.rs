@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// A file, or a folder of files, that a run has read.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct InputFile {
+pub(crate) struct InputFile {
     /// What it was to the run, such as `initial` or `mask`.
     pub role: String,
     /// Its full path.
@@ -18,7 +18,7 @@ pub struct InputFile {
 
 /// What is needed to repeat a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RunRecord {
+pub(crate) struct RunRecord {
     /// The arguments of the program, the command first.
     pub command_line: Vec<String>,
     /// The full path of the folder from which relative paths among them count.
@@ -30,7 +30,7 @@ pub struct RunRecord {
 }
 
 /// A count of seconds since the start of 1970 (UTC) as RFC 3339, such as `2026-02-28T09:05:07Z`.
-pub fn rfc3339(seconds: u64) -> String {
+pub(crate) fn rfc3339(seconds: u64) -> String {
     let (days, rest) = (seconds / 86_400, seconds % 86_400);
     // Years of 400 begin on the first of March of the year 0.
     let shifted = days + 719_468;

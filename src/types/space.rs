@@ -90,7 +90,7 @@ pub fn length(v: [f64; 3]) -> f64 {
 
 /// The product of a matrix with a vector.
 #[inline]
-pub fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
+pub(crate) fn matvec(a: &Matrix3, b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|r| a[r][0] * b[0] + a[r][1] * b[1] + a[r][2] * b[2])
 }
 
@@ -99,7 +99,7 @@ const UNIT: Matrix3 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
 
 /// The product of two matrices.
 #[inline]
-pub fn matmul(a: &Matrix3, b: &Matrix3) -> Matrix3 {
+pub(crate) fn matmul(a: &Matrix3, b: &Matrix3) -> Matrix3 {
     std::array::from_fn(|r| std::array::from_fn(|c| a[r][0] * b[0][c] + a[r][1] * b[1][c] + a[r][2] * b[2][c]))
 }
 

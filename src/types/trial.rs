@@ -138,7 +138,7 @@ pub struct Stated {
     pub broken: usize,
     /// Of the broken ones, those that nothing was said against.
     pub silent: usize,
-    /// Runs whose error is small ([`StressRun::false_alarm`]).
+    /// Runs whose error is small (`StressRun::false_alarm`).
     pub small: usize,
     /// Of these, those that something was said against.
     pub false_alarms: usize,

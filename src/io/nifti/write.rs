@@ -71,7 +71,12 @@ pub fn write_exact(path: impl AsRef<Path>, volume: &Volume, description: &str) -
 ///
 /// # Errors
 /// As [`write_volume`].
-pub fn write_codes(path: impl AsRef<Path>, grid: &Grid, codes: &[i64], description: &str) -> Result<(), IoError> {
+pub(crate) fn write_codes(
+    path: impl AsRef<Path>,
+    grid: &Grid,
+    codes: &[i64],
+    description: &str,
+) -> Result<(), IoError> {
     let (path, form) = (path.as_ref(), Form { description, ..Form::FLOATS });
     match codes.iter().all(|c| i32::try_from(*c).is_ok()) {
         true => write(path, grid, Form { datatype: 8, ..form }, &[codes], |_, v| (v as i32).to_le_bytes()).map(drop),
@@ -170,7 +175,7 @@ pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) ->
 /// 1007, float32, LPS.
 ///
 /// Components are rounded to multiples of 2^-12 mm (error at most 2^-13 mm, 0.12 um), or of a
-/// thousandth of the finest voxel edge where that is less ([`stored_length`]), so that they pack.
+/// thousandth of the finest voxel edge where that is less (`stored_length`), so that they pack.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -195,7 +200,7 @@ pub fn write_field(path: impl AsRef<Path>, field: &DenseField) -> Result<(), IoE
 ///
 /// # Errors
 /// As [`write_volume`].
-pub fn write_series_field(path: impl AsRef<Path>, field: &DenseField) -> Result<PackedField, IoError> {
+pub(crate) fn write_series_field(path: impl AsRef<Path>, field: &DenseField) -> Result<PackedField, IoError> {
     let form = Form { description: DISPLACEMENT, ..Form::VECTORS };
     let stored = stored_length(field.grid());
     let components = [field.component(0), field.component(1), field.component(2)];
@@ -237,7 +242,7 @@ const DISPLACEMENT: &str = "displacement, initial to deformed, LPS mm";
 
 /// A field as it stands packed in a file.
 #[derive(Debug)]
-pub struct PackedField {
+pub(crate) struct PackedField {
     path: PathBuf,
     runs: Vec<Run>,
 }
@@ -248,7 +253,7 @@ pub struct PackedField {
 ///
 /// # Errors
 /// [`IoError`] when a frame's file cannot be read any more, or as [`write_volume`].
-pub fn write_field_series(
+pub(crate) fn write_field_series(
     path: impl AsRef<Path>,
     grid: &Grid,
     frames: &[Option<PackedField>],
@@ -278,7 +283,7 @@ pub fn write_field_series(
 }
 
 /// Strains are multiples of 2^-18, four microstrain.
-pub const STRAIN_BITS: i32 = 18;
+pub(crate) const STRAIN_BITS: i32 = 18;
 /// Component of ours, and its sign in LPS, for each one of a tensor on disk.
 const ON_DISK: [(usize, f32); 6] = [(0, 1.0), (3, 1.0), (1, 1.0), (4, -1.0), (5, -1.0), (2, 1.0)];
 
@@ -308,7 +313,7 @@ pub fn write_tensors(
 ///
 /// # Errors
 /// As [`write_volume`].
-pub fn write_tensor_deviations(
+pub(crate) fn write_tensor_deviations(
     path: impl AsRef<Path>,
     grid: &Grid,
     deviations: &[[f32; 6]],
@@ -341,7 +346,7 @@ pub fn write_vectors<const N: usize>(
 ///
 /// # Errors
 /// As [`write_volume`].
-pub fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> Result<(), IoError> {
+pub(crate) fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> Result<(), IoError> {
     let (n, frames) = (samples.nodes().len(), samples.values().len());
     let form = Form { frames, description: "samples of the error of u: cubic B-splines, LPS mm", ..Form::VECTORS };
     let parts: Vec<&[f32]> =
@@ -351,12 +356,12 @@ pub fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> Result<(
 }
 
 /// A length (mm) as [`write_field`] keeps it on `grid`: of 10 um voxels 2^-12 mm would be 2 %.
-pub fn stored_length(grid: &Grid) -> impl Fn(f32) -> f32 + Copy + Sync + use<> {
+pub(crate) fn stored_length(grid: &Grid) -> impl Fn(f32) -> f32 + Copy + Sync + use<> {
     stored_steps(length_bits(grid))
 }
 
 /// The same as a number of bits (see [`write_steps`]).
-pub fn length_bits(grid: &Grid) -> i32 {
+pub(crate) fn length_bits(grid: &Grid) -> i32 {
     let shape = grid.shape();
     let edges = (0..3).filter(|&a| shape[a] > 1).map(|a| grid.spacing()[a]);
     let finer = (COARSE / edges.fold(f64::INFINITY, f64::min)).log2().ceil();
@@ -364,7 +369,7 @@ pub fn length_bits(grid: &Grid) -> i32 {
 }
 
 /// A value as [`write_steps`] keeps it.
-pub fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
+pub(crate) fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
     let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
     // Adding 0 turns -0 into 0.
     move |v| (v * up).round_ties_even() * down + 0.0

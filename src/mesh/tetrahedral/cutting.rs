@@ -27,7 +27,7 @@ pub struct Cut {
 }
 
 /// No part yet.
-pub const NO_PART: u8 = u8::MAX;
+pub(crate) const NO_PART: u8 = u8::MAX;
 
 impl Cut {
     /// A mesh with no surface yet.
@@ -133,7 +133,7 @@ impl Cut {
     }
 
     /// Leaves out the vertices that no cell uses.
-    pub fn compact(&mut self) {
+    pub(crate) fn compact(&mut self) {
         let mut number = vec![u32::MAX; self.places.len()];
         self.cells.iter().flatten().for_each(|&v| number[v as usize] = 0);
         let mut count = 0;

@@ -8,7 +8,7 @@
 use std::collections::{BTreeSet, HashMap};
 
 /// Most halvings of a cube.
-pub const MAX_LEVEL: u32 = 5;
+pub(crate) const MAX_LEVEL: u32 = 5;
 
 /// Vertices (grid mm) and tetrahedra.
 pub type Lattice = (Vec<[f64; 3]>, Vec<[u32; 4]>);
@@ -19,7 +19,7 @@ type Cube = (u32, [i32; 3]);
 
 /// The base cubes and which of them are divided.
 #[derive(Debug, Clone)]
-pub struct Octree {
+pub(crate) struct Octree {
     low: [f64; 3],
     size: [f64; 3],
     count: [i32; 3],

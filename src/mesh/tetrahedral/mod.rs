@@ -1,9 +1,9 @@
 //! A quality tetrahedral mesh of a label map, for elasticity: quadratic, graded, with faces on the
 //! body's surface and on the interfaces between its parts.
 //!
-//! A graded body-centred cubic lattice ([`lattice`]) is cut along the smooth surface of the body
-//! and then along that of each part ([`levels`], [`rounding`], [`cutting`]), its inner vertices are
-//! moved where that makes the worst shapes better ([`smoothing`]), and edges on surfaces are bent
+//! A graded body-centred cubic lattice (`lattice`) is cut along the smooth surface of the body
+//! and then along that of each part ([`levels`], `rounding`, `cutting`), its inner vertices are
+//! moved where that makes the worst shapes better (`smoothing`), and edges on surfaces are bent
 //! onto them ([`curving`]).
 //!
 //! Promises: neighbours share whole faces; every element lies in one part and has a positive
@@ -14,13 +14,13 @@
 
 pub mod levels;
 
-pub mod rounding;
+mod rounding;
 
-pub mod lattice;
+mod lattice;
 
-pub mod cutting;
+mod cutting;
 
-pub mod smoothing;
+mod smoothing;
 
 pub mod curving;
 
@@ -51,7 +51,7 @@ impl Fineness {
 }
 
 /// A level function of the place (grid mm: voxel index times spacing).
-pub type Wall<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
+pub(crate) type Wall<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
 
 /// The part of a mesh that is finer than the rest.
 #[derive(Clone, Copy, Default)]

@@ -52,7 +52,7 @@ const MIN_VOXELS_PER_TASK: usize = 1 << 14;
 
 /// Signed distance (voxels, positive inside) of each voxel's centre; x fastest. Voxels within two
 /// of the box's border keep the middle of their bounds, and no distance exceeds 6.
-pub fn signed_distance(inside: &[bool], shape: [usize; 3]) -> Vec<f32> {
+pub(crate) fn signed_distance(inside: &[bool], shape: [usize; 3]) -> Vec<f32> {
     let [within, without] = [true, false].map(|side| to_other(inside, shape, side));
     let middle = |o: usize| if inside[o] { within[o] - 0.5 } else { 0.5 - without[o] };
     let mut x: Vec<f32> = (0..inside.len()).into_par_iter().map(middle).collect();

@@ -122,7 +122,7 @@ fn ball_in_cell(mesh: &mut HexMesh, cell: &[u32; 8], ball: &Ball, number: usize)
 /// A block from `low` to `high` (mm) of layers, from the top down; `interface(n, x, y)` is the
 /// height between layers n and n + 1, the curved surface n. Held below; pressed above on the
 /// rectangle `punch` (low and high x, y). Planes crowd at the punch's rim.
-pub fn layered_block(
+pub(crate) fn layered_block(
     low: [f64; 3],
     high: [f64; 3],
     layers: usize,

@@ -6,7 +6,7 @@ use crate::types::space::{Matrix3, determinant};
 
 /// A symmetric matrix kept from each row's first entry to its diagonal, and its Cholesky factor.
 #[derive(Debug, Clone)]
-pub struct Coarse {
+pub(crate) struct Coarse {
     /// Row of each unknown `3 node + component`.
     row: Vec<usize>,
     first: Vec<usize>,

@@ -10,7 +10,7 @@ pub const HELD: Surfaces = 1;
 /// The pressed face.
 pub const PRESSED: Surfaces = 2;
 /// The first of the curved surfaces; the others follow.
-pub const CURVED: Surfaces = 4;
+pub(crate) const CURVED: Surfaces = 4;
 
 /// Hexahedra with corner `i + 2 j + 4 k` at the local place (i, j, k).
 #[derive(Debug, Clone, Default)]
@@ -37,7 +37,7 @@ struct Block {
 }
 
 /// Brings a place onto all of some surfaces.
-pub type Project<'a> = dyn Fn(Surfaces, [f64; 3]) -> [f64; 3] + 'a;
+pub(crate) type Project<'a> = dyn Fn(Surfaces, [f64; 3]) -> [f64; 3] + 'a;
 
 impl Block {
     /// The place at `t`: the transfinite blend (Gordon and Hall 1973) of the faces, those of the
@@ -74,7 +74,7 @@ pub type Lattice = [u32; 27];
 
 impl HexMesh {
     /// Adds a vertex; its number.
-    pub fn vertex(&mut self, place: [f64; 3], surfaces: Surfaces) -> u32 {
+    pub(crate) fn vertex(&mut self, place: [f64; 3], surfaces: Surfaces) -> u32 {
         self.vertices.push(place);
         self.surfaces.push(surfaces);
         (self.vertices.len() - 1) as u32

@@ -19,7 +19,7 @@ pub struct Place {
 }
 
 /// Values at an element's nodes, with their derivatives, at a place (continued linearly outside).
-pub fn interpolate(values: &[[f64; 3]], lattice: &Lattice, local: [f64; 3]) -> [f64; 3] {
+pub(crate) fn interpolate(values: &[[f64; 3]], lattice: &Lattice, local: [f64; 3]) -> [f64; 3] {
     extended(|n| values[lattice[n] as usize], local).0
 }
 
@@ -51,7 +51,7 @@ fn extended(value: impl Fn(usize) -> [f64; 3], local: [f64; 3]) -> ([f64; 3], Ma
 }
 
 /// Elements in the voxel frame of a grid.
-pub struct Locator<'a> {
+pub(crate) struct Locator<'a> {
     elements: &'a [Lattice],
     /// Places of the nodes (voxels).
     nodes: Vec<[f64; 3]>,

@@ -52,7 +52,7 @@ fn adjugate(m: &Matrix3) -> (Matrix3, f64) {
 }
 
 /// A pressure p (kPa) that is linear in an element: at the world's origin, and its slopes (a mm).
-pub type Pressure = [f64; 4];
+pub(crate) type Pressure = [f64; 4];
 
 /// An orthonormal basis of the linear functions on an element.
 struct Basis {
@@ -207,7 +207,7 @@ pub fn state(space: &Space, lame: &[Lame], u: &[[f64; 3]], pressure: &[Pressure]
 }
 
 /// The pressure of each element after a step `d` from `u`, ln J being carried on linearly.
-pub fn predicted(space: &Space, lame: &[Lame], u: &[[f64; 3]], d: &[[f64; 3]]) -> Vec<Pressure> {
+pub(crate) fn predicted(space: &Space, lame: &[Lame], u: &[[f64; 3]], d: &[[f64; 3]]) -> Vec<Pressure> {
     let tables = Tables::new(|v| v);
     let moved = moved(space, u);
     let batches = (0..space.batches()).into_par_iter().map(|b| {

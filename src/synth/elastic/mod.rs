@@ -34,4 +34,5 @@ mod transfer;
 
 mod vectors;
 
-pub use press::{ElasticDescription, Pressed, press};
+pub(crate) use press::ElasticDescription;
+pub use press::{Pressed, press};

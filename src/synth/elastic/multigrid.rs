@@ -30,7 +30,7 @@ struct Level<'a> {
 }
 
 /// The cycle over all levels up to one.
-pub struct Multigrid<'a> {
+pub(crate) struct Multigrid<'a> {
     coarse: Coarse,
     levels: Vec<Level<'a>>,
 }

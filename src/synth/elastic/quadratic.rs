@@ -9,7 +9,7 @@ pub const NODES: usize = 27;
 const SQRT_3_5: f64 = 0.774_596_669_241_483_4;
 
 /// Gauss points on [-1, 1].
-pub const GAUSS: [f64; 3] = [-SQRT_3_5, 0.0, SQRT_3_5];
+pub(crate) const GAUSS: [f64; 3] = [-SQRT_3_5, 0.0, SQRT_3_5];
 
 /// Their weights.
 const GAUSS_WEIGHTS: [f64; 3] = [5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0];
@@ -51,7 +51,7 @@ impl<T: Copy> Tables<T> {
 }
 
 /// `L` elements side by side.
-pub type Nodal<T, const L: usize> = [[T; L]; NODES];
+pub(crate) type Nodal<T, const L: usize> = [[T; L]; NODES];
 
 /// `out[.. q ..] += sum_n table[q][n] x[.. n ..]` along the axis of `stride` 1, 3 or 9.
 #[inline(always)]
@@ -96,7 +96,7 @@ pub fn gradient<T: Copy + Default + Mul<Output = T> + AddAssign, const L: usize>
 
 /// The transpose of [`gradient`].
 #[inline(always)]
-pub fn divergence<T: Copy + Default + Mul<Output = T> + AddAssign, const L: usize>(
+pub(crate) fn divergence<T: Copy + Default + Mul<Output = T> + AddAssign, const L: usize>(
     t: &Tables<T>,
     g: &[Nodal<T, L>; 3],
 ) -> Nodal<T, L> {

@@ -5,12 +5,12 @@ use crate::synth::elastic::quadratic::NODES;
 use rayon::prelude::*;
 
 /// Elements worked on side by side.
-pub const LANES: usize = 8;
+pub(crate) const LANES: usize = 8;
 
 /// What each of a batch's elements gives to its nodes: `[element][node][component]`.
-pub type Entries<T> = [[[T; 3]; NODES]; LANES];
+pub(crate) type Entries<T> = [[[T; 3]; NODES]; LANES];
 
-/// [`Entries`] from `[component][node][element]`.
+/// `Entries` from `[component][node][element]`.
 #[inline(always)]
 pub fn entries<T: Copy + Default>(by_component: &[[[T; LANES]; NODES]; 3]) -> Entries<T> {
     let mut out = [[[T::default(); 3]; NODES]; LANES];
@@ -59,13 +59,13 @@ impl Space {
     }
 
     /// Groups of [`LANES`] elements.
-    pub fn batches(&self) -> usize {
+    pub(crate) fn batches(&self) -> usize {
         self.elements.len().div_ceil(LANES)
     }
 
     /// The values at the nodes of batch `b`, by component; lanes past the last element repeat it.
     #[inline(always)]
-    pub fn gather<T: Copy + Default>(&self, b: usize, x: &[[T; 3]], out: &mut [[[T; LANES]; NODES]; 3]) {
+    pub(crate) fn gather<T: Copy + Default>(&self, b: usize, x: &[[T; 3]], out: &mut [[[T; LANES]; NODES]; 3]) {
         for l in 0..LANES {
             let element = &self.elements[(b * LANES + l).min(self.elements.len() - 1)];
             for a in 0..NODES {
@@ -78,7 +78,7 @@ impl Space {
     }
 
     /// Adds the element entries of each node in their order; `finish` gets the node and the sum.
-    pub fn assemble<T: Copy + Default + std::ops::AddAssign + Send + Sync>(
+    pub(crate) fn assemble<T: Copy + Default + std::ops::AddAssign + Send + Sync>(
         &self,
         parts: &[Entries<T>],
         out: &mut [[T; 3]],

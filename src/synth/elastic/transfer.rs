@@ -46,7 +46,7 @@ impl Rows {
 
 /// Interpolation from a coarse level to a fine one whose spaces are nested.
 #[derive(Debug, Clone)]
-pub struct Transfer {
+pub(crate) struct Transfer {
     down: Rows,
     up: Rows,
     coarse: usize,
@@ -111,7 +111,7 @@ impl Transfer {
     }
 
     /// The same in double precision.
-    pub fn refine_exactly(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    pub(crate) fn refine_exactly(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let rows = self.down.starts.windows(2);
         let sum = |range: &[u32]| {
             let entries = &self.down.entries[range[0] as usize..range[1] as usize];
@@ -123,7 +123,7 @@ impl Transfer {
     }
 
     /// Forces of the fine level gathered at the coarse nodes: the transpose.
-    pub fn gather(&self, x: &[[f32; 3]]) -> Nodal {
+    pub(crate) fn gather(&self, x: &[[f32; 3]]) -> Nodal {
         let mut out = vec![[0.0; 3]; self.coarse];
         self.up.apply(x, &mut out);
         out

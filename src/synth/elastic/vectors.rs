@@ -6,7 +6,7 @@ use rayon::prelude::*;
 const NODES_PER_TASK: usize = 4096;
 
 /// A single-precision value a node and component.
-pub type Nodal = Vec<[f32; 3]>;
+pub(crate) type Nodal = Vec<[f32; 3]>;
 
 /// Sum over all entries of what `term` gives for each pair.
 fn summed<T: Sync>(a: &[[T; 3]], b: &[[T; 3]], term: impl Fn(&[T; 3], &[T; 3]) -> f64 + Sync) -> f64 {
@@ -29,7 +29,7 @@ pub fn norm(a: &[[f64; 3]]) -> f64 {
 }
 
 /// `a = factor a + b`.
-pub fn scale_add(a: &mut [[f32; 3]], factor: f32, b: &[[f32; 3]]) {
+pub(crate) fn scale_add(a: &mut [[f32; 3]], factor: f32, b: &[[f32; 3]]) {
     a.par_chunks_mut(NODES_PER_TASK).zip(b.par_chunks(NODES_PER_TASK)).for_each(|(a, b)| {
         a.iter_mut().zip(b).for_each(|(a, b)| (0..3).for_each(|c| a[c] = factor * a[c] + b[c]));
     });
@@ -43,7 +43,7 @@ pub fn add(a: &mut [[f32; 3]], factor: f32, b: &[[f32; 3]]) {
 }
 
 /// `a = factor a + gain (d b)`, entry by entry.
-pub fn scale_add_product(a: &mut [[f32; 3]], factor: f32, gain: f32, d: &[[f32; 3]], b: &[[f32; 3]]) {
+pub(crate) fn scale_add_product(a: &mut [[f32; 3]], factor: f32, gain: f32, d: &[[f32; 3]], b: &[[f32; 3]]) {
     a.par_chunks_mut(NODES_PER_TASK).zip(d.par_chunks(NODES_PER_TASK)).zip(b.par_chunks(NODES_PER_TASK)).for_each(
         |((a, d), b)| {
             for ((a, d), b) in a.iter_mut().zip(d).zip(b) {
