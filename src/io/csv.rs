@@ -126,7 +126,7 @@ pub fn read_matches(path: impl AsRef<Path>) -> Result<SparseField, IoError> {
 
 /// What [`read_matches`] would read after [`write_matches`]: six decimals, one precision along all
 /// axes.
-pub(crate) fn stored_matches(field: &SparseField) -> SparseField {
+pub fn stored_matches(field: &SparseField) -> SparseField {
     let kept = |v: f64| decimal(v).parse().unwrap_or(v);
     let one = |m: &Match| {
         let sigma = kept(m.sigma());

@@ -31,7 +31,7 @@ fn nano(v: f64) -> f64 {
 }
 
 /// [`Sample::COLUMNS`] as trajectory.csv keeps them: the time to the nanosecond.
-pub(crate) fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
+pub fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
     let mut row = sample.row();
     row[0] = nano(row[0]);
     row
@@ -39,7 +39,7 @@ pub(crate) fn stored_sample(sample: &Sample) -> [f64; Sample::COLUMNS.len()] {
 
 /// [`MotionRow::COLUMNS`] behind the step as motions.csv keeps them: desired angles as they were
 /// written, without the rounding of degrees to radians and back.
-pub(crate) fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] {
+pub fn stored_motion(motion: &MotionRow) -> [f64; MotionRow::COLUMNS.len() - 1] {
     let mut row = motion.row();
     row[..2].iter_mut().for_each(|v| *v = nano(*v));
     row

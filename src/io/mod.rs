@@ -95,10 +95,10 @@ pub(crate) use bids::{describe_derivative, is_bids, read_bids, write_derivative}
 pub(crate) use chain_errors::write_chain;
 pub use config::read_config;
 pub use csv::{
-    PointTable, read_landmark_frames, read_landmark_pair, read_landmarks, read_matches, read_points, write_landmarks,
-    write_matches, write_points,
+    PointTable, read_landmark_frames, read_landmark_pair, read_landmarks, read_matches, read_points, stored_matches,
+    write_landmarks, write_matches, write_points,
 };
-pub(crate) use csv::{TableKind, stored_matches, table_kind};
+pub(crate) use csv::{TableKind, table_kind};
 pub use dicom::{Series as DicomSeries, series_in};
 pub use digest::{digest, files_of};
 pub(crate) use field::read_samples;
@@ -107,9 +107,10 @@ pub(crate) use file_kind::form_of;
 pub use file_kind::{Form, columns_of};
 pub(crate) use fingertip::read_fingertip_modulus;
 pub use fingertip::{read_fingertip_press, read_stiffness, stiffness_folder, write_fingertip};
+pub use grasp::{stored_motion, stored_sample};
 pub(crate) use grasp::{
-    stored_motion, stored_sample, write_bands, write_energy, write_motions, write_pinch_map, write_posture_force,
-    write_stability, write_sweep, write_trajectory,
+    write_bands, write_energy, write_motions, write_pinch_map, write_posture_force, write_stability, write_sweep,
+    write_trajectory,
 };
 pub use image::{ImageKind, count_non_finite, read_header, read_labels, read_mask, read_volume, read_volume_header};
 pub(crate) use image::{Stored, WHOLE, labels_of, read_integers};
@@ -120,12 +121,12 @@ pub(crate) use measured::write_measured;
 pub(crate) use memory::memory_left;
 pub use mujoco::{write_mjcf, write_msh};
 pub(crate) use nifti::{
-    PackedField, STRAIN_BITS, length_bits, stored_length, stored_steps, write_codes, write_field_series, write_samples,
-    write_series_field, write_tensor_deviations,
+    PackedField, STRAIN_BITS, length_bits, write_codes, write_field_series, write_samples, write_series_field,
+    write_tensor_deviations,
 };
 pub use nifti::{
-    Series, stored, write_by_rows, write_exact, write_field, write_integers, write_labels, write_steps, write_tensors,
-    write_vectors, write_volume,
+    Series, stored, stored_length, stored_steps, write_by_rows, write_exact, write_field, write_integers, write_labels,
+    write_steps, write_tensors, write_vectors, write_volume,
 };
 pub use output::{OutputFolder, hold};
 pub(crate) use scene::SceneFile;

@@ -356,7 +356,7 @@ pub(crate) fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> R
 }
 
 /// A length (mm) as [`write_field`] keeps it on `grid`: of 10 um voxels 2^-12 mm would be 2 %.
-pub(crate) fn stored_length(grid: &Grid) -> impl Fn(f32) -> f32 + Copy + Sync + use<> {
+pub fn stored_length(grid: &Grid) -> impl Fn(f32) -> f32 + Copy + Sync + use<> {
     stored_steps(length_bits(grid))
 }
 
@@ -369,7 +369,7 @@ pub(crate) fn length_bits(grid: &Grid) -> i32 {
 }
 
 /// A value as [`write_steps`] keeps it.
-pub(crate) fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
+pub fn stored_steps(bits: i32) -> impl Fn(f32) -> f32 + Copy + Sync {
     let (up, down) = (2f32.powi(bits), 2f32.powi(-bits));
     // Adding 0 turns -0 into 0.
     move |v| (v * up).round_ties_even() * down + 0.0
