@@ -8,6 +8,7 @@ use crate::numerics::bspline::{Lattice, Stencil};
 use crate::numerics::filters;
 use crate::numerics::random::Random;
 use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, multiply, quadratic};
+use crate::types::{GridVector, VoxelPoint};
 use rayon::prelude::*;
 
 /// One Gauss-Newton step from `coefficients` `c`: the `d` that minimises
@@ -137,10 +138,10 @@ impl Probe {
 /// A measured displacement with its information, at a place of the lattice's grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Evidence {
-    /// Where (voxels of the lattice's grid).
-    pub at: [f64; 3],
-    /// Displacement (mm).
-    pub displacement: [f64; 3],
+    /// Where, on the lattice's grid.
+    pub at: VoxelPoint,
+    /// Displacement.
+    pub displacement: GridVector,
     /// Information, the inverse covariance (1/mm^2).
     pub information: Symmetric3,
 }
@@ -196,12 +197,12 @@ pub(crate) fn fit_from(
             .par_iter()
             .map(|e| {
                 let u = lattice.at(&c, e.at);
-                let q = quadratic(&e.information, std::array::from_fn(|a| u[a] - e.displacement[a]));
+                let q = quadratic(&e.information, u.minus(e.displacement).0);
                 if round == 0 && start.is_none() { 1.0 } else { (scale / (scale + q)).powi(2) }
             })
             .collect();
         for (e, w) in evidence.iter().zip(&weights) {
-            let pull = multiply(&e.information, e.displacement).map(|v| (w * v) as f32);
+            let pull = multiply(&e.information, e.displacement.0).map(|v| (w * v) as f32);
             let info = e.information.map(|v| (w * v) as f32);
             lattice.for_each_tap(e.at, |node, b| {
                 for q in 0..6 {

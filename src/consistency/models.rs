@@ -13,8 +13,8 @@ use crate::consistency::pruning::Measured;
 use crate::numerics::ablation;
 use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::{Symmetric3, cholesky_solve, inverse, multiply, quadratic, regularized_inverse};
-use crate::types::MotionModel;
 use crate::types::space::{Matrix3, matvec};
+use crate::types::{GridVector, MotionModel, VoxelPoint};
 
 /// An affine map `x -> linear x + shift` (mm along the lattice's axes).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -69,6 +69,14 @@ impl AffineMotion {
     pub fn displacement(&self, x: [f64; 3]) -> [f64; 3] {
         let y = matvec(&self.linear, x);
         std::array::from_fn(|a| y[a] + self.shift[a] - x[a])
+    }
+}
+
+impl AffineMotion {
+    /// The displacement at a place of a grid whose voxels have edges of `spacing` (mm) and along
+    /// whose axes this motion is given.
+    pub(crate) fn on_grid(&self, p: VoxelPoint, spacing: [f64; 3]) -> GridVector {
+        GridVector(self.displacement(p.in_mm(spacing)))
     }
 }
 

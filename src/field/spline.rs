@@ -6,7 +6,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::orientation::Orientation;
 use crate::numerics::sampling::{beside, nearest};
 use crate::numerics::simd::dispatch;
-use crate::types::{Affine, AffineMap, DenseField, Grid, Mask, Volume, VoxelPoint, WorldPoint};
+use crate::types::{Affine, AffineMap, DenseField, Grid, GridVector, Mask, Volume, VoxelPoint, WorldPoint};
 use rayon::prelude::*;
 
 /// A spline lattice over a grid's voxels, and displacements (mm along the grid's axes, planar) at
@@ -63,7 +63,7 @@ fn evaluated(grid: &Grid, bodies: &[Spline], labels: &[u8]) -> DenseField {
 pub(crate) fn node_grid(grid: &Grid, lattice: &Lattice) -> Result<Grid, SpaceError> {
     let linear = grid.affine().linear();
     // The only node of a flat axis lies in its plane.
-    let place = lattice.place(0);
+    let VoxelPoint(place) = lattice.place(0);
     let first = std::array::from_fn(|a| if lattice.shape[a] > 1 { place[a] } else { 0.0 });
     let WorldPoint(first) = grid.affine().to_world(VoxelPoint(first));
     let row = |r: usize| {
@@ -74,12 +74,12 @@ pub(crate) fn node_grid(grid: &Grid, lattice: &Lattice) -> Result<Grid, SpaceErr
 }
 
 /// The place (voxels of `grid`) of a voxel offset of the grid that a spline is asked for on.
-fn place(grid: &Grid, stored: &Option<(Grid, Orientation)>, offset: usize) -> [f64; 3] {
+fn place(grid: &Grid, stored: &Option<(Grid, Orientation)>, offset: usize) -> VoxelPoint {
     let offset = match stored {
         Some((asked, orientation)) => orientation.offset(asked.shape(), asked.voxel(offset)),
         None => offset,
     };
-    grid.voxel(offset).map(|i| i as f64)
+    VoxelPoint::of(grid.voxel(offset))
 }
 
 /// A displacement field as its B-spline coefficients, one lattice a body that slides along others:
@@ -117,7 +117,7 @@ impl FieldSpline {
             let n = lattice.len();
             // Cubic B-splines through the values of a linear field are that field.
             for m in 0..n {
-                let place = lattice.place(m);
+                let VoxelPoint(place) = lattice.place(m);
                 let place = std::array::from_fn(|a| if lattice.shape[a] > 1 { place[a] } else { 0.0 });
                 let here = grid.affine().to_world(VoxelPoint(place));
                 let along = [0, 1, 2].map(|c| f64::from(coefficients[c * n + m]));
@@ -155,19 +155,19 @@ impl FieldSpline {
         }
     }
 
-    /// The displacement (mm along the axes) at a place of the canonical grid (voxels).
-    pub(crate) fn along_axes(&self, place: [f64; 3]) -> [f64; 3] {
+    /// The displacement at a place of the canonical grid.
+    pub(crate) fn along_axes(&self, place: VoxelPoint) -> GridVector {
         let body = match self.labels.is_empty() {
             true => 0,
-            false => nearest(self.grid.shape(), VoxelPoint(place)).map_or(0, |at| usize::from(self.labels[at])),
+            false => nearest(self.grid.shape(), place).map_or(0, |at| usize::from(self.labels[at])),
         };
         let (lattice, coefficients) = &self.bodies[body];
         lattice.at(coefficients, place)
     }
 
-    /// The displacement (mm, RAS) at a place of the canonical grid (voxels).
-    pub(crate) fn at_place(&self, place: [f64; 3]) -> [f64; 3] {
-        let (axes, v) = (self.grid.axes(), self.along_axes(place));
+    /// The displacement (mm, RAS) at a place of the canonical grid.
+    pub(crate) fn at_place(&self, place: VoxelPoint) -> [f64; 3] {
+        let (axes, GridVector(v)) = (self.grid.axes(), self.along_axes(place));
         std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * v[a]).sum())
     }
 
@@ -186,9 +186,9 @@ impl FieldSpline {
             let own = usize::from(self.labels[at]);
             let is_other = |&o: &usize| inside[o] != 0 && usize::from(self.labels[o]) != own;
             let other = beside(shape, at).find(is_other)?;
-            let at = |b: usize| self.bodies[b].0.at(&self.bodies[b].1, v.map(|v| v as f64));
-            let (own, other) = (at(own), at(self.labels[other].into()));
-            Some((v, (0..3).map(|a| (own[a] - other[a]).powi(2)).sum::<f64>().sqrt() as f32))
+            let at = |b: usize| self.bodies[b].0.at(&self.bodies[b].1, VoxelPoint::of(v));
+            let apart = at(own).minus(at(self.labels[other].into()));
+            Some((v, apart.0.iter().map(|d| d.powi(2)).sum::<f64>().sqrt() as f32))
         };
         (0..self.labels.len()).into_par_iter().filter(|&at| inside[at] != 0).filter_map(at_border).collect()
     }
@@ -228,8 +228,8 @@ impl ScalarSpline {
         self.at_place(place(&self.grid, &self.stored, offset))
     }
 
-    /// The value at a place of the canonical grid (voxels).
-    pub(crate) fn at_place(&self, place: [f64; 3]) -> f32 {
+    /// The value at a place of the canonical grid.
+    pub(crate) fn at_place(&self, place: VoxelPoint) -> f32 {
         let mut sum = 0.0;
         self.lattice.for_each_tap(place, |node, w| sum += w * self.values[node]);
         sum

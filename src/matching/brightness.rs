@@ -22,6 +22,7 @@ use crate::numerics::exponential::{ROUND_TO_INTEGER, exp, ln};
 use crate::numerics::neighbours::Neighbours;
 use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::{noise_sigma, percentile, robust_deviation, stands_for_all};
+use crate::types::{GridVector, VoxelPoint};
 use rayon::prelude::*;
 
 /// Which blocks of voxels the polynomials are fitted to.
@@ -176,8 +177,8 @@ impl Zero {
 
 /// A block of voxels under a field.
 struct Block {
-    /// Place in the deformed volume (voxels of the full initial lattice).
-    at: [f64; 3],
+    /// Place in the deformed volume, on the full initial lattice.
+    at: VoxelPoint,
     /// Logarithm of the brightness in both volumes.
     log: [f64; 2],
     weight: f64,
@@ -191,15 +192,15 @@ impl Block {
 }
 
 impl Brightness {
-    /// From a level of `factor`, the deformed volume `warped` by a field and its displacement (mm)
-    /// at a place (voxels); `shape` is the full initial volume's. P and Q are taken together where
-    /// they leave less than `both` of what the better one leaves alone. None where there are too
-    /// few blocks for it.
+    /// From a level of `factor`, the deformed volume `warped` by a field and its displacement at
+    /// a place; `shape` is the full initial volume's. P and Q are taken together where they leave
+    /// less than `both` of what the better one leaves alone. None where there are too few blocks
+    /// for it.
     pub fn measure(
         pair: &Pair<'_>,
         (factor, shape): ([usize; 3], [usize; 3]),
         warped: &[f32],
-        displacement: impl Fn([f64; 3]) -> [f64; 3] + Sync,
+        displacement: impl Fn(VoxelPoint) -> GridVector + Sync,
         both: f64,
     ) -> Option<Self> {
         let seen = seen_blocks(pair, warped, displacement);
@@ -283,7 +284,7 @@ impl Brightness {
     pub fn even_out(&self, values: &mut [f32], shape: [usize; 3], origin: [f64; 3], factor: [usize; 3]) {
         let [nx, ny, _] = shape;
         let at = |voxel: [usize; 3]| {
-            let p = std::array::from_fn(|a| voxel[a] as f64 + origin[a]);
+            let p = VoxelPoint(std::array::from_fn(|a| voxel[a] as f64 + origin[a]));
             scaled(self.shape, from_level(p, factor))
         };
         let step = if nx > 1 { (at([nx - 1, 0, 0])[0] - at([0; 3])[0]) / (nx - 1) as f64 } else { 0.0 };
@@ -384,7 +385,7 @@ fn monomial(at: [f64; 3], powers: [usize; 3]) -> f64 {
 }
 
 /// A place in voxels of the full initial lattice, -1 to 1 over it.
-fn scaled(shape: [usize; 3], at: [f64; 3]) -> [f64; 3] {
+fn scaled(shape: [usize; 3], VoxelPoint(at): VoxelPoint) -> [f64; 3] {
     std::array::from_fn(|a| if shape[a] > 1 { 2.0 * at[a] / (shape[a] - 1) as f64 - 1.0 } else { 0.0 })
 }
 
@@ -419,7 +420,7 @@ fn steepest(terms: &[f64]) -> f64 {
 /// By how much each of two values of blocks differs between neighbours (median), each the middle of
 /// the blocks about it.
 fn between_neighbours(blocks: &[Block], values: [&dyn Fn(&Block) -> f64; 2]) -> [f64; 2] {
-    let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at).collect();
+    let places: Vec<[f64; 3]> = blocks.iter().map(|b| b.at.0).collect();
     let tree = Neighbours::new(&places);
     let near: Vec<Vec<usize>> =
         places.iter().map(|p| tree.within(*p, f64::INFINITY, NEIGHBOURS.median_blocks)).collect();
@@ -497,23 +498,27 @@ fn fit(rows: &[Vec<f64>], blocks: &[Block], weights: &[f64]) -> Option<Vec<f64>>
 
 /// A block of voxels as both volumes show it under a field.
 struct BlockMeans {
-    /// Place in the deformed volume (voxels of the level's initial lattice).
-    at: [f64; 3],
+    /// Place in the deformed volume, on the level's initial lattice.
+    at: VoxelPoint,
     weight: f64,
     /// Mean value in both volumes.
     mean: [f64; 2],
 }
 
 /// The blocks that lie in the mask by half at least.
-fn seen_blocks(pair: &Pair<'_>, warped: &[f32], displacement: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<BlockMeans> {
+fn seen_blocks(
+    pair: &Pair<'_>,
+    warped: &[f32],
+    displacement: impl Fn(VoxelPoint) -> GridVector + Sync,
+) -> Vec<BlockMeans> {
     let side = pair.in_voxels(BLOCKS.edge_voxels);
     let along = |a: usize| (0..pair.shape[a]).step_by(side[a]);
     let starts: Vec<[usize; 3]> =
         along(2).flat_map(|k| along(1).flat_map(move |j| along(0).map(move |i| [i, j, k]))).collect();
     let seen = |first| {
         let (p, weight, mean) = means(pair, warped, first, side)?;
-        let u = displacement(p);
-        Some(BlockMeans { at: std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]), weight, mean })
+        let at = p.moved(displacement(p), pair.spacing);
+        Some(BlockMeans { at, weight, mean })
     };
     starts.into_par_iter().filter_map(seen).collect()
 }
@@ -537,7 +542,7 @@ fn blocks(seen: &[BlockMeans], (zero, least): (Zero, [f64; 2]), factor: [usize; 
 
 /// Centre (voxels), weight and mean brightness in both volumes of the block that starts at `first`;
 /// none where less than half of it is tissue that both show.
-fn means(pair: &Pair<'_>, warped: &[f32], first: [usize; 3], side: [usize; 3]) -> Option<([f64; 3], f64, [f64; 2])> {
+fn means(pair: &Pair<'_>, warped: &[f32], first: [usize; 3], side: [usize; 3]) -> Option<(VoxelPoint, f64, [f64; 2])> {
     let [nx, ny, _] = pair.shape;
     let last: [usize; 3] = std::array::from_fn(|a| (first[a] + side[a]).min(pair.shape[a]));
     let (mut centre, mut sum, mut means, mut count) = ([0.0; 3], 0.0, [0.0; 2], 0usize);
@@ -553,5 +558,5 @@ fn means(pair: &Pair<'_>, warped: &[f32], first: [usize; 3], side: [usize; 3]) -
         }
     }
     let all: usize = (0..3).map(|a| last[a] - first[a]).product();
-    (2 * count >= all && sum > 0.0).then(|| (centre.map(|c| c / sum), sum, means.map(|m| m / sum)))
+    (2 * count >= all && sum > 0.0).then(|| (VoxelPoint(centre.map(|c| c / sum)), sum, means.map(|m| m / sum)))
 }

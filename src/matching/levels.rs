@@ -142,14 +142,14 @@ impl<'a> OnAxes<'a> {
 
 /// Position on a level of `factor` of a full-resolution voxel position.
 #[inline(always)]
-pub fn to_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
-    std::array::from_fn(|a| (p[a] + 0.5) / factor[a] as f64 - 0.5)
+pub fn to_level(VoxelPoint(p): VoxelPoint, factor: [usize; 3]) -> VoxelPoint {
+    VoxelPoint(std::array::from_fn(|a| (p[a] + 0.5) / factor[a] as f64 - 0.5))
 }
 
 /// Full-resolution voxel position of a position on a level of `factor`.
 #[inline(always)]
-pub fn from_level(p: [f64; 3], factor: [usize; 3]) -> [f64; 3] {
-    std::array::from_fn(|a| (p[a] + 0.5) * factor[a] as f64 - 0.5)
+pub fn from_level(VoxelPoint(p): VoxelPoint, factor: [usize; 3]) -> VoxelPoint {
+    VoxelPoint(std::array::from_fn(|a| (p[a] + 0.5) * factor[a] as f64 - 0.5))
 }
 
 /// Reduction factors from coarse to fine. The finest is `finest` times the smallest voxel edge,

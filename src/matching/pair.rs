@@ -5,6 +5,7 @@ use crate::numerics::bspline::{Lattice, SmoothSampler};
 use crate::numerics::pyramid;
 use crate::numerics::sampling::beside;
 use crate::numerics::simd::dispatch;
+use crate::types::{GridVector, VoxelPoint};
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::ops::Range;
@@ -19,10 +20,10 @@ const MIN_TEXTURE_SNR: f32 = 1.25;
 /// A place that is known in both volumes, with how well.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Anchor {
-    /// Place (voxels of the initial lattice).
-    pub at: [f64; 3],
-    /// Displacement (mm along the lattice's axes).
-    pub displacement: [f64; 3],
+    /// Place on the initial lattice.
+    pub at: VoxelPoint,
+    /// Displacement.
+    pub displacement: GridVector,
     /// Standard deviation along an axis (mm).
     pub sd: f64,
 }
@@ -100,7 +101,7 @@ impl<'a> Pair<'a> {
 
     /// Position in the deformed volume's own voxels.
     #[inline(always)]
-    pub fn to_moving(&self, p: [f64; 3]) -> [f32; 3] {
+    pub fn to_moving(&self, VoxelPoint(p): VoxelPoint) -> [f32; 3] {
         std::array::from_fn(|a| (p[a] - self.moving_origin[a]) as f32)
     }
 
@@ -119,12 +120,12 @@ impl<'a> Pair<'a> {
         plain.map(|(_, inside)| inside).sum::<usize>() as f64 / self.inside.max(1) as f64
     }
 
-    /// Whether a place (voxels) lies in such a block, with none that has texture beside it.
-    pub(crate) fn is_plain(&self) -> impl Fn([f64; 3]) -> bool + Sync + use<> {
+    /// Whether a place lies in such a block, with none that has texture beside it.
+    pub(crate) fn is_plain(&self) -> impl Fn(VoxelPoint) -> bool + Sync + use<> {
         let side = self.in_voxels(TEXTURE_BLOCK_VOXELS);
         let [nx, ny, nz] = std::array::from_fn(|a| self.shape[a].div_ceil(side[a]));
         let textured: Vec<bool> = self.blocks().into_iter().map(|(textured, inside)| textured && inside > 0).collect();
-        move |p| {
+        move |VoxelPoint(p)| {
             let [i, j, k] = std::array::from_fn(|a| p[a].round().max(0.0) as usize / side[a]);
             let own = i + nx * (j + ny * k);
             !textured[own] && beside([nx, ny, nz], own).all(|block| !textured[block])

@@ -18,6 +18,7 @@ use crate::numerics::simd::dispatch;
 use crate::numerics::statistics::median;
 use crate::numerics::symmetric3::eigenvalues;
 use crate::numerics::{ablation, filters, pyramid};
+use crate::types::VoxelPoint;
 use rayon::prelude::*;
 
 /// Cauchy's tuning constant (standard deviations): 95 % efficiency for Gaussian noise (Holland &
@@ -88,7 +89,7 @@ impl NormalEquations {
 
     /// Adds a place that pulls with `pull` (1/mm) under the information `weight` (1/mm^2, the same
     /// along every axis), as it acts on the nodes of `lattice`.
-    pub fn add(&mut self, lattice: &Lattice, at: [f64; 3], weight: f32, pull: [f32; 3]) {
+    pub fn add(&mut self, lattice: &Lattice, at: VoxelPoint, weight: f32, pull: [f32; 3]) {
         let n = lattice.len();
         let thick: [bool; 3] = lattice.shape.map(|s| s > 1);
         lattice.for_each_tap(at, |node, b| {

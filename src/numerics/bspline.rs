@@ -8,6 +8,7 @@
 
 use crate::numerics::cubic::{self, LANES, Places};
 use crate::numerics::simd::dispatch;
+use crate::types::{GridVector, VoxelPoint};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -70,16 +71,16 @@ impl Lattice {
     }
 
     /// Where node `m` stands (voxels): the outermost nodes lie beyond the grid.
-    pub fn place(&self, m: usize) -> [f64; 3] {
+    pub fn place(&self, m: usize) -> VoxelPoint {
         let [nx, ny, _] = self.nodes;
         let index = [m % nx, m / nx % ny, m / (nx * ny)];
-        std::array::from_fn(|a| (index[a] as f64 - 1.0) * self.step[a] as f64)
+        VoxelPoint(std::array::from_fn(|a| (index[a] as f64 - 1.0) * self.step[a] as f64))
     }
 
     /// Where node `m` stands, or the nearest place of the grid to it (voxels).
-    pub fn within(&self, m: usize) -> [f64; 3] {
-        let at = self.place(m);
-        std::array::from_fn(|a| at[a].clamp(0.0, (self.shape[a] - 1) as f64))
+    pub fn within(&self, m: usize) -> VoxelPoint {
+        let at = self.place(m).0;
+        VoxelPoint(std::array::from_fn(|a| at[a].clamp(0.0, (self.shape[a] - 1) as f64)))
     }
 
     /// How many nodes act along axis `a`: 4, or 1 for a side of one voxel.
@@ -108,7 +109,7 @@ impl Lattice {
     /// Calls `tap(node, weight)` for each of the at most 64 nodes that act at a fractional voxel
     /// position.
     #[inline(always)]
-    pub fn for_each_tap(&self, p: [f64; 3], mut tap: impl FnMut(usize, f32)) {
+    pub fn for_each_tap(&self, VoxelPoint(p): VoxelPoint, mut tap: impl FnMut(usize, f32)) {
         let s: [(usize, [f32; 4]); 3] = std::array::from_fn(|a| self.stencil_at(a, p[a]));
         for c in 0..self.taps(2) {
             for b in 0..self.taps(1) {
@@ -123,15 +124,15 @@ impl Lattice {
 
     /// The nodes that act at a fractional voxel position (clamped to the grid), to be used many
     /// times.
-    pub(crate) fn stencil_near(&self, p: [f64; 3]) -> Stencil {
+    pub(crate) fn stencil_near(&self, VoxelPoint(p): VoxelPoint) -> Stencil {
         let s: [(usize, [f32; 4]); 3] = std::array::from_fn(|a| self.stencil_at(a, p[a]));
         let stride = [1, self.nodes[0], self.nodes[0] * self.nodes[1]];
         let base = (0..3).map(|a| s[a].0 * stride[a]).sum();
         Stencil { base, stride, taps: std::array::from_fn(|a| self.taps(a)), weights: s.map(|s| s.1) }
     }
 
-    /// The vector at a fractional voxel position (clamped to the grid).
-    pub fn at(&self, coefficients: &[f32], p: [f64; 3]) -> [f64; 3] {
+    /// The displacement at a fractional voxel position (clamped to the grid).
+    pub fn at(&self, coefficients: &[f32], p: VoxelPoint) -> GridVector {
         let n = self.len();
         let mut sum = [0.0f32; 3];
         self.for_each_tap(p, |node, w| {
@@ -139,7 +140,7 @@ impl Lattice {
                 sum[c] += w * coefficients[c * n + node];
             }
         });
-        sum.map(f64::from)
+        GridVector(sum.map(f64::from))
     }
 
     /// The node planes that act on slice `k`, combined: three planar components of nodes_x by
@@ -401,7 +402,7 @@ impl Lattice {
     /// Quasi-interpolation `c = v - (second differences of v) / 6`: exact for cubics, fourth order
     /// (de Boor 1978) up to the ends, where the second differences are continued in a straight
     /// line. `f` gets a node's voxel position, which may lie up to one step outside the grid.
-    pub fn fit(&self, f: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<f32> {
+    pub fn fit(&self, f: impl Fn(VoxelPoint) -> GridVector + Sync) -> Vec<f32> {
         let [mx, my, _] = self.nodes;
         let n = self.len();
         let position = |a: usize, m: usize| {
@@ -409,7 +410,7 @@ impl Lattice {
         };
         let values: Vec<[f64; 3]> = (0..n)
             .into_par_iter()
-            .map(|m| f([position(0, m % mx), position(1, m / mx % my), position(2, m / (mx * my))]))
+            .map(|m| f(VoxelPoint([position(0, m % mx), position(1, m / mx % my), position(2, m / (mx * my))])).0)
             .collect();
         let mut out = vec![0.0f32; 3 * n];
         for c in 0..3 {

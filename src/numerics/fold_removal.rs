@@ -220,6 +220,7 @@ pub(crate) fn unfold(lattice: &Lattice, spacing: [f64; 3], coefficients: &mut [f
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::types::GridVector;
 
     /// Least determinant at the knots.
     fn least(lattice: &Lattice, spacing: [f64; 3], coefficients: &[f32]) -> f32 {
@@ -240,7 +241,10 @@ mod tests {
         let lattice = Lattice::new([20, 24, 9], [4, 3, 2]);
         let spacing = [1.0, 2.0, 3.0];
         let map = [[0.1, -0.2, 0.05], [0.3, -0.3, 0.1], [0.0, 0.2, 0.2]];
-        let c = lattice.fit(|p| map.map(|r| r[0] * p[0] * 1.0 + r[1] * p[1] * 2.0 + r[2] * p[2] * 3.0));
+        let c = lattice.fit(|p| {
+            let [x, y, z] = p.in_mm([1.0, 2.0, 3.0]);
+            GridVector(map.map(|r| r[0] * x + r[1] * y + r[2] * z))
+        });
         // (1.1)(0.7 * 1.2 - 0.1 * 0.2) - (-0.2)(0.3 * 1.2 - 0) + 0.05 (0.3 * 0.2 - 0)
         assert!((least(&lattice, spacing, &c) - 0.977).abs() < 1e-3);
     }

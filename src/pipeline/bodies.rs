@@ -18,7 +18,7 @@ use crate::numerics::statistics::median;
 use crate::numerics::{ablation, filters, pyramid};
 use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, MatchParams, SplineField};
-use crate::types::LevelReport;
+use crate::types::{GridVector, LevelReport, VoxelPoint};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -197,23 +197,22 @@ impl Bodies {
         self.labels.get(voxel).copied().unwrap_or(0).into()
     }
 
-    /// The body at a place of the level, or the nearest to it (voxels).
-    pub(crate) fn label_near(&self, p: [f64; 3]) -> usize {
+    /// The body at a place of the level, or the nearest to it.
+    pub(crate) fn label_near(&self, p: VoxelPoint) -> usize {
         if self.labels.is_empty() {
             return 0;
         }
         self.label(voxel_near(self.fields[0].lattice.shape, p))
     }
 
-    /// The displacement (mm) at a place (voxels).
-    pub fn at(&self, p: [f64; 3]) -> [f64; 3] {
-        let field = &self.fields[self.label_near(p)];
-        field.lattice.at(&field.coefficients, p)
+    /// The displacement at a place of the level.
+    pub fn at(&self, p: VoxelPoint) -> GridVector {
+        self.fields[self.label_near(p)].at(p)
     }
 
     /// The same bodies on another level, on lattices as `lattice`; `place` maps its voxels to those
     /// here.
-    pub fn carried(&self, lattice: &Lattice, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Self {
+    pub fn carried(&self, lattice: &Lattice, place: impl Fn(VoxelPoint) -> VoxelPoint + Sync) -> Self {
         let labels = self.labels_on(lattice.shape, &place);
         let fields = self.fields.iter().map(|f| level::carry(f, lattice.clone(), &place)).collect();
         Self { labels, fixed: self.fixed, fields }
@@ -221,11 +220,11 @@ impl Bodies {
 
     /// The body of each voxel of another volume of `shape`, none where there is one body; `place`
     /// maps its voxels to those here.
-    pub(crate) fn labels_on(&self, shape: [usize; 3], place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<u8> {
+    pub(crate) fn labels_on(&self, shape: [usize; 3], place: impl Fn(VoxelPoint) -> VoxelPoint + Sync) -> Vec<u8> {
         let [nx, ny, nz] = shape;
         let label = |at: usize| {
             let v = [at % nx, at / nx % ny, at / (nx * ny)];
-            self.label_near(place(v.map(|v| v as f64))) as u8
+            self.label_near(place(VoxelPoint::of(v))) as u8
         };
         let voxels = if self.labels.is_empty() { 0 } else { nx * ny * nz };
         (0..voxels).into_par_iter().map(label).collect()
@@ -344,8 +343,7 @@ impl Bodies {
     fn proposed(&self, pair: &Pair<'_>, matches: &[LevelMatch], body: usize) -> Vec<Self> {
         let own: Vec<&LevelMatch> = matches.iter().filter(|m| self.label_near(m.voxel) == body).collect();
         let field = &self.fields[body];
-        let measured =
-            |m: &&LevelMatch| Measured { field: field.lattice.at(&field.coefficients, m.voxel), ..m.measured };
+        let measured = |m: &&LevelMatch| Measured { field: field.at(m.voxel).0, ..m.measured };
         let measured: Vec<Measured> = own.iter().map(measured).collect();
         let splits = grouping::splits(&measured, pyramid::finest(pair.shape, pair.spacing));
         splits.iter().map(|second| self.divided(pair, &own, second, body)).collect()
@@ -368,12 +366,7 @@ impl Bodies {
         };
         let labels = (0..votes.len()).map(label).collect();
         let side = |which: bool| {
-            let own: Vec<_> = matches
-                .iter()
-                .zip(second)
-                .filter(|(_, s)| **s == which)
-                .map(|(m, _)| (m.voxel, m.measured.displacement, m.measured.covariance))
-                .collect();
+            let own: Vec<_> = matches.iter().zip(second).filter(|(_, s)| **s == which).map(|(m, _)| m.seen()).collect();
             let (field, _) = level::couple(pair, own.into_iter(), (&pair.in_voxels(2), 0.3), None);
             level::carry(&field, self.fields[body].lattice.clone(), |p| p).before_passes()
         };
@@ -426,8 +419,8 @@ impl Bodies {
             let v = [at % nx, at / nx % ny, at / (nx * ny)];
             let steps = [(0, 1), (1, nx), (2, nx * ny)].into_iter().filter(move |&(a, _)| v[a] + 1 < pair.shape[a]);
             steps.map(move |(a, stride)| {
-                let mut p = v.map(|v| v as f64);
-                p[a] += 0.5;
+                let mut p = VoxelPoint::of(v);
+                p.0[a] += 0.5;
                 (at + stride, p)
             })
         };
@@ -436,8 +429,8 @@ impl Bodies {
             for (other, p) in after(at).filter(|(other, _)| pair.mask[*other] != 0) {
                 let sides = [self.label(at), self.label(other)];
                 if sides[0] != sides[1] && sides.contains(&body) {
-                    let [a, b] = sides.map(|s| self.fields[s].lattice.at(&self.fields[s].coefficients, p));
-                    jumps.push(distance(a, b) as f32);
+                    let [a, b] = sides.map(|s| self.fields[s].at(p));
+                    jumps.push(distance(a.0, b.0) as f32);
                 }
             }
         }
@@ -552,8 +545,8 @@ impl Bodies {
     }
 }
 
-/// The voxel at a place (voxels), or the nearest to it.
-fn voxel_near(shape: [usize; 3], p: [f64; 3]) -> usize {
+/// The voxel at a place, or the nearest to it.
+fn voxel_near(shape: [usize; 3], VoxelPoint(p): VoxelPoint) -> usize {
     let v: [usize; 3] = std::array::from_fn(|a| (p[a].round().max(0.0) as usize).min(shape[a] - 1));
     v[0] + shape[0] * (v[1] + shape[1] * v[2])
 }

@@ -16,7 +16,7 @@ use crate::pipeline::landmarks;
 use crate::pipeline::level::{self, LevelMatch, SplineField};
 use crate::pipeline::local_model::{self, Places, Rest, Tried};
 use crate::pipeline::uncertainty::{self, AtNodes, Variances};
-use crate::types::{Grid, Mask, MotionModel};
+use crate::types::{Grid, GridVector, Mask, MotionModel, VoxelPoint};
 use rayon::prelude::*;
 
 /// The mask with the `name` of each voxel's body; `labels` (bodies from 0) may be empty where there
@@ -141,9 +141,9 @@ fn smallest(
 ) -> (Choice, Vec<Tried>) {
     let finest = pyramid::finest(pair.shape, pair.spacing);
     let mut tried = Vec::new();
-    let seen_by_field = 1.0 - level::unseen(pair, |p| field.lattice.at(&field.coefficients, p));
+    let seen_by_field = 1.0 - level::unseen(pair, |p| field.at(p));
     let excess = |model, motion: &AffineMotion| {
-        let moved = |p: [f64; 3]| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a]));
+        let moved = |p| motion.on_grid(p, pair.spacing);
         if 1.0 - level::unseen(pair, moved) < MIN_SEEN_FRACTION * seen_by_field {
             return Excess { total: f64::INFINITY, worst: f64::INFINITY };
         }
@@ -166,8 +166,10 @@ pub(super) fn full_lattice(
 ) -> Spline {
     let Some(motion) = &choice.motion else { return on_full_grid(grid, field, factor) };
     let (lattice, spacing) = (over(grid, field, factor), grid.spacing());
-    let coefficients = lattice
-        .fit(|p| motion.displacement(std::array::from_fn(|a| to_level(p, judged)[a] * spacing[a] * judged[a] as f64)));
+    let coefficients = lattice.fit(|p| {
+        let VoxelPoint(p) = to_level(p, judged);
+        GridVector(motion.displacement(std::array::from_fn(|a| p[a] * spacing[a] * judged[a] as f64)))
+    });
     (lattice, coefficients)
 }
 
@@ -176,7 +178,7 @@ pub(super) fn on_full_grid(grid: &Grid, field: &SplineField, factor: [usize; 3])
     let lattice = over(grid, field, factor);
     let coefficients = match factor == [1; 3] {
         true => field.coefficients.clone(),
-        false => lattice.fit(|p| field.lattice.at(&field.coefficients, to_level(p, factor))),
+        false => lattice.fit(|p| field.at(to_level(p, factor))),
     };
     (lattice, coefficients)
 }
@@ -194,7 +196,7 @@ pub(super) fn departure((full, stated): &Spline, free: &SplineField, factor: [us
     let times = if rejected { uncertainty::left_out(axes) } else { 1.0 };
     let at = |m: usize| {
         let p = lattice.within(m);
-        times * distance(full.at(stated, from_level(p, factor)), lattice.at(&free.coefficients, p)) as f32
+        times * distance(full.at(stated, from_level(p, factor)).0, free.at(p).0) as f32
     };
     (0..lattice.len()).into_par_iter().map(at).collect()
 }
@@ -206,7 +208,7 @@ pub(super) fn hidden(pair: &Pair<'_>, field: &SplineField) -> Vec<bool> {
     let is_plain = pair.is_plain();
     let shows = |m: usize| {
         let p = lattice.within(m);
-        level::sees(pair, p, lattice.at(&field.coefficients, p)) && !is_plain(p)
+        level::sees(pair, p, field.at(p)) && !is_plain(p)
     };
     (0..lattice.len()).into_par_iter().map(|m| !shows(m)).collect()
 }

@@ -378,9 +378,9 @@ pub(super) fn begun_from(
     let axes = grid.axes();
     let of = |start: &StartMap<'_>| {
         let rest = start::rest(start);
-        let along = |p: [f64; 3]| {
-            let d = rest(grid.affine().to_world(VoxelPoint(from_level(p, factor))));
-            std::array::from_fn(|a| (0..3).map(|r| axes[r][a] * d[r]).sum())
+        let along = |p| {
+            let d = rest(grid.affine().to_world(from_level(p, factor)));
+            GridVector(std::array::from_fn(|a| (0..3).map(|r| axes[r][a] * d[r]).sum()))
         };
         let field = SplineField::still(level::lattice(&pair, COARSE_NODE_SPACING_VOXELS));
         let motion = SplineField { coefficients: field.lattice.fit(along), ..field };

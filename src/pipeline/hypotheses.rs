@@ -222,8 +222,8 @@ fn far_turn(found: &Matched) -> Option<AffineMotion> {
 
 /// The field of a rigid motion.
 fn on_lattice(lattice: &Lattice, pair: &Pair<'_>, motion: &AffineMotion) -> SplineField {
-    let moved = |p: [f64; 3]| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a]));
-    SplineField { coefficients: lattice.fit(moved), ..SplineField::still(lattice.clone()) }
+    let coefficients = lattice.fit(|p| motion.on_grid(p, pair.spacing));
+    SplineField { coefficients, ..SplineField::still(lattice.clone()) }
 }
 
 /// What a search found, or a further one about the rigid motion that most of its features agree
@@ -410,7 +410,7 @@ impl Search<'_> {
         let Some(found) = found.filter(|_| more) else { return false };
         let here = |m: LevelMatch| {
             let voxel = to_level(from_level(m.voxel, next_factor), factor);
-            let place = std::array::from_fn(|a| voxel[a] * pair.spacing[a]);
+            let place = voxel.in_mm(pair.spacing);
             LevelMatch { voxel, measured: Measured { place, ..m.measured }, ..m }
         };
         begun.matches = matches.into_iter().map(here).collect();
@@ -483,8 +483,8 @@ mod tests {
         };
         assert!(search.look_ahead((&pair, factor), (&next, next_factor), &mut begun, 4, &mut 0.0));
         let (grid, axes) = (made.initial.grid(), made.initial.grid().axes());
-        let exact = |p: [f64; 3]| -> [f64; 3] {
-            let v = from_level(p, factor).map(|v| v.round() as usize);
+        let exact = |p| -> [f64; 3] {
+            let v = from_level(p, factor).0.map(|v| v.round() as usize);
             let d = made.truth.at(grid.index(v[0], v[1], v[2])).map(f64::from);
             std::array::from_fn(|a| (0..3).map(|r| axes[r][a] * d[r]).sum())
         };
@@ -493,11 +493,11 @@ mod tests {
         let within = kept.iter().filter(|m| off(m.measured.displacement, exact(m.voxel)) < 0.5).count();
         assert!(kept.len() > 100 && 10 * within > 9 * kept.len(), "{within} of {}", kept.len());
         let placed =
-            |m: &&LevelMatch| (0..3).all(|a| (m.measured.place[a] - m.voxel[a] * pair.spacing[a]).abs() < 1e-9);
+            |m: &&LevelMatch| (0..3).all(|a| (m.measured.place[a] - m.voxel.in_mm(pair.spacing)[a]).abs() < 1e-9);
         assert!(kept.iter().all(placed));
         // Their field goes on, as the volumes agree better under it than at rest.
         let field = begun.of_matches.unwrap();
-        let carried = |m: &&&LevelMatch| off(field.lattice.at(&field.coefficients, m.voxel), m.measured.field) < 0.3;
+        let carried = |m: &&&LevelMatch| off(field.at(m.voxel).0, m.measured.field) < 0.3;
         let carried = kept.iter().filter(carried).count();
         assert!(10 * carried > 9 * kept.len(), "{carried} of {}", kept.len());
     }

@@ -14,7 +14,7 @@ use crate::pipeline::bodies::Bodies;
 use crate::pipeline::hypotheses::Start;
 use crate::pipeline::known::Known;
 use crate::pipeline::level::{self, SplineField};
-use crate::types::{Grid, Landmark, LandmarkReport};
+use crate::types::{Grid, GridVector, Landmark, LandmarkReport, VoxelPoint};
 
 /// Graduated non-convexity of the landmarks' weights (Blake and Zisserman 1987).
 struct Annealing {
@@ -41,7 +41,7 @@ pub(super) fn anchors(known: &Known<'_>, grid: &Grid) -> Vec<Anchor> {
     let of = |l: &Landmark| {
         let d = l.deformed.minus(l.initial);
         let along = |a: usize| (0..3).map(|r| axes[r][a] * d[r]).sum();
-        Anchor { at: grid.affine().to_voxel(l.initial).0, displacement: std::array::from_fn(along), sd }
+        Anchor { at: grid.affine().to_voxel(l.initial), displacement: GridVector(std::array::from_fn(along)), sd }
     };
     known.landmarks.iter().map(of).collect()
 }
@@ -52,8 +52,8 @@ fn voxel(grid: &Grid) -> f64 {
 }
 
 /// Each landmark's squared distance from a motion `at` a place, over its variance.
-fn squares(anchors: &[Anchor], at: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
-    anchors.iter().map(|a| (distance(at(a.at), a.displacement) / a.sd).powi(2)).collect()
+fn squares(anchors: &[Anchor], at: impl Fn(VoxelPoint) -> GridVector) -> Vec<f64> {
+    anchors.iter().map(|a| (distance(at(a.at).0, a.displacement.0) / a.sd).powi(2)).collect()
 }
 
 /// The squared scale of the weights, by the passes `to_come` after this one, as [`ANNEALING`] says:
@@ -65,7 +65,7 @@ fn scale(to_come: usize) -> f64 {
 
 /// How far the field is from most landmarks (mm, twice the median).
 pub(super) fn reach(pair: &Pair<'_>, field: &SplineField) -> f64 {
-    let far = |a: &Anchor| distance(field.lattice.at(&field.coefficients, a.at), a.displacement) as f32;
+    let far = |a: &Anchor| distance(field.at(a.at).0, a.displacement.0) as f32;
     let mut all: Vec<f32> = pair.anchors.iter().map(far).collect();
     if all.is_empty() { 0.0 } else { 2.0 * f64::from(median(&mut all)) }
 }
@@ -77,12 +77,10 @@ pub(super) fn are_settled(pair: &Pair<'_>, to_come: usize) -> bool {
 
 /// Adds what the landmarks pull with to a pass with `to_come` passes after it.
 pub(super) fn pull(pair: &Pair<'_>, field: &SplineField, equations: &mut NormalEquations, to_come: usize) {
-    let at = |p| field.lattice.at(&field.coefficients, p);
     let scale = scale(to_come);
-    for (anchor, q) in pair.anchors.iter().zip(squares(&pair.anchors, at)) {
+    for (anchor, q) in pair.anchors.iter().zip(squares(&pair.anchors, |p| field.at(p))) {
         let weight = scale / (scale + q) / (anchor.sd * anchor.sd);
-        let u = at(anchor.at);
-        let pull = std::array::from_fn(|c| (weight * (anchor.displacement[c] - u[c])) as f32);
+        let pull = anchor.displacement.minus(field.at(anchor.at)).0.map(|d| (weight * d) as f32);
         equations.add(&field.lattice, anchor.at, weight as f32, pull);
     }
 }
@@ -107,8 +105,8 @@ pub(super) fn add_excess(
     windows: &Lattice,
     excess: &mut [f32],
 ) {
-    let free = squares(&pair.anchors, |p| field.lattice.at(&field.coefficients, p));
-    let map = squares(&pair.anchors, |p| motion.displacement(std::array::from_fn(|a| p[a] * pair.spacing[a])));
+    let free = squares(&pair.anchors, |p| field.at(p));
+    let map = squares(&pair.anchors, |p| motion.on_grid(p, pair.spacing));
     for ((anchor, free), map) in pair.anchors.iter().zip(free).zip(map) {
         windows.stencil_near(anchor.at).scatter((cost(map) - cost(free)) as f32, excess);
     }
@@ -119,10 +117,10 @@ pub(super) fn measured(pair: &Pair<'_>, field: &SplineField) -> Vec<Measured> {
     let of = |a: &Anchor| {
         let variance = a.sd * a.sd;
         Measured {
-            place: std::array::from_fn(|c| a.at[c] * pair.spacing[c]),
-            displacement: a.displacement,
+            place: a.at.in_mm(pair.spacing),
+            displacement: a.displacement.0,
             covariance: [variance, variance, variance, 0.0, 0.0, 0.0],
-            field: field.lattice.at(&field.coefficients, a.at),
+            field: field.at(a.at).0,
         }
     };
     pair.anchors.iter().map(of).collect()
@@ -142,15 +140,15 @@ pub(super) fn start(pair: &Pair<'_>, factor: [usize; 3]) -> Option<Start> {
     Some(Start { motion: Bodies::from(field.before_passes()), factor, followed: None })
 }
 
-/// What became of the landmarks under a motion `at` a place of the full-resolution grid (voxels, mm
-/// along the axes) of such a deviation along an axis (mm).
+/// What became of the landmarks under a motion `at` a place of the full-resolution grid, of such a
+/// deviation along an axis (mm).
 pub(super) fn report(
     anchors: &[Anchor],
-    at: impl Fn([f64; 3]) -> [f64; 3],
-    deviation: impl Fn([f64; 3]) -> f64,
+    at: impl Fn(VoxelPoint) -> GridVector,
+    deviation: impl Fn(VoxelPoint) -> f64,
 ) -> Option<LandmarkReport> {
     let first = anchors.first()?;
-    let off: Vec<f64> = anchors.iter().map(|a| distance(at(a.at), a.displacement)).collect();
+    let off: Vec<f64> = anchors.iter().map(|a| distance(at(a.at).0, a.displacement.0)).collect();
     let is_wrong = |i: &usize| {
         let variance = anchors[*i].sd.powi(2) + deviation(anchors[*i].at).powi(2);
         off[*i].powi(2) / variance > GATE

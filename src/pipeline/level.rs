@@ -71,6 +71,11 @@ const PASS: PassControl = PassControl {
 };
 
 impl SplineField {
+    /// The displacement at a place of the level.
+    pub(crate) fn at(&self, p: VoxelPoint) -> GridVector {
+        self.lattice.at(&self.coefficients, p)
+    }
+
     /// No motion, with a bending energy to start from.
     pub fn still(lattice: Lattice) -> Self {
         let n = 3 * lattice.len();
@@ -287,7 +292,7 @@ pub fn excess<'a>(
     let free = Baseline::new(&some, some.warp_sparsely(&field.lattice, &field.coefficients));
     let weight = every as f32 * independent(pair);
     move |motion| {
-        let map = field.lattice.fit(|p| motion.displacement(std::array::from_fn(|a| p[a] * some.spacing[a])));
+        let map = field.lattice.fit(|p| motion.on_grid(p, some.spacing));
         let warped = some.warp_sparsely(&field.lattice, &map);
         let mut by_place = residual::excess_by_place(&some, &warped, &free, windows);
         by_place.iter_mut().for_each(|v| *v *= weight);
@@ -313,23 +318,22 @@ pub(crate) fn gained(pair: &Pair<'_>, from: &[f32], to: Vec<f32>) -> f64 {
     residual::excess(pair, from, &Baseline::new(pair, to)) * f64::from(independent(pair))
 }
 
-/// Mean and largest length over the mask (mm) of the displacement `at` a place (voxels), from every
-/// third voxel along each axis.
-pub fn lengths(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 2] {
+/// Mean and largest length over the mask (mm) of the displacement `at` a place, from every third
+/// voxel along each axis.
+pub fn lengths(pair: &Pair<'_>, at: impl Fn(VoxelPoint) -> GridVector) -> [f64; 2] {
     let [nx, ny, nz] = pair.shape;
     let (mut sum, mut count, mut largest) = (0.0, 0usize, 0.0f64);
     for (j, k) in (0..nz).step_by(3).flat_map(|k| (0..ny).step_by(3).map(move |j| (j, k))) {
         for i in (0..nx).step_by(3).filter(|i| pair.mask[i + nx * (j + ny * k)] != 0) {
-            let length = distance(at([i, j, k].map(|v| v as f64)), [0.0; 3]);
+            let length = distance(at(VoxelPoint::of([i, j, k])).0, [0.0; 3]);
             (sum, count, largest) = (sum + length, count + 1, largest.max(length));
         }
     }
     [sum / count.max(1) as f64, largest]
 }
 
-/// Whether the deformed volume shows what is at `p` (voxels) in the initial one and moves by `u`
-/// (mm).
-pub fn sees(pair: &Pair<'_>, p: [f64; 3], u: [f64; 3]) -> bool {
+/// Whether the deformed volume shows what is at `p` in the initial one and moves by `u`.
+pub fn sees(pair: &Pair<'_>, VoxelPoint(p): VoxelPoint, GridVector(u): GridVector) -> bool {
     let shape = pair.moving_shape;
     let along = |a: usize| p[a] + u[a] / pair.spacing[a] - pair.moving_origin[a];
     let there = VoxelPoint(std::array::from_fn(|a| if shape[a] > 1 { along(a) } else { 0.0 }));
@@ -337,14 +341,14 @@ pub fn sees(pair: &Pair<'_>, p: [f64; 3], u: [f64; 3]) -> bool {
 }
 
 /// The part of the mask that the deformed volume does not show (1), from every third voxel along
-/// each axis; `at` gives the displacement (mm) at a place (voxels).
-pub fn unseen(pair: &Pair<'_>, at: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> f64 {
+/// each axis; `at` gives the displacement at a place.
+pub fn unseen(pair: &Pair<'_>, at: impl Fn(VoxelPoint) -> GridVector + Sync) -> f64 {
     let [nx, ny, nz] = pair.shape;
     let in_plane = |k: usize| -> [usize; 2] {
         let every = (0..ny).step_by(3).flat_map(|j| (0..nx).step_by(3).map(move |i| [i, j, k]));
         let inside = every.filter(|[i, j, k]| pair.mask[i + nx * (j + ny * k)] != 0);
         inside.fold([0; 2], |[out, all], v| {
-            let p = v.map(|v| v as f64);
+            let p = VoxelPoint::of(v);
             [out + usize::from(!sees(pair, p, at(p))), all + 1]
         })
     };
@@ -362,17 +366,26 @@ pub fn misfit(pair: &Pair<'_>, warped: &[f32]) -> [f32; 2] {
 
 /// The field of a coarser level on this level's lattice; `from_here` maps voxels of this level to
 /// that one's.
-pub fn carry(coarse: &SplineField, lattice: Lattice, from_here: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> SplineField {
-    let coefficients = lattice.fit(|p| coarse.lattice.at(&coarse.coefficients, from_here(p)));
+pub fn carry(
+    coarse: &SplineField,
+    lattice: Lattice,
+    from_here: impl Fn(VoxelPoint) -> VoxelPoint + Sync,
+) -> SplineField {
+    let coefficients = lattice.fit(|p| coarse.at(from_here(p)));
     let smoothness = resampled(&coarse.lattice, &coarse.smoothness, &lattice, &from_here);
     SplineField { lattice, coefficients, smoothness, blocks: Blocks::default() }
 }
 
 /// Values at the nodes of one lattice (planar, three components) at those of another; `place` maps
 /// the voxels of `to` to those of `from`. Positive values stay so.
-fn resampled(from: &Lattice, values: &[f32], to: &Lattice, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Vec<f32> {
+fn resampled(
+    from: &Lattice,
+    values: &[f32],
+    to: &Lattice,
+    place: impl Fn(VoxelPoint) -> VoxelPoint + Sync,
+) -> Vec<f32> {
     let n = to.len();
-    let at: Vec<[f64; 3]> = (0..n).into_par_iter().map(|m| from.at(values, place(to.place(m)))).collect();
+    let at: Vec<[f64; 3]> = (0..n).into_par_iter().map(|m| from.at(values, place(to.place(m))).0).collect();
     (0..3).flat_map(|c| at.iter().map(move |v| v[c] as f32)).collect()
 }
 
@@ -414,14 +427,21 @@ impl MatchParams {
 /// One feature's match on a level.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LevelMatch {
-    /// Place (voxels of the level's initial lattice).
-    pub voxel: [f64; 3],
+    /// Place on the level's initial lattice.
+    pub voxel: VoxelPoint,
     /// Displacement, covariance and the coupled field's displacement (mm along the lattice's axes).
     pub measured: Measured,
     /// Correlation.
     pub ncc: f32,
     /// Survived consistency.
     pub kept: bool,
+}
+
+impl LevelMatch {
+    /// What a field is coupled to ([`couple`]).
+    pub(super) fn seen(&self) -> (VoxelPoint, GridVector, Symmetric3) {
+        (self.voxel, GridVector(self.measured.displacement), self.measured.covariance)
+    }
 }
 
 /// Features of both volumes, many-to-many candidates, relaxation, least-squares matching, coupling,
@@ -439,32 +459,33 @@ pub fn matches(
     let radius = pair.in_voxels(params.patch);
     let warped = known.map(|k| pair.warp(&k.lattice, &k.coefficients, &pair.spans.grown(radius[0] + 3)));
     let Sought { initial, starts, deformed, list, origin } = sought(pair, warped.as_deref(), &params);
-    let mm: Vec<[f64; 3]> = starts.iter().map(|p| std::array::from_fn(|a| p[a] * spacing[a])).collect();
+    let mm: Vec<[f64; 3]> = starts.iter().map(|p| p.in_mm(spacing)).collect();
     let (chosen, [energy_before, energy_after]) = assigned(pair, &mm, &list, &params);
 
     // Sub-voxel position and covariance of each choice.
     let template = template(pair, radius);
     let place = |i: usize| {
-        let start = list[i].get(chosen[i])?.displacement.0;
+        let start = list[i].get(chosen[i])?.displacement;
         let centre = initial[i].centre;
-        let at: [f64; 3] = std::array::from_fn(|a| centre[a] as f64 + start[a] / spacing[a] - origin[a]);
+        let VoxelPoint(at) = VoxelPoint::of(centre).moved(start, spacing);
+        let at = std::array::from_fn(|a| at[a] - origin[a]);
         let mut found = refined(pair, warped.as_deref(), &template, centre, at, radius)?;
         if !params.sub_voxel {
-            found.shift = GridVector([0.0; 3]);
+            found.shift = GridVector::ZERO;
         }
         Some((i, start, found))
     };
-    let refined: Vec<Option<(usize, [f64; 3], Refined)>> = (0..initial.len()).into_par_iter().map(place).collect();
+    let refined: Vec<Option<(usize, GridVector, Refined)>> = (0..initial.len()).into_par_iter().map(place).collect();
     let refined: Vec<_> = refined.into_iter().flatten().collect();
 
     // The coupled field: the known one, or one fitted to all matches with their information.
     let fitted = known.is_none().then(|| fit(pair, &starts, &refined, &radius));
     let field = known.or(fitted.as_ref());
-    let measured = |(i, start, r): &(usize, [f64; 3], Refined)| {
-        let u = field.map_or([0.0; 3], |f| f.lattice.at(&f.coefficients, starts[*i]));
-        let base = if known.is_some() { u } else { [0.0; 3] };
-        let displacement = std::array::from_fn(|a| base[a] + (start[a] + r.shift.0[a]));
-        Measured { place: mm[*i], displacement, covariance: r.covariance, field: u }
+    let measured = |(i, start, r): &(usize, GridVector, Refined)| {
+        let u = field.map_or(GridVector::ZERO, |f| f.at(starts[*i]));
+        let base = if known.is_some() { u } else { GridVector::ZERO };
+        let displacement = base.plus(start.plus(r.shift)).0;
+        Measured { place: mm[*i], displacement, covariance: r.covariance, field: u.0 }
     };
     let mut measured: Vec<Measured> = refined.iter().map(measured).collect();
     let floor = 0.2 * pyramid::finest(pair.shape, spacing);
@@ -498,8 +519,8 @@ fn is_consistent(params: &MatchParams) -> bool {
 /// Features of both volumes with their candidate matches.
 struct Sought {
     initial: Vec<Corner>,
-    /// The places of the initial features (voxels).
-    starts: Vec<[f64; 3]>,
+    /// The places of the initial features.
+    starts: Vec<VoxelPoint>,
     /// Number of features in the deformed volume.
     deformed: usize,
     list: Vec<Vec<Candidate>>,
@@ -541,7 +562,6 @@ fn sought(pair: &Pair<'_>, warped: Option<&[f32]>, params: &MatchParams) -> Soug
             min_ncc: 0.3,
         },
     );
-    let starts = starts.into_iter().map(|p| p.0).collect();
     Sought { initial, starts, deformed: deformed.len(), list, origin }
 }
 
@@ -589,28 +609,28 @@ fn refined(
 }
 
 /// Least-squares matching alone, about a field that has each place within two voxels: what is left
-/// there is measured in the deformed volume warped by it. One match a place (voxels) that has one,
+/// there is measured in the deformed volume warped by it. One match a place that has one,
 /// none rejected yet.
 pub(super) fn follow(
     pair: &Pair<'_>,
     known: &SplineField,
-    places: impl IntoParallelIterator<Item = [f64; 3], Iter: IndexedParallelIterator>,
+    places: impl IntoParallelIterator<Item = VoxelPoint, Iter: IndexedParallelIterator>,
     patch: usize,
 ) -> Vec<LevelMatch> {
     let radius = pair.in_voxels(patch);
     let warped = pair.warp(&known.lattice, &known.coefficients, &pair.spans.grown(radius[0] + 3));
     let template = template(pair, radius);
-    let measure = |voxel: [f64; 3]| {
-        let centre = std::array::from_fn(|a| (voxel[a].round().max(0.0) as usize).min(pair.shape[a] - 1));
+    let measure = |voxel: VoxelPoint| {
+        let centre = std::array::from_fn(|a| (voxel.0[a].round().max(0.0) as usize).min(pair.shape[a] - 1));
         let place = |o: [f32; 3]| std::array::from_fn(|a| centre[a] as f32 + o[a]);
         let patch = |shift, out: &mut [f32]| trilinear_patch(&warped, pair.shape, place(shift), radius, out);
         let found = least_squares_matching::refine(&template, centre, patch, 3, 2.0)?;
-        let field = known.lattice.at(&known.coefficients, voxel);
+        let field = known.at(voxel);
         let measured = Measured {
-            place: std::array::from_fn(|a| voxel[a] * pair.spacing[a]),
-            displacement: std::array::from_fn(|a| field[a] + found.shift.0[a]),
+            place: voxel.in_mm(pair.spacing),
+            displacement: field.plus(found.shift).0,
             covariance: found.covariance,
-            field,
+            field: field.0,
         };
         Some(LevelMatch { voxel, measured, ncc: found.ncc, kept: true })
     };
@@ -643,17 +663,15 @@ pub(crate) fn matches_again(
     let (mut found, more, report) = matches(&rest, None, params);
     let joined = more.map(|more| {
         let coefficients = lattice.fit(|p| {
-            let step = more.lattice.at(&more.coefficients, p);
-            let known = lattice.at(&field.coefficients, std::array::from_fn(|a| p[a] + step[a] / pair.spacing[a]));
-            std::array::from_fn(|a| step[a] + known[a])
+            let step = more.at(p);
+            step.plus(field.at(p.moved(step, pair.spacing)))
         });
         SplineField { coefficients, ..field.clone() }
     });
     // A match leads to a place of the warped volume; the field takes it on from there.
     for m in &mut found {
-        let step = m.measured.displacement;
-        let known = lattice.at(&field.coefficients, std::array::from_fn(|a| m.voxel[a] + step[a] / pair.spacing[a]));
-        m.measured.displacement = std::array::from_fn(|a| step[a] + known[a]);
+        let step = GridVector(m.measured.displacement);
+        m.measured.displacement = step.plus(field.at(m.voxel.moved(step, pair.spacing))).0;
     }
     (found, joined, report)
 }
@@ -706,7 +724,7 @@ fn corners(
     let inside = mask.map(|m| pyramid::reduce_mask(m, shape, step));
     let mut found = features::corners(smooth, (shape, spacing), (sigma, step), inside.as_deref(), wanted, least);
     for corner in &mut found {
-        corner.voxel.0 = from_level(corner.voxel.0, step);
+        corner.voxel = from_level(corner.voxel, step);
         corner.centre = std::array::from_fn(|a| (corner.voxel.0[a].round().max(0.0) as usize).min(shape[a] - 1));
     }
     found
@@ -728,23 +746,20 @@ const MATCH_FIT: MatchFit = MatchFit { iterations: 7, refit_iterations: 3, node_
 /// Couples the matches of a level into a spline field.
 fn fit(
     pair: &Pair<'_>,
-    starts: &[[f64; 3]],
-    refined: &[(usize, [f64; 3], Refined)],
+    starts: &[VoxelPoint],
+    refined: &[(usize, GridVector, Refined)],
     radius: &[usize; 3],
 ) -> SplineField {
-    let measured = refined
-        .iter()
-        .map(|(i, start, r)| (starts[*i], std::array::from_fn(|a| start[a] + r.shift.0[a]), r.covariance));
+    let measured = refined.iter().map(|(i, start, r)| (starts[*i], start.plus(r.shift), r.covariance));
     couple(pair, measured, (radius, 0.3), None).0
 }
 
-/// Couples displacements measured on a level (place in voxels, displacement in mm, covariance in
-/// mm^2) into a spline field, from one that is nearly right and on its lattice where there is one;
+/// Couples displacements measured on a level (place, displacement, covariance in mm^2) into a spline field, from one that is nearly right and on its lattice where there is one;
 /// with the evidence used. Each may be off by `floor` voxels beyond its covariance, and was found
 /// with a patch of `radius` voxels.
 pub(super) fn couple(
     pair: &Pair<'_>,
-    measured: impl ExactSizeIterator<Item = ([f64; 3], [f64; 3], Symmetric3)>,
+    measured: impl ExactSizeIterator<Item = (VoxelPoint, GridVector, Symmetric3)>,
     (radius, floor): (&[usize; 3], f64),
     known: Option<&SplineField>,
 ) -> (SplineField, Vec<Evidence>) {

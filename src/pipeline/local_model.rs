@@ -15,7 +15,7 @@ use crate::numerics::filters;
 use crate::numerics::sampling::nearest;
 use crate::numerics::symmetric3::inverse;
 use crate::pipeline::level::SplineField;
-use crate::types::{MotionModel, VoxelPoint};
+use crate::types::{GridVector, MotionModel, VoxelPoint};
 
 /// When tissue is at rest or follows one rigid motion. The misfits are calibrated:
 /// docs/lab/2026-11-expected-error.md.
@@ -175,12 +175,12 @@ impl Rest {
     }
 
     /// How much of the free field stands at a place of the windows' grid, or at the nearest to it.
-    fn free_at(&self, at: [f64; 3]) -> f32 {
+    fn free_at(&self, at: VoxelPoint) -> f32 {
         self.windows.stencil_near(at).gather(&self.free)
     }
 
-    /// The uncertainty at a place (voxels in which it was judged) as a part of the free field's.
-    pub(crate) fn narrowed(&self, at: [f64; 3]) -> f32 {
+    /// The uncertainty at a place of the level where it was judged, as a part of the free field's.
+    pub(crate) fn narrowed(&self, at: VoxelPoint) -> f32 {
         (self.windows.stencil_near(at).gather(&self.ratio) / REST.uncertain_misfit)
             .clamp(REST.min_uncertainty_ratio, 1.0)
     }
@@ -205,12 +205,8 @@ impl Rest {
 
     /// Holds `field` where tissue is at rest; `place` leads from its voxels to those in which it
     /// was judged.
-    pub fn bring(&self, field: &mut SplineField, place: impl Fn([f64; 3]) -> [f64; 3] + Sync) {
-        let motion = |p: [f64; 3]| {
-            let at = place(p);
-            self.motion.displacement(std::array::from_fn(|a| at[a] * self.spacing[a]))
-        };
-        let rest = field.lattice.fit(motion);
+    pub fn bring(&self, field: &mut SplineField, place: impl Fn(VoxelPoint) -> VoxelPoint + Sync) {
+        let rest = field.lattice.fit(|p| self.motion.on_grid(place(p), self.spacing));
         let n = field.lattice.len();
         for m in 0..n {
             let free = self.free_at(place(field.lattice.within(m)));
@@ -221,17 +217,16 @@ impl Rest {
     }
 }
 
-/// What a field shows of the tissue at its nodes where `counts` holds (voxels), with the
+/// What a field shows of the tissue at its nodes where `counts` holds, with the
 /// information that the data give there.
-pub(super) fn shown(pair: &Pair<'_>, field: &SplineField, counts: impl Fn([f64; 3]) -> bool) -> Vec<Measured> {
+pub(super) fn shown(pair: &Pair<'_>, field: &SplineField, counts: impl Fn(VoxelPoint) -> bool) -> Vec<Measured> {
     let nodes = &field.lattice;
     let of = |(m, block): (usize, [f32; 6])| {
         let at = nodes.within(m);
-        let here = nearest(pair.shape, VoxelPoint(at)).is_some_and(|at| pair.mask[at] != 0);
+        let here = nearest(pair.shape, at).is_some_and(|at| pair.mask[at] != 0);
         let covariance = if here && counts(at) { inverse(&block.map(f64::from)) } else { None }?;
-        let displacement = nodes.at(&field.coefficients, at);
-        let place = std::array::from_fn(|a| at[a] * pair.spacing[a]);
-        Some(Measured { place, displacement, covariance, field: displacement })
+        let GridVector(displacement) = field.at(at);
+        Some(Measured { place: at.in_mm(pair.spacing), displacement, covariance, field: displacement })
     };
     field.blocks.iter().enumerate().filter_map(of).collect()
 }

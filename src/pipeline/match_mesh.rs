@@ -16,7 +16,7 @@ use rayon::prelude::*;
 pub(super) fn world_match(grid: &Grid, m: &LevelMatch, factor: [usize; 3]) -> Match {
     let axes = grid.axes();
     Match {
-        initial: grid.affine().to_world(VoxelPoint(from_level(m.voxel, factor))),
+        initial: grid.affine().to_world(from_level(m.voxel, factor)),
         displacement: grid.vector_to_world(GridVector(m.measured.displacement)),
         ncc: m.ncc,
         covariance: covariance_after(&axes, &m.measured.covariance),
@@ -33,7 +33,7 @@ pub(super) fn estimated(
     deviation: &ScalarSpline,
 ) -> SparseField {
     let of = |m: &mut Match| {
-        let VoxelPoint(place) = grid.affine().to_voxel(m.initial);
+        let place = grid.affine().to_voxel(m.initial);
         *m = m.with_estimate(coefficients.at_place(place), f64::from(deviation.at_place(place)));
     };
     sparse.matches.par_iter_mut().for_each(of);

@@ -271,7 +271,7 @@ pub(super) fn measure(
     let Found { mut field, matches, .. } = found;
     progress("model", 0.9);
     let choice = chosen(&pair, &field, &matches, params, cut, &reports);
-    let unseen = level::unseen(&pair, |p| field.lattice.at(&field.coefficients, p));
+    let unseen = level::unseen(&pair, |p| field.at(p));
     clock.book("model");
     let warped = pair.warp(&field.lattice, &field.coefficients, &pair.spans);
     let (full, mut variances) = variances(&pair, &field, &warped, &choice, factor, &grid, params.seed);
@@ -371,7 +371,7 @@ fn on_level(pair: &Pair<'_>, begun: SplineField, last: bool, params: &FieldParam
         ..MatchParams::near(params, pair, wanted, last && params.points > 0)
     };
     let (matches, _, report) = level::matches(pair, Some(&begun), near);
-    let places: Vec<[f64; 3]> = matches.iter().map(|m| m.voxel).collect();
+    let places: Vec<VoxelPoint> = matches.iter().map(|m| m.voxel).collect();
     let mut found = coupled(pair, &begun, matches, report, params);
     // Comparisons without sub-voxel matching have no use for it.
     let rounds = if params.sub_voxel { LEVEL_SEARCH.iterations[which] } else { 0 };
@@ -392,10 +392,10 @@ fn coupled(
     params: &FieldParams,
 ) -> Found {
     let radius = pair.in_voxels(LEVEL_SEARCH.patch_radius_voxels);
-    let measured = matches.iter().map(|m| (m.voxel, m.measured.displacement, m.measured.covariance));
+    let measured = matches.iter().map(LevelMatch::seen);
     let (mut field, evidence) = level::couple(pair, measured, (&radius, MATCH_ERROR.own_voxels), Some(known));
     unfold(&field.lattice, pair.spacing, &mut field.coefficients, MIN_JACOBIAN);
-    let at = |m: &LevelMatch| field.lattice.at(&field.coefficients, m.voxel);
+    let at = |m: &LevelMatch| field.at(m.voxel).0;
     let mut measured: Vec<Measured> = matches.iter().map(|m| Measured { field: at(m), ..m.measured }).collect();
     let kept = match params.consistency {
         true => prune(&measured, 0.2 * pyramid::finest(pair.shape, pair.spacing), GATE),

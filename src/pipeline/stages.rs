@@ -1,5 +1,6 @@
 //! The stage account: the field as each stage left it.
 
+use crate::consistency::energy::distance;
 use crate::field::spline::FieldSpline;
 use crate::matching::levels::{from_level, to_level};
 use crate::matching::pair::Pair;
@@ -7,7 +8,7 @@ use crate::numerics::bspline::SmoothSampler;
 use crate::pipeline::bodies::Bodies;
 use crate::pipeline::body_models::on_full_grid;
 use crate::pipeline::uncertainty::evenly;
-use crate::types::{DenseField, Grid, Mask, StageReport};
+use crate::types::{DenseField, Grid, GridVector, Mask, StageReport, VoxelPoint};
 use rayon::prelude::*;
 
 /// Approximate number of places at which stages are compared.
@@ -53,11 +54,11 @@ pub(super) fn account(
 ) -> Vec<Stage> {
     let places = places(pair);
     let sampler = pair.sampler();
-    let unexplained = |moved: &[[f64; 3]]| unexplained(pair, &sampler, &places, moved);
-    let mut before = vec![[0.0; 3]; places.len()];
+    let unexplained = |moved: &[GridVector]| unexplained(pair, &sampler, &places, moved);
+    let mut before = vec![GridVector::ZERO; places.len()];
     let mut all = Vec::new();
-    let mut add = |name: String, spacing_mm: [f64; 3], moved: Vec<[f64; 3]>, field: FieldSpline| {
-        let length = |(a, b): (&[f64; 3], &[f64; 3])| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>().sqrt();
+    let mut add = |name: String, spacing_mm: [f64; 3], moved: Vec<GridVector>, field: FieldSpline| {
+        let length = |(a, b): (&GridVector, &GridVector)| distance(a.0, b.0);
         let moved_mm = moved.iter().zip(&before).map(length).sum::<f64>() / places.len().max(1) as f64;
         let report = StageReport { name, spacing_mm, moved_mm, unexplained: unexplained(&moved), error_mm: None };
         before = moved;
@@ -65,29 +66,29 @@ pub(super) fn account(
     };
     for Left { name, motion, factor: own } in left {
         let spacing = std::array::from_fn(|a| grid.spacing()[a] * own[a] as f64);
-        let at = |p: &[f64; 3]| motion.at(to_level(from_level(*p, factor), own));
+        let at = |p: &VoxelPoint| motion.at(to_level(from_level(*p, factor), own));
         let moved = places.iter().map(at).collect();
         add(name, spacing, moved, on_grid(grid, &motion, own));
     }
-    let at = |p: &[f64; 3]| stated.along_axes(from_level(*p, factor));
+    let at = |p: &VoxelPoint| stated.along_axes(from_level(*p, factor));
     add("final".into(), grid.spacing(), places.iter().map(at).collect(), stated.clone());
     all
 }
 
 /// Voxels of the tissue of a level, evenly.
-fn places(pair: &Pair<'_>) -> Vec<[f64; 3]> {
+fn places(pair: &Pair<'_>) -> Vec<VoxelPoint> {
     let [nx, ny, _] = pair.shape;
-    let of = |at: usize| [at % nx, at / nx % ny, at / (nx * ny)].map(|v| v as f64);
+    let of = |at: usize| VoxelPoint::of([at % nx, at / nx % ny, at / (nx * ny)]);
     evenly(pair.mask.len(), |at| pair.mask[at] != 0, SAMPLED_PLACES).map(of).collect()
 }
 
 /// The part of the initial volume's variance at these places that the deformed volume, sampled
-/// where they moved (mm along the axes), does not explain linearly (0 to 1).
-fn unexplained(pair: &Pair<'_>, sampler: &SmoothSampler<'_>, places: &[[f64; 3]], moved: &[[f64; 3]]) -> f64 {
+/// where they moved, does not explain linearly (0 to 1).
+fn unexplained(pair: &Pair<'_>, sampler: &SmoothSampler<'_>, places: &[VoxelPoint], moved: &[GridVector]) -> f64 {
     let [nx, ny, _] = pair.shape;
-    let values = |(p, u): (&[f64; 3], &[f64; 3])| {
-        let q = pair.to_moving(std::array::from_fn(|a| p[a] + u[a] / pair.spacing[a]));
-        let at = p.map(|v| v as usize);
+    let values = |(p, u): (&VoxelPoint, &GridVector)| {
+        let q = pair.to_moving(p.moved(*u, pair.spacing));
+        let at = p.0.map(|v| v as usize);
         [pair.fixed_smooth[at[0] + nx * (at[1] + ny * at[2])], sampler.at(q)].map(f64::from)
     };
     let pairs: Vec<[f64; 2]> = places.par_iter().zip(moved).map(values).collect();

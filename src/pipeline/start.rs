@@ -246,8 +246,7 @@ impl Halt {
     pub fn turned(motion: &AffineMotion, grid: &Grid, (factor, spacing): ([usize; 3], [f64; 3])) -> Self {
         let axes = grid.axes();
         let moved = |x: WorldPoint| {
-            let p = to_level(grid.affine().to_voxel(x).0, factor);
-            let d = motion.displacement(std::array::from_fn(|a| p[a] * spacing[a]));
+            let d = motion.displacement(to_level(grid.affine().to_voxel(x), factor).in_mm(spacing));
             Some(x.moved(std::array::from_fn(|r| dot(axes[r], d))))
         };
         affine_part(&moved, grid, None).map_or_else(Self::Error, |map| Self::Turned(Box::new(map)))

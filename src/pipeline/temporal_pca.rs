@@ -16,6 +16,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::dense::dot;
 use crate::numerics::eigen::symmetric;
 use crate::numerics::statistics::median;
+use crate::types::VoxelPoint;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
@@ -95,7 +96,7 @@ impl Modes {
             order.iter().map(|&f| carried(&fields[f].0, &fields[f].1, lattice)).collect();
         rows.insert(before, still);
         let nodes: Vec<usize> =
-            (0..lattice.len()).filter(|&m| counts(lattice.within(m).map(|v| v.round() as usize))).collect();
+            (0..lattice.len()).filter(|&m| counts(lattice.within(m).0.map(|v| v.round() as usize))).collect();
         let stated: Vec<f64> = nodes
             .par_iter()
             .map(|&m| {
@@ -131,7 +132,7 @@ fn carried<'a>(from: &Lattice, coefficients: &'a [f32], to: &Lattice) -> Cow<'a,
     if from == to {
         return Cow::Borrowed(coefficients);
     }
-    let inside = |p: [f64; 3]| std::array::from_fn(|a| p[a].clamp(0.0, (from.shape[a] - 1) as f64));
+    let inside = |VoxelPoint(p)| VoxelPoint(std::array::from_fn(|a| p[a].clamp(0.0, (from.shape[a] - 1) as f64)));
     Cow::Owned(to.fit(|p| from.at(coefficients, inside(p))))
 }
 
@@ -481,7 +482,7 @@ mod tests {
     /// the whole.
     #[test]
     fn what_one_place_does_in_one_frame_stays() {
-        let there = |m: usize| lattice().place(m).iter().all(|p| (8.0..16.0).contains(p));
+        let there = |m: usize| lattice().place(m).0.iter().all(|p| (8.0..16.0).contains(p));
         let twitch = |t: usize| {
             let all = lattice().len();
             let part = |at: usize| if t == 6 && there(at % all) { 0.1 } else { 0.0 };

@@ -15,7 +15,7 @@ use crate::numerics::bspline::Lattice;
 use crate::numerics::statistics::{median, quantile};
 use crate::pipeline::bodies::Bodies;
 use crate::types::{
-    BodyReport, DenseField, ErrorSamples, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel,
+    BodyReport, DenseField, ErrorSamples, ErrorSource, ExpectedError, Grid, LabelError, Mask, MotionModel, VoxelPoint,
 };
 use rayon::prelude::*;
 
@@ -146,7 +146,7 @@ impl Variances {
         let borders = self.part(ErrorSource::Borders);
         for (voxel, jump) in jumps {
             let square = (SOURCE.side_fraction * jump).powi(2) / cell as f32;
-            lattice.for_each_tap(to_level(voxel.map(|v| v as f64), factor), |node, w| borders[node] += w * square);
+            lattice.for_each_tap(to_level(VoxelPoint::of(voxel), factor), |node, w| borders[node] += w * square);
         }
     }
 
@@ -225,7 +225,7 @@ impl Variances {
     fn shares(&self, voxels: impl Iterator<Item = [usize; 3]>, factor: [usize; 3]) -> Vec<(ErrorSource, f64)> {
         let mut sums = [0.0f64; 6];
         for voxel in voxels {
-            let stencil = self.lattice.stencil_near(to_level(voxel.map(|v| v as f64), factor));
+            let stencil = self.lattice.stencil_near(to_level(VoxelPoint::of(voxel), factor));
             let parts = sums.iter_mut().zip(&self.parts);
             parts.for_each(|(sum, part)| *sum += f64::from(stencil.gather(part).max(0.0)));
         }

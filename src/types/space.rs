@@ -12,6 +12,24 @@ use crate::error::SpaceError;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoxelPoint(pub [f64; 3]);
 
+impl VoxelPoint {
+    /// The middle of a voxel.
+    pub(crate) fn of(voxel: [usize; 3]) -> Self {
+        Self(voxel.map(|v| v as f64))
+    }
+
+    /// The same place in mm along the axes, from the first voxel's middle, where voxels have edges of
+    /// `spacing` (mm).
+    pub(crate) fn in_mm(self, spacing: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|a| self.0[a] * spacing[a])
+    }
+
+    /// This place moved by `d`, on a grid whose voxels have edges of `spacing` (mm).
+    pub(crate) fn moved(self, d: GridVector, spacing: [f64; 3]) -> Self {
+        Self(std::array::from_fn(|a| self.0[a] + d.0[a] / spacing[a]))
+    }
+}
+
 /// A position in world millimetres, RAS: x grows to the patient's right, y to the front, z to the
 /// head.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,6 +70,21 @@ impl WorldPoint {
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GridVector(pub [f64; 3]);
+
+impl GridVector {
+    /// No displacement.
+    pub(crate) const ZERO: Self = Self([0.0; 3]);
+
+    /// Both displacements, one after the other.
+    pub(crate) fn plus(self, other: Self) -> Self {
+        Self(std::array::from_fn(|a| self.0[a] + other.0[a]))
+    }
+
+    /// What leads from `other` to this one.
+    pub(crate) fn minus(self, other: Self) -> Self {
+        Self(std::array::from_fn(|a| self.0[a] - other.0[a]))
+    }
+}
 
 /// A 3 x 3 matrix, row by row.
 pub type Matrix3 = [[f64; 3]; 3];

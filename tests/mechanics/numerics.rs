@@ -9,6 +9,7 @@ use palpate::numerics::dense::symmetric_eigen;
 use palpate::numerics::neighbours::Neighbours;
 use palpate::numerics::random::Random;
 use palpate::numerics::{filters, pyramid, statistics, symmetric3};
+use palpate::{GridVector, VoxelPoint};
 
 /// Shapes and steps: step dividing the shape or not, larger than it, one slice, a line.
 const LATTICES: [([usize; 3], [usize; 3]); 9] = [
@@ -66,7 +67,7 @@ fn a_lattice_reproduces_affine_fields() {
     let affine = |p: [f64; 3]| [3.0 + 0.5 * p[0] - 0.25 * p[1], -1.0 + 0.1 * p[2], 0.3 * p[0] + 0.2 * p[1] - p[2]];
     for (shape, step) in LATTICES {
         let lattice = Lattice::new(shape, step);
-        let field = lattice.evaluate(&lattice.fit(affine));
+        let field = lattice.evaluate(&lattice.fit(|p| GridVector(affine(p.0))));
         let total = field.len() / 3;
         for (i, p) in voxels(shape).enumerate() {
             let exact = affine(p.map(|v| v as f64));
@@ -88,7 +89,7 @@ fn the_basis_sums_to_one_everywhere() {
         for _ in 0..50 {
             let p = shape.map(|n| random.uniform(-2.0, n as f64 + 1.0));
             let mut sum = 0.0f32;
-            lattice.for_each_tap(p, |_, w| {
+            lattice.for_each_tap(VoxelPoint(p), |_, w| {
                 assert!(w >= 0.0);
                 sum += w;
             });
@@ -105,7 +106,7 @@ fn a_point_of_a_lattice_is_the_evaluated_voxel() {
         let field = lattice.evaluate(&c);
         let total = field.len() / 3;
         for (i, p) in voxels(shape).enumerate() {
-            let u = lattice.at(&c, p.map(|v| v as f64));
+            let GridVector(u) = lattice.at(&c, VoxelPoint(p.map(|v| v as f64)));
             for a in 0..3 {
                 assert!((u[a] - f64::from(field[a * total + i])).abs() < 2e-6, "{shape:?} step {step:?} at {p:?}");
             }
@@ -151,11 +152,11 @@ fn fitting_converges_with_the_fourth_order() {
     let wave = |p: [f64; 3]| [(p[0] / 9.0).sin() * (p[1] / 8.0).cos(), (p[1] / 9.0 + 1.0).sin(), 0.0];
     let error = |step: usize| {
         let lattice = Lattice::new(shape, [step; 3]);
-        let c = lattice.fit(wave);
+        let c = lattice.fit(|p| GridVector(wave(p.0)));
         voxels(shape)
             .map(|p| p.map(|v| v as f64))
             .map(|p| {
-                let (u, e) = (lattice.at(&c, p), wave(p));
+                let (GridVector(u), e) = (lattice.at(&c, VoxelPoint(p)), wave(p));
                 (0..2).map(|a| (u[a] - e[a]).abs()).fold(0.0, f64::max)
             })
             .fold(0.0, f64::max)
@@ -172,7 +173,7 @@ fn fitting_is_exact_for_cubics() {
     let shape = [33, 1, 1];
     let lattice = Lattice::new(shape, [4, 1, 1]);
     let cubic = |p: [f64; 3]| [1e-4 * (p[0] - 11.0).powi(3) - 0.01 * p[0] * p[0], 0.0, 0.0];
-    let field = lattice.evaluate(&lattice.fit(cubic));
+    let field = lattice.evaluate(&lattice.fit(|p| GridVector(cubic(p.0))));
     for i in 0..shape[0] {
         let exact = cubic([i as f64, 0.0, 0.0])[0];
         assert!((f64::from(field[i]) - exact).abs() < 1e-5, "voxel {i}: {} is not {exact}", field[i]);

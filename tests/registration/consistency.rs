@@ -12,7 +12,7 @@ use palpate::numerics::bspline::Lattice;
 use palpate::numerics::filters;
 use palpate::numerics::random::Random;
 use palpate::numerics::symmetric3::quadratic;
-use palpate::types::{Candidate, GridVector, MotionModel};
+use palpate::types::{Candidate, GridVector, MotionModel, VoxelPoint};
 
 /// An affine displacement (mm): strains of up to 8 %, a shift, a turn.
 fn affine(x: [f64; 3]) -> [f64; 3] {
@@ -154,8 +154,8 @@ fn aperture(count: usize, ranks: usize, seed: u64) -> Vec<Evidence> {
             let part: f64 = (0..3).map(|a| slid[a] * n[a]).sum();
             let free: [f64; 3] = std::array::from_fn(|a| if ranks == 1 { slid[a] - part * n[a] } else { part * n[a] });
             let u = affine(at);
-            let displacement = std::array::from_fn(|a| u[a] + free[a]);
-            Evidence { at, displacement, information: std::array::from_fn(along) }
+            let displacement = GridVector(std::array::from_fn(|a| u[a] + free[a]));
+            Evidence { at: VoxelPoint(at), displacement, information: std::array::from_fn(along) }
         })
         .collect()
 }
@@ -163,7 +163,7 @@ fn aperture(count: usize, ranks: usize, seed: u64) -> Vec<Evidence> {
 /// Largest error of a field against the affine truth (mm).
 fn field_error(lattice: &Lattice, c: &[f32]) -> f64 {
     let grid = crate::truth::voxels([5, 5, 5]).map(|p| p.map(|v| 6.0 * v as f64));
-    grid.map(|p| distance(lattice.at(c, p), affine(p))).fold(0.0, f64::max)
+    grid.map(|p| distance(lattice.at(c, VoxelPoint(p)).0, affine(p))).fold(0.0, f64::max)
 }
 
 #[test]
@@ -191,13 +191,13 @@ fn evidence_that_does_not_bend_keeps_its_field() {
         let evidence: Vec<Evidence> = (0..42)
             .map(|_| {
                 let at = [random.uniform(8.0, 24.0), random.uniform(10.0, 30.0), random.uniform(8.0, 22.0)];
-                let displacement = exact(at).map(|v| v + scatter * random.normals()[0]);
-                Evidence { at, displacement, information: [8.0, 8.0, 8.0, 0.0, 0.0, 0.0] }
+                let displacement = GridVector(exact(at).map(|v| v + scatter * random.normals()[0]));
+                Evidence { at: VoxelPoint(at), displacement, information: [8.0, 8.0, 8.0, 0.0, 0.0, 0.0] }
             })
             .collect();
         let (c, lambda) = coupling::fit(&lattice, &smoothness, &evidence, 7);
         let off = evidence.iter().map(|e| {
-            let (u, x) = (lattice.at(&c, e.at), exact(e.at));
+            let (GridVector(u), x) = (lattice.at(&c, e.at), exact(e.at.0));
             (0..3).map(|a| (u[a] - x[a]).powi(2)).sum::<f64>()
         });
         let off = (off.sum::<f64>() / evidence.len() as f64).sqrt();
@@ -213,11 +213,11 @@ fn coupling_withstands_outliers() {
     for e in &mut evidence {
         e.information = [100.0, 100.0, 100.0, 0.0, 0.0, 0.0];
         let noise = random.direction();
-        e.displacement = std::array::from_fn(|a| affine(e.at)[a] + 0.1 * noise[a]);
+        e.displacement = GridVector(std::array::from_fn(|a| affine(e.at.0)[a] + 0.1 * noise[a]));
     }
     for e in evidence.iter_mut().step_by(5) {
         let (away, by) = (random.direction(), random.uniform(2.0, 10.0));
-        e.displacement = std::array::from_fn(|a| e.displacement[a] + by * away[a]);
+        e.displacement = GridVector(std::array::from_fn(|a| e.displacement.0[a] + by * away[a]));
     }
     let (c, _) = coupling::fit(&lattice, &smoothness, &evidence, 10);
     let error = field_error(&lattice, &c);

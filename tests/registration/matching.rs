@@ -862,7 +862,7 @@ fn the_blocks_are_positive_and_bound_the_curvature() {
 fn agree(pair: &Pair<'_>, tolerance: f64) -> usize {
     let (mut worst, mut seen) = (0.0f64, 0);
     for (i, p) in voxels(pair.shape).enumerate() {
-        let q = pair.to_moving(p.map(|v| v as f64));
+        let q = pair.to_moving(VoxelPoint(p.map(|v| v as f64)));
         // Away from the deformed volume's border, where smoothing clamps.
         let deep = |a: usize| q[a] >= 4.0 && q[a] <= pair.moving_shape[a] as f32 - 5.0;
         let inner = |a: usize| p[a] >= 2 && p[a] + 2 < pair.shape[a];
@@ -927,11 +927,11 @@ fn levels_keep_places() {
         assert_eq!(pair.shape, std::array::from_fn(|a| [49usize, 46, 30][a].div_ceil(factor[a])));
         assert!(agree(&pair, 1.5) > 500);
         let p = [7.3, 0.0, 28.1];
-        let back = from_level(to_level(p, factor), factor);
+        let VoxelPoint(back) = from_level(to_level(VoxelPoint(p), factor), factor);
         assert!((0..3).all(|a| (back[a] - p[a]).abs() < 1e-12));
     }
     // The centre of the first block of two lies between its voxels.
-    assert_eq!(from_level([0.0; 3], [2, 3, 1]), [0.5, 1.0, 0.0]);
+    assert_eq!(from_level(VoxelPoint([0.0; 3]), [2, 3, 1]), VoxelPoint([0.5, 1.0, 0.0]));
 }
 
 #[test]
