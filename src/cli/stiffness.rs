@@ -444,7 +444,7 @@ impl Setting {
 
     /// What [`Self::run`] would take.
     pub(super) fn forecast(&self, field: &DenseField, params: &StiffnessParams) -> Result<Forecast, StiffnessError> {
-        self.with(field, None, FieldQuality::default(), |inputs| pipeline::stiffness::forecast(inputs, params))
+        self.with(field, None, FieldQuality::default(), |inputs| pipeline::dry_run::stiffness(inputs, params))
     }
 
     fn with<T>(

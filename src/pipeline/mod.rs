@@ -48,6 +48,7 @@ pub mod robustness;
 
 mod background;
 mod bodies;
+mod body_meshes;
 mod body_models;
 mod brightness;
 mod clock;

@@ -1,19 +1,17 @@
 //! A displacement field to Young's modulus, region by region.
 
 use crate::error::StiffnessError;
-use crate::mesh::tetrahedral::{Detail, Fineness, Mesher, Wall, pieces};
 use crate::numerics::sampling::{displacement, nearest};
+use crate::pipeline::body_meshes::{BodyMeshes, whole};
 use crate::pipeline::clock::Clock;
-use crate::pipeline::dry_run::stiffness_memory;
 use crate::pipeline::stiffness_regions;
 use crate::stiffness::boundary_conditions::{Patch, Place};
 use crate::stiffness::geometry::Geometry;
 use crate::stiffness::identify::{Estimate, Setup, State};
 use crate::stiffness::inclusion::Inclusion;
-use crate::stiffness::indenter_outline::{Outline, Rim, rim};
 use crate::stiffness::interface::Interface;
 use crate::stiffness::mesh_problem::Level;
-use crate::stiffness::model_selection::{Choice, as_meshed, choose, has_rivals, known_moduli, settle};
+use crate::stiffness::model_selection::{Choice, as_meshed, choose, known_moduli, settle};
 use crate::stiffness::observations::Observation;
 use crate::stiffness::rigid_rotation::{Affinity, Turn};
 use crate::stiffness::summary::{Hidden, Moduli, Scale};
@@ -22,12 +20,11 @@ use crate::stiffness::verdict::{Found, Misfit, Shape, Verdict};
 use crate::stiffness::{fields, geometry, summary};
 use crate::strain::deviation::error_draws;
 use crate::types::stiffness::{
-    Determined, Evidence, Forecast, Law, LawChoice, PatchReport, RegionStiffness, StiffnessParams, StiffnessResult,
+    Determined, Evidence, Law, LawChoice, PatchReport, RegionStiffness, StiffnessParams, StiffnessResult,
 };
 use crate::types::{
     DenseField, Displacement, ErrorSamples, Mask, MotionModel, QuadraticMesh, SparseField, Trust, WorldPoint,
 };
-use std::time::Instant;
 
 /// Called with a stage's name and the fraction of the whole that is done (0 to 1); may be called
 /// from any thread.
@@ -86,32 +83,6 @@ pub fn inside(matches: &SparseField, labels: &Mask) -> usize {
     matches.kept().filter(|m| held(m.initial)).count()
 }
 
-/// Size of the coarse mesh, on which models are selected.
-struct CoarseMesh {
-    /// Nodes over those of the fine mesh.
-    node_fraction: f64,
-    /// Most nodes asked for (edges of a punch and thin layers take more): the noise of the data
-    /// decides a choice long before the mesh does.
-    max_nodes: f64,
-}
-
-const COARSE_MESH: CoarseMesh = CoarseMesh { node_fraction: 0.3, max_nodes: 3_000.0 };
-
-/// The mesh at the rim of a punch.
-struct RimMesh {
-    /// Edge of the cubes (voxels); nodes lie at half of it.
-    edge_voxels: f64,
-    /// Fractions of the nodes that are tried for the rest of the body.
-    elsewhere_fractions: [f64; 5],
-    /// Factors on the edge that are tried if the nodes do not suffice for it.
-    coarsening: [f64; 3],
-}
-
-const RIM_MESH: RimMesh =
-    RimMesh { edge_voxels: 2.0, elsewhere_fractions: [0.7, 0.4, 0.25, 0.15, 0.08], coarsening: [1.0, 1.5, 2.5] };
-
-/// Most nodes of a mesh over the requested number.
-const MAX_NODE_EXCESS: f64 = 1.15;
 /// Moves of a punch's edge on the fine mesh: the coarse mesh has found most of the way.
 const MAX_FINE_MOVES: usize = 1;
 /// Tolerance of forward solutions on a fine mesh (mm).
@@ -124,7 +95,8 @@ pub(super) const FORWARD_TOLERANCE_MM: f64 = 1e-5;
 ///
 /// ```
 /// use palpate::pipeline::experimental_design::{PlanInputs, simulate};
-/// use palpate::pipeline::stiffness::{FieldQuality, Inputs, forecast, run};
+/// use palpate::pipeline::dry_run;
+/// use palpate::pipeline::stiffness::{FieldQuality, Inputs, run};
 /// use palpate::types::plan::PlanParams;
 /// use palpate::types::stiffness::{LawChoice, Side};
 /// use palpate::{Affine, Grid, Mask, Place, StiffnessParams};
@@ -155,7 +127,7 @@ pub(super) const FORWARD_TOLERANCE_MM: f64 = 1e-5;
 /// let found = run(&inputs, &params, &|_, _| {})?;
 /// assert!((found.regions[0].youngs_modulus / 20.0 - 1.0).abs() < 0.2);
 /// // What it would take was told beforehand.
-/// assert_eq!(forecast(&inputs, &params)?.nodes, found.mesh.nodes().len());
+/// assert_eq!(dry_run::stiffness(&inputs, &params)?.nodes, found.mesh.nodes().len());
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub fn run(
@@ -178,7 +150,7 @@ pub fn run(
 }
 
 /// What `then` makes of the inputs without a turn of the whole body, and that turn, if any.
-fn without_turn<R>(inputs: &Inputs<'_>, then: impl FnOnce(&Inputs<'_>) -> R) -> (R, Option<Turn>) {
+pub(super) fn without_turn<R>(inputs: &Inputs<'_>, then: impl FnOnce(&Inputs<'_>) -> R) -> (R, Option<Turn>) {
     let Some(turn) = Turn::of(inputs.field, inputs.labels) else { return (then(inputs), None) };
     let (field, matches) = (turn.undone(inputs.field), inputs.matches.map(|m| turn.undone_matches(m)));
     (then(&Inputs { field: &field, matches: matches.as_ref(), ..*inputs }), Some(turn))
@@ -231,154 +203,6 @@ fn without(labels: &Mask, label: u8, mut evidence: Vec<Evidence>) -> (Mask, Vec<
         }
     }
     (out, evidence)
-}
-
-/// How fine the mesh is on which all is chosen.
-pub(super) fn coarse_fineness(labels: &Mask, params: &StiffnessParams) -> Fineness {
-    Fineness::for_nodes(fields::volume(labels), coarse_nodes(params) as usize)
-}
-
-/// Nodes of the mesh on which all is chosen.
-fn coarse_nodes(params: &StiffnessParams) -> f64 {
-    (COARSE_MESH.node_fraction * params.nodes as f64).min(COARSE_MESH.max_nodes)
-}
-
-/// What a run with labels takes, by its factorisations: 15 bodies at 8,000 and 20,000 nodes.
-struct Cost {
-    /// Factorisations on the coarse and the fine mesh, where one contact is tried.
-    one_contact: [f64; 2],
-    /// The same where several are.
-    contacts: [f64; 2],
-    /// CPU time of a run over that of its factorisations.
-    time_ratio: f64,
-    /// Growth of the time of a factorisation with the numbers of the factor, as in nested
-    /// dissection of a body in space.
-    time_exponent: f64,
-    /// Memory without factors (bytes).
-    base_bytes: f64,
-    /// Memory for each number of a factor (bytes).
-    bytes_per_number: f64,
-}
-
-const COST: Cost = Cost {
-    one_contact: [14.0, 2.3],
-    contacts: [26.0, 4.0],
-    time_ratio: 2.5,
-    time_exponent: 4.0 / 3.0,
-    base_bytes: 125e6,
-    bytes_per_number: 5.7,
-};
-
-/// What [`run`] would take. Of 30 runs, memory is within 30 % for 29, time for 23 (at worst 2.1
-/// times as long).
-///
-/// # Errors
-/// What [`run`] would refuse before it looks for moduli.
-pub fn forecast(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<Forecast, StiffnessError> {
-    params.check()?;
-    whole(inputs.labels)?;
-    without_turn(inputs, |inputs| {
-        let Meshed { coarse, fine, mesh } = Meshed::new(inputs, params)?;
-        let nodes = mesh.nodes().len();
-        if fine.body.levels.is_some() {
-            return Ok(Forecast { nodes, memory: stiffness_memory(nodes), seconds: None });
-        }
-        let fill = |level: &Level| level.body.pattern.fill().map_err(|_| StiffnessError::Unsolvable);
-        let [small, large] = [fill(&coarse)? as f64, fill(&fine)? as f64];
-        let setup = coarse.setup(Law::Linear, params, coarse.largest());
-        let started = Instant::now();
-        setup.problem(&setup.start()).factorise(&vec![0.0; coarse.body.pattern.unknowns()])?;
-        let unit = started.elapsed().as_secs_f64();
-        let [few, many] = if has_rivals(&coarse) { COST.contacts } else { COST.one_contact };
-        let seconds = COST.time_ratio * unit * (few + many * (large / small).powf(COST.time_exponent));
-        let memory = (COST.base_bytes + COST.bytes_per_number * (small + large)) as u64;
-        Ok(Forecast { nodes, memory, seconds: inputs.labelled.then_some(seconds) })
-    })
-    .0
-}
-
-/// A body on the mesh on which all is chosen, and on the one that counts.
-pub(super) struct Meshed {
-    /// Where all is chosen.
-    pub coarse: Level,
-    /// Where moduli are found.
-    pub fine: Level,
-    mesh: QuadraticMesh,
-}
-
-impl Meshed {
-    pub fn new(inputs: &Inputs<'_>, params: &StiffnessParams) -> Result<Self, StiffnessError> {
-        let mesher = Mesher::new(inputs.labels)?;
-        let level = |mesh: &QuadraticMesh, outline: Option<&Outline>| {
-            Level::new(mesh, inputs.field, inputs.matches, inputs.labels, inputs.held, inputs.load, outline)
-        };
-        let mut coarse = level(&mesher.mesh(&coarse_fineness(inputs.labels, params))?, None)?;
-        let rim = rim(&coarse.patches[1], inputs.field, inputs.labels, coarse.tolerance(), coarse.near);
-        let volume = fields::volume(inputs.labels);
-        let mesh = meshed(&mesher, volume, &rim, coarse.voxel, params.nodes as f64, RIM_MESH.edge_voxels)?;
-        let outline = rim.outline.as_ref();
-        if !rim.places.is_empty() {
-            let nodes = coarse_nodes(params);
-            coarse = level(&meshed(&mesher, volume, &rim, coarse.voxel, nodes, 2.0 * RIM_MESH.edge_voxels)?, outline)?;
-        }
-        let mut fine = level(&mesh, outline)?;
-        coarse.agree_on_shape(&mut fine)?;
-        if inputs.labelled {
-            coarse.open_borders(params.label_sd);
-            fine.open_borders(params.label_sd);
-        }
-        Ok(Self { coarse, fine, mesh })
-    }
-}
-
-/// A mesh of about `nodes` nodes, as fine everywhere; `volume` of the body in mm^3.
-pub(super) fn evenly_meshed(mesher: &Mesher, volume: f64, nodes: f64) -> Result<QuadraticMesh, StiffnessError> {
-    let mesh = mesher.mesh(&Fineness::for_nodes(volume, nodes as usize))?;
-    let count = mesh.nodes().len() as f64;
-    // Thin layers and a rough surface take more than a block does.
-    match count <= MAX_NODE_EXCESS * nodes {
-        true => Ok(mesh),
-        false => Ok(mesher.mesh(&Fineness::for_nodes(volume, (nodes * nodes / count) as usize))?),
-    }
-}
-
-/// A mesh of about `nodes` nodes, finer along the rim of a punch: cubes of `size` voxels there.
-fn meshed(
-    mesher: &Mesher,
-    volume: f64,
-    rim: &Rim,
-    voxel: f64,
-    nodes: f64,
-    size: f64,
-) -> Result<QuadraticMesh, StiffnessError> {
-    if rim.places.is_empty() {
-        return evenly_meshed(mesher, volume, nodes);
-    }
-    let within = rim.outline.as_ref().map(|o| |p| o.within(p));
-    let wall = within.as_ref().map(|w| w as Wall<'_>);
-    let detail = |size: f64| Detail { near: &rim.places, size: size * voxel, wall };
-    // How many nodes the rim takes hangs on how the cubes come to halve: of a few meshes the
-    // finest within the limit.
-    let mut best: Option<(f64, Fineness, Detail<'_>)> = None;
-    for coarser in RIM_MESH.coarsening {
-        for elsewhere in RIM_MESH.elsewhere_fractions {
-            let fineness = Fineness::for_nodes(volume, (elsewhere * nodes) as usize);
-            let detail = detail(coarser * size);
-            let Some(count) = mesher.nodes(&fineness, detail) else { continue };
-            let count = count as f64 / nodes;
-            let rank = if count <= MAX_NODE_EXCESS { -count } else { count };
-            if best.as_ref().is_none_or(|(least, ..)| rank < *least) {
-                best = Some((rank, fineness, detail));
-            }
-        }
-        if best.as_ref().is_some_and(|(rank, ..)| *rank < 0.0) {
-            break;
-        }
-    }
-    // Where none of them keeps all parts, the mesher goes on to smaller cubes.
-    let plain = (Fineness::for_nodes(volume, nodes as usize), detail(size));
-    let (fineness, detail) = best.map_or(plain, |(_, fineness, detail)| (fineness, detail));
-    Ok(mesher.mesh_finer(&fineness, detail)?)
 }
 
 /// The chain for labelled regions; `tried` is the evidence that led to them.
@@ -477,7 +301,7 @@ fn solved(
     clock: &mut Clock,
 ) -> Result<(Solved, QuadraticMesh), StiffnessError> {
     progress("mesh", 0.0);
-    let Meshed { mut coarse, mut fine, mesh } = Meshed::new(inputs, params)?;
+    let BodyMeshes { mut coarse, mut fine, mesh } = BodyMeshes::new(inputs, params)?;
     let reference = fine.largest();
     clock.book("mesh");
 
@@ -666,27 +490,4 @@ fn errors_drawn(inputs: &Inputs<'_>, level: &Level) -> Vec<Vec<[f64; 3]>> {
         displacement(error, WorldPoint(o.place)).map(|v| if v.is_finite() { v } else { 0.0 })
     };
     draws.iter().map(|error| level.observations.iter().map(|o| at(error, o)).collect()).collect()
-}
-
-/// The body must have three dimensions and hang together.
-pub(super) fn whole(labels: &Mask) -> Result<(), StiffnessError> {
-    let grid = labels.grid();
-    let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
-    for o in (0..grid.len()).filter(|&o| labels.as_slice()[o] > 0) {
-        let at = grid.voxel(o);
-        (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(at[a]), high[a].max(at[a])));
-    }
-    if let Some(a) = (0..3).find(|&a| low[a] == high[a]) {
-        return Err(StiffnessError::Flat { axis: ['x', 'y', 'z'][a] });
-    }
-    let found = pieces(labels);
-    match found[..] {
-        [largest, next, ..] => Err(StiffnessError::Disconnected {
-            what: "the body (mask or labels)".into(),
-            pieces: found.len(),
-            largest,
-            next,
-        }),
-        _ => Ok(()),
-    }
 }

@@ -2,7 +2,8 @@
 
 use crate::error::StiffnessError;
 use crate::mesh::tetrahedral::{Fineness, mesh_labels};
-use crate::pipeline::stiffness::{Inputs, Progress, coarse_fineness};
+use crate::pipeline::body_meshes::coarse_fineness;
+use crate::pipeline::stiffness::{Inputs, Progress};
 use crate::stiffness::geometry;
 use crate::stiffness::identify::{Estimate, State};
 use crate::stiffness::inclusion::{Inclusion, SHAPE_FUNCTIONS};
