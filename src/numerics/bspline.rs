@@ -351,7 +351,7 @@ impl Lattice {
             }
             end = start;
         }
-        debug_assert_eq!(out.len(), Q * mx * my * mz);
+        assert_eq!(out.len(), Q * mx * my * mz);
         out
     }
 

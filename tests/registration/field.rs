@@ -221,7 +221,7 @@ fn where_few_features_agree_motion_is_looked_for_farther() {
 #[test]
 fn no_jumps_are_made_between_two_people() {
     let head =
-        |seed| PhantomParams { seed, motion: MotionKind::None, ..PhantomParams::new(PhantomKind::Head).sized(64) };
+        |seed| PhantomParams { seed, motion: MotionKind::None, ..PhantomParams::new(PhantomKind::Head).sized(48) };
     let [one, other] = [1, 2].map(|seed| phantom(&head(seed)).unwrap().initial);
     let found = run(&one, &other, None, &FieldParams::default(), &|_, _| {}).unwrap();
     assert_eq!(found.summary.bodies.len(), 1, "{:?}", found.summary.evidence);
@@ -298,14 +298,14 @@ fn tissue_without_texture_is_warned_of_and_noisy_tissue_is_not() {
     // A ball of even grey was crossed smoothly, in millimetres, and not a word about it.
     let warned = |r: &FieldResult| r.summary.warnings.iter().any(|w| w.contains("shows no texture"));
     for (kind, even) in [(PhantomKind::Block, 50.0), (PhantomKind::Head, 50.0), (PhantomKind::Calf, 30.0)] {
-        let base = PhantomParams::new(kind).sized(64);
+        let base = PhantomParams::new(kind).sized(48);
         let said = [0.0, even].map(|percent| {
             let p = troubled(&base, Trouble::NoTexture, percent).unwrap();
             warned(&run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {}).unwrap())
         });
         assert_eq!(said, [false, true], "{kind:?}");
     }
-    let (noisy, _) = measure(&PhantomParams { noise: 0.1, ..PhantomParams::new(PhantomKind::Block).sized(64) });
+    let (noisy, _) = measure(&PhantomParams { noise: 0.1, ..PhantomParams::new(PhantomKind::Block).sized(48) });
     assert!(!warned(&noisy), "{:?}", noisy.summary.warnings);
 }
 
@@ -320,7 +320,7 @@ fn a_turned_head_is_not_taken_for_one_that_bends() {
             seed,
             ..PhantomParams::new(PhantomKind::Head)
         };
-        let p = phantom(&head.sized(64)).unwrap();
+        let p = phantom(&head.sized(48)).unwrap();
         let result = run(&p.initial, &p.deformed, None, &FieldParams::default(), &|_, _| {}).unwrap();
         let m = evaluate::metrics(&result.displacement, &p.truth, Some(&p.mask), &[]).unwrap();
         assert!(m.mean_mm < 1.0, "{seed} {:?} {m:?}", result.summary.evidence);
@@ -559,7 +559,7 @@ fn a_background_that_was_cut_through_tissue_is_not_seen() {
 /// 1.04 mm for 0.56).
 #[test]
 fn a_part_that_was_set_to_zero_is_not_seen() {
-    let head = PhantomParams { amplitude: 6.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
+    let head = PhantomParams { amplitude: 6.0, ..PhantomParams::new(PhantomKind::Head).sized(48) };
     let whole = phantom(&head).unwrap();
     let g = *whole.deformed.grid();
     let middle = g.shape().map(|n| (n as f64 - 1.0) / 2.0);
@@ -589,7 +589,7 @@ fn a_coil_profile_or_another_contrast_in_one_volume_is_not_taken_for_motion() {
     let told = |r: &FieldResult, what: &str| {
         r.summary.evidence.iter().any(|e| e.starts_with("brightness") && e.contains(what))
     };
-    let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
+    let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(48) };
     for (motion, amplitude) in [(MotionKind::None, 1.0), (MotionKind::Press, 4.0), (MotionKind::Smooth, 6.0)] {
         let p = phantom(&PhantomParams { motion, amplitude, ..head.clone() }).unwrap();
         let (even, plain) = measure_with(&p, &FieldParams::default());
@@ -668,7 +668,7 @@ fn passes_on_the_next_finer_level_find_what_averages_of_voxels_hide() {
 /// and a head at rest became a free motion of high trust.
 #[test]
 fn a_step_in_brightness_is_left_to_the_local_gain() {
-    let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(64) };
+    let head = PhantomParams { bias: 0.0, ..PhantomParams::new(PhantomKind::Head).sized(48) };
     for (motion, amplitude) in [(MotionKind::None, 1.0), (MotionKind::Translate, 3.0), (MotionKind::Rotate, 5.0)] {
         let p = phantom(&PhantomParams { motion, amplitude, ..head.clone() }).unwrap();
         let (even, plain) = measure_with(&p, &FieldParams::default());
@@ -747,7 +747,7 @@ fn tissue_that_does_not_keep_its_volume_is_told_of() {
 
 #[test]
 fn the_number_of_threads_changes_nothing() {
-    let cases = [block(40, MotionKind::Smooth, 2.0), PhantomParams::new(PhantomKind::Slice).sized(64)];
+    let cases = [block(40, MotionKind::Smooth, 2.0), PhantomParams::new(PhantomKind::Slice).sized(48)];
     for (params, preset) in cases.iter().zip([Preset::Balanced, Preset::Fast]) {
         let p = phantom(params).unwrap();
         let with = |threads: usize| {
@@ -783,7 +783,7 @@ fn the_uncertainty_is_calibrated_on_smooth_motions() {
     for (name, params) in [
         ("block", block(48, MotionKind::Smooth, 3.0)),
         ("head", PhantomParams { amplitude: 6.0, ..PhantomParams::new(PhantomKind::Head).sized(48) }),
-        ("calf", PhantomParams::new(PhantomKind::Calf).sized(64)),
+        ("calf", PhantomParams::new(PhantomKind::Calf).sized(48)),
     ] {
         let p = phantom(&params).unwrap();
         let (result, _) = measure_with(&p, &FieldParams::default());

@@ -61,7 +61,7 @@ impl Levels {
                 map[to..to + run].copy_from_slice(&values[from..from + run]);
             }
         }
-        debug_assert!(n.iter().all(|&s| s > 0));
+        assert!(n.iter().all(|&s| s > 0));
         let mut seen = [false; 256];
         map.iter().for_each(|&v| seen[v as usize] = true);
         let present: Vec<u8> = (1..=255).filter(|&v| seen[v as usize]).collect();
