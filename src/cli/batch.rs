@@ -28,7 +28,7 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 /// Part of the free memory that is taken unasked.
-const SHARE: f64 = 0.8;
+const MEMORY_FRACTION: f64 = 0.8;
 /// What stands for a batch in a folder.
 const TABLE: &str = "batch.csv";
 /// What is known of a pair's stages, in its folder.
@@ -95,7 +95,7 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
         true => pairs.iter().map(|pair| collected(pair, output, tuning)).collect(),
         false => {
             let free = io::memory_left();
-            let budget = memory.map(|gb| (1e9 * gb) as u64).or(free.map(|b| (SHARE * b as f64) as u64));
+            let budget = memory.map(|gb| (1e9 * gb) as u64).or(free.map(|b| (MEMORY_FRACTION * b as f64) as u64));
             // Where memory is not known, one at a time.
             let jobs = if budget.is_none() { 1 } else { jobs.map_or(rayon::current_num_threads(), usize::from) };
             let batch = Batch { options, pairs: &pairs, budget: budget.unwrap_or(u64::MAX), console };

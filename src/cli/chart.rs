@@ -112,7 +112,7 @@ const SIDES: [usize; 4] = [32, 48, 80, 128];
 const NODES: [usize; 5] = [1000, 2000, 4000, 8000, 20_000];
 /// Voxels across the pressed bodies: a third less, and the punch on the layers is too small to be
 /// found on coarse meshes.
-const PRESSED: usize = 48;
+const PRESSED_BODY_VOXELS: usize = 48;
 
 /// What the flags ask for that cannot be had together.
 fn check(options: &Options, wanted: impl Fn(Part) -> bool, warnings: &mut Vec<String>) -> Result<()> {
@@ -185,7 +185,8 @@ pub fn run(options: &Options, console: &Console) -> Result<()> {
     }
     if wanted(Part::Stiffness) {
         let nodes = if *quick { &NODES[..2] } else { &NODES[..] };
-        let found = compression_phantoms::stiffness_trials(PRESSED, nodes, &|f| progress.set("stiffness", f))?;
+        let found =
+            compression_phantoms::stiffness_trials(PRESSED_BODY_VOXELS, nodes, &|f| progress.set("stiffness", f))?;
         groups.push(Group {
             part: Part::Stiffness,
             title: "Stiffness".into(),

@@ -331,7 +331,7 @@ fn read_truth(path: &Path, grid: &Grid, initial: &Path) -> Result<DenseField> {
 }
 
 /// Bodies at most: each takes passes of its own.
-const BODIES: usize = 32;
+const MAX_BODIES: usize = 32;
 
 /// The labels of `path` inside the mask. Each of `rigid` must be among them.
 fn bodies_of(path: &Path, mut labels: Mask, mask: Option<&Mask>, rigid: &[u8]) -> Result<Mask> {
@@ -343,8 +343,11 @@ fn bodies_of(path: &Path, mut labels: Mask, mask: Option<&Mask>, rigid: &[u8]) -
     let names = || found.iter().map(u8::to_string).collect::<Vec<_>>().join(", ");
     match (found.len(), rigid.iter().find(|r| !found.contains(r))) {
         (0, _) => bail!("{}: no body lies in the mask; give labels that are 1 or more in the tissue", path.shown()),
-        (n, _) if n > BODIES => {
-            bail!("{}: {n} bodies; give at most {BODIES} labels, one a part that slides along the others", path.shown())
+        (n, _) if n > MAX_BODIES => {
+            bail!(
+                "{}: {n} bodies; give at most {MAX_BODIES} labels, one a part that slides along the others",
+                path.shown()
+            )
         }
         (_, Some(label)) => bail!("{}: --rigid {label} is no body of it; there are {}", path.shown(), names()),
         _ => Ok(labels),

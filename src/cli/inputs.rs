@@ -79,10 +79,10 @@ impl Part {
             return Ok(path.into());
         }
         let all = io::list(path).map_err(|e| e.to_string())?;
-        let shown: Vec<String> = all.iter().take(SHOWN).map(|file| name(file)).collect();
+        let shown: Vec<String> = all.iter().take(MAX_FILES_SHOWN).map(|file| name(file)).collect();
         let holds = match all.len() {
             0 => "it is empty".into(),
-            n if n > SHOWN => format!("it has {}, and {} more", shown.join(", "), n - SHOWN),
+            n if n > MAX_FILES_SHOWN => format!("it has {}, and {} more", shown.join(", "), n - MAX_FILES_SHOWN),
             _ => format!("it has {}", shown.join(", ")),
         };
         Err(format!("is a folder without a {what} ({}); {holds}; name the file", names.join(" or ")))
@@ -90,7 +90,7 @@ impl Part {
 }
 
 /// Files of a folder that a message lists at most.
-const SHOWN: usize = 12;
+const MAX_FILES_SHOWN: usize = 12;
 
 /// The file that `path` stands for where `part` is asked for: itself, or that of a folder which
 /// palpate wrote. A folder with a DICOM series stands for itself.

@@ -39,9 +39,9 @@ fn longest(grid: &Grid) -> f64 {
 
 /// How far the logarithm (to base 10) of a ratio of sides may be under one, that of a factor of
 /// ten.
-const ABOUT: f64 = 0.1;
+const TENFOLD_TOLERANCE_LOG10: f64 = 0.1;
 /// Ratio of the numbers of voxels along a side up to which two volumes may show the same part.
-const ALIKE: f64 = 2.5;
+const MAX_SIDE_RATIO: f64 = 2.5;
 
 /// Refuses two volumes of about as many voxels whose longest sides differ by a factor of about 10
 /// or more: their units differ, or one has lost its header.
@@ -50,13 +50,13 @@ pub fn same_unit(initial: &Path, a: &Grid, deformed: &Path, b: &Grid) -> Result<
         if longest(a) < longest(b) { ((initial, a), (deformed, b)) } else { ((deformed, b), (initial, a)) };
     let log = (longest(large.1) / longest(small.1)).log10();
     let voxels = |g: &Grid| g.shape().into_iter().max().unwrap_or(1) as f64;
-    let alike = (voxels(a) / voxels(b)).max(voxels(b) / voxels(a)) <= ALIKE;
+    let alike = (voxels(a) / voxels(b)).max(voxels(b) / voxels(a)) <= MAX_SIDE_RATIO;
     let unit = match log.round() {
         1.0 => "centimetres",
         3.0 => "metres or micrometres",
         _ => "another unit than mm",
     };
-    if !alike || log < 1.0 - ABOUT {
+    if !alike || log < 1.0 - TENFOLD_TOLERANCE_LOG10 {
         return Ok(());
     }
     let lost = |g: &Grid| g.spacing().iter().all(|s| (s - 1.0).abs() < 1e-6);
@@ -71,7 +71,11 @@ pub fn same_unit(initial: &Path, a: &Grid, deformed: &Path, b: &Grid) -> Result<
         short(longest(small.1)),
         large.0.shown(),
         short(longest(large.1)),
-        if (log - log.round()).abs() > ABOUT { 10f64.powf(log).round() } else { 10f64.powf(log.round()) }
+        if (log - log.round()).abs() > TENFOLD_TOLERANCE_LOG10 {
+            10f64.powf(log).round()
+        } else {
+            10f64.powf(log.round())
+        }
     );
 }
 

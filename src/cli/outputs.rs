@@ -107,7 +107,7 @@ pub struct Measured<'a> {
 
 /// Voxels of a grid up to which what is made for a file is kept for the report. Of a larger one,
 /// files are made some rows at a time, and the report works out what it shows.
-const KEPT: usize = 2_000_000;
+const MAX_KEPT_VOXELS: usize = 2_000_000;
 
 /// A scalar over the result's grid: kept, or worked out where it is asked for.
 enum Layer<'a> {
@@ -122,7 +122,7 @@ impl<'a> Layer<'a> {
         rows: impl Fn(usize, &mut [f32]) + Sync + 'a,
         at: impl Fn(usize) -> f32 + Sync + 'a,
     ) -> Self {
-        if grid.len() > KEPT {
+        if grid.len() > MAX_KEPT_VOXELS {
             return Self::Made { grid, rows: Box::new(rows), at: Box::new(at) };
         }
         Self::Kept(Volume::by_rows(*grid, rows))
@@ -183,7 +183,7 @@ pub fn write_field(folder: &mut OutputFolder, measured: Measured<'_>, result: &m
     summary.seconds.push(("warp".into(), started.elapsed().as_secs_f64()));
 
     let started = Instant::now();
-    let centres = (grid.len() <= KEPT && deformed_grid == *initial.grid()).then(|| sampler.at_centres());
+    let centres = (grid.len() <= MAX_KEPT_VOXELS && deformed_grid == *initial.grid()).then(|| sampler.at_centres());
     let still = |offset: usize| match &centres {
         Some(values) => values[offset],
         None => {

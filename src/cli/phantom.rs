@@ -16,7 +16,7 @@ use palpate::types::names::choose;
 use std::path::PathBuf;
 
 /// Default of --bias.
-const BIAS: f64 = 0.15;
+const DEFAULT_BIAS: f64 = 0.15;
 
 #[derive(Debug, Args)]
 pub struct Options {
@@ -62,7 +62,7 @@ pub struct Options {
     #[arg(long, value_name = "PART", default_value_t = 0.03)]
     noise: f64,
     /// Largest change of brightness across the deformed volume, as a part
-    #[arg(long, value_name = "PART", default_value_t = BIAS)]
+    #[arg(long, value_name = "PART", default_value_t = DEFAULT_BIAS)]
     bias: f64,
 }
 
@@ -104,7 +104,7 @@ impl Options {
 
     /// A sequence's parameters, in range.
     fn sequence(&self, kind: SequenceKind) -> Result<SequenceParams> {
-        if self.motion.is_some() || self.bias != BIAS {
+        if self.motion.is_some() || self.bias != DEFAULT_BIAS {
             bail!(Usage("a sequence has a motion of its own and no bias: leave --motion and --bias out".into()));
         }
         refuse(self.contrast, "contrast", INCLUSION)?;

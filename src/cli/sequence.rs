@@ -11,7 +11,7 @@ use palpate::types::WorldPoint;
 use serde_json::json;
 
 /// Frames in the picture.
-const SHOWN: usize = 4;
+const FRAMES_SHOWN: usize = 4;
 
 /// Stages `frame_<t>.nii.gz`, `truth_<t>.nii.gz`, mask, labels, description and picture; gives the
 /// summary back.
@@ -40,7 +40,7 @@ pub fn write(folder: &mut OutputFolder, params: &SequenceParams, console: &Conso
             let centre: WorldPoint = centre_of_motion(&last, Some(&sequence.mask));
             (Section::through(frame.grid(), centre), gray_range(&frame))
         });
-        if t % frames.div_ceil(SHOWN) == 0 {
+        if t % frames.div_ceil(FRAMES_SHOWN) == 0 {
             let values = frame.as_slice();
             panels.push(Panel::gray(&format!("frame {t}"), sections, |o| values[o], *range)?);
         }

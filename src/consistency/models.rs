@@ -5,8 +5,8 @@
 //! the map, in units of noise (twice the log-likelihood ratio). Fitting noise alone, a free field
 //! agrees better by about as much as it has degrees of freedom that the data determine, so an
 //! excess per degree of freedom near 1 or below says that the field shows nothing that the map does
-//! not. The first model, from the simplest, whose ratio is under [`CHANCE`] is taken; else the
-//! field stays free.
+//! not. The first model, from the simplest, whose ratio is under [`MAX_EXCESS_RATIO`] is taken;
+//! else the field stays free.
 
 use crate::consistency::energy::distance;
 use crate::consistency::pruning::Measured;
@@ -107,7 +107,7 @@ impl Choice {
 
 /// Excess misfit per degree of freedom up to which a simpler model is accepted. 96 phantoms without
 /// motion: median 0.49, nine in ten under 1.07, at most 1.39.
-pub const CHANCE: f64 = 1.7;
+pub const MAX_EXCESS_RATIO: f64 = 1.7;
 
 /// Least number of degrees of freedom in a ratio of misfits: with fewer, chance and the rounding of
 /// the noise model dominate.
@@ -125,7 +125,7 @@ const CONTRADICTION: Contradiction = Contradiction { min_distance: 50.0, min_rat
 
 /// Excess misfit per degree of freedom about one place beyond which no map is accepted: true maps
 /// reach 2.7. Calibrated: docs/lab/2026-11-expected-error.md.
-pub const PLACE: f64 = 4.0;
+pub const MAX_LOCAL_EXCESS_RATIO: f64 = 4.0;
 
 /// How much worse the volumes agree under a map than under the free field, in units of noise.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -173,11 +173,16 @@ pub fn choose(
         let name = model.name();
         let contradicted = off > CONTRADICTION.min_distance * model_mm && off > CONTRADICTION.min_ratio * scatter;
         let but = if contradicted { format!("; matches are {off:.1} mm off") } else { String::new() };
-        let there = format!(", {worst:.1} at the worst place (at most {PLACE})");
+        let there = format!(", {worst:.1} at the worst place (at most {MAX_LOCAL_EXCESS_RATIO})");
         evidence.push(format!(
-            "{name}: excess misfit {ratio:.2} per degree of freedom (chance: at most {CHANCE}){there}{but}"
+            "{name}: excess misfit {ratio:.2} per degree of freedom (chance: at most {MAX_EXCESS_RATIO}){there}{but}"
         ));
-        if chosen.is_none() && ablation::is_on("model") && ratio <= CHANCE && worst <= PLACE && !contradicted {
+        if chosen.is_none()
+            && ablation::is_on("model")
+            && ratio <= MAX_EXCESS_RATIO
+            && worst <= MAX_LOCAL_EXCESS_RATIO
+            && !contradicted
+        {
             chosen = Some((model, motion));
         }
     }

@@ -8,7 +8,7 @@ pub(crate) const BAND: f64 = 1.959_964;
 
 /// Squared radius of the region that holds 95 % of a normal distribution in two and in three axes,
 /// in variances along an axis (chi-square's quantile).
-const REGIONS: [f64; 2] = [5.991, 7.815];
+const REGION_95_SQUARED: [f64; 2] = [5.991, 7.815];
 
 /// The share of displacements over `mask` whose error lies in the 95 % region of `sigma` (mm, one
 /// standard deviation along an axis, by voxel): a ball, or a disc for a single slice. None for an
@@ -32,7 +32,7 @@ pub fn coverage(
     mask: &Mask,
 ) -> Option<f64> {
     let inside = mask.as_slice();
-    let region = REGIONS[usize::from(!field.grid().is_single_slice())];
+    let region = REGION_95_SQUARED[usize::from(!field.grid().is_single_slice())];
     let (good, all) = (0..inside.len())
         .into_par_iter()
         .filter(|&at| inside[at] != 0)

@@ -14,10 +14,10 @@ pub struct Row {
 }
 
 /// Part of a wave that a row of a mask must span to tell its amplitude (1).
-const SPANS: f64 = 0.75;
+const MIN_ROW_WAVELENGTHS: f64 = 0.75;
 
 /// Voxels of a row that tell its amplitude, at least.
-const LEAST: usize = 30;
+const MIN_ROW_VOXELS: usize = 30;
 
 /// The rows of voxel axis `grow`, within `mask`, of a motion along voxel axis `moves` in waves
 /// along `wave`. `fields` are averaged; `wavelength` gives that of a row (mm).
@@ -39,7 +39,7 @@ pub fn rows(
         let places = || own.iter().map(|&at| grid.voxel(at)[wave]);
         let span = (places().max()? + 1 - places().min()?) as f64 * spacing[wave];
         let wavelength = wavelength(j as f64);
-        if own.len() < LEAST || span < SPANS * wavelength {
+        if own.len() < MIN_ROW_VOXELS || span < MIN_ROW_WAVELENGTHS * wavelength {
             return None;
         }
         let mean = own.iter().map(|&at| along(truth.at(at))).sum::<f64>() / own.len() as f64;
@@ -55,14 +55,14 @@ pub fn rows(
 }
 
 /// Wavelengths in an octave at which a gain is given.
-const AN_OCTAVE: f64 = 4.0;
+const GAINS_PER_OCTAVE: f64 = 4.0;
 
 /// The gain at evenly spaced wavelengths (mm, on a logarithmic scale): the share of the true
 /// amplitude that was found.
 pub fn gains(rows: &[Row]) -> Vec<[f64; 2]> {
     let mut bins: Vec<(i64, f64, f64, f64)> = Vec::new();
     for row in rows {
-        let bin = (AN_OCTAVE * row.wavelength.log2()).round() as i64;
+        let bin = (GAINS_PER_OCTAVE * row.wavelength.log2()).round() as i64;
         match bins.iter_mut().find(|b| b.0 == bin) {
             Some(b) => (b.1, b.2, b.3) = (b.1 + row.found, b.2 + row.there, b.3 + row.there * row.wavelength),
             None => bins.push((bin, row.found, row.there, row.there * row.wavelength)),

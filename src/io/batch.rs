@@ -34,7 +34,7 @@ pub(crate) const PAIR_COLUMNS: [&str; 16] = [
 ];
 
 /// No table has more: each takes some hundred bytes of memory, whatever its line.
-const MOST_PAIRS: usize = 100_000;
+const MAX_PAIRS: usize = 100_000;
 
 /// Reads a table of pairs: comma-separated, one header line with some of `PAIR_COLUMNS` in any
 /// order, `initial` and `deformed` among them. Paths count from the table's folder. An empty place
@@ -55,8 +55,8 @@ pub fn read_pairs(path: impl AsRef<Path>) -> Result<Vec<Pair>, IoError> {
     let mut pairs = Vec::new();
     for record in reader.records() {
         let record = record.map_err(|e| damaged(path, e))?;
-        if pairs.len() == MOST_PAIRS {
-            return Err(format(path, format!("has more than {MOST_PAIRS} pairs"), "divide the table"));
+        if pairs.len() == MAX_PAIRS {
+            return Err(format(path, format!("has more than {MAX_PAIRS} pairs"), "divide the table"));
         }
         let line = record.position().map_or(0, csv::Position::line);
         let flaw = |what: String, hint: &str| format(path, format!("line {line}: {what}"), hint);

@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use std::path::Path;
 
 /// No file of parameters is longer (bytes).
-const LONGEST: u64 = 1 << 24;
+const MAX_FILE_BYTES: u64 = 1 << 24;
 
 /// Reads parameters under the keys that `summary.json` has in `params`: there, or alone at the top
 /// of a JSON or TOML file. Keys that are left out keep the preset's value (`balanced` without one).
@@ -32,7 +32,7 @@ const LONGEST: u64 = 1 << 24;
 /// ```
 pub fn read_config(path: impl AsRef<Path>) -> Result<FieldParams, IoError> {
     let path = path.as_ref();
-    let text = source::keyed(path, LONGEST, source::MOST_VALUES)?;
+    let text = source::keyed(path, MAX_FILE_BYTES, source::MAX_VALUES)?;
     let given = if text.trim_start().starts_with('{') { from_json(path, &text)? } else { from_toml(path, &text)? };
     let preset = match given.get("preset") {
         Some(value) => serde_json::from_value(value.clone())

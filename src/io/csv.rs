@@ -313,11 +313,11 @@ fn reader_of(bytes: Vec<u8>) -> Reader<Cursor<Vec<u8>>> {
 }
 
 /// No table has more columns.
-const MOST_COLUMNS: usize = 1000;
+const MAX_COLUMNS: usize = 1000;
 
 /// The header line of a table, and the reader of the lines after it.
 pub(super) fn open_table(path: &Path) -> Result<(StringRecord, Reader<Cursor<Vec<u8>>>), IoError> {
-    let bytes = source::bytes(path, source::LONGEST_TEXT)?;
+    let bytes = source::bytes(path, source::MAX_TEXT_BYTES)?;
     check_quotes(&bytes).map_err(|flaw| flaw.at(path))?;
     let mut reader = reader_of(bytes);
     let header = reader.headers().map_err(|e| damaged(path, e))?.clone();
@@ -345,8 +345,8 @@ fn check_quotes(bytes: &[u8]) -> Result<(), Flaw> {
             (None, b'"') if start => opened = Some(line),
             (None, b',') => {
                 columns = columns.map(|n| n + 1);
-                if columns.is_some_and(|n| n > MOST_COLUMNS) {
-                    let what = format!("line 1: has more than {MOST_COLUMNS} columns");
+                if columns.is_some_and(|n| n > MAX_COLUMNS) {
+                    let what = format!("line 1: has more than {MAX_COLUMNS} columns");
                     return Err(Flaw::new(what, "the first line must name the columns; check which file it is"));
                 }
             }

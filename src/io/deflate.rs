@@ -7,16 +7,16 @@
 //! libdeflate's 0.74 s at level 1, and 39 MB instead of 34.
 
 /// Bytes that share one Huffman code.
-const BLOCK: usize = 1 << 19;
+const BYTES_PER_BLOCK: usize = 1 << 19;
 /// Longest code (bits): four of them and a rest of 7 bits fit in 64 bits.
-const LONGEST: usize = 12;
+const MAX_CODE_BITS: usize = 12;
 /// Literals 0 to 255, end of block 256, lengths 257 to 285.
 const SYMBOLS: usize = 286;
-const END: usize = 256;
+const END_OF_BLOCK: usize = 256;
 /// More than the bytes of a block's code, its end and one store past the end.
-const HEADER: usize = 256;
+const MAX_HEADER_BYTES: usize = 256;
 /// Words in the longest run: 256 bytes, as DEFLATE's longest match of 258 is not a multiple of 4.
-const LONGEST_RUN: usize = 64;
+const MAX_RUN_WORDS: usize = 64;
 /// Smallest match length of symbols 257 to 284 (RFC 1951, 3.2.5).
 const LENGTH_BASE: [usize; 28] =
     [3, 4, 5, 6, 7, 8, 9, 10, 11, 13, 15, 17, 19, 23, 27, 31, 35, 43, 51, 59, 67, 83, 99, 115, 131, 163, 195, 227];
@@ -25,10 +25,10 @@ const LENGTH_BASE: [usize; 28] =
 /// can be joined; [`FINISH`] ends the stream. Nothing refers to bytes before `data`.
 pub(super) fn deflate(data: &[u8]) -> Vec<u8> {
     let mut out = BitWriter { bytes: Vec::new(), length: 0, held: 0, count: 0 };
-    for block in data.chunks(BLOCK) {
+    for block in data.chunks(BYTES_PER_BLOCK) {
         deflate_block(block, &mut out);
     }
-    out.reserve(HEADER);
+    out.reserve(MAX_HEADER_BYTES);
     // An empty stored block: three zero bits, the rest of the byte, length 0 and its complement.
     out.put(0, 3);
     out.count = out.count.next_multiple_of(8);
@@ -43,7 +43,7 @@ pub(super) const FINISH: [u8; 5] = [1, 0, 0, 0xff, 0xff];
 /// One block with its own code (RFC 1951, 3.2.7). The only distance ever used is 4.
 fn deflate_block(block: &[u8], out: &mut BitWriter) {
     let mut counts = [0u32; SYMBOLS];
-    counts[END] = 1;
+    counts[END_OF_BLOCK] = 1;
     scan(block, |token| match token {
         Token::Literals(bytes) => bytes.iter().for_each(|&b| counts[b as usize] += 1),
         Token::Run(words) => counts[run_symbol(words).0] += 1,
@@ -51,7 +51,7 @@ fn deflate_block(block: &[u8], out: &mut BitWriter) {
     let lengths = code_lengths(&counts);
     let codes = canonical_codes(&lengths);
 
-    out.reserve(block.len() * LONGEST / 8 + HEADER);
+    out.reserve(block.len() * MAX_CODE_BITS / 8 + MAX_HEADER_BYTES);
     out.put(0b100, 3); // not final, dynamic code
     out.put(SYMBOLS as u64 - 257, 5);
     out.put(4 - 1, 5); // four distance codes
@@ -78,7 +78,7 @@ fn deflate_block(block: &[u8], out: &mut BitWriter) {
             out.put(1, 1); // distance 4
         }
     });
-    out.put(codes[END].0, codes[END].1);
+    out.put(codes[END_OF_BLOCK].0, codes[END_OF_BLOCK].1);
 }
 
 enum Token<'a> {
@@ -94,7 +94,7 @@ fn scan<'a>(block: &'a [u8], mut token: impl FnMut(Token<'a>)) {
     while i < words.len() {
         let mut run = 0;
         if i > 0 {
-            let limit = LONGEST_RUN.min(words.len() - i);
+            let limit = MAX_RUN_WORDS.min(words.len() - i);
             run = words[i..i + limit].iter().take_while(|&&w| w == words[i - 1]).count();
         }
         if run >= 2 {
@@ -114,8 +114,8 @@ fn run_symbol(words: usize) -> (usize, usize, u32) {
     (257 + at, LENGTH_BASE[at], if at < 8 { 0 } else { (at as u32 - 4) / 4 })
 }
 
-/// Lengths of an optimal prefix code with no length past [`LONGEST`] (package-merge; Larmore and
-/// Hirschberg 1990, doi:10.1145/79147.79150). A symbol that does not occur gets 0; at least two
+/// Lengths of an optimal prefix code with no length past [`MAX_CODE_BITS`] (package-merge; Larmore
+/// and Hirschberg 1990, doi:10.1145/79147.79150). A symbol that does not occur gets 0; at least two
 /// must occur.
 fn code_lengths(counts: &[u32; SYMBOLS]) -> [u8; SYMBOLS] {
     let mut leaves: Vec<(u32, usize)> = (0..SYMBOLS).filter(|&s| counts[s] > 0).map(|s| (counts[s], s)).collect();
@@ -128,7 +128,7 @@ fn code_lengths(counts: &[u32; SYMBOLS]) -> [u8; SYMBOLS] {
         row
     };
     let mut rows = vec![row(&mut std::iter::empty())];
-    for level in 1..LONGEST {
+    for level in 1..MAX_CODE_BITS {
         let next = row(&mut rows[level - 1].chunks_exact(2).map(|pair| pair[0].0 + pair[1].0));
         rows.push(next);
     }
@@ -149,7 +149,7 @@ fn code_lengths(counts: &[u32; SYMBOLS]) -> [u8; SYMBOLS] {
 fn canonical_codes(lengths: &[u8; SYMBOLS]) -> [(u64, u32); SYMBOLS] {
     let mut codes = [(0, 0); SYMBOLS];
     let mut next = 0u16;
-    for length in 1..=LONGEST as u32 {
+    for length in 1..=MAX_CODE_BITS as u32 {
         next <<= 1;
         for symbol in (0..SYMBOLS).filter(|&s| u32::from(lengths[s]) == length) {
             codes[symbol] = (reversed(next, length), length);
@@ -248,14 +248,14 @@ mod tests {
             (a, b) = (b, a + b);
         }
         let lengths = code_lengths(&counts);
-        assert_eq!(lengths.iter().max(), Some(&(LONGEST as u8)));
+        assert_eq!(lengths.iter().max(), Some(&(MAX_CODE_BITS as u8)));
         let kraft: f64 = lengths.iter().filter(|&&l| l > 0).map(|&l| 0.5f64.powi(i32::from(l))).sum();
         assert_eq!(kraft, 1.0);
     }
 
     #[test]
     fn several_blocks_and_constant_data() {
-        let ramp: Vec<u8> = (0..3 * BLOCK as u32).flat_map(|i| (i / 7).to_le_bytes()).collect();
+        let ramp: Vec<u8> = (0..3 * BYTES_PER_BLOCK as u32).flat_map(|i| (i / 7).to_le_bytes()).collect();
         assert!(round_trip(&[&ramp, &ramp[..1001], &[]]) < ramp.len());
         assert!(round_trip(&[&vec![0; 1 << 20]]) < 8000);
         round_trip(&[]);

@@ -8,7 +8,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Bytes read at a time.
-const PIECE: usize = 1 << 18;
+const BYTES_PER_READ: usize = 1 << 18;
 
 /// Size in bytes and SHA-256 (64 hexadecimal digits) of a file. Of a folder, those of the files in
 /// it, one after the other by name; folders in it do not count.
@@ -22,7 +22,7 @@ pub fn digest(path: impl AsRef<Path>) -> Result<(u64, String), IoError> {
         true => super::list(path)?.into_iter().filter(|file| file.is_file()).collect(),
         false => vec![path.into()],
     };
-    let mut piece = vec![0; PIECE];
+    let mut piece = vec![0; BYTES_PER_READ];
     for file in files {
         let mut source = source::open(&file)?;
         loop {

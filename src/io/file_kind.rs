@@ -6,7 +6,7 @@ use crate::error::IoError;
 use std::path::Path;
 
 /// Bytes looked at.
-const HEAD: u64 = 1 << 16;
+const EXAMINED_BYTES: u64 = 1 << 16;
 
 /// What a file is.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -41,7 +41,7 @@ pub(crate) fn form_of(path: impl AsRef<Path>) -> Result<Form, IoError> {
     if path.is_dir() {
         return Ok(Form::Other);
     }
-    let head = source::head(path, HEAD)?;
+    let head = source::head(path, EXAMINED_BYTES)?;
     let text = String::from_utf8_lossy(&head);
     let start = text.trim_start();
     Ok(match start {

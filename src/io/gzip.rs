@@ -14,7 +14,7 @@ use std::ops::Range;
 /// No DEFLATE stream unpacks to more than this many times its size.
 pub(super) const LARGEST_RATIO: u64 = 1032;
 /// Bytes after the voxels that are still read, to check the checksum behind them.
-const SLACK: u64 = 1 << 20;
+const MAX_TRAILING_BYTES: u64 = 1 << 20;
 /// How every member begins.
 const MAGIC: [u8; 2] = [0x1f, 0x8b];
 
@@ -120,7 +120,7 @@ pub(super) fn unpack(packed: &[u8], needed: usize) -> io::Result<Vec<u8>> {
 
 /// Reads on behind the voxels so that the checksum there is checked; the bytes that were skipped.
 pub(super) fn check_end(unpacked: &mut impl Read) -> io::Result<u64> {
-    io::copy(&mut unpacked.take(SLACK), &mut io::sink())
+    io::copy(&mut unpacked.take(MAX_TRAILING_BYTES), &mut io::sink())
 }
 
 /// What is wrong with a file that does not unpack.
@@ -157,7 +157,7 @@ impl<R: BufRead> Read for Members<R> {
 /// The fast path: one member that ends the file, whose last four bytes say how long it is.
 fn unpack_single(packed: &[u8], needed: usize) -> Option<Vec<u8>> {
     let size = u32::from_le_bytes(*packed.last_chunk()?) as usize;
-    if !(needed..=needed + SLACK as usize).contains(&size) {
+    if !(needed..=needed + MAX_TRAILING_BYTES as usize).contains(&size) {
         return None;
     }
     Vec::<u8>::new().try_reserve_exact(size).ok()?;

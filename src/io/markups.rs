@@ -45,7 +45,7 @@ pub(crate) fn is_slicer(path: &Path) -> bool {
 
 /// Reads the points of either format, world mm RAS, with a column `label`.
 pub(super) fn read(path: &Path) -> Result<PointTable, IoError> {
-    let text = source::text(path, source::LONGEST_TEXT)?;
+    let text = source::text(path, source::MAX_TEXT_BYTES)?;
     let (points, labels) = match path.to_string_lossy().to_lowercase().ends_with(".fcsv") {
         true => read_fcsv(path, &text)?,
         false => read_json(path, &text)?,

@@ -11,7 +11,7 @@ use std::path::Path;
 const FORCE: [&str; 3] = ["d", "tilt_deg", "force"];
 const COURSE: [&str; 6] = ["time", "theta1_deg", "theta2_deg", "x", "y", "theta_deg"];
 /// Fewest rows that say anything of a model.
-const FEWEST: usize = 5;
+const MIN_ROWS: usize = 5;
 
 /// Reads presses (d, tilt_deg, force; dt, and rate or time where there are such columns) or the
 /// course of a grasp (time, theta1_deg, theta2_deg, x, y, theta_deg).
@@ -46,8 +46,8 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Measurements, IoError> {
         })?),
     };
     match found.len() {
-        n if n < FEWEST => {
-            Err(format(path, format!("has {n} rows, and {FEWEST} are the fewest to fit a model to"), "measure more"))
+        n if n < MIN_ROWS => {
+            Err(format(path, format!("has {n} rows, and {MIN_ROWS} are the fewest to fit a model to"), "measure more"))
         }
         _ => Ok(found),
     }

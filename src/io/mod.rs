@@ -160,7 +160,7 @@ fn os(path: &Path, action: &'static str) -> impl FnOnce(std::io::Error) -> IoErr
 /// What is wrong with a file's content, and what to try.
 fn format(path: &Path, what: impl Into<String>, hint: impl Into<String>) -> IoError {
     let mut what = what.into();
-    if let Some((at, _)) = what.char_indices().nth(LONGEST_REASON) {
+    if let Some((at, _)) = what.char_indices().nth(MAX_REASON_CHARS) {
         what.truncate(at);
         what.push_str("...");
     }
@@ -168,4 +168,4 @@ fn format(path: &Path, what: impl Into<String>, hint: impl Into<String>) -> IoEr
 }
 
 /// Characters of a reason that a message shows at most, whatever a file holds.
-const LONGEST_REASON: usize = 1000;
+const MAX_REASON_CHARS: usize = 1000;

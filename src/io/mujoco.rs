@@ -4,7 +4,7 @@
 //! bodies of their common nodes: the regions hold together exactly. Units: m, Pa, kg, s.
 
 use super::atomic::write_atomic;
-use super::simulators::{METRE, PARTS, linear, masses, moduli, prescribed};
+use super::simulators::{LINEAR_PER_QUADRATIC, METRES_PER_MM, linear, masses, moduli, prescribed};
 use crate::error::IoError;
 use crate::types::stiffness::StiffnessResult;
 use std::collections::BTreeMap;
@@ -15,9 +15,9 @@ use std::path::Path;
 const AXES: [(&str, &str); 3] = [("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1")];
 /// Stiffness of what moves a prescribed node, over the largest modulus times an element's side (1):
 /// the node stays within a thousandth of what is prescribed.
-const GRIP: f64 = 100.0;
+const HOLD_STIFFNESS_RATIO: f64 = 100.0;
 /// Step and Rayleigh damping (s): a choice that settles in a few hundred steps; not measured.
-const STEP: [f64; 2] = [0.002, 0.05];
+const STEP_AND_DAMPING_S: [f64; 2] = [0.002, 0.05];
 
 /// What stands at the head of the model.
 const ABOUT: &str = "Units: m, Pa, kg, s; places are world RAS. Needs MuJoCo 3.13 or later.\n     One flex a region, each with \
@@ -38,7 +38,7 @@ pub fn write_mjcf(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<()
         let fixed = prescribed(result);
         writeln!(w, "<!-- palpate {}: identified stiffness.\n     {ABOUT} -->", env!("CARGO_PKG_VERSION"))?;
         writeln!(w, "<mujoco model=\"palpate\">")?;
-        let step = STEP[0];
+        let step = STEP_AND_DAMPING_S[0];
         writeln!(
             w,
             "\t<option timestep=\"{step}\" integrator=\"discrete\" solver=\"CG\" iterations=\"1000\" gravity=\"0 0 0\"/>"
@@ -52,10 +52,10 @@ pub fn write_mjcf(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<()
             writeln!(w, "\t\t<position joint=\"n{}{}\" kp=\"{grip:.6e}\"/>", node + 1, AXES[a].0)?;
         }
         write!(w, "\t</actuator>\n\t<keyframe>\n\t\t<key name=\"pressed\" ctrl=\"")?;
-        pulls(&fixed).try_for_each(|(_, _, v)| write!(w, "{:.9} ", v * METRE))?;
+        pulls(&fixed).try_for_each(|(_, _, v)| write!(w, "{:.9} ", v * METRES_PER_MM))?;
         write!(w, "\" qpos=\"")?;
         for (_, u) in (0u32..).zip(&result.displacement).filter(|(n, _)| !still(fixed.get(n))) {
-            write!(w, "{:.9} {:.9} {:.9} ", u[0] * METRE, u[1] * METRE, u[2] * METRE)?;
+            write!(w, "{:.9} {:.9} {:.9} ", u[0] * METRES_PER_MM, u[1] * METRES_PER_MM, u[2] * METRES_PER_MM)?;
         }
         writeln!(w, "\"/>\n\t</keyframe>\n</mujoco>")
     })
@@ -74,9 +74,9 @@ fn pulls(fixed: &BTreeMap<u32, [Option<f64>; 3]>) -> impl Iterator<Item = (u32, 
 
 /// Stiffness of the actuators (N/m).
 fn grip(result: &StiffnessResult, tetrahedra: &[[u32; 4]]) -> f64 {
-    let volume: f64 = masses(&result.mesh, tetrahedra).iter().sum::<f64>() / super::simulators::DENSITY;
+    let volume: f64 = masses(&result.mesh, tetrahedra).iter().sum::<f64>() / super::simulators::TISSUE_DENSITY;
     let side = (volume / tetrahedra.len().max(1) as f64).cbrt();
-    GRIP * side * moduli(result).into_values().fold(0.0, f64::max)
+    HOLD_STIFFNESS_RATIO * side * moduli(result).into_values().fold(0.0, f64::max)
 }
 
 fn bodies(
@@ -87,14 +87,14 @@ fn bodies(
 ) -> io::Result<()> {
     writeln!(w, "\t<worldbody>")?;
     for (n, (p, mass)) in (0u32..).zip(result.mesh.nodes().iter().zip(masses(&result.mesh, tetrahedra))) {
-        let [x, y, z] = p.0.map(|v| v * METRE);
+        let [x, y, z] = p.0.map(|v| v * METRES_PER_MM);
         write!(w, "\t\t<body name=\"n{}\" pos=\"{x:.9} {y:.9} {z:.9}\"", n + 1)?;
         if still(fixed.get(&n)) {
             writeln!(w, "/>")?;
             continue;
         }
         // A node cannot turn; MuJoCo asks for an inertia all the same.
-        let inertia = mass * METRE * METRE;
+        let inertia = mass * METRES_PER_MM * METRES_PER_MM;
         write!(
             w,
             "><inertial pos=\"0 0 0\" mass=\"{mass:.6e}\" diaginertia=\"{inertia:.3e} {inertia:.3e} {inertia:.3e}\"/>"
@@ -114,7 +114,7 @@ fn flex(
     label: u8,
     young: f64,
 ) -> io::Result<()> {
-    let inside = |e: &usize| result.mesh.labels()[e / PARTS] == label;
+    let inside = |e: &usize| result.mesh.labels()[e / LINEAR_PER_QUADRATIC] == label;
     let own: Vec<&[u32; 4]> = (0..tetrahedra.len()).filter(inside).map(|e| &tetrahedra[e]).collect();
     let mut nodes: Vec<u32> = own.iter().copied().flatten().copied().collect();
     nodes.sort_unstable();
@@ -125,7 +125,7 @@ fn flex(
     for node in own.into_iter().flatten() {
         write!(w, "{} ", nodes.partition_point(|n| n < node))?;
     }
-    let (poisson, damping) = (result.poisson_of(label), STEP[1]);
+    let (poisson, damping) = (result.poisson_of(label), STEP_AND_DAMPING_S[1]);
     writeln!(w, "\">\n\t\t\t<elasticity young=\"{young:.6e}\" poisson=\"{poisson}\" damping=\"{damping}\"/>")?;
     writeln!(w, "\t\t\t<contact contype=\"0\" conaffinity=\"0\" selfcollide=\"none\"/>\n\t\t</flex>")
 }
@@ -143,19 +143,19 @@ pub fn write_msh(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<(),
         regions.keys().try_for_each(|label| writeln!(w, "3 {label} \"region{label}\""))?;
         writeln!(w, "$EndPhysicalNames\n$Nodes\n{}", result.mesh.nodes().len())?;
         for (n, p) in (1..).zip(result.mesh.nodes()) {
-            let [x, y, z] = p.0.map(|v| v * METRE);
+            let [x, y, z] = p.0.map(|v| v * METRES_PER_MM);
             writeln!(w, "{n} {x:.9} {y:.9} {z:.9}")?;
         }
         writeln!(w, "$EndNodes\n$Elements\n{}", tetrahedra.len())?;
         for (e, t) in tetrahedra.iter().enumerate() {
-            let group = result.mesh.labels()[e / PARTS];
+            let group = result.mesh.labels()[e / LINEAR_PER_QUADRATIC];
             let [a, b, c, d] = t.map(|n| n + 1);
             writeln!(w, "{} 4 2 {group} {group} {a} {b} {c} {d}", e + 1)?;
         }
         let name = "youngs_modulus";
         writeln!(w, "$EndElements\n$ElementData\n1\n\"{name}\"\n1\n0\n3\n0\n1\n{}", tetrahedra.len())?;
         for e in 0..tetrahedra.len() {
-            let young = regions.get(&result.mesh.labels()[e / PARTS]).copied().unwrap_or_default();
+            let young = regions.get(&result.mesh.labels()[e / LINEAR_PER_QUADRATIC]).copied().unwrap_or_default();
             writeln!(w, "{} {young:.6e}", e + 1)?;
         }
         writeln!(w, "$EndElementData")

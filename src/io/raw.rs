@@ -13,7 +13,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// No text header is longer (bytes).
-const LONGEST_HEADER: u64 = 1 << 20;
+const MAX_HEADER_BYTES: u64 = 1 << 20;
 
 /// How the voxels are packed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,7 +50,7 @@ pub(super) struct RawImage {
 /// The first lines of a file as far as they can belong to a header (text up to the first byte that
 /// is none, or 1 MiB).
 pub(super) fn head(path: &Path) -> Result<Vec<u8>, IoError> {
-    source::head(path, LONGEST_HEADER)
+    source::head(path, MAX_HEADER_BYTES)
 }
 
 /// A line of `bytes` from `from`, without its end, and where the next one begins; none past the

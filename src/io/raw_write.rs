@@ -11,7 +11,7 @@ use std::ops::Range;
 use std::path::Path;
 
 /// Voxels that are packed together; fixed, so that bytes do not depend on the number of threads.
-const CHUNK: usize = 1 << 18;
+const VOXELS_PER_CHUNK: usize = 1 << 18;
 
 /// A format whose header is text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,7 +46,8 @@ impl TextImage<'_> {
         bytes: impl Fn(usize, Range<usize>) -> Vec<u8> + Sync,
     ) -> Result<(), IoError> {
         let all = self.grid.len();
-        let ranges: Vec<Range<usize>> = (0..all).step_by(CHUNK).map(|from| from..(from + CHUNK).min(all)).collect();
+        let ranges: Vec<Range<usize>> =
+            (0..all).step_by(VOXELS_PER_CHUNK).map(|from| from..(from + VOXELS_PER_CHUNK).min(all)).collect();
         let size = self.kind.size();
         let together = |range: &Range<usize>| -> Vec<u8> {
             let parts: Vec<Vec<u8>> = (0..self.components).map(|c| bytes(c, range.clone())).collect();

@@ -82,7 +82,7 @@ const GAINS: [&str; 3] = ["kp", "kd", "ki"];
 const FINGER: [&str; 6] = ["link", "links", "base", "inertia", "gains", "fixed"];
 const TIP: [&str; 3] = ["radius", "youngs_modulus", "damping"];
 /// Most cases of an ensemble.
-const MOST_CASES: usize = 100_000;
+const MAX_CASES: usize = 100_000;
 
 /// Reads a scene file.
 ///
@@ -111,7 +111,7 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
     }
     let scene = scene(path, table.clone(), overrides)?;
     let count = sweeps.iter().try_fold(1usize, |n, (_, values)| n.checked_mul(values.len()));
-    if count.is_none_or(|n| n > MOST_CASES) {
+    if count.is_none_or(|n| n > MAX_CASES) {
         return Err(format(path, "[[sweep]] asks for more than 100,000 scenes", "give fewer values"));
     }
     let mut sweep = Vec::new();
@@ -130,10 +130,10 @@ pub fn read_scene(path: impl AsRef<Path>, overrides: &SceneOverrides) -> Result<
 }
 
 /// No scene and no fingertip is longer (bytes).
-const LONGEST: u64 = 1 << 22;
+const MAX_FILE_BYTES: u64 = 1 << 22;
 
 pub(super) fn read_table(path: &Path) -> Result<Table, IoError> {
-    parse_table(path, &source::keyed(path, LONGEST, source::MOST_VALUES)?)
+    parse_table(path, &source::keyed(path, MAX_FILE_BYTES, source::MAX_VALUES)?)
 }
 
 pub(super) fn parse_table(path: &Path, text: &str) -> Result<Table, IoError> {

@@ -10,11 +10,11 @@ use crate::types::stiffness::StiffnessResult;
 use std::collections::BTreeMap;
 
 /// Metres in a millimetre.
-pub(super) const METRE: f64 = 1e-3;
+pub(super) const METRES_PER_MM: f64 = 1e-3;
 /// Pascals in a kilopascal.
-pub(super) const PASCAL: f64 = 1e3;
+pub(super) const PASCALS_PER_KPA: f64 = 1e3;
 /// Density of soft tissue (kg/m^3): that of water. It changes motion in time and no rest.
-pub(super) const DENSITY: f64 = 1000.0;
+pub(super) const TISSUE_DENSITY: f64 = 1000.0;
 
 /// The tetrahedra at the corners of a quadratic one, by its ten nodes.
 const CORNERS: [[usize; 4]; 4] = [[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3]];
@@ -25,7 +25,7 @@ const INNER: [[[usize; 4]; 4]; 3] = [
     [[6, 8, 4, 5], [6, 8, 5, 9], [6, 8, 9, 7], [6, 8, 7, 4]],
 ];
 /// Linear tetrahedra that a quadratic one gives.
-pub(super) const PARTS: usize = 8;
+pub(super) const LINEAR_PER_QUADRATIC: usize = 8;
 
 /// Six times the volume (mm^3), positive where the corners are in order.
 fn six_volumes(mesh: &QuadraticMesh, t: &[u32; 4]) -> f64 {
@@ -38,10 +38,10 @@ fn ordered(mesh: &QuadraticMesh, [a, b, c, d]: [u32; 4]) -> [u32; 4] {
     if six_volumes(mesh, &[a, b, c, d]) < 0.0 { [a, b, d, c] } else { [a, b, c, d] }
 }
 
-/// [`PARTS`] linear tetrahedra for each quadratic one, in order, all positively oriented. The
-/// octahedron is divided along the diagonal that leaves the largest smallest part.
+/// [`LINEAR_PER_QUADRATIC`] linear tetrahedra for each quadratic one, in order, all positively
+/// oriented. The octahedron is divided along the diagonal that leaves the largest smallest part.
 pub(super) fn linear(mesh: &QuadraticMesh) -> Vec<[u32; 4]> {
-    let mut out = Vec::with_capacity(PARTS * mesh.tetrahedra().len());
+    let mut out = Vec::with_capacity(LINEAR_PER_QUADRATIC * mesh.tetrahedra().len());
     for t in mesh.tetrahedra() {
         let of = |part: &[usize; 4]| ordered(mesh, part.map(|i| t[i]));
         let least =
@@ -57,7 +57,7 @@ pub(super) fn linear(mesh: &QuadraticMesh) -> Vec<[u32; 4]> {
 pub(super) fn masses(mesh: &QuadraticMesh, tetrahedra: &[[u32; 4]]) -> Vec<f64> {
     let mut out = vec![0.0; mesh.nodes().len()];
     for t in tetrahedra {
-        let part = six_volumes(mesh, t).max(0.0) / 24.0 * METRE.powi(3) * DENSITY;
+        let part = six_volumes(mesh, t).max(0.0) / 24.0 * METRES_PER_MM.powi(3) * TISSUE_DENSITY;
         t.iter().for_each(|&n| out[n as usize] += part);
     }
     out
@@ -79,5 +79,5 @@ pub(super) fn prescribed(result: &StiffnessResult) -> BTreeMap<u32, [Option<f64>
 /// Labels of the regions, ascending, with the modulus (Pa) of each.
 pub(super) fn moduli(result: &StiffnessResult) -> BTreeMap<u8, f64> {
     let each = result.mesh.labels().iter().zip(&result.element_modulus);
-    each.map(|(&label, e)| (label, e * PASCAL)).collect()
+    each.map(|(&label, e)| (label, e * PASCALS_PER_KPA)).collect()
 }

@@ -1,7 +1,7 @@
 //! The identified model as a scene of SOFA (`.scn`).
 
 use super::atomic::write_atomic;
-use super::simulators::{METRE, PARTS, PASCAL, linear, masses, prescribed};
+use super::simulators::{LINEAR_PER_QUADRATIC, METRES_PER_MM, PASCALS_PER_KPA, linear, masses, prescribed};
 use crate::error::IoError;
 use crate::types::stiffness::{Law, StiffnessResult};
 use std::io::{self, Write};
@@ -56,7 +56,7 @@ pub fn write_sofa(path: impl AsRef<Path>, result: &StiffnessResult) -> Result<()
 fn state(w: &mut impl Write, result: &StiffnessResult) -> io::Result<()> {
     let fixed = prescribed(result);
     let place = |w: &mut dyn Write, p: [f64; 3]| {
-        let [x, y, z] = p.map(|v| v * METRE);
+        let [x, y, z] = p.map(|v| v * METRES_PER_MM);
         write!(w, "{x:.9} {y:.9} {z:.9} ")
     };
     result.mesh.nodes().iter().try_for_each(|p| place(w, p.0))?;
@@ -79,13 +79,15 @@ fn material(w: &mut impl Write, result: &StiffnessResult, tetrahedra: &[[u32; 4]
     for (k, nu) in ratios.into_iter().enumerate() {
         let own: Vec<usize> = (0..result.element_modulus.len()).filter(|&e| ratio(e) == nu).collect();
         write!(w, "\t\t<Node name=\"material{}\">\n\t\t\t<TetrahedronSetTopologyContainer tetrahedra=\"", k + 1)?;
-        for [a, b, c, d] in own.iter().flat_map(|e| &tetrahedra[PARTS * e..PARTS * (e + 1)]) {
+        for [a, b, c, d] in
+            own.iter().flat_map(|e| &tetrahedra[LINEAR_PER_QUADRATIC * e..LINEAR_PER_QUADRATIC * (e + 1)])
+        {
             write!(w, "{a} {b} {c} {d} ")?;
         }
         write!(w, "\"/>\n\t\t\t<TetrahedronFEMForceField method=\"{method}\" poissonRatio=\"{nu}\" youngModulus=\"")?;
         for e in own {
-            let modulus = result.element_modulus[e] * PASCAL;
-            (0..PARTS).try_for_each(|_| write!(w, "{modulus:.6e} "))?;
+            let modulus = result.element_modulus[e] * PASCALS_PER_KPA;
+            (0..LINEAR_PER_QUADRATIC).try_for_each(|_| write!(w, "{modulus:.6e} "))?;
         }
         writeln!(w, "\"/>\n\t\t</Node>")?;
     }

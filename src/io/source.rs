@@ -10,10 +10,10 @@ use std::io::Read;
 use std::path::Path;
 
 /// No table and no file of numbers as text is longer (bytes).
-pub(super) const LONGEST_TEXT: u64 = 1 << 28;
+pub(super) const MAX_TEXT_BYTES: u64 = 1 << 28;
 
 /// No scene and no set of parameters has more values.
-pub(super) const MOST_VALUES: usize = 1 << 16;
+pub(super) const MAX_VALUES: usize = 1 << 16;
 
 /// Opens a regular file.
 pub(super) fn open(path: &Path) -> Result<File, IoError> {

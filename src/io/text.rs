@@ -23,7 +23,7 @@ pub fn read_json(path: impl AsRef<Path>) -> Result<Value, IoError> {
 /// # Errors
 /// [`IoError`] when the file cannot be read or is no UTF-8.
 pub fn read_text(path: impl AsRef<Path>) -> Result<String, IoError> {
-    source::text(path.as_ref(), source::LONGEST_TEXT)
+    source::text(path.as_ref(), source::MAX_TEXT_BYTES)
 }
 
 /// The files and folders in a folder, sorted.

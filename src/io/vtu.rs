@@ -16,7 +16,7 @@ use std::io::{self, Write as _};
 use std::path::Path;
 
 /// Bytes compressed together.
-const BLOCK: usize = 1 << 20;
+const BYTES_PER_BLOCK: usize = 1 << 20;
 /// VTK's numbers for the cells.
 const VTK_TRIANGLE: u8 = 5;
 const VTK_TETRA: u8 = 10;
@@ -193,9 +193,9 @@ impl Appended {
              offset=\"{offset}\"/>"
         )?;
         let mut compressor = Compressor::new(CompressionLvl::default());
-        let mut header = vec![raw.len().div_ceil(BLOCK), BLOCK, raw.len() % BLOCK];
+        let mut header = vec![raw.len().div_ceil(BYTES_PER_BLOCK), BYTES_PER_BLOCK, raw.len() % BYTES_PER_BLOCK];
         let mut blocks = Vec::new();
-        for block in raw.chunks(BLOCK) {
+        for block in raw.chunks(BYTES_PER_BLOCK) {
             let mut packed = vec![0; compressor.zlib_compress_bound(block.len())];
             let size = compressor.zlib_compress(block, &mut packed)?;
             header.push(size);

@@ -1,4 +1,4 @@
-//! The two meshes of a body of which stiffness is found: a coarse one, on which models are selected,
+//! The two meshes of a body whose stiffness is found: a coarse one, on which models are selected,
 //! and a fine one, on which moduli are found.
 
 use crate::error::StiffnessError;

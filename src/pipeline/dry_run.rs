@@ -175,8 +175,8 @@ const COST: Cost = Cost {
     bytes_per_number: 5.7,
 };
 
-/// What [`crate::pipeline::stiffness::run`] would take. Of 30 runs, memory is within 30 % for 29, time for 23 (at worst 2.1
-/// times as long).
+/// What [`crate::pipeline::stiffness::run`] would take. Of 30 runs, memory is within 30 % for 29,
+/// time for 23 (at worst 2.1 times as long).
 ///
 /// # Errors
 /// What that would refuse before it looks for moduli.

@@ -536,7 +536,7 @@ pub fn run(inputs: &PlanInputs<'_>, params: &PlanParams, progress: Progress<'_>)
     progress("mesh", 0.0);
     let bench = Bench::new(inputs, params)?;
     let given = &params.press_mm;
-    let usual = || PlanParams::PRESS.map(|part| part * bench.extent).to_vec();
+    let usual = || PlanParams::DEFAULT_PRESSES.map(|part| part * bench.extent).to_vec();
     let presses = sorted(if given.is_empty() { usual() } else { given.clone() });
     let own = bench.voxel();
     let voxels = sorted(if params.voxel_mm.is_empty() { vec![own] } else { params.voxel_mm.clone() });
@@ -647,7 +647,7 @@ impl Options<'_> {
         let (mut expected, mut least_press, mut unfelt) = (Vec::new(), f64::INFINITY, Vec::new());
         for &voxel in voxels {
             let given = &self.params.noise_mm;
-            let usual = || PlanParams::NOISE.map(|part| part * voxel).to_vec();
+            let usual = || PlanParams::DEFAULT_NOISES.map(|part| part * voxel).to_vec();
             let noises = sorted(if given.is_empty() { usual() } else { given.clone() });
             let before = expected.len();
             for noise in noises {

@@ -754,9 +754,10 @@ fn fit(
     couple(pair, measured, (radius, 0.3), None).0
 }
 
-/// Couples displacements measured on a level (place, displacement, covariance in mm^2) into a spline field, from one that is nearly right and on its lattice where there is one;
-/// with the evidence used. Each may be off by `floor` voxels beyond its covariance, and was found
-/// with a patch of `radius` voxels.
+/// Couples displacements measured on a level (place, displacement, covariance in mm^2) into a
+/// spline field, from one that is nearly right and on its lattice where there is one; with the evidence
+/// used. Each may be off by `floor` voxels beyond its covariance, and was found with a patch of
+/// `radius` voxels.
 pub(super) fn couple(
     pair: &Pair<'_>,
     measured: impl ExactSizeIterator<Item = (VoxelPoint, GridVector, Symmetric3)>,

@@ -170,7 +170,7 @@ pub fn python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>
 }
 
 /// Most threads that can be asked for, as on the command line.
-const MOST_THREADS: i64 = 1024;
+const MAX_THREADS: i64 = 1024;
 
 /// Runs `work` without the interpreter, on `threads` threads (all cores without a number), and
 /// tells `callback` how far it is. What the callback raises is raised when the work is done.
@@ -180,8 +180,8 @@ pub fn run<R: Send>(
     threads: Option<i64>,
     work: impl FnOnce(&(dyn Fn(&str, f64) + Sync)) -> R + Send,
 ) -> PyResult<R> {
-    if let Some(n) = threads.filter(|n| !(1..=MOST_THREADS).contains(n)) {
-        return Err(told(format!("threads is {n}, but must be 1 to {MOST_THREADS}")));
+    if let Some(n) = threads.filter(|n| !(1..=MAX_THREADS).contains(n)) {
+        return Err(told(format!("threads is {n}, but must be 1 to {MAX_THREADS}")));
     }
     let raised: Mutex<Option<PyErr>> = Mutex::new(None);
     let tell = |stage: &str, part: f64| {

@@ -15,7 +15,7 @@ use serde::Serialize;
 use std::fmt::Write;
 
 /// Nodes of the mesh along the longer side of a section.
-const ACROSS: usize = 36;
+const NODES_ACROSS: usize = 36;
 
 /// Pictures and meshes of the frames so far.
 #[derive(Debug)]
@@ -45,7 +45,7 @@ impl Film {
     /// Sections through `centre` (mm) of the reference's grid; gray from `range[0]` to `range[1]`.
     pub fn new(grid: &Grid, centre: WorldPoint, mask: Option<&Mask>, range: [f64; 2]) -> Self {
         let plane = |section: Section| {
-            let columns = section.columns(ACROSS).0;
+            let columns = section.columns(NODES_ACROSS).0;
             let rows = columns.first().map_or(0, Vec::len);
             let nodes = columns.concat();
             let inside = |n: &usize| mask.is_none_or(|m| m.as_slice()[nodes[*n]] != 0);

@@ -7,9 +7,9 @@ use crate::types::{DenseField, Mask, Match};
 use std::fmt::Write;
 
 /// Arrows along the longer side of a picture.
-const ACROSS: usize = 16;
+const ARROWS_ACROSS: usize = 16;
 /// Matches drawn at most in one picture.
-const MATCHES: usize = 1200;
+const MAX_MATCHES_DRAWN: usize = 1200;
 
 /// An SVG of the section's size in mm, with the picture behind `content`.
 fn over(picture: &Picture, label: &str, content: &str) -> String {
@@ -30,7 +30,7 @@ pub(crate) fn arrows(
     factor: f64,
     scale: &Scale,
 ) -> String {
-    let (nodes, step) = section.lattice(ACROSS);
+    let (nodes, step) = section.lattice(ARROWS_ACROSS);
     let width = step / 8.0;
     let mut svg =
         format!(r#"<g fill="none" stroke-width="{width:.2}" stroke-linecap="round" stroke-linejoin="round">"#);
@@ -71,7 +71,7 @@ pub(crate) fn arrows(
 /// How many times longer than in truth arrows should be, so that one of `length` mm fills about two
 /// lattice steps.
 pub(crate) fn arrow_factor(sections: &[Section], length: f64) -> f64 {
-    let step = sections.iter().map(|s| s.lattice(ACROSS).1).fold(f64::INFINITY, f64::min);
+    let step = sections.iter().map(|s| s.lattice(ARROWS_ACROSS).1).fold(f64::INFINITY, f64::min);
     let wanted = 2.0 * step / length.max(1e-6);
     [1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0].into_iter().rfind(|f| *f <= wanted).unwrap_or(1.0)
 }
@@ -83,7 +83,7 @@ pub fn matches(section: &Section, background: &Picture, matches: &[Match], slab:
         matches.iter().map(|m| (m, section.place(m.initial))).filter(|(_, (_, behind))| behind.abs() <= slab).collect();
     let r = background.size_mm[0].max(background.size_mm[1]) / 160.0;
     let (mut kept, mut rejected) = (String::new(), String::new());
-    for (m, ([x, y], _)) in near.iter().step_by(near.len().div_ceil(MATCHES).max(1)) {
+    for (m, ([x, y], _)) in near.iter().step_by(near.len().div_ceil(MAX_MATCHES_DRAWN).max(1)) {
         let _ = if m.kept {
             write!(kept, r#"<circle cx="{x:.1}" cy="{y:.1}" r="{r:.2}" fill="{}"/>"#, scale.hex(m.sigma()))
         } else {

@@ -36,7 +36,7 @@ fn colour(varied: &str) -> usize {
 const SIZE: [f64; 2] = [520.0, 360.0];
 
 /// Smaller errors are drawn here.
-const FLOOR: f64 = 1e-9;
+const MIN_DRAWN_ERROR: f64 = 1e-9;
 
 /// All panels as one SVG; pointing at a place shows its settings.
 pub fn svg(groups: &[Group], trials: &[Trial]) -> String {
@@ -54,30 +54,31 @@ fn against_time(group: &Group) -> (Panel, String) {
     if shown.len() < group.standings.len() {
         let _ = write!(note, "; {} without any result", group.standings.len() - shown.len());
     }
-    if shown.iter().any(|s| s.error < FLOOR) {
-        let _ = write!(note, "; errors below {FLOOR:.0e} at it");
+    if shown.iter().any(|s| s.error < MIN_DRAWN_ERROR) {
+        let _ = write!(note, "; errors below {MIN_DRAWN_ERROR:.0e} at it");
     }
     let panel = Panel {
         title: group.title.clone(),
         note,
         across: Axis::around("CPU time, s", true, shown.iter().map(|s| s.cpu_s)),
-        up: Axis::around(&format!("error, {}", group.unit), true, shown.iter().map(|s| s.error.max(FLOOR))),
+        up: Axis::around(&format!("error, {}", group.unit), true, shown.iter().map(|s| s.error.max(MIN_DRAWN_ERROR))),
         size: SIZE,
     };
-    let mut front: Vec<[f64; 2]> = shown.iter().filter(|s| s.on_front).map(|s| [s.cpu_s, s.error.max(FLOOR)]).collect();
+    let mut front: Vec<[f64; 2]> =
+        shown.iter().filter(|s| s.on_front).map(|s| [s.cpu_s, s.error.max(MIN_DRAWN_ERROR)]).collect();
     front.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let mut out = format!(r#"<path class="front" d="{}"/>"#, path(front.iter().map(|&p| panel.at(p))));
     let mut taken: Vec<[f64; 4]> = shown
         .iter()
         .map(|s| {
-            let [x, y] = panel.at([s.cpu_s, s.error.max(FLOOR)]);
+            let [x, y] = panel.at([s.cpu_s, s.error.max(MIN_DRAWN_ERROR)]);
             [x - 5.0, x + 5.0, y - 5.0, y + 5.0]
         })
         .collect();
     // Presets and what is on the front find room for their names first, and lie on top.
     let mut order: Vec<&Standing> = shown;
     order.sort_by_key(|s| (s.varied != "preset", !s.on_front));
-    let place = |s: &Standing| panel.at([s.cpu_s, s.error.max(FLOOR)]);
+    let place = |s: &Standing| panel.at([s.cpu_s, s.error.max(MIN_DRAWN_ERROR)]);
     let mut names = String::new();
     for s in &order {
         let (name, [x, y]) = (name(s), place(s));
@@ -187,14 +188,14 @@ fn against_nodes(trials: &[Trial]) -> Option<(Panel, String)> {
         title: "Stiffness: error against nodes".into(),
         note: "nodes of the mesh, which may be more than were asked for".into(),
         across: Axis::around("nodes", true, all().map(|t| t.size as f64)),
-        up: Axis::around("error, % of the moduli", true, all().map(|t| t.error.max(FLOOR))),
+        up: Axis::around("error, % of the moduli", true, all().map(|t| t.error.max(MIN_DRAWN_ERROR))),
         size: SIZE,
     };
     let told = |name: &str, t: &Trial| {
         let [error, seconds] = [t.error, t.cpu_s].map(significant);
         format!("{name}, {}: {} nodes, error {error} %, {seconds} s of CPU time", t.method, t.size)
     };
-    let out = drawn(&panel, &lines, |t| [t.size as f64, t.error.max(FLOOR)], told);
+    let out = drawn(&panel, &lines, |t| [t.size as f64, t.error.max(MIN_DRAWN_ERROR)], told);
     Some((panel, out))
 }
 

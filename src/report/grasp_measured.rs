@@ -7,7 +7,7 @@ use crate::types::measured::{CoursePoint, Estimate, ForcePoint, MeasuredFit, Mea
 use maud::{Markup, html};
 
 /// Tilts that the plot of forces shows at most.
-const TILTS: usize = 3;
+const MAX_TILTS_SHOWN: usize = 3;
 
 /// Three significant digits.
 fn digits(v: f64) -> String {
@@ -85,8 +85,11 @@ fn presses(points: &[ForcePoint], fit: &MeasuredFit) -> Markup {
     let mut tilts: Vec<f64> = points.iter().map(degrees).collect();
     tilts.sort_by(f64::total_cmp);
     tilts.dedup();
-    let shown: Vec<f64> =
-        if tilts.len() <= TILTS { tilts } else { vec![tilts[0], tilts[tilts.len() / 2], tilts[tilts.len() - 1]] };
+    let shown: Vec<f64> = if tilts.len() <= MAX_TILTS_SHOWN {
+        tilts
+    } else {
+        vec![tilts[0], tilts[tilts.len() / 2], tilts[tilts.len() - 1]]
+    };
     let mut lines = Vec::new();
     for (colour, tilt) in shown.iter().enumerate() {
         let mut at: Vec<usize> = (0..points.len()).filter(|&i| degrees(&points[i]) == *tilt).collect();

@@ -10,9 +10,9 @@ use maud::{Markup, PreEscaped, html};
 use std::fmt::Write;
 
 /// Frames of an animation at most.
-const FRAMES: usize = 500;
+const MAX_FRAMES: usize = 500;
 /// Length of the arrow for the largest force (mm).
-const ARROW: f64 = 26.0;
+const LONGEST_ARROW_MM: f64 = 26.0;
 
 /// Lengths of a scene in mm; index 0 is the left finger.
 struct Lengths {
@@ -49,7 +49,10 @@ fn arrows(scene: &Scene, s: &Sample, largest: f64) -> [[f64; 4]; 2] {
         let (js, jc) = s.joints[i].sin_cos();
         let (ox, oy) = (base[i][0] + side * link[i] * js, base[i][1] - link[i] * jc);
         let reach = side * (radius[i] - 1e3 * s.normal[i]);
-        let (n, t) = (side * s.normal_force[i] * ARROW / largest, -s.tangential_force[i] * ARROW / largest);
+        let (n, t) = (
+            side * s.normal_force[i] * LONGEST_ARROW_MM / largest,
+            -s.tangential_force[i] * LONGEST_ARROW_MM / largest,
+        );
         [ox + reach * cos, oy + reach * sin, n * cos - t * sin, n * sin + t * cos]
     })
 }
@@ -113,7 +116,7 @@ pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> Stri
         0.5 * h - 2.0
     );
     if !trail.is_empty() {
-        let step = trail.len().div_ceil(FRAMES).max(1);
+        let step = trail.len().div_ceil(MAX_FRAMES).max(1);
         let mut path = String::new();
         for (i, p) in trail.iter().step_by(step).enumerate() {
             let _ = write!(path, "{}{:.2} {:.2}", if i == 0 { 'M' } else { 'L' }, 1e3 * p.pose[0], 1e3 * p.pose[1]);
@@ -132,7 +135,7 @@ pub fn moment(scene: &Scene, s: &Sample, largest: f64, trail: &[Sample]) -> Stri
 pub(super) fn animation(scene: &Scene, samples: &[Sample]) -> Markup {
     let Some(first) = samples.first() else { return Markup::default() };
     let largest = largest_force(samples);
-    let step = samples.len().div_ceil(FRAMES).max(1);
+    let step = samples.len().div_ceil(MAX_FRAMES).max(1);
     let mut frames = String::new();
     for s in samples.iter().step_by(step) {
         let [p, q] = arrows(scene, s, largest);

@@ -16,7 +16,7 @@ pub(crate) struct Facts {
 }
 
 /// Labels listed at most.
-const LABELS: usize = 12;
+const MAX_LABELS_SHOWN: usize = 12;
 
 /// Whether all values are whole numbers from 0 to 255, and few of them.
 pub(crate) fn looks_like_labels(volume: &Volume) -> bool {
@@ -124,12 +124,12 @@ impl Facts {
             values.iter().for_each(|&v| counts[v as usize] += 1);
             let voxel = volume.grid().spacing().iter().product::<f64>();
             let there: Vec<usize> = (1..256).filter(|&l| counts[l] > 0).collect();
-            for &l in there.iter().take(LABELS) {
+            for &l in there.iter().take(MAX_LABELS_SHOWN) {
                 let ml = counts[l] as f64 * voxel / 1000.0;
                 let words = format!("{} voxels, {} ml", thousands(counts[l]), short((ml * 100.0).round() / 100.0));
                 self.add(&format!("label {l}"), words, json!(counts[l]));
             }
-            if there.len() > LABELS {
+            if there.len() > MAX_LABELS_SHOWN {
                 self.add("labels", format!("{} in all", there.len()), json!(there.len()));
             }
         }

@@ -7,7 +7,7 @@ use crate::types::WorldPoint;
 use std::fmt::Write;
 
 /// Nodes drawn at most; more are evenly thinned.
-const NODES: usize = 4000;
+const MAX_NODES_DRAWN: usize = 4000;
 const WIDTH: f64 = 560.0;
 const HEIGHT: f64 = 440.0;
 
@@ -51,7 +51,7 @@ pub fn scatter(nodes: &[WorldPoint], displacement: &[[f64; 3]], scale: &Scale) -
     let mut points: Vec<([f64; 3], f64)> = nodes
         .iter()
         .zip(displacement)
-        .step_by(nodes.len().div_ceil(NODES).max(1))
+        .step_by(nodes.len().div_ceil(MAX_NODES_DRAWN).max(1))
         .map(|(p, d)| (project(p.0), d.iter().map(|v| v * v).sum::<f64>().sqrt()))
         .collect();
     points.sort_by(|a, b| b.0[2].total_cmp(&a.0[2]));
@@ -122,6 +122,6 @@ mod tests {
     fn many_nodes_are_thinned() {
         let nodes = vec![WorldPoint([1.0, 2.0, 3.0]); 9000];
         let svg = scatter(&nodes, &vec![[0.0; 3]; 9000], &Scale::from_zero(1.0, "mm", ColorMap::Viridis));
-        assert!((2000..=NODES).contains(&svg.matches("<circle").count()));
+        assert!((2000..=MAX_NODES_DRAWN).contains(&svg.matches("<circle").count()));
     }
 }

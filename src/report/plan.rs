@@ -22,7 +22,7 @@ pub(crate) struct PlanReport<'a> {
 }
 
 /// Standard deviations past this (1) are drawn at the plot's upper end: nothing is known there.
-const DRAWN: f64 = 1.0;
+const MAX_DRAWN_SD: f64 = 1.0;
 /// Of a deviation the part that noise makes, under which less noise hardly helps (1).
 const BY_NOISE: f64 = 0.5;
 
@@ -205,7 +205,7 @@ fn plot(plan: &Plan, region: &PlannedRegion, voxel: f64) -> Markup {
         .map(|(k, noise)| {
             let at = |e: &&Expected| e.voxel_mm == voxel && e.noise_mm == noise;
             // A bound has no deviation to show.
-            let value = |e: &Expected| if e.felt && e.sd <= DRAWN { 100.0 * e.sd } else { f64::NAN };
+            let value = |e: &Expected| if e.felt && e.sd <= MAX_DRAWN_SD { 100.0 * e.sd } else { f64::NAN };
             let points = plan.of(region.label).filter(at).map(|e| [e.press_mm, value(e)]).collect();
             Line::new(&format!("noise {} mm", length(noise)), k % 3, k >= 3, points)
         })
@@ -234,7 +234,7 @@ pub(crate) fn page(report: &PlanReport<'_>) -> String {
             _ => "lost in noise",
         };
         let [press, voxel, noise] = [e.press_mm, e.voxel_mm, e.noise_mm].map(length);
-        let [sd, scatter] = [e.sd, e.scatter].map(|v| if v <= DRAWN { percent(v) } else { "over 100".into() });
+        let [sd, scatter] = [e.sd, e.scatter].map(|v| if v <= MAX_DRAWN_SD { percent(v) } else { "over 100".into() });
         [press, voxel, noise, e.name.clone(), sd, scatter, said.into()]
     });
     let head = ["Press, mm", "Voxel, mm", "Noise, mm", "Region", "Deviation, %", "By noise alone, %", "Enough"];

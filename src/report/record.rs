@@ -7,7 +7,7 @@ use maud::html;
 use serde_json::Value;
 
 /// Digits of a hash that a page shows.
-const DIGITS: usize = 12;
+const HASH_DIGITS: usize = 12;
 
 /// Arguments as a shell takes them.
 fn quoted(argument: &str) -> String {
@@ -41,7 +41,7 @@ pub(crate) fn on_page(mut page: String, record: &RunRecord) -> String {
         ("Date", record.date.clone()),
     ];
     let file = |f: &InputFile| {
-        let digits = f.sha256.get(..DIGITS).unwrap_or(&f.sha256);
+        let digits = f.sha256.get(..HASH_DIGITS).unwrap_or(&f.sha256);
         [f.role.clone(), f.path.clone(), thousands(f.bytes as usize), digits.into()]
     };
     let section = html! {

@@ -7,7 +7,7 @@
 use crate::types::{Grid, VoxelPoint, WorldPoint};
 
 /// Pixels along the longer side at most; longer sides are averaged down.
-const PIXELS: usize = 320;
+const MAX_PIXELS: usize = 320;
 
 /// The three orthogonal planes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -185,7 +185,7 @@ impl Section {
         let at = grid.affine().to_voxel(centre).0;
         let cut = |plane: Plane| {
             let axes = plane.axes().map(|w| axes[w]);
-            let step = axes[0].len.max(axes[1].len).div_ceil(PIXELS);
+            let step = axes[0].len.max(axes[1].len).div_ceil(MAX_PIXELS);
             let index = at[axes[2].voxel].round().clamp(0.0, (axes[2].len - 1) as f64) as usize;
             let [width, height] = [axes[0], axes[1]].map(|a| a.len.div_ceil(step));
             Section { plane, width, height, grid: *grid, axes, index, step }

@@ -4,7 +4,7 @@ use crate::types::Mask;
 
 /// Numbers taken at most: enough for a picture (a part of them is known to 0.2 %), cheap for any
 /// volume.
-const SAMPLES: usize = 50_000;
+const MAX_SAMPLES: usize = 50_000;
 
 /// Offsets of the voxels inside `mask` (all of `len` without one), evenly thinned to at most
 /// 50,000.
@@ -13,9 +13,9 @@ pub fn sample(len: usize, mask: Option<&Mask>) -> Vec<usize> {
         Some(mask) => {
             let inside = mask.iter().filter(|m| **m > 0).count();
             let offsets = mask.iter().enumerate().filter(|(_, m)| **m > 0).map(|(at, _)| at);
-            offsets.step_by(inside.div_ceil(SAMPLES).max(1)).collect()
+            offsets.step_by(inside.div_ceil(MAX_SAMPLES).max(1)).collect()
         }
-        None => (0..len).step_by(len.div_ceil(SAMPLES).max(1)).collect(),
+        None => (0..len).step_by(len.div_ceil(MAX_SAMPLES).max(1)).collect(),
     }
 }
 
@@ -82,6 +82,6 @@ mod tests {
     #[test]
     fn thinning_keeps_the_whole_range() {
         let s = sample(1_000_000, None);
-        assert!(s.len() <= SAMPLES && s.len() > SAMPLES / 2 && s[s.len() - 1] > 990_000);
+        assert!(s.len() <= MAX_SAMPLES && s.len() > MAX_SAMPLES / 2 && s[s.len() - 1] > 990_000);
     }
 }

@@ -222,7 +222,7 @@ pub(crate) struct Shown<'a> {
 }
 
 /// Voxels from one stripe of a hatching to the next.
-const STRIPES: usize = 3;
+const STRIPE_SPACING_VOXELS: usize = 3;
 
 /// What a region's modulus is: the value itself (0), a lower bound of it (1) or an upper one (2).
 fn bound(region: &RegionStiffness) -> u8 {
@@ -369,7 +369,7 @@ fn page_with(
         result.regions.iter().map(|r| (r.youngs_modulus as f32, bound(r))).filter(|b| b.1 > 0).collect();
     let bound_at = |o: usize| bounds.iter().find(|b| b.0 == map[o]).map_or(0, |b| b.1);
     // Stripes along a diagonal of the voxels show on sections along every axis.
-    let striped = |o: usize| bound_at(o) > 0 && grid.voxel(o).iter().sum::<usize>() % STRIPES == 0;
+    let striped = |o: usize| bound_at(o) > 0 && grid.voxel(o).iter().sum::<usize>() % STRIPE_SPACING_VOXELS == 0;
     let hatched: Values<'_> = &|o| if striped(o) { f32::NAN } else { moduli(o) };
     let map_panel = panel(
         "Young's modulus",

@@ -76,7 +76,7 @@ pub(super) fn bodies(report: &FieldReport<'_>) -> Markup {
 }
 
 /// Landmarks drawn at most, the furthest first, and the length of its bar (em).
-const LANDMARKS: usize = 20;
+const MAX_LANDMARKS_SHOWN: usize = 20;
 const BAR: f64 = 10.0;
 
 /// How far the deformed place of each landmark is from where the field leads, as bars; red where
@@ -97,7 +97,7 @@ pub(super) fn landmarks(report: &FieldReport<'_>) -> Option<Markup> {
             "Distance of " (l.count) " landmarks from where the field leads: " (format_args!("{:.2}", l.mean_mm))
             " mm on average, for a deviation of " (short(l.sd_mm)) " mm along each axis."
         }
-        (table(&[], order.iter().take(LANDMARKS).map(row)))
+        (table(&[], order.iter().take(MAX_LANDMARKS_SHOWN).map(row)))
     })
 }
 

@@ -21,10 +21,10 @@ pub(crate) struct Verdict {
 
 /// The uncertainty of the worst tenth over that of the middle from which the place is named: of a
 /// field with one uncertainty everywhere it is 1.
-const UNEVEN: f64 = 1.5;
+const MIN_UNEVENNESS: f64 = 1.5;
 
 /// A source of error is named from this share of the expected squared error on.
-const NAMED: f64 = 0.2;
+const MIN_NAMED_SHARE: f64 = 0.2;
 
 /// Judges a result: trust follows from the expected error alone ([`Trust::of`]).
 pub fn verdict(report: &FieldReport<'_>) -> Verdict {
@@ -51,7 +51,7 @@ pub(crate) fn judge(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32, s: &Field
     let headline = format!("{motion}; expected error {}.", expected(s));
     let trust = s.expected.trust();
     let mut reasons = vec![format!("the expected error is {}", relative(s))];
-    let named = s.expected.sources.iter().filter(|(_, share)| *share >= NAMED);
+    let named = s.expected.sources.iter().filter(|(_, share)| *share >= MIN_NAMED_SHARE);
     let named: Vec<String> =
         named.map(|(source, share)| format!("{} ({:.0} %)", source.words(), 100.0 * share)).collect();
     if !named.is_empty() {
@@ -113,7 +113,7 @@ fn least_sure(bodies: &Mask, uncertainty: &dyn Fn(usize) -> f32) -> Option<Strin
     let at = |part: f64| quantile(picked.iter().map(|&o| f64::from(uncertainty(o))), part);
     let (middle, worst) = (at(0.5), at(0.9));
     let (_, side) = uncertain(bodies, uncertainty, worst);
-    (worst > UNEVEN * middle).then(|| {
+    (worst > MIN_UNEVENNESS * middle).then(|| {
         format!(
             "a tenth of the tissue is uncertain by ± {} mm or more{side}, half by ± {}",
             short2(worst),

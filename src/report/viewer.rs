@@ -25,7 +25,7 @@ const SMOOTH_VOXELS: [usize; 2] = [120_000, 60_000];
 /// Bytes of all moments at most, before they are packed.
 const MOMENTS_BYTES: usize = 9_000_000;
 /// Matches at most, evenly thinned.
-const MATCHES: usize = 60_000;
+const MAX_MATCHES: usize = 60_000;
 /// A mesh of more elements is left out, of one moment and of several.
 const ELEMENTS: [usize; 2] = [200_000, 50_000];
 
@@ -162,16 +162,16 @@ fn byte(scale: &Scale, value: f32) -> u8 {
 
 /// The byte of an overlay for the end of its scale; the next one is for what lies past it, the last
 /// for what is not known.
-const END: u8 = 253;
+const END_OF_SCALE: u8 = 253;
 
 /// `value`, which an overlay shows, in 8 bits; what is not finite is not known.
 #[inline(always)]
 fn code(scale: &Scale, value: f32) -> u8 {
     match scale.position(f64::from(value)) {
-        t if !t.is_finite() => END + 2,
+        t if !t.is_finite() => END_OF_SCALE + 2,
         // Single precision may lie a little beyond the end that it is meant to be.
-        t if t > 1.0 + 1e-6 => END + 1,
-        t => (f64::from(END) * t.min(1.0) + 0.5) as u8,
+        t if t > 1.0 + 1e-6 => END_OF_SCALE + 1,
+        t => (f64::from(END_OF_SCALE) * t.min(1.0) + 0.5) as u8,
     }
 }
 
@@ -242,7 +242,7 @@ impl Moment<'_> {
         });
         let matches = self.matches.as_ref().map(|(all, scale)| {
             maps.push(scale.map);
-            let some: Vec<&Match> = all.iter().step_by(all.len().div_ceil(MATCHES).max(1)).collect();
+            let some: Vec<&Match> = all.iter().step_by(all.len().div_ceil(MAX_MATCHES).max(1)).collect();
             let sigma: Vec<u8> = some.iter().map(|m| byte(scale, m.sigma() as f32)).collect();
             let kept: Vec<u8> = some.iter().map(|m| u8::from(m.kept)).collect();
             let place = places(&canonical, some.iter().map(|m| m.initial));

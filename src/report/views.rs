@@ -147,7 +147,7 @@ fn unseen(report: &FieldReport<'_>, median: f64) -> String {
     match report.summary.model {
         MotionModel::Identity if !report.summary.rejected => {
             format!(
-                "{said} Nothing seemed to move: a motion of {SEEN} times as much would have been seen, 95 % of the time."
+                "{said} Nothing seemed to move: a motion of {BAND_95_SD} times as much would have been seen, 95 % of the time."
             )
         }
         _ => said,
@@ -155,7 +155,7 @@ fn unseen(report: &FieldReport<'_>, median: f64) -> String {
 }
 
 /// Deviations along an axis within which 95 % of the lengths of normal errors lie, in three axes.
-const SEEN: f64 = 2.8;
+const BAND_95_SD: f64 = 2.8;
 
 /// Range and colours of what is measured: the same in pictures, viewers and distributions.
 pub(super) struct Scales {

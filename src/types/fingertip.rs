@@ -49,10 +49,10 @@ impl FromStr for FingertipModel {
 }
 
 /// Maxwell branches of a fingertip at most.
-pub(crate) const MOST_BRANCHES: usize = 3;
+pub(crate) const MAX_BRANCHES: usize = 3;
 
 /// Least Young's modulus of a fingertip (Pa): brain and fat, the softest tissues, have about 1 kPa.
-pub(crate) const SOFTEST: f64 = 1e3;
+pub(crate) const MIN_YOUNGS_MODULUS_PA: f64 = 1e3;
 
 /// A hemispherical soft fingertip.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -124,12 +124,12 @@ impl Fingertip {
     /// [`ParamError`] names the first value out of range.
     pub fn check(&self) -> Result<(), ParamError> {
         positive("fingertip.radius", self.radius, 1.0, "above 0 and at most 1 m (SI units: is it in mm?)")?;
-        if !(self.youngs_modulus >= SOFTEST && self.youngs_modulus <= 1e12) {
+        if !(self.youngs_modulus >= MIN_YOUNGS_MODULUS_PA && self.youngs_modulus <= 1e12) {
             let range = "1000 to 1e12 Pa, from the softest tissues up (SI units: is it in kPa?)";
             return Err(ParamError { name: "fingertip.youngs_modulus", value: self.youngs_modulus, range });
         }
         self.damping.iter().try_for_each(|&c| at_least_zero("fingertip.damping", c, "0 or more N s/m"))?;
-        if self.maxwell.len() > MOST_BRANCHES {
+        if self.maxwell.len() > MAX_BRANCHES {
             let range = "up to 3 pairs [Pa, Pa s]";
             return Err(ParamError {
                 name: "fingertip.maxwell, number of pairs",

@@ -99,7 +99,7 @@ pub struct MeasuredFit {
 }
 
 /// Log odds from which evidence is called strong: 20 to 1 (Kass and Raftery 1995).
-pub const STRONG: f64 = 3.0;
+pub const STRONG_EVIDENCE: f64 = 3.0;
 
 impl MeasuredFit {
     /// What the evidence says, in one sentence.
@@ -109,12 +109,12 @@ impl MeasuredFit {
             return format!("{only} is all that there is to fit");
         };
         match -next.log_evidence {
-            odds if odds >= STRONG => format!(
+            odds if odds >= STRONG_EVIDENCE => format!(
                 "the measurements are for {} over {} by log odds of {odds:.1} (misfits {:.2e} and {:.2e})",
                 best.model, next.model, best.rms, next.rms
             ),
             odds => format!(
-                "the measurements do not tell {} from {} (log odds {odds:.1}, strong from {STRONG})",
+                "the measurements do not tell {} from {} (log odds {odds:.1}, strong from {STRONG_EVIDENCE})",
                 best.model, next.model
             ),
         }

@@ -9,7 +9,7 @@ use crate::error::UnknownName;
 /// [`UnknownName`] lists the known names and suggests the nearest one (at most a third of its
 /// letters wrong).
 pub fn choose<T: Copy>(what: &'static str, found: &str, known: &[(&'static str, T)]) -> Result<T, UnknownName> {
-    let (wanted, long) = (found.to_lowercase(), found.len() > LONGEST);
+    let (wanted, long) = (found.to_lowercase(), found.len() > MAX_NAME_BYTES);
     if let Some((_, value)) = known.iter().find(|(name, _)| *name == wanted) {
         return Ok(*value);
     }
@@ -25,11 +25,11 @@ pub fn choose<T: Copy>(what: &'static str, found: &str, known: &[(&'static str, 
 
 /// No name is longer (bytes): of a longer one nothing near is looked for, and messages show its
 /// start.
-const LONGEST: usize = 100;
+const MAX_NAME_BYTES: usize = 100;
 
 /// The text, or the start of a long one, as a message shows it.
 pub fn cut(text: &str) -> String {
-    match text.char_indices().nth(LONGEST) {
+    match text.char_indices().nth(MAX_NAME_BYTES) {
         Some((at, _)) => format!("{}...", &text[..at]),
         None => text.into(),
     }

@@ -11,12 +11,12 @@ pub struct PlanParams {
     pub moduli: Vec<(u8, f64)>,
     /// Wanted standard deviation of each modulus over the modulus (1).
     pub want: f64,
-    /// How far the plate goes in (mm); empty for `Self::PRESS` of the body's extent.
+    /// How far the plate goes in (mm); empty for `Self::DEFAULT_PRESSES` of the body's extent.
     pub press_mm: Vec<f64>,
     /// Edge of a voxel (mm, the finest axis); empty for that of the labels.
     pub voxel_mm: Vec<f64>,
     /// Standard deviation of the displacement of one voxel along an axis (mm); empty for
-    /// [`Self::NOISE`] of each voxel size.
+    /// [`Self::DEFAULT_NOISES`] of each voxel size.
     pub noise_mm: Vec<f64>,
     /// How a flat loaded patch touches its plate: sticking or sliding. A curved one always slides.
     pub contact: Contact,
@@ -44,12 +44,12 @@ impl Default for PlanParams {
 impl PlanParams {
     /// Presses that are tried, over the body's extent along the load (1): from what shows at all to
     /// what the linear law bears.
-    pub(crate) const PRESS: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
+    pub(crate) const DEFAULT_PRESSES: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
     /// Noise that is tried, over the edge of a voxel (1): of correlation on good images to poor
     /// ones.
-    pub const NOISE: [f64; 3] = [0.05, 0.1, 0.2];
+    pub const DEFAULT_NOISES: [f64; 3] = [0.05, 0.1, 0.2];
     /// Largest number of presses, voxel sizes or noises.
-    pub(crate) const MOST: usize = 20;
+    pub(crate) const MAX_CHOICES: usize = 20;
 
     /// Assumed Young's modulus of a label (kPa).
     pub fn modulus(&self, label: u8) -> Option<f64> {
@@ -78,7 +78,7 @@ impl PlanParams {
             if let Some(&value) = values.iter().find(|v| !positive(**v)) {
                 return Err(ParamError { name, value, range: "above 0 mm; give lengths in mm, as 0.5,1,2" });
             }
-            if values.len() > Self::MOST {
+            if values.len() > Self::MAX_CHOICES {
                 let value = values.len() as f64;
                 return Err(ParamError { name, value, range: "a list of 20 values at most; leave some out" });
             }

@@ -267,8 +267,8 @@ pub const EIGHT_MOTIONS: [[f64; 2]; 8] =
 
 /// Most steps and most samples of one run, so that a slip of the pen does not run for days or fill
 /// the memory.
-const MOST_STEPS: f64 = 2e9;
-const MOST_SAMPLES: f64 = 2e6;
+const MAX_STEPS: f64 = 2e9;
+const MAX_SAMPLES: f64 = 2e6;
 
 impl Scene {
     /// Half the distance between the joints (m).
@@ -485,7 +485,7 @@ impl Scene {
             }
         }
         let duration = self.duration();
-        if duration / integrator.step > MOST_STEPS || duration / integrator.output_every > MOST_SAMPLES {
+        if duration / integrator.step > MAX_STEPS || duration / integrator.output_every > MAX_SAMPLES {
             return Err(SceneError::TooLong { duration });
         }
         Ok(())

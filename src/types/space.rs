@@ -18,7 +18,7 @@ impl VoxelPoint {
         Self(voxel.map(|v| v as f64))
     }
 
-    /// The same place in mm along the axes, from the first voxel's middle, where voxels have edges of
+    /// The same place in mm along the axes, from the first voxel's middle; voxels have edges of
     /// `spacing` (mm).
     pub(crate) fn in_mm(self, spacing: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|a| self.0[a] * spacing[a])

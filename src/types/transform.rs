@@ -5,7 +5,7 @@ use crate::types::field::DenseField;
 use crate::types::space::{Affine, Grid, VoxelPoint, WorldPoint};
 
 /// Largest entry of the linear part of a transform, and of its shift (mm).
-const LARGEST: [f64; 2] = [1e4, 1e6];
+const MAX_ENTRY_AND_SHIFT: [f64; 2] = [1e4, 1e6];
 
 /// An invertible affine map of world points (mm, RAS), initial to deformed.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,7 +25,7 @@ impl AffineMap {
         if rows.iter().flatten().any(|v| !v.is_finite()) {
             return Err(fault("holds a value that is not finite".into()));
         }
-        let large = |v: &f64, c: usize| v.abs() > LARGEST[usize::from(c == 3)];
+        let large = |v: &f64, c: usize| v.abs() > MAX_ENTRY_AND_SHIFT[usize::from(c == 3)];
         if let Some(v) = rows.iter().flat_map(|r| r.iter().enumerate()).find(|(c, v)| large(v, *c)) {
             return Err(fault(format!("holds {}, which is no motion of tissue", v.1)));
         }

@@ -100,7 +100,7 @@ pub struct StressRun {
 }
 
 /// Part of the limit under which an error is small: warnings about it are false alarms (1).
-const SMALL: f64 = 0.3;
+const SMALL_ERROR_FRACTION: f64 = 0.3;
 
 impl StressRun {
     /// Whether there is no result, or one of no use.
@@ -120,7 +120,7 @@ impl StressRun {
 
     /// Whether the error is under three tenths of the limit: of a field, a tenth of the motion.
     pub fn is_small(&self) -> bool {
-        self.error < SMALL * self.limit
+        self.error < SMALL_ERROR_FRACTION * self.limit
     }
 
     /// Warned of although the error is small.

@@ -5,7 +5,7 @@ use palpate::grasp::measured::fit;
 use palpate::grasp::models::{Tilt, tip_of};
 use palpate::grasp::simulate::simulate;
 use palpate::io;
-use palpate::types::measured::{CoursePoint, ForcePoint, Measurements, STRONG};
+use palpate::types::measured::{CoursePoint, ForcePoint, Measurements, STRONG_EVIDENCE};
 use palpate::types::scene::Motion;
 use palpate::types::{FingertipModel, Scene};
 use std::path::Path;
@@ -82,7 +82,7 @@ fn the_evidence_names_the_model_that_the_presses_are_of() {
             let found = fit(&scene, &Measurements::Force(presses(*model, 100 + seed, 0.0)));
             assert_eq!(found.models.len(), 3);
             assert!(found.models[0].log_evidence == 0.0 && found.models[1].log_evidence <= 0.0);
-            let strong = found.models[1].log_evidence <= -STRONG;
+            let strong = found.models[1].log_evidence <= -STRONG_EVIDENCE;
             right += usize::from(found.models[0].model == model.name() && strong);
             wrong += usize::from(found.models[0].model != model.name() && strong);
         }
@@ -126,7 +126,7 @@ fn a_course_gives_modulus_and_damping_and_the_model() {
         assert!(found.joints_off < 1e-3, "{}", found.joints_off);
         if model == FingertipModel::Parallel {
             let best = &found.models[0];
-            assert!(found.models[1].log_evidence < -STRONG);
+            assert!(found.models[1].log_evidence < -STRONG_EVIDENCE);
             let (e, c) = (best.youngs_modulus, best.damping.unwrap());
             assert!((e.value - 1.6e5).abs() < 3.0 * e.sd && e.sd < 0.05 * e.value, "{e:?}");
             assert!((c.value - 30.0).abs() < 3.0 * c.sd && c.sd < c.value, "{c:?}");

@@ -3,7 +3,9 @@
 use crate::truth::{Dense, dense, entry, invert, normals, random_blocks, with_threads};
 use palpate::consistency::coupling::{self, Evidence};
 use palpate::consistency::energy::{EnergyParams, Graph, distance, penalty};
-use palpate::consistency::models::{AffineMotion, CHANCE, Excess, PLACE, choose, nearest_rigid};
+use palpate::consistency::models::{
+    AffineMotion, Excess, MAX_EXCESS_RATIO, MAX_LOCAL_EXCESS_RATIO, choose, nearest_rigid,
+};
 use palpate::consistency::pruning::{Measured, prune};
 use palpate::consistency::relaxation::relax;
 use palpate::numerics::bending::{Coupled, Smoothness};
@@ -523,7 +525,10 @@ fn whole(total: f64) -> Excess {
 fn one_place_that_moves_contradicts_any_map() {
     let matches = moved(&AffineMotion::IDENTITY, 0, false);
     let at = |worst: f64| choose(&matches, |_, _| Excess { total: 20.0, worst }, 200.0, 0.05).model;
-    assert_eq!((at(PLACE - 0.1), at(PLACE + 0.1)), (MotionModel::Identity, MotionModel::Free));
+    assert_eq!(
+        (at(MAX_LOCAL_EXCESS_RATIO - 0.1), at(MAX_LOCAL_EXCESS_RATIO + 0.1)),
+        (MotionModel::Identity, MotionModel::Free)
+    );
 }
 
 fn close(a: &AffineMotion, b: &AffineMotion, tolerance: f64) {
@@ -586,10 +591,13 @@ fn a_free_motion_stays_free_and_the_evidence_says_why() {
     assert_eq!(choose(&astray, |_, _| whole(200.0), 200.0, 0.05).model, MotionModel::Identity);
     let matches = moved(&AffineMotion::IDENTITY, 0, false);
     let at = |ratio: f64| choose(&matches, |_, _| whole(200.0 * ratio), 200.0, 0.05).model;
-    assert_eq!((at(CHANCE), at(CHANCE + 0.01)), (MotionModel::Identity, MotionModel::Free));
+    assert_eq!((at(MAX_EXCESS_RATIO), at(MAX_EXCESS_RATIO + 0.01)), (MotionModel::Identity, MotionModel::Free));
     // Few degrees of freedom count as a hundred.
     let few = |excess: f64| choose(&matches, |_, _| whole(excess), 9.0, 0.05).model;
-    assert_eq!((few(100.0 * CHANCE), few(101.0 * CHANCE)), (MotionModel::Identity, MotionModel::Free));
+    assert_eq!(
+        (few(100.0 * MAX_EXCESS_RATIO), few(101.0 * MAX_EXCESS_RATIO)),
+        (MotionModel::Identity, MotionModel::Free)
+    );
 }
 
 #[test]

@@ -14,9 +14,9 @@ const ITEM: Tag = (0xfffe, 0xe000);
 const ITEM_END: Tag = (0xfffe, 0xe00d);
 const SEQUENCE_END: Tag = (0xfffe, 0xe0dd);
 /// A length that only an end mark tells.
-const UNDEFINED: usize = 0xffff_ffff;
+const UNDEFINED_LENGTH: usize = 0xffff_ffff;
 /// Sequences in sequences at most.
-const DEEPEST: usize = 16;
+const MAX_NESTING: usize = 16;
 
 /// How elements are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -81,7 +81,7 @@ impl<'a> Elements<'a> {
     fn add(&mut self, at: usize) -> Option<usize> {
         let mut element = Element::at(self.bytes, at, self.form)?;
         let next = element.next(self.bytes, 0)?;
-        if element.length == UNDEFINED {
+        if element.length == UNDEFINED_LENGTH {
             element.length = next - 8 - element.value; // without the end mark
         }
         self.places.insert(element.tag, element);
@@ -100,7 +100,7 @@ impl<'a> Elements<'a> {
         std::iter::from_fn(move || {
             let item = Element::at(self.bytes, at, form).filter(|item| at < end && item.tag == ITEM)?;
             let next = item.next(self.bytes, 1)?;
-            let length = if item.length == UNDEFINED { next - 8 - item.value } else { item.length };
+            let length = if item.length == UNDEFINED_LENGTH { next - 8 - item.value } else { item.length };
             at = next;
             Some(Element { length, ..item })
         })
@@ -150,10 +150,10 @@ impl Element {
 
     /// Where what follows begins.
     fn next(&self, bytes: &[u8], depth: usize) -> Option<usize> {
-        if self.length != UNDEFINED {
+        if self.length != UNDEFINED_LENGTH {
             return self.value.checked_add(self.length).filter(|&end| end <= bytes.len());
         }
-        if depth > DEEPEST {
+        if depth > MAX_NESTING {
             return None;
         }
         // Items up to the end mark of the sequence, or elements up to that of the item.

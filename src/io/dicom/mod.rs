@@ -27,9 +27,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// A file of a series is never larger (bytes).
-const LARGEST: u64 = 1 << 30;
+const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Bytes up to the end of DICOM's mark.
-pub(super) const MARK: usize = 132;
+pub(super) const PREAMBLE_BYTES: usize = 132;
 
 const SERIES_NAME: Tag = (0x0008, 0x103e);
 const SERIES: Tag = (0x0020, 0x000e);
@@ -48,11 +48,11 @@ const ORIENTATION_GROUP: Tag = (0x0020, 0x9116);
 const MEASURES_GROUP: Tag = (0x0028, 0x9110);
 const VALUES_GROUP: Tag = (0x0028, 0x9145);
 /// Slices that are this near lie at one place (mm).
-const SAME_PLACE: f64 = 1e-3;
+const SAME_POSITION_MM: f64 = 1e-3;
 
 /// Whether a file begins as DICOM does.
 pub(super) fn is_dicom(head: &[u8]) -> bool {
-    head.get(128..MARK) == Some(b"DICM")
+    head.get(128..PREAMBLE_BYTES) == Some(b"DICM")
 }
 
 /// One slice: where it lies, and which part of which file it is.
@@ -129,7 +129,7 @@ impl Said<'_> {
 impl File {
     /// None where it holds no image.
     fn read(path: &Path) -> Result<Option<Self>, IoError> {
-        let bytes = source::bytes(path, LARGEST)?;
+        let bytes = source::bytes(path, MAX_FILE_BYTES)?;
         Self::of(path, &bytes).map_err(|flaw| flaw.at(path))
     }
 
@@ -159,7 +159,7 @@ impl File {
 
     /// Puts the numbers of its slices where `places` says: of a slice, its number in the stack.
     fn load(&self, places: &[(Slice, usize)], out: &mut [f32]) -> Result<(), IoError> {
-        let bytes = source::bytes(&self.path, LARGEST)?;
+        let bytes = source::bytes(&self.path, MAX_FILE_BYTES)?;
         let frames = Source::of(&bytes).and_then(|source| source.frames(&source.elements()?, &self.pixels));
         let frames = frames.map_err(|flaw| flaw.at(&self.path))?;
         for (slice, place) in places {
@@ -221,7 +221,7 @@ fn gather(path: &Path) -> Result<Vec<File>, IoError> {
     names.sort();
     let mut files = Vec::new();
     for name in names.into_iter().filter(|n| n.is_file() && n.file_name().is_none_or(|n| n != "DICOMDIR")) {
-        if !is_dicom(&source::head(&name, MARK as u64).unwrap_or_default()) {
+        if !is_dicom(&source::head(&name, PREAMBLE_BYTES as u64).unwrap_or_default()) {
             continue;
         }
         match (File::read(&name), &alone) {
@@ -340,7 +340,7 @@ fn one_series(files: &[File]) -> Result<(), Flaw> {
 
 /// Puts the slices in order; shape and steps (LPS mm) of the stack. `called` names a slice.
 fn stack(slices: &mut [Slice], called: impl Fn(&Slice) -> String) -> Result<([usize; 3], [[f64; 3]; 3]), Flaw> {
-    let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(x, y)| (x - y).abs() < SAME_PLACE);
+    let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(x, y)| (x - y).abs() < SAME_POSITION_MM);
     let (shape, axes, spacing) = (slices[0].shape, slices[0].axes, slices[0].spacing);
     let alike =
         |s: &Slice| s.shape == shape && near(s.axes.as_flattened(), axes.as_flattened()) && near(&s.spacing, &spacing);
@@ -358,7 +358,7 @@ fn stack(slices: &mut [Slice], called: impl Fn(&Slice) -> String) -> Result<([us
     };
     let between: Vec<f64> =
         slices.windows(2).map(|pair| dot(pair[1].position, normal) - dot(pair[0].position, normal)).collect();
-    if let Some(at) = between.iter().position(|d| *d < SAME_PLACE) {
+    if let Some(at) = between.iter().position(|d| *d < SAME_POSITION_MM) {
         let (a, b) = (&slices[at], &slices[at + 1]);
         let what = format!("holds several slices at one place: {} and {} at {} mm", called(a), called(b), place(a));
         return Err(Flaw::new(what, "keep one time or echo, or one copy, or use dcm2niix"));

@@ -20,7 +20,7 @@ const PIXELS: Tag = (0x7fe0, 0x0010);
 pub(super) const CONVERT: &str = "convert it with dcm2niix";
 const UNPACK: &str = "unpack it with `gdcmconv --raw IN OUT`, or convert it with dcm2niix";
 /// What no file unpacks to more than (bytes).
-const LARGEST: u64 = 1 << 30;
+const MAX_UNPACKED_BYTES: u64 = 1 << 30;
 /// A byte of a JPEG stream stands for at most this number of pixels: two bits for a block of 8 x 8.
 const JPEG_RATIO: usize = 256;
 /// Two bytes of RLE stand for at most 128.
@@ -90,7 +90,8 @@ impl<'a> Source<'a> {
             "1.2.840.10008.1.2.2" => Self { form: Form { explicit: true, big_endian: true }, ..plain },
             "1.2.840.10008.1.2.1.99" => {
                 let mut bytes = Vec::new();
-                let packed = flate2::read::DeflateDecoder::new(&file[start..]).take(LARGEST).read_to_end(&mut bytes);
+                let packed =
+                    flate2::read::DeflateDecoder::new(&file[start..]).take(MAX_UNPACKED_BYTES).read_to_end(&mut bytes);
                 packed.map_err(|_| damaged())?;
                 Self { bytes: Cow::Owned(bytes), start: 0, ..plain }
             }

@@ -10,7 +10,7 @@ use crate::types::{Affine, VoxelPoint};
 
 /// Largest cosine between two axes that still counts as a right angle; 200 mm away it moves a voxel
 /// by 2 um.
-const SHEAR: f64 = 1e-5;
+const MAX_SHEAR_COSINE: f64 = 1e-5;
 
 /// The affine (mm, RAS): the sform where its code is positive, else the qform where its code is,
 /// else the voxel size with the first voxel at the origin. `axes` are the first three, to excuse an
@@ -86,7 +86,7 @@ pub(super) fn quaternion(affine: &Affine) -> Option<(f64, [f64; 3])> {
     let (linear, size) = (affine.linear(), affine.spacing());
     let mut r: Matrix3 = std::array::from_fn(|i| std::array::from_fn(|j| linear[i][j] / size[j]));
     let dot = |r: &Matrix3, p: usize, q: usize| (0..3).map(|i| r[i][p] * r[i][q]).sum::<f64>();
-    if [(0, 1), (0, 2), (1, 2)].iter().any(|&(p, q)| dot(&r, p, q).abs() > SHEAR) {
+    if [(0, 1), (0, 2), (1, 2)].iter().any(|&(p, q)| dot(&r, p, q).abs() > MAX_SHEAR_COSINE) {
         return None;
     }
     let determinant = (0..3).map(|i| r[0][i] * minor(&r, i)).sum::<f64>();

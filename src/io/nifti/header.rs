@@ -4,7 +4,7 @@ use crate::io::format_error::Flaw;
 use nifti::{Endianness, NiftiHeader};
 
 /// Bytes of the longest header, NIfTI-2's; more than NIfTI-1's 348.
-pub(super) const LONGEST: usize = 540;
+pub(super) const MAX_HEADER_BYTES: usize = 540;
 
 /// What NiftyReg writes as `intent_name` of a transformation.
 pub(super) const NIFTYREG: &[u8] = b"NREG_TRANS";
@@ -47,7 +47,8 @@ fn shown(bytes: &[u8]) -> String {
 }
 
 impl Header {
-    /// From the first [`LONGEST`] bytes of the unpacked file, or all of it where it is shorter.
+    /// From the first [`MAX_HEADER_BYTES`] bytes of the unpacked file, or all of it where it is
+    /// shorter.
     pub(super) fn parse(head: &[u8]) -> Result<Self, Flaw> {
         let cut =
             || Flaw::new(format!("ends inside the header (after {} bytes)", head.len()), "copy or export it again");

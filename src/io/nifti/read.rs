@@ -1,7 +1,7 @@
 //! Reading volumes and displacement fields.
 
 use super::affine::{affine, disagreement};
-use super::header::{Header, LONGEST};
+use super::header::{Header, MAX_HEADER_BYTES};
 use crate::error::IoError;
 use crate::io::format_error::Flaw;
 use crate::io::image::Stored;
@@ -61,7 +61,7 @@ pub(in crate::io) fn volume_header(path: &Path) -> Result<Stored, IoError> {
 
 const EXPORT: &str = "export it again";
 /// NIfTI's code of a label map.
-const LABEL: i64 = 1002;
+const LABEL_INTENT: i64 = 1002;
 
 /// Who wrote a field, and what its numbers are.
 #[derive(Debug, Clone, PartialEq)]
@@ -128,7 +128,7 @@ pub(super) struct Opened {
     pub(super) voxels: PathBuf,
     /// As it is stored.
     pub(super) size: u64,
-    /// The first bytes of the file with the header, unpacked, at most [`LONGEST`].
+    /// The first bytes of the file with the header, unpacked, at most [`MAX_HEADER_BYTES`].
     pub(super) head: Vec<u8>,
     pub(super) packed: bool,
 }
@@ -164,7 +164,7 @@ impl Opened {
         let grid = Grid::new(shape, affine(&header, shape)?).map_err(|e| Flaw::new(e.to_string(), EXPORT))?;
         let apart_mm = disagreement(&header, shape);
         let axes = axes[..used].to_vec();
-        let (labels, description) = (header.intent == LABEL, header.description);
+        let (labels, description) = (header.intent == LABEL_INTENT, header.description);
         let stored = Stored { format, datatype, axes, placed, apart_mm, grid, labels, bytes: self.size, description };
         Ok((stored, header.intent))
     }
@@ -201,10 +201,10 @@ fn open_one(path: &Path) -> Result<Opened, IoError> {
     let mut file = source::open(path)?;
     let size = file.metadata().map_err(os(path, "read"))?.len();
     let mut head = Vec::new();
-    file.by_ref().take(LONGEST as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
+    file.by_ref().take(MAX_HEADER_BYTES as u64).read_to_end(&mut head).map_err(os(path, "read"))?;
     let packed = gzip::is_gzip(&head);
     if packed {
-        head = gzip::peek(head.chain(BufReader::new(&mut file)), LONGEST);
+        head = gzip::peek(head.chain(BufReader::new(&mut file)), MAX_HEADER_BYTES);
     }
     file.rewind().map_err(os(path, "read"))?;
     Ok(Opened { file, voxels: path.into(), size, head, packed })

@@ -24,7 +24,7 @@ const SYMMETRIC: i16 = 1005;
 /// FSL's code of a displacement field.
 const FNIRT: i16 = 2006;
 /// Values packed together; fixed, so that the bytes do not depend on the number of threads.
-const CHUNK: usize = 1 << 18;
+const VALUES_PER_CHUNK: usize = 1 << 18;
 /// Chunks that are held packed at a time: of few threads six for each, of many two.
 const BATCH: [usize; 2] = [6, 2];
 const FEW: usize = 4;
@@ -271,8 +271,8 @@ pub(crate) fn write_field_series(
                 match frame.as_ref().and_then(|f| Some((&f.path, f.runs.get(component)?))) {
                     Some((file, run)) => member.copy(&mut File::open(file)?, run)?,
                     None => {
-                        for from in (0..grid.len()).step_by(CHUNK) {
-                            member.add(&missing(CHUNK.min(grid.len() - from)))?;
+                        for from in (0..grid.len()).step_by(VALUES_PER_CHUNK) {
+                            member.add(&missing(VALUES_PER_CHUNK.min(grid.len() - from)))?;
                         }
                     }
                 }
@@ -469,7 +469,7 @@ fn write_made<'a, T: Copy + Sync + 'a, const N: usize>(
     }
     let header = header(grid, &form).map_err(|flaw| flaw.at(path))?;
     let all = grid.len();
-    let ranges = (0..all).step_by(CHUNK).map(|from| from..(from + CHUNK).min(all));
+    let ranges = (0..all).step_by(VALUES_PER_CHUNK).map(|from| from..(from + VALUES_PER_CHUNK).min(all));
     let chunks: Vec<(usize, Range<usize>)> = (0..parts).flat_map(|p| ranges.clone().map(move |r| (p, r))).collect();
     let bytes = |(part, range): &(usize, Range<usize>)| -> Vec<u8> {
         let (part, values) = (*part, made(*part, range.clone()));

@@ -19,7 +19,7 @@ use std::io::Write;
 use std::path::Path;
 
 /// Bytes of memory that a byte of a file takes while it is read, about.
-const TAKES: u64 = 12;
+const BYTES_PER_FILE_BYTE: u64 = 12;
 
 /// A format that a mesh can be in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -105,7 +105,7 @@ impl SolidFile {
 /// The bytes of a regular file that memory holds.
 fn whole(path: &Path) -> Result<Vec<u8>, IoError> {
     let size = source::open(path)?.metadata().map_err(os(path, "read"))?.len();
-    fits(TAKES.saturating_mul(size)).map_err(|flaw| flaw.at(path))?;
+    fits(BYTES_PER_FILE_BYTE.saturating_mul(size)).map_err(|flaw| flaw.at(path))?;
     source::bytes(path, size)
 }
 

@@ -16,7 +16,7 @@ const EXPORT: &str = "save it again from SimpleITK or ANTs";
 /// The kinds that are read, for messages.
 const KINDS: &str = "read are affine, Euler, versor, similarity, scale, translation and displacement field transforms";
 /// What a file with more transforms than this holds is no chain.
-const MOST: usize = 1000;
+const MAX_TRANSFORMS: usize = 1000;
 
 /// One transform as it is stored.
 pub(super) struct Block {
@@ -43,13 +43,15 @@ fn blocks(text: &str) -> Result<Vec<Block>, Flaw> {
             continue;
         }
         let (key, value) = line.split_once(':').ok_or_else(|| odd(&place, line))?;
-        let full = blocks.len() == MOST;
+        let full = blocks.len() == MAX_TRANSFORMS;
         match (key.trim(), blocks.last_mut()) {
             ("Transform", _) if !full => {
                 let name = value.trim().into();
                 blocks.push(Block { name, parameters: Vec::new(), fixed: Vec::new(), place });
             }
-            ("Transform", _) => return Err(Flaw::new(format!("{place}: more than {MOST} transforms"), EXPORT)),
+            ("Transform", _) => {
+                return Err(Flaw::new(format!("{place}: more than {MAX_TRANSFORMS} transforms"), EXPORT));
+            }
             ("Parameters", Some(block)) => block.parameters = numbers(value, &place)?,
             ("FixedParameters", Some(block)) => block.fixed = numbers(value, &place)?,
             _ => return Err(odd(&place, line)),
@@ -181,9 +183,9 @@ fn euler([x, y, z]: [f64; 3], zyx: bool) -> Matrix3 {
 
 /// A rotation by the vector part of a unit quaternion; one too long is cut as ITK does.
 fn versor(p: &[f64]) -> Matrix3 {
-    const SLACK: f64 = 1e-10; // itkVersorRigid3DTransform.hxx
+    const MATRIX_TOLERANCE: f64 = 1e-10; // itkVersorRigid3DTransform.hxx
     let norm = p[..3].iter().map(|v| v * v).sum::<f64>().sqrt();
-    let cut = if norm >= 1.0 - SLACK { norm * (1.0 + SLACK) } else { 1.0 };
+    let cut = if norm >= 1.0 - MATRIX_TOLERANCE { norm * (1.0 + MATRIX_TOLERANCE) } else { 1.0 };
     let [x, y, z] = [p[0] / cut, p[1] / cut, p[2] / cut];
     quaternion([x, y, z, (1.0 - x * x - y * y - z * z).max(0.0).sqrt()])
 }

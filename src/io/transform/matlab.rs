@@ -12,11 +12,11 @@ use crate::types::Transform;
 use std::path::Path;
 
 /// No file of affine transforms is longer (bytes).
-const LONGEST: u64 = 1 << 20;
+const MAX_FILE_BYTES: u64 = 1 << 20;
 const EXPORT: &str = "copy it again, or save it as .tfm from SimpleITK";
 
 /// Bytes of the numbers before the name.
-const HEADER: usize = 20;
+const HEADER_BYTES: usize = 20;
 
 /// One matrix as it is stored.
 struct Matrix<'a> {
@@ -27,12 +27,12 @@ struct Matrix<'a> {
 
 /// Whether the bytes start as a matrix of level 4 does: a known type, no imaginary part and a name.
 pub(super) fn is_matlab(head: &[u8]) -> bool {
-    layout(head).is_some() && head.get(HEADER).is_some_and(u8::is_ascii_alphabetic)
+    layout(head).is_some() && head.get(HEADER_BYTES).is_some_and(u8::is_ascii_alphabetic)
 }
 
 /// Reads the transform of a file, initial to deformed.
 pub(super) fn read(path: &Path) -> Result<Vec<Transform>, IoError> {
-    let bytes = source::bytes(path, LONGEST)?;
+    let bytes = source::bytes(path, MAX_FILE_BYTES)?;
     blocks(&bytes).and_then(chain).map_err(|flaw| flaw.at(path))
 }
 
@@ -70,7 +70,7 @@ fn layout(bytes: &[u8]) -> Option<(bool, bool, [usize; 3])> {
 /// The matrix at the start of `bytes`; none when it is not all there.
 fn matrix(bytes: &[u8]) -> Option<Matrix<'_>> {
     let (big_endian, single, [rows, columns, length]) = layout(bytes)?;
-    let (name, data) = bytes.get(HEADER..)?.split_at_checked(length)?;
+    let (name, data) = bytes.get(HEADER_BYTES..)?.split_at_checked(length)?;
     let size = if single { 4 } else { 8 };
     let (data, rest) = data.split_at_checked(rows.checked_mul(columns)?.checked_mul(size)?)?;
     let value = |b: &[u8]| -> Option<f64> {

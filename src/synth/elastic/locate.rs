@@ -122,8 +122,8 @@ impl<'a> Locator<'a> {
 
     /// Takes element `e` if `p` lies in it, or nearer to it than to the one found before.
     fn improve(&self, e: usize, p: [f64; 3], found: &mut Option<Place>) {
-        const INSIDE: f64 = 1e-9;
-        if found.is_some_and(|f| f.outside <= INSIDE) {
+        const INSIDE_TOLERANCE: f64 = 1e-9;
+        if found.is_some_and(|f| f.outside <= INSIDE_TOLERANCE) {
             return;
         }
         let lattice = &self.elements[e];

@@ -84,11 +84,11 @@ impl Space {
         out: &mut [[T; 3]],
         finish: impl Fn(usize, [T; 3]) -> [T; 3] + Sync,
     ) {
-        const CHUNK: usize = 2048;
+        const ELEMENTS_PER_CHUNK: usize = 2048;
         let parts = parts.as_flattened().as_flattened();
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
+        out.par_chunks_mut(ELEMENTS_PER_CHUNK).enumerate().for_each(|(chunk, out)| {
             for (i, v) in out.iter_mut().enumerate() {
-                let node = chunk * CHUNK + i;
+                let node = chunk * ELEMENTS_PER_CHUNK + i;
                 let mut sum = [T::default(); 3];
                 for &entry in &self.entries[self.starts[node] as usize..self.starts[node + 1] as usize] {
                     let part = &parts[entry as usize];

@@ -13,10 +13,10 @@ struct Rows {
 
 impl Rows {
     fn apply(&self, x: &[[f32; 3]], out: &mut [[f32; 3]]) {
-        const CHUNK: usize = 2048;
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
+        const NODES_PER_CHUNK: usize = 2048;
+        out.par_chunks_mut(NODES_PER_CHUNK).enumerate().for_each(|(chunk, out)| {
             for (i, v) in out.iter_mut().enumerate() {
-                let row = chunk * CHUNK + i;
+                let row = chunk * NODES_PER_CHUNK + i;
                 let mut sum = [0.0f32; 3];
                 for &(n, w) in &self.entries[self.starts[row] as usize..self.starts[row + 1] as usize] {
                     (0..3).for_each(|c| sum[c] += w * x[n as usize][c]);
