@@ -755,9 +755,9 @@ fn fit(
 }
 
 /// Couples displacements measured on a level (place, displacement, covariance in mm^2) into a
-/// spline field, from one that is nearly right and on its lattice where there is one; with the evidence
-/// used. Each may be off by `floor` voxels beyond its covariance, and was found with a patch of
-/// `radius` voxels.
+/// spline field, from one that is nearly right and on its lattice where there is one; with the
+/// evidence used. Each may be off by `floor` voxels beyond its covariance, and was found with a
+/// patch of `radius` voxels.
 pub(super) fn couple(
     pair: &Pair<'_>,
     measured: impl ExactSizeIterator<Item = (VoxelPoint, GridVector, Symmetric3)>,
