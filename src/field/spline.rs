@@ -142,7 +142,7 @@ impl FieldSpline {
     }
 
     /// The displacement at every voxel (mm, RAS). What folds, between the knots of a lattice or at
-    /// a border between bodies, is opened ([`jacobian::unfold`]).
+    /// a border between bodies, is opened (`jacobian::unfold`).
     ///
     /// # Errors
     /// [`SpaceError`] where the grid it is asked for on is not one of the same voxels.

@@ -14,7 +14,7 @@ const MAX_CODE_BITS: usize = 12;
 const SYMBOLS: usize = 286;
 const END_OF_BLOCK: usize = 256;
 /// More than the bytes of a block's code, its end and one store past the end.
-const MAX_HEADER_BYTES: usize = 256;
+const SPARE_BYTES: usize = 256;
 /// Words in the longest run: 256 bytes, as DEFLATE's longest match of 258 is not a multiple of 4.
 const MAX_RUN_WORDS: usize = 64;
 /// Smallest match length of symbols 257 to 284 (RFC 1951, 3.2.5).
@@ -28,7 +28,7 @@ pub(super) fn deflate(data: &[u8]) -> Vec<u8> {
     for block in data.chunks(BYTES_PER_BLOCK) {
         deflate_block(block, &mut out);
     }
-    out.reserve(MAX_HEADER_BYTES);
+    out.reserve(SPARE_BYTES);
     // An empty stored block: three zero bits, the rest of the byte, length 0 and its complement.
     out.put(0, 3);
     out.count = out.count.next_multiple_of(8);
@@ -51,7 +51,7 @@ fn deflate_block(block: &[u8], out: &mut BitWriter) {
     let lengths = code_lengths(&counts);
     let codes = canonical_codes(&lengths);
 
-    out.reserve(block.len() * MAX_CODE_BITS / 8 + MAX_HEADER_BYTES);
+    out.reserve(block.len() * MAX_CODE_BITS / 8 + SPARE_BYTES);
     out.put(0b100, 3); // not final, dynamic code
     out.put(SYMBOLS as u64 - 257, 5);
     out.put(4 - 1, 5); // four distance codes

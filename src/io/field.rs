@@ -124,7 +124,7 @@ pub fn read_field_as(
 ///
 /// # Errors
 /// As [`read_field`].
-pub(crate) fn read_samples(path: impl AsRef<Path>) -> Result<ErrorSamples, IoError> {
+pub fn read_samples(path: impl AsRef<Path>) -> Result<ErrorSamples, IoError> {
     let path = path.as_ref();
     let (nodes, mut values) = nifti::read::samples(path)?;
     for sample in &mut values {

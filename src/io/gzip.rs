@@ -12,7 +12,7 @@ use std::io::{self, BufRead, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 
 /// No DEFLATE stream unpacks to more than this many times its size.
-pub(super) const LARGEST_RATIO: u64 = 1032;
+pub(super) const MAX_DEFLATE_RATIO: u64 = 1032;
 /// Bytes after the voxels that are still read, to check the checksum behind them.
 const MAX_TRAILING_BYTES: u64 = 1 << 20;
 /// How every member begins.

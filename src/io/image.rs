@@ -27,7 +27,7 @@ impl Format {
         if path.is_dir() {
             return Ok(Self::Dicom);
         }
-        let whole = source::head(path, dicom::PREAMBLE_BYTES as u64)?;
+        let whole = source::head(path, dicom::PREAMBLE_AND_MARK_BYTES as u64)?;
         if dicom::is_dicom(&whole) {
             return Ok(Self::Dicom);
         }

@@ -101,8 +101,7 @@ pub use csv::{
 pub(crate) use csv::{TableKind, table_kind};
 pub use dicom::{Series as DicomSeries, series_in};
 pub use digest::{digest, files_of};
-pub(crate) use field::read_samples;
-pub use field::{FieldConvention, read_field, read_field_as};
+pub use field::{FieldConvention, read_field, read_field_as, read_samples};
 pub(crate) use file_kind::form_of;
 pub use file_kind::{Form, columns_of};
 pub(crate) use fingertip::read_fingertip_modulus;
@@ -121,12 +120,11 @@ pub(crate) use measured::write_measured;
 pub(crate) use memory::memory_left;
 pub use mujoco::{write_mjcf, write_msh};
 pub(crate) use nifti::{
-    PackedField, STRAIN_BITS, length_bits, write_codes, write_field_series, write_samples, write_series_field,
-    write_tensor_deviations,
+    PackedField, STRAIN_BITS, length_bits, write_codes, write_field_series, write_series_field, write_tensor_deviations,
 };
 pub use nifti::{
     Series, stored, stored_length, stored_steps, write_by_rows, write_exact, write_field, write_integers, write_labels,
-    write_steps, write_tensors, write_vectors, write_volume,
+    write_samples, write_steps, write_tensors, write_vectors, write_volume,
 };
 pub use output::{OutputFolder, hold};
 pub(crate) use scene::SceneFile;

@@ -1,7 +1,7 @@
 //! Voxels that a text header describes: in the same file after it, or in one beside it.
 
 use super::format_error::Flaw;
-use super::gzip::{self, LARGEST_RATIO};
+use super::gzip::{self, MAX_DEFLATE_RATIO};
 use super::image::Stored;
 use super::memory::fits;
 use super::voxels::{Kind, count, decode, integers};
@@ -135,7 +135,7 @@ impl RawImage {
             Start::Last => size.saturating_sub(needed),
         };
         let held = size.saturating_sub(start);
-        let most = if self.packing == Packing::None { held } else { held.saturating_mul(LARGEST_RATIO) };
+        let most = if self.packing == Packing::None { held } else { held.saturating_mul(MAX_DEFLATE_RATIO) };
         if needed > most { Err(self.short(most)) } else { Ok((file, start)) }
     }
 

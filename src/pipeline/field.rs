@@ -2,7 +2,7 @@
 
 use crate::error::FieldError;
 use crate::field::jacobian;
-use crate::field::spline::{FieldSpline, ScalarSpline};
+pub use crate::field::spline::{FieldSpline, ScalarSpline};
 use crate::matching::levels::{Aligned, to_level};
 use crate::matching::pair::{Anchor, Pair, dilate};
 use crate::numerics::ablation;
@@ -21,7 +21,7 @@ use crate::pipeline::field_warnings::{
     why_so_many, without_texture,
 };
 use crate::pipeline::hypotheses::Begun;
-pub(crate) use crate::pipeline::hypotheses::Start;
+pub use crate::pipeline::hypotheses::Start;
 use crate::pipeline::input_checks::{self, Checked};
 use crate::pipeline::known::{Known, Turned};
 use crate::pipeline::landmarks;
@@ -32,7 +32,8 @@ pub(crate) use crate::pipeline::match_mesh::mesh_of;
 use crate::pipeline::match_mesh::{Meshed, estimated, interpolated, thinned, with_mesh, world_match};
 use crate::pipeline::refinement::{uneven, unlike};
 use crate::pipeline::sparse;
-use crate::pipeline::stages::{self, Stage};
+use crate::pipeline::stages;
+pub use crate::pipeline::stages::Stage;
 use crate::pipeline::start::{Begin, Halt};
 use crate::pipeline::uncertainty::{self, Variances};
 use crate::types::params::{BodySource, Interpolation, Method};

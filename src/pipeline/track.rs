@@ -42,12 +42,12 @@ impl<'a> Tracker<'a> {
     }
 
     /// With more that is known of the reference and of each frame.
-    pub(crate) fn knowing(reference: &'a Voxels<'a>, known: Known<'a>, params: &'a FieldParams) -> Self {
+    pub fn knowing(reference: &'a Voxels<'a>, known: Known<'a>, params: &'a FieldParams) -> Self {
         Self { reference, known, params, past: [None, None] }
     }
 
     /// Forgets the frames so far: the next one again comes right after (or before) the reference.
-    pub(crate) fn restart(&mut self) {
+    pub fn restart(&mut self) {
         self.past = [None, None];
     }
 

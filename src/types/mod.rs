@@ -55,7 +55,7 @@ pub mod skin;
 
 mod trial;
 
-pub(crate) mod batch;
+pub mod batch;
 
 pub use certificate::{Certificate, Gain, GaugeNoise, Imposed};
 pub use expected::{ErrorSource, ExpectedError, LabelError, Trust};

@@ -25,12 +25,8 @@ struct Scene {
 
 impl Scene {
     /// Tissue whose place `p` belongs to the body `label(p)` and moves to `moved(p)`.
-    fn new(
-        (shape, seed): ([usize; 3], u64),
-        label: impl Fn([f64; 3]) -> u8 + Sync,
-        moved: impl Fn([f64; 3]) -> [f64; 3] + Sync,
-    ) -> Self {
-        let grid = Grid::new(shape, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
+    fn new(seed: u64, label: impl Fn([f64; 3]) -> u8 + Sync, moved: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Self {
+        let grid = Grid::new(SHAPE, Affine::scaled([1.0; 3], [0.0; 3]).unwrap()).unwrap();
         let texture = Texture::new(seed);
         let content = |p: [f64; 3]| 300.0 * (1.0 + 0.3 * texture.at(p)).max(0.1);
         let noisy = |stream: u64, value: &dyn Fn([f64; 3]) -> f64| {
@@ -62,7 +58,7 @@ impl Scene {
             let ([x, y, _], (s, c)) = (from(p), angle.sin_cos());
             [MIDDLE[0] + c * x - s * y, MIDDLE[1] + s * x + c * y, p[2]]
         };
-        Self::new((SHAPE, seed), move |p| 1 + u8::from(inside(p)), move |p| if inside(p) { turned(p) } else { p })
+        Self::new(seed, move |p| 1 + u8::from(inside(p)), move |p| if inside(p) { turned(p) } else { p })
     }
 
     /// Two halves that move apart along an oblique plane by `mm` each.
@@ -73,14 +69,14 @@ impl Scene {
             let by = if above(p) { mm } else { -mm };
             std::array::from_fn(|a| p[a] + by * along[a])
         };
-        Self::new((SHAPE, seed), move |p| 1 + u8::from(above(p)), moved)
+        Self::new(seed, move |p| 1 + u8::from(above(p)), moved)
     }
 
     /// One body, bent by `mm` at most.
     fn smooth(mm: f64, seed: u64) -> Self {
         let wave = move |v: f64| (2.0 * std::f64::consts::PI * (v + 7.0 * seed as f64) / 60.0).sin();
         let moved = move |p: [f64; 3]| [p[0] + mm * wave(p[1]), p[1], p[2] + 0.5 * mm * wave(p[0])];
-        Self::new(([40, 38, 36], seed), |_| 1, moved)
+        Self::new(seed, |_| 1, moved)
     }
 
     fn measured(&self, mask: Option<&Mask>, params: &FieldParams) -> FieldResult {

@@ -28,8 +28,8 @@ use std::path::{Path, PathBuf};
 
 /// A file of a series is never larger (bytes).
 const MAX_FILE_BYTES: u64 = 1 << 30;
-/// Bytes up to the end of DICOM's mark.
-pub(super) const PREAMBLE_BYTES: usize = 132;
+/// Bytes of the preamble and of DICOM's mark behind it.
+pub(super) const PREAMBLE_AND_MARK_BYTES: usize = 132;
 
 const SERIES_NAME: Tag = (0x0008, 0x103e);
 const SERIES: Tag = (0x0020, 0x000e);
@@ -52,7 +52,7 @@ const SAME_POSITION_MM: f64 = 1e-3;
 
 /// Whether a file begins as DICOM does.
 pub(super) fn is_dicom(head: &[u8]) -> bool {
-    head.get(128..PREAMBLE_BYTES) == Some(b"DICM")
+    head.get(128..PREAMBLE_AND_MARK_BYTES) == Some(b"DICM")
 }
 
 /// One slice: where it lies, and which part of which file it is.
@@ -221,7 +221,7 @@ fn gather(path: &Path) -> Result<Vec<File>, IoError> {
     names.sort();
     let mut files = Vec::new();
     for name in names.into_iter().filter(|n| n.is_file() && n.file_name().is_none_or(|n| n != "DICOMDIR")) {
-        if !is_dicom(&source::head(&name, PREAMBLE_BYTES as u64).unwrap_or_default()) {
+        if !is_dicom(&source::head(&name, PREAMBLE_AND_MARK_BYTES as u64).unwrap_or_default()) {
             continue;
         }
         match (File::read(&name), &alone) {

@@ -26,10 +26,9 @@ mod write;
 pub use series::Series;
 pub(super) use write::{ForeignField, write_foreign_field};
 pub(crate) use write::{
-    PackedField, STRAIN_BITS, length_bits, write_codes, write_field_series, write_samples, write_series_field,
-    write_tensor_deviations,
+    PackedField, STRAIN_BITS, length_bits, write_codes, write_field_series, write_series_field, write_tensor_deviations,
 };
 pub use write::{
     stored, stored_length, stored_steps, write_by_rows, write_exact, write_field, write_integers, write_labels,
-    write_steps, write_tensors, write_vectors, write_volume,
+    write_samples, write_steps, write_tensors, write_vectors, write_volume,
 };

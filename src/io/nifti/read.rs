@@ -136,7 +136,7 @@ pub(super) struct Opened {
 impl Opened {
     /// Bytes that the file can unpack to.
     pub(super) fn most(&self) -> u64 {
-        if self.packed { self.size.saturating_mul(gzip::LARGEST_RATIO) } else { self.size }
+        if self.packed { self.size.saturating_mul(gzip::MAX_DEFLATE_RATIO) } else { self.size }
     }
 
     /// What the header says about the file, and its intent.

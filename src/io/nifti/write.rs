@@ -175,7 +175,7 @@ pub fn write_labels(path: impl AsRef<Path>, labels: &Mask, description: &str) ->
 /// 1007, float32, LPS.
 ///
 /// Components are rounded to multiples of 2^-12 mm (error at most 2^-13 mm, 0.12 um), or of a
-/// thousandth of the finest voxel edge where that is less (`stored_length`), so that they pack.
+/// thousandth of the finest voxel edge where that is less ([`stored_length`]), so that they pack.
 ///
 /// # Errors
 /// As [`write_volume`].
@@ -346,7 +346,7 @@ pub fn write_vectors<const N: usize>(
 ///
 /// # Errors
 /// As [`write_volume`].
-pub(crate) fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> Result<(), IoError> {
+pub fn write_samples(path: impl AsRef<Path>, samples: &ErrorSamples) -> Result<(), IoError> {
     let (n, frames) = (samples.nodes().len(), samples.values().len());
     let form = Form { frames, description: "samples of the error of u: cubic B-splines, LPS mm", ..Form::VECTORS };
     let parts: Vec<&[f32]> =

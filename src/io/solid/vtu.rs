@@ -3,6 +3,7 @@
 
 use super::edit::Edit;
 use crate::io::format_error::Flaw;
+use crate::io::gzip::MAX_DEFLATE_RATIO;
 use crate::types::{Measured, SolidElement, SolidMesh, SolidShape, WorldPoint};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use libdeflater::Decompressor;
@@ -10,8 +11,6 @@ use roxmltree::{Document, Node, ParsingOptions};
 use std::fmt::Write;
 
 const AGAIN: &str = "write it again with ParaView or meshio";
-/// Bytes that one byte packed with zlib can stand for at most.
-const MAX_ZLIB_RATIO: usize = 1032;
 /// VTK's numbers for cells that are no solids: points, lines, triangles and quadrilaterals.
 const FLAT: [i64; 13] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 21, 22, 23];
 
@@ -173,7 +172,7 @@ impl<'a> Store<'a> {
             let end = at.checked_add(self.header(header, 3 + block)?)?;
             let part = data.get(at..end)?;
             let length = if block + 1 == blocks && last > 0 { last } else { size };
-            if length > MAX_ZLIB_RATIO.checked_mul(part.len())? {
+            if length > (MAX_DEFLATE_RATIO as usize).checked_mul(part.len())? {
                 return None;
             }
             let start = out.len();

@@ -1,8 +1,7 @@
 //! Smooth level functions of a label map: where the body and each of its parts ends, to a fraction
 //! of a voxel.
 //!
-//! A voxel map has stairs; `rounding` takes them out of the body and of each
-//! part.
+//! A voxel map has stairs; `rounding` takes them out of the body and of each part.
 //!
 //! All positions here are in *grid millimetres*: voxel index times voxel size.
 

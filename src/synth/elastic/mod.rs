@@ -34,5 +34,5 @@ mod transfer;
 
 mod vectors;
 
-pub(crate) use press::ElasticDescription;
+pub use press::ElasticDescription;
 pub use press::{Pressed, press};
