@@ -70,9 +70,7 @@ impl AffineMotion {
         let y = matvec(&self.linear, x);
         std::array::from_fn(|a| y[a] + self.shift[a] - x[a])
     }
-}
 
-impl AffineMotion {
     /// The displacement at a place of a grid whose voxels have edges of `spacing` (mm) and along
     /// whose axes this motion is given.
     pub(crate) fn on_grid(&self, p: VoxelPoint, spacing: [f64; 3]) -> GridVector {

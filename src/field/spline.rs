@@ -111,8 +111,7 @@ impl FieldSpline {
     /// The same field, followed by an affine map of the world (mm, RAS).
     #[must_use]
     pub(crate) fn followed_by(mut self, map: &AffineMap) -> Self {
-        let (grid, axes) = (self.grid, self.grid.axes());
-        let spacing = grid.spacing();
+        let grid = self.grid;
         for (lattice, coefficients) in &mut self.bodies {
             let n = lattice.len();
             // Cubic B-splines through the values of a linear field are that field.
@@ -120,11 +119,10 @@ impl FieldSpline {
                 let VoxelPoint(place) = lattice.place(m);
                 let place = std::array::from_fn(|a| if lattice.shape[a] > 1 { place[a] } else { 0.0 });
                 let here = grid.affine().to_world(VoxelPoint(place));
-                let along = [0, 1, 2].map(|c| f64::from(coefficients[c * n + m]));
-                let world = std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * along[a]).sum());
-                let moved = map.at(here.moved(world)).minus(here);
-                let moved = grid.affine().vector_to_voxel(moved);
-                (0..3).for_each(|c| coefficients[c * n + m] = (spacing[c] * moved[c]) as f32);
+                let along = GridVector([0, 1, 2].map(|c| f64::from(coefficients[c * n + m])));
+                let moved = map.at(here.moved(grid.vector_to_world(along))).minus(here);
+                let GridVector(moved) = grid.vector_from_world(moved);
+                (0..3).for_each(|c| coefficients[c * n + m] = moved[c] as f32);
             }
         }
         self
@@ -167,8 +165,7 @@ impl FieldSpline {
 
     /// The displacement (mm, RAS) at a place of the canonical grid.
     pub(crate) fn at_place(&self, place: VoxelPoint) -> [f64; 3] {
-        let (axes, GridVector(v)) = (self.grid.axes(), self.along_axes(place));
-        std::array::from_fn(|r| (0..3).map(|a| axes[r][a] * v[a]).sum())
+        self.grid.vector_to_world(self.along_axes(place))
     }
 
     /// The displacement (mm, RAS) at a voxel offset (x fastest) of the grid it is asked for on,

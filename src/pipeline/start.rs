@@ -244,10 +244,9 @@ impl<E: Into<FieldError>> From<E> for Halt {
 impl Halt {
     /// For a motion (mm) along the axes of a level of `grid`, with its factor and spacing.
     pub fn turned(motion: &AffineMotion, grid: &Grid, (factor, spacing): ([usize; 3], [f64; 3])) -> Self {
-        let axes = grid.axes();
         let moved = |x: WorldPoint| {
-            let d = motion.displacement(to_level(grid.affine().to_voxel(x), factor).in_mm(spacing));
-            Some(x.moved(std::array::from_fn(|r| dot(axes[r], d))))
+            let d = motion.on_grid(to_level(grid.affine().to_voxel(x), factor), spacing);
+            Some(x.moved(grid.vector_to_world(d)))
         };
         affine_part(&moved, grid, None).map_or_else(Self::Error, |map| Self::Turned(Box::new(map)))
     }

@@ -11,12 +11,12 @@ pub struct PlanParams {
     pub moduli: Vec<(u8, f64)>,
     /// Wanted standard deviation of each modulus over the modulus (1).
     pub want: f64,
-    /// How far the plate goes in (mm); empty for `Self::DEFAULT_PRESSES` of the body's extent.
+    /// How far the plate goes in (mm); empty for [`Self::DEFAULT_PRESSES`] of the body's extent.
     pub press_mm: Vec<f64>,
     /// Edge of a voxel (mm, the finest axis); empty for that of the labels.
     pub voxel_mm: Vec<f64>,
     /// Standard deviation of the displacement of one voxel along an axis (mm); empty for
-    /// `Self::DEFAULT_NOISES` of each voxel size.
+    /// [`Self::DEFAULT_NOISES`] of each voxel size.
     pub noise_mm: Vec<f64>,
     /// How a flat loaded patch touches its plate: sticking or sliding. A curved one always slides.
     pub contact: Contact,
@@ -44,10 +44,10 @@ impl Default for PlanParams {
 impl PlanParams {
     /// Presses that are tried, over the body's extent along the load (1): from what shows at all to
     /// what the linear law bears.
-    pub(crate) const DEFAULT_PRESSES: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
+    pub const DEFAULT_PRESSES: [f64; 5] = [0.005, 0.01, 0.02, 0.04, 0.08];
     /// Noise that is tried, over the edge of a voxel (1): of correlation on good images to poor
     /// ones.
-    pub(crate) const DEFAULT_NOISES: [f64; 3] = [0.05, 0.1, 0.2];
+    pub const DEFAULT_NOISES: [f64; 3] = [0.05, 0.1, 0.2];
     /// Largest number of presses, voxel sizes or noises.
     pub(crate) const MAX_CHOICES: usize = 20;
 

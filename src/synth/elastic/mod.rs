@@ -34,5 +34,4 @@ mod transfer;
 
 mod vectors;
 
-pub use press::ElasticDescription;
-pub use press::{Pressed, press};
+pub use press::{ElasticDescription, Pressed, press};
